@@ -1,0 +1,101 @@
+"""Rigid-body kinematics of a tree of links, from the robot description (see `robot.py`)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from math import cos, sin
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Link:
+    """One row of the kinematic table: Rz(theta) Tz(d) Tx(r) Rx(alpha), then Rz(joint angle + offset)."""
+
+    name: str
+    parent: str
+    joint: str | None
+    theta_rad: float
+    d_m: float
+    alpha_rad: float
+    r_m: float
+    offset_rad: float
+
+    def fixed(self) -> Array:
+        """4 x 4 transform from the link's frame to its parent's at joint angle minus offset, i.e. before the
+        joint's own turn."""
+        ct, st = cos(self.theta_rad), sin(self.theta_rad)
+        ca, sa = cos(self.alpha_rad), sin(self.alpha_rad)
+        return np.array(
+            [
+                [ct, -st * ca, st * sa, self.r_m * ct],
+                [st, ct * ca, -ct * sa, self.r_m * st],
+                [0.0, sa, ca, self.d_m],
+                [0.0, 0.0, 0.0, 1.0],
+            ]
+        )
+
+
+def turn_z(angle_rad: float) -> Array:
+    """4 x 4 rotation about z."""
+    c, s = cos(angle_rad), sin(angle_rad)
+    return np.array([[c, -s, 0.0, 0.0], [s, c, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+
+
+class Chain:
+    """The links from the body to one tip, and the joints that move it.
+
+    Raises KeyError (naming the link) when the tip or one of its parents is not in the table.
+    """
+
+    def __init__(self, links: Mapping[str, Link], tip: str, root: str = "body") -> None:
+        rows: list[Link] = []
+        name = tip
+        while name != root:
+            if name not in links:
+                raise KeyError(f"link {name!r} is not in the robot description")
+            rows.append(links[name])
+            name = links[name].parent
+        rows.reverse()
+        self.tip = tip
+        self.joints = tuple(row.joint for row in rows if row.joint is not None)
+        self._steps = [(row.fixed(), row.joint, row.offset_rad) for row in rows]
+
+    def pose(self, angles_rad: Mapping[str, float]) -> Array:
+        """4 x 4 transform from the tip's frame to the root's. `angles_rad` has every joint of the chain."""
+        total = np.eye(4)
+        for fixed, joint, offset in self._steps:
+            total = total @ fixed
+            if joint is not None:
+                total = total @ turn_z(angles_rad[joint] + offset)
+        return total
+
+    def position(self, angles_rad: Mapping[str, float]) -> Array:
+        """The tip's origin in the root's frame, shape (3,)."""
+        return self.pose(angles_rad)[:3, 3]
+
+    def jacobian(self, angles_rad: Mapping[str, float], joints: Iterable[str] | None = None) -> Array:
+        """Geometric Jacobian of the tip, shape (6, n): rows 0-2 linear (m/rad), 3-5 angular, root's frame.
+
+        Columns follow `joints` (those of the chain by default); a joint outside the chain has a zero column.
+        """
+        columns: dict[str, tuple[Array, Array]] = {}
+        total = np.eye(4)
+        for fixed, joint, offset in self._steps:
+            total = total @ fixed
+            if joint is not None:
+                columns[joint] = (total[:3, 2].copy(), total[:3, 3].copy())
+                total = total @ turn_z(angles_rad[joint] + offset)
+        tip = total[:3, 3]
+        wanted = tuple(joints) if joints is not None else self.joints
+        jac = np.zeros((6, len(wanted)))
+        for i, joint in enumerate(wanted):
+            if joint in columns:
+                axis, origin = columns[joint]
+                jac[:3, i] = np.cross(axis, tip - origin)
+                jac[3:, i] = axis
+        return jac

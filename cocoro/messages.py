@@ -1,0 +1,421 @@
+"""The typed messages of the mesh: SI units, named in the field (`_m`, `_rad`, `_mps`, `_ns`).
+
+Every message is a MessagePack map on the wire, validated when it is decoded. Positions are in the body
+frame unless the field says otherwise: x forward, y left, z up, origin on the floor between the drive
+wheels. A reader ignores fields that it does not know, so a field with a default may be added at any time.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import Meta
+
+Finite = float  # checked by `_require_finite`: MessagePack can carry NaN and infinity
+NonNegative = Annotated[float, Meta(ge=0)]
+Count = Annotated[int, Meta(ge=0)]
+Vec2 = tuple[float, float]
+Vec3 = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+"""x, y, z, w."""
+
+
+def _require_finite(message: msgspec.Struct, *names: str) -> None:
+    """Refuse NaN and infinity in the named number, sequence or optional fields."""
+    for name in names:
+        value = getattr(message, name)
+        if value is None:
+            continue
+        values = value if isinstance(value, (tuple, list)) else (value,)
+        if not all(v is None or math.isfinite(v) for v in values):
+            raise ValueError(f"{name} must be finite, not {value!r}")
+
+
+class Message(msgspec.Struct, kw_only=True):
+    """What every message says of itself; the node fills these three in when it publishes."""
+
+    stamp_ns: int = 0
+    """When what the message tells was true, on the robot's clock. A publisher may set it earlier than now."""
+    seq: Count = 0
+    """Counts up by one for each message of one publisher on one key: a gap is a lost message."""
+    incarnation: Count = 0
+    """Drawn anew at each start of the publisher, so that a restart is not mistaken for a loss."""
+
+
+# --- hardware -------------------------------------------------------------------------------------
+
+
+class Frame(Message):
+    """One colour and depth pair of the Kinect. The pixels decode without a copy, as `memoryview`."""
+
+    width: Annotated[int, Meta(ge=1, le=4096)]
+    height: Annotated[int, Meta(ge=1, le=4096)]
+    colour: memoryview
+    """RGB, 8 bits a channel, row-major: height x width x 3 bytes."""
+    depth: memoryview
+    """Raw 11-bit depth codes as little-endian uint16, row-major: height x width x 2 bytes; 2047 = no data.
+    The depth camera's own view: registration to the colour image is the reader's work."""
+
+    def __post_init__(self) -> None:
+        pixels = self.width * self.height
+        for name, have, want in (
+            ("colour", self.colour.nbytes, 3 * pixels),
+            ("depth", self.depth.nbytes, 2 * pixels),
+        ):
+            if have != want:
+                raise ValueError(f"{name} has {have} bytes, {self.width} x {self.height} needs {want}")
+
+
+LatchState = Literal["unknown", "released", "latched"]
+"""Of the emergency stop, as a service knows it. Unknown counts as latched: the hardware stays still."""
+
+
+class BaseState(Message):
+    """The Create: odometry since the service started, its bumpers and its health."""
+
+    odometry_m: Vec2
+    """x, y of the body in the odometry frame: where the body stood when the service started."""
+    odometry_yaw_rad: float
+    """Heading in the odometry frame, counter-clockwise, not wrapped."""
+    speed_mps: float
+    """Forward speed, as odometry has it."""
+    turn_rate_radps: float
+    """Counter-clockwise, as odometry has it."""
+    bump_left: bool = False
+    bump_right: bool = False
+    wheel_drop: bool = False
+    cliff: bool = False
+    overcurrent: bool = False
+    mode: Literal["off", "passive", "safe", "full"] = "full"
+    battery_fraction: Annotated[float, Meta(ge=0, le=1)] = 1.0
+    battery_v: NonNegative = 16.0
+    charging: bool = False
+    latch: LatchState = "unknown"
+    stopped_by: str = ""
+    """Why the base refuses or zeroes wheel commands now ('' when it obeys): estop, latch unknown, bump,
+    cliff, wheel drop, no command, mode."""
+
+    def __post_init__(self) -> None:
+        _require_finite(self, "odometry_m", "odometry_yaw_rad", "speed_mps", "turn_rate_radps")
+
+
+class BaseCommand(Message):
+    """Wheel speeds. Valid for 0.2 s: a base that hears nothing newer commands zero."""
+
+    left_mps: float
+    right_mps: float
+
+    def __post_init__(self) -> None:
+        _require_finite(self, "left_mps", "right_mps")
+
+
+class ServoState(Message):
+    """One servo network, read at one time; every tuple is in the order of `joints`."""
+
+    joints: tuple[str, ...]
+    position_rad: tuple[float, ...]
+    """In the kinematic chain's own sense and zero (the common reference frame), not the servo's counts."""
+    speed_radps: tuple[float, ...]
+    load: tuple[float, ...]
+    """Signed share of the stall torque, -1 to 1, positive where the motor pushes towards greater angles."""
+    temperature_c: tuple[float, ...] = ()
+    voltage_v: tuple[float, ...] = ()
+    torque_enabled: tuple[bool, ...] = ()
+    faults: tuple[str, ...] = ()
+    """Latched faults, each 'joint: what', e.g. 'elbow: overload'."""
+    latch: LatchState = "unknown"
+    stopped_by: str = ""
+    """Why the network holds still whatever is commanded ('' when it obeys)."""
+
+    def __post_init__(self) -> None:
+        for name in ("position_rad", "speed_radps", "load"):
+            if len(getattr(self, name)) != len(self.joints):
+                raise ValueError(f"{name} has {len(getattr(self, name))} values for {len(self.joints)} joints")
+        _require_finite(self, "position_rad", "speed_radps", "load")
+
+
+class ServoCommand(Message):
+    """Goals for the named joints of one network; a joint that is not named keeps its goal. Valid for 0.2 s:
+    then an arm or neck joint that is still on its way holds where it is; the hand keeps its goal, so
+    that a held object stays held."""
+
+    joints: tuple[str, ...]
+    goal_rad: tuple[float, ...]
+    speed_radps: tuple[Annotated[float, Meta(ge=0)], ...]
+    """Speed limit on the way to the goal. 0 means hold where it is (never 'full speed', as the servo has it)."""
+
+    def __post_init__(self) -> None:
+        for name in ("goal_rad", "speed_radps"):
+            if len(getattr(self, name)) != len(self.joints):
+                raise ValueError(f"{name} has {len(getattr(self, name))} values for {len(self.joints)} joints")
+        _require_finite(self, "goal_rad", "speed_radps")
+
+
+# --- perception -----------------------------------------------------------------------------------
+
+
+class Detection(msgspec.Struct, kw_only=True):
+    """One known object in one frame."""
+
+    label: str
+    u_px: float
+    v_px: float
+    """Centroid in the colour image, pixels right and down from the top left pixel's centre."""
+    area_px: Count
+    box_px: tuple[int, int, int, int]
+    """left, top, right, bottom of the matching pixels, right and bottom exclusive."""
+    depth_m: float | None = None
+    """Along the optical axis, of the visible surface; None when the depth image has none there."""
+    position_m: Vec3 | None = None
+    """The object's centre (visible surface carried inwards by the known radius), body frame as the body
+    stood at the frame's stamp; None without depth or without head angles for that stamp."""
+    note: str = ""
+    """Why there is no position, or what makes it doubtful: 'no depth', 'no head angles', 'occluded', 'cut'."""
+
+
+class Detections(Message):
+    """All known objects in one frame. `stamp_ns` is the frame's stamp, not the time of publishing."""
+
+    frame_seq: Count
+    frame_incarnation: Count
+    width: int
+    height: int
+    pan_rad: float | None = None
+    tilt_rad: float | None = None
+    """The head angles that were used: interpolated at the frame's stamp."""
+    detections: tuple[Detection, ...] = ()
+
+
+# --- planning -------------------------------------------------------------------------------------
+
+Behaviour = Literal["idle", "park", "search", "approach", "reach", "grasp", "lift", "place"]
+
+
+class Intent(Message):
+    """What the executive wants of the planner. Repeated at the topic's rate: a planner that no longer hears
+    it stands still."""
+
+    task_id: str = ""
+    step: Count = 0
+    """Counts the intents of one run of the executive, so that a status can say which one it answers."""
+    behaviour: Behaviour = "idle"
+    label: str = ""
+
+
+class TargetEstimate(msgspec.Struct, kw_only=True):
+    """What the planner believes of one object now: fused over time and carried by odometry."""
+
+    label: str
+    position_m: Vec3
+    """Centre, body frame, now."""
+    velocity_mps: Vec3 = (0.0, 0.0, 0.0)
+    """In the odometry frame."""
+    sigma_m: float = 0.0
+    """Standard deviation of the horizontal position."""
+    age_s: float = 0.0
+    """Since the newest frame in which it was localised."""
+    odometry_position_m: Vec3 = (0.0, 0.0, 0.0)
+    """The same centre in the odometry frame."""
+
+
+class PlannerStatus(Message):
+    """What the planner does and why; the executive decides on it, people read it."""
+
+    task_id: str = ""
+    step: Count = 0
+    behaviour: Behaviour = "idle"
+    state: Literal["running", "done", "failed"] = "running"
+    reason: str = ""
+    """For 'failed', a word that the executive acts on: lost, unreachable, blocked, slipped, no_grip, stale."""
+    why: str = ""
+    """One sentence for people: why it does what it does now."""
+    target: TargetEstimate | None = None
+    distance_m: float | None = None
+    """What is left to go: to the stopping place when driving, hand to target when reaching."""
+    hand_m: Vec3 | None = None
+    """Centre between the pads, body frame, felt (from the joint angles)."""
+    holding: bool = False
+    """The claws are stopped by something between them."""
+    known: tuple[TargetEstimate, ...] = ()
+    """Every object in memory."""
+
+
+# --- executive ------------------------------------------------------------------------------------
+
+TaskName = Literal["fetch", "park", "put-down"]
+Outcome = Literal["done", "failed", "cancelled"]
+
+
+class Phase(msgspec.Struct, kw_only=True):
+    name: str
+    start_ns: int
+    end_ns: int | None = None
+
+
+class TaskState(Message):
+    """The task that runs, or the one that ran last."""
+
+    task_id: str = ""
+    task: str = ""
+    label: str = ""
+    phase: str = "idle"
+    text: str = ""
+    """What it does now, in words, with the planner's reason."""
+    distance_m: float | None = None
+    started_ns: int = 0
+    phases: tuple[Phase, ...] = ()
+    outcome: Outcome | None = None
+    reason: str = ""
+    """For failed and cancelled: not_found, lost, slipped, unreachable, timed_out, ... and words after a colon."""
+    elapsed_s: float = 0.0
+
+
+class TaskRequest(msgspec.Struct, kw_only=True):
+    task: TaskName
+    label: str = ""
+    timeout_s: Annotated[float, Meta(gt=0, le=3600)] | None = None
+
+
+RefusalCode = Literal["unknown_label", "busy", "estop", "not_alive", "not_holding", "bad_request", "no_task"]
+
+
+class TaskReply(msgspec.Struct, kw_only=True):
+    """Accepted with a task's id, or refused with a code and a sentence that says what to do."""
+
+    accepted: bool
+    task_id: str = ""
+    refusal: RefusalCode | None = None
+    text: str = ""
+
+
+class CancelRequest(msgspec.Struct, kw_only=True):
+    task_id: str = ""
+    """Empty cancels whatever runs."""
+
+
+class ObjectsRequest(msgspec.Struct, kw_only=True):
+    pass
+
+
+class KnownObject(msgspec.Struct, kw_only=True):
+    label: str
+    shape: Literal["cylinder", "sphere", "box"]
+    size_m: Vec3
+    graspable: bool
+    seen: TargetEstimate | None = None
+
+
+class ObjectsReply(msgspec.Struct, kw_only=True):
+    objects: tuple[KnownObject, ...]
+
+
+# --- safety ---------------------------------------------------------------------------------------
+
+
+class EstopRequest(msgspec.Struct, kw_only=True):
+    """Latch or release the emergency stop; every hardware service and the executive answer it."""
+
+    latched: bool
+    by: str = ""
+
+
+class EstopReply(msgspec.Struct, kw_only=True):
+    service: str
+    latch: LatchState
+    text: str = ""
+
+
+class Latch(Message):
+    """The executive's word on the emergency stop; a restarted hardware service stays still until it hears it."""
+
+    state: LatchState
+    by: str = ""
+
+
+# --- clock, health, records -----------------------------------------------------------------------
+
+
+class Clock(Message):
+    """Simulated time is `stamp_ns`; a new incarnation is a new epoch."""
+
+    rate: float = 1.0
+    """Simulated seconds a real second, as the simulator last measured it."""
+    paused: bool = False
+
+
+class TopicHealth(msgspec.Struct, kw_only=True):
+    key: str
+    direction: Literal["in", "out"]
+    count: Count = 0
+    rate_hz: float = 0.0
+    age_s: float | None = None
+    """Of the newest sample by its stamp, when the health was taken; None when there was none."""
+    skipped: Count = 0
+    """State that was overwritten by newer state before it was read."""
+    lost: Count = 0
+    """Gaps in the sequence: never arrived."""
+    rejected: Count = 0
+    """Malformed, wrongly typed, oversized or out of order: counted, dropped."""
+    last_error: str = ""
+
+
+class LoopHealth(msgspec.Struct, kw_only=True):
+    """Of a fixed-rate loop or a driven core, over the last health period."""
+
+    name: str
+    rate_hz: float = 0.0
+    period_median_ms: float = 0.0
+    period_p99_ms: float = 0.0
+    step_median_ms: float = 0.0
+    overruns: Count = 0
+    """Periods that were missed altogether since the start."""
+
+
+class Health(Message):
+    service: str
+    pid: int = 0
+    state: Literal["starting", "ready", "degraded", "stopping"] = "starting"
+    text: str = ""
+    uptime_s: float = 0.0
+    cpu_share: float = 0.0
+    """Of one core, over the last health period."""
+    rss_mb: float = 0.0
+    topics: tuple[TopicHealth, ...] = ()
+    loops: tuple[LoopHealth, ...] = ()
+    faults: tuple[str, ...] = ()
+
+
+class StepRecord(Message):
+    """What one step of a pure core consumed and gave, in order: enough to execute it again exactly."""
+
+    now_ns: int
+    core: str = ""
+    consumed: tuple[tuple[str, int, int], ...] = ()
+    """(topic, incarnation, seq) in the order in which the core was given them."""
+    produced: tuple[tuple[str, int, int], ...] = ()
+
+
+# --- truth: the simulator's own, for tests, the judge and viewers alone ---------------------------
+
+
+class TrueObject(msgspec.Struct, kw_only=True):
+    label: str
+    kind: Literal["object", "obstacle"]
+    position_m: Vec3
+    """Centre, world frame."""
+    orientation: Quaternion
+    touching: tuple[str, ...] = ()
+    """Names of what it touches: robot links ('claw_left'), 'floor', other labels."""
+
+
+class Truth(Message):
+    body_m: Vec3
+    """The body frame's origin in the world."""
+    body_orientation: Quaternion
+    joints_rad: dict[str, float]
+    """True joint angles."""
+    objects: tuple[TrueObject, ...]
+    collisions: tuple[str, ...] = ()
+    """Contacts of the robot now, other than wheels on floor and claws on object: 'elbow~green_can'."""

@@ -1,0 +1,241 @@
+"""The robot description: one TOML file that the simulator, the models and the drivers all read."""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import dataclass
+from functools import cached_property
+from importlib import resources
+from math import pi, radians, tan
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+from numpy.typing import NDArray
+
+from cocoro.errors import ConfigError
+from cocoro.kinematics import Array, Chain, Link
+
+Positive = Annotated[float, Meta(gt=0)]
+Vec3 = tuple[float, float, float]
+
+SERVO_COUNTS = 1024
+SERVO_RANGE_RAD = radians(300.0)
+SERVO_COUNT_RAD = SERVO_RANGE_RAD / (SERVO_COUNTS - 1)
+"""0..1023 stand for 0..300 degrees (ROBOTIS AX-12 manual)."""
+
+
+class Base(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    wheel_separation_m: Positive
+    wheel_radius_m: Positive
+    chassis_diameter_m: Positive
+    chassis_height_m: Positive
+    mass_kg: Positive
+    max_wheel_speed_mps: Positive
+    command_timeout_s: Positive
+    state_rate_hz: Positive
+
+
+class Kinect(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    width: int
+    height: int
+    rate_hz: Positive
+    horizontal_fov_rad: Positive
+    vertical_fov_rad: Positive
+    depth_offset_m: Vec3
+    projector_offset_m: Vec3
+    min_range_m: Positive
+    max_range_m: Positive
+    depth_curve: Vec3
+    mount_min_m: Vec3
+    mount_max_m: Vec3
+
+
+class Marker(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The ball on the hand that babbling looks at; `position_m` in the link's frame."""
+
+    link: str
+    radius_m: Positive
+    position_m: Vec3
+
+
+class Network(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    baud: int
+    rate_hz: Positive
+
+
+class Claw(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    pad_length_m: Positive
+    open_sign: dict[str, float]
+
+
+class Joint(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    name: str
+    network: Literal["arm", "hand"]
+    id: int
+    limits_deg: tuple[float, float]
+    torque_nm: Positive
+    max_speed_radps: Positive
+    direction: Literal[-1, 1] = 1
+    centre_count: float = (SERVO_COUNTS - 1) / 2
+
+    @property
+    def limits_rad(self) -> tuple[float, float]:
+        return radians(self.limits_deg[0]), radians(self.limits_deg[1])
+
+    def to_count(self, angle_rad: float) -> int:
+        """The servo position nearest to a joint angle, clipped to 0..1023."""
+        count = round(self.centre_count + self.direction * angle_rad / SERVO_COUNT_RAD)
+        return min(max(count, 0), SERVO_COUNTS - 1)
+
+    def to_angle(self, count: float) -> float:
+        """The joint angle in radians that a servo position stands for."""
+        return self.direction * (count - self.centre_count) * SERVO_COUNT_RAD
+
+
+class _LinkRow(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    name: str
+    parent: str
+    theta_deg: float
+    d_m: float
+    alpha_deg: float
+    r_m: float
+    joint: str | None = None
+    offset_deg: float = 0.0
+
+
+class _File(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    name: str
+    base: Base
+    kinect: Kinect
+    link: list[_LinkRow]
+    marker: Marker
+    network: dict[Literal["arm", "hand"], Network]
+    joint: list[Joint]
+    claw: Claw
+    pose: dict[str, dict[str, float]]
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera: pixel (u, v) right and down, camera frame x right, y down, z forward."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+    def ray(self, u_px: float, v_px: float) -> Array:
+        """Direction of a pixel, camera frame, with z = 1; shape (3,)."""
+        return np.array([(u_px - self.cx) / self.fx, (v_px - self.cy) / self.fy, 1.0])
+
+    def scaled(self, width: int, height: int) -> Camera:
+        """The same camera at another resolution."""
+        sx, sy = width / self.width, height / self.height
+        return Camera(width, height, self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy)
+
+
+class Robot:
+    """The description, ready to compute with. Make it with `Robot.load()`."""
+
+    def __init__(self, spec: _File) -> None:
+        self.name = spec.name
+        self.base = spec.base
+        self.kinect = spec.kinect
+        self.marker = spec.marker
+        self.networks = spec.network
+        self.claw = spec.claw
+        self.poses = spec.pose
+        self.joints = {joint.name: joint for joint in spec.joint}
+        self.links = {
+            row.name: Link(
+                row.name,
+                row.parent,
+                row.joint,
+                radians(row.theta_deg),
+                row.d_m,
+                radians(row.alpha_deg),
+                row.r_m,
+                radians(row.offset_deg),
+            )
+            for row in spec.link
+        }
+
+    @classmethod
+    def load(cls, path: Path | None = None, override: Path | None = None) -> Robot:
+        """Read the Calliope's own description, or another one.
+
+        `override` is a robot's own file with just the values that were measured on that robot; tables are
+        merged, and `[[link]]` and `[[joint]]` rows by their name. Raises ConfigError naming file and field.
+        """
+        text = (
+            path.read_text() if path else resources.files("cocoro").joinpath("calliope.toml").read_text()
+        )
+        where = str(path) if path else "calliope.toml"
+        try:
+            data = tomllib.loads(text)
+            if override is not None:
+                where = str(override)
+                _merge(data, tomllib.loads(override.read_text()))
+            return cls(msgspec.convert(data, _File))
+        except (tomllib.TOMLDecodeError, msgspec.ValidationError, OSError) as error:
+            raise ConfigError(f"robot description {where}: {error}") from error
+
+    def network_joints(self, network: str) -> tuple[str, ...]:
+        """The joints of one servo network, in the order of their servo IDs."""
+        rows = [joint for joint in self.joints.values() if joint.network == network]
+        return tuple(joint.name for joint in sorted(rows, key=lambda joint: joint.id))
+
+    def chain(self, tip: str) -> Chain:
+        return Chain(self.links, tip)
+
+    @cached_property
+    def camera(self) -> Camera:
+        k = self.kinect
+        return Camera(
+            k.width,
+            k.height,
+            k.width / 2 / tan(k.horizontal_fov_rad / 2),
+            k.height / 2 / tan(k.vertical_fov_rad / 2),
+            k.width / 2,
+            k.height / 2,
+        )
+
+    def depth_m(self, raw: NDArray[np.uint16]) -> NDArray[np.float32]:
+        """Raw 11-bit depth codes to metres along the optical axis; no data (2047 and beyond) becomes NaN."""
+        return self._depth_table[np.minimum(raw, 2047)]
+
+    def depth_code(self, depth_m: Array) -> NDArray[np.uint16]:
+        """Metres to raw codes, 2047 outside of the range; the inverse of `depth_m` up to quantisation."""
+        a, b, c = self.kinect.depth_curve
+        inside = (depth_m >= self.kinect.min_range_m) & (depth_m <= self.kinect.max_range_m)
+        codes = np.rint(b * (np.arctan(np.where(inside, depth_m, 1.0) / a) - c))
+        return np.where(inside, codes, 2047).astype(np.uint16)
+
+    @cached_property
+    def _depth_table(self) -> NDArray[np.float32]:
+        a, b, c = self.kinect.depth_curve
+        angle = np.arange(2048) / b + c
+        table = np.where(angle < pi / 2, a * np.tan(angle), np.nan)
+        table[2047] = np.nan
+        table[table > 2 * self.kinect.max_range_m] = np.nan
+        return table.astype(np.float32)
+
+
+def _merge(into: dict[str, Any], extra: dict[str, Any]) -> None:
+    for key, value in extra.items():
+        if isinstance(value, dict) and isinstance(into.get(key), dict):
+            _merge(into[key], value)
+        elif isinstance(value, list) and value and isinstance(value[0], dict) and isinstance(into.get(key), list):
+            rows = {row.get("name"): row for row in into[key]}
+            for row in value:
+                if row.get("name") in rows:
+                    _merge(rows[row["name"]], row)
+                else:
+                    into[key].append(row)
+        else:
+            into[key] = value

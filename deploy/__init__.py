@@ -1,0 +1,1 @@
+"""Profiles, and the supervisor that starts and stops the processes of one."""
