@@ -1,0 +1,150 @@
+"""Clocks: real, virtual (the event loop's own time), and followed (the simulator's clock key).
+
+A clock that jumps back starts a new epoch; whoever keeps ages, histories or deadlines begins anew then.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from typing import Protocol
+
+NS = 1_000_000_000
+
+
+class Clock(Protocol):
+    @property
+    def epoch(self) -> int:
+        """Counts the times that the clock jumped back."""
+
+    def now_ns(self) -> int: ...
+
+    async def sleep_until(self, when_ns: int) -> bool:
+        """Wait for a time. False when a new epoch began instead: the deadline has lost its meaning."""
+
+
+async def sleep(clock: Clock, seconds: float) -> bool:
+    """Wait for a duration of the clock's time; False when a new epoch began meanwhile."""
+    return await clock.sleep_until(clock.now_ns() + round(seconds * NS))
+
+
+class RealClock:
+    """The system's clock. Waiting is paced by the monotonic clock, in slices so that a step is noticed."""
+
+    STEP_NS = NS // 2
+    """A jump back by more than this is a new epoch (a smaller one is the time daemon's work)."""
+
+    def __init__(self) -> None:
+        self._newest_ns = 0
+        self._epoch = 0
+
+    @property
+    def epoch(self) -> int:
+        self.now_ns()
+        return self._epoch
+
+    def now_ns(self) -> int:
+        now = time.time_ns()
+        if now < self._newest_ns:
+            if self._newest_ns - now <= self.STEP_NS:
+                return self._newest_ns
+            self._epoch += 1
+        self._newest_ns = now
+        return now
+
+    async def sleep_until(self, when_ns: int) -> bool:
+        epoch = self.epoch
+        while (left_ns := when_ns - self.now_ns()) > 0:
+            await asyncio.sleep(min(left_ns / NS, 1.0))
+            if self.epoch != epoch:
+                return False
+        return True
+
+
+class VirtualClock:
+    """The running event loop's own time, for `vloop.VirtualTimeLoop`."""
+
+    epoch = 0
+
+    def now_ns(self) -> int:
+        return round(asyncio.get_running_loop().time() * NS)
+
+    async def sleep_until(self, when_ns: int) -> bool:
+        loop = asyncio.get_running_loop()
+        if when_ns > self.now_ns():
+            done = loop.create_future()
+            timer = loop.call_at(when_ns / NS, _finish, done)
+            try:
+                await done
+            finally:
+                timer.cancel()
+        else:
+            await asyncio.sleep(0)
+        return True
+
+
+def _finish(done: asyncio.Future[None]) -> None:
+    if not done.done():
+        done.set_result(None)
+
+
+class FollowedClock:
+    """Follows ticks of simulated time. Between ticks it runs on at the simulator's rate, for at most
+    `run_on_s`: when the simulator stands still, time stands still."""
+
+    def __init__(self, run_on_s: float = 0.03) -> None:
+        self._run_on_ns = round(run_on_s * NS)
+        self._epoch = 0
+        self._incarnation: int | None = None
+        self._tick_ns = 0
+        self._tick_real_ns = 0
+        self._newest_ns = 0
+        self._rate = 1.0
+        self._ticked = asyncio.Event()
+
+    @property
+    def epoch(self) -> int:
+        return self._epoch
+
+    @property
+    def started(self) -> bool:
+        return self._incarnation is not None
+
+    def tick(self, stamp_ns: int, incarnation: int, rate: float = 1.0) -> None:
+        """A sample of the clock key. Ticks that arrive late within an incarnation are ignored."""
+        if incarnation != self._incarnation:
+            if self._incarnation is not None:
+                self._epoch += 1
+            self._incarnation = incarnation
+            self._newest_ns = 0
+        elif stamp_ns < self._tick_ns:
+            return
+        self._tick_ns = stamp_ns
+        self._tick_real_ns = time.monotonic_ns()
+        self._rate = min(max(rate, 0.01), 2.0)
+        ticked, self._ticked = self._ticked, asyncio.Event()
+        ticked.set()
+
+    def now_ns(self) -> int:
+        if self._incarnation is None:
+            return 0
+        run_on = min(round((time.monotonic_ns() - self._tick_real_ns) * self._rate), self._run_on_ns)
+        self._newest_ns = max(self._newest_ns, self._tick_ns + run_on)
+        return self._newest_ns
+
+    async def wait_started(self) -> None:
+        while self._incarnation is None:
+            await self._ticked.wait()
+
+    async def sleep_until(self, when_ns: int) -> bool:
+        await self.wait_started()
+        epoch = self._epoch
+        while (left_ns := when_ns - self.now_ns()) > 0:
+            reachable_ns = self._tick_ns + self._run_on_ns - self.now_ns()
+            if left_ns <= reachable_ns:
+                await asyncio.sleep(left_ns / NS / self._rate)
+            else:
+                await self._ticked.wait()
+            if self._epoch != epoch:
+                return False
+        return True
