@@ -120,7 +120,11 @@ class _File(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera: pixel (u, v) right and down, camera frame x right, y down, z forward."""
+    """A pinhole camera: pixel (u, v) right and down, camera frame x right, y down, z forward.
+
+    A pixel's index is its centre (the top left pixel's centre is (0, 0)), so the image reaches from -0.5 to
+    width - 0.5 and its middle is at (width - 1) / 2.
+    """
 
     width: int
     height: int
@@ -136,7 +140,9 @@ class Camera:
     def scaled(self, width: int, height: int) -> Camera:
         """The same camera at another resolution."""
         sx, sy = width / self.width, height / self.height
-        return Camera(width, height, self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy)
+        cx = (self.cx + 0.5) * sx - 0.5  # what scales is the distance from the image's edge, at -0.5
+        cy = (self.cy + 0.5) * sy - 0.5
+        return Camera(width, height, self.fx * sx, self.fy * sy, cx, cy)
 
 
 class Robot:
@@ -201,8 +207,8 @@ class Robot:
             k.height,
             k.width / 2 / tan(k.horizontal_fov_rad / 2),
             k.height / 2 / tan(k.vertical_fov_rad / 2),
-            k.width / 2,
-            k.height / 2,
+            (k.width - 1) / 2,  # 319.5: the middle of a field of view that is equal to both sides (see Camera)
+            (k.height - 1) / 2,
         )
 
     def depth_m(self, raw: NDArray[np.uint16]) -> NDArray[np.float32]:
