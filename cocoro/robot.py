@@ -207,7 +207,7 @@ class Robot:
             k.height,
             k.width / 2 / tan(k.horizontal_fov_rad / 2),
             k.height / 2 / tan(k.vertical_fov_rad / 2),
-            (k.width - 1) / 2,  # 319.5: the middle of a field of view that is equal to both sides (see Camera)
+            (k.width - 1) / 2,  # 319.5, the middle of a symmetric view: see Camera
             (k.height - 1) / 2,
         )
 
