@@ -178,9 +178,7 @@ class Robot:
         `override` is a robot's own file with just the values that were measured on that robot; tables are
         merged, and `[[link]]` and `[[joint]]` rows by their name. Raises ConfigError naming file and field.
         """
-        text = (
-            path.read_text() if path else resources.files("cocoro").joinpath("calliope.toml").read_text()
-        )
+        text = path.read_text() if path else resources.files("cocoro").joinpath("calliope.toml").read_text()
         where = str(path) if path else "calliope.toml"
         try:
             data = tomllib.loads(text)

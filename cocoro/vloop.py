@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import heapq
 import selectors
-from collections.abc import Coroutine
+from collections.abc import Callable, Coroutine
 from typing import Any, TypeVar
 
 T = TypeVar("T")
@@ -67,7 +67,9 @@ class VirtualTimeLoop(asyncio.SelectorEventLoop):
         if self._scheduled:
             self._virtual_s = max(self._virtual_s, self._scheduled[0].when())
 
-    def call_at(self, when: float, callback: Any, *args: Any, context: Any = None) -> asyncio.TimerHandle:
+    def call_at(  # type: ignore[override] # the stubs type the arguments as a tuple variable
+        self, when: float, callback: Callable[..., object], *args: Any, context: Any = None
+    ) -> asyncio.TimerHandle:
         timer = _Timer(when, callback, args, self, context)
         timer.order = self._orders
         self._orders += 1
@@ -75,7 +77,9 @@ class VirtualTimeLoop(asyncio.SelectorEventLoop):
         timer._scheduled = True  # type: ignore[attr-defined] # what BaseEventLoop.call_at does
         return timer
 
-    def call_soon_threadsafe(self, callback: Any, *args: Any, context: Any = None) -> asyncio.Handle:
+    def call_soon_threadsafe(  # type: ignore[override] # as above
+        self, callback: Callable[..., object], *args: Any, context: Any = None
+    ) -> asyncio.Handle:
         return self.call_soon(callback, *args, context=context)
 
 

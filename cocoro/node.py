@@ -1,0 +1,372 @@
+"""Node: what a component is written against.
+
+    async with Node("planning", bus, clock, robot) as node:
+        await node.drive(PlanningCore(...))
+
+A node publishes with stamp, sequence and incarnation filled in, reads with every sample checked and counted,
+answers typed requests, tells its health once a second, and holds the service's liveliness token.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine
+from typing import Any, Generic, TypeVar
+
+import msgspec
+
+from cocoro import topics
+from cocoro.bus.base import Bus, Handle, Payload, Reply
+from cocoro.clock import NS, Clock, FollowedClock, VirtualClock
+from cocoro.clock import sleep as clock_sleep
+from cocoro.core import Core, Sample
+from cocoro.errors import CocoroError, MeshError, RemoteError
+from cocoro.inbox import Inbox, Intake, Latest, Rate, Stream
+from cocoro.loops import LoopMeter, Schedule, every
+from cocoro.messages import Health, Message, StepRecord, TopicHealth
+from cocoro.meter import ProcessMeter
+from cocoro.robot import Robot
+from cocoro.topics import HEALTH, STEPS, Qos, Request, Topic
+
+M = TypeVar("M", bound=Message)
+Q = TypeVar("Q", bound=msgspec.Struct)
+R = TypeVar("R", bound=msgspec.Struct)
+
+ALIVE = "{service}/alive"
+"""The liveliness token's place under the robot's name."""
+
+
+def alive_key(robot: str, service: str) -> str:
+    return f"{robot}/{ALIVE.format(service=service)}"
+
+
+class Publisher(Generic[M]):
+    """Publishes on one topic. Makes stamp, sequence and incarnation, so that no component has to."""
+
+    def __init__(self, topic: Topic[M], key: str, bus: Bus, clock: Clock) -> None:
+        self.topic = topic
+        self.key = key
+        self.rate = Rate()
+        self.newest_stamp_ns: int | None = None
+        self._raw = bus.publisher(key, topic.qos)
+        self._incarnation = bus.new_incarnation()
+        self._encoder = msgspec.msgpack.Encoder()
+        self._clock = clock
+
+    def put(self, message: M, stamp_ns: int | None = None) -> M:
+        """Publish and return the message, completed in place. `stamp_ns` defaults to the message's own when it has one,
+        else to now."""
+        if not isinstance(message, self.topic.type):
+            raise TypeError(f"{self.topic.name} carries {self.topic.type.__name__}, not {type(message).__name__}")
+        if stamp_ns is not None:
+            message.stamp_ns = stamp_ns
+        elif message.stamp_ns == 0:
+            message.stamp_ns = self._clock.now_ns()
+        message.seq = self.rate.count
+        message.incarnation = self._incarnation
+        self.rate.count += 1
+        self.newest_stamp_ns = message.stamp_ns
+        self._raw.put(self._encoder.encode(message))
+        return message
+
+    def health(self, now_ns: int) -> TopicHealth:
+        age_s = None if self.newest_stamp_ns is None else (now_ns - self.newest_stamp_ns) / NS
+        return TopicHealth(
+            key=self.key, direction="out", count=self.rate.count, rate_hz=self.rate.take(now_ns), age_s=age_s
+        )
+
+
+class Node:
+    """One service on the mesh. Use it as an asynchronous context manager."""
+
+    def __init__(
+        self,
+        name: str,
+        bus: Bus,
+        clock: Clock,
+        robot: Robot,
+        *,
+        robot_name: str | None = None,
+        latency_s: float = 0.0,
+        record_steps: bool = False,
+        health_hz: float = 1.0,
+    ) -> None:
+        """`latency_s` is added to every step of a driven core, as if computing took that much longer."""
+        self.name = name
+        self.bus = bus
+        self.clock = clock
+        self.robot = robot
+        self.robot_name = robot_name or robot.name
+        self.latency_s = latency_s
+        self.record_steps = record_steps
+        self.log = logging.getLogger(f"cocoro.{name}")
+        self.state: str = "starting"
+        self.text = ""
+        self.faults: tuple[str, ...] = ()
+        self._health_hz = health_hz
+        self._inboxes: dict[str, Inbox[Any]] = {}
+        self._publishers: dict[str, Publisher[Any]] = {}
+        self._meters: list[LoopMeter] = []
+        self._handles: list[Handle] = []
+        self._tasks: set[asyncio.Task[Any]] = set()
+        self._process = None if isinstance(clock, VirtualClock) else ProcessMeter()
+
+    # --- lifecycle --------------------------------------------------------------------------------
+
+    async def __aenter__(self) -> Node:
+        if isinstance(self.clock, FollowedClock) and self.name != "sim":
+            self.inbox(topics.CLOCK).add(self._tick)
+        self.spawn(self._tell_health())
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        self.state = "stopping"
+        for task in list(self._tasks):
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        for handle in reversed(self._handles):
+            handle.close()
+        self._handles.clear()
+
+    def ready(self, text: str = "") -> None:
+        """Say that the service works from now on: declares its liveliness token."""
+        if self.state == "starting":
+            self._handles.append(self.bus.declare_alive(alive_key(self.robot_name, self.name)))
+        self.state = "ready"
+        self.text = text
+
+    def degraded(self, text: str) -> None:
+        """Say that it works, but not as it should."""
+        if self.state == "starting":
+            self.ready()
+        self.state = "degraded"
+        self.text = text
+
+    def spawn(self, work: Coroutine[Any, Any, Any]) -> asyncio.Task[Any]:
+        """Run something beside; it ends with the node. An exception in it is logged and degrades the node."""
+        task = asyncio.create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._spawn_ended)
+        return task
+
+    def _spawn_ended(self, task: asyncio.Task[Any]) -> None:
+        self._tasks.discard(task)
+        if not task.cancelled() and (error := task.exception()) is not None:
+            self.log.error("background work failed", exc_info=error)
+            self.degraded(f"background work failed: {error}")
+
+    def _tick(self, _key: str, clock: Message) -> None:
+        assert isinstance(self.clock, FollowedClock)
+        self.clock.tick(clock.stamp_ns, clock.incarnation, getattr(clock, "rate", 1.0))
+
+    def sibling(self, name: str) -> Node:
+        """Another service in this process, on the same bus and clock: the simulator stands in for four."""
+        return Node(name, self.bus, self.clock, self.robot, robot_name=self.robot_name)
+
+    # --- reading ----------------------------------------------------------------------------------
+
+    def inbox(self, topic: Topic[M], *, service: str | None = None) -> Inbox[M]:
+        """The one inbox of a topic; `service='*'` reads a per-service topic of all services."""
+        if service is not None:
+            topic = topic.of(service)
+        if topic.name not in self._inboxes:
+            key = topic.key(self.robot_name)
+            inbox = self._inboxes[topic.name] = Inbox(topic, key, self.clock)
+            depth = 2 if topic.qos is Qos.FRAME else 256
+            inbox.subscription = self.bus.subscribe(key, topic.qos, inbox.deliver, depth=depth)
+            self._handles.append(inbox.subscription)
+        return self._inboxes[topic.name]
+
+    def latest(self, topic: Topic[M], *, service: str | None = None) -> Latest[M]:
+        return Latest(self.inbox(topic, service=service), self.clock)
+
+    def stream(self, topic: Topic[M], *, service: str | None = None) -> Stream[M]:
+        return Stream(self.inbox(topic, service=service))
+
+    def on(self, topic: Topic[M], handler: Callable[[M], None], *, service: str | None = None) -> None:
+        """Call `handler(message)` for each message."""
+        self.inbox(topic, service=service).add(lambda _key, message: handler(message))
+
+    # --- publishing -------------------------------------------------------------------------------
+
+    def publisher(self, topic: Topic[M]) -> Publisher[M]:
+        if topic.name not in self._publishers:
+            publisher = Publisher(topic, topic.key(self.robot_name), self.bus, self.clock)
+            self._publishers[topic.name] = publisher
+            self._handles.append(publisher._raw)
+        return self._publishers[topic.name]
+
+    def publish(self, topic: Topic[M], message: M, stamp_ns: int | None = None) -> M:
+        return self.publisher(topic).put(message, stamp_ns)
+
+    # --- requests ---------------------------------------------------------------------------------
+
+    async def call(self, request: Request[Q, R], question: Q, timeout_s: float | None = None) -> R:
+        """Ask, and wait for the answer. Raises MeshError when nobody serves it (CallTimeoutError when nobody answers in
+        time) and RemoteError with the server's own words when it answers with an error."""
+        replies = await self._ask(request, question, timeout_s)
+        if not replies:
+            raise MeshError(f"nobody answers {request.key(self.robot_name)}: is {request.server} running?")
+        return _understand(request, replies[0])
+
+    async def call_all(self, request: Request[Q, R], question: Q, timeout_s: float | None = None) -> list[R]:
+        """Ask all who serve it (a request with `*` in its name); the good answers."""
+        return [_understand(request, reply) for reply in await self._ask(request, question, timeout_s) if reply.ok]
+
+    async def _ask(self, request: Request[Q, R], question: Q, timeout_s: float | None) -> list[Reply]:
+        payload = msgspec.msgpack.encode(question)
+        wait_s = request.timeout_s if timeout_s is None else timeout_s
+        return await self.bus.call(request.key(self.robot_name), payload, wait_s)
+
+    def serve(self, request: Request[Q, R], handler: Callable[[Q], Awaitable[R]]) -> None:
+        """Answer a request. A handler that raises CocoroError answers with its text."""
+        decoder = msgspec.msgpack.Decoder(request.request)
+
+        async def answer(_key: str, payload: Payload) -> bytes:
+            try:
+                question = decoder.decode(payload)
+            except (msgspec.MsgspecError, ValueError) as error:
+                raise CocoroError(f"{request.name}: not a good {request.request.__name__}: {error}") from error
+            try:
+                return msgspec.msgpack.encode(await handler(question))
+            except CocoroError:
+                raise
+            except Exception as error:
+                self.log.exception("%s failed", request.name)
+                raise CocoroError(f"{request.name}: internal error in {self.name}: {error}") from error
+
+        self._handles.append(self.bus.serve(request.key(self.robot_name), answer))
+
+    # --- time -------------------------------------------------------------------------------------
+
+    def now_ns(self) -> int:
+        return self.clock.now_ns()
+
+    async def sleep(self, seconds: float) -> bool:
+        return await clock_sleep(self.clock, seconds)
+
+    def every(self, rate_hz: float, name: str = "loop") -> AsyncIterator[int]:
+        """`async for now_ns in node.every(50.0)`: a fixed-rate loop whose jitter and overruns show in the health."""
+        return every(self.clock, rate_hz, self._meter(name))
+
+    def _meter(self, name: str) -> LoopMeter:
+        meter = LoopMeter(name)
+        self._meters.append(meter)
+        return meter
+
+    # --- driving a core ---------------------------------------------------------------------------
+
+    async def drive(self, core: Core, name: str | None = None) -> None:
+        """Step a pure core for ever: at its rate, and at once when a triggering topic arrives."""
+        step = self.stepper(core, name)
+        meter = self._meter(name or self.name)
+        schedule = Schedule(self.clock, core.schedule.rate_hz, meter) if core.schedule.rate_hz else None
+        if isinstance(self.clock, FollowedClock):
+            await self.clock.wait_started()
+        self.ready()
+        epoch = self.clock.epoch
+        while True:
+            due = schedule is None
+            if schedule is not None:
+                due = await self._wait(step.wake, schedule.deadline_ns)
+            else:
+                await step.wake.wait()
+            if self.clock.epoch != epoch:
+                epoch = self.clock.epoch
+                due = True
+            step.wake.clear()
+            now_ns = self.clock.now_ns()
+            if due:
+                meter.began(now_ns)
+            started = time.perf_counter()
+            await step(now_ns)
+            meter.steps_ms.append((time.perf_counter() - started) * 1e3)
+            if due and schedule is not None:
+                schedule.advance()
+
+    def stepper(self, core: Core, name: str | None = None) -> Stepper:
+        """What gathers a core's inputs, steps it and publishes, for those who drive it themselves."""
+        return Stepper(self, core, name or self.name)
+
+    async def _wait(self, wake: asyncio.Event, deadline_ns: int) -> bool:
+        """Wait for a deadline (True) or an earlier wake (False)."""
+        if self.clock.now_ns() >= deadline_ns:
+            return True
+        timer = asyncio.ensure_future(self.clock.sleep_until(deadline_ns))
+        waker = asyncio.ensure_future(wake.wait())
+        try:
+            await asyncio.wait((timer, waker), return_when=asyncio.FIRST_COMPLETED)
+            return timer.done()
+        finally:
+            timer.cancel()
+            waker.cancel()
+
+    # --- health -----------------------------------------------------------------------------------
+
+    async def _tell_health(self) -> None:
+        started_ns: int | None = None
+        topic = HEALTH.of(self.name)
+        async for now_ns in every(self.clock, self._health_hz, LoopMeter("health")):
+            started_ns = now_ns if started_ns is None else started_ns
+            self.publish(topic, self.health(now_ns, started_ns))
+
+    def health(self, now_ns: int, started_ns: int) -> Health:
+        ports: list[Inbox[Any] | Publisher[Any]] = [*self._inboxes.values(), *self._publishers.values()]
+        cpu_share, rss_mb = self._process.take() if self._process else (0.0, 0.0)
+        return Health(
+            service=self.name,
+            pid=os.getpid() if self._process else 0,
+            state=self.state,  # type: ignore[arg-type] # one of the literals by construction
+            text=self.text,
+            uptime_s=(now_ns - started_ns) / NS,
+            cpu_share=cpu_share,
+            rss_mb=rss_mb,
+            topics=tuple(port.health(now_ns) for port in ports if port.topic.name != HEALTH.of(self.name).name),
+            loops=tuple(meter.health() for meter in self._meters),
+            faults=self.faults,
+        )
+
+
+class Stepper:
+    """Gathers a core's inputs; each call is one step: take, step, wait out the latency, publish, record."""
+
+    def __init__(self, node: Node, core: Core, name: str) -> None:
+        self.wake = asyncio.Event()
+        self._node = node
+        self._core = core
+        self._name = name
+        self._intake = Intake()
+        triggers = {topic.name for topic in core.schedule.triggers}
+        for topic, take in core.reads.items():
+            inbox = node.inbox(topic)
+            wake = self.wake.set if topic.name in triggers else None
+            inbox.add(self._intake.reader(topic, inbox, take == "all", wake))
+
+    async def __call__(self, now_ns: int) -> None:
+        node = self._node
+        samples = [Sample(topic, message) for topic, message in self._intake.take()]
+        outputs = self._core.step(samples, now_ns)
+        if node.latency_s > 0:
+            await node.sleep(node.latency_s)
+        produced = []
+        for topic, message in outputs:
+            if message.stamp_ns == 0:
+                message.stamp_ns = now_ns
+            sent = node.publish(topic, message)
+            produced.append((topic.name, sent.incarnation, sent.seq))
+        if node.record_steps:
+            consumed = tuple((s.topic.name, s.message.incarnation, s.message.seq) for s in samples)
+            record = StepRecord(now_ns=now_ns, core=self._name, consumed=consumed, produced=tuple(produced))
+            node.publish(STEPS.of(node.name), record)
+
+
+def _understand(request: Request[Q, R], reply: Reply) -> R:
+    if not reply.ok:
+        raise RemoteError(reply.payload.decode(errors="replace"))
+    try:
+        return msgspec.msgpack.decode(reply.payload, type=request.reply)
+    except msgspec.MsgspecError as error:
+        raise RemoteError(f"{reply.key} answered something that is not a {request.reply.__name__}: {error}") from error
