@@ -62,8 +62,8 @@ class Bus(Protocol):
     def serve(self, key: str, server: Server) -> Handle: ...
 
     async def call(self, keyexpr: str, payload: bytes, timeout_s: float) -> list[Reply]:
-        """Ask everyone who serves a matching key. Returns when all have answered, or raises
-        cocoro.errors.CallTimeoutError when some have not by then and none has; an empty list means that nobody serves it."""
+        """Ask everyone who serves a matching key. Returns the answers when all have answered or the time is over;
+        raises cocoro.errors.CallTimeoutError when by then none has. An empty list means that nobody serves it."""
 
     def declare_alive(self, key: str) -> Handle:
         """A liveliness token: it vanishes with this process, however it ends."""

@@ -1,0 +1,109 @@
+"""A state read as history: bounded, ordered by stamp, interpolated, and honest about its gaps."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections.abc import Sequence
+from math import pi
+
+import numpy as np
+from numpy.typing import NDArray
+
+Vector = NDArray[np.float64]
+
+DEFAULT_CAPACITY = 256
+"""About five seconds of a 50 Hz state."""
+DEFAULT_JUMP_BACK_NS = 500_000_000
+
+
+class History:
+    """The newest samples of one state vector, for asking what it was at a given time.
+
+    A sample of another incarnation (its publisher restarted) or one whose stamp lies more than `jump_back_ns`
+    before the newest (its clock began a new epoch) empties the history first: what was before has no
+    place on the new time line. A sample that is merely late or repeated is refused.
+    """
+
+    def __init__(
+        self,
+        width: int,
+        *,
+        angular: Sequence[int] = (),
+        capacity: int = DEFAULT_CAPACITY,
+        jump_back_ns: int = DEFAULT_JUMP_BACK_NS,
+    ) -> None:
+        """Vectors have `width` components. The `angular` ones (radians) are unwrapped on entry, each to within
+        half a turn of the one before, so that interpolating from 179 to -179 degrees does not pass through 0."""
+        if capacity < 2:
+            raise ValueError(f"a history of {capacity} samples cannot be interpolated")
+        self._width = width
+        self._angular = list(angular)
+        self._capacity = capacity
+        self._jump_back_ns = jump_back_ns
+        self._incarnation: int | None = None
+        self._stamps_ns: list[int] = []
+        self._values: list[Vector] = []
+        self.resets = 0
+        """Times that a restart or a jump back of the clock emptied it."""
+        self.refused = 0
+        """Samples that came late or twice."""
+
+    def __len__(self) -> int:
+        return len(self._stamps_ns)
+
+    def add(self, stamp_ns: int, values: Sequence[float] | Vector, incarnation: int = 0) -> bool:
+        """Append one sample; False when it is late or repeated and was refused. ValueError on a wrong width."""
+        vector = np.array(values, dtype=np.float64)
+        if vector.shape != (self._width,):
+            raise ValueError(f"a vector of {self._width} was expected, not shape {vector.shape}")
+        if self._stamps_ns and (
+            incarnation != self._incarnation or stamp_ns < self._stamps_ns[-1] - self._jump_back_ns
+        ):
+            self.clear()
+            self.resets += 1
+        self._incarnation = incarnation
+        if self._stamps_ns:
+            if stamp_ns <= self._stamps_ns[-1]:
+                self.refused += 1
+                return False
+            for i in self._angular:
+                vector[i] -= 2 * pi * round((vector[i] - self._values[-1][i]) / (2 * pi))
+        self._stamps_ns.append(stamp_ns)
+        self._values.append(vector)
+        if len(self._stamps_ns) > self._capacity:
+            del self._stamps_ns[0], self._values[0]
+        return True
+
+    def at(self, stamp_ns: int, max_gap_ns: int) -> Vector | None:
+        """The vector at a time, linearly interpolated between the two samples around it; shape (width,).
+
+        None when the time is outside of what is held (nothing is extrapolated) or when the two samples lie
+        more than `max_gap_ns` apart. A sample of exactly that stamp is returned as it is.
+        """
+        after = bisect_left(self._stamps_ns, stamp_ns)
+        if after == len(self._stamps_ns):
+            return None
+        if self._stamps_ns[after] == stamp_ns:
+            return self._values[after].copy()
+        if after == 0:
+            return None
+        start_ns, end_ns = self._stamps_ns[after - 1], self._stamps_ns[after]
+        if end_ns - start_ns > max_gap_ns:
+            return None
+        share = (stamp_ns - start_ns) / (end_ns - start_ns)
+        return (1.0 - share) * self._values[after - 1] + share * self._values[after]
+
+    @property
+    def newest(self) -> tuple[int, Vector] | None:
+        """The last sample, (stamp_ns, vector); None when there is none."""
+        return (self._stamps_ns[-1], self._values[-1].copy()) if self._stamps_ns else None
+
+    @property
+    def oldest_ns(self) -> int | None:
+        """The stamp of the first sample still held; None when there is none."""
+        return self._stamps_ns[0] if self._stamps_ns else None
+
+    def clear(self) -> None:
+        """Forget every sample."""
+        self._stamps_ns.clear()
+        self._values.clear()
