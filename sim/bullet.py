@@ -1,0 +1,63 @@
+"""PyBullet, imported without its banner, one client object a world."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from typing import Any
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Send what is written to file descriptors 1 and 2 to nowhere, whether Python or C code writes it: a tool's
+    `--json` must hold nothing else, and a log file no banner."""
+    libc = ctypes.CDLL(None)
+    sys.stdout.flush()
+    sys.stderr.flush()
+    libc.fflush(None)
+    try:
+        saved = {fd: os.dup(fd) for fd in (1, 2)}
+    except OSError:  # a service without standard streams has nothing to keep clean
+        yield
+        return
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    try:
+        for fd in saved:
+            os.dup2(nowhere, fd)
+        yield
+    finally:
+        sys.stderr.flush()
+        libc.fflush(None)
+        for fd, copy in saved.items():
+            os.dup2(copy, fd)
+            os.close(copy)
+        os.close(nowhere)
+
+
+with _quiet():
+    import pybullet
+
+
+class Bullet:
+    """One PyBullet client without a window. Every function and constant of `pybullet` is an attribute; the
+    functions are bound to this client, so that worlds in one process do not meet."""
+
+    def __init__(self) -> None:
+        self.client: int = pybullet.connect(pybullet.DIRECT)
+
+    def __getattr__(self, name: str) -> Any:
+        value = getattr(pybullet, name)
+        if callable(value):
+            value = partial(value, physicsClientId=self.client)
+        self.__dict__[name] = value
+        return value
+
+    def close(self) -> None:
+        """Free the world. Closing twice is harmless."""
+        if self.client >= 0:
+            pybullet.disconnect(physicsClientId=self.client)
+            self.client = -1
