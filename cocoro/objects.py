@@ -1,0 +1,166 @@
+"""The catalogue of known objects: their shape, size and colour, read from one TOML file (`objects.toml`)."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Iterator
+from importlib import resources
+from math import pi
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import msgspec
+from msgspec import Meta
+
+from cocoro.errors import ConfigError
+
+Positive = Annotated[float, Meta(gt=0)]
+Share = Annotated[float, Meta(ge=0, le=1)]
+Vec3 = tuple[float, float, float]
+Label = Annotated[str, Meta(pattern=r"\A[a-z][a-z0-9_-]{0,63}\Z")]
+
+DEFAULT_FILE = "objects.toml"
+
+
+class LabBox(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A box in true CIELAB units (D65): L 0 to 100, a and b about -128 to 127; both ends are inside."""
+
+    low: Vec3
+    high: Vec3
+
+    def __post_init__(self) -> None:
+        for axis, low, high in zip("Lab", self.low, self.high, strict=True):
+            bounds = (0.0, 100.0) if axis == "L" else (-128.0, 127.0)
+            if not bounds[0] <= low < high <= bounds[1]:
+                raise ValueError(f"{axis} must rise within {bounds[0]:g} to {bounds[1]:g}, not {low:g} to {high:g}")
+
+
+class KnownObject(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One row of the catalogue. A cylinder stands upright; a box stands on its x-y face, at any yaw."""
+
+    label: Label
+    shape: Literal["cylinder", "sphere", "box"]
+    radius_m: Positive | None = None
+    """Cylinder and sphere."""
+    height_m: Positive | None = None
+    """Cylinder."""
+    box_m: tuple[Positive, Positive, Positive] | None = msgspec.field(default=None, name="size_m")
+    """Box: full x, y, z; `size_m` in the file."""
+    mass_kg: Positive = 0.2
+    graspable: bool = False
+    marker: bool = False
+    """The ball on the robot's own hand."""
+    rgb: tuple[Share, Share, Share]
+    """Surface colour under full white light, sRGB, 0 to 1 a channel."""
+    lab: Annotated[tuple[LabBox, ...], Meta(min_length=1)]
+    """A pixel is the object's when any of these boxes holds its colour."""
+
+    def __post_init__(self) -> None:
+        wanted = {"cylinder": {"radius_m", "height_m"}, "sphere": {"radius_m"}, "box": {"size_m"}}[self.shape]
+        given = {
+            name
+            for name, value in (
+                ("radius_m", self.radius_m),
+                ("height_m", self.height_m),
+                ("size_m", self.box_m),
+            )
+            if value is not None
+        }
+        if missing := sorted(wanted - given):
+            raise ValueError(f"a {self.shape} needs {' and '.join(missing)}")
+        if surplus := sorted(given - wanted):
+            raise ValueError(f"a {self.shape} has no {' or '.join(surplus)}")
+
+    @property
+    def size_m(self) -> Vec3:
+        """Full x, y, z of the upright object's bounding box."""
+        if self.box_m is not None:
+            return self.box_m
+        assert self.radius_m is not None
+        diameter = 2 * self.radius_m
+        return diameter, diameter, diameter if self.height_m is None else self.height_m
+
+    @property
+    def planar_radius_m(self) -> float:
+        """Of the upright object seen from above; for a box the circle of equal area."""
+        if self.box_m is not None:
+            return float((self.box_m[0] * self.box_m[1] / pi) ** 0.5)
+        assert self.radius_m is not None
+        return self.radius_m
+
+
+class _File(msgspec.Struct, forbid_unknown_fields=True):
+    object: list[dict[str, Any]]
+
+
+class Catalogue:
+    """The known objects, in the file's order; `catalogue[label]`, `label in catalogue`, iteration, `len`."""
+
+    def __init__(self, objects: tuple[KnownObject, ...]) -> None:
+        self.objects = objects
+        self._by_label = {known.label: known for known in objects}
+
+    @classmethod
+    def load(cls, path: Path | None = None) -> Catalogue:
+        """Read the project's own catalogue, or another file. Raises ConfigError naming file, table and field."""
+        where = str(path) if path else DEFAULT_FILE
+        try:
+            text = path.read_text() if path else resources.files("cocoro").joinpath(DEFAULT_FILE).read_text()
+            rows = msgspec.convert(tomllib.loads(text), _File).object
+        except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+            raise ConfigError(f"known objects {where}: {error}") from error
+        except msgspec.ValidationError as error:
+            raise ConfigError(f"known objects {where}: {error}; it must be a list of [[object]] tables") from error
+        objects: list[KnownObject] = []
+        for number, row in enumerate(rows, start=1):
+            table = f"[[object]] {number} ({row.get('label', 'no label')})"
+            try:
+                known = msgspec.convert(row, KnownObject)
+            except msgspec.ValidationError as error:
+                raise ConfigError(f"known objects {where}: {table}: {_field(error)}") from error
+            for earlier in objects:
+                if known.label == earlier.label:
+                    raise ConfigError(f"known objects {where}: {table}: label: it is taken by an earlier object")
+                if known.marker and earlier.marker:
+                    raise ConfigError(f"known objects {where}: {table}: marker: {earlier.label} is the marker")
+            objects.append(known)
+        if not objects:
+            raise ConfigError(f"known objects {where}: there is no [[object]] in it")
+        return cls(tuple(objects))
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        return tuple(self._by_label)
+
+    @property
+    def targets(self) -> tuple[KnownObject, ...]:
+        """Every object but the hand's marker."""
+        return tuple(known for known in self.objects if not known.marker)
+
+    @property
+    def marker(self) -> KnownObject | None:
+        return next((known for known in self.objects if known.marker), None)
+
+    def get(self, label: str) -> KnownObject | None:
+        return self._by_label.get(label)
+
+    def __getitem__(self, label: str) -> KnownObject:
+        return self._by_label[label]
+
+    def __contains__(self, label: object) -> bool:
+        return label in self._by_label
+
+    def __iter__(self) -> Iterator[KnownObject]:
+        return iter(self.objects)
+
+    def __len__(self) -> int:
+        return len(self.objects)
+
+
+def _field(error: msgspec.ValidationError) -> str:
+    """msgspec's 'what - at `$.lab[0].low`' as 'lab[0].low: what'."""
+    match = re.fullmatch(r"(.*) - at `\$\.?(.*)`", str(error), re.DOTALL)
+    if match and match[2]:
+        return f"{match[2]}: {match[1]}"
+    return match[1] if match else str(error)
