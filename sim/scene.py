@@ -1,0 +1,311 @@
+"""The scene file: what stands around the robot, in which light, and where the robot starts."""
+
+from __future__ import annotations
+
+import tomllib
+from importlib import resources
+from math import cos, hypot, isfinite, sin
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+import msgspec
+from msgspec import Meta
+
+from cocoro.errors import ConfigError
+from sim.seeds import stream
+
+Vec3 = tuple[float, float, float]
+Place = Annotated[tuple[float, ...], Meta(min_length=2, max_length=3)]
+Shape = Literal["cylinder", "sphere", "box"]
+
+_COLOURS: dict[str, Vec3] = {
+    "red": (0.80, 0.04, 0.05),
+    "green": (0.03, 0.55, 0.10),
+    "blue": (0.04, 0.14, 0.75),
+    "yellow": (0.90, 0.78, 0.03),
+}
+_GREY: Vec3 = (0.6, 0.6, 0.6)
+
+
+class _Table(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A table of the file."""
+
+
+class _Body(_Table, frozen=True, kw_only=True):
+    """Something with a primitive shape. Sizes in metres."""
+
+    shape: Shape
+    radius_m: float | None = None
+    height_m: float | None = None
+    size_m: Vec3 | None = None
+    rgb: Vec3 | None = None
+    """0 to 1 a channel."""
+
+    @property
+    def colour(self) -> Vec3:
+        return self.rgb if self.rgb is not None else _GREY
+
+    @property
+    def dimensions_m(self) -> tuple[float, ...]:
+        """box: full x, y, z; cylinder: radius, height; sphere: radius."""
+        sizes = {
+            "box": self.size_m,
+            "cylinder": (self.radius_m, self.height_m),
+            "sphere": (self.radius_m,),
+        }[self.shape]
+        assert sizes is not None
+        return tuple(float(size) for size in sizes if size is not None)
+
+    @property
+    def standing_height_m(self) -> float:
+        """From the floor to the centre when it stands."""
+        if self.shape == "sphere":
+            return self.dimensions_m[0]
+        return self.dimensions_m[-1] / 2
+
+
+class SceneObject(_Body, frozen=True, kw_only=True):
+    """Something to fetch, follow or knock over."""
+
+    label: str
+    position_m: Place
+    """[x, y] stands on the floor, [x, y, z] has its centre at z; in the robot's frame at the start."""
+    mass_kg: float = 0.2
+    path_m: tuple[Place, ...] = ()
+    """Waypoints after `position_m`, in the same frame; with two numbers the height stays what it was."""
+    speed_mps: float = 0.0
+    path_loop: bool = False
+    """After the last waypoint go back to the start and round again; else it stops there."""
+    floating: bool = False
+    """Stays in the air where it is put."""
+
+    @property
+    def colour(self) -> Vec3:
+        """Its own, or the one that its label names ('red_can'), or grey."""
+        return self.rgb if self.rgb is not None else _COLOURS.get(self.label.split("_")[0], _GREY)
+
+    @property
+    def kinematic(self) -> bool:
+        """Carried by an unseen hand: nothing that touches it moves it."""
+        return self.floating or bool(self.path_m)
+
+    @property
+    def centre_m(self) -> Vec3:
+        """At the start, in the robot's frame at the start."""
+        return _at(self.position_m, self.standing_height_m)
+
+
+class Obstacle(_Body, frozen=True, kw_only=True):
+    """Something that stands fast."""
+
+    position_m: tuple[float, float]
+    """In the robot's frame at the start."""
+    yaw_rad: float = 0.0
+
+    @property
+    def centre_m(self) -> Vec3:
+        return _at(self.position_m, self.standing_height_m)
+
+
+class Light(_Table, frozen=True, kw_only=True):
+    """One far lamp and what comes from everywhere."""
+
+    ambient: float = 0.55
+    diffuse: float = 0.45
+    direction: Vec3 = (-0.4, 0.3, -1.0)
+    """The way the light travels, world frame; any length but zero."""
+    temperature_k: float = 5500.0
+
+
+class Start(_Table, frozen=True, kw_only=True):
+    """Where the robot starts, in the world."""
+
+    position_m: tuple[float, float] = (0.0, 0.0)
+    yaw_rad: float = 0.0
+
+
+class Scatter(_Table, frozen=True, kw_only=True):
+    """What no two set-ups of one scene share; drawn from the run's seed."""
+
+    position_m: float = 0.0
+    """Each object that stands stands up to this far from its place, evenly over the disc."""
+
+
+class Scene(msgspec.Struct, frozen=True, kw_only=True):
+    """A scene, checked, with the seed's scatter applied."""
+
+    name: str
+    objects: tuple[SceneObject, ...] = ()
+    obstacles: tuple[Obstacle, ...] = ()
+    light: Light = Light()
+    robot: Start = Start()
+
+    def object(self, label: str) -> SceneObject:
+        """The object of that label. Raises KeyError naming those there are."""
+        for item in self.objects:
+            if item.label == label:
+                return item
+        raise KeyError(f"{label!r}; the scene has {', '.join(o.label for o in self.objects) or 'no objects'}")
+
+    def to_world(self, point_m: Vec3) -> Vec3:
+        """A point of the robot's frame at the start in the world's."""
+        x, y, z = point_m
+        c, s = cos(self.robot.yaw_rad), sin(self.robot.yaw_rad)
+        return self.robot.position_m[0] + c * x - s * y, self.robot.position_m[1] + s * x + c * y, z
+
+
+def load_scene(name_or_path: str | Path, seed: int = 0) -> Scene:
+    """Read a scene: one of the project's by name (`paper`), or a TOML file by its path.
+
+    Raises ConfigError that names the file, the table and the field.
+    """
+    text, where = _read(name_or_path)
+    try:
+        data = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{where}: not TOML: {error}") from error
+    known = {"name", "object", "obstacle", "light", "robot", "scatter"}
+    if extra := sorted(set(data) - known):
+        raise ConfigError(f"{where}: unknown table or field {extra[0]!r}; known are {', '.join(sorted(known))}")
+    name = data.get("name", Path(name_or_path).stem)
+    if not isinstance(name, str):
+        raise ConfigError(f"{where}: name must be text")
+    objects = _rows(data, "object", SceneObject, where)
+    _check_labels(objects, where)
+    scene = Scene(
+        name=name,
+        objects=tuple(objects),
+        obstacles=tuple(_rows(data, "obstacle", Obstacle, where)),
+        light=_table(data.get("light", {}), Light, f"{where}, [light]"),
+        robot=_table(data.get("robot", {}), Start, f"{where}, [robot]"),
+    )
+    scatter = _table(data.get("scatter", {}), Scatter, f"{where}, [scatter]")
+    return _scattered(scene, scatter, seed)
+
+
+def scene_names() -> list[str]:
+    """The scenes that come with the project."""
+    folder = resources.files("sim").joinpath("scenes")
+    return sorted(file.name.removesuffix(".toml") for file in folder.iterdir() if file.name.endswith(".toml"))
+
+
+_T = TypeVar("_T", bound=_Table)
+
+
+def _read(name_or_path: str | Path) -> tuple[str, str]:
+    name = str(name_or_path)
+    if name in scene_names():
+        return resources.files("sim").joinpath("scenes", f"{name}.toml").read_text(), f"scene {name}"
+    path = Path(name_or_path)
+    if path.suffix != ".toml" and not path.exists():
+        raise ConfigError(f"no scene {name!r}: give a .toml file or one of {', '.join(scene_names())}")
+    try:
+        return path.read_text(), f"scene {path.name}"
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"scene {path}: {getattr(error, 'strerror', None) or error}") from error
+
+
+def _rows(data: dict[str, Any], key: str, kind: type[_T], where: str) -> list[_T]:
+    rows = data.get(key, [])
+    if not isinstance(rows, list):
+        raise ConfigError(f"{where}: [{key}] must be written [[{key}]], once for each")
+    found = []
+    for number, row in enumerate(rows, 1):
+        label = f" {row['label']!r}" if isinstance(row, dict) and isinstance(row.get("label"), str) else ""
+        found.append(_table(row, kind, f"{where}, [[{key}]] {number}{label}"))
+    return found
+
+
+def _table(data: Any, kind: type[_T], where: str) -> _T:
+    try:
+        table = msgspec.convert(data, kind)
+    except msgspec.ValidationError as error:
+        what, _, place = str(error).partition(" - at `$")
+        field = place.strip(".`")
+        raise ConfigError(f"{where}: {field + ': ' if field else ''}{what}") from error
+    if problem := _problem(table):
+        raise ConfigError(f"{where}: {problem}")
+    return table
+
+
+def _problem(table: _Table) -> str | None:
+    """What is wrong with the values of a table, or None."""
+    for field in table.__struct_fields__:
+        if not all(isfinite(number) for number in _numbers(getattr(table, field))):
+            return f"{field} must be finite"
+    if isinstance(table, _Body):
+        return _body_problem(table) or (_object_problem(table) if isinstance(table, SceneObject) else None)
+    if isinstance(table, Light):
+        for field in ("ambient", "diffuse"):
+            if not 0.0 <= getattr(table, field) <= 1.0:
+                return f"{field} must be 0 to 1"
+        if hypot(*table.direction) == 0.0:
+            return "direction must not be zero"
+        if not 1000.0 <= table.temperature_k <= 40000.0:
+            return "temperature_k must be 1000 to 40000"
+    if isinstance(table, Scatter) and table.position_m < 0:
+        return "position_m must be >= 0"
+    return None
+
+
+def _body_problem(body: _Body) -> str | None:
+    wanted = {"cylinder": ("radius_m", "height_m"), "sphere": ("radius_m",), "box": ("size_m",)}[body.shape]
+    for field in ("radius_m", "height_m", "size_m"):
+        value = getattr(body, field)
+        if field in wanted and value is None:
+            return f"{field} is missing: a {body.shape} needs {' and '.join(wanted)}"
+        if field not in wanted and value is not None:
+            return f"{field} does not belong to a {body.shape}, which has {' and '.join(wanted)}"
+        if value is not None and any(number <= 0 for number in _numbers(value)):
+            return f"{field} must be > 0"
+    if body.rgb is not None and not all(0.0 <= channel <= 1.0 for channel in body.rgb):
+        return "rgb must be 0 to 1 a channel"
+    return None
+
+
+def _object_problem(item: SceneObject) -> str | None:
+    if not item.label or any(char in item.label for char in " ~,/"):
+        return "label must be one word, without '~', ',' or '/'"
+    if item.mass_kg <= 0:
+        return "mass_kg must be > 0"
+    if item.speed_mps < 0:
+        return "speed_mps must be >= 0"
+    if item.path_m and item.speed_mps == 0:
+        return "speed_mps must be > 0 for an object with a path_m"
+    if item.speed_mps and not item.path_m:
+        return "path_m is missing: an object with a speed_mps needs its waypoints"
+    return None
+
+
+def _check_labels(objects: list[SceneObject], where: str) -> None:
+    seen: set[str] = set()
+    for number, item in enumerate(objects, 1):
+        if item.label in seen:
+            raise ConfigError(f"{where}, [[object]] {number} {item.label!r}: label is taken by another object")
+        seen.add(item.label)
+
+
+def _numbers(value: Any) -> list[float]:
+    if isinstance(value, tuple):
+        return [number for item in value for number in _numbers(item)]
+    return [float(value)] if isinstance(value, (int, float)) and not isinstance(value, bool) else []
+
+
+def _at(place: Place, height_m: float) -> Vec3:
+    return place[0], place[1], place[2] if len(place) == 3 else height_m
+
+
+def _scattered(scene: Scene, scatter: Scatter, seed: int) -> Scene:
+    if scatter.position_m == 0.0:
+        return scene
+    draws = stream(seed, "scene scatter")
+    moved = []
+    for item in scene.objects:
+        turn, reach = draws.uniform(0.0, 6.283185307179586), scatter.position_m * draws.uniform() ** 0.5
+        if item.kinematic:
+            moved.append(item)
+            continue
+        x, y, *height = item.position_m
+        place = (x + reach * cos(turn), y + reach * sin(turn), *height)
+        moved.append(msgspec.structs.replace(item, position_m=place))
+    return msgspec.structs.replace(scene, objects=tuple(moved))
