@@ -34,6 +34,7 @@ class Base(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     chassis_height_m: Positive
     mass_kg: Positive
     max_wheel_speed_mps: Positive
+    wheel_acceleration_mps2: Positive
     command_timeout_s: Positive
     state_rate_hz: Positive
 
@@ -78,6 +79,10 @@ class Joint(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     limits_deg: tuple[float, float]
     torque_nm: Positive
     max_speed_radps: Positive
+    compliance_deg: Annotated[float, Meta(ge=0)] = 0.0
+    """How far from its goal the servo pushes with all of `torque_nm`, and with less when nearer; 0: always."""
+    overload_s: Positive = 5.0
+    """Pushing at its limit for so long is an overload."""
     direction: Literal[-1, 1] = 1
     centre_count: float = (SERVO_COUNTS - 1) / 2
 
