@@ -1,0 +1,34 @@
+"""What `cocoro rehearse` asks for: one task, in one process, in virtual time."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import Meta
+
+from cocoro.messages import TaskName
+
+Sensors = Literal["ideal", "real"]
+
+
+class RehearsalRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Two rehearsals of one request give equal results but for the wall time."""
+
+    task: TaskName
+    label: str = ""
+    scene: str = "paper"
+    """A scene's name, or the path of a scene file."""
+    seed: Annotated[int, Meta(ge=0)] = 0
+    sensors: Sensors = "ideal"
+    latency: dict[str, Annotated[float, Meta(ge=0, le=60)]] = {}
+    """Seconds that are added to every step of a service, by the service's name."""
+    lockstep: bool = False
+    """One serial cycle over all components, as the paper had it: the baseline to compare with."""
+    width: Annotated[int, Meta(ge=16, le=4096)] = 640
+    height: Annotated[int, Meta(ge=16, le=4096)] = 480
+    frame_rate_hz: Annotated[float, Meta(gt=0, le=120)] = 30.0
+    timeout_s: Annotated[float, Meta(gt=0, le=3600)] | None = None
+    """Of the task, simulated seconds; None is the executive's own limit."""
+    picture: str | None = None
+    """Where to write what the robot saw at the grasp (PNG)."""
