@@ -1,0 +1,107 @@
+"""Where the mesh is, and how a process gets into it: no multicast, no daemon, no guessing.
+
+On one machine the mesh is a directory. Every process listens on a Unix socket there and connects to all that came
+before it (see `members`), so all of them hear each other directly, at the least latency, and there is no process
+whose death takes the mesh with it. Two robots have two directories and never meet; the directory is its owner's
+alone, so nobody else on the machine can drive the robot. Across machines, `client` mode speaks through routers.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from cocoro.errors import ConfigError
+
+LONGEST_SOCKET_PATH = 100
+"""Bytes; the kernel takes 107 on Linux and 103 on macOS."""
+FORBIDDEN = "#?;"
+"""What would end the path in an endpoint."""
+
+
+@dataclass(frozen=True)
+class ZenohConfig:
+    """How one process joins. Either a directory, or endpoints such as 'tcp/127.0.0.1:7447', never both."""
+
+    name: str
+    """What the process is called in the register and in logs."""
+    directory: Path | None = None
+    mode: Literal["peer", "client", "router"] = "peer"
+    listen: tuple[str, ...] = ()
+    connect: tuple[str, ...] = ()
+    lease_s: float = 4.0
+    """How long a process may be silent (stopped, cut off) before its liveliness tokens drop. A killed one's drop
+    at once."""
+    patience_s: float = 1.0
+    """How long opening waits for the mesh, and for a member of it that does not answer."""
+    options: Mapping[str, Any] = field(default_factory=dict)
+    """Further zenoh options by path ('transport/link/tls/...'), for certificates and access control."""
+
+    def __post_init__(self) -> None:
+        if self.directory is not None:
+            if self.mode != "peer" or self.listen or self.connect:
+                raise ConfigError(f"mesh of {self.name}: a directory goes without mode, listen and connect")
+            path = str(self.directory)
+            if len(os.fsencode(path)) > LONGEST_SOCKET_PATH - len("/0123456789abcdef.sock"):
+                raise ConfigError(
+                    f"mesh directory {path}: the path is too long for a Unix socket, choose a shorter"
+                )
+            if any(c in path for c in FORBIDDEN):
+                raise ConfigError(f"mesh directory {path}: the path may not contain any of {FORBIDDEN}")
+        elif not self.listen and not self.connect:
+            raise ConfigError(f"mesh of {self.name}: say a directory, or where to listen or connect")
+
+    @property
+    def where(self) -> str:
+        """In words, for errors."""
+        return str(self.directory) if self.directory else ", ".join(self.connect or self.listen)
+
+
+def default(robot: str, name: str, run_dir: Path | None = None) -> ZenohConfig:
+    """The mesh of a robot that lives on this machine: a directory for it below the run directory.
+
+    The run directory is, in this order: the argument, $COCORO_RUN_DIR, `cocoro` in $XDG_RUNTIME_DIR, a directory
+    of this user's in the system's place for temporary files. It must be this user's alone.
+    """
+    return ZenohConfig(name=name, directory=(run_dir or default_run_dir()) / robot)
+
+
+def default_run_dir() -> Path:
+    if explicit := os.environ.get("COCORO_RUN_DIR"):
+        return Path(explicit).absolute()
+    if runtime := os.environ.get("XDG_RUNTIME_DIR"):
+        return Path(runtime) / "cocoro"
+    return Path(tempfile.gettempdir()) / f"cocoro-{os.getuid()}"
+
+
+def zenoh_options(
+    config: ZenohConfig, identity: str, listen: list[str], connect: list[str]
+) -> dict[str, str]:
+    """The options of a zenoh session, path to JSON. What is not said here is zenoh's default."""
+    patience_ms = round(config.patience_s * 1000)
+    options: dict[str, Any] = {
+        "id": identity,
+        "mode": config.mode,
+        "scouting/multicast/enabled": False,
+        # Everyone connects to everyone by the register. Gossip would only connect them twice.
+        "scouting/gossip/enabled": config.mode == "peer" and config.directory is None,
+        # The longest that opening waits for the endpoints that it connects to. A router waits all of it, always.
+        "scouting/delay": patience_ms if config.mode == "peer" else 0,
+        # Zenoh's own wait for a peer's declarations sometimes misses their end and takes all of the delay, so
+        # the bus itself waits for the members' tokens, which come last.
+        "open/return_conditions": {"connect_scouted": True, "declares": False},
+        "listen/endpoints": listen,
+        "connect/endpoints": connect,
+        "connect/timeout_ms": patience_ms if config.mode == "client" else -1,
+        "connect/retry": {"period_init_ms": 20, "period_max_ms": 2000, "period_increase_factor": 2},
+        "transport/link/tx/lease": round(config.lease_s * 1000),
+        "transport/shared_memory/transport_optimization/pool_size": 32 * 1024 * 1024,
+        "transport/shared_memory/transport_optimization/message_size_threshold": 32 * 1024,
+        **config.options,
+    }
+    return {path: json.dumps(value) for path, value in options.items()}
