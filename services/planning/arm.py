@@ -1,0 +1,157 @@
+"""The arm's trajectories: unfolding, folding, and moving the hand to a pose, one step at a time.
+
+Between the folded (parked) pose and the space before the robot the arm goes by way of two poses: folded out in the
+plane that it parks in (the hand's thin side to the camera mount), then swung to the front. All references are kept
+as commanded angles: feeding back the servos' coarse positions would only add their steps to the motion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from cocoro.kinematics import Array
+from cocoro.robot import Robot
+from services.planning.clearance import Clearance
+from services.planning.config import Arm
+from services.planning.reach import ARM, LEVEL_ROLL_RAD, HandPose, Reacher
+
+ROLL = "wrist_roll"
+_OUT = {"shoulder": 1.9, "elbow": -2.3, "wrist_pitch": 0.4}
+"""Folded out: the hand points away from the arm base, level, 0.2 m up and 0.36 m out."""
+_SIDE_RAD = 0.6
+"""With the arm base turned further than this the arm is in the plane that it parks in."""
+_NEAR_RAD = 0.06
+_FRONT_RAD = -0.087
+
+
+class Step(NamedTuple):
+    """Goals for the arm's joints (order of ARM) and the wrist roll, with speeds."""
+
+    goal_rad: Array
+    speed_radps: Array
+    roll_rad: float
+    left: float
+    """What is left: metres for a hand pose, radians for joint poses."""
+    arrived: bool
+    blocked: bool = False
+
+
+class ArmController:
+    def __init__(self, robot: Robot, config: Arm, reacher: Reacher) -> None:
+        self._config = config
+        self._reacher = reacher
+        self._clearance = Clearance(robot)
+        self._park = {name: robot.poses["park"][name] for name in ARM}
+        self._reference: dict[str, float] | None = None
+        self._roll_rad = 0.0
+
+    @property
+    def reference(self) -> dict[str, float] | None:
+        """The commanded angles (ARM and the wrist roll); None before the first measurement."""
+        return self._reference
+
+    def resync(self) -> None:
+        """Start from the measured angles at the next step: something else has moved or stopped the arm."""
+        self._reference = None
+
+    def folded(self, angles: Mapping[str, float]) -> bool:
+        """Whether the arm is in, or near, the plane that it parks in."""
+        return angles["arm_base"] > _SIDE_RAD
+
+    def parked(self, angles: Mapping[str, float]) -> bool:
+        return all(abs(angles[name] - self._park[name]) < 0.08 for name in ARM)
+
+    def hold(self, measured: Mapping[str, float], dt_s: float) -> Step:
+        reference = self._sync(measured)
+        goal = np.array([reference[name] for name in ARM])
+        return Step(goal, np.full(4, 0.5), reference[ROLL], 0.0, True)
+
+    def park(self, measured: Mapping[str, float], dt_s: float) -> Step:
+        """Fold the arm up beside the camera mount."""
+        reference = self._sync(measured)
+        if not self.folded(reference):
+            pose = self._reacher.pose(reference)
+            out = all(abs(reference[name] - angle) < _NEAR_RAD for name, angle in _OUT.items())
+            if not out and pose.height_m < 0.15:
+                rise = HandPose(
+                    max(pose.radius_m, self._config.travel_radius_m),
+                    pose.azimuth_rad,
+                    self._config.travel_height_m,
+                    pose.pitch_rad,
+                )
+                return self._cartesian(rise, self._config.hand_speed_mps, dt_s)._replace(arrived=False)
+            if not out:
+                return self._joints(_OUT | {ROLL: 0.0}, dt_s)._replace(arrived=False)
+            if abs(reference[ROLL]) > _NEAR_RAD:
+                return self._joints(_OUT | {ROLL: 0.0}, dt_s)._replace(arrived=False)
+            return self._joints(_OUT | {ROLL: 0.0, "arm_base": self._park["arm_base"]}, dt_s)._replace(arrived=False)
+        if abs(reference["arm_base"] - self._park["arm_base"]) > _NEAR_RAD:
+            return self._joints(_OUT | {ROLL: 0.0, "arm_base": self._park["arm_base"]}, dt_s)._replace(arrived=False)
+        return self._joints(self._park | {ROLL: 0.0}, dt_s)
+
+    def reach(self, goal: HandPose, speed_mps: float, measured: Mapping[str, float], dt_s: float) -> Step:
+        """Move the hand towards a pose in front of the robot; unfolds the arm first where it is folded."""
+        reference = self._sync(measured)
+        if self.folded(reference):
+            out = all(abs(reference[name] - angle) < _NEAR_RAD for name, angle in _OUT.items())
+            if not out and reference["arm_base"] > self._park["arm_base"] - 0.2:
+                return self._joints(_OUT | {ROLL: 0.0}, dt_s)._replace(arrived=False)
+            return self._joints(_OUT | {"arm_base": _FRONT_RAD}, dt_s)._replace(arrived=False)
+        if reference["arm_base"] > 0.35 and goal.azimuth_rad < 0.3:
+            return self._joints(_OUT | {"arm_base": _FRONT_RAD, ROLL: LEVEL_ROLL_RAD}, dt_s)._replace(arrived=False)
+        return self._cartesian(goal, speed_mps, dt_s)
+
+    def _sync(self, measured: Mapping[str, float]) -> dict[str, float]:
+        names = (*ARM, ROLL)
+        if self._reference is None:
+            self._reference = {name: measured[name] for name in names}
+        for name in names:
+            lead = self._reference[name] - measured[name]
+            if abs(lead) > self._config.lead_rad:
+                self._reference[name] = measured[name] + float(np.sign(lead)) * self._config.lead_rad
+        return self._reference
+
+    def _joints(self, goals: Mapping[str, float], dt_s: float) -> Step:
+        """Move the named joints together to their goals, the others stay."""
+        assert self._reference is not None
+        gaps = {name: goal - self._reference[name] for name, goal in goals.items()}
+        widest = max(abs(gap) for gap in gaps.values())
+        scale = min(1.0, self._config.joint_speed_radps * dt_s / widest) if widest > 0 else 1.0
+        trial = dict(self._reference)
+        for name, gap in gaps.items():
+            trial[name] += scale * gap
+        return self._commit(trial, widest * (1 - scale), dt_s, arrived=widest * (1 - scale) < 0.02)
+
+    def _cartesian(self, goal: HandPose, speed_mps: float, dt_s: float) -> Step:
+        assert self._reference is not None
+        have = self._reacher.pose(self._reference)
+        waypoint = have.towards(goal, speed_mps * dt_s, 1.0 * dt_s)
+        trial = dict(self._reference)
+        trial.update(zip(ARM, self._reacher.step(self._reference, waypoint), strict=True))
+        limit = 2.5 * dt_s
+        for name in ARM:
+            change = trial[name] - self._reference[name]
+            trial[name] = self._reference[name] + min(max(change, -limit), limit)
+        roll_gap = LEVEL_ROLL_RAD - self._reference[ROLL]
+        trial[ROLL] += min(max(roll_gap, -limit), limit)
+        left = float(np.linalg.norm(self._reacher.point(goal) - self._reacher.point(have)))
+        arrived = left < 0.004 and abs(goal.pitch_rad - have.pitch_rad) < 0.05 and abs(roll_gap) < 0.05
+        return self._commit(trial, left, dt_s, arrived=arrived)
+
+    def _commit(self, trial: dict[str, float], left: float, dt_s: float, *, arrived: bool) -> Step:
+        """Take a step unless it brings the arm nearer to what it must not touch."""
+        assert self._reference is not None
+        clearance_m = self._clearance.of(trial)
+        before_m = self._clearance.of(self._reference)
+        blocked = clearance_m < self._config.clearance_m and clearance_m < before_m - 1e-6
+        if blocked:
+            trial = self._reference
+        goal = np.array([trial[name] for name in ARM])
+        moved = np.abs(goal - np.array([self._reference[name] for name in ARM]))
+        # A little faster than the reference, so that a servo that lags can catch up.
+        speed = np.maximum(1.5 * moved / dt_s, 0.3)
+        self._reference = trial
+        return Step(goal, speed, trial[ROLL], left, arrived and not blocked, blocked)

@@ -1,0 +1,64 @@
+"""How near the arm is to what it must not enter: the camera mount, the chassis and the floor.
+
+The arm's hull is a chain of balls along its links; distances are to their surfaces (derived).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from cocoro.kinematics import Array
+from cocoro.robot import Robot
+
+_TUBES = (
+    # from, to, radius of the hull, balls
+    ("elbow", "wrist_pitch", 0.025, 4),
+    ("wrist_pitch", "wrist_roll", 0.025, 2),
+    ("wrist_roll", "gripper", 0.030, 5),
+)
+_TIPS = ("claw_left", "claw_right")
+_TIP_M = 0.085
+_TIP_RADIUS_M = 0.015
+
+
+class Clearance:
+    def __init__(self, robot: Robot) -> None:
+        self._chains = {name: robot.chain(name) for name in {t[0] for t in _TUBES} | {t[1] for t in _TUBES}}
+        self._tips = [robot.chain(name) for name in _TIPS]
+        self._mount_min = np.array(robot.kinect.mount_min_m)
+        self._mount_max = np.array(robot.kinect.mount_max_m)
+        self._chassis_radius_m = robot.base.chassis_diameter_m / 2
+        self._chassis_top_m = robot.base.chassis_height_m + 0.03
+
+    def hull(self, angles: Mapping[str, float]) -> tuple[Array, Array]:
+        """Centres (n, 3) in the body frame and radii (n,) of the arm's balls. The claws' angles may be left out."""
+        angles = dict.fromkeys(_TIPS, 0.0) | dict(angles)
+        places = {name: chain.position(angles) for name, chain in self._chains.items()}
+        centres: list[Array] = []
+        radii: list[float] = []
+        for start, end, radius_m, count in _TUBES:
+            for share in np.linspace(0.0, 1.0, count):
+                centres.append((1 - share) * places[start] + share * places[end])
+                radii.append(radius_m)
+        for chain in self._tips:
+            pose = chain.pose(angles)
+            # The finger lies across the claw's own x axis, towards the hand's tip.
+            centres.append(pose[:3, 3])
+            radii.append(0.022)
+        hand = self._chains["gripper"].pose(angles)
+        centres.append(hand[:3, 3] + hand[:3, 2] * (_TIP_M - 0.03))
+        radii.append(_TIP_RADIUS_M)
+        return np.array(centres), np.array(radii)
+
+    def of(self, angles: Mapping[str, float]) -> float:
+        """The least distance, metres; negative inside of something."""
+        centres, radii = self.hull(angles)
+        nearest = np.clip(centres, self._mount_min, self._mount_max)
+        mount = np.linalg.norm(centres - nearest, axis=1) - radii
+        floor = centres[:, 2] - radii
+        over = np.maximum(np.hypot(centres[:, 0], centres[:, 1]) - self._chassis_radius_m, 0.0)
+        above = np.maximum(centres[:, 2] - self._chassis_top_m, 0.0)
+        chassis = np.hypot(over, above) - radii
+        return float(min(mount.min(), floor.min(), chassis.min()))

@@ -1,0 +1,104 @@
+"""What can be tuned in the planner; a profile's `[service.planning]` table sets these."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import Meta
+
+Positive = Annotated[float, Meta(gt=0)]
+
+
+class Memory(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Of the target memory's filter."""
+
+    sigma_m: Positive = 0.004
+    """Standard deviation of a position at no distance; grows by `sigma_per_m` with the distance."""
+    sigma_per_m: Positive = 0.006
+    doubtful_factor: Positive = 4.0
+    """For detections that are occluded or cut by the image's edge."""
+    acceleration_mps2: Positive = 0.08
+    """How restless an object is expected to be; grows by itself when the object proves to move."""
+    velocity_fade_s: Positive = 0.8
+    """An unseen object's velocity fades with this time constant."""
+    gate_sigmas: Positive = 6.0
+    gate_m: Positive = 0.08
+    """A sighting further off than both is an outlier; three that agree move the memory."""
+    forget_s: Positive = 120.0
+
+
+class Head(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    sweep_speed_radps: Positive = 0.9
+    sweep_pan_rad: Positive = 2.6
+    sweep_tilts_rad: tuple[float, ...] = (-0.30, -0.75)
+    """One pass over the pan range at each."""
+    fixate_speed_radps: Positive = 4.0
+    look_where_it_was_s: Positive = 1.5
+    """A remembered object is looked for at its place for so long before sweeping."""
+
+
+class Navigation(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    max_speed_mps: Positive = 0.35
+    max_turn_radps: Positive = 0.9
+    acceleration_mps2: Positive = 0.5
+    turn_acceleration_radps2: Positive = 2.5
+    turn_in_place_rad: Positive = 0.9
+    """Further off than this it turns on the spot first."""
+    distance_tolerance_m: Positive = 0.012
+    heading_tolerance_rad: Positive = 0.05
+
+
+class Arm(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    joint_speed_radps: Positive = 1.6
+    hand_speed_mps: Positive = 0.25
+    insert_speed_mps: Positive = 0.12
+    lift_speed_mps: Positive = 0.12
+    damping: Positive = 0.02
+    """Of the damped pseudo-inverse, metres."""
+    pitch_rad: float = -0.17
+    travel_radius_m: Positive = 0.37
+    travel_height_m: Positive = 0.20
+    grasp_radius_m: Positive = 0.49
+    """Where a target should stand for grasping: from the arm base's axis."""
+    grasp_radius_range_m: tuple[float, float] = (0.468, 0.535)
+    """Nearer, the open claws would come down on the target; further, the arm does not reach."""
+    grasp_azimuth_range_rad: tuple[float, float] = (-0.45, 0.45)
+    grasp_height_range_m: tuple[float, float] = (0.045, 0.30)
+    retreat_radius_m: Positive = 0.37
+    """Where the hand waits behind a target before it closes in: as near as the arm folds at that height."""
+    descend_at_m: Positive = 0.45
+    """While driving, the hand comes down when so much is left to drive."""
+    carry_radius_m: Positive = 0.38
+    carry_rise_m: Positive = 0.17
+    """How much higher than where it was grasped a thing is carried."""
+    clearance_m: Positive = 0.008
+    """The arm's hull stays so far from the camera mount, the chassis and the floor."""
+    lead_rad: Positive = 0.25
+    """A joint's goal never runs further ahead of where the joint is."""
+
+
+class Hand(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    open_rad: Positive = 0.42
+    squeeze_rad: Positive = 0.30
+    """Past where the claws would touch a target, so that they press on it."""
+    speed_radps: Positive = 1.2
+    grip_load: Positive = 0.25
+    """Share of the stall torque, closing, at which a stopped claw is held to have something."""
+    settle_s: Positive = 0.25
+    give_up_s: Positive = 2.0
+
+
+class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    rate_hz: Positive = 50.0
+    coordination: Literal["concurrent", "lockstep"] = "concurrent"
+    """Lockstep: the arm waits until the base stands, as the paper has it."""
+    memory: Memory = Memory()
+    head: Head = Head()
+    navigation: Navigation = Navigation()
+    arm: Arm = Arm()
+    hand: Hand = Hand()
+    odometry_gap_s: Positive = 0.1
+    """Odometry is interpolated over no more than this."""
+    stale_target_s: Positive = 3.0
+    """While driving or reaching a target not seen for longer is lost."""

@@ -1,0 +1,166 @@
+"""The planner's pure core: samples in, commands and status out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from cocoro import topics
+from cocoro.clock import NS
+from cocoro.core import Output, Sample, Schedule, Take
+from cocoro.messages import BaseCommand, Intent, PlannerStatus, ServoCommand
+from cocoro.robot import Robot
+from cocoro.topics import Topic
+from services.planning.arm import Step
+from services.planning.behaviours import BEHAVIOURS, Behaviour, Idle, Limbs, Plan, Scene
+from services.planning.config import Config
+from services.planning.head import PAN, TILT
+from services.planning.reach import ARM
+from services.planning.senses import Senses
+
+_STALE_NS = NS
+"""A running behaviour fails when the robot's state has been missing for so long."""
+
+
+class PlanningCore:
+    """See `cocoro.core.Core`. Stands still, and says why, whenever it is not sure."""
+
+    def __init__(self, robot: Robot, config: Config) -> None:
+        self._config = config
+        self._senses = Senses(config)
+        self._limbs = Limbs(robot, config)
+        self._intent = Intent()
+        self._behaviour: Behaviour = Idle()
+        self._ended: Plan | None = None
+        self._last_ns: int | None = None
+        self._missing_since_ns: int | None = None
+        self._head_goal: tuple[float, float] | None = None
+
+    reads: Mapping[Topic, Take] = {  # type: ignore[type-arg]
+        topics.BASE_STATE: "all",
+        topics.ARM_STATE: "latest",
+        topics.HAND_STATE: "latest",
+        topics.DETECTIONS: "all",
+        topics.INTENT: "latest",
+    }
+
+    @property
+    def schedule(self) -> Schedule:
+        if self._config.coordination == "lockstep":
+            return Schedule(None, (topics.DETECTIONS,))
+        return Schedule(self._config.rate_hz, (topics.DETECTIONS,))
+
+    def step(self, inputs: Sequence[Sample], now_ns: int) -> Sequence[Output]:
+        for sample in inputs:
+            self._senses.take(sample.topic, sample.message, now_ns)
+        self._senses.localise(now_ns)
+        dt_s = self._elapsed(now_ns)
+        self._follow_intent(now_ns)
+        halted = self._senses.missing(now_ns) or self._senses.latched()
+        body = self._senses.body()
+        if halted or body is None:
+            return self._halt(halted or "no odometry yet", now_ns)
+        self._missing_since_ns = None
+        hand = self._senses.hand
+        assert hand is not None
+        self._limbs.grip.feel(hand, now_ns)
+        scene = Scene(now_ns, dt_s, self._senses, body, self._senses.angles(), self._limbs)
+        plan = self._plan(scene)
+        status = self._status(plan, scene)
+        return [*self._commands(plan, scene), Output(topics.PLAN, status)]
+
+    def _elapsed(self, now_ns: int) -> float:
+        last_ns, self._last_ns = self._last_ns, now_ns
+        if last_ns is None or now_ns <= last_ns:
+            return 1.0 / self._config.rate_hz
+        # After a pause, motion goes on from where it stood, it does not jump.
+        return min((now_ns - last_ns) / NS, self._longest_s)
+
+    @property
+    def _longest_s(self) -> float:
+        return 1.0 if self._config.coordination == "lockstep" else 0.05
+
+    def _follow_intent(self, now_ns: int) -> None:
+        fresh = self._senses.fresh_intent(now_ns)
+        intent = fresh or Intent(task_id=self._intent.task_id, step=self._intent.step)
+        wanted = (intent.task_id, intent.step, intent.behaviour, intent.label)
+        current = (self._intent.task_id, self._intent.step, self._intent.behaviour, self._intent.label)
+        if wanted == current:
+            return
+        self._intent = intent
+        self._ended = None
+        if fresh is None:
+            self._behaviour = Idle("the executive is silent")
+        else:
+            self._behaviour = BEHAVIOURS[intent.behaviour](intent.label)
+
+    def _plan(self, scene: Scene) -> Plan:
+        """Step the behaviour; once it has ended, hold still with its result."""
+        if self._ended is not None:
+            return Plan(
+                scene.stand(),
+                scene.still(),
+                self._ended.why,
+                None,
+                self._ended.state,
+                self._ended.reason,
+                self._ended.distance_m,
+            )
+        plan = self._behaviour.step(scene)
+        if plan.state != "running" and not isinstance(self._behaviour, Idle):
+            self._ended = plan
+        return plan
+
+    def _halt(self, why: str, now_ns: int) -> Sequence[Output]:
+        """Command nothing, so that everything stops by itself, and start afresh from what is measured later."""
+        self._limbs.arm.resync()
+        self._limbs.driver.reset()
+        self._limbs.grip.keep()
+        self._head_goal = None
+        if self._missing_since_ns is None:
+            self._missing_since_ns = now_ns
+        failed = self._intent.behaviour != "idle" and now_ns - self._missing_since_ns > _STALE_NS
+        status = PlannerStatus(
+            task_id=self._intent.task_id,
+            step=self._intent.step,
+            behaviour=self._intent.behaviour,
+            state="failed" if failed else "running",
+            reason="stale" if failed else "",
+            why=f"standing still: {why}",
+        )
+        return [Output(topics.PLAN, status)]
+
+    def _status(self, plan: Plan, scene: Scene) -> PlannerStatus:
+        x, y, z = self._limbs.reacher.position(scene.angles)
+        return PlannerStatus(
+            task_id=self._intent.task_id,
+            step=self._intent.step,
+            behaviour=self._intent.behaviour,
+            state=plan.state,
+            reason=plan.reason,
+            why=plan.why,
+            target=scene.target(self._intent.label) if self._intent.label else None,
+            distance_m=plan.distance_m,
+            hand_m=(float(x), float(y), float(z)),
+            holding=scene.holding,
+            known=self._senses.memory.all(scene.body, scene.now_ns),
+        )
+
+    def _commands(self, plan: Plan, scene: Scene) -> list[Output]:
+        base: BaseCommand = plan.base
+        step: Step = plan.arm
+        if plan.head is not None:
+            self._head_goal = plan.head[:2]
+        if self._head_goal is None:
+            self._head_goal = (scene.angles[PAN], scene.angles[TILT])
+        head_speed = plan.head[2] if plan.head is not None else 1.0
+        arm = ServoCommand(
+            joints=(PAN, TILT, *ARM),
+            goal_rad=(*self._head_goal, *(float(angle) for angle in step.goal_rad)),
+            speed_radps=(head_speed, head_speed, *(float(speed) for speed in step.speed_radps)),
+        )
+        hand = self._limbs.grip.command(step.roll_rad)
+        return [
+            Output(topics.BASE_COMMAND, base),
+            Output(topics.ARM_COMMAND, arm),
+            Output(topics.HAND_COMMAND, hand),
+        ]

@@ -1,0 +1,73 @@
+"""Where the head looks: sweeping when the target is lost, fixating it when it is seen."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from math import atan2, cos
+
+import numpy as np
+
+from cocoro.robot import Robot
+from services.planning.config import Head
+
+PAN, TILT = "neck_pan", "neck_tilt"
+
+
+class Gaze:
+    """Solves for the pan and tilt that bring a point of the body frame into the centre of the image."""
+
+    def __init__(self, robot: Robot) -> None:
+        self._chain = robot.chain("camera")
+        self._limits = [robot.joints[name].limits_rad for name in (PAN, TILT)]
+
+    def at(self, point_m: tuple[float, float, float], start: Mapping[str, float]) -> tuple[float, float]:
+        """(pan, tilt) in radians, within the limits; Newton's method from the present angles (derived): the neck's axes
+        are nearly those of the image, so each angle is corrected by its own image angle."""
+        pan, tilt = start.get(PAN, 0.0), start.get(TILT, 0.0)
+        point = np.array([*point_m, 1.0])
+        for _ in range(4):
+            pose = self._chain.pose({PAN: pan, TILT: tilt})
+            x, y, z = pose[:3, :3].T @ (point[:3] - pose[:3, 3])
+            if z < 1e-3:
+                # Behind the camera: turn by the bearing first.
+                pan += atan2(-x, z)
+                continue
+            pan -= atan2(x, z * max(cos(tilt), 0.2))
+            tilt -= atan2(y, z)
+        (pan_min, pan_max), (tilt_min, tilt_max) = self._limits
+        pan = (pan + np.pi) % (2 * np.pi) - np.pi
+        return float(min(max(pan, pan_min), pan_max)), float(min(max(tilt, tilt_min), tilt_max))
+
+
+class Sweep:
+    """A fixed pattern over the whole pan range, once at each tilt, the nearer side first."""
+
+    def __init__(self, config: Head, pan_rad: float) -> None:
+        self._config = config
+        reach = config.sweep_pan_rad
+        side = reach if pan_rad >= 0 else -reach
+        self._corners = [(side, config.sweep_tilts_rad[0])]
+        for tilt in config.sweep_tilts_rad:
+            if self._corners[-1][1] != tilt:
+                self._corners.append((side, tilt))
+            side = -side
+            self._corners.append((side, tilt))
+        self.swept = 0
+        """Corners that were reached."""
+
+    @property
+    def done(self) -> bool:
+        return self.swept >= len(self._corners)
+
+    @property
+    def share(self) -> float:
+        return self.swept / len(self._corners)
+
+    def next(self, pan_rad: float, tilt_rad: float) -> tuple[float, float]:
+        """(pan, tilt) to go to now."""
+        while not self.done:
+            pan, tilt = self._corners[self.swept]
+            if abs(pan - pan_rad) > 0.05 or abs(tilt - tilt_rad) > 0.05:
+                return pan, tilt
+            self.swept += 1
+        return self._corners[-1]

@@ -1,0 +1,133 @@
+"""Target memory: where each known object is, in the odometry frame, and how it moves.
+
+Per object a constant-velocity Kalman filter (derived), the same for the three axes. Sightings enter with the
+time of their frame; an unseen object is carried by odometry because its place is kept in the odometry frame.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from math import exp, hypot
+
+import numpy as np
+
+from cocoro.clock import NS
+from cocoro.frames import Pose2
+from cocoro.kinematics import Array
+from cocoro.messages import TargetEstimate
+from services.planning.config import Memory
+
+_AGREE = 3
+"""So many outliers in a row that agree with one another move the memory to their place."""
+
+
+@dataclass
+class Track:
+    """One object's filter. Positions in the odometry frame, metres; `covariance` of (position, velocity)."""
+
+    position_m: Array
+    stamp_ns: int
+    sigma_m: float
+    velocity_mps: Array = field(default_factory=lambda: np.zeros(3))
+    covariance: Array = field(default_factory=lambda: np.diag([1e-4, 1e-2]))
+    sightings: int = 1
+    surprise: float = 1.0
+    """Smoothed normalised innovation: above 1 the object moves more than was expected of it."""
+    outliers: list[Array] = field(default_factory=list)
+
+
+class TargetMemory:
+    def __init__(self, config: Memory) -> None:
+        self._config = config
+        self._tracks: dict[str, Track] = {}
+
+    def clear(self) -> None:
+        self._tracks.clear()
+
+    def forget(self, label: str) -> None:
+        self._tracks.pop(label, None)
+
+    def see(self, label: str, position_m: Array, distance_m: float, stamp_ns: int, *, doubtful: bool) -> None:
+        """One sighting: the object's centre in the odometry frame at the frame's stamp."""
+        config = self._config
+        sigma_m = config.sigma_m + config.sigma_per_m * distance_m
+        if doubtful:
+            sigma_m *= config.doubtful_factor
+        track = self._tracks.get(label)
+        if track is None or (stamp_ns - track.stamp_ns) / NS > config.forget_s:
+            self._tracks[label] = Track(position_m.copy(), stamp_ns, sigma_m)
+            return
+        dt_s = (stamp_ns - track.stamp_ns) / NS
+        if dt_s < 0:
+            return
+        predicted = _moved(track, dt_s, config.velocity_fade_s)
+        off_m = float(np.linalg.norm(position_m - predicted))
+        spread_m = float(np.sqrt(track.covariance[0, 0] + (0.1 * dt_s) ** 2) + sigma_m)
+        if off_m > max(config.gate_sigmas * spread_m, config.gate_m):
+            self._outlier(label, track, position_m, stamp_ns, sigma_m, doubtful)
+            return
+        track.outliers.clear()
+        self._update(track, predicted, position_m, dt_s, sigma_m)
+        track.stamp_ns = stamp_ns
+        track.sightings += 1
+
+    def _update(self, track: Track, predicted: Array, seen: Array, dt_s: float, sigma_m: float) -> None:
+        fade = exp(-dt_s / self._config.velocity_fade_s) if dt_s > 0.2 else 1.0
+        q = self._config.acceleration_mps2**2 * max(track.surprise, 1.0) ** 2
+        step = np.array([[1.0, dt_s], [0.0, fade]])
+        noise = q * np.array([[dt_s**4 / 4, dt_s**3 / 2], [dt_s**3 / 2, dt_s**2]])
+        covariance = step @ track.covariance @ step.T + noise
+        variance = covariance[0, 0] + sigma_m**2
+        innovation = seen - predicted
+        normalised = float(innovation @ innovation) / 3.0 / variance
+        track.surprise += 0.15 * (min(normalised, 25.0) - track.surprise)
+        gain = covariance[:, 0] / variance
+        track.position_m = predicted + gain[0] * innovation
+        track.velocity_mps = fade * track.velocity_mps + gain[1] * innovation
+        track.covariance = covariance - np.outer(gain, covariance[0])
+        track.sigma_m = float(np.sqrt(track.covariance[0, 0]))
+
+    def _outlier(
+        self, label: str, track: Track, position_m: Array, stamp_ns: int, sigma_m: float, doubtful: bool
+    ) -> None:
+        """A sighting far from where the object should be: something else, or it was moved."""
+        if doubtful:
+            return
+        if track.outliers and np.linalg.norm(position_m - track.outliers[-1]) > 2 * self._config.gate_m:
+            track.outliers.clear()
+        track.outliers.append(position_m.copy())
+        if len(track.outliers) >= _AGREE:
+            self._tracks[label] = Track(np.mean(track.outliers, axis=0), stamp_ns, sigma_m)
+
+    def estimate(self, label: str, body: Pose2, now_ns: int) -> TargetEstimate | None:
+        """What is believed of an object now, seen from the body's pose in the odometry frame."""
+        track = self._tracks.get(label)
+        if track is None:
+            return None
+        age_s = max((now_ns - track.stamp_ns) / NS, 0.0)
+        if age_s > self._config.forget_s:
+            del self._tracks[label]
+            return None
+        position = _moved(track, age_s, self._config.velocity_fade_s)
+        return TargetEstimate(
+            label=label,
+            position_m=body.inverse().apply(position),
+            velocity_mps=(float(track.velocity_mps[0]), float(track.velocity_mps[1]), float(track.velocity_mps[2])),
+            sigma_m=float(hypot(track.sigma_m, 0.01 * age_s)),
+            age_s=age_s,
+            odometry_position_m=(float(position[0]), float(position[1]), float(position[2])),
+        )
+
+    def sightings(self, label: str) -> int:
+        """How often the object was seen where it is believed to be."""
+        track = self._tracks.get(label)
+        return track.sightings if track else 0
+
+    def all(self, body: Pose2, now_ns: int) -> tuple[TargetEstimate, ...]:
+        found = (self.estimate(label, body, now_ns) for label in sorted(self._tracks))
+        return tuple(estimate for estimate in found if estimate is not None)
+
+
+def _moved(track: Track, dt_s: float, fade_s: float) -> Array:
+    """The place after `dt_s`, the velocity fading: the integral of v exp(-t / fade)."""
+    return track.position_m + track.velocity_mps * fade_s * (1.0 - exp(-dt_s / fade_s))

@@ -1,0 +1,99 @@
+"""Egocentric navigation: arcs that bring a target to a given place beside the robot.
+
+The paper's arc to a target at planar (rho, phi) has radius R = rho / (2 sin phi) (derived). Here the target is not
+to end under the robot's centre but on a line parallel to its heading, `aim_m` = (x, y) in the body frame, since the arm
+reaches along y = -0.10. A robot that drives straight with the target at bearing phi_aim = asin(y / rho) ends there; so
+phi is replaced by the bearing error phi - phi_aim, and rho by the distance still to drive.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import asin, atan2, copysign, hypot, sin, sqrt
+
+from cocoro.frames import wrap_rad
+from cocoro.messages import BaseCommand
+from cocoro.robot import Base
+from services.planning.config import Navigation
+
+
+@dataclass(frozen=True)
+class Offset:
+    """What is left of a drive."""
+
+    ahead_m: float
+    """Still to drive, negative when the target is too near."""
+    heading_rad: float
+    """Still to turn, counter-clockwise positive."""
+
+
+def offset_to(target_m: tuple[float, float], aim_m: tuple[float, float]) -> Offset:
+    """From where the target is to where it shall be, both in the body frame."""
+    x, y = target_m
+    rho = max(hypot(x, y), abs(aim_m[1]) + 1e-3)
+    aim_bearing = asin(aim_m[1] / rho)
+    heading = wrap_rad(atan2(y, x) - aim_bearing)
+    return Offset(sqrt(rho * rho - aim_m[1] ** 2) - aim_m[0], heading)
+
+
+class Driver:
+    """Turns what is left of a drive into wheel speeds, with bounded acceleration."""
+
+    def __init__(self, config: Navigation, base: Base) -> None:
+        self._config = config
+        self._base = base
+        self._speed_mps = 0.0
+        self._turn_radps = 0.0
+
+    def reset(self) -> None:
+        self._speed_mps = self._turn_radps = 0.0
+
+    @property
+    def moving(self) -> bool:
+        return abs(self._speed_mps) > 1e-3 or abs(self._turn_radps) > 1e-3
+
+    def arrived(self, offset: Offset) -> bool:
+        config = self._config
+        return (
+            abs(offset.ahead_m) <= config.distance_tolerance_m
+            and abs(offset.heading_rad) <= config.heading_tolerance_rad
+        )
+
+    def towards(self, offset: Offset, dt_s: float) -> BaseCommand:
+        """One step of the arc."""
+        config = self._config
+        ahead, heading = offset.ahead_m, offset.heading_rad
+        if abs(ahead) <= config.distance_tolerance_m:
+            speed = 0.0
+        else:
+            # Never faster than what can be braked within what is left.
+            speed = copysign(min(config.max_speed_mps, sqrt(config.acceleration_mps2 * abs(ahead))), ahead)
+        if abs(heading) > config.turn_in_place_rad:
+            speed = 0.0
+        elif ahead > 0:
+            speed *= max(0.0, 1.0 - abs(heading) / config.turn_in_place_rad)
+        arc = 2.0 * speed * sin(heading) / max(abs(ahead), 0.15) if ahead > 0 else 0.0
+        align = 1.8 * heading if abs(heading) > config.heading_tolerance_rad / 2 else 0.0
+        turn = arc if abs(arc) > abs(align) else align
+        return self.command(speed, turn, dt_s)
+
+    def command(self, speed_mps: float, turn_radps: float, dt_s: float) -> BaseCommand:
+        """Approach a speed and turn rate within the acceleration limits; scaled together when a wheel saturates,
+        which keeps the arc."""
+        config = self._config
+        self._speed_mps = _approach(self._speed_mps, speed_mps, config.acceleration_mps2 * dt_s)
+        turn_radps = min(max(turn_radps, -config.max_turn_radps), config.max_turn_radps)
+        self._turn_radps = _approach(self._turn_radps, turn_radps, config.turn_acceleration_radps2 * dt_s)
+        half = self._turn_radps * self._base.wheel_separation_m / 2
+        left, right = self._speed_mps - half, self._speed_mps + half
+        excess = max(abs(left), abs(right)) / self._base.max_wheel_speed_mps
+        if excess > 1.0:
+            left, right = left / excess, right / excess
+        return BaseCommand(left_mps=left, right_mps=right)
+
+    def brake(self, dt_s: float) -> BaseCommand:
+        return self.command(0.0, 0.0, dt_s)
+
+
+def _approach(value: float, goal: float, step: float) -> float:
+    return goal if abs(goal - value) <= step else value + copysign(step, goal - value)

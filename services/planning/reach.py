@@ -1,0 +1,119 @@
+"""Rigid-body reaching: the hand moved in cylindrical coordinates about the arm base's axis by the damped pseudo-inverse
+of the Jacobian, within the joint limits (the paper's 'Motor planning for reaching' with the model's own Jacobian)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from math import asin, atan2, cos, hypot, pi, sin
+from typing import NamedTuple
+
+import numpy as np
+
+from cocoro.frames import wrap_rad
+from cocoro.kinematics import Array
+from cocoro.robot import Robot
+
+ARM = ("arm_base", "shoulder", "elbow", "wrist_pitch")
+LEVEL_ROLL_RAD = pi / 2
+"""The wrist roll at which the claws lie level, for upright targets."""
+
+
+class HandPose(NamedTuple):
+    """Where the pads' centre is and how the hand is pitched, about the arm base's vertical axis."""
+
+    radius_m: float
+    azimuth_rad: float
+    """Body frame: 0 is straight ahead."""
+    height_m: float
+    """Above the floor."""
+    pitch_rad: float
+    """Of the hand's own axis, up positive."""
+
+    def towards(self, goal: HandPose, step_m: float, step_rad: float) -> HandPose:
+        """A pose nearer to the goal: no coordinate moves further than its step, all arrive together."""
+        gaps = [g - v for g, v in zip(goal, self, strict=True)]
+        gaps[1] = wrap_rad(gaps[1])
+        scale = max(
+            1.0,
+            hypot(gaps[0], gaps[2]) / step_m,
+            abs(gaps[1]) * max(self.radius_m, 0.1) / step_m,
+            abs(gaps[3]) / step_rad,
+        )
+        return HandPose(*(v + gap / scale for v, gap in zip(self, gaps, strict=True)))
+
+
+class Reacher:
+    """Forward and inverse kinematics of the hand, from the robot description."""
+
+    def __init__(self, robot: Robot, damping: float) -> None:
+        self._pad = robot.chain("pad_centre")
+        self._axis = robot.chain("arm_base").position({"arm_base": 0.0})
+        self._limits = np.array([robot.joints[name].limits_rad for name in ARM])
+        self._damping2 = damping * damping
+
+    def position(self, angles: Mapping[str, float]) -> Array:
+        """The pads' centre, body frame, shape (3,)."""
+        return self._pad.position(angles)
+
+    def pose(self, angles: Mapping[str, float]) -> HandPose:
+        transform = self._pad.pose(angles)
+        x, y, z = transform[:3, 3] - self._axis * [1, 1, 0]
+        return HandPose(hypot(x, y), atan2(y, x), float(z), asin(min(max(float(transform[2, 2]), -1.0), 1.0)))
+
+    def point(self, pose: HandPose) -> Array:
+        """A hand pose's place in the body frame, shape (3,)."""
+        return np.array(
+            [
+                self._axis[0] + pose.radius_m * cos(pose.azimuth_rad),
+                self._axis[1] + pose.radius_m * sin(pose.azimuth_rad),
+                pose.height_m,
+            ]
+        )
+
+    def seen_from_arm(self, point_m: tuple[float, float, float]) -> tuple[float, float, float]:
+        """(radius_m, azimuth_rad, height_m) of a point of the body frame about the arm base's axis."""
+        x, y = point_m[0] - self._axis[0], point_m[1] - self._axis[1]
+        return hypot(x, y), atan2(y, x), point_m[2]
+
+    def step(self, angles: Mapping[str, float], pose: HandPose) -> Array:
+        """Joint angles (in the order of ARM, shape (4,)) one step nearer to a hand pose.
+
+        A joint that a step would carry over its limit is put on the limit and the others are solved again.
+        """
+        transform = self._pad.pose(angles)
+        jac6 = self._pad.jacobian(angles, ARM)
+        along = transform[:3, 2]
+        level = max(float(np.sqrt(max(1.0 - along[2] ** 2, 0.0))), 0.1)
+        pitch_row = np.cross(jac6[3:].T, along)[:, 2] / level
+        jac = np.vstack([jac6[:3], 0.2 * pitch_row])
+        error = np.empty(4)
+        error[:3] = self.point(pose) - transform[:3, 3]
+        # 0.2 m: what a radian of pitch counts against a metre of place.
+        error[3] = 0.2 * (pose.pitch_rad - asin(min(max(float(along[2]), -1.0), 1.0)))
+        start = np.array([angles[name] for name in ARM])
+        free = np.ones(4, dtype=bool)
+        change = np.zeros(4)
+        for _ in range(4):
+            part = jac[:, free]
+            rest = error - jac[:, ~free] @ change[~free]
+            change[free] = part.T @ np.linalg.solve(part @ part.T + self._damping2 * np.eye(4), rest)
+            goal = start + change
+            over = free & ((goal < self._limits[:, 0]) | (goal > self._limits[:, 1]))
+            if not over.any():
+                break
+            change[over] = np.clip(goal[over], self._limits[over, 0], self._limits[over, 1]) - start[over]
+            free &= ~over
+        return start + change
+
+    def solve(self, angles: Mapping[str, float], pose: HandPose) -> dict[str, float] | None:
+        """Joint angles for a hand pose, found from nearby ones; None when it is out of reach (5 mm, 3 degrees)."""
+        trial = dict(angles)
+        for _ in range(60):
+            trial.update(zip(ARM, self.step(trial, pose), strict=True))
+            have = self.pose(trial)
+            off_m = float(np.linalg.norm(self.point(have) - self.point(pose)))
+            if off_m < 0.002 and abs(have.pitch_rad - pose.pitch_rad) < 0.02:
+                return {name: trial[name] for name in ARM}
+        if off_m < 0.005 and abs(have.pitch_rad - pose.pitch_rad) < 0.05:
+            return {name: trial[name] for name in ARM}
+        return None

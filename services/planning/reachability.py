@@ -1,0 +1,52 @@
+"""Whether a target can be grasped from where the robot stands, by the rigid-body model."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from cocoro.messages import Vec3
+from services.planning.config import Arm
+from services.planning.reach import LEVEL_ROLL_RAD, HandPose, Reacher
+
+_UPRIGHT = {"arm_base": -0.087, "shoulder": 0.66, "elbow": -1.6, "wrist_pitch": 0.77, "wrist_roll": LEVEL_ROLL_RAD}
+"""Elbow up, hand before the robot: where the search for joint angles starts, so that it stays in that family."""
+
+
+class Grasp(NamedTuple):
+    """Where the hand has to go for a target: behind it, and around it."""
+
+    behind: HandPose
+    around: HandPose
+
+
+class Reachability:
+    def __init__(self, config: Arm, reacher: Reacher) -> None:
+        self._config = config
+        self._reacher = reacher
+
+    def grasp(self, target_m: Vec3) -> Grasp:
+        """The hand poses for a target's centre (body frame), reachable or not."""
+        config = self._config
+        radius, azimuth, height = self._reacher.seen_from_arm(target_m)
+        low, high = config.grasp_height_range_m
+        height = min(max(height, low), high)
+        behind = HandPose(config.retreat_radius_m, azimuth, height, config.pitch_rad)
+        return Grasp(behind, behind._replace(radius_m=radius))
+
+    def why_not(self, target_m: Vec3) -> str:
+        """Why a target cannot be grasped from here; '' when it can."""
+        config = self._config
+        radius, azimuth, height = self._reacher.seen_from_arm(target_m)
+        for name, value, (low, high), unit in (
+            ("radius", radius, config.grasp_radius_range_m, "m from the arm base"),
+            ("azimuth", azimuth, config.grasp_azimuth_range_rad, "rad from the arm base"),
+        ):
+            if not low <= value <= high:
+                return f"its {name} is {value:.2f} {unit}, reachable is {low:.2f} to {high:.2f}"
+        if height > config.grasp_height_range_m[1]:
+            return f"it is {height:.2f} m high, reachable is up to {config.grasp_height_range_m[1]:.2f}"
+        grasp = self.grasp(target_m)
+        start = _UPRIGHT | {"arm_base": _UPRIGHT["arm_base"] + azimuth}
+        if self._reacher.solve(start, grasp.around) is None or self._reacher.solve(start, grasp.behind) is None:
+            return "the joint limits do not let the hand there"
+        return ""

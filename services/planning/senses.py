@@ -1,0 +1,114 @@
+"""What the planner knows of the robot itself, read as history and never older than its stated age."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+
+import numpy as np
+
+from cocoro import topics
+from cocoro.clock import NS
+from cocoro.frames import Pose2
+from cocoro.history import History
+from cocoro.messages import BaseState, Detections, Intent, Message, ServoState
+from cocoro.topics import Topic
+from services.planning.config import Config
+from services.planning.memory import TargetMemory
+
+_WAIT_FOR_ODOMETRY_NS = NS // 5
+
+
+class Senses:
+    """Takes every input of the planner; answers by time."""
+
+    def __init__(self, config: Config) -> None:
+        self.memory = TargetMemory(config.memory)
+        self.base: BaseState | None = None
+        self.arm: ServoState | None = None
+        self.hand: ServoState | None = None
+        self.intent: Intent | None = None
+        self.unlocalised: dict[str, tuple[int, str]] = {}
+        """Per label the stamp and the note of its newest detection without a position."""
+        self._odometry = History(3, angular=(2,))
+        self._gap_ns = round(config.odometry_gap_s * NS)
+        self._waiting: deque[Detections] = deque(maxlen=8)
+
+    def take(self, topic: Topic[Message], message: Message, now_ns: int) -> None:
+        if isinstance(message, BaseState):
+            self.base = message
+            resets = self._odometry.resets
+            pose = (*message.odometry_m, message.odometry_yaw_rad)
+            self._odometry.add(message.stamp_ns, pose, message.incarnation)
+            if self._odometry.resets != resets:
+                # The base restarted: its odometry frame is a new one, places in the old one mean nothing now.
+                self.memory.clear()
+                self._waiting.clear()
+        elif isinstance(message, ServoState):
+            if topic.name == topics.ARM_STATE.name:
+                self.arm = message
+            else:
+                self.hand = message
+        elif isinstance(message, Detections):
+            self._waiting.append(message)
+        elif isinstance(message, Intent):
+            self.intent = message
+
+    def localise(self, now_ns: int) -> None:
+        """Enter the detections whose odometry is known; the others wait, briefly."""
+        for _ in range(len(self._waiting)):
+            detections = self._waiting.popleft()
+            pose = self._odometry.at(detections.stamp_ns, self._gap_ns)
+            if pose is not None:
+                self._remember(detections, Pose2(*pose))
+            elif now_ns - detections.stamp_ns < _WAIT_FOR_ODOMETRY_NS:
+                self._waiting.append(detections)
+
+    def _remember(self, detections: Detections, body: Pose2) -> None:
+        for detection in detections.detections:
+            if detection.position_m is None:
+                self.unlocalised[detection.label] = (detections.stamp_ns, detection.note)
+                continue
+            distance_m = float(np.linalg.norm(detection.position_m))
+            place = np.array(body.apply(detection.position_m))
+            doubtful = detection.note != ""
+            self.memory.see(detection.label, place, distance_m, detections.stamp_ns, doubtful=doubtful)
+
+    def body(self) -> Pose2 | None:
+        """The body's newest pose in the odometry frame."""
+        newest = self._odometry.newest
+        return Pose2(*newest[1]) if newest else None
+
+    def missing(self, now_ns: int) -> str:
+        """Which state is missing or too old to move on ('' when all are fresh)."""
+        for topic, message in (
+            (topics.BASE_STATE, self.base),
+            (topics.ARM_STATE, self.arm),
+            (topics.HAND_STATE, self.hand),
+        ):
+            if message is None:
+                return f"no {topic.name} yet"
+            age_s = (now_ns - message.stamp_ns) / NS
+            if age_s > topic.max_age_s:
+                return f"{topic.name} is {age_s:.2f} s old"
+        return ""
+
+    def latched(self) -> str:
+        """Which hardware stands still for the emergency stop ('' when none)."""
+        for name, state in (("base", self.base), ("arm", self.arm), ("hand", self.hand)):
+            if state is not None and state.latch != "released":
+                return f"{name}: emergency stop {state.latch}"
+        return ""
+
+    def fresh_intent(self, now_ns: int) -> Intent | None:
+        if self.intent is None or now_ns - self.intent.stamp_ns > topics.INTENT.max_age_s * NS:
+            return None
+        return self.intent
+
+    def angles(self) -> Mapping[str, float]:
+        """Every joint's newest measured angle."""
+        angles: dict[str, float] = {}
+        for state in (self.arm, self.hand):
+            if state is not None:
+                angles.update(zip(state.joints, state.position_rad, strict=True))
+        return angles
