@@ -1,0 +1,72 @@
+"""Who touches whom: PyBullet's contact points under the names of the description and the scene."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from math import atan2, degrees
+from typing import Any
+
+import numpy as np
+
+from cocoro.kinematics import Array
+from sim.base import Bumper
+from sim.body import CHASSIS
+from sim.stage import FLOOR
+
+BUMPER_HALF_DEG = 90.0
+"""The bumper spans the front half of the chassis."""
+BUMPER_OVERLAP_DEG = 20.0
+"""Pressed within so much of straight ahead, both of its switches close."""
+ROLLS_ON_FLOOR = frozenset({"wheel_left", "wheel_right", "caster_front", "caster_rear"})
+
+Pair = tuple[str, str]
+
+
+def touching_pairs(
+    points: Iterable[tuple[Any, ...]], robot_body: int, link_names: Mapping[int, str], names: Mapping[int, str]
+) -> tuple[frozenset[Pair], list[tuple[float, float, float]]]:
+    """The names that press on each other, robot links first, and where something presses on the chassis.
+
+    A pair that is merely near is none: only contacts with a force count.
+    """
+    pairs: set[Pair] = set()
+    on_chassis: list[tuple[float, float, float]] = []
+    for point in points:
+        if point[9] <= 0.0:
+            continue
+        (body_a, body_b), (link_a, link_b) = point[1:3], point[3:5]
+        one = link_names[link_a] if body_a == robot_body else names[body_a]
+        other = link_names[link_b] if body_b == robot_body else names[body_b]
+        if body_b == robot_body and body_a != robot_body:
+            one, other = other, one
+        pairs.add((one, other))
+        if body_a != body_b and one == CHASSIS and other != FLOOR:
+            on_chassis.append(point[5])
+    return frozenset(pairs), on_chassis
+
+
+def bumper(points_m: Iterable[tuple[float, float, float]], body_pose: Array) -> Bumper:
+    """Which of the bumper's switches the contact points on the chassis close."""
+    left = right = False
+    for point in points_m:
+        x, y, _ = body_pose[:3, :3].T @ (np.array(point) - body_pose[:3, 3])
+        bearing_deg = degrees(atan2(y, x))
+        if abs(bearing_deg) <= BUMPER_HALF_DEG:
+            left |= bearing_deg >= -BUMPER_OVERLAP_DEG
+            right |= bearing_deg <= BUMPER_OVERLAP_DEG
+    return Bumper(left, right)
+
+
+def collisions(pairs: Iterable[Pair], links: frozenset[str], objects: frozenset[str]) -> tuple[str, ...]:
+    """The robot's contacts that are no part of its work: not wheels on the floor, not claws on an object,
+    not the claws closed on each other. 'link~other', sorted."""
+    claws = {link for link in links if link.startswith("claw_")}
+    return tuple(
+        sorted(
+            f"{one}~{other}"
+            for one, other in pairs
+            if one in links
+            and not (one in ROLLS_ON_FLOOR and other == FLOOR)
+            and not (one in claws and (other in objects or other in claws))
+        )
+    )

@@ -1,0 +1,212 @@
+"""The robot as a URDF, written from the robot description and the table of its parts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from math import asin, atan2, pi
+from pathlib import Path
+
+import numpy as np
+
+from cocoro.kinematics import Array, Link, turn_z
+from cocoro.robot import Robot
+from sim.body import CHASSIS, Body, Extra, Part, calliope_body
+from sim.visual import Visual
+
+WHEELS = ("wheel_left", "wheel_right")
+
+_NEIGHBOURS = {
+    # Links that touch where they are joined, or that turn inside one another. Every other pair may collide.
+    frozenset(pair)
+    for pair in (
+        (CHASSIS, "arm_base"),
+        ("riser", "arm_base"),
+        ("riser", "shoulder"),
+        ("arm_base", "shoulder"),
+        ("arm_base", "elbow"),
+        ("shoulder", "elbow"),
+        ("elbow", "wrist_pitch"),
+        ("wrist_pitch", "wrist_roll"),
+        ("wrist_pitch", "claw_left"),
+        ("wrist_pitch", "claw_right"),
+        ("wrist_roll", "claw_left"),
+        ("wrist_roll", "claw_right"),
+        ("neck_pan", "neck_tilt"),
+        ("mount", "neck_pan"),
+    )
+}
+_FIXED = frozenset({CHASSIS, "mount", "riser", *WHEELS, "caster_front", "caster_rear"})
+
+
+@dataclass(frozen=True)
+class Model:
+    """What the simulator loads, and how its links carry the description's."""
+
+    urdf: str
+    links: tuple[str, ...]
+    """The root first. PyBullet numbers them in its own way: ask it for the names."""
+    body: Body
+    carried: dict[str, tuple[str, Array]]
+    """For every link of the description: the URDF link that carries it and the fixed transform between."""
+
+    def collision_pairs(self) -> Iterator[tuple[str, str]]:
+        """The pairs of the robot's own links that are to collide."""
+        for i, one in enumerate(self.links):
+            for other in self.links[i + 1 :]:
+                if frozenset((one, other)) not in _NEIGHBOURS and not {one, other} <= _FIXED:
+                    yield one, other
+
+    def visuals(self) -> list[tuple[str, Array, Visual]]:
+        """Every part: the URDF link that carries it, its 4 x 4 pose there, and how it looks."""
+        found = []
+        for link, parts in self.body.parts.items():
+            carrier, offset = self.carried.get(link, (link, np.eye(4)))
+            found += [
+                (carrier, offset @ part.pose(), Visual(part.name, part.shape, part.size_m, part.rgb)) for part in parts
+            ]
+        return found
+
+
+def build_model(robot: Robot) -> Model:
+    """The URDF of the robot. Its forward kinematics are those of the description.
+
+    Links without a joint of their own are merged into the link that carries them: fewer links, same poses.
+    """
+    body = calliope_body(robot)
+    carried = {"body": (CHASSIS, np.eye(4))}
+    joints: list[str] = []
+    links = [CHASSIS]
+    for extra in body.extras:
+        joints.append(_extra_joint(extra))
+        links.append(extra.name)
+    for name, link in _parents_first(robot.links):
+        carrier, offset = carried[link.parent]
+        place = offset @ link.fixed()
+        if link.joint is None:
+            carried[name] = (carrier, place @ turn_z(link.offset_rad))
+        else:
+            carried[name] = (name, np.eye(4))
+            joints.append(_servo_joint(robot, link, carrier, place @ turn_z(link.offset_rad)))
+            links.append(name)
+    solid: dict[str, list[tuple[Array, Part]]] = {name: [] for name in links}
+    for name, parts in body.parts.items():
+        carrier, offset = carried.get(name, (name, np.eye(4)))
+        solid[carrier] += [(offset, part) for part in parts]
+    text = "\n".join(
+        ['<?xml version="1.0"?>', f'<robot name="{robot.name}">']
+        + [_link_xml(name, solid[name]) for name in links]
+        + joints
+        + ["</robot>", ""]
+    )
+    return Model(text, tuple(links), body, carried)
+
+
+def write_urdf(model: Model, folder: Path) -> Path:
+    """Write the file into a folder of the process's own: two processes must not share one."""
+    path = folder / "robot.urdf"
+    path.write_text(model.urdf)
+    return path
+
+
+def _parents_first(links: dict[str, Link]) -> Iterator[tuple[str, Link]]:
+    known, waiting = {"body"}, dict(links)
+    while waiting:
+        ready = [name for name, link in waiting.items() if link.parent in known]
+        if not ready:
+            raise ValueError(f"links {sorted(waiting)} hang on no link that leads to the body")
+        for name in ready:
+            known.add(name)
+            yield name, waiting.pop(name)
+
+
+# One element a line: PyBullet reads a URDF that is one long line wrongly, by chance.
+
+
+def _link_xml(name: str, placed: list[tuple[Array, Part]]) -> str:
+    lines = [f'  <link name="{name}">', *_inertial_xml(placed)]
+    for offset, part in placed:
+        if part.solid:
+            lines += ["    <collision>", f"      {_origin_xml(offset @ part.pose())}", "      <geometry>"]
+            lines += [f"        {_geometry_xml(part)}", "      </geometry>", "    </collision>"]
+    return "\n".join([*lines, "  </link>"])
+
+
+def _inertial_xml(placed: list[tuple[Array, Part]]) -> list[str]:
+    mass = sum(part.mass_kg for _, part in placed)
+    centres = [(offset @ part.pose())[:3, 3] for offset, part in placed]
+    centre = sum((part.mass_kg * c for c, (_, part) in zip(centres, placed, strict=True)), np.zeros(3)) / mass
+    inertia = np.zeros((3, 3))
+    for at, (offset, part) in zip(centres, placed, strict=True):
+        turn, arm = offset[:3, :3], at - centre
+        inertia += turn @ part.inertia() @ turn.T
+        inertia += part.mass_kg * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+    place = np.eye(4)
+    place[:3, 3] = centre
+    entries = (("ixx", 0, 0), ("ixy", 0, 1), ("ixz", 0, 2), ("iyy", 1, 1), ("iyz", 1, 2), ("izz", 2, 2))
+    values = " ".join(f'{label}="{inertia[row, column]:.12g}"' for label, row, column in entries)
+    return [
+        "    <inertial>",
+        f"      {_origin_xml(place)}",
+        f'      <mass value="{mass:.12g}"/>',
+        f"      <inertia {values}/>",
+        "    </inertial>",
+    ]
+
+
+def _geometry_xml(part: Part) -> str:
+    if part.shape == "box":
+        return f'<box size="{_numbers(*part.size_m)}"/>'
+    if part.shape == "cylinder":
+        return f'<cylinder radius="{part.size_m[0]:.12g}" length="{part.size_m[1]:.12g}"/>'
+    return f'<sphere radius="{part.size_m[0]:.12g}"/>'
+
+
+def _extra_joint(extra: Extra) -> str:
+    place = np.eye(4)
+    place[:3, 3] = extra.position_m
+    return _joint_xml(extra.name, CHASSIS, place, "continuous" if extra.wheel else "fixed", axis="0 1 0")
+
+
+def _servo_joint(robot: Robot, link: Link, parent: str, place: Array) -> str:
+    assert link.joint is not None
+    joint = robot.joints[link.joint]
+    low, high = joint.limits_rad
+    limit = f'lower="{low:.12g}" upper="{high:.12g}" effort="{joint.torque_nm:.12g}"'
+    return _joint_xml(
+        link.name,
+        parent,
+        place,
+        "revolute",
+        axis="0 0 1",
+        more=[f'    <limit {limit} velocity="{joint.max_speed_radps:.12g}"/>'],
+    )
+
+
+def _joint_xml(child: str, parent: str, place: Array, kind: str, axis: str, more: list[str] | None = None) -> str:
+    return "\n".join(
+        [
+            f'  <joint name="{child}" type="{kind}">',
+            f'    <parent link="{parent}"/>',
+            f'    <child link="{child}"/>',
+            f"    {_origin_xml(place)}",
+            *([f'    <axis xyz="{axis}"/>'] if kind != "fixed" else []),
+            *(more or []),
+            "  </joint>",
+        ]
+    )
+
+
+def _origin_xml(place: Array) -> str:
+    turn = place[:3, :3]
+    pitch = asin(max(-1.0, min(1.0, -turn[2, 0])))
+    if abs(turn[2, 0]) < 1.0 - 1e-12:
+        roll, yaw = atan2(turn[2, 1], turn[2, 2]), atan2(turn[1, 0], turn[0, 0])
+    else:  # straight up or down: roll and yaw turn about the same axis, so roll does it all
+        roll, yaw = atan2(-turn[0, 1] * (1 if pitch < 0 else -1), turn[1, 1]), 0.0
+        pitch = pi / 2 if pitch > 0 else -pi / 2
+    return f'<origin xyz="{_numbers(*place[:3, 3])}" rpy="{_numbers(roll, pitch, yaw)}"/>'
+
+
+def _numbers(*values: float) -> str:
+    return " ".join(f"{float(value):.12g}" for value in values)

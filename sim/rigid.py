@@ -1,0 +1,23 @@
+"""Rigid transforms in bulk."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cocoro.kinematics import Array
+
+
+def rotations(quaternions: Array) -> Array:
+    """Rotation matrices of unit quaternions (x, y, z, w); shape (n, 4) to (n, 3, 3)."""
+    x, y, z, w = quaternions.T
+    rows = np.empty((len(quaternions), 3, 3))
+    rows[:, 0, 0] = 1 - 2 * (y * y + z * z)
+    rows[:, 0, 1] = 2 * (x * y - z * w)
+    rows[:, 0, 2] = 2 * (x * z + y * w)
+    rows[:, 1, 0] = 2 * (x * y + z * w)
+    rows[:, 1, 1] = 1 - 2 * (x * x + z * z)
+    rows[:, 1, 2] = 2 * (y * z - x * w)
+    rows[:, 2, 0] = 2 * (x * z - y * w)
+    rows[:, 2, 1] = 2 * (y * z + x * w)
+    rows[:, 2, 2] = 1 - 2 * (x * x + y * y)
+    return rows

@@ -1,0 +1,209 @@
+"""The servos as the wire shows them: positions in counts, limits of speed and torque, expiry, overload.
+
+Pure: one `Servo` a joint, told the time, the joint's true angle and the motor's torque at every step, and asked
+what the motor is to do. Nothing here knows the physics engine.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from math import degrees, radians
+from typing import NamedTuple
+
+from cocoro.messages import LatchState, ServoCommand, ServoState
+from cocoro.robot import Joint
+
+SPEED_COUNT_RADPS = 0.111 * 2 * 3.141592653589793 / 60
+"""The unit of speed registers (ROBOTIS AX-12 manual)."""
+LOAD_COUNTS = 1023
+AT_GOAL_COUNTS = 2
+"""A joint that near to its goal has arrived: it is not stopped when the command expires."""
+PUNCH = 0.1
+"""Least share of the torque limit that a compliant servo pushes with."""
+OVERLOAD_SHARE = 0.98
+HOLD_SPEED_RADPS = 1.0
+TEMPERATURE_C = 38.0
+VOLTAGE_V = 12.0
+
+
+class Drive(NamedTuple):
+    """What the joint's motor is to do from now on."""
+
+    target_rad: float
+    max_speed_radps: float
+    max_torque_nm: float
+
+
+class Play:
+    """Backlash: the measured shaft follows the joint only where the joint pushes it along.
+
+    Derived: the play (hysteresis) operator. With `width_rad` 0 the two are one.
+    """
+
+    def __init__(self, width_rad: float, angle_rad: float = 0.0) -> None:
+        self._half_rad = width_rad / 2
+        self.shaft_rad = angle_rad
+
+    def follow(self, angle_rad: float) -> float:
+        """The measured shaft's angle once the joint is at `angle_rad`."""
+        half = self._half_rad
+        self.shaft_rad = min(max(self.shaft_rad, angle_rad - half), angle_rad + half)
+        return self.shaft_rad
+
+
+class Servo:
+    """One servo: what it was told, what it measures, what its motor does."""
+
+    def __init__(self, joint: Joint, angle_rad: float, backlash_rad: float = 0.0) -> None:
+        self.joint = joint
+        self.goal_count = joint.to_count(angle_rad)
+        self.speed_limit_radps = HOLD_SPEED_RADPS
+        self.overloaded = False
+        self._play = Play(backlash_rad, angle_rad)
+        self.angle_rad = angle_rad
+        """True angle of the joint."""
+        self._speed_radps = 0.0
+        self._torque_nm = 0.0
+        self._valid_until_ns: int | None = None
+        self._straining_since_ns: int | None = None
+
+    @property
+    def count(self) -> int:
+        """Present position."""
+        return self.joint.to_count(self._play.shaft_rad)
+
+    @property
+    def position_rad(self) -> float:
+        return self.joint.to_angle(self.count)
+
+    @property
+    def speed_radps(self) -> float:
+        return round(self._speed_radps / SPEED_COUNT_RADPS) * SPEED_COUNT_RADPS
+
+    @property
+    def load(self) -> float:
+        """Share of the stall torque, -1 to 1."""
+        share = self._torque_nm / self.joint.torque_nm
+        return round(min(max(share, -1.0), 1.0) * LOAD_COUNTS) / LOAD_COUNTS
+
+    def command(self, goal_rad: float, speed_radps: float, until_ns: int) -> None:
+        """Go to a goal within the joint's limits; a speed of 0 holds where the joint is."""
+        self._valid_until_ns = until_ns
+        if speed_radps == 0.0:
+            self._hold_here()
+            return
+        low, high = self.joint.limits_rad
+        self.goal_count = self.joint.to_count(min(max(goal_rad, low), high))
+        counts = max(1, round(speed_radps / SPEED_COUNT_RADPS))
+        self.speed_limit_radps = min(counts * SPEED_COUNT_RADPS, self.joint.max_speed_radps)
+
+    def hold(self) -> None:
+        """Stay at the present position, once, whatever was commanded."""
+        self._valid_until_ns = None
+        self._hold_here()
+
+    def expire(self, now_ns: int) -> bool:
+        """Hold where the joint is if the last command's time is over and it has not arrived; was it so?"""
+        if self._valid_until_ns is None or now_ns <= self._valid_until_ns:
+            return False
+        self._valid_until_ns = None
+        if abs(self.goal_count - self.count) <= AT_GOAL_COUNTS:
+            return False
+        self._hold_here()
+        return True
+
+    def sense(self, angle_rad: float, speed_radps: float, torque_nm: float, now_ns: int) -> None:
+        """What the joint did in the step that ended now."""
+        self.angle_rad = angle_rad
+        self._speed_radps = speed_radps
+        self._torque_nm = torque_nm
+        self._play.follow(angle_rad)
+        if abs(torque_nm) < OVERLOAD_SHARE * self.joint.torque_nm:
+            self._straining_since_ns = None
+        elif self._straining_since_ns is None:
+            self._straining_since_ns = now_ns
+        elif now_ns - self._straining_since_ns > self.joint.overload_s * 1e9:
+            self.overloaded = True
+
+    def drive(self, speed_factor: float = 1.0) -> Drive:
+        """What the motor does now: the servo closes its loop on the shaft that it measures, so the joint itself
+        ends up to half the backlash beside the goal."""
+        goal_rad = self.joint.to_angle(self.goal_count)
+        error_rad = goal_rad - self._play.shaft_rad
+        torque_nm = self.joint.torque_nm
+        if self.joint.compliance_deg:
+            share = abs(degrees(error_rad)) / self.joint.compliance_deg
+            torque_nm *= min(max(share, PUNCH), 1.0)
+        speed_radps = min(self.speed_limit_radps * speed_factor, self.joint.max_speed_radps)
+        return Drive(self.angle_rad + error_rad, speed_radps, torque_nm)
+
+    def _hold_here(self) -> None:
+        self.goal_count = self.count
+
+
+class ServoNetwork:
+    """One bus of servos: commands in, states out, the emergency stop and the expiry of commands.
+
+    An arm or neck joint that was not named again for `timeout_s` holds where it is unless it has arrived; with
+    `keeps_goal` (the hand) it keeps its goal, so that a held object stays held, also while stopped.
+    """
+
+    def __init__(
+        self,
+        joints: Mapping[str, Joint],
+        angles_rad: Mapping[str, float],
+        *,
+        keeps_goal: bool,
+        timeout_s: float,
+        backlash_deg: float = 0.0,
+    ) -> None:
+        self.servos = {name: Servo(joint, angles_rad[name], radians(backlash_deg)) for name, joint in joints.items()}
+        self.latch: LatchState = "released"
+        self._keeps_goal = keeps_goal
+        self._timeout_ns = round(timeout_s * 1e9)
+
+    @property
+    def stopped_by(self) -> str:
+        return {"released": "", "latched": "estop", "unknown": "latch unknown"}[self.latch]
+
+    def command(self, command: ServoCommand, now_ns: int) -> str:
+        """Take the goals, all or none. Returns '' when taken, otherwise why not."""
+        if self.stopped_by:
+            return self.stopped_by
+        if unknown := [name for name in command.joints if name not in self.servos]:
+            return f"no joint {unknown[0]!r} on this network, which has {', '.join(self.servos)}"
+        for name, goal_rad, speed_radps in zip(command.joints, command.goal_rad, command.speed_radps, strict=True):
+            self.servos[name].command(goal_rad, speed_radps, now_ns + self._timeout_ns)
+        return ""
+
+    def set_latch(self, state: LatchState) -> None:
+        """Latched and unknown hold the arm and neck where they are; a reset by hand clears the overloads."""
+        if state != "released" and self.latch == "released" and not self._keeps_goal:
+            for servo in self.servos.values():
+                servo.hold()
+        if state == "released" and self.latch == "latched":
+            for servo in self.servos.values():
+                servo.overloaded = False
+        self.latch = state
+
+    def expire(self, now_ns: int) -> None:
+        """Hold the joints whose commands are over. To be called at every step."""
+        if not self._keeps_goal:
+            for servo in self.servos.values():
+                servo.expire(now_ns)
+
+    def state(self, now_ns: int) -> ServoState:
+        servos = self.servos.values()
+        return ServoState(
+            stamp_ns=now_ns,
+            joints=tuple(self.servos),
+            position_rad=tuple(servo.position_rad for servo in servos),
+            speed_radps=tuple(servo.speed_radps for servo in servos),
+            load=tuple(servo.load for servo in servos),
+            temperature_c=(TEMPERATURE_C,) * len(servos),
+            voltage_v=(VOLTAGE_V,) * len(servos),
+            torque_enabled=(True,) * len(servos),
+            faults=tuple(f"{name}: overload" for name, servo in self.servos.items() if servo.overloaded),
+            latch=self.latch,
+            stopped_by=self.stopped_by,
+        )

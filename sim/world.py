@@ -1,0 +1,283 @@
+"""The simulated robot in its scene: physics, motors and sensors of the body, stepped by hand, no clock of its own."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from types import TracebackType
+
+import numpy as np
+
+from cocoro.kinematics import Array
+from cocoro.messages import BaseCommand, BaseState, LatchState, ServoCommand, ServoState, TrueObject, Truth
+from cocoro.robot import Robot
+from sim.base import MobileBase
+from sim.bullet import Bullet
+from sim.contacts import Pair, bumper, collisions, touching_pairs
+from sim.mechanism import Mechanism
+from sim.model import build_model
+from sim.realism import REALISM, Sensors, Wander
+from sim.scene import Light, Scene
+from sim.seeds import stream
+from sim.servos import Drive, ServoNetwork
+from sim.stage import Stage
+from sim.visual import Visual
+
+SOLVER_ITERATIONS = 50
+SETTLE_S = 0.5
+SENSE_HZ = 60.0
+"""How often contacts are looked at and the bodies' imperfections drawn anew."""
+CONTACT_MEMORY = 2
+"""What touched at one of so many looks touches: a contact that the solver lets go for one step is none lost."""
+NETWORKS = ("arm", "hand")
+
+
+class World:
+    """One PyBullet world with one robot in it. Deterministic: the same arguments and commands, the same states.
+
+    It starts as hardware does, with the emergency stop's state unknown: `set_latch("released")` makes it obey.
+    Use it with `with`, or close it.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        scene: Scene,
+        *,
+        seed: int = 0,
+        sensors: Sensors = "ideal",
+        physics_hz: int = 240,
+    ) -> None:
+        self.robot = robot
+        self.scene = scene
+        self._hz = physics_hz
+        self._dt_s = 1.0 / physics_hz
+        self._steps = 0
+        self._sense_every = max(1, round(physics_hz / SENSE_HZ))
+        realism = REALISM[sensors]
+        self._bullet = Bullet()
+        self._bullet.setGravity(0.0, 0.0, -9.81)
+        self._bullet.setPhysicsEngineParameter(
+            fixedTimeStep=self._dt_s,
+            numSolverIterations=SOLVER_ITERATIONS,
+            numSubSteps=0,
+            deterministicOverlappingPairs=1,
+        )
+        self._stage = Stage(self._bullet, scene)
+        self._model = build_model(robot)
+        angles = dict.fromkeys(robot.joints, 0.0) | robot.poses["park"]
+        self._mechanism = Mechanism(self._bullet, robot, self._model, scene.robot, angles)
+        self._names = {body: name for name, body in self._stage.bodies.items()}
+
+        self._base = MobileBase(robot.base, exact=realism.exact_odometry)
+        self._networks = {
+            name: ServoNetwork(
+                {joint: robot.joints[joint] for joint in robot.network_joints(name)},
+                angles,
+                keeps_goal=name == "hand",
+                timeout_s=robot.base.command_timeout_s,
+                backlash_deg=realism.backlash_deg,
+            )
+            for name in NETWORKS
+        }
+        servos = {joint: servo for network in self._networks.values() for joint, servo in network.servos.items()}
+        self._servos = [servos[joint] for joint in self._mechanism.joints]
+        self._driven: list[Drive | None] = [None] * len(self._servos)
+        self._spun: tuple[float, float] | None = None
+
+        sense_s = self._sense_every * self._dt_s
+        scale = stream(seed, "wheel scale").uniform(-1.0, 1.0, 2) * realism.wheel_scale_error
+        self._wheel_scale = 1.0 + scale
+        self._slip = Wander(stream(seed, "wheel slip"), 2, realism.wheel_slip, realism.slip_time_s, sense_s)
+        self._scatter = Wander(
+            stream(seed, "servo speed"),
+            len(self._servos),
+            realism.servo_speed_scatter,
+            realism.scatter_time_s,
+            sense_s,
+        )
+        self._rolled_m = [0.0, 0.0]
+        self._contacts: deque[frozenset[Pair]] = deque(maxlen=CONTACT_MEMORY)
+        self._place_visuals()
+        self.set_latch("unknown")
+        self._settle()
+
+    def __enter__(self) -> World:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        self._bullet.close()
+
+    @property
+    def time_ns(self) -> int:
+        """Simulated time since the start."""
+        return self._steps * 1_000_000_000 // self._hz
+
+    # --- commands and states ----------------------------------------------------------------------
+
+    def command_base(self, command: BaseCommand) -> str:
+        """Wheel speeds. Returns '' when they are taken, otherwise why not."""
+        return self._base.command(command, self.time_ns)
+
+    def command_servos(self, network: str, command: ServoCommand) -> str:
+        """Goals for joints of 'arm' or 'hand', all or none. Returns '' when they are taken, otherwise why not."""
+        return self._networks[network].command(command, self.time_ns)
+
+    def set_latch(self, state: LatchState) -> None:
+        """The emergency stop of base, arm and hand."""
+        self._base.set_latch(state)
+        for network in self._networks.values():
+            network.set_latch(state)
+
+    def base_state(self) -> BaseState:
+        return self._base.state(self.time_ns)
+
+    def servo_state(self, network: str) -> ServoState:
+        return self._networks[network].state(self.time_ns)
+
+    # --- time -------------------------------------------------------------------------------------
+
+    def step(self) -> None:
+        """One step of the physics, 1 / `physics_hz` seconds."""
+        now_ns, dt_s = self.time_ns, self._dt_s
+        if self._steps % self._sense_every == 0:
+            self._look_at_contacts()
+            self._slip.step()
+            self._scatter.step()
+        stretch = self._wheel_scale * (1.0 + self._slip.values)
+        radius_m = self.robot.base.wheel_radius_m
+        left_mps, right_mps = self._base.wheels(now_ns, dt_s)
+        self._spin(left_mps * stretch[0] / radius_m, right_mps * stretch[1] / radius_m)
+        for network in self._networks.values():
+            network.expire(now_ns)
+        self._drive_servos()
+
+        self._stage.move((self._steps + 1) / self._hz)
+        self._bullet.stepSimulation()
+        self._steps += 1
+
+        now_ns = self.time_ns
+        readings = self._mechanism.read()
+        for servo, reading in zip(self._servos, readings, strict=False):
+            servo.sense(*reading, now_ns)
+        rolled = [wheel.angle_rad * radius_m for wheel in readings[-2:]]
+        # The encoders count turns of the wheel; how far it came with them is not theirs to know.
+        left_m, right_m = (
+            float((new - old) / share) for new, old, share in zip(rolled, self._rolled_m, stretch, strict=True)
+        )
+        self._rolled_m = rolled
+        self._base.rolled(left_m, right_m, now_ns, dt_s)
+
+    # --- truth, and what the renderer draws ---------------------------------------------------------
+
+    def truth(self) -> Truth:
+        """Where everything really is."""
+        pairs = frozenset().union(*self._contacts)
+        touched: dict[str, set[str]] = {label: set() for label in self._stage.labels}
+        for one, other in pairs:
+            if one in touched:
+                touched[one].add(other)
+            if other in touched:
+                touched[other].add(one)
+        objects = []
+        for number, label in enumerate(self._stage.labels):
+            position, orientation = self._stage.pose(label)
+            objects.append(
+                TrueObject(
+                    label=label,
+                    kind="object" if number < self._stage.object_count else "obstacle",
+                    position_m=position,
+                    orientation=orientation,
+                    touching=tuple(sorted(touched[label])),
+                )
+            )
+        body, orientation = self._mechanism.root()
+        return Truth(
+            stamp_ns=self.time_ns,
+            body_m=body,
+            body_orientation=orientation,
+            joints_rad=dict(zip(self._mechanism.joints, self._angles(), strict=True)),
+            objects=tuple(objects),
+            collisions=collisions(
+                pairs,
+                frozenset(self._model.links),
+                frozenset(self._stage.labels[: self._stage.object_count]),
+            ),
+        )
+
+    @property
+    def light(self) -> Light:
+        return self.scene.light
+
+    @property
+    def visuals(self) -> Sequence[Visual]:
+        """Everything to draw but the floor."""
+        return self._visuals
+
+    def visual_poses(self) -> Array:
+        """World poses of `visuals` now, in their order: shape (n, 4, 4)."""
+        links = self._mechanism.link_poses()
+        poses = np.empty((len(self._visuals), 4, 4))
+        on_robot = len(self._carriers)
+        np.matmul(links[self._carriers], self._offsets, out=poses[:on_robot])
+        poses[on_robot:] = self._stage.poses()
+        return poses
+
+    def camera_pose(self) -> Array:
+        """World pose of the camera: 4 x 4, x right, y down, z forward."""
+        return self.link_pose("camera")
+
+    def link_pose(self, link: str) -> Array:
+        """World pose of a link of the robot description: 4 x 4."""
+        carrier, offset = self._model.carried[link]
+        pose: Array = self._mechanism.link_poses()[self._mechanism.index[carrier]] @ offset
+        return pose
+
+    # --- inside -------------------------------------------------------------------------------------
+
+    def _place_visuals(self) -> None:
+        rows = self._model.visuals()
+        self._carriers = np.array([self._mechanism.index[carrier] for carrier, _, _ in rows])
+        self._offsets = np.array([offset for _, offset, _ in rows])
+        self._visuals = [visual for _, _, visual in rows] + self._stage.visuals
+
+    def _settle(self) -> None:
+        """Let everything come to rest on the floor before time begins."""
+        self._spin(0.0, 0.0)
+        self._drive_servos()
+        self._stage.move(0.0)
+        for _ in range(round(SETTLE_S * self._hz)):
+            self._bullet.stepSimulation()
+        readings = self._mechanism.read()
+        for servo, reading in zip(self._servos, readings, strict=False):
+            servo.sense(*reading, 0)
+        self._rolled_m = [wheel.angle_rad * self.robot.base.wheel_radius_m for wheel in readings[-2:]]
+        self._look_at_contacts()
+
+    def _angles(self) -> list[float]:
+        return [servo.angle_rad for servo in self._servos]
+
+    def _spin(self, left_radps: float, right_radps: float) -> None:
+        if self._spun != (left_radps, right_radps):
+            self._spun = left_radps, right_radps
+            self._mechanism.spin(left_radps, right_radps)
+
+    def _drive_servos(self) -> None:
+        """Tell the motors whose orders have changed."""
+        for number, (joint, servo) in enumerate(zip(self._mechanism.joints, self._servos, strict=True)):
+            drive = servo.drive(1.0 + self._scatter.values[number])
+            if drive != self._driven[number]:
+                self._driven[number] = drive
+                self._mechanism.drive(joint, drive)
+
+    def _look_at_contacts(self) -> None:
+        pairs, on_chassis = touching_pairs(
+            self._bullet.getContactPoints(), self._mechanism.body, self._mechanism.link_names, self._names
+        )
+        self._contacts.append(pairs)
+        self._base.bumper = bumper(on_chassis, self._mechanism.root_pose())
