@@ -1,0 +1,45 @@
+"""Which renderer this machine can run."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from typing import Literal
+
+from cocoro.errors import ConfigError
+from cocoro.robot import Camera
+from sim.render.interface import Renderer
+from sim.visual import Visual
+
+_log = logging.getLogger(__name__)
+
+MISSING_EGL = (
+    "slow pictures: no OpenGL on EGL here (%s), so PyBullet's TinyRenderer draws;"
+    " for the fast one: apt install libegl1 libgl1 libgl1-mesa-dri"
+)
+
+Choice = Literal["auto", "moderngl", "tiny"]
+
+
+def make_renderer(visuals: Sequence[Visual], camera: Camera, choice: Choice = "auto") -> Renderer:
+    """The fast renderer, or by `auto` the slow one where that cannot run, with one logged warning.
+
+    Raises ConfigError when `moderngl` is demanded and cannot run.
+    """
+    if choice != "tiny":
+        try:
+            from sim.render.gl import GlRenderer
+
+            renderer: Renderer = GlRenderer(visuals, camera)
+            return renderer
+        except Exception as error:  # moderngl and glcontext raise plain Exception for a missing library
+            reason = " ".join(str(error).split()) or type(error).__name__
+            if choice == "moderngl":
+                raise ConfigError(
+                    f"the moderngl renderer cannot run here ({reason}): apt install libegl1 libgl1"
+                    " libgl1-mesa-dri, or let the renderer be chosen (auto)"
+                ) from error
+            _log.warning(MISSING_EGL, reason)
+    from sim.render.tiny import TinyRenderer
+
+    return TinyRenderer(visuals, camera)

@@ -1,0 +1,69 @@
+"""What the camera asks of a renderer."""
+
+from __future__ import annotations
+
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cocoro.kinematics import Array
+from cocoro.robot import Camera
+
+
+class Light(Protocol):
+    """One lamp far away and the light that the room throws back."""
+
+    @property
+    def ambient(self) -> float:
+        """Share of a surface's colour that it shows in shadow, 0 to 1."""
+
+    @property
+    def diffuse(self) -> float:
+        """Share that the lamp adds where it falls straight on the surface, 0 to 1."""
+
+    @property
+    def direction(self) -> tuple[float, float, float]:
+        """Where the lamp's light goes, world frame; its length does not matter."""
+
+    @property
+    def temperature_k(self) -> float:
+        """Colour temperature; the camera is balanced for 6500 K, so that is white."""
+
+
+class Images(NamedTuple):
+    """One look at the world. The arrays are the renderer's own: they hold until its next `render`."""
+
+    colour: NDArray[np.uint8]
+    """height x width x 3, RGB, the colour camera's view."""
+    depth_m: NDArray[np.float32]
+    """height x width, metres along the depth camera's optical axis, from that camera's own pose; infinite where
+    there is nothing. NEGATIVE (the same metres) where the projector's light does not reach, if a projector
+    was given."""
+
+
+class Renderer(Protocol):
+    """Draws the visuals that it was made with. Both cameras have the intrinsics `camera`.
+
+    Poses are 4 x 4 transforms to the world; a camera's frame is x right, y down, z forward. Equal inputs
+    give equal bytes, in this process and in another one.
+    """
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def camera(self) -> Camera: ...
+
+    def render(
+        self,
+        poses: Array,
+        camera_pose: Array,
+        depth_camera_pose: Array,
+        light: Light,
+        projector_pose: Array | None = None,
+    ) -> Images:
+        """One frame. `poses` is (n, 4, 4) in the order of the visuals."""
+
+    def close(self) -> None:
+        """Give back what was taken; the renderer must not be used after it."""

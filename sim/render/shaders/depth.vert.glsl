@@ -1,0 +1,20 @@
+#version 330
+// The depth camera's view of the visuals and of the room (whose pose is the identity).
+
+uniform mat4 view;
+uniform vec4 axis;       // the depth camera's optical axis: dot with a world point is metres along it
+uniform mat4 projector;  // world to the projector's clip space, rows
+
+in vec3 in_corner;
+in vec3 in_scale;
+in mat4 in_pose;
+
+out float depth_m;
+out vec4 projector_place;
+
+void main() {
+    vec4 world = vec4(in_corner * in_scale, 1.0) * in_pose;
+    depth_m = dot(world, axis);
+    projector_place = world * projector;
+    gl_Position = world * view;
+}

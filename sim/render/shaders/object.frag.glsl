@@ -1,0 +1,17 @@
+#version 330
+// Lambert's law: a share that is always there, and the lamp's where it reaches.
+
+uniform vec3 ambient;    // with the lamp's tint
+uniform vec3 diffuse;
+uniform sampler2DShadow lamp_map;
+
+in vec3 rgb;
+in float facing;
+in vec3 lamp_place;
+
+out vec4 colour;
+
+void main() {
+    float lit = facing > 0.0 ? facing * texture(lamp_map, lamp_place) : 0.0;
+    colour = vec4(rgb * (ambient + diffuse * lit), 1.0);
+}
