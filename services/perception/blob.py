@@ -1,0 +1,153 @@
+"""The default detector: one connected blob of the object's colour, of a size that fits its distance.
+
+What it does where the paper's fails: a second region of the same colour does not pull the centroid; noise and
+specks are cleaned away; depth is registered and comes from a robust window; a patch or a wall of the right
+colour has the wrong size; and colour without depth is said to have none.
+"""
+
+from __future__ import annotations
+
+from math import log, sqrt
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cocoro.objects import Catalogue, KnownObject
+from services.perception.colours import Classes, ColourTable
+from services.perception.config import Config
+from services.perception.image import Box, RgbdImage
+from services.perception.region import Mask, Region, components
+from services.perception.shapes import area_range_m2, reach_m
+from services.perception.sighting import Sighting
+
+NEAREST_M = 0.3
+"""A blob without depth is no larger than the object is from here: nearer, little of it fits into the image."""
+MAX_STRETCH = 1.5
+"""Of a blob's diagonal, over that of the whole object's outline."""
+
+
+class BlobDetector:
+    def __init__(self, catalogue: Catalogue, config: Config) -> None:
+        self._catalogue = catalogue
+        self._config = config
+        self._table = ColourTable(catalogue)
+
+    def detect(self, image: RgbdImage) -> list[Sighting]:
+        classes = self._table.classify(image.colour)
+        found = (self._find(known, _mask(classes, bit), image) for bit, known in enumerate(self._catalogue))
+        return [sighting for sighting in found if sighting is not None]
+
+    def _find(self, known: KnownObject, mask: Mask, image: RgbdImage) -> Sighting | None:
+        min_area_px = self._config.min_area_px * image.scale**2
+        parts = _clean_components(mask, image, min_area_px)
+        if not parts:
+            return None
+        fit = _Fit(known, image, self._config)
+        regions: list[Region] = []
+        for part in parts:
+            region = Region(*part, image)
+            if fit.too_large(region) and region.diagonal_px < fit.largest_split_px:
+                regions += [Region(*piece, image) for piece in region.split_by_depth()]
+            else:
+                regions.append(region)
+        plausible = [region for region in regions if fit.plausible(region)]
+        if not plausible:
+            return None
+        best = fit.completed(max(plausible, key=fit.score), regions)
+        return Sighting(
+            label=known.label,
+            u_px=best.u_px,
+            v_px=best.v_px,
+            area_px=best.area_px,
+            box_px=best.bounds,
+            depth_m=best.depth_m,
+            cut=best.cut,
+            evidence=best.evidence(reach_m(known)),
+        )
+
+
+class _Fit:
+    """How well a region's size goes with one known object at the region's own distance."""
+
+    def __init__(self, known: KnownObject, image: RgbdImage, config: Config) -> None:
+        camera = image.camera
+        self._config = config
+        self._focal2 = camera.fx * camera.fy
+        self._least_m2, self._greatest_m2 = area_range_m2(known)
+        self._reach_m = reach_m(known)
+        self._inwards_m = known.planar_radius_m
+        self._min_area_px = config.min_area_px * image.scale**2
+        self.largest_split_px = 0.75 * image.width
+
+    def _pixels(self, area_m2: float, depth_m: float) -> float:
+        return area_m2 * self._focal2 / (depth_m + self._inwards_m) ** 2
+
+    def _diagonal_px(self, depth_m: float) -> float:
+        return MAX_STRETCH * 2 * self._reach_m * sqrt(self._focal2) / depth_m + 4
+
+    def too_large(self, region: Region) -> bool:
+        depth_m = region.depth_m or NEAREST_M
+        most = self._config.max_share * self._pixels(self._greatest_m2, depth_m)
+        return region.area_px > most or region.diagonal_px > self._diagonal_px(depth_m)
+
+    def plausible(self, region: Region) -> bool:
+        if region.area_px < self._min_area_px or self.too_large(region):
+            return False
+        if region.depth_m is None:
+            return True
+        whole_px = self._pixels(self._least_m2, region.depth_m)
+        if region.area_px >= self._config.min_share * whole_px:
+            return True
+        return region.area_px >= self._config.min_hidden_share * whole_px and (region.cut or region.hidden)
+
+    def score(self, region: Region) -> tuple[bool, float, int]:
+        """Greater is better: with depth before without, then by how near it comes to the expected size."""
+        if region.depth_m is None:
+            return False, 0.0, region.area_px
+        expected_px = self._pixels(sqrt(self._least_m2 * self._greatest_m2), region.depth_m)
+        # Half-octave steps: among those of about the right size the larger, that is nearer, one wins.
+        return True, -round(2 * abs(log(region.area_px / expected_px, 2))), region.area_px
+
+    def completed(self, best: Region, regions: list[Region]) -> Region:
+        """With the other pieces of the same object, where something before it parts it in two."""
+        for other in regions:
+            if other is best or best.depth_m is None or other.depth_m is None:
+                continue
+            if abs(other.depth_m - best.depth_m) < self._reach_m:
+                both = _union(best, other)
+                if not self.too_large(both):
+                    best = both
+        return best
+
+
+def _mask(classes: Classes, bit: int) -> Mask:
+    """255 where the bit is set."""
+    return np.asarray((classes & classes.dtype.type(1 << bit)) != 0, dtype=np.uint8)
+
+
+def _clean_components(mask: Mask, image: RgbdImage, min_area_px: float) -> list[tuple[Mask, Box]]:
+    """The mask's connected regions, after specks and threads of noise are opened away."""
+    if cv2.countNonZero(mask) < min_area_px:
+        return []
+    left, top, width, height = cv2.boundingRect(mask)
+    crop = mask[top : top + height, left : left + width]
+    opened: NDArray[np.uint8] = np.asarray(
+        cv2.morphologyEx(crop, cv2.MORPH_OPEN, np.ones((3, 3), dtype=np.uint8)), dtype=np.uint8
+    )
+    return components(opened, (left, top), image, min_area_px)
+
+
+def _union(a: Region, b: Region) -> Region:
+    box = (
+        min(a.box[0], b.box[0]),
+        min(a.box[1], b.box[1]),
+        max(a.box[2], b.box[2]),
+        max(a.box[3], b.box[3]),
+    )
+    mask = np.zeros((box[3] - box[1], box[2] - box[0]), dtype=np.uint8)
+    for region in (a, b):
+        left, top = region.box[0] - box[0], region.box[1] - box[1]
+        height, width = region.mask.shape
+        mask[top : top + height, left : left + width] |= region.mask
+    return Region(mask, box, a.image)

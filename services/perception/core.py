@@ -1,0 +1,137 @@
+"""Perception's pure core: frames and head angles in, detections out, fused by the frame's stamp."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from cocoro.core import Output, Sample, Schedule, Take
+from cocoro.history import History, Vector
+from cocoro.messages import Detections, Frame, ServoState
+from cocoro.objects import Catalogue
+from cocoro.robot import Camera, Robot
+from cocoro.topics import ARM_STATE, DETECTIONS, FRAME, Topic
+from services.perception.blob import BlobDetector
+from services.perception.config import Config
+from services.perception.image import RgbdImage
+from services.perception.localise import Localiser
+from services.perception.paper import PaperDetector
+from services.perception.sighting import Detector, Sighting
+
+NS = 1_000_000_000
+MAX_PENDING = 8
+"""Frames that wait for head angles; one more and the oldest goes out without."""
+
+DETECTORS: dict[str, Callable[[Catalogue, Config], Detector]] = {"blob": BlobDetector, "paper": PaperDetector}
+
+
+@dataclass(frozen=True)
+class _Pending:
+    """What was seen in one frame, until the head angles of its stamp are known. The pixels are not kept."""
+
+    stamp_ns: int
+    frame_seq: int
+    frame_incarnation: int
+    camera: Camera
+    sightings: tuple[Sighting, ...]
+    deadline_ns: int
+
+
+class PerceptionCore:
+    """Detects at once when a frame arrives; localises with the head angles interpolated at the frame's stamp.
+
+    A frame that arrives before the arm's state has passed its stamp waits, `bracket_wait_s` at most by the
+    steps' now; then its detections go out without positions. Detections go out in the order of their frames.
+    """
+
+    def __init__(self, robot: Robot, config: Config, catalogue: Catalogue) -> None:
+        self._robot = robot
+        self._config = config
+        self._detector: Detector = DETECTORS[config.detector](catalogue, config)
+        self._localiser = Localiser(robot, catalogue, config.occluded_share)
+        self._head = History(len(self._localiser.joints))
+        self._max_gap_ns = round(config.max_head_gap_s * NS)
+        self._pending: deque[_Pending] = deque()
+        self._now_ns = 0
+        self.stale_frames = 0
+        """Frames that were too old when they came, and were not looked at."""
+        self.unlocalised_frames = 0
+        """Frames whose detections went out without head angles."""
+
+    @property
+    def reads(self) -> Mapping[Topic[Any], Take]:
+        return {FRAME: "latest", ARM_STATE: "all"}
+
+    @property
+    def schedule(self) -> Schedule:
+        return Schedule(rate_hz=None, triggers=(FRAME, ARM_STATE))
+
+    def step(self, inputs: Sequence[Sample], now_ns: int) -> Sequence[Output]:
+        if now_ns < self._now_ns:  # a new epoch of the clock: what was before means nothing now
+            self._pending.clear()
+            self._head.clear()
+        self._now_ns = now_ns
+        for sample in inputs:
+            if isinstance(sample.message, ServoState):
+                self._remember(sample.message)
+        for sample in inputs:
+            if isinstance(sample.message, Frame):
+                self._look(sample.message, now_ns)
+        return self._release(now_ns)
+
+    def _remember(self, state: ServoState) -> None:
+        angles = dict(zip(state.joints, state.position_rad, strict=True))
+        if all(joint in angles for joint in self._localiser.joints):
+            head = [angles[joint] for joint in self._localiser.joints]
+            self._head.add(state.stamp_ns, head, state.incarnation)
+
+    def _look(self, frame: Frame, now_ns: int) -> None:
+        if now_ns - frame.stamp_ns > self._config.max_frame_age_s * NS:
+            self.stale_frames += 1
+            return
+        image = RgbdImage.of(frame, self._robot)
+        self._pending.append(
+            _Pending(
+                stamp_ns=frame.stamp_ns,
+                frame_seq=frame.seq,
+                frame_incarnation=frame.incarnation,
+                camera=image.camera,
+                sightings=tuple(self._detector.detect(image)),
+                deadline_ns=now_ns + round(self._config.bracket_wait_s * NS),
+            )
+        )
+
+    def _release(self, now_ns: int) -> list[Output]:
+        outputs = []
+        while self._pending:
+            pending = self._pending[0]
+            angles = self._head.at(pending.stamp_ns, self._max_gap_ns)
+            if angles is None and self._may_still_come(pending, now_ns):
+                break
+            self._pending.popleft()
+            outputs.append(Output(DETECTIONS, self._localised(pending, angles)))
+        return outputs
+
+    def _may_still_come(self, pending: _Pending, now_ns: int) -> bool:
+        newest = self._head.newest
+        passed = newest is not None and newest[0] >= pending.stamp_ns
+        return not passed and now_ns < pending.deadline_ns and len(self._pending) <= MAX_PENDING
+
+    def _localised(self, pending: _Pending, angles: Vector | None) -> Detections:
+        if angles is None:
+            self.unlocalised_frames += 1
+        head = dict(zip(self._localiser.joints, angles.tolist(), strict=True)) if angles is not None else {}
+        return Detections(
+            stamp_ns=pending.stamp_ns,
+            frame_seq=pending.frame_seq,
+            frame_incarnation=pending.frame_incarnation,
+            width=pending.camera.width,
+            height=pending.camera.height,
+            pan_rad=head.get("neck_pan"),
+            tilt_rad=head.get("neck_tilt"),
+            detections=tuple(
+                self._localiser.locate(sighting, pending.camera, angles) for sighting in pending.sightings
+            ),
+        )

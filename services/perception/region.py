@@ -1,0 +1,175 @@
+"""A connected region of one colour, with the registered depth of itself and its surroundings."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from services.perception.image import Box, RgbdImage
+from services.perception.sighting import Evidence
+
+Mask = NDArray[np.uint8]
+Bools = NDArray[np.bool_]
+Depth = NDArray[np.float32]
+
+MIN_DEPTH_PIXELS = 6
+MIN_DEPTH_SHARE = 0.1
+"""With depth on fewer of its pixels a region has none."""
+NEARER_STEP_M = 0.015
+"""What stands so much nearer than the region right beside it may hide some of it."""
+NEARER_SHARE = 0.12
+UNKNOWN_SHARE = 0.45
+"""Of a region's outline: next to something nearer, or next to no data (too near to be measured; an infrared shadow
+alone is less), for more of the object to be hidden there."""
+MAX_SURFACE_POINTS = 240
+MAX_RAYS = 80
+
+
+def depth_doubt_m(depth_m: Any) -> Any:
+    """How far a depth may be off: noise and quantisation of the sensor, growing with the square of the distance."""
+    return 0.003 + 0.0025 * depth_m**2
+
+
+class Region:
+    """`mask` (uint8, non-zero inside) and `box`, its place in the image, have a margin around the region."""
+
+    def __init__(self, mask: Mask, box: Box, image: RgbdImage) -> None:
+        self.mask = mask
+        self.box = box
+        self.image = image
+        rows, columns = np.nonzero(mask)
+        self.area_px = len(rows)
+        self.u_px = float(columns.mean()) + box[0]
+        self.v_px = float(rows.mean()) + box[1]
+        self.bounds: Box = (
+            int(columns.min()) + box[0],
+            int(rows.min()) + box[1],
+            int(columns.max()) + box[0] + 1,
+            int(rows.max()) + box[1] + 1,
+        )
+
+    @staticmethod
+    def margin_px(image: RgbdImage) -> int:
+        """What is kept around a region: the ring of `surroundings` and a pixel to spare."""
+        return _ring_px(image) + 2
+
+    @property
+    def diagonal_px(self) -> float:
+        left, top, right, bottom = self.bounds
+        return float(np.hypot(right - left, bottom - top))
+
+    @property
+    def cut(self) -> bool:
+        """It touches the image's edge."""
+        left, top, right, bottom = self.bounds
+        return left <= 1 or top <= 1 or right >= self.image.width - 1 or bottom >= self.image.height - 1
+
+    @cached_property
+    def depth(self) -> Depth:
+        """Registered, of `box`; NaN without data."""
+        return self.image.depth_m(self.box)
+
+    @cached_property
+    def depth_m(self) -> float | None:
+        """Of the visible surface: the median of the region's middle, or of all of it when the middle has too little."""
+        inside = (self.mask > 0) & np.isfinite(self.depth)
+        enough = max(MIN_DEPTH_PIXELS, MIN_DEPTH_SHARE * self.area_px)
+        if np.count_nonzero(inside) < enough:
+            return None
+        left, top, right, bottom = (bound - start for bound, start in zip(self.bounds, self.box[:2] * 2, strict=True))
+        across, down = (right - left) // 4, (bottom - top) // 4
+        middle = np.zeros_like(inside)
+        middle[top + down : bottom - down, left + across : right - across] = True
+        middle &= inside
+        window = middle if np.count_nonzero(middle) >= enough / 2 else inside
+        return float(np.median(self.depth[window]))
+
+    @cached_property
+    def surroundings(self) -> Bools:
+        """A ring just outside of the outline, where neither blended pixels nor the cleaning's one pixel reach."""
+        ring = 2 * _ring_px(self.image) + 1
+        outer = cv2.dilate(self.mask, np.ones((ring, ring), dtype=np.uint8))
+        inner = cv2.dilate(self.mask, np.ones((3, 3), dtype=np.uint8))
+        return np.asarray(outer, dtype=np.bool_) & ~np.asarray(inner, dtype=np.bool_)
+
+    @cached_property
+    def hidden(self) -> bool:
+        """Something nearer stands along enough of the outline to hide more of the same thing."""
+        around = self.surroundings
+        total = np.count_nonzero(around)
+        if total == 0:
+            return True
+        own = np.where((self.mask > 0) & np.isfinite(self.depth), self.depth, np.float32(0))
+        reach = 2 * _ring_px(self.image) + 3
+        beside = np.asarray(cv2.dilate(own, np.ones((reach, reach), dtype=np.uint8)))
+        known = np.isfinite(self.depth)
+        step = NEARER_STEP_M + depth_doubt_m(beside)
+        nearer = np.count_nonzero(around & known & (self.depth < beside - step))
+        unknown = np.count_nonzero(around & ~known)
+        return bool(nearer >= NEARER_SHARE * total or unknown >= UNKNOWN_SHARE * total)
+
+    def split_by_depth(self) -> list[tuple[Mask, Box]]:
+        """The region cut where its depth jumps: an object before a wall of its colour, one can before another."""
+        depth = np.nan_to_num(self.depth, nan=0.0)
+        kernel = np.ones((3, 3), dtype=np.uint8)
+        far = np.asarray(cv2.dilate(depth, kernel))
+        near = np.asarray(cv2.erode(np.where(depth > 0, depth, np.float32(99)), kernel))
+        smooth = far - near < 0.03 + 4 * depth_doubt_m(far)
+        return components(
+            ((self.mask > 0) & smooth & (depth > 0)).astype(np.uint8), self.box[:2], self.image, self.area_px // 50
+        )
+
+    def evidence(self, reach_m: float) -> Evidence | None:
+        """What fits an object that reaches `reach_m` from its centre; None without depth."""
+        if self.depth_m is None:
+            return None
+        core = np.asarray(cv2.erode(self.mask, np.ones((3, 3), dtype=np.uint8)))
+        inside = (core if np.count_nonzero(core) > self.area_px // 2 else self.mask) > 0
+        window_m = 1.5 * reach_m + depth_doubt_m(self.depth_m)
+        on_surface = inside & (np.abs(self.depth - np.float32(self.depth_m)) < window_m)
+        rays = self._rays(on_surface, MAX_SURFACE_POINTS)
+        around = self._rays(self.surroundings & np.isfinite(self.depth), MAX_RAYS)
+        free_to_m = around[:, 3] - 0.01 - depth_doubt_m(around[:, 3])
+        return Evidence(rays[:, :3] * rays[:, 3:], around[:, :3], free_to_m)
+
+    def _rays(self, where: Bools, at_most: int) -> NDArray[np.float64]:
+        """Directions with z = 1, and depth, of some of the pixels; (n, 4)."""
+        camera = self.image.camera
+        rows, columns = np.nonzero(where)
+        if len(rows) > at_most:
+            some = np.linspace(0, len(rows) - 1, at_most).astype(int)
+            rows, columns = rows[some], columns[some]
+        out = np.empty((len(rows), 4))
+        out[:, 0] = (columns + self.box[0] - camera.cx) / camera.fx
+        out[:, 1] = (rows + self.box[1] - camera.cy) / camera.fy
+        out[:, 2] = 1.0
+        out[:, 3] = self.depth[rows, columns]
+        return out
+
+
+def components(
+    mask: Mask, origin: tuple[int, int], image: RgbdImage, min_area_px: float, at_most: int = 8
+) -> list[tuple[Mask, Box]]:
+    """The largest connected regions of a mask whose first pixel is the image's `origin`, each with a margin around."""
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8, ltype=cv2.CV_32S)
+    by_area = sorted(range(1, count), key=lambda i: -int(stats[i, cv2.CC_STAT_AREA]))
+    found = []
+    for i in by_area[:at_most]:
+        left, top, width, height, area = (int(value) for value in stats[i])
+        if area < min_area_px:
+            break
+        own = (origin[0] + left, origin[1] + top, origin[0] + left + width, origin[1] + top + height)
+        box = image.clip(own, Region.margin_px(image))
+        out = np.zeros((box[3] - box[1], box[2] - box[0]), dtype=np.uint8)
+        inner = out[own[1] - box[1] : own[3] - box[1], own[0] - box[0] : own[2] - box[0]]
+        inner[:] = labels[top : top + height, left : left + width] == i
+        found.append((out, box))
+    return found
+
+
+def _ring_px(image: RgbdImage) -> int:
+    return 3 if image.scale > 0.75 else 2

@@ -1,0 +1,18 @@
+"""Perception's shell: the core, driven by the node."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from cocoro.node import Node
+from cocoro.objects import Catalogue
+from services.perception.config import Config
+from services.perception.core import PerceptionCore
+
+__all__ = ["Config", "run"]
+
+
+async def run(node: Node, config: Config) -> None:
+    """Look at every frame that arrives, until cancelled. Raises ConfigError for a bad file of known objects."""
+    catalogue = Catalogue.load(Path(config.objects) if config.objects else None)
+    await node.drive(PerceptionCore(node.robot, config, catalogue))

@@ -1,0 +1,45 @@
+"""What a detector says of one object in one image, before anything is known of the head."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.perception.image import Box, RgbdImage
+
+Points = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What the depth image says of the object's extent, colour camera's frame (x right, y down, z forward)."""
+
+    surface_m: Points
+    """Points on its visible surface, (n, 3)."""
+    rays: Points
+    """Directions (m, 3), z = 1, of pixels just outside of its outline whose depth is known."""
+    free_to_m: Points
+    """How far along the optical axis each ray is known to pass through nothing, (m,)."""
+
+
+@dataclass(frozen=True)
+class Sighting:
+    label: str
+    u_px: float
+    v_px: float
+    area_px: int
+    box_px: Box
+    depth_m: float | None
+    """Of the visible surface, along the optical axis."""
+    cut: bool = False
+    """It touches the image's edge."""
+    evidence: Evidence | None = None
+    """Only from a detector that looks beyond the centroid."""
+
+
+class Detector(Protocol):
+    def detect(self, image: RgbdImage) -> list[Sighting]:
+        """The known objects in the image, at most one of each label, in the catalogue's order."""
