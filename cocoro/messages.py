@@ -278,7 +278,9 @@ class TaskRequest(msgspec.Struct, kw_only=True):
     timeout_s: Annotated[float, Meta(gt=0, le=3600)] | None = None
 
 
-RefusalCode = Literal["unknown_label", "busy", "estop", "not_alive", "not_holding", "bad_request", "no_task"]
+RefusalCode = Literal[
+    "unknown_label", "not_graspable", "busy", "estop", "not_alive", "holding", "not_holding", "bad_request", "no_task"
+]
 
 
 class TaskReply(msgspec.Struct, kw_only=True):

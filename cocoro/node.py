@@ -190,6 +190,14 @@ class Node:
         """Call `handler(message)` for each message."""
         self.inbox(topic, service=service).add(lambda _key, message: handler(message))
 
+    def watch_alive(self, handler: Callable[[str, bool], None]) -> None:
+        """Call `handler(service, alive)` as services of this robot come and go, at once for those that live."""
+
+        def tell(key: str, alive: bool) -> None:
+            handler(key.split("/")[1], alive)
+
+        self._handles.append(self.bus.watch_alive(alive_key(self.robot_name, "*"), tell))
+
     # --- publishing -------------------------------------------------------------------------------
 
     def publisher(self, topic: Topic[M]) -> Publisher[M]:

@@ -1,0 +1,1 @@
+"""The executive: working memory, tasks, and the word on the emergency stop."""

@@ -1,0 +1,220 @@
+"""Takes requests, runs one task at a time, and says what is going on."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+from cocoro import topics
+from cocoro.clock import NS
+from cocoro.messages import (
+    BaseState,
+    CancelRequest,
+    KnownObject,
+    ObjectsReply,
+    ObjectsRequest,
+    Outcome,
+    Phase,
+    RefusalCode,
+    TaskReply,
+    TaskRequest,
+    TaskState,
+)
+from cocoro.node import Node
+from cocoro.objects import Catalogue
+from services.executive.config import Config
+from services.executive.estop import Estop
+from services.executive.skills import PlannerSkills, Skills, TaskFailedError
+from services.executive.tasks import fetch, park, put_down
+
+Task = Callable[[Skills, str, Config], Awaitable[None]]
+TASKS: dict[str, Task] = {"fetch": fetch, "park": park, "put-down": put_down}
+
+
+class Executive:
+    def __init__(self, node: Node, config: Config, catalogue: Catalogue) -> None:
+        self._node = node
+        self._config = config
+        self._catalogue = catalogue
+        self._alive: set[str] = set()
+        self._running: asyncio.Task[Any] | None = None
+        self._end_reason: tuple[Outcome, str] | None = None
+        self._count = 0
+        self.state = TaskState()
+        self._base = node.latest(topics.BASE_STATE)
+        self._publisher = node.publisher(topics.TASK)
+        self._skills = PlannerSkills(node, self._enter_phase, config.intent_hz, config.planner_silence_s)
+        self._estop = Estop(node, config.latch_hz, self._on_latch)
+        node.watch_alive(self._on_alive)
+        node.serve(topics.RUN, self._run)
+        node.serve(topics.CANCEL, self._cancel)
+        node.serve(topics.OBJECTS, self._objects)
+
+    async def tell(self) -> None:
+        """Publish the task's progress for ever."""
+        async for _ in self._node.every(self._config.progress_hz, "progress"):
+            self._publish()
+
+    # --- requests ---------------------------------------------------------------------------------
+
+    async def _run(self, request: TaskRequest) -> TaskReply:
+        refusal = self._refusal(request)
+        if refusal is not None:
+            code, text = refusal
+            return TaskReply(accepted=False, refusal=code, text=text)
+        self._count += 1
+        task_id = f"{request.task}-{self._node.now_ns()}-{self._count}"
+        self.state = TaskState(
+            task_id=task_id, task=request.task, label=request.label, phase="start", started_ns=self._node.now_ns()
+        )
+        self._end_reason = None
+        self._running = self._node.spawn(self._carry_out(request))
+        return TaskReply(accepted=True, task_id=task_id)
+
+    def _refusal(self, request: TaskRequest) -> tuple[RefusalCode, str] | None:
+        if request.task == "fetch":
+            known = self._catalogue.get(request.label)
+            targets = [target.label for target in self._catalogue.targets if target.graspable]
+            if known is None or known.marker:
+                return "unknown_label", f"unknown object {request.label!r}; known are {', '.join(targets)}"
+            if not known.graspable:
+                return "not_graspable", f"{request.label} does not fit into the hand; what does: {', '.join(targets)}"
+        if self._running is not None:
+            return "busy", f"{self._what()} is running; cancel it first (cocoro cancel)"
+        if self._estop.state != "released":
+            return "estop", f"the emergency stop is {self._estop.state}; release it first (cocoro reset)"
+        missing = [service for service in self._config.needed if service not in self._alive]
+        if missing:
+            return "not_alive", f"not alive: {', '.join(missing)}; see cocoro status"
+        status = self._skills.status
+        if status is None:
+            return "not_alive", "the planner says nothing; see cocoro status"
+        if request.task in ("fetch", "park") and status.holding:
+            return "holding", "the hand holds something; put it down first (cocoro put-down)"
+        if request.task == "put-down" and not status.holding:
+            return "not_holding", "the hand holds nothing"
+        return None
+
+    async def _cancel(self, request: CancelRequest) -> TaskReply:
+        if self._running is None or request.task_id not in ("", self.state.task_id):
+            return TaskReply(accepted=False, refusal="no_task", text="no such task is running")
+        self._end("cancelled", "by the operator")
+        return TaskReply(accepted=True, task_id=self.state.task_id)
+
+    async def _objects(self, request: ObjectsRequest) -> ObjectsReply:
+        status = self._skills.status
+        seen = {estimate.label: estimate for estimate in status.known} if status is not None else {}
+        return ObjectsReply(
+            objects=tuple(
+                KnownObject(
+                    label=known.label,
+                    shape=known.shape,
+                    size_m=known.size_m,
+                    graspable=known.graspable,
+                    seen=seen.get(known.label),
+                )
+                for known in self._catalogue.targets
+            )
+        )
+
+    # --- the running task -------------------------------------------------------------------------
+
+    async def _carry_out(self, request: TaskRequest) -> None:
+        timeout_s = request.timeout_s or self._config.task_timeout_s
+        outcome: Outcome = "done"
+        reason = ""
+        self._skills.want("idle", "", self.state.task_id)
+        work = asyncio.ensure_future(TASKS[request.task](self._skills, request.label, self._config))
+        timer = asyncio.ensure_future(self._node.sleep(timeout_s))
+        try:
+            await asyncio.wait((work, timer), return_when=asyncio.FIRST_COMPLETED)
+            if not work.done():
+                outcome, reason = "failed", f"timed_out: the task took over {timeout_s:g} s"
+            else:
+                await work
+        except TaskFailedError as failed:
+            outcome, reason = "failed", str(failed)
+        except asyncio.CancelledError:
+            if self._end_reason is None:
+                raise
+            outcome, reason = self._end_reason
+        except Exception as error:
+            self._node.log.exception("task %s failed", self.state.task_id)
+            outcome, reason = "failed", f"internal error: {error}"
+        finally:
+            work.cancel()
+            timer.cancel()
+            self._skills.want("idle", "", self.state.task_id)
+        await self._come_to_rest()
+        self._finish(outcome, reason)
+
+    async def _come_to_rest(self) -> None:
+        """Wait until the base stands, so that 'done' and 'failed' mean that the robot is still."""
+        end_ns = self._node.now_ns() + round(self._config.settle_s * NS)
+        while self._node.now_ns() < end_ns and not self._standing(self._base.fresh()):
+            if not await self._node.sleep(0.02):
+                return
+            if "base" not in self._alive:
+                return
+
+    @staticmethod
+    def _standing(base: BaseState | None) -> bool:
+        return base is not None and abs(base.speed_mps) < 0.01 and abs(base.turn_rate_radps) < 0.03
+
+    def _finish(self, outcome: Outcome, reason: str) -> None:
+        self._close_phase()
+        self._running = None
+        self.state.outcome = outcome
+        self.state.reason = reason
+        self.state.phase = "end"
+        self.state.text = reason or outcome
+        self._node.log.info("%s %s %s", self._what(), outcome, reason)
+        self._publish()
+
+    def _end(self, outcome: Outcome, reason: str) -> None:
+        """End the running task from outside."""
+        if self._running is not None and self._end_reason is None:
+            self._end_reason = (outcome, reason)
+            self._running.cancel()
+
+    def _what(self) -> str:
+        return " ".join(filter(None, (self.state.task, self.state.label)))
+
+    # --- what happens around it -------------------------------------------------------------------
+
+    def _on_alive(self, service: str, alive: bool) -> None:
+        if alive:
+            self._alive.add(service)
+            return
+        self._alive.discard(service)
+        if service in self._config.needed:
+            self._end("failed", f"not_alive: {service} died")
+
+    def _on_latch(self, latched: bool, by: str) -> None:
+        if latched:
+            self._end("failed", f"estop: emergency stop by {by or 'unknown'}")
+
+    # --- progress ---------------------------------------------------------------------------------
+
+    def _enter_phase(self, name: str) -> None:
+        self._close_phase()
+        self.state.phase = name
+        self.state.phases = (*self.state.phases, Phase(name=name, start_ns=self._node.now_ns()))
+        self._publish()
+
+    def _close_phase(self) -> None:
+        if self.state.phases and self.state.phases[-1].end_ns is None:
+            last = self.state.phases[-1]
+            ended = Phase(name=last.name, start_ns=last.start_ns, end_ns=self._node.now_ns())
+            self.state.phases = (*self.state.phases[:-1], ended)
+
+    def _publish(self) -> None:
+        status = self._skills.status
+        state = self.state
+        if self._running is not None:
+            state.elapsed_s = (self._node.now_ns() - state.started_ns) / NS
+            if status is not None:
+                state.text, state.distance_m = status.why, status.distance_m
+        state.stamp_ns = self._node.now_ns()
+        self._publisher.put(state)
