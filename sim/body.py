@@ -54,7 +54,9 @@ class Part:
     axis: str = "z"
     """Along which axis of the link a cylinder lies."""
     solid: bool = True
-    """False for what is only seen."""
+    """False for what is only seen, or only weighs."""
+    seen: bool = True
+    """False for what is only touched, or only weighs."""
 
     def pose(self) -> Array:
         """4 x 4 transform from the part's frame to its link's."""
@@ -117,8 +119,8 @@ def calliope_body(robot: Robot) -> Body:
     parts: dict[str, list[Part]] = {
         "mount": [Part("mount", "box", tuple(float(v) for v in high - low), (0, 0, 0), _WHITE, 4.6)],
         "riser": [Part("riser", "box", (0.06, 0.06, 0.03), (0, 0, 0), _DARK, 0.10)],
-        "wheel_left": [Part("wheel_left", "cylinder", (wheel, 0.02), (0, 0, 0), _DARK, 0.15, "y")],
-        "wheel_right": [Part("wheel_right", "cylinder", (wheel, 0.02), (0, 0, 0), _DARK, 0.15, "y")],
+        "wheel_left": _wheel("wheel_left", wheel),
+        "wheel_right": _wheel("wheel_right", wheel),
         "caster_front": [Part("caster_front", "sphere", (CASTER_RADIUS_M,), (0, 0, 0), _METAL, 0.03)],
         "caster_rear": [Part("caster_rear", "sphere", (CASTER_RADIUS_M,), (0, 0, 0), _METAL, 0.03)],
         "neck_pan": [Part("neck_pan", "box", (0.05, 0.034, 0.034), (0, 0, 0.040), _DARK, 0.07)],
@@ -159,7 +161,7 @@ def calliope_body(robot: Robot) -> Body:
     parts[CHASSIS] = [
         Part("chassis", "cylinder", (radius, height), (0, 0, centre_z), _METAL, rest - 0.9),
         # The battery stands behind the axle, against the arm.
-        Part("battery", "box", (0.08, 0.16, 0.05), (-0.10, 0, centre_z), _DARK, 0.9, solid=False),
+        Part("battery", "box", (0.08, 0.16, 0.05), (-0.10, 0, centre_z), _DARK, 0.9, solid=False, seen=False),
     ]
     arm_foot = (float(shoulder_x), float(arm_y), (top_m + arm_z - 0.028) / 2)
     return Body(
@@ -180,6 +182,15 @@ def calliope_body(robot: Robot) -> Body:
             **{claw: Friction(0.9, spinning=0.01) for claw in robot.claw.open_sign},
         },
     )
+
+
+def _wheel(name: str, radius_m: float) -> list[Part]:
+    """A wheel that touches the floor in one point, in the middle of its tread: where in a tread's width a wheel
+    pivots is not the solver's to choose."""
+    return [
+        Part(name, "cylinder", (radius_m, 0.02), (0, 0, 0), _DARK, 0.15, "y", solid=False),
+        Part(f"{name}_tread", "sphere", (radius_m,), (0, 0, 0), _DARK, seen=False),
+    ]
 
 
 def _claw(robot: Robot, claw: str) -> list[Part]:

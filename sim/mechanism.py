@@ -22,6 +22,10 @@ from sim.servos import Drive
 
 WHEEL_TORQUE_NM = 1.0
 """At the rim 33 N a wheel: a third of the robot's weight. Ours; the maker gives none."""
+WHEEL_LAG_RAD = 0.05
+"""A blocked wheel is not wound up further behind its goal than this."""
+WHEEL_GAIN = 0.2
+"""Share of a wheel's lag that is made up for in one step."""
 
 
 class JointReading(NamedTuple):
@@ -56,6 +60,8 @@ class Mechanism:
         link_of_joint = {joint: link for link, joint in joint_of_link.items()}
         self._motors = {joint: self.index[link_of_joint[joint]] for joint in self.joints}
         self._wheels = tuple(self.index[wheel] for wheel in WHEELS)
+        self._wheel_rad = [0.0, 0.0]
+        self._wheel_goal_rad = [0.0, 0.0]
         self._read_indices = [*self._motors.values(), *self._wheels]
         # PyBullet tells the root's pose at its centre of mass.
         self._root_offset = np.array(bullet.getDynamicsInfo(self.body, -1)[3])
@@ -72,19 +78,28 @@ class Mechanism:
             maxVelocity=drive.max_speed_radps,
         )
 
-    def spin(self, left_radps: float, right_radps: float) -> None:
-        for wheel, speed_radps in zip(self._wheels, (left_radps, right_radps), strict=True):
+    def spin(self, left_radps: float, right_radps: float, dt_s: float) -> None:
+        """Turn the wheels at these speeds for the next step, as a controller with encoders does: what a wheel
+        lags or creeps in one step is made up for in the next."""
+        for number, speed_radps in enumerate((left_radps, right_radps)):
+            lag = self._wheel_goal_rad[number] - self._wheel_rad[number]
+            goal = self._wheel_rad[number] + min(max(lag, -WHEEL_LAG_RAD), WHEEL_LAG_RAD)
+            self._wheel_goal_rad[number] = goal + speed_radps * dt_s
             self._bullet.setJointMotorControl2(
                 self.body,
-                wheel,
-                self._bullet.VELOCITY_CONTROL,
+                self._wheels[number],
+                self._bullet.POSITION_CONTROL,
+                targetPosition=goal,
                 targetVelocity=speed_radps,
+                positionGain=WHEEL_GAIN,
+                velocityGain=1.0,
                 force=WHEEL_TORQUE_NM,
             )
 
     def read(self) -> list[JointReading]:
         """All servo joints in the order of `joints`, then the left and the right wheel."""
         states = self._bullet.getJointStates(self.body, self._read_indices)
+        self._wheel_rad = [state[0] for state in states[-2:]]
         return [JointReading(angle, speed, torque) for angle, speed, _, torque in states]
 
     def root(self) -> tuple[Vec3, Quaternion]:

@@ -83,7 +83,6 @@ class World:
         servos = {joint: servo for network in self._networks.values() for joint, servo in network.servos.items()}
         self._servos = [servos[joint] for joint in self._mechanism.joints]
         self._driven: list[Drive | None] = [None] * len(self._servos)
-        self._spun: tuple[float, float] | None = None
 
         sense_s = self._sense_every * self._dt_s
         scale = stream(seed, "wheel scale").uniform(-1.0, 1.0, 2) * realism.wheel_scale_error
@@ -152,7 +151,7 @@ class World:
         stretch = self._wheel_scale * (1.0 + self._slip.values)
         radius_m = self.robot.base.wheel_radius_m
         left_mps, right_mps = self._base.wheels(now_ns, dt_s)
-        self._spin(left_mps * stretch[0] / radius_m, right_mps * stretch[1] / radius_m)
+        self._mechanism.spin(left_mps * stretch[0] / radius_m, right_mps * stretch[1] / radius_m, dt_s)
         for network in self._networks.values():
             network.expire(now_ns)
         self._drive_servos()
@@ -248,7 +247,7 @@ class World:
 
     def _settle(self) -> None:
         """Let everything come to rest on the floor before time begins."""
-        self._spin(0.0, 0.0)
+        self._mechanism.spin(0.0, 0.0, self._dt_s)
         self._drive_servos()
         self._stage.move(0.0)
         for _ in range(round(SETTLE_S * self._hz)):
@@ -261,11 +260,6 @@ class World:
 
     def _angles(self) -> list[float]:
         return [servo.angle_rad for servo in self._servos]
-
-    def _spin(self, left_radps: float, right_radps: float) -> None:
-        if self._spun != (left_radps, right_radps):
-            self._spun = left_radps, right_radps
-            self._mechanism.spin(left_radps, right_radps)
 
     def _drive_servos(self) -> None:
         """Tell the motors whose orders have changed."""
