@@ -93,6 +93,8 @@ class FollowedClock:
     `run_on_s`: when the simulator stands still, time stands still."""
 
     def __init__(self, run_on_s: float = 0.03) -> None:
+        self.driven = False
+        """True in the simulator's own process, which ticks it directly."""
         self._run_on_ns = round(run_on_s * NS)
         self._epoch = 0
         self._incarnation: int | None = None

@@ -94,7 +94,7 @@ class Node:
         record_steps: bool = False,
         health_hz: float = 1.0,
     ) -> None:
-        """`latency_s` is added to every step of a driven core, as if computing took that much longer."""
+        """`latency_s` is added to every step of a driven core that gives outputs, as if computing them took longer."""
         self.name = name
         self.bus = bus
         self.clock = clock
@@ -117,7 +117,7 @@ class Node:
     # --- lifecycle --------------------------------------------------------------------------------
 
     async def __aenter__(self) -> Node:
-        if isinstance(self.clock, FollowedClock) and self.name != "sim":
+        if isinstance(self.clock, FollowedClock) and not self.clock.driven:
             self.inbox(topics.CLOCK).add(self._tick)
         self.spawn(self._tell_health())
         return self
@@ -164,7 +164,7 @@ class Node:
 
     def sibling(self, name: str) -> Node:
         """Another service in this process, on the same bus and clock: the simulator stands in for four."""
-        return Node(name, self.bus, self.clock, self.robot, robot_name=self.robot_name)
+        return Node(name, self.bus, self.clock, self.robot, robot_name=self.robot_name, health_hz=self._health_hz)
 
     # --- reading ----------------------------------------------------------------------------------
 
@@ -353,22 +353,27 @@ class Stepper:
             wake = self.wake.set if topic.name in triggers else None
             inbox.add(self._intake.reader(topic, inbox, take == "all", wake))
 
-    async def __call__(self, now_ns: int) -> None:
+    async def __call__(self, now_ns: int) -> int:
+        """One step; the number of messages that it gave."""
         node = self._node
         samples = [Sample(topic, message) for topic, message in self._intake.take()]
         outputs = self._core.step(samples, now_ns)
-        if node.latency_s > 0:
+        stamp_ns = now_ns
+        if outputs and node.latency_s > 0:
             await node.sleep(node.latency_s)
+            # What takes longer to compute is said later; a command's age counts from when it could be given.
+            stamp_ns += round(node.latency_s * NS)
         produced = []
         for topic, message in outputs:
             if message.stamp_ns == 0:
-                message.stamp_ns = now_ns
+                message.stamp_ns = stamp_ns
             sent = node.publish(topic, message)
             produced.append((topic.name, sent.incarnation, sent.seq))
         if node.record_steps:
             consumed = tuple((s.topic.name, s.message.incarnation, s.message.seq) for s in samples)
             record = StepRecord(now_ns=now_ns, core=self._name, consumed=consumed, produced=tuple(produced))
             node.publish(STEPS.of(node.name), record)
+        return len(produced)
 
 
 def _understand(request: Request[Q, R], reply: Reply) -> R:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 from importlib import resources
@@ -193,6 +194,12 @@ class Robot:
             return cls(msgspec.convert(data, _File))
         except (tomllib.TOMLDecodeError, msgspec.ValidationError, OSError) as error:
             raise ConfigError(f"robot description {where}: {error}") from error
+
+    def with_base(self, **changes: float) -> Robot:
+        """The same robot with other values in its `[base]` table."""
+        other = copy(self)
+        other.base = msgspec.structs.replace(self.base, **changes)
+        return other
 
     def network_joints(self, network: str) -> tuple[str, ...]:
         """The joints of one servo network, in the order of their servo IDs."""

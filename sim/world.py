@@ -127,11 +127,13 @@ class World:
         """Goals for joints of 'arm' or 'hand', all or none. Returns '' when they are taken, otherwise why not."""
         return self._networks[network].command(command, self.time_ns)
 
-    def set_latch(self, state: LatchState) -> None:
-        """The emergency stop of base, arm and hand."""
-        self._base.set_latch(state)
-        for network in self._networks.values():
-            network.set_latch(state)
+    def set_latch(self, state: LatchState, service: str | None = None) -> None:
+        """The emergency stop of one of base, arm and hand, or of all."""
+        if service in (None, "base"):
+            self._base.set_latch(state)
+        for name, network in self._networks.items():
+            if service in (None, name):
+                network.set_latch(state)
 
     def base_state(self) -> BaseState:
         return self._base.state(self.time_ns)

@@ -1,0 +1,212 @@
+"""`cocoro rehearse`: the whole robot in one process, in virtual time, judged by the simulator's truth.
+
+The services are the real ones, found by the process table and run on the local bus; only time and the bus differ
+from a live run.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from contextlib import AsyncExitStack
+from pathlib import Path
+from typing import Any
+
+import msgspec
+from cocoro.picture import save_picture
+
+from cocoro import topics
+from cocoro.bus.local import LocalMesh
+from cocoro.clock import NS, VirtualClock
+from cocoro.core import Core
+from cocoro.errors import CocoroError, ConfigError
+from cocoro.messages import Detections, Frame, TaskReply, TaskRequest, TaskState
+from cocoro.node import Node, Stepper
+from cocoro.processes import load, named
+from cocoro.rehearsal import RehearsalRequest
+from cocoro.robot import Robot
+from cocoro.vloop import run_virtual
+from sim.judge import Judge
+
+PROCESSES = ("sim", "perception", "planning", "executive")
+START_S = 5.0
+"""So long the robot may take until it accepts a task."""
+_LONG_S = 60.0
+
+
+def rehearse(request: RehearsalRequest) -> dict[str, Any]:
+    """Run one task and return the result, as the JSON has it. Raises CocoroError when the robot refuses the task,
+    ConfigError for a wrong scene or service name."""
+    started = time.perf_counter()
+    unknown = sorted(set(request.latency) - set(PROCESSES))
+    if unknown:
+        raise ConfigError(f"--latency {unknown[0]}: no such service; known are {', '.join(PROCESSES)}")
+    result = run_virtual(_Rehearsal(request).run())
+    result["wall_s"] = round(time.perf_counter() - started, 3)
+    return result
+
+
+class TaskRefusedError(CocoroError):
+    """The executive would not start the task."""
+
+    def __init__(self, reply: TaskReply) -> None:
+        super().__init__(reply.text)
+        self.code = reply.refusal
+
+
+class LockstepCycle:
+    """The paper's one serial cycle: sense, perceive, plan, act; the next begins when the last has ended, and
+    commands hold meanwhile. The services' own cores, latencies included, in turn."""
+
+    ORDER = ("perception", "planning")
+
+    def __init__(self) -> None:
+        self._steps: dict[str, tuple[Node, Stepper]] = {}
+
+    async def join(self, node: Node, core: Core) -> None:
+        """In place of `Node.drive`: the core is stepped when its turn comes."""
+        self._steps[node.name] = (node, node.stepper(core))
+        node.ready()
+        if set(self._steps) == set(self.ORDER):
+            await self._run()
+        else:
+            await asyncio.get_running_loop().create_future()
+
+    async def _run(self) -> None:
+        perceiver, perceive = self._steps["perception"]
+        planner, plan = self._steps["planning"]
+        while True:
+            await perceive.wake.wait()
+            perceive.wake.clear()
+            if await perceive(perceiver.now_ns()):
+                # Lets what was published arrive; no time passes.
+                await asyncio.sleep(0)
+                await plan(planner.now_ns())
+
+
+class LockstepNode(Node):
+    """A node whose core is driven by the cycle."""
+
+    cycle: LockstepCycle
+
+    async def drive(self, core: Core, name: str | None = None) -> None:
+        await self.cycle.join(self, core)
+
+
+class _Rehearsal:
+    def __init__(self, request: RehearsalRequest) -> None:
+        self._request = request
+        self._judge = Judge(request.label)
+        self._frame: Frame | None = None
+        self._seen: Detections | None = None
+
+    async def run(self) -> dict[str, Any]:
+        request = self._request
+        mesh, clock, robot = LocalMesh(), VirtualClock(), Robot.load()
+        cycle = LockstepCycle()
+        async with AsyncExitStack() as stack:
+            services = []
+            for name in PROCESSES:
+                component = load(named(name))
+                config = msgspec.convert(self._settings(name), component.config)
+                lockstep = request.lockstep and name in LockstepCycle.ORDER
+                kind = LockstepNode if lockstep else Node
+                node = kind(name, mesh.join(), clock, robot, latency_s=request.latency.get(name, 0.0))
+                if isinstance(node, LockstepNode):
+                    node.cycle = cycle
+                await stack.enter_async_context(node)
+                services.append(asyncio.ensure_future(component.run(node, config)))
+            operator = await stack.enter_async_context(Node("operator", mesh.join(), clock, robot))
+            operator.on(topics.TRUTH, self._judge.see)
+            task = asyncio.ensure_future(self._operate(operator))
+            try:
+                await asyncio.wait((task, *services), return_when=asyncio.FIRST_COMPLETED)
+                for service in services:
+                    if service.done():
+                        service.result()
+                        raise CocoroError("a service of the rehearsal ended by itself")
+                state = task.result()
+            finally:
+                for future in (task, *services):
+                    future.cancel()
+                await asyncio.gather(task, *services, return_exceptions=True)
+        return self._result(state)
+
+    def _settings(self, name: str) -> dict[str, Any]:
+        request = self._request
+        if name == "sim":
+            settings: dict[str, Any] = {
+                field: getattr(request, field)
+                for field in ("scene", "seed", "sensors", "width", "height", "frame_rate_hz")
+            }
+            return settings | ({"command_timeout_s": _LONG_S} if request.lockstep else {})
+        if request.lockstep:
+            # The baseline's planner speaks once a cycle, however long that is: no penalty for it.
+            return {
+                "planning": {"coordination": "lockstep"},
+                "executive": {"planner_silence_s": _LONG_S},
+            }.get(name, {})
+        return {}
+
+    async def _operate(self, operator: Node) -> TaskState:
+        """What the operator does: give the task, watch it to its end."""
+        request = self._request
+        states = operator.stream(topics.TASK)
+        if request.picture is not None:
+            operator.on(topics.FRAME, self._keep_frame)
+            operator.on(topics.DETECTIONS, self._keep_seen)
+        question = TaskRequest(task=request.task, label=request.label, timeout_s=request.timeout_s)
+        reply = await self._ask(operator, question)
+        while reply.refusal in ("not_alive", "estop") and operator.now_ns() < START_S * NS:
+            await operator.sleep(0.1)
+            reply = await self._ask(operator, question)
+        if not reply.accepted:
+            raise TaskRefusedError(reply)
+        self._judge.start()
+        pictured = request.picture is None
+        async for state in states:
+            if state.task_id != reply.task_id:
+                continue
+            if not pictured and state.phase == "lift":
+                self._take_picture()
+                pictured = True
+            if state.outcome is not None:
+                return state
+        raise AssertionError("a stream has no end")
+
+    @staticmethod
+    async def _ask(operator: Node, question: TaskRequest) -> TaskReply:
+        try:
+            return await operator.call(topics.RUN, question)
+        except CocoroError as error:
+            return TaskReply(accepted=False, refusal="not_alive", text=str(error))
+
+    def _keep_frame(self, frame: Frame) -> None:
+        self._frame = frame
+
+    def _keep_seen(self, seen: Detections) -> None:
+        self._seen = seen
+
+    def _take_picture(self) -> None:
+        if self._frame is not None and self._request.picture is not None:
+            save_picture(Path(self._request.picture), self._frame, self._seen)
+
+    def _result(self, state: TaskState) -> dict[str, Any]:
+        request = self._request
+        return {
+            "task": request.task,
+            "label": request.label,
+            "scene": request.scene,
+            "seed": request.seed,
+            "sensors": request.sensors,
+            "lockstep": request.lockstep,
+            "outcome": state.outcome,
+            "reason": state.reason,
+            "sim_s": round(state.elapsed_s, 3),
+            "wall_s": 0.0,
+            "phases": [
+                {"name": phase.name, "sim_s": round(((phase.end_ns or state.stamp_ns) - phase.start_ns) / NS, 3)}
+                for phase in state.phases
+            ],
+            "truth": self._judge.result(),
+        }

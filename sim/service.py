@@ -1,0 +1,209 @@
+"""The simulator as a service: it stands in for kinect, base, arm and hand, key for key, and keeps the clock."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable
+from contextlib import AsyncExitStack
+from heapq import heappop, heappush
+from typing import Annotated, Any, Literal
+
+import msgspec
+from msgspec import Meta
+
+from cocoro import topics
+from cocoro.clock import NS, Clock, FollowedClock
+from cocoro.latch import LatchKeeper
+from cocoro.messages import BaseCommand, LatchState, Message, ServoCommand
+from cocoro.messages import Clock as ClockMessage
+from cocoro.node import Node, Publisher
+from cocoro.robot import Robot
+from sim.camera import Kinect
+from sim.render import make_renderer
+from sim.scene import load_scene
+from sim.world import World
+
+__all__ = ["Config", "run"]
+
+TICK_HZ = 120
+"""The clock key's rate; the physics runs whole steps between ticks."""
+FRAME_LATENCY_S = 0.020
+STATE_LATENCY_S = 0.005
+"""From a stamp to its publishing, with real sensors."""
+LATE_S = 0.1
+"""Further behind real time than this, simulated time slips instead of catching up."""
+
+
+class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    scene: str = "paper"
+    seed: Annotated[int, Meta(ge=0)] = 0
+    sensors: Literal["ideal", "real"] = "ideal"
+    width: Annotated[int, Meta(ge=16, le=4096)] = 640
+    height: Annotated[int, Meta(ge=16, le=4096)] = 480
+    frame_rate_hz: Annotated[float, Meta(gt=0, le=120)] = 30.0
+    state_rate_hz: Annotated[float, Meta(gt=0, le=120)] = 50.0
+    physics_hz: Annotated[int, Meta(ge=TICK_HZ, multiple_of=TICK_HZ)] = 240
+    command_timeout_s: Annotated[float, Meta(gt=0)] | None = None
+    """Instead of the robot's own deadman; only the lock-step baseline asks for one."""
+    renderer: Literal["auto", "moderngl", "tiny"] = "auto"
+
+
+class _Outbox:
+    """Messages on their way: published when their latency is over, by simulated time."""
+
+    def __init__(self) -> None:
+        self._waiting: list[tuple[int, int, Publisher[Any], Message]] = []
+        self._count = 0
+
+    def put(self, publisher: Publisher[Any], message: Message, due_ns: int) -> None:
+        heappush(self._waiting, (due_ns, self._count, publisher, message))
+        self._count += 1
+
+    def flush(self, now_ns: int) -> None:
+        while self._waiting and self._waiting[0][0] <= now_ns:
+            _, _, publisher, message = heappop(self._waiting)
+            publisher.put(message, message.stamp_ns)
+
+
+class _Every:
+    """Says when something of a fixed rate is due, in whole physics steps."""
+
+    def __init__(self, rate_hz: float) -> None:
+        self._rate_hz = rate_hz
+        self._done = -1
+
+    def due(self, now_ns: int) -> bool:
+        count = int(now_ns * self._rate_hz / NS + 1e-6)
+        if count <= self._done:
+            return False
+        self._done = count
+        return True
+
+
+class Simulator:
+    """Steps the world and exchanges its commands, states and frames with the mesh."""
+
+    def __init__(self, node: Node, config: Config, world: World, kinect: Kinect) -> None:
+        self._config = config
+        self._world = world
+        self._kinect = kinect
+        self._clock = node.clock
+        self._outbox = _Outbox()
+        self._state_due = _Every(config.state_rate_hz)
+        self._frame_due = _Every(config.frame_rate_hz)
+        self._truth_due = _Every(topics.TRUTH.rate_hz or 30.0)
+        real = config.sensors == "real"
+        self._state_latency_ns = round(STATE_LATENCY_S * NS) if real else 0
+        self._frame_latency_ns = round(FRAME_LATENCY_S * NS) if real else 0
+        self._ticks = node.publisher(topics.CLOCK)
+        self._truth = node.publisher(topics.TRUTH)
+        self.rate = 1.0
+
+    def connect(self, kinect: Node, base: Node, arm: Node, hand: Node) -> None:
+        world = self._world
+        self._frames = kinect.publisher(topics.FRAME)
+        self._states: tuple[tuple[Publisher[Any], Callable[[], Message]], ...] = (
+            (base.publisher(topics.BASE_STATE), world.base_state),
+            (arm.publisher(topics.ARM_STATE), lambda: world.servo_state("arm")),
+            (hand.publisher(topics.HAND_STATE), lambda: world.servo_state("hand")),
+        )
+        for node in (base, arm, hand):
+            self._keep_latch(node)
+        base.on(topics.BASE_COMMAND, self._command_base)
+        arm.on(topics.ARM_COMMAND, lambda command: self._command_servos("arm", command))
+        hand.on(topics.HAND_COMMAND, lambda command: self._command_servos("hand", command))
+
+    def _keep_latch(self, node: Node) -> None:
+        def changed(state: LatchState, by: str) -> None:
+            self._world.set_latch(state, node.name)
+
+        LatchKeeper(node, changed)
+
+    def _command_base(self, command: BaseCommand) -> None:
+        self._world.command_base(command)
+
+    def _command_servos(self, network: str, command: ServoCommand) -> None:
+        self._world.command_servos(network, command)
+
+    def tick(self) -> None:
+        """One tick of the clock: some steps of physics, and what became due in them."""
+        world = self._world
+        for _ in range(self._config.physics_hz // TICK_HZ):
+            world.step()
+            now_ns = world.time_ns
+            if self._state_due.due(now_ns):
+                for publisher, state in self._states:
+                    self._outbox.put(publisher, state(), now_ns + self._state_latency_ns)
+            if self._truth_due.due(now_ns):
+                self._outbox.put(self._truth, world.truth(), now_ns)
+            if self._frame_due.due(now_ns):
+                frame = self._kinect.capture(world.visual_poses(), world.camera_pose(), now_ns, world.light)
+                self._outbox.put(self._frames, frame, now_ns + self._frame_latency_ns)
+        sent = self._ticks.put(ClockMessage(rate=self.rate), world.time_ns)
+        if isinstance(self._clock, FollowedClock):
+            self._clock.tick(sent.stamp_ns, sent.incarnation, self.rate)
+        self._outbox.flush(world.time_ns)
+
+
+async def run(node: Node, config: Config) -> None:
+    """Simulate for ever: in real time, or as the loop's virtual time goes."""
+    scene = load_scene(config.scene, config.seed)
+    robot = node.robot
+    with World(
+        _with_timeout(robot, config.command_timeout_s),
+        scene,
+        seed=config.seed,
+        sensors=config.sensors,
+        physics_hz=config.physics_hz,
+    ) as world:
+        camera = robot.camera.scaled(config.width, config.height)
+        renderer = make_renderer(world.visuals, camera, config.renderer)
+        kinect = Kinect(
+            robot, renderer, sensors=config.sensors, seed=config.seed, width=config.width, height=config.height
+        )
+        if isinstance(node.clock, FollowedClock):
+            node.clock.driven = True
+        simulator = Simulator(node, config, world, kinect)
+        async with AsyncExitStack() as stack:
+            hardware = [await stack.enter_async_context(node.sibling(name)) for name in topics.HARDWARE]
+            simulator.connect(*hardware)
+            for part in (node, *hardware):
+                part.ready(f"simulated, scene {scene.name}, {config.sensors} sensors")
+            if isinstance(node.clock, FollowedClock):
+                await _in_real_time(simulator)
+            else:
+                await _in_virtual_time(simulator, node.clock)
+
+
+async def _in_virtual_time(simulator: Simulator, clock: Clock) -> None:
+    ticks = 0
+    while True:
+        ticks += 1
+        await clock.sleep_until(ticks * NS // TICK_HZ)
+        simulator.tick()
+
+
+async def _in_real_time(simulator: Simulator) -> None:
+    """Keep up with the monotonic clock; where that cannot be done, let simulated time slip and say so in the rate."""
+    due_s = measured_s = time.monotonic()
+    ticks = 0
+    while True:
+        due_s += 1 / TICK_HZ
+        behind_s = time.monotonic() - due_s
+        if behind_s > LATE_S:
+            due_s += behind_s
+        await asyncio.sleep(max(-behind_s, 0.0))
+        simulator.tick()
+        ticks += 1
+        if ticks == TICK_HZ:
+            now_s = time.monotonic()
+            simulator.rate = min(ticks / TICK_HZ / (now_s - measured_s), 1.0)
+            measured_s, ticks = now_s, 0
+
+
+def _with_timeout(robot: Robot, timeout_s: float | None) -> Robot:
+    """The robot with another deadman."""
+    if timeout_s is None:
+        return robot
+    return robot.with_base(command_timeout_s=timeout_s)
