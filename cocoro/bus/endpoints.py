@@ -8,7 +8,6 @@ alone, so nobody else on the machine can drive the robot. Across machines, `clie
 
 from __future__ import annotations
 
-import json
 import os
 import tempfile
 from collections.abc import Mapping
@@ -48,9 +47,7 @@ class ZenohConfig:
                 raise ConfigError(f"mesh of {self.name}: a directory goes without mode, listen and connect")
             path = str(self.directory)
             if len(os.fsencode(path)) > LONGEST_SOCKET_PATH - len("/0123456789abcdef.sock"):
-                raise ConfigError(
-                    f"mesh directory {path}: the path is too long for a Unix socket, choose a shorter"
-                )
+                raise ConfigError(f"mesh directory {path}: the path is too long for a Unix socket, choose a shorter")
             if any(c in path for c in FORBIDDEN):
                 raise ConfigError(f"mesh directory {path}: the path may not contain any of {FORBIDDEN}")
         elif not self.listen and not self.connect:
@@ -77,31 +74,3 @@ def default_run_dir() -> Path:
     if runtime := os.environ.get("XDG_RUNTIME_DIR"):
         return Path(runtime) / "cocoro"
     return Path(tempfile.gettempdir()) / f"cocoro-{os.getuid()}"
-
-
-def zenoh_options(
-    config: ZenohConfig, identity: str, listen: list[str], connect: list[str]
-) -> dict[str, str]:
-    """The options of a zenoh session, path to JSON. What is not said here is zenoh's default."""
-    patience_ms = round(config.patience_s * 1000)
-    options: dict[str, Any] = {
-        "id": identity,
-        "mode": config.mode,
-        "scouting/multicast/enabled": False,
-        # Everyone connects to everyone by the register. Gossip would only connect them twice.
-        "scouting/gossip/enabled": config.mode == "peer" and config.directory is None,
-        # The longest that opening waits for the endpoints that it connects to. A router waits all of it, always.
-        "scouting/delay": patience_ms if config.mode == "peer" else 0,
-        # Zenoh's own wait for a peer's declarations sometimes misses their end and takes all of the delay, so
-        # the bus itself waits for the members' tokens, which come last.
-        "open/return_conditions": {"connect_scouted": True, "declares": False},
-        "listen/endpoints": listen,
-        "connect/endpoints": connect,
-        "connect/timeout_ms": patience_ms if config.mode == "client" else -1,
-        "connect/retry": {"period_init_ms": 20, "period_max_ms": 2000, "period_increase_factor": 2},
-        "transport/link/tx/lease": round(config.lease_s * 1000),
-        "transport/shared_memory/transport_optimization/pool_size": 32 * 1024 * 1024,
-        "transport/shared_memory/transport_optimization/message_size_threshold": 32 * 1024,
-        **config.options,
-    }
-    return {path: json.dumps(value) for path, value in options.items()}

@@ -50,7 +50,7 @@ class Membership:
         _make_private(directory)
         with _locked(directory):
             others = _living(directory)
-            member = Member(_new_identity(), name, os.getpid())
+            member = Member(new_identity(), name, os.getpid())
             entry = directory / (member.identity + ENTRY)
             lock_fd = os.open(entry, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600)
             fcntl.flock(lock_fd, fcntl.LOCK_EX)
@@ -84,7 +84,8 @@ def endpoint(directory: Path, member: Member) -> str:
     return f"unixsock-stream/{directory / (member.identity + SOCKET)}"
 
 
-def _new_identity() -> str:
+def new_identity() -> str:
+    """16 random hexadecimal digits."""
     return f"{secrets.randbits(63) | 1 << 63:016x}"  # zenoh takes no leading zeros
 
 
@@ -93,9 +94,7 @@ def _make_private(directory: Path) -> None:
         directory.mkdir(mode=0o700, parents=True, exist_ok=True)
         status = directory.stat()
     except OSError as error:
-        raise ConfigError(
-            f"mesh directory {directory}: {error.strerror}; choose another run directory"
-        ) from error
+        raise ConfigError(f"mesh directory {directory}: {error.strerror}; choose another run directory") from error
     if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid() or status.st_mode & 0o022:
         raise ConfigError(
             f"mesh directory {directory}: it must be a directory that only this user can write to; "

@@ -18,9 +18,7 @@ class Ring(Generic[T]):
     Without one nothing is lost, and the order holds over all keys.
     """
 
-    def __init__(
-        self, loop: asyncio.AbstractEventLoop, deliver: Callable[[str, T], None], depth: int | None
-    ) -> None:
+    def __init__(self, loop: asyncio.AbstractEventLoop, deliver: Callable[[str, T], None], depth: int | None) -> None:
         self.skipped = 0
         self._loop = loop
         self._deliver: Callable[[str, T], None] | None = deliver
@@ -30,6 +28,8 @@ class Ring(Generic[T]):
         self._woken = False
 
     def push(self, key: str, item: T) -> None:
+        if self._deliver is None:
+            return
         with self._lock:
             place = key if self._depth is not None else ""
             ring = self._waiting.get(place)
@@ -57,9 +57,7 @@ class Ring(Generic[T]):
                 try:
                     self._deliver(key, item)
                 except Exception as error:
-                    self._loop.call_exception_handler(
-                        {"message": f"the reader of {key} failed", "exception": error}
-                    )
+                    self._loop.call_exception_handler({"message": f"the reader of {key} failed", "exception": error})
 
     def close(self) -> None:
         """Nothing is delivered afterwards."""

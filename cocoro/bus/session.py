@@ -1,0 +1,128 @@
+"""Opening and closing zenoh sessions without blocking the loop, and without a session outliving its interpreter."""
+
+from __future__ import annotations
+
+import asyncio
+import atexit
+import contextlib
+import json
+import threading
+from collections.abc import Callable
+from typing import Any, TypeVar, cast
+
+import zenoh
+
+from cocoro.bus.endpoints import ZenohConfig
+from cocoro.errors import ConfigError, MeshError
+
+T = TypeVar("T")
+
+LEAVE_S = 2.0
+"""How long leaving the mesh may take before it is given up; the process can end all the same."""
+FRAGMENT_WAIT_US = 10_000
+"""How long a large sample without shared memory may wait for a receiver on this machine that does not read."""
+
+
+def no_mesh(config: ZenohConfig) -> MeshError:
+    return MeshError(f"no mesh at {config.where}: start one with `cocoro up`")
+
+
+def options(config: ZenohConfig, identity: str, listen: list[str], connect: list[str]) -> dict[str, Any]:
+    """The options of a zenoh session by path. What is not said here is zenoh's default."""
+    local = config.directory is not None
+    patience_ms = round(config.patience_s * 1000)
+    chosen: dict[str, Any] = {
+        "id": identity,
+        "mode": config.mode,
+        "scouting/multicast/enabled": False,
+        # By the register everyone connects to everyone; gossip would only make them do it twice.
+        "scouting/gossip/enabled": config.mode == "peer" and not local,
+        # The longest that opening as a peer waits for its endpoints. A router would wait all of it, always.
+        "scouting/delay": patience_ms if config.mode == "peer" else 0,
+        # Zenoh's own wait for what the others declared now and then misses its end and takes all of the delay, so
+        # the bus itself waits for their tokens, which come last; in a directory it knows whose.
+        "open/return_conditions": {"connect_scouted": not local, "declares": False},
+        "listen/endpoints": listen,
+        "connect/endpoints": connect,
+        "connect/timeout_ms": patience_ms if config.mode == "client" else -1,
+        "connect/retry": {"period_init_ms": 20, "period_max_ms": 2000, "period_increase_factor": 2},
+        "transport/link/tx/lease": round(config.lease_s * 1000),
+        # Frames have pools of their own (see `pool`).
+        "transport/shared_memory/transport_optimization/enabled": False,
+    }
+    if local:
+        chosen["transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments"] = FRAGMENT_WAIT_US
+    return {**chosen, **config.options}
+
+
+def open_session(config: ZenohConfig, chosen: dict[str, Any]) -> zenoh.Session:
+    """Blocks for at most the configuration's patience. MeshError, ConfigError."""
+    settings = zenoh.Config()
+    for path, value in chosen.items():
+        try:
+            settings.insert_json5(path, json.dumps(value))
+        except zenoh.ZError as error:
+            raise ConfigError(f"mesh of {config.name}: option {path} = {value!r}: {error}") from error
+    try:
+        return zenoh.open(settings)
+    except zenoh.ZError as error:
+        if config.mode == "client":
+            raise no_mesh(config) from error
+        raise MeshError(f"mesh of {config.name} at {config.where}: {error}") from error
+
+
+def close_session(session: zenoh.Session) -> None:
+    session.close()  # type: ignore[no-untyped-call]
+
+
+async def in_thread(work: Callable[[], T], undo: Callable[[T], None] | None = None) -> T:
+    """Await work that blocks, in a daemon thread, so that it cannot keep the process from ending.
+    Work that nobody waits for any more when it is done is undone."""
+    loop = asyncio.get_running_loop()
+    future: asyncio.Future[T] = loop.create_future()
+
+    def hand_over(result: T | None, error: BaseException | None) -> None:
+        if future.cancelled():
+            if error is None and undo is not None:
+                undo(cast(T, result))
+        elif error is not None:
+            future.set_exception(error)
+        else:
+            future.set_result(cast(T, result))
+
+    def run() -> None:
+        result: T | None = None
+        error: BaseException | None = None
+        try:
+            result = work()
+        except BaseException as raised:
+            error = raised
+        with contextlib.suppress(RuntimeError):  # the loop has been closed
+            loop.call_soon_threadsafe(hand_over, result, error)
+
+    threading.Thread(target=run, name="mesh", daemon=True).start()
+    return await future
+
+
+class ExitGuard:
+    """Sessions that the program forgot to close: zenoh must not call back into an interpreter that ends."""
+
+    def __init__(self) -> None:
+        self._leaves: set[Callable[[], None]] = set()
+        atexit.register(self._leave_all)
+
+    def add(self, leave: Callable[[], None]) -> None:
+        self._leaves.add(leave)
+
+    def discard(self, leave: Callable[[], None]) -> None:
+        self._leaves.discard(leave)
+
+    def _leave_all(self) -> None:
+        threads = [threading.Thread(target=leave, daemon=True) for leave in list(self._leaves)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join(LEAVE_S)
+
+
+exit_guard = ExitGuard()
