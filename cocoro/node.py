@@ -17,6 +17,7 @@ from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine
 from typing import Any, Generic, TypeVar
 
 import msgspec
+import numpy as np
 
 from cocoro import topics
 from cocoro.bus.base import Bus, Handle, Payload, Reply
@@ -53,7 +54,7 @@ class Publisher(Generic[M]):
         self.newest_stamp_ns: int | None = None
         self._raw = bus.publisher(key, topic.qos)
         self._incarnation = bus.new_incarnation()
-        self._encoder = msgspec.msgpack.Encoder()
+        self._encoder = msgspec.msgpack.Encoder(enc_hook=_plain)
         self._clock = clock
 
     def put(self, message: M, stamp_ns: int | None = None) -> M:
@@ -374,6 +375,13 @@ class Stepper:
             record = StepRecord(now_ns=now_ns, core=self._name, consumed=consumed, produced=tuple(produced))
             node.publish(STEPS.of(node.name), record)
         return len(produced)
+
+
+def _plain(value: object) -> object:
+    """NumPy's scalars as Python's, so that a component's author need not think of it."""
+    if isinstance(value, np.generic):
+        return value.item()
+    raise TypeError(f"a {type(value).__name__} cannot be sent")
 
 
 def _understand(request: Request[Q, R], reply: Reply) -> R:

@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-from cocoro.picture import save_picture
+from cocoro.objects import Catalogue
+from cocoro.picture import draw, save_png
 
 from cocoro import topics
 from cocoro.bus.local import LocalMesh
@@ -189,7 +190,7 @@ class _Rehearsal:
 
     def _take_picture(self) -> None:
         if self._frame is not None and self._request.picture is not None:
-            save_picture(Path(self._request.picture), self._frame, self._seen)
+            save_png(draw(self._frame, self._seen, Catalogue.load()), Path(self._request.picture))
 
     def _result(self, state: TaskState) -> dict[str, Any]:
         request = self._request

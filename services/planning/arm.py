@@ -130,7 +130,7 @@ class ArmController:
         have = self._reacher.pose(self._reference)
         waypoint = have.towards(goal, speed_mps * dt_s, 1.0 * dt_s)
         trial = dict(self._reference)
-        trial.update(zip(ARM, self._reacher.step(self._reference, waypoint), strict=True))
+        trial.update(zip(ARM, self._reacher.step(self._reference, waypoint).tolist(), strict=True))
         limit = 2.5 * dt_s
         for name in ARM:
             change = trial[name] - self._reference[name]

@@ -247,7 +247,8 @@ class Reach:
             assert target is not None
             grasp = limbs.reachability.grasp(target.position_m)
         head = scene.look_at(target.position_m) if target is not None else None
-        if not self._inserting:
+        closing_in = self._inserting
+        if not closing_in:
             arm = limbs.arm.reach(grasp.behind, config.arm.hand_speed_mps, scene.angles, scene.dt_s)
             ready = arm.left < self.CLOSE_IN_M and scene.senses.hand is not None
             if ready and scene.senses.hand is not None and limbs.grip.opened(scene.senses.hand):
@@ -261,7 +262,7 @@ class Reach:
         plan = Plan(scene.stand(), arm, why, head, distance_m=arm.left)
         if arm.blocked:
             plan.state, plan.reason, plan.why = "failed", "blocked", "the hand's way is blocked"
-        elif self._inserting and arm.arrived:
+        elif closing_in and arm.arrived:
             limbs.grasp_height_m = grasp.around.height_m
             plan.state, plan.why = "done", "the target is between the claws"
         return plan

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-
 from cocoro.messages import ServoCommand, ServoState
 from cocoro.robot import Robot
 from services.planning.config import Hand

@@ -111,7 +111,7 @@ class TargetMemory:
         position = _moved(track, age_s, self._config.velocity_fade_s)
         return TargetEstimate(
             label=label,
-            position_m=body.inverse().apply(position),
+            position_m=body.inverse().apply(position.tolist()),
             velocity_mps=(float(track.velocity_mps[0]), float(track.velocity_mps[1]), float(track.velocity_mps[2])),
             sigma_m=float(hypot(track.sigma_m, 0.01 * age_s)),
             age_s=age_s,

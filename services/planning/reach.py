@@ -109,7 +109,7 @@ class Reacher:
         """Joint angles for a hand pose, found from nearby ones; None when it is out of reach (5 mm, 3 degrees)."""
         trial = dict(angles)
         for _ in range(60):
-            trial.update(zip(ARM, self.step(trial, pose), strict=True))
+            trial.update(zip(ARM, self.step(trial, pose).tolist(), strict=True))
             have = self.pose(trial)
             off_m = float(np.linalg.norm(self.point(have) - self.point(pose)))
             if off_m < 0.002 and abs(have.pitch_rad - pose.pitch_rad) < 0.02:

@@ -60,7 +60,7 @@ class Senses:
             detections = self._waiting.popleft()
             pose = self._odometry.at(detections.stamp_ns, self._gap_ns)
             if pose is not None:
-                self._remember(detections, Pose2(*pose))
+                self._remember(detections, Pose2(*pose.tolist()))
             elif now_ns - detections.stamp_ns < _WAIT_FOR_ODOMETRY_NS:
                 self._waiting.append(detections)
 
@@ -77,7 +77,7 @@ class Senses:
     def body(self) -> Pose2 | None:
         """The body's newest pose in the odometry frame."""
         newest = self._odometry.newest
-        return Pose2(*newest[1]) if newest else None
+        return Pose2(*newest[1].tolist()) if newest else None
 
     def missing(self, now_ns: int) -> str:
         """Which state is missing or too old to move on ('' when all are fresh)."""
