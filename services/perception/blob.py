@@ -18,7 +18,7 @@ from services.perception.colours import Classes, ColourTable
 from services.perception.config import Config
 from services.perception.image import Box, RgbdImage
 from services.perception.region import Mask, Region, components
-from services.perception.shapes import area_range_m2, reach_m
+from services.perception.shapes import area_range_m2, counted_px, reach_m
 from services.perception.sighting import Sighting
 
 NEAREST_M = 0.3
@@ -81,7 +81,7 @@ class _Fit:
         self.largest_split_px = 0.75 * image.width
 
     def _pixels(self, area_m2: float, depth_m: float) -> float:
-        return area_m2 * self._focal2 / (depth_m + self._inwards_m) ** 2
+        return counted_px(area_m2 * self._focal2 / (depth_m + self._inwards_m) ** 2)
 
     def _diagonal_px(self, depth_m: float) -> float:
         return MAX_STRETCH * 2 * self._reach_m * sqrt(self._focal2) / depth_m + 4

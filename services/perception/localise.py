@@ -14,7 +14,7 @@ from cocoro.messages import Detection, Vec3
 from cocoro.objects import Catalogue, KnownObject
 from cocoro.robot import Camera, Robot
 from services.perception.region import depth_doubt_m
-from services.perception.shapes import reach_m, seen_area_m2, signed_distance
+from services.perception.shapes import counted_px, distance_from, reach_m, seen_area_m2, signed_distance
 from services.perception.sighting import Evidence, Sighting
 
 Array = NDArray[np.float64]
@@ -24,7 +24,9 @@ SETTLED_M = 2e-5
 MIN_SURFACE_POINTS = 12
 PRIOR_M = 0.05
 """How far the first guess, the surface pushed inwards, may be off; it settles only what no evidence does."""
-RAY_SAMPLES = 7
+RAY_SAMPLES = 5
+RAY_DOUBT_M, RAY_DOUBT_RAD = 0.001, 0.002
+"""How far the outline may be off: at a distance about a pixel."""
 HUBER = 1.5
 
 
@@ -57,7 +59,7 @@ class Localiser:
             position = float(centre[0]), float(centre[1]), float(centre[2])
             if sighting.cut:
                 note = "cut"
-            elif sighting.area_px < self._occluded_share * expected_area_px(known, centre, camera, pose):
+            elif sighting.area_px < self._occluded_share * counted_px(expected_area_px(known, centre, camera, pose)):
                 note = "occluded"
         return Detection(
             label=sighting.label,
@@ -86,56 +88,67 @@ def first_guess(known: KnownObject, surface_m: Array, pose: Array) -> Array:
 def fit_centre(known: KnownObject, evidence: Evidence, pose: Array, start: Array) -> Array:
     """The centre, body frame, of the upright shape that goes best with the evidence, shape (3,).
 
-    Gauss-Newton on signed distances: surface points want distance 0, each against its depth's doubt and with
-    Huber weights; a ray wants not to enter the shape before the depth it is free to. Derived.
+    Gauss-Newton on signed distances, with Huber weights: surface points want distance 0, each against its
+    depth's doubt; a ray of the outline wants to meet the shape; a ray beside it wants not to enter the shape
+    before the depth that it is free to. The latter two are one-sided. Derived.
     """
     rotation, origin = pose[:3, :3], pose[:3, 3]
     surface = evidence.surface_m @ rotation.T + origin
     surface_sigma = depth_doubt_m(evidence.surface_m[:, 2])
-    directions = evidence.rays @ rotation.T
-    ray_sigma = 0.002 + 0.003 * evidence.free_to_m.clip(0.0, 4.0)
-    axis = rotation[:, 2]
-    reach = reach_m(known)
+    rays = _Rays(known, evidence, rotation, origin, start)
+    ray_sigma = RAY_DOUBT_M + RAY_DOUBT_RAD * float((start - origin) @ rotation[:, 2])
     centre = start.copy()
     for _ in range(ITERATIONS):
         distance, gradient = signed_distance(known, surface - centre)
-        residual = distance / surface_sigma
-        weight = HUBER / np.maximum(np.abs(residual), HUBER)
-        rows = -gradient / surface_sigma[:, None]
-        hessian = (rows * weight[:, None]).T @ rows + np.eye(3) / PRIOR_M**2
-        slope = rows.T @ (weight * residual) + (centre - start) / PRIOR_M**2
-
-        inside, inside_gradient, which = _intrusions(known, centre, directions, evidence, origin, axis, reach)
-        if len(inside):
-            rows = -inside_gradient / ray_sigma[which, None]
-            residual = inside / ray_sigma[which]
-            weight = HUBER / np.maximum(np.abs(residual), HUBER)
-            hessian += (rows * weight[:, None]).T @ rows
-            slope += rows.T @ (weight * residual)
-
-        move = -np.linalg.solve(hessian, slope)
+        ray_distance, ray_gradient = rays.misses(centre)
+        residual = np.concatenate([distance / surface_sigma, ray_distance / ray_sigma])
+        rows = np.concatenate([gradient / -surface_sigma[:, None], ray_gradient / -ray_sigma])
+        weighted = rows * (HUBER / np.maximum(np.abs(residual), HUBER))[:, None]
+        move = np.linalg.solve(
+            weighted.T @ rows + np.eye(3) / PRIOR_M**2, -weighted.T @ residual - (centre - start) / PRIOR_M**2
+        )
         centre = centre + move
         if float(np.abs(move).max()) < SETTLED_M:
             break
     return centre
 
 
-def _intrusions(
-    known: KnownObject, centre: Array, directions: Array, evidence: Evidence, origin: Array, axis: Array, reach: float
-) -> tuple[Array, Array, NDArray[np.intp]]:
-    """Of the free rays that enter the shape: how deep (negative, (m,)), the gradient there (m, 3), and which rays."""
-    depth = float((centre - origin) @ axis)
-    start, end = depth - reach, np.minimum(depth + reach, evidence.free_to_m)
-    steps = np.linspace(0.0, 1.0, RAY_SAMPLES)
-    along = start + (np.maximum(end, start) - start)[:, None] * steps
-    points = origin + directions[:, None, :] * along[:, :, None] - centre
-    distance, gradient = signed_distance(known, points.reshape(-1, 3))
-    distance = distance.reshape(along.shape)
-    deepest = distance.argmin(axis=1)
-    every = np.arange(len(deepest))
-    which = np.nonzero(distance[every, deepest] < 0)[0]
-    chosen = gradient.reshape(*along.shape, 3)[which, deepest[which]]
-    return distance[which, deepest[which]], chosen, which
+class _Rays:
+    """The evidence's rays, and by how much each contradicts a centre of the shape.
+
+    Along a ray the distance from a convex shape is convex: a coarse look once, then a fine one around the place
+    that was nearest before, which follows the centre as it moves.
+    """
+
+    def __init__(self, known: KnownObject, evidence: Evidence, rotation: Array, origin: Array, start: Array) -> None:
+        self._known = known
+        self._origin = origin
+        self._directions = np.concatenate([evidence.outline, evidence.beside]) @ rotation.T
+        self._meeting = len(evidence.outline)
+        self._free_to = np.concatenate([np.full(self._meeting, np.inf), evidence.free_to_m])
+        length = np.linalg.norm(self._directions, axis=1)
+        steps = np.linspace(-1.0, 1.0, RAY_SAMPLES) * reach_m(known) / length[:, None]
+        self._depth = self._nearest((self._directions @ (start - origin) / length**2)[:, None] + steps, start - origin)
+        self._fine_steps = steps * 1.5 / (RAY_SAMPLES - 1)
+
+    def misses(self, centre: Array) -> tuple[Array, Array]:
+        """For each ray a distance (n,) and its gradient (n, 3): by how much a ray of the outline passes the shape, or
+        (negative) how deep a ray beside enters it; zero where a ray agrees."""
+        to_centre = centre - self._origin
+        self._depth = self._nearest(self._depth[:, None] + self._fine_steps, to_centre)
+        distance, gradient = signed_distance(self._known, self._depth[:, None] * self._directions - to_centre)
+        agrees = distance > 0.0
+        agrees[: self._meeting] ^= True
+        distance[agrees] = 0.0
+        gradient[agrees] = 0.0
+        return distance, gradient
+
+    def _nearest(self, depths: Array, to_centre: Array) -> Array:
+        """Of the points at these depths (n, samples) on each ray the nearest one's depth, (n,)."""
+        depths = np.minimum(depths, self._free_to[:, None])
+        points = depths[:, :, None] * self._directions[:, None, :] - to_centre
+        nearest: Array = depths[np.arange(len(depths)), distance_from(self._known, points).argmin(axis=1)]
+        return nearest
 
 
 def expected_area_px(known: KnownObject, centre: Array, camera: Camera, pose: Array) -> float:

@@ -25,8 +25,8 @@ NEARER_SHARE = 0.12
 UNKNOWN_SHARE = 0.45
 """Of a region's outline: next to something nearer, or next to no data (too near to be measured; an infrared shadow
 alone is less), for more of the object to be hidden there."""
-MAX_SURFACE_POINTS = 240
-MAX_RAYS = 80
+MAX_SURFACE_POINTS = 180
+MAX_RAYS = 60
 
 
 def depth_doubt_m(depth_m: Any) -> Any:
@@ -131,10 +131,11 @@ class Region:
         inside = (core if np.count_nonzero(core) > self.area_px // 2 else self.mask) > 0
         window_m = 1.5 * reach_m + depth_doubt_m(self.depth_m)
         on_surface = inside & (np.abs(self.depth - np.float32(self.depth_m)) < window_m)
-        rays = self._rays(on_surface, MAX_SURFACE_POINTS)
+        surface = self._rays(on_surface, MAX_SURFACE_POINTS)
         around = self._rays(self.surroundings & np.isfinite(self.depth), MAX_RAYS)
         free_to_m = around[:, 3] - 0.01 - depth_doubt_m(around[:, 3])
-        return Evidence(rays[:, :3] * rays[:, 3:], around[:, :3], free_to_m)
+        outline = self._rays((self.mask > 0) & (core == 0), MAX_RAYS)
+        return Evidence(surface[:, :3] * surface[:, 3:], outline[:, :3], around[:, :3], free_to_m)
 
     def _rays(self, where: Bools, at_most: int) -> NDArray[np.float64]:
         """Directions with z = 1, and depth, of some of the pixels; (n, 4)."""

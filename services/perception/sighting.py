@@ -19,10 +19,12 @@ class Evidence:
 
     surface_m: Points
     """Points on its visible surface, (n, 3)."""
-    rays: Points
+    outline: Points
+    """Directions (k, 3), z = 1, of its outermost pixels: each ray meets the object."""
+    beside: Points
     """Directions (m, 3), z = 1, of pixels just outside of its outline whose depth is known."""
     free_to_m: Points
-    """How far along the optical axis each ray is known to pass through nothing, (m,)."""
+    """How far along the optical axis each ray beside is known to pass through nothing, (m,)."""
 
 
 @dataclass(frozen=True)
