@@ -275,11 +275,13 @@ class Close:
         self._since_ns: int | None = None
 
     def step(self, scene: Scene) -> Plan:
-        scene.limbs.grip.close()
+        hand = scene.senses.hand
         if self._since_ns is None:
             self._since_ns = scene.now_ns
+            scene.limbs.grip.close()
         plan = Plan(scene.stand(), scene.still(), "closing the claws")
-        if scene.holding:
+        if scene.holding and hand is not None:
+            scene.limbs.grip.clamp(hand)
             plan.state, plan.why = "done", "the claws hold something"
         elif (scene.now_ns - self._since_ns) / 1e9 > scene.limbs.config.hand.give_up_s:
             plan.state, plan.reason, plan.why = "failed", "no_grip", "the claws closed on nothing"
@@ -299,7 +301,6 @@ class Lift:
 
     def step(self, scene: Scene) -> Plan:
         limbs, config = scene.limbs, scene.limbs.config.arm
-        limbs.grip.close()
         if self._start is None:
             self._start = limbs.reacher.pose(scene.angles)
         top_m = limbs.grasp_height_m + config.carry_rise_m

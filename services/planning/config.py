@@ -80,8 +80,10 @@ class Arm(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 class Hand(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     open_rad: Positive = 0.42
-    squeeze_rad: Positive = 0.30
-    """Past where the claws would touch a target, so that they press on it."""
+    close_rad: Positive = 0.30
+    """How far the claws close on nothing: well past where they would touch a target."""
+    clamp_rad: Positive = 0.10
+    """How far past where it was stopped each claw pushes on."""
     speed_radps: Positive = 1.2
     grip_load: Positive = 0.25
     """Share of the stall torque, closing, at which a stopped claw is held to have something."""

@@ -10,23 +10,34 @@ CLAWS = ("claw_left", "claw_right")
 
 
 class Grip:
+    """Commands the claws, each by its opening angle, and feels what they hold.
+
+    Closing goes past contact at full torque. Once something has stopped the claws, `clamp` sets each claw's goal a
+    fixed angle past where it stopped: within the servos' compliance slope the torques then balance, and what is held stays
+    where it was grasped instead of drifting with the pair.
+    """
+
     def __init__(self, robot: Robot, config: Hand) -> None:
         self._config = config
         self._opens = robot.claw.open_sign
-        self.goal_rad: float | None = None
-        """Opening angle that is commanded to both claws; None leaves them as they are."""
+        self._goals: dict[str, float] | None = None
         self._held_since_ns: int | None = None
 
     def open(self) -> None:
-        self.goal_rad = self._config.open_rad
+        self._goals = dict.fromkeys(CLAWS, self._config.open_rad)
 
     def close(self) -> None:
-        """Close on whatever is there: past contact, so that the claws press."""
-        self.goal_rad = -self._config.squeeze_rad
+        self._goals = dict.fromkeys(CLAWS, -self._config.close_rad)
+
+    def clamp(self, hand: ServoState) -> None:
+        """Hold what has stopped the claws."""
+        self._goals = {
+            name: angle - self._config.clamp_rad for name, angle in zip(CLAWS, self.opening(hand), strict=True)
+        }
 
     def keep(self) -> None:
         """Leave the claws as they are."""
-        self.goal_rad = None
+        self._goals = None
 
     def command(self, roll_rad: float | None) -> ServoCommand:
         joints: list[str] = []
@@ -36,11 +47,10 @@ class Grip:
             joints.append("wrist_roll")
             goals.append(roll_rad)
             speeds.append(2.5)
-        if self.goal_rad is not None:
-            for name in CLAWS:
-                joints.append(name)
-                goals.append(self._opens[name] * self.goal_rad)
-                speeds.append(self._config.speed_radps)
+        for name, opening in (self._goals or {}).items():
+            joints.append(name)
+            goals.append(self._opens[name] * opening)
+            speeds.append(self._config.speed_radps)
         return ServoCommand(joints=tuple(joints), goal_rad=tuple(goals), speed_radps=tuple(speeds))
 
     def opening(self, hand: ServoState) -> tuple[float, float]:
@@ -54,9 +64,7 @@ class Grip:
 
     def feel(self, hand: ServoState, now_ns: int) -> None:
         """Take a measurement; a hold must last to count."""
-        pressed = all(self._pressing(hand, name) for name in CLAWS)
-        stopped_short = sum(self.opening(hand)) > 2 * (0.06 - self._config.squeeze_rad)
-        if pressed and stopped_short:
+        if self._pressed(hand) and sum(self.opening(hand)) > 2 * (0.06 - self._config.close_rad):
             if self._held_since_ns is None:
                 self._held_since_ns = now_ns
         else:
@@ -66,7 +74,10 @@ class Grip:
         """The claws have been stopped by something for long enough."""
         return self._held_since_ns is not None and (now_ns - self._held_since_ns) / 1e9 >= self._config.settle_s
 
-    def _pressing(self, hand: ServoState, name: str) -> bool:
-        i = hand.joints.index(name)
-        closing_load = -self._opens[name] * hand.load[i]
-        return closing_load >= self._config.grip_load and abs(hand.speed_radps[i]) < 0.25
+    def _pressed(self, hand: ServoState) -> bool:
+        """Both claws push inwards, and nothing gives way between them: they may swing together, not close."""
+        loads = dict(zip(hand.joints, hand.load, strict=True))
+        speeds = dict(zip(hand.joints, hand.speed_radps, strict=True))
+        pushing = all(-self._opens[name] * loads[name] >= self._config.grip_load for name in CLAWS)
+        closing_radps = -sum(self._opens[name] * speeds[name] for name in CLAWS)
+        return pushing and abs(closing_radps) < 0.3
