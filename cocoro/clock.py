@@ -6,6 +6,7 @@ A clock that jumps back starts a new epoch; whoever keeps ages, histories or dea
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import time
 from typing import Protocol
 
@@ -20,7 +21,8 @@ class Clock(Protocol):
     def now_ns(self) -> int: ...
 
     async def sleep_until(self, when_ns: int) -> bool:
-        """Wait for a time. False when a new epoch began instead: the deadline has lost its meaning."""
+        """Wait for a time. False when a new epoch began instead: the deadline has lost its meaning.
+        Others get their turn even when the time has passed already."""
 
 
 async def sleep(clock: Clock, seconds: float) -> bool:
@@ -54,11 +56,12 @@ class RealClock:
 
     async def sleep_until(self, when_ns: int) -> bool:
         epoch = self.epoch
+        await asyncio.sleep(0)
         while (left_ns := when_ns - self.now_ns()) > 0:
-            await asyncio.sleep(min(left_ns / NS, 1.0))
-            if self.epoch != epoch:
+            if self._epoch != epoch:
                 return False
-        return True
+            await asyncio.sleep(min(left_ns / NS, 1.0))
+        return self._epoch == epoch
 
 
 class VirtualClock:
@@ -141,12 +144,12 @@ class FollowedClock:
     async def sleep_until(self, when_ns: int) -> bool:
         await self.wait_started()
         epoch = self._epoch
-        while (left_ns := when_ns - self.now_ns()) > 0:
+        await asyncio.sleep(0)
+        while (left_ns := when_ns - self.now_ns()) > 0 and self._epoch == epoch:
             reachable_ns = self._tick_ns + self._run_on_ns - self.now_ns()
-            if left_ns <= reachable_ns:
-                await asyncio.sleep(left_ns / NS / self._rate)
-            else:
-                await self._ticked.wait()
-            if self._epoch != epoch:
-                return False
-        return True
+            # A tick may say that time goes faster than it seemed, so it always ends the wait.
+            wait_s = left_ns / NS / self._rate if left_ns <= reachable_ns else None
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(wait_s):
+                    await self._ticked.wait()
+        return self._epoch == epoch

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import heapq
+import math
 import selectors
 from collections.abc import Callable, Coroutine
 from typing import Any, TypeVar
@@ -50,6 +51,7 @@ class VirtualTimeLoop(asyncio.SelectorEventLoop):
     """See the module. `time()` starts at 0."""
 
     _scheduled: list[asyncio.TimerHandle]
+    _check_closed: Callable[[], None]
 
     def __init__(self) -> None:
         selector = _Selector()
@@ -57,7 +59,7 @@ class VirtualTimeLoop(asyncio.SelectorEventLoop):
         selector.loop = self
         self._virtual_s = 0.0
         self._orders = 0
-        self._clock_resolution = 1e-9
+        self._clock_resolution = math.ulp(0.0)
 
     def time(self) -> float:
         return self._virtual_s
@@ -66,10 +68,13 @@ class VirtualTimeLoop(asyncio.SelectorEventLoop):
         """Jump to the next timer's deadline."""
         if self._scheduled:
             self._virtual_s = max(self._virtual_s, self._scheduled[0].when())
+            # The loop runs what is due before `time + resolution`: with one ulp, this deadline and none after it.
+            self._clock_resolution = math.ulp(self._virtual_s)
 
     def call_at(  # type: ignore[override] # the stubs type the arguments as a tuple variable
         self, when: float, callback: Callable[..., object], *args: Any, context: Any = None
     ) -> asyncio.TimerHandle:
+        self._check_closed()
         timer = _Timer(when, callback, args, self, context)
         timer.order = self._orders
         self._orders += 1

@@ -8,12 +8,15 @@ from __future__ import annotations
 
 import asyncio
 from collections import defaultdict, deque
-from collections.abc import Callable
+from typing import TypeVar
 
-from cocoro.bus.base import OnAlive, OnSample, Payload, Reply, Server
+from cocoro.bus.answer import answer
+from cocoro.bus.base import Handle, OnAlive, OnSample, Payload, Reply, Server
 from cocoro.bus.keys import matches
-from cocoro.errors import CallTimeoutError, CocoroError
+from cocoro.errors import CallTimeoutError
 from cocoro.topics import Qos
+
+D = TypeVar("D", bound=Handle)
 
 
 class LocalMesh:
@@ -35,7 +38,7 @@ class LocalMesh:
         self._incarnations += 1
         return self._incarnations
 
-    def publish(self, key: str, payload: Payload) -> None:
+    def publish(self, key: str, payload: bytes) -> None:
         hit = self._matching.get(key)
         if hit is None:
             hit = self._matching[key] = [s for s in self.subscriptions if matches(s.keyexpr, key)]
@@ -55,16 +58,6 @@ class LocalMesh:
                     watch.tell(key, self.tokens[key] > 0)
 
 
-class _Closable:
-    def __init__(self, undo: Callable[[], None]) -> None:
-        self._undo: Callable[[], None] | None = undo
-
-    def close(self) -> None:
-        undo, self._undo = self._undo, None
-        if undo is not None:
-            undo()
-
-
 class LocalSubscription:
     """A ring per key between `put` and the loop, as on the real mesh."""
 
@@ -74,34 +67,37 @@ class LocalSubscription:
         self._mesh = mesh
         self._handler: OnSample | None = handler
         self._depth = None if qos is Qos.EVENT else depth
-        self._waiting: dict[str, deque[Payload]] = {}
+        self._waiting: dict[str, deque[tuple[str, bytes]]] = {}
         mesh.subscriptions.append(self)
         mesh.changed()
 
-    def offer(self, key: str, payload: Payload) -> None:
+    def offer(self, key: str, payload: bytes) -> None:
         loop = asyncio.get_running_loop()
         if self._mesh.transport_s > 0:
             loop.call_later(self._mesh.transport_s, self._arrive, key, payload)
         else:
             self._arrive(key, payload)
 
-    def _arrive(self, key: str, payload: Payload) -> None:
-        ring = self._waiting.get(key)
+    def _arrive(self, key: str, payload: bytes) -> None:
+        place = key if self._depth is not None else ""
+        ring = self._waiting.get(place)
         if ring is None:
-            ring = self._waiting[key] = deque()
-        if not ring:
-            asyncio.get_running_loop().call_soon(self._drain, key)
-        if self._depth is not None and len(ring) >= self._depth:
-            ring.popleft()
+            ring = self._waiting[place] = deque(maxlen=self._depth)
+            asyncio.get_running_loop().call_soon(self._drain, place)
+        if len(ring) == self._depth:
             self.skipped += 1
-        ring.append(payload)
+        ring.append((key, payload))
 
-    def _drain(self, key: str) -> None:
-        ring = self._waiting[key]
-        while ring:
-            payload = ring.popleft()
-            if self._handler is not None:
+    def _drain(self, place: str) -> None:
+        for key, payload in self._waiting.pop(place):
+            if self._handler is None:
+                return
+            try:
                 self._handler(key, payload)
+            except Exception as error:
+                asyncio.get_running_loop().call_exception_handler(
+                    {"message": f"the reader of {key} failed", "exception": error}
+                )
 
     def close(self) -> None:
         self._handler = None
@@ -117,7 +113,7 @@ class LocalPublisher:
 
     def put(self, payload: Payload) -> None:
         if self._mesh is not None:
-            self._mesh.publish(self._key, payload)
+            self._mesh.publish(self._key, bytes(payload))
 
     def close(self) -> None:
         self._mesh = None
@@ -127,17 +123,32 @@ class _Serving:
     def __init__(self, bus: LocalBus, key: str, server: Server) -> None:
         self.bus, self.key, self.server = bus, key, server
 
-    async def answer(self, payload: bytes) -> Reply:
-        try:
-            return Reply(self.key, True, bytes(await self.server(self.key, payload)))
-        except CocoroError as error:
-            return Reply(self.key, False, str(error).encode())
+    def close(self) -> None:
+        if self in self.bus.mesh.servers:
+            self.bus.mesh.servers.remove(self)
+
+
+class _Token:
+    def __init__(self, mesh: LocalMesh, key: str) -> None:
+        self._mesh: LocalMesh | None = mesh
+        self._key = key
+        mesh.token(key, +1)
+
+    def close(self) -> None:
+        mesh, self._mesh = self._mesh, None
+        if mesh is not None:
+            mesh.token(self._key, -1)
 
 
 class _Watch:
-    def __init__(self, keyexpr: str, handler: OnAlive) -> None:
+    def __init__(self, mesh: LocalMesh, keyexpr: str, handler: OnAlive) -> None:
         self.keyexpr = keyexpr
+        self._mesh = mesh
         self._handler: OnAlive | None = handler
+        mesh.watchers.append(self)
+        for key, count in mesh.tokens.items():
+            if count > 0 and matches(keyexpr, key):
+                self.tell(key, True)
 
     def tell(self, key: str, alive: bool) -> None:
         asyncio.get_running_loop().call_soon(self._call, key, alive)
@@ -148,6 +159,8 @@ class _Watch:
 
     def close(self) -> None:
         self._handler = None
+        if self in self._mesh.watchers:
+            self._mesh.watchers.remove(self)
 
 
 class LocalBus:
@@ -156,63 +169,49 @@ class LocalBus:
     where = "in this process"
 
     def __init__(self, mesh: LocalMesh) -> None:
-        self._mesh = mesh
-        self._declared: list[_Closable | LocalSubscription | LocalPublisher] = []
+        self.mesh = mesh
+        self._declared: list[Handle] = []
         self._answers: set[asyncio.Task[Reply]] = set()
 
     def new_incarnation(self) -> int:
-        return self._mesh.new_incarnation()
+        return self.mesh.new_incarnation()
 
     def publisher(self, key: str, qos: Qos) -> LocalPublisher:
-        publisher = LocalPublisher(self._mesh, key)
-        self._declared.append(publisher)
-        return publisher
+        return self._keep(LocalPublisher(self.mesh, key))
 
     def subscribe(self, keyexpr: str, qos: Qos, handler: OnSample, *, depth: int) -> LocalSubscription:
-        subscription = LocalSubscription(self._mesh, keyexpr, qos, handler, depth)
-        self._declared.append(subscription)
-        return subscription
+        return self._keep(LocalSubscription(self.mesh, keyexpr, qos, handler, depth))
 
-    def serve(self, key: str, server: Server) -> _Closable:
+    def serve(self, key: str, server: Server) -> Handle:
         serving = _Serving(self, key, server)
-        self._mesh.servers.append(serving)
-        return self._keep(_Closable(lambda: self._mesh.servers.remove(serving)))
+        self.mesh.servers.append(serving)
+        return self._keep(serving)
 
     async def call(self, keyexpr: str, payload: bytes, timeout_s: float) -> list[Reply]:
-        servers = [s for s in self._mesh.servers if matches(keyexpr, s.key)]
-        if not servers:
+        tasks = [s.bus.answer(s, payload) for s in self.mesh.servers if matches(keyexpr, s.key)]
+        if not tasks:
             return []
-        tasks = []
-        for serving in servers:
-            task = asyncio.create_task(serving.answer(bytes(payload)))
-            serving.bus._answers.add(task)
-            task.add_done_callback(serving.bus._answers.discard)
-            tasks.append(task)
-        await asyncio.wait(tasks, timeout=timeout_s)
+        _, unfinished = await asyncio.wait(tasks, timeout=timeout_s)
         replies = [task.result() for task in tasks if task.done() and not task.cancelled()]
-        if not replies:
+        if unfinished and not replies:
             raise CallTimeoutError(f"{keyexpr}: no answer within {timeout_s:g} s")
         return replies
 
-    def declare_alive(self, key: str) -> _Closable:
-        self._mesh.token(key, +1)
-        return self._keep(_Closable(lambda: self._mesh.token(key, -1)))
+    def answer(self, serving: _Serving, payload: bytes) -> asyncio.Task[Reply]:
+        """This participant's part of a call; its end, not the caller's, is what cancels it."""
+        task = asyncio.create_task(answer(serving.server, serving.key, bytes(payload)))
+        self._answers.add(task)
+        task.add_done_callback(self._answers.discard)
+        return task
 
-    def watch_alive(self, keyexpr: str, handler: OnAlive) -> _Closable:
-        watch = _Watch(keyexpr, handler)
-        self._mesh.watchers.append(watch)
-        for key, count in self._mesh.tokens.items():
-            if count > 0 and matches(keyexpr, key):
-                watch.tell(key, True)
+    def declare_alive(self, key: str) -> Handle:
+        return self._keep(_Token(self.mesh, key))
 
-        def undo() -> None:
-            watch.close()
-            self._mesh.watchers.remove(watch)
-
-        return self._keep(_Closable(undo))
+    def watch_alive(self, keyexpr: str, handler: OnAlive) -> Handle:
+        return self._keep(_Watch(self.mesh, keyexpr, handler))
 
     async def alive(self, keyexpr: str, timeout_s: float = 1.0) -> list[str]:
-        return [key for key, count in self._mesh.tokens.items() if count > 0 and matches(keyexpr, key)]
+        return sorted(key for key, count in self.mesh.tokens.items() if count > 0 and matches(keyexpr, key))
 
     def kill(self) -> None:
         """Leave as a killed process does: at once, with requests unanswered."""
@@ -225,6 +224,6 @@ class LocalBus:
     async def close(self) -> None:
         self.kill()
 
-    def _keep(self, closable: _Closable) -> _Closable:
-        self._declared.append(closable)
-        return closable
+    def _keep(self, declared: D) -> D:
+        self._declared.append(declared)
+        return declared
