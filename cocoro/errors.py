@@ -19,3 +19,7 @@ class CallTimeoutError(MeshError):
 
 class RemoteError(CocoroError):
     """The service that was asked answered with an error; the text is the service's own."""
+
+
+class RefusedError(CocoroError):
+    """What was asked cannot be now, because of something that is there already; the text says what."""

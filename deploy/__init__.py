@@ -1,1 +1,1 @@
-"""Profiles, and the supervisor that starts and stops the processes of one."""
+"""Profiles, and the supervisor that starts, watches and stops the processes of one."""

@@ -1,0 +1,239 @@
+"""The commands and their options. What they do is imported when they are called, so that `--help` is quick."""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from cocoro.cli import exits
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    help="Start, command and watch a CoCoRo robot.\n\n"
+    "First `cocoro up sim --detach`, then `cocoro fetch red_can`, at last `cocoro down`.",
+    epilog="Exit codes: 0 done, 1 the task failed, 2 bad usage, 3 refused or cancelled, 4 the mesh is not there.",
+)
+
+TASKS, WATCH, RUNNING, SAFETY = "Tasks", "Watching", "Starting and stopping", "Safety"
+
+Robot = Annotated[str | None, typer.Option(help="Which robot; needed only when several are up here.")]
+Reach = Annotated[
+    str | None,
+    typer.Option("--profile", metavar="PROFILE", help="Reach the robot as this profile says, on another machine."),
+]
+Json = Annotated[bool, typer.Option("--json", help="Print JSON, for scripts.")]
+Set = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="Any setting of the profile: service.sim.seed=3. Repeatable."),
+]
+Latency = Annotated[
+    list[str] | None,
+    typer.Option(metavar="NAME=SECONDS", help="Slow a service down: perception=0.5. Repeatable."),
+]
+Frames = Annotated[str | None, typer.Option(metavar="WxH@HZ", help="The camera's frames: 320x240@15.")]
+Timeout = Annotated[float | None, typer.Option(min=0.1, max=3600.0, metavar="SECONDS", help="Give up after this.")]
+
+
+# --- tasks ----------------------------------------------------------------------------------------
+
+
+def _task(
+    task: str, label: str, robot: str | None, profile: str | None, timeout: float | None, as_json: bool,
+    snapshot: Path | None = None,
+) -> None:  # fmt: skip
+    from cocoro.cli import tasks
+    from cocoro.cli.link import Where
+
+    sys.exit(asyncio.run(tasks.run(Where(robot, profile), task, label, timeout, as_json, snapshot)))
+
+
+@app.command(rich_help_panel=TASKS)
+def fetch(
+    label: Annotated[str, typer.Argument(help="What to fetch; `cocoro objects` lists what the robot knows.")],
+    timeout: Timeout = None,
+    snapshot: Annotated[
+        Path | None, typer.Option(metavar="OUT.png", help="Write what the robot sees when it grasps.")
+    ] = None,
+    robot: Robot = None,
+    profile: Reach = None,
+    json: Json = False,
+) -> None:
+    """Find an object, drive there, grasp it and lift it. Ctrl-C cancels it on the robot."""
+    _task("fetch", label, robot, profile, timeout, json, snapshot)
+
+
+@app.command(rich_help_panel=TASKS)
+def park(timeout: Timeout = None, robot: Robot = None, profile: Reach = None, json: Json = False) -> None:
+    """Fold the arm. Ctrl-C cancels it on the robot."""
+    _task("park", "", robot, profile, timeout, json)
+
+
+@app.command("put-down", rich_help_panel=TASKS)
+def put_down(timeout: Timeout = None, robot: Robot = None, profile: Reach = None, json: Json = False) -> None:
+    """Set down what the hand holds. Ctrl-C cancels it on the robot."""
+    _task("put-down", "", robot, profile, timeout, json)
+
+
+@app.command(rich_help_panel=TASKS)
+def cancel(robot: Robot = None, profile: Reach = None) -> None:
+    """End the running task; the robot stands still."""
+    from cocoro.cli import tasks
+    from cocoro.cli.link import Where
+
+    sys.exit(asyncio.run(tasks.cancel(Where(robot, profile))))
+
+
+@app.command(rich_help_panel=TASKS)
+def rehearse(
+    task: Annotated[str, typer.Argument(help="fetch, park or put-down.")],
+    label: Annotated[str, typer.Argument(help="What to fetch.")] = "",
+    scene: Annotated[str, typer.Option(help="A scene's name, or its file.")] = "paper",
+    seed: Annotated[int, typer.Option(min=0, help="Everything that is drawn comes from it.")] = 0,
+    sensors: Annotated[
+        str, typer.Option(metavar="ideal|real", help="Perfect camera and body, or real ones.")
+    ] = "ideal",
+    latency: Latency = None,
+    lockstep: Annotated[bool, typer.Option("--lockstep", help="One serial cycle over all, as in the paper.")] = False,
+    frames: Frames = None,
+    timeout: Timeout = None,
+    picture: Annotated[
+        Path | None, typer.Option(metavar="OUT.png", help="Write what the robot saw when it grasped.")
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Try a task in simulation: the whole robot in one process, in virtual time."""
+    from cocoro.cli import rehearse as rehearsing
+
+    options = {
+        "task": task, "label": label, "scene": scene, "seed": seed, "sensors": sensors, "lockstep": lockstep,
+        "timeout_s": timeout, "picture": None if picture is None else str(picture),
+    }  # fmt: skip
+    sys.exit(rehearsing.rehearse(options, latency or [], frames, json))
+
+
+# --- watching -------------------------------------------------------------------------------------
+
+
+@app.command(rich_help_panel=WATCH)
+def status(robot: Robot = None, profile: Reach = None, json: Json = False) -> None:
+    """What runs, how it is, what it does and why. Exit code 1 when something that should run does not."""
+    from cocoro.cli import status as telling
+    from cocoro.cli.link import Where
+
+    sys.exit(asyncio.run(telling.status(Where(robot, profile), json)))
+
+
+@app.command(rich_help_panel=WATCH)
+def objects(robot: Robot = None, profile: Reach = None, json: Json = False) -> None:
+    """The objects that the robot knows, and where it saw each last."""
+    from cocoro.cli import objects as listing
+    from cocoro.cli.link import Where
+
+    sys.exit(asyncio.run(listing.objects(Where(robot, profile), json)))
+
+
+@app.command(rich_help_panel=WATCH)
+def snapshot(
+    out: Annotated[Path, typer.Argument(metavar="OUT.png", help="The picture's file.")],
+    robot: Robot = None,
+    profile: Reach = None,
+) -> None:
+    """What the robot sees now, with its detections drawn in."""
+    from cocoro.cli import snapshot as taking
+    from cocoro.cli.link import Where
+
+    sys.exit(asyncio.run(taking.snapshot(Where(robot, profile), out)))
+
+
+@app.command(rich_help_panel=WATCH)
+def topics(
+    markdown: Annotated[bool, typer.Option("--markdown", help="The whole page of the documentation.")] = False,
+    json: Json = False,
+) -> None:
+    """What travels on the mesh: every key, its type, rate, quality of service and publisher."""
+    from cocoro.cli import topics as listing
+
+    print(listing.markdown() if markdown else listing.as_json() if json else listing.table(), end="")
+
+
+# --- starting and stopping ------------------------------------------------------------------------
+
+
+@app.command(rich_help_panel=RUNNING)
+def up(
+    profile: Annotated[str, typer.Argument(help="A profile's name (sim, robot) or file.")] = "sim",
+    detach: Annotated[bool, typer.Option("--detach", "-d", help="Return when the robot is up.")] = False,
+    scene: Annotated[str | None, typer.Option(help="Simulator: a scene's name, or its file.")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Simulator: the seed of all that is drawn.")] = None,
+    sensors: Annotated[str | None, typer.Option(metavar="ideal|real", help="Simulator: perfect or real.")] = None,
+    frames: Frames = None,
+    latency: Latency = None,
+    set_: Set = None,
+) -> None:
+    """Start a robot's processes and stay until Ctrl-C (or, with --detach, until they are ready)."""
+    from cocoro import profiles
+    from cocoro.cli import running
+
+    overrides = running.overrides(scene, seed, sensors, frames, latency or [], set_ or [])
+    read = profiles.read(profile, overrides)
+    sys.exit(running.up_detached(read) if detach else running.up(read))
+
+
+@app.command(rich_help_panel=RUNNING)
+def down(robot: Robot = None) -> None:
+    """Stop a robot's processes. Nothing running is no error."""
+    from cocoro.cli import running
+
+    sys.exit(running.down(robot))
+
+
+@app.command(rich_help_panel=RUNNING)
+def run(
+    process: Annotated[str, typer.Argument(help="A process of the profile, or any other that is installed.")],
+    profile: Annotated[
+        str | None, typer.Option(metavar="PROFILE", help="By default that of the robot that is up here, else sim.")
+    ] = None,
+    set_: Set = None,
+) -> None:
+    """One process in this terminal, on the mesh of the profile. Ctrl-C ends it."""
+    from cocoro.cli import running
+
+    sys.exit(running.run(process, profile, set_ or []))
+
+
+# --- safety ---------------------------------------------------------------------------------------
+
+_CONTEXT = {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}
+
+
+@app.command(rich_help_panel=SAFETY, context_settings=_CONTEXT)
+def estop(context: typer.Context) -> None:
+    """Emergency stop, now: all that moves holds still until `reset`. (`stop` is the same.)"""
+    from cocoro.cli import estop as stopping
+
+    sys.exit(stopping.main("estop", context.args))
+
+
+@app.command(hidden=True, context_settings=_CONTEXT)
+def stop(context: typer.Context) -> None:
+    """The same as estop."""
+    estop(context)
+
+
+@app.command(rich_help_panel=SAFETY)
+def reset(robot: Robot = None, profile: Reach = None) -> None:
+    """Release the emergency stop. The executive may refuse, and says why."""
+    from cocoro.cli import reset as releasing
+    from cocoro.cli.link import Where
+
+    sys.exit(asyncio.run(releasing.reset(Where(robot, profile))))
+
+
+__all__ = ["app", "exits"]

@@ -1,0 +1,157 @@
+"""`up`, `down` and `run`: what starts and ends processes."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import signal
+import subprocess
+import sys
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from cocoro import launch, profiles
+from cocoro.cli import exits
+from cocoro.cli.options import frames_of, latencies_of
+from cocoro.errors import CocoroError, ConfigError
+from cocoro.profiles import Profile
+from cocoro.rundir import RunDir, Target, robots, targets
+
+SUPERVISOR = "deploy.supervisor"
+"""Loaded by name: the API knows nothing of the deployment."""
+STOP_S = 60.0
+"""How long a supervisor may take to stop everything."""
+
+
+def overrides(
+    scene: str | None,
+    seed: int | None,
+    sensors: str | None,
+    frames: str | None,
+    latency: list[str],
+    settings: list[str],
+) -> list[str]:
+    """The options of `up` as settings of the profile. Raises ConfigError."""
+    sim: dict[str, Any] = {}
+    if scene is not None:
+        sim["scene"] = scene_of(scene)
+    if seed is not None:
+        sim["seed"] = seed
+    if sensors is not None:
+        sim["sensors"] = sensors
+    if frames is not None:
+        sim.update(frames_of(frames))
+    found = [f"service.sim.{name}={json.dumps(value)}" for name, value in sim.items()]  # JSON's values are TOML's here
+    found += [f"service.{name}.latency_s={seconds}" for name, seconds in latencies_of(latency).items()]
+    return found + settings
+
+
+def scene_of(scene: str) -> str:
+    """A scene's name as it is; a file's name so that it means the same file from anywhere."""
+    if not scene.endswith(".toml") and os.sep not in scene:
+        return scene
+    if not Path(scene).is_file():
+        raise ConfigError(f"there is no scene file {scene}")
+    return str(Path(scene).resolve())
+
+
+def up(profile: Profile) -> int:
+    """Supervise a robot in the foreground."""
+    run_dir = RunDir(profile.robot)
+    code: int = importlib.import_module(SUPERVISOR).supervise(profile, run_dir, _say, lambda: _say("Ctrl-C stops it"))
+    return code
+
+
+def up_detached(profile: Profile) -> int:
+    """Start a supervisor of its own, and return when the robot is up or could not be started."""
+    run_dir = RunDir(profile.robot)
+    run_dir.make()
+    reader_fd, writer_fd = os.pipe()
+    errors = run_dir.logs / "supervisor.err"
+    with errors.open("wb") as stderr:
+        process = subprocess.Popen(
+            [sys.executable, "-P", "-m", SUPERVISOR, "--run-dir", str(run_dir.path), "--report-fd", str(writer_fd)],
+            stdin=subprocess.PIPE,
+            stdout=stderr,
+            stderr=stderr,
+            pass_fds=(writer_fd,),
+            start_new_session=True,
+        )
+    os.close(writer_fd)
+    assert process.stdin is not None
+    with process.stdin as stdin:
+        stdin.write(msgspec.json.encode(profile))
+    code = None
+    with os.fdopen(reader_fd) as reports:
+        try:
+            for report in map(json.loads, reports):
+                if "line" in report:
+                    _say(report["line"])
+                else:
+                    code = report["code"]
+        except KeyboardInterrupt:
+            process.send_signal(signal.SIGINT)
+            process.wait()
+            return exits.REFUSED
+    if code is None:
+        process.wait()
+        lines = errors.read_text(errors="replace").splitlines()
+        raise CocoroError(f"the supervisor died{f': {lines[-1]}' if lines else ''}; see {errors}")
+    if code != exits.DONE:
+        process.wait()
+    return int(code)
+
+
+def down(robot: str | None) -> int:
+    """Stop one robot, or all that are up on this machine."""
+    chosen = [RunDir(robot)] if robot is not None else [r for r in robots() if r.supervisor() or r.claims()]
+    stopped = [_stop(run_dir) for run_dir in chosen]
+    if not any(stopped):
+        _say(f"{robot or 'nothing'} was not up" if robot else "nothing was up")
+    return exits.DONE
+
+
+def _stop(run_dir: RunDir) -> bool:
+    """Whether there was something to stop."""
+    found = False
+    with closing(Target(run_dir.path / "supervisor")) as supervisor:
+        if supervisor.pid is not None:
+            found = True
+            supervisor.signal(signal.SIGTERM)
+            if not supervisor.wait(STOP_S):
+                _say(f"{run_dir.robot}: the supervisor (pid {supervisor.pid}) does not end: killed")
+                supervisor.signal(signal.SIGKILL)
+                supervisor.wait(STOP_S)
+    for target in targets(run_dir):  # what a killed supervisor left, or was started by `run`
+        with closing(target):
+            found = found or target.pid is not None
+            target.signal(signal.SIGTERM)
+            if not target.wait(launch.ORPHAN_S):
+                target.signal(signal.SIGKILL)
+                target.wait(launch.ORPHAN_S)
+    if found:
+        _say(f"{run_dir.robot} is down")
+    return found
+
+
+def run(process: str, profile: str | None, settings: list[str]) -> int:
+    """One process in the foreground."""
+    if profile is None and not settings and (up_here := robots()):
+        if len(up_here) > 1:
+            raise ConfigError(f"several robots are up ({', '.join(r.robot for r in up_here)}): say --profile")
+        data = up_here[0].resolved()
+        read = profiles.from_data(data, data.get("name", "")) if data else profiles.read("sim")
+    else:
+        read = profiles.read(profile or "sim", settings)
+    run_dir = RunDir(read.robot)
+    run_dir.make()
+    launch.set_up_logging(process)
+    return launch.run(process, run_dir, msgspec.to_builtins(read), read.name)
+
+
+def _say(text: str) -> None:
+    print(text, flush=True)

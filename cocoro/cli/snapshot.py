@@ -1,0 +1,77 @@
+"""A picture of what the robot sees: a frame with the detections that were made in that very frame."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import OrderedDict
+from pathlib import Path
+
+from cocoro.cli import exits
+from cocoro.cli.link import Link, Where, joined, within
+from cocoro.errors import ConfigError, MeshError
+from cocoro.messages import Detections, Frame
+from cocoro.topics import DETECTIONS, FRAME
+
+KEPT_FRAMES = 45
+"""Frames that wait for their detections: perception may be that far behind."""
+FRAME_S = 5.0
+DETECTIONS_S = 3.0
+"""How long to wait for a frame at all, and for what was detected in one."""
+
+
+async def snapshot(where: Where, out: Path) -> int:
+    if out.suffix.lower() != ".png":
+        raise ConfigError(f"{out}: the picture is a PNG, so let its name end with .png")
+    async with joined(where) as link:
+        print(await Snapshot(link).take(out))
+    return exits.DONE
+
+
+class Snapshot:
+    """Takes one picture of the robot's sight."""
+
+    def __init__(self, link: Link) -> None:
+        self._link = link
+        self._frames: OrderedDict[tuple[int, int], Frame] = OrderedDict()
+        self._pair: tuple[Frame, Detections] | None = None
+        self._changed = asyncio.Event()
+
+    async def take(self, out: Path) -> str:
+        """Write the picture; returns in words what it shows. Raises MeshError when the robot sends no frames."""
+        inboxes = (self._link.inbox(FRAME), self._link.inbox(DETECTIONS))
+        inboxes[0].add(lambda _key, frame: self._on_frame(frame))
+        inboxes[1].add(lambda _key, detections: self._on_detections(detections))
+        try:
+            if not await within(FRAME_S, lambda: bool(self._frames), self._changed):
+                raise MeshError(f"no frame from the camera within {FRAME_S:g} s: `cocoro status` tells more")
+            paired = await within(DETECTIONS_S, lambda: self._pair is not None, self._changed)
+        finally:
+            for inbox in inboxes:
+                assert inbox.subscription is not None
+                inbox.subscription.close()
+        frame, detections = self._pair if paired and self._pair else (next(reversed(self._frames.values())), None)
+        _write(out, frame, detections)
+        if detections is None:
+            return f"{out}: {frame.width} x {frame.height}, without detections (perception is silent)"
+        labels = ", ".join(sorted(detection.label for detection in detections.detections)) or "nothing known"
+        return f"{out}: {frame.width} x {frame.height}, {labels}"
+
+    def _on_frame(self, frame: Frame) -> None:
+        if self._pair is None:
+            self._frames[frame.incarnation, frame.seq] = frame
+            while len(self._frames) > KEPT_FRAMES:
+                self._frames.popitem(last=False)
+            self._changed.set()
+
+    def _on_detections(self, detections: Detections) -> None:
+        frame = self._frames.get((detections.frame_incarnation, detections.frame_seq))
+        if frame is not None and self._pair is None:
+            self._pair = (frame, detections)
+            self._changed.set()
+
+
+def _write(out: Path, frame: Frame, detections: Detections | None) -> None:
+    from cocoro import picture  # brings the image library
+    from cocoro.objects import Catalogue
+
+    picture.save_png(picture.draw(frame, detections, Catalogue.load()), out)

@@ -1,0 +1,161 @@
+"""`fetch`, `park`, `put-down` and `cancel`: ask the executive, follow the task to its outcome, say it."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import cast
+
+import msgspec
+
+from cocoro.cli import exits
+from cocoro.cli.link import Link, Where, joined
+from cocoro.cli.progress import View, view
+from cocoro.cli.snapshot import Snapshot
+from cocoro.errors import CallTimeoutError, CocoroError
+from cocoro.messages import CancelRequest, TaskName, TaskReply, TaskRequest, TaskState
+from cocoro.topics import CANCEL, RUN, TASK
+
+USAGE_REFUSALS = ("unknown_label", "not_graspable", "bad_request")
+"""Refusals that are the operator's mistake, not the robot's state."""
+SNAPSHOT_PHASE = "grasp"
+CANCEL_S = 10.0
+"""How long a cancelled task may take to say its outcome."""
+
+
+async def run(where: Where, task: str, label: str, timeout_s: float | None, as_json: bool, picture: Path | None) -> int:
+    """Run a task to its outcome and return the exit code."""
+    request = TaskRequest(task=cast(TaskName, task), label=label, timeout_s=timeout_s)
+    async with joined(where) as link:
+        follower = Follower(link, request, view(as_json), picture)
+        with _interrupts(follower.interrupt):
+            code, result = await follower.run()
+    if as_json:
+        print(json.dumps(result))
+    return code
+
+
+async def cancel(where: Where) -> int:
+    async with joined(where) as link:
+        reply = await link.call(CANCEL, CancelRequest())
+    if not reply.accepted:
+        print(f"cocoro: refused: {reply.text}", file=sys.stderr)
+        return exits.REFUSED
+    print(reply.text or "cancelled")
+    return exits.DONE
+
+
+class Follower:
+    """One task, from the request to the outcome. `interrupt` cancels it on the robot."""
+
+    def __init__(self, link: Link, request: TaskRequest, view: View, picture: Path | None) -> None:
+        self._link = link
+        self._request = request
+        self._view = view
+        self._picture = picture
+        self._name = f"{request.task} {request.label}".strip()
+        self._task_id = ""
+        self._news: asyncio.Queue[TaskState | None] = asyncio.Queue()
+        """What the executive says; None when it has died."""
+        self._interrupted = asyncio.Event()
+        self._working: list[asyncio.Task[None]] = []
+
+    def interrupt(self) -> None:
+        """The first one cancels the task on the robot, the second one leaves at once."""
+        if self._interrupted.is_set():
+            raise KeyboardInterrupt
+        self._interrupted.set()
+
+    async def run(self) -> tuple[int, dict[str, object]]:
+        """The exit code, and the result as data."""
+        self._link.inbox(TASK).add(
+            lambda _key, state: self._news.put_nowait(state)
+        )  # before the call: nothing is missed
+        alive = self._link.watch_alive("executive", lambda alive: None if alive else self._news.put_nowait(None))
+        snapshot = Snapshot(self._link) if self._picture is not None else None
+        reply = await self._link.call(RUN, self._request)
+        if not reply.accepted:
+            return self._refused(reply)
+        self._task_id = reply.task_id
+        self._working = [asyncio.create_task(self._cancel_when_interrupted())]
+        try:
+            state = await self._follow(snapshot)
+        finally:
+            alive.close()
+            for work in self._working:
+                work.cancel()
+        return self._outcome(state)
+
+    async def _follow(self, snapshot: Snapshot | None) -> TaskState | None:
+        """The task's last state; None when the executive dies before."""
+        while (state := await self._news.get()) is not None:
+            if state.task_id != self._task_id:
+                continue
+            if state.outcome is not None:
+                return state
+            self._view.show(state)
+            if snapshot is not None and state.phase == SNAPSHOT_PHASE:
+                self._working.append(asyncio.create_task(self._take(snapshot)))
+                snapshot = None
+        return None
+
+    async def _take(self, snapshot: Snapshot) -> None:
+        assert self._picture is not None
+        try:
+            self._view.say(await snapshot.take(self._picture))
+        except CocoroError as error:
+            self._view.say(f"no picture: {error}")
+
+    async def _cancel_when_interrupted(self) -> None:
+        await self._interrupted.wait()
+        self._view.say(f"cancelling {self._name} (once more leaves without waiting)")
+        try:
+            reply = await self._link.call(CANCEL, CancelRequest(task_id=self._task_id))
+            if reply.accepted:
+                await asyncio.sleep(CANCEL_S)
+                self._view.say("the task does not end: `cocoro estop` stops the robot")
+            else:
+                self._view.say(f"not cancelled: {reply.text}")
+        except CallTimeoutError:
+            self._view.say("the executive does not answer: `cocoro estop` stops the robot")
+        except CocoroError as error:
+            self._view.say(f"not cancelled: {error}")
+
+    # --- the end ----------------------------------------------------------------------------------
+
+    def _refused(self, reply: TaskReply) -> tuple[int, dict[str, object]]:
+        result = {"task": self._request.task, "label": self._request.label, "outcome": "refused"}
+        print(f"cocoro: refused: {reply.text}", file=sys.stderr)
+        code = exits.USAGE if reply.refusal in USAGE_REFUSALS else exits.REFUSED
+        return code, result | {"reason": reply.refusal, "text": reply.text}
+
+    def _outcome(self, state: TaskState | None) -> tuple[int, dict[str, object]]:
+        if state is None:
+            state = TaskState(
+                task_id=self._task_id, task=self._request.task, label=self._request.label,
+                outcome="failed", reason="executive died",
+            )  # fmt: skip
+        code = {"done": exits.DONE, "failed": exits.FAILED, "cancelled": exits.REFUSED}[state.outcome or "failed"]
+        time = f" {'in' if state.outcome == 'done' else 'after'} {state.elapsed_s:.1f} s" if state.elapsed_s else ""
+        reason = f": {state.reason}" if state.reason and state.outcome != "done" else ""
+        self._view.result(f"{state.outcome}: {self._name}{time}{reason}")
+        return code, msgspec.to_builtins(state)
+
+
+@contextmanager
+def _interrupts(handler: Callable[[], None]) -> Iterator[None]:
+    """Ctrl-C, being told to end and a closed terminal all go to `handler`: a task is not left running by itself."""
+    loop = asyncio.get_running_loop()
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    for number in numbers:
+        loop.add_signal_handler(number, handler)
+    try:
+        yield
+    finally:
+        for number in numbers:
+            loop.remove_signal_handler(number)

@@ -1,0 +1,248 @@
+"""The run directory: what of a robot runs on this machine. One folder a robot, below one place for them all.
+
+    <run>/<robot>/profile.json     the resolved profile of the last start
+                  supervisor       held by the supervisor
+                  claims/<service> held by the process that is that service
+                  logs/            one file a process, of the last starts
+                  (and the mesh's own register, see cocoro.bus.endpoints)
+
+"Held" means locked for as long as its process lives, however that ends: so a process number that is read from a
+held file is that process, and never one that got the number later.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import select
+import signal
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Annotated, Any, Literal, NamedTuple
+
+import msgspec
+from msgspec import Meta
+
+from cocoro.bus.endpoints import ZenohConfig, default, default_run_dir
+from cocoro.bus.members import members
+from cocoro.errors import ConfigError, RefusedError
+
+KEPT_LOGS = 5
+"""Of earlier starts, for each process."""
+
+
+class Mesh(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Where a robot's processes meet: a profile's `[mesh]` table. Without endpoints it is the run directory; the
+    fields are those of `cocoro.bus.endpoints.ZenohConfig`."""
+
+    mode: Literal["peer", "client", "router"] = "peer"
+    listen: tuple[str, ...] = ()
+    connect: tuple[str, ...] = ()
+    lease_s: Annotated[float, Meta(gt=0)] = 4.0
+    patience_s: Annotated[float, Meta(gt=0)] = 1.0
+    options: dict[str, Any] = {}
+
+
+class Holder(NamedTuple):
+    """Who holds a file."""
+
+    name: str
+    pid: int
+
+
+class Held:
+    """A held file. `release` gives it back; so does the end of the process."""
+
+    def __init__(self, fd: int) -> None:
+        self._fd: int | None = fd
+
+    def release(self) -> None:
+        fd, self._fd = self._fd, None
+        if fd is not None:
+            os.close(fd)
+
+
+def hold(path: Path, name: str) -> Held | None:
+    """Hold a file in the name of this process; None when another one holds it."""
+    path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    fd = os.open(path, os.O_CREAT | os.O_RDWR, 0o600)
+    try:
+        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(fd)
+        return None
+    os.ftruncate(fd, 0)
+    os.write(fd, json.dumps({"name": name, "pid": os.getpid()}).encode())
+    return Held(fd)
+
+
+def holder(path: Path) -> Holder | None:
+    """Who holds a file now."""
+    try:
+        fd = os.open(path, os.O_RDONLY)
+    except FileNotFoundError:
+        return None
+    try:
+        fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        try:
+            about = json.loads(os.read(fd, 4096))
+        except ValueError:  # it was taken this very moment
+            return Holder("", 0)
+        return Holder(about["name"], about["pid"])
+    finally:
+        os.close(fd)
+    return None
+
+
+class RunDir:
+    """One robot's folder. Nothing is made until something is written."""
+
+    def __init__(self, robot: str, root: Path | None = None) -> None:
+        self.robot = robot
+        self.root = root or default_run_dir()
+        self.path = self.root / robot
+        self.profile_file = self.path / "profile.json"
+        self.logs = self.path / "logs"
+
+    def make(self) -> None:
+        try:
+            self.path.mkdir(mode=0o700, parents=True, exist_ok=True)
+            self.logs.mkdir(exist_ok=True)
+        except OSError as error:
+            raise ConfigError(
+                f"run directory {self.path}: {error.strerror}; choose another by COCORO_RUN_DIR"
+            ) from error
+
+    # --- who runs ---------------------------------------------------------------------------------
+
+    def hold_supervisor(self, profile: str) -> Held:
+        """Raises RefusedError when the robot is up already."""
+        held = hold(self.path / "supervisor", profile)
+        if held is None:
+            by = self.supervisor()
+            raise RefusedError(
+                f"{self.robot} is up already{f' (profile {by.name}, pid {by.pid})' if by else ''}; "
+                f"`cocoro down --robot {self.robot}` stops it"
+            )
+        return held
+
+    def supervisor(self) -> Holder | None:
+        """Named after its profile."""
+        return holder(self.path / "supervisor")
+
+    def claim(self, process: str, services: Iterable[str]) -> list[Held]:
+        """Be these services, alone on this machine. Raises RefusedError when a process is one of them already."""
+        held: list[Held] = []
+        for service in sorted(services):  # always in one order: of two that start at once, one gets all
+            claim = hold(self.path / "claims" / service, process)
+            if claim is None:
+                by = holder(self.path / "claims" / service)
+                for other in held:
+                    other.release()
+                raise RefusedError(
+                    f"{self.robot} has a {service} already{f' ({by.name}, pid {by.pid})' if by else ''}: "
+                    f"stop that one first"
+                )
+            held.append(claim)
+        return held
+
+    def claims(self) -> dict[str, Holder]:
+        """Each service that a process of this machine is, and which process that is."""
+        found = ((file.name, holder(file)) for file in sorted((self.path / "claims").glob("*")))
+        return {service: by for service, by in found if by is not None and by.pid}
+
+    # --- the mesh ---------------------------------------------------------------------------------
+
+    def join_as(self, name: str, mesh: Mesh | None = None) -> ZenohConfig:
+        """How a process called `name` gets into the mesh that a profile tells of (the last start's by default)."""
+        if mesh is None:
+            mesh = msgspec.convert(self.resolved().get("mesh", {}), Mesh)
+        if not mesh.listen and not mesh.connect:
+            ours = default(self.robot, name, self.root)
+            return replace(ours, lease_s=mesh.lease_s, patience_s=mesh.patience_s, options=mesh.options)
+        fields = msgspec.structs.asdict(mesh)
+        return ZenohConfig(name=name, **fields)
+
+    def resolved(self) -> dict[str, Any]:
+        """The profile of the last start, as data; empty when there was none."""
+        try:
+            return dict(json.loads(self.profile_file.read_bytes()))
+        except (FileNotFoundError, ValueError):
+            return {}
+
+    @property
+    def populated(self) -> bool:
+        """Whether any process of this machine is in the robot's mesh."""
+        return self.supervisor() is not None or bool(members(self.path))
+
+    # --- logs -------------------------------------------------------------------------------------
+
+    def log(self, process: str) -> Path:
+        return self.logs / f"{process}.log"
+
+    def rotate_log(self, process: str) -> Path:
+        """Set the last start's log aside, and forget the oldest."""
+        log = self.log(process)
+        files = [log, *(self.logs / f"{process}.log.{n}" for n in range(1, KEPT_LOGS + 1))]
+        for newer, older in reversed(list(pairwise(files))):
+            with suppress(FileNotFoundError):
+                newer.replace(older)
+        return log
+
+
+def robots(root: Path | None = None) -> list[RunDir]:
+    """The robots of which something runs on this machine."""
+    root = root or default_run_dir()
+    if not root.is_dir():
+        return []
+    found = (RunDir(folder.name, root) for folder in sorted(root.iterdir()) if folder.is_dir())
+    return [run_dir for run_dir in found if run_dir.populated]
+
+
+class Target:
+    """A process to signal: the one that held a file when this was made, or nobody."""
+
+    def __init__(self, path: Path) -> None:
+        self.pid: int | None = None
+        self._fd: int | None = None
+        by = holder(path)
+        if by is None or not by.pid:
+            return
+        with suppress(ProcessLookupError):
+            self._fd = os.pidfd_open(by.pid)
+            if holder(path) == by:  # it still holds the file, so the number is still its own
+                self.pid = by.pid
+            else:
+                self.close()
+
+    def signal(self, number: signal.Signals) -> None:
+        if self._fd is not None:
+            with suppress(ProcessLookupError):
+                signal.pidfd_send_signal(self._fd, number)
+
+    def wait(self, timeout_s: float) -> bool:
+        """Whether it has ended; waits for that."""
+        if self._fd is None:
+            return True
+        poll = select.poll()
+        poll.register(self._fd, select.POLLIN)
+        return bool(poll.poll(timeout_s * 1000))
+
+    def close(self) -> None:
+        fd, self._fd = self._fd, None
+        if fd is not None:
+            os.close(fd)
+
+
+def targets(run_dir: RunDir) -> Iterator[Target]:
+    """What still holds a claim, one target a process."""
+    seen: set[int] = set()
+    for service, by in run_dir.claims().items():
+        if by.pid not in seen:
+            seen.add(by.pid)
+            yield Target(run_dir.path / "claims" / service)

@@ -1,0 +1,182 @@
+"""One process under the supervisor: started, awaited, started again by its policy, stopped."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from contextlib import suppress
+
+from cocoro.launch import MISCONFIGURED
+from cocoro.processes import BACKOFF_LIMIT_S, SETTLED_S, Process
+from cocoro.rundir import RunDir
+
+ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+"""The matrices here are small: more threads would only take each other's processors, and jitter."""
+
+
+class StartError(Exception):
+    """A process did not become ready. `misconfigured` is set when it said itself that its user can mend it."""
+
+    def __init__(self, text: str, misconfigured: bool = False) -> None:
+        super().__init__(text)
+        self.misconfigured = misconfigured
+
+
+class Child:
+    """`start`, then `keep` for ever, then `stop`. `tell` gets what people should know, a line at a time."""
+
+    def __init__(self, row: Process, run_dir: RunDir, parent_fd: int, tell: Callable[[str], None]) -> None:
+        self.row = row
+        self.restarts = 0
+        self._run_dir = run_dir
+        self._parent_fd = parent_fd
+        self._tell = tell
+        self._alive: set[str] = set()
+        self._ready = asyncio.Event()
+        self._was_ready = False
+        self._process: subprocess.Popen[bytes] | None = None
+        self._exit: asyncio.Future[int] = asyncio.get_running_loop().create_future()
+        self._started_s = 0.0
+        self._stopping = False
+
+    @property
+    def pid(self) -> int | None:
+        return self._process.pid if self._process is not None and not self._exit.done() else None
+
+    async def start(self) -> None:
+        """Start it, and return when it is ready. Raises StartError when it ends before, or takes too long."""
+        self._spawn()
+        if not await self._becomes_ready():
+            if self._exit.done():
+                code = self._exit.result()
+                raise StartError(
+                    f"{self.row.name} {_ended(code)} at its start{self._last_words(code)}", code == MISCONFIGURED
+                )
+            missing = ", ".join(sorted(set(self.row.services) - self._alive))
+            raise StartError(
+                f"{self.row.name} was not ready after {self.row.start_s:g} s: no sign of {missing}{self._last_words()}"
+            )
+        self._say_ready()
+
+    async def keep(self) -> None:
+        """Start it again whenever its policy says so; returns when it does not."""
+        while True:
+            code = await asyncio.shield(self._exit)
+            if self._stopping:
+                return
+            lived_s = time.monotonic() - self._started_s
+            again = self.row.restart == "always" or (self.row.restart == "on-failure" and code != 0)
+            if not again:
+                self._tell(f"{self.row.name} {_ended(code)}; it is not restarted{self._last_words(code)}")
+                return
+            self.restarts = 1 if lived_s > SETTLED_S else self.restarts + 1
+            wait_s = min(self.row.backoff_s * 2 ** (self.restarts - 1), BACKOFF_LIMIT_S)
+            self._tell(f"{self.row.name} {_ended(code)}; restart in {wait_s:g} s{self._last_words(code)}")
+            await asyncio.sleep(wait_s)
+            self._spawn()
+            if await self._becomes_ready():
+                self._say_ready()
+            elif not self._exit.done():
+                self._tell(f"{self.row.name} was not ready after {self.row.start_s:g} s: killed")
+                self._signal(signal.SIGKILL)
+
+    async def stop(self) -> None:
+        """SIGTERM, and SIGKILL when that is not obeyed in time. Returns when the process is gone."""
+        self._stopping = True
+        if self.pid is None:
+            return
+        self._signal(signal.SIGTERM)
+        self._signal(signal.SIGCONT)  # a stopped process could not obey
+        with suppress(TimeoutError):
+            await asyncio.wait_for(asyncio.shield(self._exit), self.row.stop_s)
+        if self._exit.done():
+            self._tell(f"{self.row.name} stopped")
+            return
+        self._signal(signal.SIGKILL)
+        await self._exit
+        self._tell(f"{self.row.name} did not stop within {self.row.stop_s:g} s: killed")
+
+    def on_alive(self, service: str, alive: bool) -> None:
+        """The mesh tells of one of its services."""
+        if alive:
+            self._alive.add(service)
+        else:
+            self._alive.discard(service)
+        ready = self._alive >= set(self.row.services)
+        if ready:
+            self._ready.set()
+        else:
+            self._ready.clear()
+        if self._was_ready and self.pid is not None and not self._stopping:
+            if ready:
+                self._tell(f"{self.row.name} is back")
+            elif not alive:
+                self._tell(f"{self.row.name} is silent: no sign of {service}")
+
+    # --- the process ------------------------------------------------------------------------------
+
+    def _spawn(self) -> None:
+        command = [sys.executable, "-P", "-m", "cocoro.launch", self.row.name]
+        command += ["--run-dir", str(self._run_dir.path), "--parent-fd", str(self._parent_fd)]
+        loop = asyncio.get_running_loop()
+        self._alive.clear()
+        self._ready.clear()
+        self._was_ready = False
+        self._exit = loop.create_future()
+        self._started_s = time.monotonic()
+        with self._run_dir.rotate_log(self.row.name).open("wb") as log:
+            self._process = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                env=ONE_THREAD | os.environ,
+                pass_fds=(self._parent_fd,),
+                start_new_session=True,  # so that Ctrl-C in a terminal is for the supervisor alone
+            )
+        pid_fd = os.pidfd_open(self._process.pid)
+        loop.add_reader(pid_fd, self._on_exit, self._process, pid_fd)
+
+    def _on_exit(self, process: subprocess.Popen[bytes], pid_fd: int) -> None:
+        asyncio.get_running_loop().remove_reader(pid_fd)
+        os.close(pid_fd)
+        with suppress(ProcessLookupError, PermissionError):
+            os.killpg(process.pid, signal.SIGKILL)  # what it started itself; the number is its own until it is reaped
+        self._exit.set_result(process.wait())
+        self._alive.clear()
+        self._ready.clear()
+        self._was_ready = False
+
+    def _signal(self, number: signal.Signals) -> None:
+        if self._process is not None and not self._exit.done():  # not reaped yet, so the number is its own
+            self._process.send_signal(number)
+
+    async def _becomes_ready(self) -> bool:
+        ready = asyncio.ensure_future(self._ready.wait())
+        await asyncio.wait((ready, self._exit), timeout=self.row.start_s, return_when=asyncio.FIRST_COMPLETED)
+        ready.cancel()
+        return self._ready.is_set() and not self._exit.done()
+
+    def _say_ready(self) -> None:
+        self._was_ready = True
+        services = "" if self.row.services == (self.row.name,) else f" ({', '.join(self.row.services)})"
+        self._tell(f"{self.row.name}{services} ready in {time.monotonic() - self._started_s:.1f} s")
+
+    def _last_words(self, code: int | None = None) -> str:
+        """The end of its log, to be put after a sentence: of a mistake the line that tells it, else a few."""
+        log = self._run_dir.log(self.row.name)
+        lines = [line for line in log.read_text(errors="replace").splitlines() if line.strip()]
+        if code == MISCONFIGURED and lines:
+            return f": {lines[-1].partition(f'{self.row.name}: ')[2] or lines[-1]}"
+        return "".join(f"\n    {line}" for line in (f"{log}:", *lines[-3:]))
+
+
+def _ended(code: int) -> str:
+    if code < 0:
+        return f"was killed by {signal.Signals(-code).name}"
+    return f"ended (exit code {code})"

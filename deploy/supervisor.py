@@ -1,0 +1,216 @@
+"""Starts the processes of a profile, watches them, and stops them again: what `cocoro up` runs.
+
+Detached it is `python -m deploy.supervisor --run-dir DIR --report-fd N`, with the resolved profile on its standard
+input; it tells through the pipe what it does until the robot is up, one JSON object a line.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import logging
+import os
+import signal
+import socket
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import msgspec
+
+from cocoro.bus.zenoh import ZenohBus
+from cocoro.errors import CocoroError, RefusedError
+from cocoro.profiles import Profile, from_data
+from cocoro.rundir import RunDir
+from deploy.child import Child, StartError
+
+STOPPED, FAILED, MISCONFIGURED, REFUSED = 0, 1, 2, 3
+"""Exit codes, as of every command."""
+LEFTOVER_S = 8.0
+"""How long the processes of a killed supervisor may take to notice it and end."""
+
+log = logging.getLogger(__name__)
+
+
+class Supervisor:
+    """One robot's processes on this machine. `run` does it all."""
+
+    def __init__(
+        self, profile: Profile, run_dir: RunDir, tell: Callable[[str], None], on_up: Callable[[], None] = lambda: None
+    ) -> None:
+        self._profile = profile
+        self._run_dir = run_dir
+        self._on_up = on_up
+        self._tell_people = tell
+        self._children: list[Child] = []
+        self._stop = asyncio.Event()
+
+    async def run(self) -> int:
+        """Start everything, stay until SIGINT or SIGTERM, stop everything. Returns the exit code.
+
+        Raises RefusedError when the robot is up already, ConfigError for a mesh that cannot be.
+        """
+        self._run_dir.make()
+        held = self._run_dir.hold_supervisor(self._profile.name)
+        try:
+            self._log_to_file()
+            await self._wait_for_leftovers()
+            self._run_dir.profile_file.write_bytes(msgspec.json.format(msgspec.json.encode(self._profile)))
+            with _signals(self._on_signal):
+                return await self._run()
+        finally:
+            held.release()
+
+    async def _run(self) -> int:
+        code = STOPPED
+        reader_fd, writer_fd = os.pipe()  # the children hold its reading end: it closes when this process ends
+        try:
+            async with await ZenohBus.open(self._run_dir.join_as("supervisor", self._profile.mesh)) as bus:
+                self._children = [Child(row, self._run_dir, reader_fd, self._tell) for row in self._profile.rows()]
+                by_service = {service: child for child in self._children for service in child.row.services}
+
+                def on_alive(key: str, alive: bool) -> None:
+                    service = key.split("/")[1]
+                    if service in by_service:
+                        by_service[service].on_alive(service, alive)
+
+                bus.watch_alive(f"{self._profile.robot}/*/alive", on_alive)
+                try:
+                    code = await self._start_and_keep()
+                finally:
+                    _notify_service_manager("STOPPING=1")
+                    for child in reversed(self._children):
+                        await child.stop()
+        finally:
+            os.close(writer_fd)
+            os.close(reader_fd)
+        return code
+
+    async def _start_and_keep(self) -> int:
+        starting = asyncio.gather(*(child.start() for child in self._children))
+        told = asyncio.ensure_future(self._stop.wait())
+        await asyncio.wait((starting, told), return_when=asyncio.FIRST_COMPLETED)
+        told.cancel()
+        if not starting.done():
+            starting.cancel()
+            with suppress(asyncio.CancelledError):
+                await starting
+            return REFUSED
+        try:
+            starting.result()
+        except StartError as error:
+            self._tell(str(error))
+            return MISCONFIGURED if error.misconfigured else FAILED
+        self._tell(f"{self._profile.robot} is up ({self._profile.name})")
+        self._on_up()
+        _notify_service_manager("READY=1")
+        async with asyncio.TaskGroup() as group:
+            keeping = [group.create_task(child.keep()) for child in self._children]
+            await self._stop.wait()
+            for task in keeping:
+                task.cancel()
+        return STOPPED
+
+    async def _wait_for_leftovers(self) -> None:
+        """A killed supervisor's processes end by themselves: give them the time for it."""
+        services = set(self._profile.services())
+        deadline_s = asyncio.get_running_loop().time() + LEFTOVER_S
+        while found := {service: by for service, by in self._run_dir.claims().items() if service in services}:
+            if asyncio.get_running_loop().time() > deadline_s:
+                who = ", ".join(f"{service} ({by.name}, pid {by.pid})" for service, by in found.items())
+                raise RefusedError(f"of {self._profile.robot} there runs already: {who}; `cocoro down` ends it")
+            await asyncio.sleep(0.05)
+
+    def _on_signal(self, number: signal.Signals) -> None:
+        self._tell("still stopping" if self._stop.is_set() else f"stopping ({number.name})")
+        self._stop.set()
+
+    def _tell(self, text: str) -> None:
+        log.info("%s", text)
+        self._tell_people(text)
+
+    def _log_to_file(self) -> None:
+        handler = logging.FileHandler(self._run_dir.rotate_log("supervisor"))
+        handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)-7s supervisor: %(message)s"))
+        log.handlers[:] = [handler]
+        log.setLevel(logging.INFO)
+        log.propagate = False
+
+
+@contextmanager
+def _signals(handler: Callable[[signal.Signals], None]) -> Iterator[None]:
+    """SIGINT and SIGTERM go to `handler` for as long as this context lasts."""
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, handler, number)
+    try:
+        yield
+    finally:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            loop.remove_signal_handler(number)
+
+
+def _notify_service_manager(state: str) -> None:
+    """systemd's notification protocol (sd_notify(3)); nothing where there is no systemd."""
+    address = os.environ.get("NOTIFY_SOCKET")
+    if address:
+        with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as notify:
+            notify.sendto(state.encode(), f"\0{address[1:]}" if address[0] == "@" else address)
+
+
+def supervise(
+    profile: Profile, run_dir: RunDir, tell: Callable[[str], None], on_up: Callable[[], None] = lambda: None
+) -> int:
+    """Run a robot in the foreground; returns the exit code. `tell` gets a line for people at a time."""
+
+    async def run() -> int:
+        return await Supervisor(profile, run_dir, tell, on_up).run()
+
+    try:
+        return asyncio.run(run())
+    except RefusedError as error:
+        tell(str(error))
+        return REFUSED
+    except CocoroError as error:
+        tell(str(error))
+        return MISCONFIGURED
+
+
+class _Pipe:
+    """Tells the command that started this process, until the robot is up."""
+
+    def __init__(self, fd: int) -> None:
+        self._file = os.fdopen(fd, "w", buffering=1)
+
+    def line(self, text: str) -> None:
+        self._write({"line": text})
+
+    def close(self, code: int) -> None:
+        self._write({"code": code})
+        with suppress(OSError):
+            self._file.close()
+
+    def _write(self, message: dict[str, object]) -> None:
+        with suppress(OSError, ValueError):  # nobody listens any more
+            self._file.write(json.dumps(message) + "\n")
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(prog="python -m deploy.supervisor", description="Run a robot, detached.")
+    parser.add_argument("--run-dir", type=Path, required=True, help="the robot's folder")
+    parser.add_argument("--report-fd", type=int, required=True, help="a pipe to tell through until the robot is up")
+    options = parser.parse_args()
+    pipe = _Pipe(options.report_fd)
+    data = json.loads(sys.stdin.buffer.read())
+    profile = from_data(data, data.get("name", ""))
+    code = supervise(
+        profile, RunDir(profile.robot, options.run_dir.parent), pipe.line, on_up=lambda: pipe.close(STOPPED)
+    )
+    pipe.close(code)
+    return code
+
+
+if __name__ == "__main__":
+    sys.exit(main())
