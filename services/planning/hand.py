@@ -12,9 +12,9 @@ CLAWS = ("claw_left", "claw_right")
 class Grip:
     """Commands the claws, each by its opening angle, and feels what they hold.
 
-    Closing goes past contact at full torque. Once something has stopped the claws, `clamp` sets each claw's goal a
-    fixed angle past where it stopped: within the servos' compliance slope the torques then balance, and what is held stays
-    where it was grasped instead of drifting with the pair.
+    Closing goes past contact at full torque. Once something has stopped the claws, `clamp` sets each claw's goal
+    a fixed angle past where it stopped: within the servos' compliance slope the torques then balance, and what
+    is held stays where it was grasped instead of drifting with the pair.
     """
 
     def __init__(self, robot: Robot, config: Hand) -> None:
