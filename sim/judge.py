@@ -1,0 +1,119 @@
+"""What really became of a task, by the simulator's truth and never by the robot's own belief."""
+
+from __future__ import annotations
+
+from math import acos, degrees, hypot, sqrt
+
+import msgspec
+import numpy as np
+
+from cocoro.messages import TrueObject, Truth, Vec3
+from sim.rigid import rotations
+from sim.scene import Scene, SceneObject
+
+HELD_HEIGHT_M = 0.10
+HELD_S = 2.0
+TILTED_DEG = 30.0
+MOVED_M = 0.05
+CLAWS = frozenset({"claw_left", "claw_right"})
+
+
+class Verdict(msgspec.Struct, frozen=True, kw_only=True):
+    """Of the run up to the newest truth."""
+
+    lifted_m: float
+    """How much higher the target's lowest point is than at the start."""
+    held: bool
+    """The target's lowest point at least 0.10 m above the floor for the last 2 s, touching both claws and nothing
+    else in all that time."""
+    knocked_over: tuple[str, ...]
+    """Objects that tilted by more than 30 degrees (not balls) or moved by more than 5 cm; the target only until
+    both claws first touched it. What moves by itself does not count."""
+    collisions: tuple[str, ...]
+    """Contacts of the robot that are no part of its work ('elbow~green_can'), each once, in order of appearance."""
+    target_moved_m: float
+    """How far the target was from its first place, level, at most, until both claws first touched it."""
+
+
+class Judge:
+    """Feed it every truth, 30 to 60 a second, from the start of the task on.
+
+    `target` is the label of what is to be fetched, or '' for a task without one. Raises KeyError for a label
+    that the scene has not.
+    """
+
+    def __init__(self, scene: Scene, target: str = "") -> None:
+        self._scene = scene
+        self._target = scene.object(target).label if target else ""
+        self._first: dict[str, Vec3] = {}
+        self._first_bottom_m = 0.0
+        self._bottom_m = 0.0
+        self._now_ns = 0
+        self._held_since_ns: int | None = None
+        self._grasped = False
+        self._moved_m = 0.0
+        self._knocked: dict[str, None] = {}
+        self._collisions: dict[str, None] = {}
+
+    def feed(self, truth: Truth) -> None:
+        self._now_ns = truth.stamp_ns
+        self._collisions.update(dict.fromkeys(truth.collisions))
+        for item in truth.objects:
+            if item.kind == "object":
+                self._feed_object(item)
+
+    def result(self) -> Verdict:
+        held_ns = self._now_ns - self._held_since_ns if self._held_since_ns is not None else 0
+        return Verdict(
+            lifted_m=self._bottom_m - self._first_bottom_m,
+            held=held_ns >= HELD_S * 1e9,
+            knocked_over=tuple(self._knocked),
+            collisions=tuple(self._collisions),
+            target_moved_m=self._moved_m,
+        )
+
+    def _feed_object(self, item: TrueObject) -> None:
+        known = self._scene.object(item.label)
+        first = self._first.setdefault(item.label, item.position_m)
+        moved_m = hypot(item.position_m[0] - first[0], item.position_m[1] - first[1])
+        is_target = item.label == self._target
+        if is_target:
+            self._feed_target(item, known, fresh=first is item.position_m)
+            if not self._grasped:
+                self._moved_m = max(self._moved_m, moved_m)
+        if known.kinematic or (is_target and self._grasped):
+            return
+        if moved_m > MOVED_M or (known.shape != "sphere" and _tilt_deg(item) > TILTED_DEG):
+            self._knocked[item.label] = None
+
+    def _feed_target(self, item: TrueObject, known: SceneObject, *, fresh: bool) -> None:
+        self._bottom_m = item.position_m[2] - _reach_down_m(known, item)
+        if fresh:
+            self._first_bottom_m = self._bottom_m
+        self._grasped |= set(item.touching) >= CLAWS
+        if self._bottom_m < HELD_HEIGHT_M or set(item.touching) != CLAWS:
+            self._held_since_ns = None
+        elif self._held_since_ns is None:
+            self._held_since_ns = self._now_ns
+
+
+def _upright(item: TrueObject) -> tuple[float, float, float]:
+    """The world's z in the object's axes."""
+    x, y, z = rotations(np.array([item.orientation]))[0][2]
+    return float(x), float(y), float(z)
+
+
+def _tilt_deg(item: TrueObject) -> float:
+    return degrees(acos(min(max(_upright(item)[2], -1.0), 1.0)))
+
+
+def _reach_down_m(known: SceneObject, item: TrueObject) -> float:
+    """From the object's centre down to its lowest point."""
+    sizes = known.dimensions_m
+    if known.shape == "sphere":
+        return sizes[0]
+    up = _upright(item)
+    if known.shape == "box":
+        return sum(abs(share) * size / 2 for share, size in zip(up, sizes, strict=True))
+    radius_m, height_m = sizes
+    return abs(up[2]) * height_m / 2 + sqrt(max(0.0, 1.0 - up[2] ** 2)) * radius_m
