@@ -9,6 +9,9 @@ from typing import Protocol, TextIO
 
 from cocoro.messages import TaskState
 
+EVERY_S = 2.0
+"""How often a long phase gets a further line, where lines are not written over."""
+
 
 class View(Protocol):
     def show(self, state: TaskState) -> None: ...
@@ -44,16 +47,21 @@ class Silent:
 
 
 class Lines:
-    """A line when a phase begins."""
+    """A line for each phase, and one now and then while it lasts."""
 
     def __init__(self, out: TextIO) -> None:
         self._out = out
+        self._begun: tuple[int, str] | None = None
         self._shown: tuple[int, str] | None = None
+        self._shown_s = 0.0
 
     def show(self, state: TaskState) -> None:
         phase = (len(state.phases), state.phase)
-        if phase != self._shown:
-            self._shown = phase
+        begins, self._begun = phase != self._begun, phase
+        if begins:  # what a phase begins with is still the last one's reason and distance
+            return
+        if phase != self._shown or state.elapsed_s - self._shown_s >= EVERY_S:
+            self._shown, self._shown_s = phase, state.elapsed_s
             self.say(line(state))
 
     def say(self, text: str) -> None:

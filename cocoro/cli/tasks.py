@@ -16,20 +16,27 @@ import msgspec
 from cocoro.cli import exits
 from cocoro.cli.link import Link, Where, joined
 from cocoro.cli.progress import View, view
-from cocoro.cli.snapshot import Snapshot
+from cocoro.cli.snapshot import Snapshot, check
 from cocoro.errors import CallTimeoutError, CocoroError
 from cocoro.messages import CancelRequest, TaskName, TaskReply, TaskRequest, TaskState
-from cocoro.topics import CANCEL, RUN, TASK
+from cocoro.topics import CANCEL, LATCH, RUN, TASK
 
 USAGE_REFUSALS = ("unknown_label", "not_graspable", "bad_request")
 """Refusals that are the operator's mistake, not the robot's state."""
+UNSETTLED = ("not_alive", "estop")
+"""Refusals that may be over in a moment: not everyone has been heard yet, or the emergency stop is not known yet."""
+SETTLE_S = 3.0
+ASK_AGAIN_S = 0.1
 SNAPSHOT_PHASE = "grasp"
+"""The picture is the last one of this phase: the claws have closed, the hand has not moved yet."""
 CANCEL_S = 10.0
 """How long a cancelled task may take to say its outcome."""
 
 
 async def run(where: Where, task: str, label: str, timeout_s: float | None, as_json: bool, picture: Path | None) -> int:
     """Run a task to its outcome and return the exit code."""
+    if picture is not None:
+        check(picture)
     request = TaskRequest(task=cast(TaskName, task), label=label, timeout_s=timeout_s)
     async with joined(where) as link:
         follower = Follower(link, request, view(as_json), picture)
@@ -63,7 +70,6 @@ class Follower:
         self._news: asyncio.Queue[TaskState | None] = asyncio.Queue()
         """What the executive says; None when it has died."""
         self._interrupted = asyncio.Event()
-        self._working: list[asyncio.Task[None]] = []
 
     def interrupt(self) -> None:
         """The first one cancels the task on the robot, the second one leaves at once."""
@@ -77,37 +83,50 @@ class Follower:
             lambda _key, state: self._news.put_nowait(state)
         )  # before the call: nothing is missed
         alive = self._link.watch_alive("executive", lambda alive: None if alive else self._news.put_nowait(None))
-        snapshot = Snapshot(self._link) if self._picture is not None else None
-        reply = await self._link.call(RUN, self._request)
+        reply = await self._ask()
         if not reply.accepted:
             return self._refused(reply)
         self._task_id = reply.task_id
-        self._working = [asyncio.create_task(self._cancel_when_interrupted())]
+        cancelling = asyncio.create_task(self._cancel_when_interrupted())
         try:
-            state = await self._follow(snapshot)
+            state = await self._follow()
         finally:
             alive.close()
-            for work in self._working:
-                work.cancel()
+            cancelling.cancel()
         return self._outcome(state)
 
-    async def _follow(self, snapshot: Snapshot | None) -> TaskState | None:
+    async def _ask(self) -> TaskReply:
+        """Ask for the task; a robot that has only just come up gets a little time to find itself able."""
+        latch = self._link.latest(LATCH)
+        for _ in range(round(SETTLE_S / ASK_AGAIN_S)):
+            reply = await self._link.call(RUN, self._request)
+            latched = latch.value is not None and latch.value.state == "latched"
+            if reply.accepted or reply.refusal not in UNSETTLED or (reply.refusal == "estop" and latched):
+                break
+            await asyncio.sleep(ASK_AGAIN_S)
+        return reply
+
+    async def _follow(self) -> TaskState | None:
         """The task's last state; None when the executive dies before."""
+        camera: Snapshot | None = None
         while (state := await self._news.get()) is not None:
             if state.task_id != self._task_id:
                 continue
+            if self._picture is not None:
+                if state.phase == SNAPSHOT_PHASE and camera is None:
+                    camera = Snapshot(self._link)
+                    camera.open()
+                elif state.phase != SNAPSHOT_PHASE and camera is not None:
+                    await self._take(camera, self._picture)
+                    camera = None
             if state.outcome is not None:
                 return state
             self._view.show(state)
-            if snapshot is not None and state.phase == SNAPSHOT_PHASE:
-                self._working.append(asyncio.create_task(self._take(snapshot)))
-                snapshot = None
         return None
 
-    async def _take(self, snapshot: Snapshot) -> None:
-        assert self._picture is not None
+    async def _take(self, camera: Snapshot, picture: Path) -> None:
         try:
-            self._view.say(await snapshot.take(self._picture))
+            self._view.say(await camera.write(picture))
         except CocoroError as error:
             self._view.say(f"no picture: {error}")
 

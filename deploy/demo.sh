@@ -1,0 +1,20 @@
+#!/usr/bin/env bash
+# The simulated robot, as processes of its own, fetches the red can of the paper's scene. Leaves in out/ what it saw
+# at the grasp, and the logs. Has a mesh of its own, so that it disturbs no robot that is up here.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+cocoro=$PWD/.venv/bin/cocoro
+mkdir -p out
+COCORO_RUN_DIR=$(mktemp -d)
+export COCORO_RUN_DIR
+
+finish() {
+    "$cocoro" down >/dev/null || true
+    rm -rf out/logs
+    cp -r "$COCORO_RUN_DIR"/*/logs out/logs 2>/dev/null || true
+    rm -rf "$COCORO_RUN_DIR"
+}
+trap finish EXIT
+
+"$cocoro" up sim --detach
+"$cocoro" fetch red_can --snapshot out/grasp.png
