@@ -28,6 +28,7 @@ from cocoro.rehearsal import RehearsalRequest
 from cocoro.robot import Robot
 from cocoro.vloop import run_virtual
 from sim.judge import Judge
+from sim.scene import load_scene
 
 PROCESSES = ("sim", "perception", "planning", "executive")
 START_S = 5.0
@@ -97,7 +98,9 @@ class LockstepNode(Node):
 class _Rehearsal:
     def __init__(self, request: RehearsalRequest) -> None:
         self._request = request
-        self._judge = Judge(request.label)
+        scene = load_scene(request.scene, request.seed)
+        labels = [item.label for item in scene.objects]
+        self._judge = Judge(scene, request.label if request.label in labels else "")
         self._frame: Frame | None = None
         self._seen: Detections | None = None
 
@@ -118,7 +121,7 @@ class _Rehearsal:
                 await stack.enter_async_context(node)
                 services.append(asyncio.ensure_future(component.run(node, config)))
             operator = await stack.enter_async_context(Node("operator", mesh.join(), clock, robot))
-            operator.on(topics.TRUTH, self._judge.see)
+            operator.on(topics.TRUTH, self._judge.feed)
             task = asyncio.ensure_future(self._operate(operator))
             try:
                 await asyncio.wait((task, *services), return_when=asyncio.FIRST_COMPLETED)
@@ -163,7 +166,6 @@ class _Rehearsal:
             reply = await self._ask(operator, question)
         if not reply.accepted:
             raise TaskRefusedError(reply)
-        self._judge.start()
         pictured = request.picture is None
         async for state in states:
             if state.task_id != reply.task_id:
@@ -209,5 +211,5 @@ class _Rehearsal:
                 {"name": phase.name, "sim_s": round(((phase.end_ns or state.stamp_ns) - phase.start_ns) / NS, 3)}
                 for phase in state.phases
             ],
-            "truth": self._judge.result(),
+            "truth": msgspec.to_builtins(self._judge.result()),
         }
