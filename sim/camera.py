@@ -8,8 +8,6 @@ which needs the pose of the frame before).
 
 from __future__ import annotations
 
-from typing import Literal
-
 import numpy as np
 
 from cocoro.errors import ConfigError
@@ -17,6 +15,7 @@ from cocoro.kinematics import Array
 from cocoro.messages import Frame
 from cocoro.robot import Robot
 from sim.render import Light, Renderer
+from sim.realism import Sensors
 from sim.seeds import stream
 from sim.sensor_effects import (
     Codes,
@@ -30,8 +29,6 @@ from sim.sensor_effects import (
     motion_between,
     scale_channels,
 )
-
-Sensors = Literal["ideal", "real"]
 
 EXPOSURE_S = 1 / 30
 """The Kinect's colour camera exposes for the whole of its frame period in a room's light."""
@@ -84,6 +81,7 @@ class Kinect:
         self._projector_offset_m = np.array(robot.kinect.projector_offset_m)
         self._coder = DepthCoder(robot)
         self._before: tuple[int, Array] | None = None
+        _keep_freed_memory()
         if self._real:
             rng = stream(seed, "kinect")
             self._colour_noise = NoiseBank(rng, (height, width * 3), COLOUR_SIGMA)
@@ -147,3 +145,11 @@ def moved(camera_pose: Array, offset_m: Array) -> Array:
     pose = camera_pose.copy()
     pose[:3, 3] += camera_pose[:3, :3] @ offset_m
     return pose
+
+
+def _keep_freed_memory() -> None:
+    """Have the C library keep what is freed for the next frame, instead of giving it back to the system and
+    faulting in fresh pages 30 times a second, which would cost as much as the depth picture does. glibc raises its
+    limit to the size of the largest block that was freed; elsewhere this does nothing."""
+    largest = np.empty(31 * 1024 * 1024, np.uint8)
+    del largest

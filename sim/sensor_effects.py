@@ -42,7 +42,7 @@ class DepthCoder:
         steps = np.clip(depth_m, np.float32(0), self._top_m)
         steps *= np.float32(STEPS_PER_M)
         steps += np.float32(0.5)
-        return self._table[steps.astype(np.uint16)]
+        return self._table.take(steps.astype(np.uint16))
 
 
 class NoiseBank:

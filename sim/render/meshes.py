@@ -53,6 +53,13 @@ def box() -> Mesh:
     return _stack(faces)
 
 
+def square() -> Mesh:
+    """Side 1, in the plane z = 0, seen from above."""
+    up = np.array([0.0, 0.0, 1.0])
+    corners = [np.array([x, y, 0.0]) for x, y in ((-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5))]
+    return _stack([_quad(corners, [up] * 4)])
+
+
 def cylinder() -> Mesh:
     """Radius 1, height 1, the axis along z."""
     rim = [np.array([np.cos(a), np.sin(a), 0.0]) for a in np.arange(SLICES + 1) * 2 * pi / SLICES]

@@ -6,23 +6,31 @@ stand out of the depth camera's range of anything near the middle of the room.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from sim.visual import Visual
+
+Vec3 = tuple[float, float, float]
 
 HALF_WIDTH_M = 10.0
 HEIGHT_M = 3.0
-
-Rgb = tuple[float, float, float]
-
-
-class RoomColours(NamedTuple):
-    floor: Rgb = (0.50, 0.49, 0.47)
-    floor_other: Rgb = (0.54, 0.53, 0.51)
-    """Every other tile of 0.5 m."""
-    wall: Rgb = (0.70, 0.70, 0.69)
-    skirting: Rgb = (0.42, 0.42, 0.42)
-    ceiling: Rgb = (0.80, 0.80, 0.79)
-
-
 TILE_M = 0.5
-SKIRTING_M = 0.12
-COLOURS = RoomColours()
+FLOOR_RGB: Vec3 = (0.49, 0.49, 0.485)
+OTHER_TILE_RGB: Vec3 = (0.53, 0.53, 0.525)
+_WALL_RGB: Vec3 = (0.72, 0.72, 0.71)
+_SKIRTING_RGB: Vec3 = (0.40, 0.40, 0.40)
+_CEILING_RGB: Vec3 = (0.85, 0.85, 0.84)
+_THICK_M = 0.1
+_SKIRTING_M = 0.12
+
+
+def walls() -> list[tuple[Visual, Vec3]]:
+    """Walls, skirting boards and ceiling, each with its centre in the world."""
+    long, half = 2 * HALF_WIDTH_M, HALF_WIDTH_M + _THICK_M / 2
+    parts = [(Visual("ceiling", "box", (long, long, _THICK_M), _CEILING_RGB), (0.0, 0.0, HEIGHT_M + _THICK_M / 2))]
+    for x, y in ((half, 0.0), (-half, 0.0), (0.0, half), (0.0, -half)):
+        for name, rgb, height, thick in (
+            ("wall", _WALL_RGB, HEIGHT_M, _THICK_M),
+            ("skirting", _SKIRTING_RGB, _SKIRTING_M, 1.5 * _THICK_M),
+        ):
+            size = (thick, long, height) if x else (long, thick, height)
+            parts.append((Visual(name, "box", size, rgb), (x, y, height / 2)))
+    return parts

@@ -18,12 +18,13 @@ from cocoro.kinematics import Array
 from cocoro.robot import Camera
 from sim.bullet import Bullet
 from sim.render.interface import Images, Light
-from sim.render.room import COLOURS, HALF_WIDTH_M, HEIGHT_M, Rgb
+from sim.render.room import FLOOR_RGB, HALF_WIDTH_M, walls
 from sim.render.views import PROJECTOR_BIAS_PER_M, lamp_tint, projection, projector_camera, rigid_inverse
 from sim.visual import Visual
 
 NEAR_M, FAR_M = 0.05, 30.0
 """Closer together than the other renderer's, for its depth is what is left of a 32 bit float after division."""
+FLOOR_THICK_M = 0.02
 _SAMPLE_OFFSET_PX = (-0.5, 0.5)
 """TinyRenderer samples a pixel at its left lower corner, not at its centre (measured on a plane and a can)."""
 _TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -39,17 +40,11 @@ class TinyRenderer:
         self.camera = camera
         self._bullet = bullet = Bullet()
         self._bodies = [self._body(self._shape(visual), visual.rgb) for visual in visuals]
-        thick = 0.02
-        across, wide = HALF_WIDTH_M, 2 * HALF_WIDTH_M
-        for x, y, z, size, rgb in (
-            (0.0, 0.0, -thick / 2, (wide, wide, thick), COLOURS.floor),
-            (across, 0.0, HEIGHT_M / 2, (thick, wide, HEIGHT_M), COLOURS.wall),
-            (-across, 0.0, HEIGHT_M / 2, (thick, wide, HEIGHT_M), COLOURS.wall),
-            (0.0, across, HEIGHT_M / 2, (wide, thick, HEIGHT_M), COLOURS.wall),
-            (0.0, -across, HEIGHT_M / 2, (wide, thick, HEIGHT_M), COLOURS.wall),
-        ):
-            body = self._body({"shapeType": bullet.GEOM_BOX, "halfExtents": [s / 2 for s in size]}, rgb)
-            bullet.resetBasePositionAndOrientation(body, (x, y, z), (0, 0, 0, 1))
+        side = 2 * HALF_WIDTH_M
+        floor = Visual("floor", "box", (side, side, FLOOR_THICK_M), FLOOR_RGB)
+        for visual, centre in ((floor, (0.0, 0.0, -FLOOR_THICK_M / 2)), *walls()):
+            body = self._body(self._shape(visual), visual.rgb)
+            bullet.resetBasePositionAndOrientation(body, centre, (0, 0, 0, 1))
 
     def _shape(self, visual: Visual) -> dict[str, Any]:
         match visual.shape, visual.size_m:
@@ -61,7 +56,7 @@ class TinyRenderer:
                 return {"shapeType": self._bullet.GEOM_SPHERE, "radius": radius}
         raise ValueError(f"visual {visual.name!r}: a {visual.shape} cannot have the size {visual.size_m}")
 
-    def _body(self, shape: dict[str, Any], rgb: Rgb) -> int:
+    def _body(self, shape: dict[str, Any], rgb: tuple[float, float, float]) -> int:
         index = self._bullet.createVisualShape(**shape, rgbaColor=(*rgb, 1.0), specularColor=(0, 0, 0))
         body: int = self._bullet.createMultiBody(baseMass=0.0, baseVisualShapeIndex=index)
         return body

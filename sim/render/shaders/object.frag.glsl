@@ -12,6 +12,6 @@ in vec3 lamp_place;
 out vec4 colour;
 
 void main() {
-    float lit = facing > 0.0 ? facing * texture(lamp_map, lamp_place) : 0.0;
+    float lit = facing > 0.0 ? facing * texture(lamp_map, vec3(lamp_place.xy, min(lamp_place.z, 1.0))) : 0.0;
     colour = vec4(rgb * (ambient + diffuse * lit), 1.0);
 }

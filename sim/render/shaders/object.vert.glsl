@@ -23,6 +23,5 @@ void main() {
     // Off the surface by a little more than a texel, so that it does not shade itself.
     vec4 shade_at = world + vec4(normal * 0.012, 0.0);
     lamp_place = (shade_at * lamp).xyz * 0.5 + 0.5;
-    lamp_place.z = min(lamp_place.z, 1.0);  // beyond the map all is lit
     gl_Position = world * view;
 }
