@@ -118,7 +118,7 @@ class Mechanism:
 
     def link_poses(self) -> Array:
         """Of every link in the world, shape (links + 1, 4, 4): row i is PyBullet's link i, the last the root."""
-        states = self._bullet.getLinkStates(self.body, self._link_indices)
+        states = self._bullet.getLinkStates(self.body, self._link_indices, computeForwardKinematics=1)
         poses = np.zeros((len(states) + 1, 4, 4))
         poses[:-1, :3, :3] = rotations(np.array([state[5] for state in states]))
         poses[:-1, :3, 3] = [state[4] for state in states]
