@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import zenoh
@@ -17,7 +18,7 @@ from cocoro.topics import Qos
 _DROP, _BLOCK = zenoh.CongestionControl.DROP, zenoh.CongestionControl.BLOCK
 QOS: dict[Qos, dict[str, Any]] = {
     Qos.COMMAND: {"priority": zenoh.Priority.REAL_TIME, "congestion_control": _DROP, "express": True},
-    Qos.STATE: {"priority": zenoh.Priority.DATA_HIGH, "congestion_control": _DROP, "express": True},
+    Qos.STATE: {"priority": zenoh.Priority.DATA_HIGH, "congestion_control": _DROP, "express": False},
     Qos.EVENT: {"priority": zenoh.Priority.DATA, "congestion_control": _BLOCK, "express": False},
     Qos.FRAME: {"priority": zenoh.Priority.BACKGROUND, "congestion_control": _DROP, "express": False},
 }
@@ -45,6 +46,9 @@ class Declared:
             return
         self.mute()
         self.on_close(self)
+        self._undeclare()
+
+    def _undeclare(self) -> None:
         with contextlib.suppress(zenoh.ZError):  # the session has ended
             self._declaration.undeclare()
 
@@ -70,7 +74,7 @@ class ZenohPublisher(Declared):
             return
         data = payload if isinstance(payload, bytes) else bytes(payload)
         if self._outbox is not None:
-            self._outbox.put(self._put, data)
+            self._outbox.put(partial(self._put, data), len(data))
         elif self._pool is not None:
             self._put(self._pool.hold(data))
         else:
@@ -79,3 +83,9 @@ class ZenohPublisher(Declared):
     def _put(self, data: bytes | zenoh.ZBytes) -> None:
         with contextlib.suppress(zenoh.ZError):  # the session has ended
             self._declaration.put(data)
+
+    def _undeclare(self) -> None:
+        if self._outbox is not None:  # after what waits there
+            self._outbox.put(super()._undeclare, 0)
+        else:
+            super()._undeclare()

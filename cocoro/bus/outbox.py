@@ -14,26 +14,27 @@ CAPACITY_BYTES = 64 * 1024 * 1024
 
 
 class Outbox:
-    """Puts in order from its own thread. `put` never waits; beyond the capacity it drops, counts and says so."""
+    """Does one thing after another in its own thread. `put` never waits; beyond the capacity it drops, counts and
+    says so."""
 
     def __init__(self, name: str) -> None:
         self.lost = 0
-        self._waiting: deque[tuple[Callable[[bytes], None], bytes]] = deque()
+        self._waiting: deque[tuple[Callable[[], None], int]] = deque()
         self._waiting_bytes = 0
         self._changed = threading.Condition()
         self._closing = False
         self._thread = threading.Thread(target=self._run, name=f"{name} outbox", daemon=True)
         self._thread.start()
 
-    def put(self, send: Callable[[bytes], None], payload: bytes) -> None:
+    def put(self, send: Callable[[], None], size_bytes: int) -> None:
         with self._changed:
-            if self._waiting_bytes + len(payload) > CAPACITY_BYTES:
+            if self._waiting_bytes + size_bytes > CAPACITY_BYTES:
                 self.lost += 1
                 if self.lost & (self.lost - 1) == 0:  # at 1, 2, 4, 8 and so on
                     log.error("%d events are lost: a receiver does not take them", self.lost)
                 return
-            self._waiting.append((send, payload))
-            self._waiting_bytes += len(payload)
+            self._waiting.append((send, size_bytes))
+            self._waiting_bytes += size_bytes
             self._changed.notify()
 
     def close(self, timeout_s: float) -> None:
@@ -52,8 +53,8 @@ class Outbox:
                     self._changed.wait()
                 if not self._waiting:
                     return
-                send, payload = self._waiting[0]
-            send(payload)
+                send, size_bytes = self._waiting[0]
+            send()
             with self._changed:
                 self._waiting.popleft()
-                self._waiting_bytes -= len(payload)
+                self._waiting_bytes -= size_bytes

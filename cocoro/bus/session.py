@@ -22,6 +22,11 @@ LEAVE_S = 2.0
 FRAGMENT_WAIT_US = 10_000
 """How long a large sample without shared memory may wait for a receiver on this machine that does not read."""
 
+PACKETS = 16
+"""May wait for the network in each priority, which is all that zenoh allows. An express sample is a packet by itself,
+and a service publishes several at once: of zenoh's usual 2, a busy processor would lose some."""
+SMALL_PRIORITIES = ("control", "real_time", "interactive_high", "interactive_low", "data_high", "data")
+
 
 def no_mesh(config: ZenohConfig) -> MeshError:
     return MeshError(f"no mesh at {config.where}: start one with `cocoro up`")
@@ -47,6 +52,7 @@ def options(config: ZenohConfig, identity: str, listen: list[str], connect: list
         "connect/timeout_ms": patience_ms if config.mode == "client" else -1,
         "connect/retry": {"period_init_ms": 20, "period_max_ms": 2000, "period_increase_factor": 2},
         "transport/link/tx/lease": round(config.lease_s * 1000),
+        "transport/link/tx/queue/size": dict.fromkeys(SMALL_PRIORITIES, PACKETS),
         # Frames have pools of their own (see `pool`).
         "transport/shared_memory/transport_optimization/enabled": False,
     }
