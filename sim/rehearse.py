@@ -13,8 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-from cocoro.objects import Catalogue
-from cocoro.picture import draw, save_png
 
 from cocoro import topics
 from cocoro.bus.local import LocalMesh
@@ -23,6 +21,8 @@ from cocoro.core import Core
 from cocoro.errors import CocoroError, ConfigError
 from cocoro.messages import Detections, Frame, TaskReply, TaskRequest, TaskState
 from cocoro.node import Node, Stepper
+from cocoro.objects import Catalogue
+from cocoro.picture import draw, save_png
 from cocoro.processes import load, named
 from cocoro.rehearsal import RehearsalRequest
 from cocoro.robot import Robot
@@ -146,10 +146,11 @@ class _Rehearsal:
             return settings | ({"command_timeout_s": _LONG_S} if request.lockstep else {})
         if request.lockstep:
             # The baseline's planner speaks once a cycle, however long that is: no penalty for it.
-            return {
+            baseline: dict[str, dict[str, Any]] = {
                 "planning": {"coordination": "lockstep"},
                 "executive": {"planner_silence_s": _LONG_S},
-            }.get(name, {})
+            }
+            return baseline.get(name, {})
         return {}
 
     async def _operate(self, operator: Node) -> TaskState:
