@@ -35,7 +35,12 @@ class BlobDetector:
 
     def detect(self, image: RgbdImage) -> list[Sighting]:
         classes = self._table.classify(image.colour)
-        found = (self._find(known, _mask(classes, bit), image) for bit, known in enumerate(self._catalogue))
+        present = int(np.bitwise_or.reduce(classes, axis=None))
+        found = (
+            self._find(known, _mask(classes, bit), image)
+            for bit, known in enumerate(self._catalogue)
+            if present >> bit & 1
+        )
         return [sighting for sighting in found if sighting is not None]
 
     def _find(self, known: KnownObject, mask: Mask, image: RgbdImage) -> Sighting | None:
@@ -122,8 +127,9 @@ class _Fit:
 
 
 def _mask(classes: Classes, bit: int) -> Mask:
-    """255 where the bit is set."""
-    return np.asarray((classes & classes.dtype.type(1 << bit)) != 0, dtype=np.uint8)
+    """Non-zero where the bit is set."""
+    own = classes & classes.dtype.type(1 << bit)
+    return own if own.itemsize == 1 else np.asarray(own != 0, dtype=np.uint8)
 
 
 def _clean_components(mask: Mask, image: RgbdImage, min_area_px: float) -> list[tuple[Mask, Box]]:

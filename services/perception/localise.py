@@ -20,10 +20,10 @@ from services.perception.sighting import Evidence, Sighting
 Array = NDArray[np.float64]
 
 ITERATIONS = 12
-SETTLED_M = 2e-5
+SETTLED_M = 1e-4
 MIN_SURFACE_POINTS = 12
-PRIOR_M = 0.05
-"""How far the first guess, the surface pushed inwards, may be off; it settles only what no evidence does."""
+PRIOR = np.eye(3) / 0.05**2
+"""The first guess, the surface pushed inwards, may be 5 cm off: it settles only what no evidence does."""
 RAY_SAMPLES = 5
 RAY_DOUBT_M, RAY_DOUBT_RAD = 0.001, 0.002
 """How far the outline may be off: at a distance about a pixel."""
@@ -93,61 +93,57 @@ def fit_centre(known: KnownObject, evidence: Evidence, pose: Array, start: Array
     before the depth that it is free to. The latter two are one-sided. Derived.
     """
     rotation, origin = pose[:3, :3], pose[:3, 3]
-    surface = evidence.surface_m @ rotation.T + origin
-    surface_sigma = depth_doubt_m(evidence.surface_m[:, 2])
-    rays = _Rays(known, evidence, rotation, origin, start)
-    ray_sigma = RAY_DOUBT_M + RAY_DOUBT_RAD * float((start - origin) @ rotation[:, 2])
-    centre = start.copy()
+    surface = evidence.surface_m @ rotation.T
+    rays = _Rays(known, evidence, rotation, start - origin)
+    seen, met = len(surface), len(surface) + len(evidence.outline)
+    points = np.concatenate([surface, rays.directions])
+    ray_doubt = RAY_DOUBT_M + RAY_DOUBT_RAD * float((start - origin) @ rotation[:, 2])
+    doubt = np.concatenate([depth_doubt_m(evidence.surface_m[:, 2]), np.full(len(points) - seen, ray_doubt)])
+    # To the centre from the camera, the origin of the points.
+    guess = start - origin
+    centre = guess
     for _ in range(ITERATIONS):
-        distance, gradient = signed_distance(known, surface - centre)
-        ray_distance, ray_gradient = rays.misses(centre)
-        residual = np.concatenate([distance / surface_sigma, ray_distance / ray_sigma])
-        rows = np.concatenate([gradient / -surface_sigma[:, None], ray_gradient / -ray_sigma])
-        weighted = rows * (HUBER / np.maximum(np.abs(residual), HUBER))[:, None]
-        move = np.linalg.solve(
-            weighted.T @ rows + np.eye(3) / PRIOR_M**2, -weighted.T @ residual - (centre - start) / PRIOR_M**2
-        )
+        points[seen:] = rays.nearest(centre)
+        distance, gradient = signed_distance(known, points - centre)
+        np.maximum(distance[seen:met], 0.0, out=distance[seen:met])
+        np.minimum(distance[met:], 0.0, out=distance[met:])
+        residual = distance / doubt
+        rows = gradient / -doubt[:, None]
+        weight = HUBER / np.maximum(np.abs(residual), HUBER) * (residual != 0.0)
+        weighted = rows * weight[:, None]
+        move = np.linalg.solve(weighted.T @ rows + PRIOR, -weighted.T @ residual - PRIOR @ (centre - guess))
         centre = centre + move
         if float(np.abs(move).max()) < SETTLED_M:
             break
-    return centre
+    return centre + origin
 
 
 class _Rays:
-    """The evidence's rays, and by how much each contradicts a centre of the shape.
+    """The evidence's rays, and where each comes nearest to the shape. Points are relative to the camera.
 
     Along a ray the distance from a convex shape is convex: a coarse look once, then a fine one around the place
     that was nearest before, which follows the centre as it moves.
     """
 
-    def __init__(self, known: KnownObject, evidence: Evidence, rotation: Array, origin: Array, start: Array) -> None:
+    def __init__(self, known: KnownObject, evidence: Evidence, rotation: Array, guess: Array) -> None:
         self._known = known
-        self._origin = origin
-        self._directions = np.concatenate([evidence.outline, evidence.beside]) @ rotation.T
-        self._meeting = len(evidence.outline)
-        self._free_to = np.concatenate([np.full(self._meeting, np.inf), evidence.free_to_m])
-        length = np.linalg.norm(self._directions, axis=1)
-        steps = np.linspace(-1.0, 1.0, RAY_SAMPLES) * reach_m(known) / length[:, None]
-        self._depth = self._nearest((self._directions @ (start - origin) / length**2)[:, None] + steps, start - origin)
+        self.directions: Array = np.concatenate([evidence.outline, evidence.beside]) @ rotation.T
+        self._free_to = np.concatenate([np.full(len(evidence.outline), np.inf), evidence.free_to_m])[:, None]
+        self._every = np.arange(len(self.directions))
+        length2 = (self.directions * self.directions).sum(axis=1)
+        steps = np.linspace(-1.0, 1.0, RAY_SAMPLES) * (reach_m(known) / np.sqrt(length2))[:, None]
+        self._depth = self._nearest_depth((self.directions @ guess / length2)[:, None] + steps, guess)
         self._fine_steps = steps * 1.5 / (RAY_SAMPLES - 1)
 
-    def misses(self, centre: Array) -> tuple[Array, Array]:
-        """For each ray a distance (n,) and its gradient (n, 3): by how much a ray of the outline passes the shape, or
-        (negative) how deep a ray beside enters it; zero where a ray agrees."""
-        to_centre = centre - self._origin
-        self._depth = self._nearest(self._depth[:, None] + self._fine_steps, to_centre)
-        distance, gradient = signed_distance(self._known, self._depth[:, None] * self._directions - to_centre)
-        agrees = distance > 0.0
-        agrees[: self._meeting] ^= True
-        distance[agrees] = 0.0
-        gradient[agrees] = 0.0
-        return distance, gradient
+    def nearest(self, centre: Array) -> Array:
+        """The point of each ray, of its free part, that is nearest to (or deepest in) the shape there, (n, 3)."""
+        self._depth = self._nearest_depth(self._depth[:, None] + self._fine_steps, centre)
+        return self._depth[:, None] * self.directions
 
-    def _nearest(self, depths: Array, to_centre: Array) -> Array:
-        """Of the points at these depths (n, samples) on each ray the nearest one's depth, (n,)."""
-        depths = np.minimum(depths, self._free_to[:, None])
-        points = depths[:, :, None] * self._directions[:, None, :] - to_centre
-        nearest: Array = depths[np.arange(len(depths)), distance_from(self._known, points).argmin(axis=1)]
+    def _nearest_depth(self, depths: Array, centre: Array) -> Array:
+        depths = np.minimum(depths, self._free_to)
+        points = depths[:, :, None] * self.directions[:, None, :] - centre
+        nearest: Array = depths[self._every, distance_from(self._known, points).argmin(axis=1)]
         return nearest
 
 

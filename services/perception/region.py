@@ -29,6 +29,9 @@ MAX_SURFACE_POINTS = 180
 MAX_RAYS = 60
 
 
+_AROUND = np.ones((3, 3), dtype=np.uint8)
+
+
 def depth_doubt_m(depth_m: Any) -> Any:
     """How far a depth may be off: noise and quantisation of the sensor, growing with the square of the distance."""
     return 0.003 + 0.0025 * depth_m**2
@@ -93,7 +96,7 @@ class Region:
         """A ring just outside of the outline, where neither blended pixels nor the cleaning's one pixel reach."""
         ring = 2 * _ring_px(self.image) + 1
         outer = cv2.dilate(self.mask, np.ones((ring, ring), dtype=np.uint8))
-        inner = cv2.dilate(self.mask, np.ones((3, 3), dtype=np.uint8))
+        inner = cv2.dilate(self.mask, _AROUND)
         return np.asarray(outer, dtype=np.bool_) & ~np.asarray(inner, dtype=np.bool_)
 
     @cached_property
@@ -115,9 +118,8 @@ class Region:
     def split_by_depth(self) -> list[tuple[Mask, Box]]:
         """The region cut where its depth jumps: an object before a wall of its colour, one can before another."""
         depth = np.nan_to_num(self.depth, nan=0.0)
-        kernel = np.ones((3, 3), dtype=np.uint8)
-        far = np.asarray(cv2.dilate(depth, kernel))
-        near = np.asarray(cv2.erode(np.where(depth > 0, depth, np.float32(99)), kernel))
+        far = np.asarray(cv2.dilate(depth, _AROUND))
+        near = np.asarray(cv2.erode(np.where(depth > 0, depth, np.float32(99)), _AROUND))
         smooth = far - near < 0.03 + 4 * depth_doubt_m(far)
         return components(
             ((self.mask > 0) & smooth & (depth > 0)).astype(np.uint8), self.box[:2], self.image, self.area_px // 50
@@ -127,7 +129,7 @@ class Region:
         """What fits an object that reaches `reach_m` from its centre; None without depth."""
         if self.depth_m is None:
             return None
-        core = np.asarray(cv2.erode(self.mask, np.ones((3, 3), dtype=np.uint8)))
+        core = np.asarray(cv2.erode(self.mask, _AROUND))
         inside = (core if np.count_nonzero(core) > self.area_px // 2 else self.mask) > 0
         window_m = 1.5 * reach_m + depth_doubt_m(self.depth_m)
         on_surface = inside & (np.abs(self.depth - np.float32(self.depth_m)) < window_m)
@@ -142,7 +144,7 @@ class Region:
         camera = self.image.camera
         rows, columns = np.nonzero(where)
         if len(rows) > at_most:
-            some = np.linspace(0, len(rows) - 1, at_most).astype(int)
+            some = np.arange(at_most) * len(rows) // at_most
             rows, columns = rows[some], columns[some]
         out = np.empty((len(rows), 4))
         out[:, 0] = (columns + self.box[0] - camera.cx) / camera.fx

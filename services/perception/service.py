@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
+
 from cocoro.node import Node
 from cocoro.objects import Catalogue
 from services.perception.config import Config
@@ -14,5 +16,7 @@ __all__ = ["Config", "run"]
 
 async def run(node: Node, config: Config) -> None:
     """Look at every frame that arrives, until cancelled. Raises ConfigError for a bad file of known objects."""
+    # A frame takes a few milliseconds: spreading it over threads would only take the other services' cores.
+    cv2.setNumThreads(1)
     catalogue = Catalogue.load(Path(config.objects) if config.objects else None)
     await node.drive(PerceptionCore(node.robot, config, catalogue))

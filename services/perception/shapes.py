@@ -36,17 +36,19 @@ def signed_distance(known: KnownObject, offsets_m: Points) -> tuple[Points, Poin
     planar = np.sqrt(offsets_m[:, 0] ** 2 + offsets_m[:, 1] ** 2)
     beside = planar - known.planar_radius_m
     above = np.abs(offsets_m[:, 2]) - known.size_m[2] / 2
-    # Beyond the rim both count; elsewhere the nearer of mantle and lid alone.
-    beyond = (beside > 0) & (above > 0)
-    corner = np.sqrt(beside**2 + above**2)
-    distance = np.where(beyond, corner, np.maximum(beside, above))
-    share = np.maximum(corner, 1e-9)
-    radial = np.where(beyond, beside / share, beside >= above)
-    vertical = np.where(beyond, above / share, beside < above)
+    radial, vertical = np.maximum(beside, 0.0), np.maximum(above, 0.0)
+    outside = np.sqrt(radial * radial + vertical * vertical)
+    within = np.maximum(beside, above)
+    # Inside, the nearer of mantle and lid alone counts.
+    deep = within <= 0.0
+    mantle = beside >= above
+    share = np.where(deep, 1.0, outside)
+    radial = np.where(deep, mantle, radial / share)
+    vertical = np.where(deep, ~mantle, vertical / share)
     gradient = np.empty_like(offsets_m)
     gradient[:, :2] = offsets_m[:, :2] * (radial / np.maximum(planar, 1e-9))[:, None]
     gradient[:, 2] = np.copysign(vertical, offsets_m[:, 2])
-    return distance, gradient
+    return outside + np.minimum(within, 0.0), gradient
 
 
 def reach_m(known: KnownObject) -> float:
