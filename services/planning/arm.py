@@ -95,14 +95,17 @@ class ArmController:
     def reach(self, goal: HandPose, speed_mps: float, measured: Mapping[str, float], dt_s: float) -> Step:
         """Move the hand towards a pose in front of the robot; unfolds the arm first where it is folded."""
         reference = self._sync(measured)
+        stage: dict[str, float] | None = None
         if self.folded(reference):
             out = all(abs(reference[name] - angle) < _NEAR_RAD for name, angle in _OUT.items())
-            if not out and reference["arm_base"] > self._park["arm_base"] - 0.2:
-                return self._joints(_OUT | {ROLL: 0.0}, dt_s)._replace(arrived=False)
-            return self._joints(_OUT | {"arm_base": _FRONT_RAD}, dt_s)._replace(arrived=False)
-        if reference["arm_base"] > 0.35 and goal.azimuth_rad < 0.3:
-            return self._joints(_OUT | {"arm_base": _FRONT_RAD, ROLL: LEVEL_ROLL_RAD}, dt_s)._replace(arrived=False)
-        return self._cartesian(goal, speed_mps, dt_s)
+            in_park_plane = reference["arm_base"] > self._park["arm_base"] - 0.2
+            stage = _OUT | ({ROLL: 0.0} if not out and in_park_plane else {"arm_base": _FRONT_RAD})
+        elif reference["arm_base"] > 0.35 and goal.azimuth_rad < 0.3:
+            stage = _OUT | {"arm_base": _FRONT_RAD, ROLL: LEVEL_ROLL_RAD}
+        if stage is None:
+            return self._cartesian(goal, speed_mps, dt_s)
+        left_m = float(np.linalg.norm(self._reacher.point(goal) - self._reacher.position(reference)))
+        return self._joints(stage, dt_s)._replace(arrived=False, left=left_m)
 
     def _sync(self, measured: Mapping[str, float]) -> dict[str, float]:
         names = (*ARM, ROLL)

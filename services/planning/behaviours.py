@@ -126,34 +126,42 @@ class Park:
 
 
 class Search:
-    """Look where the target was last, then sweep the head over the whole surroundings."""
+    """Look where the target was last, then sweep the head over the whole surroundings. What shows up in the sweep is
+    looked at until it is confirmed."""
 
     CONFIRMED = 2
+    IN_VIEW_S = 0.2
+    """A target is in view when its newest sighting is not older than this and perception's own lag."""
 
     def __init__(self, label: str) -> None:
         self._label = label
         self._sweep: Sweep | None = None
-        self._looking_since_ns: int | None = None
+        self._looked_at_ns: int | None = None
+        self._looked_from = 0
+        """Sightings there were when looking at the remembered place began."""
 
     def step(self, scene: Scene) -> Plan:
         config = scene.limbs.config.head
         target = scene.target(self._label)
         base, arm = scene.stand(), scene.still()
-        if target is not None and scene.senses.memory.sightings(self._label) >= self.CONFIRMED:
+        if target is not None:
             head = scene.look_at(target.position_m)
-            if target.age_s < 0.3:
+            sightings = scene.senses.memory.sightings(self._label)
+            lag_s = scene.senses.sight_lag_s
+            if sightings >= self.CONFIRMED and target.age_s < self.IN_VIEW_S + lag_s:
                 return Plan(base, arm, f"{self._label} is in view", head, "done", distance_m=_planar(target))
-            if self._sweep is None:
-                if self._looking_since_ns is None:
-                    self._looking_since_ns = scene.now_ns
-                if scene.now_ns - self._looking_since_ns < config.look_where_it_was_s * 1e9:
-                    why = f"{self._label} was seen {target.age_s:.1f} s ago: looking there"
-                    return Plan(base, arm, why, head, distance_m=_planar(target))
+            if self._looked_at_ns is None or sightings > self._looked_from:
+                self._looked_at_ns, self._looked_from = scene.now_ns, sightings
+            if scene.now_ns - self._looked_at_ns < (config.look_where_it_was_s + 2 * lag_s) * 1e9:
+                why = f"{self._label} was seen {target.age_s:.1f} s ago: looking there"
+                return Plan(base, arm, why, head, distance_m=_planar(target))
         pan, tilt = scene.angles[PAN], scene.angles[TILT]
         if self._sweep is None:
             self._sweep = Sweep(config, pan)
         goal = self._sweep.next(pan, tilt)
-        head = (*goal, config.sweep_speed_radps)
+        # Slow perception must still see every direction twice as the view passes over it.
+        speed = min(config.sweep_speed_radps, 0.4 / max(scene.senses.sight_lag_s, 1e-3))
+        head = (*goal, speed)
         if self._sweep.done:
             why = f"the whole surroundings were searched, {self._label} is not there"
             return Plan(base, arm, why, head, "failed", "not_found")
@@ -170,7 +178,7 @@ class Approach:
     def step(self, scene: Scene) -> Plan:
         limbs, config = scene.limbs, scene.limbs.config
         target = scene.target(self._label)
-        if target is None or target.age_s > config.stale_target_s:
+        if target is None or target.age_s > config.stale_target_s + scene.senses.sight_lag_s:
             why = f"{self._label} has not been seen for {target.age_s:.1f} s" if target else f"{self._label} is unknown"
             return Plan(scene.stand(), scene.still(), why, None, "failed", "lost")
         head = scene.look_at(target.position_m)
@@ -235,7 +243,7 @@ class Reach:
     def step(self, scene: Scene) -> Plan:
         limbs, config = scene.limbs, scene.limbs.config
         target = scene.target(self._label)
-        if self._frozen is None and (target is None or target.age_s > config.stale_target_s):
+        if self._frozen is None and (target is None or target.age_s > config.stale_target_s + scene.senses.sight_lag_s):
             return Plan(scene.stand(), scene.still(), f"{self._label} is out of sight", None, "failed", "lost")
         if target is not None and not self._inserting:
             why_not = limbs.reachability.why_not(target.position_m)

@@ -33,6 +33,9 @@ class Senses:
         self._odometry = History(3, angular=(2,))
         self._gap_ns = round(config.odometry_gap_s * NS)
         self._waiting: deque[Detections] = deque(maxlen=8)
+        self.sight_lag_s = 0.0
+        """How old a sighting is when the next one comes, smoothed: a fast perception makes it small."""
+        self._looked_ns: int | None = None
 
     def take(self, topic: Topic[Message], message: Message, now_ns: int) -> None:
         if isinstance(message, BaseState):
@@ -51,6 +54,10 @@ class Senses:
                 self.hand = message
         elif isinstance(message, Detections):
             self._waiting.append(message)
+            if self._looked_ns is not None and message.stamp_ns > self._looked_ns:
+                lag_s = min((now_ns - self._looked_ns) / NS, 5.0)
+                self.sight_lag_s += 0.3 * (lag_s - self.sight_lag_s)
+            self._looked_ns = message.stamp_ns
         elif isinstance(message, Intent):
             self.intent = message
 
