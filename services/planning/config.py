@@ -31,8 +31,10 @@ class Memory(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class Head(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     sweep_speed_radps: Positive = 0.9
     sweep_pan_rad: Positive = 2.6
-    sweep_tilts_rad: tuple[float, ...] = (-0.30, -0.75)
-    """One pass over the pan range at each."""
+    sweep_ahead_rad: Positive = 1.05
+    """How far to the first side it looks before it looks everywhere."""
+    sweep_tilts_rad: tuple[float, float] = (-0.30, -0.75)
+    """For the floor from 0.9 m on, and for the floor up to 1.8 m (the camera stands 0.73 m high)."""
     fixate_speed_radps: Positive = 4.0
     look_where_it_was_s: Positive = 1.5
     """A remembered object is looked for at its place for so long before sweeping."""

@@ -40,18 +40,16 @@ class Gaze:
 
 
 class Sweep:
-    """A fixed pattern over the whole pan range, once at each tilt, the nearer side first."""
+    """A fixed pattern over the whole pan range at two tilts, one for the floor far off, one for the floor near by.
+    What lies ahead comes first: a little to one side, all the way to the other, back at the near tilt, and last what is
+    left of the first side."""
 
     def __init__(self, config: Head, pan_rad: float) -> None:
         self._config = config
-        reach = config.sweep_pan_rad
-        side = reach if pan_rad >= 0 else -reach
-        self._corners = [(side, config.sweep_tilts_rad[0])]
-        for tilt in config.sweep_tilts_rad:
-            if self._corners[-1][1] != tilt:
-                self._corners.append((side, tilt))
-            side = -side
-            self._corners.append((side, tilt))
+        side = 1.0 if pan_rad >= 0 else -1.0
+        reach, ahead = side * config.sweep_pan_rad, side * config.sweep_ahead_rad
+        far, near = config.sweep_tilts_rad
+        self._corners = [(ahead, far), (-reach, far), (-reach, near), (reach, near), (reach, far), (ahead, far)]
         self.swept = 0
         """Corners that were reached."""
 
