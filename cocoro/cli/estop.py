@@ -8,9 +8,13 @@ from __future__ import annotations
 import argparse
 import asyncio
 import json
+import os
 import sys
 import time
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
+from pathlib import Path
 from typing import NamedTuple
 
 import msgspec
@@ -25,6 +29,7 @@ from cocoro.topics import ESTOP, STOPPABLE
 
 ROUND_S = 0.3
 """How long one round of asking waits for those that do not answer."""
+PAUSE_S = 0.05
 GIVE_UP_S = 3.0
 PATIENCE_S = 0.15
 """How long joining the mesh waits for members that do not answer (a stopped process, say)."""
@@ -36,10 +41,11 @@ class Stop(NamedTuple):
     robot: str
     acknowledged: tuple[str, ...]
     missing: tuple[str, ...]
-    """Alive, and did not acknowledge."""
+    """Known to run, and did not acknowledge."""
     absent: tuple[str, ...]
-    """Not alive: nobody there to acknowledge."""
+    """Nobody there to acknowledge."""
     seconds: float
+    """From Enter to the last acknowledgement."""
 
     @property
     def code(self) -> int:
@@ -57,7 +63,7 @@ class Stop(NamedTuple):
 
 
 def main(command: str, arguments: list[str]) -> int:
-    started_s = time.monotonic()
+    started_s = _process_start_s()
     parser = argparse.ArgumentParser(
         prog=f"cocoro {command}",
         description="Latch the emergency stop: wheels, arm and hand hold still until `cocoro reset`. "
@@ -83,6 +89,16 @@ def main(command: str, arguments: list[str]) -> int:
     return asyncio.run(_stop_all(found, started_s, options.json))
 
 
+def _process_start_s() -> float:
+    """When this process was started, on the monotonic clock: the operator's Enter, to 10 ms (proc_pid_stat(5))."""
+    try:
+        ticks = int(Path("/proc/self/stat").read_text().rpartition(")")[2].split()[19])
+        age_s = time.clock_gettime(time.CLOCK_BOOTTIME) - ticks / os.sysconf("SC_CLK_TCK")
+    except (OSError, AttributeError):  # not Linux
+        age_s = 0.0
+    return time.monotonic() - age_s
+
+
 def _robots(robot: str | None, profile: str | None) -> list[tuple[RunDir, ZenohConfig]]:
     """Those to be stopped, and how to reach each."""
     if profile is not None:
@@ -96,15 +112,15 @@ def _robots(robot: str | None, profile: str | None) -> list[tuple[RunDir, ZenohC
 
 
 async def _stop_all(found: list[tuple[RunDir, ZenohConfig]], started_s: float, as_json: bool) -> int:
-    stops = (stop(run_dir.robot, config, started_s) for run_dir, config in found)
+    def say(result: Stop) -> None:
+        text = json.dumps(result._asdict()) if as_json else str(result)
+        print(text, file=sys.stderr if result.code and not as_json else sys.stdout, flush=True)
+
+    stops = (stop(run_dir, config, started_s, say) for run_dir, config in found)
     results = await asyncio.gather(*stops, return_exceptions=True)
     code = exits.DONE
     for (run_dir, _), result in zip(found, results, strict=True):
         if isinstance(result, Stop):
-            if as_json:
-                print(json.dumps(result._asdict()))
-            else:
-                print(result, file=sys.stderr if result.code else sys.stdout)
             code = code or result.code
         elif isinstance(result, CocoroError):
             print(f"cocoro: {run_dir.robot}: {result}", file=sys.stderr)
@@ -114,33 +130,51 @@ async def _stop_all(found: list[tuple[RunDir, ZenohConfig]], started_s: float, a
     return code
 
 
-async def stop(robot: str, config: ZenohConfig, started_s: float) -> Stop:
-    """Latch one robot's emergency stop: ask again and again until all who live and move have acknowledged.
+async def stop(run_dir: RunDir, config: ZenohConfig, started_s: float, say: Callable[[Stop], None]) -> Stop:
+    """Latch one robot's emergency stop: ask again and again until all who run and move have acknowledged.
 
-    Raises MeshError when its mesh is not there.
+    `say` gets the result at once; leaving the mesh may take a while. Raises MeshError when that is not there.
     """
-    key = ESTOP.of("*").key(robot)
-    question = msgspec.msgpack.encode(EstopRequest(latched=True, by="operator"))
-    decoder = msgspec.msgpack.Decoder(EstopReply)
-    acknowledged: dict[str, float] = {}
     async with await ZenohBus.open(replace(config, patience_s=PATIENCE_S), expect_mesh=True) as bus:
+        acknowledged: dict[str, float] = {}
+        waited = False
         while True:
-            alive = asyncio.ensure_future(bus.alive(f"{robot}/*/alive", ROUND_S))
-            try:
-                replies = await bus.call(key, question, ROUND_S)
-            except CallTimeoutError:
-                replies = []
-            for reply in replies:
-                try:
-                    answer = decoder.decode(reply.payload) if reply.ok else None
-                except msgspec.MsgspecError:
-                    answer = None
-                if answer is not None and answer.latch == "latched":
-                    acknowledged.setdefault(answer.service, time.monotonic() - started_s)
-            living = {token.split("/")[1] for token in await alive}
-            missing = tuple(s for s in STOPPABLE if s in living and s not in acknowledged)
+            living, answers = await asyncio.gather(_living(run_dir, bus), _ask(run_dir.robot, bus))
             took_s = time.monotonic() - started_s
+            for service in answers:
+                acknowledged.setdefault(service, took_s)
+            waiting = [service for service in STOPPABLE if service not in acknowledged]
+            missing = tuple(service for service in waiting if service in living)
             if not missing or took_s > GIVE_UP_S:
-                absent = tuple(s for s in STOPPABLE if s not in living and s not in acknowledged)
-                took_s = max(acknowledged.values(), default=took_s) if not missing else took_s
-                return Stop(robot, tuple(acknowledged), missing, absent, took_s)
+                break
+            if not waited:
+                print(f"{run_dir.robot}: waiting for {', '.join(missing)}", file=sys.stderr, flush=True)
+            waited = True
+            await asyncio.sleep(PAUSE_S)
+        absent = tuple(service for service in waiting if service not in living)
+        took_s = took_s if missing else max(acknowledged.values(), default=took_s)
+        result = Stop(run_dir.robot, tuple(acknowledged), missing, absent, took_s)
+        say(result)
+        return result
+
+
+async def _ask(robot: str, bus: ZenohBus) -> list[str]:
+    """Ask everybody once; the services that say they are latched."""
+    question = msgspec.msgpack.encode(EstopRequest(latched=True, by="operator"))
+    try:
+        replies = await bus.call(ESTOP.of("*").key(robot), question, ROUND_S)
+    except CallTimeoutError:
+        return []
+    latched = []
+    for reply in replies:
+        with suppress(msgspec.MsgspecError):
+            answer = msgspec.msgpack.decode(reply.payload, type=EstopReply) if reply.ok else None
+            if answer is not None and answer.latch == "latched":
+                latched.append(answer.service)
+    return latched
+
+
+async def _living(run_dir: RunDir, bus: ZenohBus) -> set[str]:
+    """The services that are alive on the mesh, and those that a process here is, though it may have been stopped."""
+    tokens = await bus.alive(f"{run_dir.robot}/*/alive", ROUND_S)
+    return {token.split("/")[1] for token in tokens} | set(run_dir.claims())

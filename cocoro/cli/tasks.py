@@ -170,7 +170,8 @@ class Follower:
 def _interrupts(handler: Callable[[], None]) -> Iterator[None]:
     """Ctrl-C, being told to end and a closed terminal all go to `handler`: a task is not left running by itself."""
     loop = asyncio.get_running_loop()
-    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    ends = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    numbers = [number for number in ends if signal.getsignal(number) != signal.SIG_IGN]  # as nohup has it
     for number in numbers:
         loop.add_signal_handler(number, handler)
     try:
