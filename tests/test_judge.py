@@ -1,0 +1,189 @@
+"""The judge, fed truths that are made by hand."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from math import cos, radians, sin
+
+import msgspec
+import pytest
+
+from cocoro.messages import TrueObject, Truth, Vec3
+from sim.judge import Judge
+from sim.scene import Scene, SceneObject
+
+HZ = 30
+BOTH = ("claw_left", "claw_right")
+SCENE = Scene(
+    name="test",
+    objects=(
+        SceneObject(label="red_can", shape="cylinder", radius_m=0.033, height_m=0.12, position_m=(1.0, 0.0)),
+        SceneObject(label="green_can", shape="cylinder", radius_m=0.033, height_m=0.12, position_m=(1.0, 1.0)),
+        SceneObject(label="yellow_ball", shape="sphere", radius_m=0.03, position_m=(1.0, -1.0)),
+        SceneObject(
+            label="blue_ball",
+            shape="sphere",
+            radius_m=0.04,
+            position_m=(2.0, 0.0, 0.5),
+            path_m=((2.0, 1.0),),
+            speed_mps=0.2,
+        ),
+    ),
+)
+PLACES: dict[str, Vec3] = {
+    "red_can": (1.0, 0.0, 0.06),
+    "green_can": (1.0, 1.0, 0.06),
+    "yellow_ball": (1.0, -1.0, 0.03),
+    "blue_ball": (2.0, 0.0, 0.5),
+}
+
+
+def truth(
+    time_s: float,
+    places: dict[str, Vec3] | None = None,
+    touching: Iterable[str] = ("floor",),
+    tilt_deg: dict[str, float] | None = None,
+    collisions: tuple[str, ...] = (),
+) -> Truth:
+    """All at their places but those that are given; `touching` is the red can's, tilts are about x."""
+    objects = []
+    for label, place in (PLACES | (places or {})).items():
+        half = radians((tilt_deg or {}).get(label, 0.0)) / 2
+        objects.append(
+            TrueObject(
+                label=label,
+                kind="object",
+                position_m=place,
+                orientation=(sin(half), 0.0, 0.0, cos(half)),
+                touching=tuple(touching) if label == "red_can" else ("floor",),
+            )
+        )
+    return Truth(
+        stamp_ns=round(time_s * 1e9),
+        body_m=(0.0, 0.0, 0.0),
+        body_orientation=(0.0, 0.0, 0.0, 1.0),
+        joints_rad={},
+        objects=tuple(objects),
+        collisions=collisions,
+    )
+
+
+def hold(judge: Judge, start_s: float, lasting_s: float, height_m: float, touching: Iterable[str] = BOTH) -> None:
+    for tick in range(round(lasting_s * HZ) + 1):
+        judge.feed(truth(start_s + tick / HZ, {"red_can": (0.4, -0.1, height_m + 0.06)}, touching))
+
+
+def test_a_can_in_both_claws_ten_centimetres_up_for_two_seconds_is_held() -> None:
+    judge = Judge(SCENE, "red_can")
+    judge.feed(truth(0.0))
+    judge.feed(truth(1.0, touching=("floor", *BOTH)))
+    hold(judge, 2.0, 1.9, height_m=0.15)
+    assert not judge.result().held
+    hold(judge, 3.9, 0.1, height_m=0.15)
+    verdict = judge.result()
+    assert verdict.held
+    assert verdict.lifted_m == pytest.approx(0.15)
+    assert verdict.knocked_over == ()
+
+
+@pytest.mark.parametrize(
+    ("height_m", "touching"),
+    [
+        (0.09, BOTH),
+        (0.15, ("claw_left",)),
+        (0.15, (*BOTH, "wrist_roll")),
+        (0.15, (*BOTH, "floor")),
+        (0.15, ()),
+    ],
+)
+def test_too_low_in_one_claw_or_leaning_on_something_is_not_held(height_m: float, touching: tuple[str, ...]) -> None:
+    judge = Judge(SCENE, "red_can")
+    judge.feed(truth(0.0))
+    hold(judge, 1.0, 5.0, height_m, touching)
+    assert not judge.result().held
+
+
+def test_one_slip_starts_the_two_seconds_anew() -> None:
+    judge = Judge(SCENE, "red_can")
+    judge.feed(truth(0.0))
+    hold(judge, 1.0, 5.0, height_m=0.15)
+    hold(judge, 6.1, 0.0, height_m=0.15, touching=("claw_left",))
+    hold(judge, 6.2, 1.5, height_m=0.15)
+    assert not judge.result().held
+
+
+def test_a_tilted_can_hangs_lower_than_its_centre_says() -> None:
+    judge = Judge(SCENE, "red_can")
+    judge.feed(truth(0.0))
+    for tick in range(3 * HZ):
+        judge.feed(truth(1.0 + tick / HZ, {"red_can": (0.4, 0.0, 0.155)}, BOTH, {"red_can": 30.0}))
+    verdict = judge.result()
+    # 0.06 cos 30 + 0.033 sin 30 = 0.0685 below the centre
+    assert verdict.lifted_m == pytest.approx(0.155 - 0.06846, abs=1e-4)
+    assert not verdict.held
+
+
+def test_a_can_that_tilts_or_moves_too_far_is_knocked_over() -> None:
+    judge = Judge(SCENE, "red_can")
+    judge.feed(truth(0.0))
+    judge.feed(truth(1.0, {"green_can": (1.0, 1.049, 0.06)}, tilt_deg={"green_can": 29.0}))
+    assert judge.result().knocked_over == ()
+    judge.feed(truth(2.0, tilt_deg={"green_can": 31.0}))
+    judge.feed(truth(3.0, {"red_can": (1.04, 0.04, 0.06)}))
+    judge.feed(truth(4.0))
+    verdict = judge.result()
+    assert set(verdict.knocked_over) == {"green_can", "red_can"}
+    assert verdict.target_moved_m == pytest.approx(0.0566, abs=1e-3)
+
+
+def test_what_the_hand_does_with_the_target_is_no_knocking_over() -> None:
+    judge = Judge(SCENE, "red_can")
+    judge.feed(truth(0.0))
+    judge.feed(truth(1.0, {"red_can": (1.01, 0.0, 0.06)}))
+    judge.feed(truth(2.0, {"red_can": (1.01, 0.0, 0.06)}, (*BOTH, "floor")))
+    judge.feed(truth(3.0, {"red_can": (0.5, 0.0, 0.3)}, BOTH, {"red_can": 45.0}))
+    verdict = judge.result()
+    assert verdict.knocked_over == ()
+    assert verdict.target_moved_m == pytest.approx(0.01)
+
+
+def test_a_ball_does_not_tilt_and_what_moves_by_itself_is_not_knocked_over() -> None:
+    judge = Judge(SCENE, "red_can")
+    judge.feed(truth(0.0))
+    judge.feed(truth(1.0, {"blue_ball": (2.0, 0.9, 0.5)}, tilt_deg={"yellow_ball": 90.0}))
+    assert judge.result().knocked_over == ()
+    judge.feed(truth(2.0, {"yellow_ball": (1.1, -1.0, 0.03)}))
+    assert judge.result().knocked_over == ("yellow_ball",)
+
+
+def test_collisions_are_told_once_each_in_the_order_in_which_they_came() -> None:
+    judge = Judge(SCENE, "red_can")
+    judge.feed(truth(0.0, collisions=("elbow~green_can",)))
+    judge.feed(truth(1.0, collisions=("chassis~red_can", "elbow~green_can")))
+    assert judge.result().collisions == ("elbow~green_can", "chassis~red_can")
+
+
+def test_a_task_without_a_target_is_judged_by_the_rest() -> None:
+    judge = Judge(SCENE)
+    judge.feed(truth(0.0))
+    judge.feed(truth(1.0, {"red_can": (1.2, 0.0, 0.06)}))
+    verdict = judge.result()
+    assert not verdict.held
+    assert verdict.knocked_over == ("red_can",)
+
+
+def test_a_verdict_is_json() -> None:
+    judge = Judge(SCENE, "red_can")
+    judge.feed(truth(0.0))
+    assert set(msgspec.json.decode(msgspec.json.encode(judge.result()))) == {
+        "lifted_m",
+        "held",
+        "knocked_over",
+        "collisions",
+        "target_moved_m",
+    }
+
+
+def test_a_target_that_the_scene_has_not_is_refused() -> None:
+    with pytest.raises(KeyError, match="red_can"):
+        Judge(SCENE, "purple_can")

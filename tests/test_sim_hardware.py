@@ -1,0 +1,353 @@
+"""The simulated servos and base behave as the hardware does: all of it without the physics engine."""
+
+from __future__ import annotations
+
+from math import degrees, hypot, pi, radians
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cocoro.messages import BaseCommand, ServoCommand
+from cocoro.odometry import Odometry, WheelRamp
+from cocoro.robot import SERVO_COUNT_RAD, Robot
+from sim.base import Bumper, CreateCounters, MobileBase
+from sim.realism import Wander
+from sim.seeds import stream
+from sim.servos import Play, Servo, ServoNetwork
+
+ROBOT = Robot.load()
+HZ = 240
+MS = 1_000_000
+
+
+# --- servos ---------------------------------------------------------------------------------------
+
+
+def servo(joint: str = "elbow", angle_rad: float = 0.0, backlash_rad: float = 0.0) -> Servo:
+    return Servo(ROBOT.joints[joint], angle_rad, backlash_rad)
+
+
+def network(name: str = "arm", backlash_deg: float = 0.0) -> ServoNetwork:
+    joints = {joint: ROBOT.joints[joint] for joint in ROBOT.network_joints(name)}
+    angles = dict.fromkeys(joints, 0.0)
+    return ServoNetwork(joints, angles, keeps_goal=name == "hand", timeout_s=0.2, backlash_deg=backlash_deg)
+
+
+def order(goal_rad: float, speed_radps: float = 1.0, joint: str = "elbow") -> ServoCommand:
+    return ServoCommand(joints=(joint,), goal_rad=(goal_rad,), speed_radps=(speed_radps,))
+
+
+@given(st.floats(-2.6, 2.6))
+def test_goals_and_positions_come_in_counts(angle_rad: float) -> None:
+    one = servo()
+    one.command(angle_rad, 1.0, until_ns=0)
+    one.sense(angle_rad, 0.0, 0.0, now_ns=0)
+    assert abs(one.drive().target_rad - angle_rad) <= SERVO_COUNT_RAD / 2 + 1e-9
+    assert abs(one.position_rad - angle_rad) <= SERVO_COUNT_RAD / 2 + 1e-9
+    assert one.joint.to_count(one.position_rad) == one.count
+
+
+def test_goals_stay_within_the_joints_limits_and_speeds_within_the_servos() -> None:
+    one = servo("shoulder")
+    one.command(-3.0, 100.0, until_ns=0)
+    low, _ = one.joint.limits_rad
+    assert one.drive().target_rad == pytest.approx(low, abs=SERVO_COUNT_RAD)
+    assert one.drive().max_speed_radps == one.joint.max_speed_radps
+    assert one.drive().max_torque_nm == one.joint.torque_nm
+
+
+def test_the_slowest_command_still_moves_and_speed_zero_holds() -> None:
+    one = servo()
+    one.command(1.0, 1e-6, until_ns=0)
+    assert 0.0 < one.drive().max_speed_radps < 0.02
+    one.sense(0.5, 1.0, 0.0, now_ns=0)
+    one.command(1.0, 0.0, until_ns=0)
+    assert one.drive().target_rad == pytest.approx(0.5, abs=SERVO_COUNT_RAD)
+
+
+def test_an_arm_joint_on_its_way_holds_when_its_command_expires() -> None:
+    arm = network()
+    arm.command(order(1.0), now_ns=0)
+    arm.servos["elbow"].sense(0.3, 1.0, 0.0, now_ns=200 * MS)
+    arm.expire(200 * MS)
+    assert arm.servos["elbow"].drive().target_rad == pytest.approx(1.0, abs=SERVO_COUNT_RAD)
+    arm.expire(201 * MS)
+    held = arm.servos["elbow"].drive().target_rad
+    assert held == pytest.approx(0.3, abs=SERVO_COUNT_RAD)
+    # Once: it does not follow the joint when something pushes it.
+    arm.servos["elbow"].sense(0.2, 0.0, 0.0, now_ns=300 * MS)
+    arm.expire(300 * MS)
+    assert arm.servos["elbow"].drive().target_rad == pytest.approx(held)
+
+
+def test_a_joint_that_is_not_named_any_more_expires_though_others_are() -> None:
+    arm = network()
+    arm.command(order(1.0), now_ns=0)
+    arm.servos["elbow"].sense(0.3, 1.0, 0.0, now_ns=0)
+    for tick in range(1, 20):
+        arm.command(order(0.5, joint="neck_pan"), now_ns=tick * 20 * MS)
+        arm.expire(tick * 20 * MS)
+    assert arm.servos["elbow"].drive().target_rad == pytest.approx(0.3, abs=SERVO_COUNT_RAD)
+    assert arm.servos["neck_pan"].drive().target_rad == pytest.approx(0.5, abs=SERVO_COUNT_RAD)
+
+
+def test_the_hand_keeps_its_goal_when_commands_stop_and_when_stopped() -> None:
+    hand = network("hand")
+    hand.command(order(0.3, joint="claw_left"), now_ns=0)
+    hand.servos["claw_left"].sense(0.1, 0.0, 1.0, now_ns=0)
+    hand.expire(10_000 * MS)
+    hand.set_latch("latched")
+    goal = ROBOT.joints["claw_left"].to_angle(ROBOT.joints["claw_left"].to_count(0.3))
+    assert hand.servos["claw_left"].drive().target_rad == pytest.approx(goal)
+
+
+@pytest.mark.parametrize(("latch", "why"), [("latched", "estop"), ("unknown", "latch unknown")])
+def test_a_stopped_arm_holds_and_refuses_and_says_why(latch: str, why: str) -> None:
+    arm = network()
+    arm.command(order(1.0), now_ns=0)
+    arm.servos["elbow"].sense(0.3, 1.0, 0.0, now_ns=0)
+    arm.set_latch(latch)  # type: ignore[arg-type]
+    assert arm.servos["elbow"].drive().target_rad == pytest.approx(0.3, abs=SERVO_COUNT_RAD)
+    assert arm.command(order(1.0), now_ns=MS) == why
+    assert arm.state(MS).stopped_by == why
+    assert arm.state(MS).latch == latch
+    arm.set_latch("released")
+    assert arm.servos["elbow"].drive().target_rad == pytest.approx(0.3, abs=SERVO_COUNT_RAD)
+    assert arm.command(order(1.0), now_ns=2 * MS) == ""
+
+
+def test_a_command_for_a_joint_of_another_network_is_refused_whole() -> None:
+    arm = network()
+    command = ServoCommand(joints=("elbow", "claw_left"), goal_rad=(1.0, 1.0), speed_radps=(1.0, 1.0))
+    assert "claw_left" in arm.command(command, now_ns=0)
+    assert arm.servos["elbow"].drive().target_rad == pytest.approx(0.0, abs=SERVO_COUNT_RAD)
+
+
+def test_pushing_at_the_limit_for_long_is_an_overload_until_it_is_reset() -> None:
+    arm = network()
+    elbow = arm.servos["elbow"]
+    limit = elbow.joint.torque_nm
+    for tick in range(51):
+        elbow.sense(0.3, 0.0, -limit, now_ns=tick * 100 * MS)
+    assert arm.state(0).faults == ()
+    assert arm.state(0).load[arm.state(0).joints.index("elbow")] == -1.0
+    elbow.sense(0.3, 0.0, -limit, now_ns=5_100 * MS)
+    assert arm.state(0).faults == ("elbow: overload",)
+    assert elbow.drive().max_torque_nm == limit  # what it holds up does not fall
+    elbow.sense(0.3, 0.0, 0.0, now_ns=6_000 * MS)
+    assert arm.state(0).faults == ("elbow: overload",)
+    arm.set_latch("latched")
+    arm.set_latch("released")
+    assert arm.state(0).faults == ()
+
+
+def test_a_moments_relief_starts_the_overload_anew_and_a_grip_is_none() -> None:
+    elbow = servo()
+    for tick in range(200):
+        relief = tick % 40 == 39
+        elbow.sense(0.3, 0.0, 0.0 if relief else elbow.joint.torque_nm, now_ns=tick * 100 * MS)
+    assert not elbow.overloaded
+    claw = servo("claw_left")
+    for tick in range(600):
+        claw.sense(0.05, 0.0, claw.joint.torque_nm, now_ns=tick * 100 * MS)
+    assert not claw.overloaded
+
+
+def test_a_claw_pushes_harder_the_further_it_is_from_its_goal() -> None:
+    claw = servo("claw_left")
+    torques = []
+    for goal_deg in (0.5, 5.0, 10.0, 15.0, 40.0):
+        claw.command(radians(goal_deg), 1.0, until_ns=0)
+        torques.append(claw.drive().max_torque_nm)
+    assert torques == sorted(torques)
+    assert torques[0] == pytest.approx(0.1 * claw.joint.torque_nm)
+    assert torques[2] == pytest.approx(claw.joint.torque_nm * 10.0 / claw.joint.compliance_deg, rel=0.02)
+    assert torques[-1] == claw.joint.torque_nm
+
+
+def test_backlash_makes_the_reading_depend_on_where_the_joint_came_from() -> None:
+    play = Play(radians(0.5))
+    up = [play.follow(radians(angle)) for angle in (0.0, 0.2, 1.0)]
+    assert degrees(up[0]) == 0.0
+    assert degrees(up[1]) == 0.0  # within the play
+    assert degrees(up[2]) == pytest.approx(0.75)
+    assert degrees(play.follow(radians(0.6))) == pytest.approx(0.75)
+    assert degrees(play.follow(radians(0.0))) == pytest.approx(0.25)
+
+
+@given(st.lists(st.floats(-2.0, 2.0), min_size=1, max_size=30))
+def test_the_reading_is_never_further_off_than_half_the_backlash(angles_rad: list[float]) -> None:
+    one = servo(backlash_rad=radians(0.5))
+    for angle_rad in angles_rad:
+        one.sense(angle_rad, 0.0, 0.0, now_ns=0)
+        assert abs(one.position_rad - angle_rad) <= radians(0.25) + SERVO_COUNT_RAD / 2 + 1e-9
+
+
+def test_without_backlash_the_servo_drives_the_joint_to_its_goal_and_with_it_the_reading() -> None:
+    for backlash_rad in (0.0, radians(0.5)):
+        one = servo(backlash_rad=backlash_rad)
+        one.command(0.5, 1.0, until_ns=0)
+        angle_rad = 0.0
+        for _ in range(100):
+            angle_rad = min(angle_rad + 0.01, one.drive().target_rad)
+            one.sense(angle_rad, 1.0, 0.0, now_ns=0)
+        assert one.count == one.goal_count
+        assert angle_rad - one.position_rad == pytest.approx(backlash_rad / 2, abs=1e-9)
+
+
+# --- base -----------------------------------------------------------------------------------------
+
+
+def run(base: MobileBase, seconds: float, command: BaseCommand | None, start_ns: int = 0) -> tuple[int, float]:
+    """Let the wheels turn as asked; commands at 48 Hz. Returns the time and the fastest change of speed, m/s2."""
+    steepest, before = 0.0, base.ramp.left_mps
+    for step in range(round(seconds * HZ)):
+        now_ns = start_ns + step * 1_000_000_000 // HZ
+        if command is not None and step % 5 == 0:
+            base.command(command, now_ns)
+        left, right = base.wheels(now_ns, 1 / HZ)
+        base.rolled(left / HZ, right / HZ, now_ns, 1 / HZ)
+        steepest = max(steepest, abs(left - before) * HZ)
+        before = left
+    return start_ns + round(seconds * 1e9), steepest
+
+
+def test_wheel_speeds_are_ramped_and_clipped() -> None:
+    base = MobileBase(ROBOT.base, exact=True)
+    _, steepest = run(base, 1.0, BaseCommand(left_mps=3.0, right_mps=-3.0))
+    assert (base.ramp.left_mps, base.ramp.right_mps) == (0.5, -0.5)
+    assert steepest == pytest.approx(ROBOT.base.wheel_acceleration_mps2)
+
+
+def test_the_base_stops_when_commands_stop() -> None:
+    base = MobileBase(ROBOT.base, exact=True)
+    now_ns, _ = run(base, 1.0, BaseCommand(left_mps=0.2, right_mps=0.2))
+    now_ns, _ = run(base, 0.15, None, now_ns)
+    assert base.ramp.left_mps == pytest.approx(0.2)
+    assert base.state(now_ns).stopped_by == ""
+    now_ns, _ = run(base, 0.2, None, now_ns)
+    assert base.ramp.left_mps == 0.0
+    assert base.state(now_ns).stopped_by == "no command"
+
+
+def test_a_latched_base_stops_refuses_and_does_not_resume_an_old_command() -> None:
+    base = MobileBase(ROBOT.base, exact=True)
+    ahead = BaseCommand(left_mps=0.4, right_mps=0.4)
+    now_ns, _ = run(base, 1.0, ahead)
+    base.set_latch("latched")
+    now_ns, _ = run(base, 0.25, None, now_ns)
+    assert base.ramp.left_mps == 0.0
+    assert base.command(ahead, now_ns) == "estop"
+    assert base.state(now_ns).stopped_by == "estop"
+    base.set_latch("released")
+    now_ns, _ = run(base, 0.1, None, now_ns)
+    assert base.ramp.left_mps == 0.0
+
+
+def test_a_pressed_bumper_forbids_forward_but_lets_the_base_back_off_and_turn() -> None:
+    base = MobileBase(ROBOT.base, exact=True)
+    base.bumper = Bumper(left=True)
+    now_ns, _ = run(base, 0.5, BaseCommand(left_mps=0.3, right_mps=0.3))
+    assert (base.ramp.left_mps, base.ramp.right_mps) == (0.0, 0.0)
+    state = base.state(now_ns)
+    assert (state.stopped_by, state.bump_left, state.bump_right) == ("bump", True, False)
+    now_ns, _ = run(base, 0.5, BaseCommand(left_mps=0.3, right_mps=0.1), now_ns)
+    assert (base.ramp.left_mps, base.ramp.right_mps) == pytest.approx((0.1, -0.1))
+    now_ns, _ = run(base, 0.5, BaseCommand(left_mps=-0.3, right_mps=-0.2), now_ns)
+    assert (base.ramp.left_mps, base.ramp.right_mps) == pytest.approx((-0.3, -0.2))
+    assert base.state(now_ns).stopped_by == ""
+
+
+# --- odometry -------------------------------------------------------------------------------------
+
+
+def drive_by_reports(
+    left_mps: float, right_mps: float, seconds: float, *, share: float = 1.0, report_hz: int = 5
+) -> tuple[Odometry, Odometry]:
+    """Fused and exact odometry of wheels that turn at `share` of what they are told."""
+    fused, exact = Odometry(ROBOT.base), Odometry(ROBOT.base)
+    counters = CreateCounters(ROBOT.base.wheel_separation_m)
+    ramp = WheelRamp(ROBOT.base)
+    for step in range(1, round(seconds * HZ) + 1):
+        ramp.advance(left_mps, right_mps, 1 / HZ)
+        fused.advance(ramp.left_mps / HZ, ramp.right_mps / HZ, 1 / HZ)
+        left_m, right_m = share * ramp.left_mps / HZ, share * ramp.right_mps / HZ
+        exact.advance(left_m, right_m, 1 / HZ)
+        counters.roll(left_m, right_m)
+        if step % (HZ // report_hz) == 0:
+            fused.report(*counters.take())
+    return fused, exact
+
+
+def apart_m(one: Odometry, other: Odometry) -> float:
+    return hypot(one.x_m - other.x_m, one.y_m - other.y_m)
+
+
+def test_the_counters_forget_what_is_less_than_a_unit() -> None:
+    counters = CreateCounters(ROBOT.base.wheel_separation_m)
+    counters.roll(0.0109, 0.0109)
+    assert counters.take() == (10, 0)
+    counters.roll(0.0109, 0.0109)
+    assert counters.take() == (10, 0)
+    counters.roll(-0.0015, 0.0035)
+    assert counters.take() == (1, 1)
+
+
+def test_a_slow_arc_that_the_reports_alone_call_straight_is_followed() -> None:
+    # 4.4 degrees a second: less than one degree in each of the 0.2 s between reports.
+    fused, exact = drive_by_reports(0.10, 0.12, 20.0)
+    assert degrees(exact.yaw_rad) == pytest.approx(87.6, abs=0.5)
+    assert apart_m(fused, exact) < 0.001
+    assert degrees(abs(fused.yaw_rad - exact.yaw_rad)) < 0.1
+
+
+@pytest.mark.parametrize("share", [0.8, 0.95, 1.05])
+def test_wheels_that_do_not_what_they_are_told_are_corrected_to_within_the_reports_units(share: float) -> None:
+    fused, exact = drive_by_reports(0.2, 0.2, 10.0, share=share)
+    assert apart_m(fused, exact) <= 0.001 * 50 + 1e-9  # a millimetre a report at worst
+    assert apart_m(fused, exact) < 0.5 * abs(1.0 - share) * 2.0
+
+
+def test_blocked_wheels_are_not_believed_to_turn() -> None:
+    fused, _ = drive_by_reports(0.2, 0.2, 5.0, share=0.0)
+    assert hypot(fused.x_m, fused.y_m) < 0.002
+    fused, _ = drive_by_reports(-0.2, 0.2, 5.0, share=0.0)
+    assert abs(degrees(fused.yaw_rad)) < 0.5
+
+
+@given(st.floats(-0.5, 0.5), st.floats(-0.5, 0.5))
+def test_arcs_are_integrated_exactly(left_m: float, right_m: float) -> None:
+    whole, pieces = Odometry(ROBOT.base), Odometry(ROBOT.base)
+    whole.advance(left_m, right_m, 1.0)
+    for _ in range(100):
+        pieces.advance(left_m / 100, right_m / 100, 0.01)
+    assert apart_m(whole, pieces) < 1e-9
+    assert whole.yaw_rad == pytest.approx(pieces.yaw_rad, abs=1e-12)
+
+
+def test_turning_on_the_spot_is_measured_at_the_wheels_distance() -> None:
+    odometry = Odometry(ROBOT.base)
+    around_m = pi * ROBOT.base.wheel_separation_m / 2
+    odometry.advance(-around_m, around_m, 1.0)
+    assert odometry.yaw_rad == pytest.approx(pi)
+    assert hypot(odometry.x_m, odometry.y_m) < 1e-12
+
+
+# --- noise ----------------------------------------------------------------------------------------
+
+
+def test_noise_wanders_with_the_spread_that_it_is_given() -> None:
+    noise = Wander(stream(1, "test"), 4, sigma=0.02, time_s=0.5, dt_s=1 / 60)
+    values = np.array([noise.step() for _ in range(60_000)])
+    assert np.abs(values.mean(axis=0)).max() < 0.002
+    assert values.std(axis=0) == pytest.approx([0.02] * 4, rel=0.1)
+    lag = 30  # half a second: correlated by 1 / e
+    assert np.corrcoef(values[:-lag, 0], values[lag:, 0])[0, 1] == pytest.approx(0.37, abs=0.1)
+
+
+def test_streams_of_one_seed_are_separate_and_repeatable() -> None:
+    assert stream(5, "slip").random() == stream(5, "slip").random()
+    assert stream(5, "slip").random() != stream(5, "scatter").random()
+    assert stream(5, "slip").random() != stream(6, "slip").random()
