@@ -188,9 +188,24 @@ class Detections(Message):
     detections: tuple[Detection, ...] = ()
 
 
+class Obstacles(Message):
+    """What stands on the floor and where the floor is free, from one depth image; known objects included.
+    `stamp_ns` is the frame's. Body frame as the body stood then."""
+
+    points_m: Annotated[tuple[Vec3, ...], Meta(max_length=4096)] = ()
+    """One a floor cell of 4 cm in which something stands: its middle x, y, and the height of the highest point seen."""
+    free: Annotated[tuple[Vec3, ...], Meta(max_length=1024)] = ()
+    """Rays over free floor from `origin_m`: bearing (rad, body frame), and from which to which distance (m) the floor
+    is seen; a ray ends before the first thing that stands in it."""
+    origin_m: Vec2 = (0.0, 0.0)
+    """Where the camera stood, on the floor."""
+
+
 # --- planning -------------------------------------------------------------------------------------
 
-Behaviour = Literal["idle", "park", "search", "approach", "reach", "grasp", "lift", "place"]
+Behaviour = Literal[
+    "idle", "park", "search", "explore", "approach", "reach", "grasp", "lift", "carry", "place", "follow"
+]
 
 
 class Intent(Message):
@@ -202,6 +217,8 @@ class Intent(Message):
     """Counts the intents of one run of the executive, so that a status can say which one it answers."""
     behaviour: Behaviour = "idle"
     label: str = ""
+    place_m: Vec2 | None = None
+    """For 'carry': where to put down, in the odometry frame."""
 
 
 class TargetEstimate(msgspec.Struct, kw_only=True):
@@ -238,13 +255,16 @@ class PlannerStatus(Message):
     """Centre between the pads, body frame, felt (from the joint angles)."""
     holding: bool = False
     """The claws are stopped by something between them."""
+    body_m: Vec2 | None = None
+    body_yaw_rad: float = 0.0
+    """Where the body stands in the odometry frame."""
     known: tuple[TargetEstimate, ...] = ()
     """Every object in memory."""
 
 
 # --- executive ------------------------------------------------------------------------------------
 
-TaskName = Literal["fetch", "park", "put-down"]
+TaskName = Literal["fetch", "follow", "park", "put-down"]
 Outcome = Literal["done", "failed", "cancelled"]
 
 
@@ -276,6 +296,10 @@ class TaskRequest(msgspec.Struct, kw_only=True):
     task: TaskName
     label: str = ""
     timeout_s: Annotated[float, Meta(gt=0, le=3600)] | None = None
+    bring: bool = False
+    """Fetch: carry it to where the task began and put it down there."""
+    for_s: Annotated[float, Meta(gt=0, le=3600)] | None = None
+    """Follow: for so long; None is until cancelled."""
 
 
 RefusalCode = Literal[

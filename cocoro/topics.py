@@ -110,6 +110,11 @@ DETECTIONS = Topic(
     "perception/detections", m.Detections, Qos.STATE, "perception", 30.0, 1.0,
     "Known objects in one frame, stamped with the frame's time. Older ones only age the target memory.",
 )  # fmt: skip
+OBSTACLES = Topic(
+    "perception/obstacles", m.Obstacles, Qos.STATE, "perception", 10.0, 1.0,
+    "What stands on the floor and where it is free, from the depth image. Older ones are not entered in the map.",
+    max_bytes=262_144,
+)  # fmt: skip
 PLAN = Topic(
     "planning/status", m.PlannerStatus, Qos.STATE, "planning", 50.0, 0.5,
     "What the planner does and why. Beyond its age the running task fails: planner silent.",
@@ -145,7 +150,7 @@ STEPS = Topic(
 
 TOPICS: tuple[Topic[Any], ...] = (
     FRAME, BASE_STATE, BASE_COMMAND, ARM_STATE, ARM_COMMAND, HAND_STATE, HAND_COMMAND,
-    DETECTIONS, PLAN, INTENT, TASK, LATCH, CLOCK, TRUTH, HEALTH, STEPS,
+    DETECTIONS, OBSTACLES, PLAN, INTENT, TASK, LATCH, CLOCK, TRUTH, HEALTH, STEPS,
 )  # fmt: skip
 
 RUN = Request(
