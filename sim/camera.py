@@ -14,15 +14,16 @@ from cocoro.errors import ConfigError
 from cocoro.kinematics import Array
 from cocoro.messages import Frame
 from cocoro.robot import Robot
-from sim.render import Light, Renderer
 from sim.realism import Sensors
+from sim.render import Light, Renderer
 from sim.seeds import stream
 from sim.sensor_effects import (
+    ByteNoise,
     Codes,
     DepthCoder,
+    DepthNoise,
     Drift,
     Metres,
-    NoiseBank,
     Rgb,
     blur_along_motion,
     drop_edges,
@@ -84,8 +85,8 @@ class Kinect:
         _keep_freed_memory()
         if self._real:
             rng = stream(seed, "kinect")
-            self._colour_noise = NoiseBank(rng, (height, width * 3), COLOUR_SIGMA)
-            self._depth_noise = NoiseBank(rng, (height, width), DEPTH_SIGMA_PER_M)
+            self._colour_noise = ByteNoise(rng, width * height, COLOUR_SIGMA)
+            self._depth_noise = DepthNoise(rng, (height, width), DEPTH_SIGMA_PER_M)
             self._exposure = Drift(rng, EXPOSURE_DRIFT, DRIFT_S)
             self._white_balance = Drift(rng, WHITE_BALANCE_DRIFT, DRIFT_S)
 
@@ -130,14 +131,12 @@ class Kinect:
         time_s = stamp_ns / 1e9
         exposure, balance = 1 + self._exposure.at(time_s), self._white_balance.at(time_s)
         gains = np.array([exposure * (1 + balance), exposure, exposure * (1 - balance)])
-        return self._colour_noise.add_to_bytes(scale_channels(colour, gains), rng)
+        return self._colour_noise.add(scale_channels(colour, gains), rng)
 
     def _measure(self, depth_m: Metres, rng: np.random.Generator) -> Codes:
         """What the depth camera reports: noise before quantising; nothing out of range, in the projector's
         shadow (negative metres) and here and there on edges."""
-        near = np.clip(depth_m, 0.0, 10.0)
-        noisy = near + near * near * self._depth_noise.draw(rng)
-        return drop_edges(self._coder.codes(noisy), rng)
+        return drop_edges(self._coder.codes(self._depth_noise.add(depth_m, rng)), rng)
 
 
 def moved(camera_pose: Array, offset_m: Array) -> Array:

@@ -45,31 +45,41 @@ class DepthCoder:
         return self._table.take(steps.astype(np.uint16))
 
 
-class NoiseBank:
-    """Gaussian noise that was drawn once, a little more than a frame of it; a frame takes a window at an offset
-    of its own. Drawing 1.2 million normals for every frame would cost more than rendering it."""
+NOISE_OFFSETS = 1 << 18
+"""Noise is drawn once, this much more than a frame of it, and each frame takes a window at a place of its own:
+drawing 1.2 million normals for every frame would cost more than rendering it."""
 
-    OFFSETS = 1 << 18
 
-    def __init__(self, rng: np.random.Generator, shape: tuple[int, int], sigma: float) -> None:
+class DepthNoise:
+    """Gaussian noise that grows with the square of the distance, as it does where disparity is what is measured."""
+
+    def __init__(self, rng: np.random.Generator, shape: tuple[int, int], sigma_per_m: float) -> None:
         self._shape = shape
         self._size = shape[0] * shape[1]
-        self._bank = sigma * rng.standard_normal(self._size + self.OFFSETS, dtype=np.float32)
-        whole = np.rint(self._bank)
-        self._more = np.maximum(whole, 0).astype(np.uint8)
-        self._less = np.maximum(-whole, 0).astype(np.uint8)
+        self._bank = np.float32(sigma_per_m) * rng.standard_normal(self._size + NOISE_OFFSETS, dtype=np.float32)
 
-    def draw(self, rng: np.random.Generator) -> NDArray[np.float32]:
-        """A frame of noise, a view into the bank."""
-        start = int(rng.integers(self.OFFSETS))
-        return self._bank[start : start + self._size].reshape(self._shape)
+    def add(self, depth_m: Metres, rng: np.random.Generator) -> Metres:
+        """z + sigma z^2 times a normal draw a pixel; negative metres (no light there) become 0."""
+        start = int(rng.integers(NOISE_OFFSETS))
+        noise = self._bank[start : start + self._size].reshape(self._shape)
+        z = np.clip(depth_m, np.float32(0), np.float32(10))  # beyond any range; infinity has no square
+        return z + z * z * noise
 
-    def add_to_bytes(self, image: Rgb, rng: np.random.Generator) -> Rgb:
-        """The image with rounded noise on every byte; bytes stop at 0 and 255 (saturating, as OpenCV's are)."""
-        start = int(rng.integers(self.OFFSETS))
-        window = slice(start, start + self._size)
-        more = self._more[window].reshape(image.shape)
-        less = self._less[window].reshape(image.shape)
+
+class ByteNoise:
+    """Gaussian noise on every byte of a picture, rounded; bytes stop at 0 and 255, as a sensor saturates."""
+
+    def __init__(self, rng: np.random.Generator, pixels: int, sigma: float) -> None:
+        self._size = 3 * pixels
+        bank = np.rint(sigma * rng.standard_normal(self._size + NOISE_OFFSETS, dtype=np.float32))
+        # Apart, what is added and what is taken away fit in bytes, and OpenCV's saturating sums do the rest.
+        self._more = np.maximum(bank, 0).astype(np.uint8)
+        self._less = np.maximum(-bank, 0).astype(np.uint8)
+
+    def add(self, image: Rgb, rng: np.random.Generator) -> Rgb:
+        start = int(rng.integers(NOISE_OFFSETS))
+        more = self._more[start : start + self._size].reshape(image.shape)
+        less = self._less[start : start + self._size].reshape(image.shape)
         return _bytes(cv2.subtract(cv2.add(image, more), less))
 
 

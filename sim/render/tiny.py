@@ -92,7 +92,7 @@ class TinyRenderer:
             view.T.ravel().tolist(),
             project.T.ravel().tolist(),
             lightDirection=[-v for v in light.direction],
-            lightColor=lamp_tint(light.temperature_k).tolist(),
+            lightColor=(1.0, 1.0, 1.0),
             lightDistance=10.0,
             shadow=0,
             lightAmbientCoeff=light.ambient,
@@ -103,8 +103,10 @@ class TinyRenderer:
         )
         z = np.asarray(z, np.float32).reshape(camera.height, camera.width)
         depth = FAR_M * NEAR_M / (FAR_M - (FAR_M - NEAR_M) * z)
-        rgba = np.asarray(rgba, np.uint8).reshape(camera.height, camera.width, 4)
-        return np.ascontiguousarray(rgba[..., :3]), depth
+        depth[depth > 0.99 * FAR_M] = np.inf
+        # The lamp's tint is put on afterwards: TinyRenderer's own colour of the light leaves the ambient share white.
+        rgb = np.asarray(rgba, np.uint8).reshape(camera.height, camera.width, 4)[..., :3]
+        return np.rint(rgb * lamp_tint(light.temperature_k)).astype(np.uint8), depth
 
     def close(self) -> None:
         self._bullet.close()
