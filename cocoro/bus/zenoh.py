@@ -26,7 +26,7 @@ from cocoro.bus.outbox import Outbox
 from cocoro.bus.pool import SharedPool, read
 from cocoro.bus.ring import Ring
 from cocoro.bus.session import LEAVE_S, close_session, exit_guard, in_thread, no_mesh, open_session, options
-from cocoro.errors import CallTimeoutError
+from cocoro.errors import CallTimeoutError, MeshError
 from cocoro.topics import Qos
 
 log = logging.getLogger(__name__)
@@ -212,7 +212,10 @@ class ZenohBus:
             with contextlib.suppress(RuntimeError):  # the loop has been closed
                 self._loop.call_soon_threadsafe(everyone.set)
 
-        ask(final)
+        try:
+            ask(final)
+        except zenoh.ZError as error:
+            raise MeshError(f"the mesh at {self.where} has been left: {error}") from error
         await asyncio.wait_for(everyone.wait(), timeout_s)
 
     async def close(self) -> None:
