@@ -1,0 +1,177 @@
+"""What is known of the floor around the robot: where it is free, where something stands, where nobody has looked.
+
+An evidence grid in the odometry frame (derived): rays over free floor take evidence away, points that stand up from
+it add. It moves along with the robot; what falls off its edge is forgotten.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import cos, sin
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cocoro.frames import Pose2
+from cocoro.kinematics import Array
+from cocoro.messages import Obstacles
+
+Cells = NDArray[np.bool_]
+
+CELL_M = 0.05
+SIZE = 160
+"""Cells along each side: 8 m."""
+_HIT, _FREE, _MOST, _LEAST, _OCCUPIED = 3, 1, 9, -4, 3
+_EDGE_CELLS = 40
+"""Nearer to the edge than this, the map moves along with the robot."""
+
+
+class FloorMap:
+    def __init__(self) -> None:
+        self._evidence = np.zeros((SIZE, SIZE), dtype=np.int8)
+        self._looked = np.zeros((SIZE, SIZE), dtype=bool)
+        self._corner = np.array([-SIZE // 2, -SIZE // 2])
+        """Cell numbers of the array's first cell, counted from the odometry frame's origin."""
+        self.changes = 0
+        """Counts up with every update."""
+
+    def clear(self) -> None:
+        self._evidence[:] = 0
+        self._looked[:] = False
+        self.changes += 1
+
+    # --- what is seen -----------------------------------------------------------------------------
+
+    def enter(self, seen: Obstacles, body: Pose2, own: tuple[Array, Array] | None) -> None:
+        """One depth image's floor and obstacles, seen from a pose of the body.
+
+        `own` are the centres (n, 3) and radii (n,) of the robot's own hull in the body frame: what is inside is itself.
+        """
+        self._follow(body)
+        origin = np.array(body.apply((*seen.origin_m, 0.0))[:2])
+        if seen.free:
+            self._add(self._along(np.array(seen.free), origin, body.yaw_rad), -_FREE)
+        if seen.points_m:
+            points = np.array(seen.points_m)
+            if own is not None:
+                points = points[~_inside(points, *own)]
+            c, s = cos(body.yaw_rad), sin(body.yaw_rad)
+            turned = points[:, :2] @ np.array([[c, s], [-s, c]])
+            self._add(turned + np.array([body.x_m, body.y_m]), _HIT)
+        self.changes += 1
+
+    def bump(self, places_m: Sequence[tuple[float, float]]) -> None:
+        """Something was touched at these places of the odometry frame, seen or not."""
+        for _ in range(3):
+            self._add(np.array(places_m), _HIT)
+        self.changes += 1
+
+    @staticmethod
+    def _along(rays: Array, origin: Array, yaw_rad: float) -> Array:
+        """Points every half cell along the rays (bearing, near, far), odometry frame."""
+        steps = np.arange(0.0, float(rays[:, 2].max()), CELL_M)
+        inside = (steps[None, :] >= rays[:, 1:2]) & (steps[None, :] <= rays[:, 2:3])
+        directions = np.stack([np.cos(rays[:, 0] + yaw_rad), np.sin(rays[:, 0] + yaw_rad)], axis=1)
+        points: Array = (origin + directions[:, None, :] * steps[None, :, None])[inside]
+        return points
+
+    def _add(self, points_m: Array, evidence: int) -> None:
+        """Add evidence, once a cell however many points fall into it."""
+        index = self._index(points_m)
+        index = index[((index >= 0) & (index < SIZE)).all(axis=1)]
+        flat = np.unique(index[:, 0] * SIZE + index[:, 1])
+        cells = self._evidence.reshape(-1)
+        cells[flat] = np.clip(cells[flat] + evidence, _LEAST, _MOST)
+        self._looked.reshape(-1)[flat] = True
+
+    def _follow(self, body: Pose2) -> None:
+        at = self._index(np.array([[body.x_m, body.y_m]]))[0]
+        if ((at >= _EDGE_CELLS) & (at < SIZE - _EDGE_CELLS)).all():
+            return
+        shift = at - SIZE // 2
+        evidence, looked = np.zeros_like(self._evidence), np.zeros_like(self._looked)
+        to, source = _overlap(-shift)
+        evidence[to] = self._evidence[source]
+        looked[to] = self._looked[source]
+        self._evidence, self._looked = evidence, looked
+        self._corner = self._corner + shift
+
+    # --- what is asked ----------------------------------------------------------------------------
+
+    def _index(self, points_m: Array) -> NDArray[np.int64]:
+        index: NDArray[np.int64] = np.floor(np.asarray(points_m)[:, :2] / CELL_M).astype(np.int64) - self._corner
+        return index
+
+    def centre(self, row: int, column: int) -> tuple[float, float]:
+        """A cell's middle, odometry frame."""
+        x, y = ((np.array([row, column]) + self._corner) + 0.5) * CELL_M
+        return float(x), float(y)
+
+    def cell(self, x_m: float, y_m: float) -> tuple[int, int] | None:
+        """The cell of a place; None beyond the map."""
+        row, column = self._index(np.array([[x_m, y_m]]))[0]
+        return (int(row), int(column)) if 0 <= row < SIZE and 0 <= column < SIZE else None
+
+    def occupied(self, ignore: Sequence[tuple[float, float, float]] = ()) -> Cells:
+        """Where something stands; (SIZE, SIZE), rows along x. `ignore`: discs (x, y, radius) that do not count."""
+        cells: Cells = self._evidence >= _OCCUPIED
+        for x, y, radius in ignore:
+            cells &= ~self._disc(x, y, radius)
+        return cells
+
+    def looked_at(self) -> Cells:
+        """Where the floor, or what stands on it, was seen."""
+        return self._looked
+
+    def add_discs(self, cells: Cells, discs: Sequence[tuple[float, float, float]]) -> Cells:
+        """The same with discs (x, y, radius) that count as occupied."""
+        for x, y, radius in discs:
+            cells = cells | self._disc(x, y, radius)
+        return cells
+
+    def _disc(self, x_m: float, y_m: float, radius_m: float) -> Cells:
+        rows = (np.arange(SIZE) + self._corner[0] + 0.5) * CELL_M - x_m
+        columns = (np.arange(SIZE) + self._corner[1] + 0.5) * CELL_M - y_m
+        disc: Cells = rows[:, None] ** 2 + columns[None, :] ** 2 <= radius_m**2
+        return disc
+
+
+class ClearanceField:
+    """Distance from any place to the nearest occupied cell."""
+
+    def __init__(self, floor: FloorMap, occupied: Cells) -> None:
+        self._floor = floor
+        free = (~occupied).astype(np.uint8)
+        distance = cv2.distanceTransform(free, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) if occupied.any() else None
+        self.metres: Array = (
+            np.full((SIZE, SIZE), 9.0)
+            if distance is None
+            # From cell middle to cell middle: the occupied cell's own half is taken off.
+            else np.maximum(np.asarray(distance, dtype=np.float64) * CELL_M - CELL_M / 2, 0.0)
+        )
+
+    def at(self, places_m: Array) -> Array:
+        """Clearance at places (n, 2) of the odometry frame, metres, shape (n,); far where the map ends."""
+        index = self._floor._index(places_m)
+        inside = ((index >= 0) & (index < SIZE)).all(axis=1)
+        clearance = np.full(len(index), 9.0)
+        clearance[inside] = self.metres[index[inside, 0], index[inside, 1]]
+        return clearance
+
+
+def _inside(points: Array, centres: Array, radii: Array) -> Cells:
+    """Which points (n, 3) lie within any of the balls, seen from above: nothing stands where the robot itself is."""
+    gaps = np.linalg.norm(points[:, None, :2] - centres[None, :, :2], axis=2) - radii[None, :]
+    inside: Cells = (gaps < 0.0).any(axis=1)
+    return inside
+
+
+def _overlap(shift: NDArray[np.int64]) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
+    """Where to and where from to copy an array that moves by `shift` cells."""
+    to, source = [], []
+    for step in shift:
+        step = int(step)
+        to.append(slice(max(step, 0), max(SIZE + min(step, 0), 0)))
+        source.append(slice(max(-step, 0), max(SIZE - max(step, 0), 0)))
+    return (to[0], to[1]), (source[0], source[1])

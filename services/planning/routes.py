@@ -1,0 +1,75 @@
+"""Ways over the free floor: cheapest paths for the round body, keeping off what stands there (Dijkstra's algorithm)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import dijkstra
+
+from cocoro.kinematics import Array
+from services.planning.floor_map import CELL_M, SIZE, ClearanceField, FloorMap
+
+_STEPS = ((1, 0), (0, 1), (1, 1), (1, -1))
+
+
+class Routes:
+    """All cheapest paths from one place, over a map as it is now."""
+
+    def __init__(
+        self, floor: FloorMap, field: ClearanceField, start_m: tuple[float, float], radius_m: float, comfort_m: float
+    ) -> None:
+        """The body of `radius_m` never touches; nearer than `comfort_m` to something costs more. Where the robot
+        stands now, it may be nearer: it can always leave."""
+        self._floor = floor
+        cost = np.where(
+            field.metres >= radius_m, 1.0 + 3.0 * np.clip((comfort_m - field.metres) / comfort_m, 0.0, 1.0), np.inf
+        )
+        start = floor.cell(*start_m)
+        self._predecessors: NDArray[np.int32] | None = None
+        self._distance: Array = np.full(SIZE * SIZE, np.inf)
+        if start is None:
+            return
+        row, column = start
+        here = (slice(max(row - 4, 0), row + 5), slice(max(column - 4, 0), column + 5))
+        cost[here] = np.where(np.isfinite(cost[here]), cost[here], 6.0)
+        start_at = np.array([row * SIZE + column])
+        distance, predecessors = dijkstra(_graph(cost), directed=False, indices=start_at, return_predecessors=True)
+        self._distance, self._predecessors = distance[0], predecessors[0]
+
+    def cost(self, x_m: float, y_m: float) -> float:
+        """What the way there costs, metres of comfortable floor; infinite when there is none."""
+        cell = self._floor.cell(x_m, y_m)
+        return float(self._distance[cell[0] * SIZE + cell[1]]) if cell is not None else float("inf")
+
+    def path(self, x_m: float, y_m: float) -> list[tuple[float, float]]:
+        """Cell middles from the start to there, odometry frame; empty when there is no way."""
+        cell = self._floor.cell(x_m, y_m)
+        if cell is None or self._predecessors is None:
+            return []
+        at = cell[0] * SIZE + cell[1]
+        if not np.isfinite(self._distance[at]):
+            return []
+        path = []
+        while at >= 0:
+            path.append(self._floor.centre(at // SIZE, at % SIZE))
+            at = int(self._predecessors[at])
+        path.reverse()
+        return path
+
+
+def _graph(cost: Array) -> csr_array[np.float64, tuple[int, int]]:
+    """Neighbouring cells joined by the mean of their costs times the step's length."""
+    numbers = np.arange(SIZE * SIZE).reshape(SIZE, SIZE)
+    rows, columns, weights = [], [], []
+    for down, right in _STEPS:
+        left = slice(0, SIZE - right) if right >= 0 else slice(-right, SIZE)
+        shifted = slice(right, SIZE) if right >= 0 else slice(0, SIZE + right)
+        one, other = numbers[: SIZE - down, left], numbers[down:, shifted]
+        weight = (cost[: SIZE - down, left] + cost[down:, shifted]) / 2 * np.hypot(down, right) * CELL_M
+        open_ = np.isfinite(weight)
+        rows.append(one[open_])
+        columns.append(other[open_])
+        weights.append(weight[open_])
+    places = (np.concatenate(rows), np.concatenate(columns))
+    return csr_array((np.concatenate(weights), places), shape=(SIZE * SIZE, SIZE * SIZE), dtype=np.float64)
