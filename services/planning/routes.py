@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
+from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
 from cocoro.kinematics import Array
@@ -58,7 +60,7 @@ class Routes:
         return path
 
 
-def _graph(cost: Array) -> csr_array[np.float64, tuple[int, int]]:
+def _graph(cost: Array) -> Any:
     """Neighbouring cells joined by the mean of their costs times the step's length."""
     numbers = np.arange(SIZE * SIZE).reshape(SIZE, SIZE)
     rows, columns, weights = [], [], []
@@ -71,5 +73,5 @@ def _graph(cost: Array) -> csr_array[np.float64, tuple[int, int]]:
         rows.append(one[open_])
         columns.append(other[open_])
         weights.append(weight[open_])
-    places = (np.concatenate(rows), np.concatenate(columns))
-    return csr_array((np.concatenate(weights), places), shape=(SIZE * SIZE, SIZE * SIZE), dtype=np.float64)
+    entries: Any = (np.concatenate(weights), (np.concatenate(rows), np.concatenate(columns)))
+    return coo_array(entries, shape=(SIZE * SIZE, SIZE * SIZE)).tocsr()
