@@ -29,6 +29,8 @@ from services.executive.skills import PlannerSkills, Skills, TaskFailedError
 from services.executive.tasks import fetch, park, put_down
 
 Task = Callable[[Skills, str, Config], Awaitable[None]]
+_CLOCK_STANDS_S = 1.0
+"""When 20 ms of the clock take longer than this, it stands still."""
 TASKS: dict[str, Task] = {"fetch": fetch, "park": park, "put-down": put_down}
 
 
@@ -39,7 +41,8 @@ class Executive:
         self._catalogue = catalogue
         self._alive: set[str] = set()
         self._running: asyncio.Task[Any] | None = None
-        self._end_reason: tuple[Outcome, str] | None = None
+        self._ended: asyncio.Future[tuple[Outcome, str]] | None = None
+        """Of the running task: gets its outcome when something outside of it ends it."""
         self._count = 0
         self.state = TaskState()
         self._base = node.latest(topics.BASE_STATE)
@@ -68,8 +71,8 @@ class Executive:
         self.state = TaskState(
             task_id=task_id, task=request.task, label=request.label, phase="start", started_ns=self._node.now_ns()
         )
-        self._end_reason = None
-        self._running = self._node.spawn(self._carry_out(request))
+        self._ended = asyncio.get_running_loop().create_future()
+        self._running = self._node.spawn(self._carry_out(request, self._ended))
         return TaskReply(accepted=True, task_id=task_id)
 
     def _refusal(self, request: TaskRequest) -> tuple[RefusalCode, str] | None:
@@ -120,28 +123,25 @@ class Executive:
 
     # --- the running task -------------------------------------------------------------------------
 
-    async def _carry_out(self, request: TaskRequest) -> None:
+    async def _carry_out(self, request: TaskRequest, ended: asyncio.Future[tuple[Outcome, str]]) -> None:
+        """From the request to the outcome. What ends it from outside says so by `ended` and never cancels this
+        coroutine, so that every task comes to its end, whenever that happens."""
         timeout_s = request.timeout_s or self._config.task_timeout_s
-        outcome: Outcome = "done"
-        reason = ""
         self._skills.want("idle", "", self.state.task_id)
         work = asyncio.ensure_future(TASKS[request.task](self._skills, request.label, self._config))
         timer = asyncio.ensure_future(self._node.sleep(timeout_s))
         try:
-            await asyncio.wait((work, timer), return_when=asyncio.FIRST_COMPLETED)
-            if not work.done():
+            await asyncio.wait((ended, work, timer), return_when=asyncio.FIRST_COMPLETED)
+            if ended.done():
+                outcome, reason = ended.result()
+            elif work.done():
+                outcome, reason = self._outcome_of(work)
+            elif timer.result():
                 outcome, reason = "failed", f"timed_out: the task took over {timeout_s:g} s"
             else:
-                await work
-        except TaskFailedError as failed:
-            outcome, reason = "failed", str(failed)
-        except asyncio.CancelledError:
-            if self._end_reason is None:
-                raise
-            outcome, reason = self._end_reason
-        except Exception as error:
-            self._node.log.exception("task %s failed", self.state.task_id)
-            outcome, reason = "failed", f"internal error: {error}"
+                outcome, reason = "failed", "clock: the clock began anew"
+            if not ended.done():
+                ended.set_result((outcome, reason))
         finally:
             work.cancel()
             timer.cancel()
@@ -149,13 +149,27 @@ class Executive:
         await self._come_to_rest()
         self._finish(outcome, reason)
 
+    def _outcome_of(self, work: asyncio.Future[None]) -> tuple[Outcome, str]:
+        """Of a task's function that has ended."""
+        error = work.exception()
+        if error is None:
+            return "done", ""
+        if isinstance(error, TaskFailedError):
+            return "failed", str(error)
+        self._node.log.error("task %s failed", self.state.task_id, exc_info=error)
+        return "failed", f"internal error: {error}"
+
     async def _come_to_rest(self) -> None:
         """Wait until the base stands, so that 'done' and 'failed' mean that the robot is still."""
         end_ns = self._node.now_ns() + round(self._config.settle_s * NS)
         while self._node.now_ns() < end_ns and not self._standing(self._base.fresh()):
-            if not await self._node.sleep(0.02):
-                return
             if "base" not in self._alive:
+                return
+            try:
+                async with asyncio.timeout(_CLOCK_STANDS_S):
+                    if not await self._node.sleep(0.02):
+                        return
+            except TimeoutError:  # the simulator has died, and its clock stands still: so does all that it drove
                 return
 
     @staticmethod
@@ -174,9 +188,8 @@ class Executive:
 
     def _end(self, outcome: Outcome, reason: str) -> None:
         """End the running task from outside."""
-        if self._running is not None and self._end_reason is None:
-            self._end_reason = (outcome, reason)
-            self._running.cancel()
+        if self._running is not None and self._ended is not None and not self._ended.done():
+            self._ended.set_result((outcome, reason))
 
     def _what(self) -> str:
         return " ".join(filter(None, (self.state.task, self.state.label)))
@@ -213,7 +226,7 @@ class Executive:
         status = self._skills.status
         state = self.state
         if self._running is not None:
-            state.elapsed_s = (self._node.now_ns() - state.started_ns) / NS
+            state.elapsed_s = max(self._node.now_ns() - state.started_ns, 0) / NS
             if status is not None:
                 state.text, state.distance_m = status.why, status.distance_m
         state.stamp_ns = self._node.now_ns()

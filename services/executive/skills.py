@@ -82,7 +82,7 @@ class PlannerSkills:
                     raise TaskFailedError("not_alive", "the planner is silent")
             else:
                 heard_ns = now_ns
-                if status.step == self.intent.step and status.task_id == self.intent.task_id:
+                if self._answers(status):
                     if status.state == "done":
                         return status
                     if status.state == "failed":
@@ -90,6 +90,11 @@ class PlannerSkills:
             if now_ns > deadline_ns:
                 why = status.why if status is not None else ""
                 raise TaskFailedError("timed_out", f"{behaviour} took over {timeout_s:g} s: {why}")
+
+    def _answers(self, status: PlannerStatus) -> bool:
+        """Whether a status is of what is wanted now; a planner that did not hear for a while is idle meanwhile."""
+        wanted = self.intent
+        return (status.task_id, status.step, status.behaviour) == (wanted.task_id, wanted.step, wanted.behaviour)
 
     async def watch_hold(self, seconds: float) -> None:
         self._phase("hold")
