@@ -17,14 +17,17 @@ Bools = NDArray[np.bool_]
 Depth = NDArray[np.float32]
 
 MIN_DEPTH_PIXELS = 6
-MIN_DEPTH_SHARE = 0.1
-"""With depth on fewer of its pixels a region has none."""
+MIN_DEPTH_SHARE = 0.4
+"""With depth on fewer of its pixels a region has none. Past an object too near to be measured the depth camera sees up
+to 25 mm of what lies behind it, 0.38 of a can: that depth is not the object's."""
 NEARER_STEP_M = 0.015
 """What stands so much nearer than the region right beside it may hide some of it."""
 NEARER_SHARE = 0.12
 UNKNOWN_SHARE = 0.45
-"""Of a region's outline: next to something nearer, or next to no data (too near to be measured; an infrared shadow
-alone is less), for more of the object to be hidden there."""
+UNKNOWN_WITHIN_M = 1.0
+"""Of a region's outline: next to something nearer, or next to no data, for more of the object to be hidden there. No
+data counts beside near regions alone, where it may be the robot's own hand, too near to be measured; farther
+away it is what lies out of range. An infrared shadow takes less of an outline."""
 MAX_SURFACE_POINTS = 180
 MAX_RAYS = 60
 
@@ -113,6 +116,8 @@ class Region:
         step = NEARER_STEP_M + depth_doubt_m(beside)
         nearer = np.count_nonzero(around & known & (self.depth < beside - step))
         unknown = np.count_nonzero(around & ~known)
+        if self.depth_m is None or self.depth_m > UNKNOWN_WITHIN_M:
+            unknown = 0
         return bool(nearer >= NEARER_SHARE * total or unknown >= UNKNOWN_SHARE * total)
 
     def split_by_depth(self) -> list[tuple[Mask, Box]]:

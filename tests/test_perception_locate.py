@@ -1,0 +1,205 @@
+"""Where perception says that rendered objects are, against the truth."""
+
+from math import cos, radians, sin
+
+import numpy as np
+import pytest
+from perception_scenes import CATALOGUE, MS, ROBOT, STAMP_NS, Scene, block, error_mm, facing, known, seen, the
+
+from services.perception.shapes import distance_from, signed_distance
+from sim.scene import Light
+
+pytestmark = pytest.mark.sim
+
+GREY = (0.5, 0.5, 0.5)
+CAN = "red_can"
+AIMS = ((0.0, 0.0), (0.2, 0.1), (-0.25, -0.12))
+"""Pan and tilt beside the object, rad."""
+
+
+def errors_mm(distance_m, sensors, size=(640, 480), label=CAN):
+    """(horizontal, vertical) errors of one object at a distance, for three bearings and three aims of the head."""
+    errors = []
+    for number, bearing in enumerate((-0.4, 0.1, 0.6)):
+        thing = known(label, distance_m * cos(bearing), distance_m * sin(bearing))
+        pan, tilt = facing(thing)
+        with Scene([thing], sensors, number, *size) as scene:
+            for right, up in AIMS:
+                frame = scene.frame(pan + right, tilt + up, STAMP_NS + 1000 * MS * len(errors))
+                errors.append(error_mm(the(label, seen(frame, pan + right, tilt + up)), thing))
+    return np.array(errors)
+
+
+@pytest.mark.parametrize(
+    ("distance_m", "sensors", "mean_mm", "most_mm"),
+    [
+        (0.6, "ideal", 1.0, 2.0),
+        (0.75, "ideal", 1.0, 2.0),
+        (1.0, "ideal", 1.0, 2.0),
+        (1.5, "ideal", 1.5, 3.0),
+        (2.0, "ideal", 2.0, 4.0),
+        (3.0, "ideal", 5.0, 10.0),
+        (0.6, "real", 1.0, 2.0),
+        (0.75, "real", 1.0, 2.0),
+        (1.0, "real", 1.5, 3.0),
+        (1.5, "real", 3.0, 6.0),
+        (2.0, "real", 5.0, 10.0),
+        (3.0, "real", 15.0, 30.0),
+    ],
+)
+def test_a_cans_centre_is_known_to_millimetres(distance_m, sensors, mean_mm, most_mm):
+    errors = errors_mm(distance_m, sensors)
+    assert errors[:, 0].mean() < mean_mm
+    assert errors.max() < most_mm
+
+
+@pytest.mark.parametrize(("distance_m", "most_mm"), [(0.75, 2.0), (1.5, 8.0), (3.0, 50.0)])
+def test_a_quarter_of_the_pixels_costs_little(distance_m, most_mm):
+    assert errors_mm(distance_m, "real", (320, 240)).max() < most_mm
+
+
+@pytest.mark.parametrize("label", CATALOGUE.labels)
+def test_every_known_object_is_located(label):
+    assert errors_mm(0.9, "real", label=label).max() < 3.0
+
+
+@pytest.mark.parametrize("light", [
+    Light(ambient=0.3, diffuse=0.7, temperature_k=5500),
+    Light(ambient=0.8, diffuse=0.2, temperature_k=4600),
+    Light(ambient=0.5, diffuse=0.5, temperature_k=8000),
+    Light(ambient=0.4, diffuse=0.6, direction=(1.0, 1.0, -0.3)),
+], ids=["contrast", "warm", "cold", "low side light"])  # fmt: skip
+def test_changing_light_leaves_all_objects_found_and_placed(light):
+    things = [
+        known("red_can", 1.5, 0.0),
+        known("green_can", 1.6, -0.5),
+        known("blue_can", 1.0, 0.4),
+        known("yellow_ball", 1.1, 0.1),
+        known("blue_ball", 1.3, -0.15),
+        known("hand_marker", 0.9, -0.1, 0.1),
+    ]
+    for seed in range(2):
+        with Scene(things, "real", seed, light=light) as scene:
+            detections = seen(scene.frame(0.0, -0.45), 0.0, -0.45)
+        for thing in things:
+            assert max(error_mm(the(thing.name, detections), thing)) < 6.0, thing.name
+
+
+@pytest.mark.parametrize("speed_radps", [0.5, 1.0])
+def test_a_turning_heads_motion_blur_leaves_a_near_can_in_place(speed_radps):
+    can = known(CAN, 1.5, 0.1)
+    pan, tilt = facing(can)
+    with Scene([can], "real") as scene:
+        scene.frame(pan - speed_radps / 30, tilt, STAMP_NS)
+        frame = scene.frame(pan, tilt, STAMP_NS + 1_000_000_000 // 30)
+    assert error_mm(the(CAN, seen(frame, pan, tilt)), can)[0] < 5.0
+
+
+# --- hidden in part -------------------------------------------------------------------------------
+
+NEAR = known(CAN, 0.75, 0.0)
+
+
+@pytest.mark.parametrize("size", [(640, 480), (320, 240)], ids=["640x480", "320x240"])
+@pytest.mark.parametrize(
+    "cover",
+    [
+        block(0.68, -0.03, 0.05, (0.02, 0.04, 0.10), GREY),
+        block(0.68, 0.03, 0.05, (0.02, 0.04, 0.10), GREY),
+        block(0.62, 0.05, 0.10, (0.02, 0.10, 0.20), GREY),
+        block(0.62, -0.05, 0.10, (0.02, 0.10, 0.20), GREY),
+        block(0.62, 0.00, 0.06, (0.02, 0.20, 0.12), GREY),
+        block(0.62, 0.00, 0.17, (0.02, 0.30, 0.02), GREY),
+    ],
+    ids=["right finger", "left finger", "left half", "right half", "bottom", "bar across"],
+)
+def test_a_body_before_the_can_does_not_move_its_axis(cover, size):
+    pan, tilt = 0.0, -0.7
+    with Scene([NEAR], "real", 1, *size) as scene:
+        free = the(CAN, seen(scene.frame(pan, tilt), pan, tilt))
+    with Scene([NEAR, cover], "real", 1, *size) as scene:
+        hidden = the(CAN, seen(scene.frame(pan, tilt), pan, tilt))
+    assert hidden.area_px < 0.9 * free.area_px
+    assert abs(hidden.u_px - free.u_px) + abs(hidden.v_px - free.v_px) > 1.0  # the visible centroid does jump
+    assert error_mm(hidden, NEAR)[0] < 4.0
+
+
+def test_the_papers_way_moves_where_the_shape_fit_does_not():
+    cover = block(0.62, 0.05, 0.10, (0.02, 0.10, 0.20), GREY)
+    with Scene([NEAR, cover]) as scene:
+        frame = scene.frame(0.0, -0.7)
+    plain = error_mm(the(CAN, seen(frame, 0.0, -0.7, detector="paper")), NEAR)[0]
+    fitted = error_mm(the(CAN, seen(frame, 0.0, -0.7)), NEAR)[0]
+    assert plain > 10.0
+    assert fitted < 2.0
+
+
+def test_an_object_cut_by_the_images_edge_is_placed_by_what_is_left():
+    pan, tilt = 0.0, -0.42
+    with Scene([NEAR], "real") as scene:
+        found = the(CAN, seen(scene.frame(pan, tilt), pan, tilt))
+    assert found.note == "cut"
+    assert error_mm(found, NEAR)[0] < 4.0
+
+
+# --- what else has its colour ---------------------------------------------------------------------
+
+RED = CATALOGUE[CAN].rgb
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        block(1.0, -0.3, 0.02, (0.03, 0.03, 0.04), RED),
+        block(1.8, -0.4, 0.30, (0.02, 0.05, 0.05), RED),
+        block(1.8, 0.0, 0.30, (0.05, 1.50, 0.60), RED),
+        block(1.2, -0.4, 0.15, (0.30, 0.30, 0.30), RED),
+    ],
+    ids=["small block", "patch in the air", "wall behind", "large box"],
+)
+def test_other_red_things_do_not_draw_the_can_away(other):
+    can = known(CAN, 1.2, 0.1)
+    with Scene([can, other], "real") as scene:
+        found = the(CAN, seen(scene.frame(0.0, -0.45), 0.0, -0.45))
+    assert max(error_mm(found, can)) < 3.0
+
+
+def test_a_red_patch_alone_is_no_can():
+    with Scene([block(1.8, -0.4, 0.3, (0.02, 0.05, 0.05), RED)], "real") as scene:
+        assert seen(scene.frame(0.0, -0.45), 0.0, -0.45).detections == ()
+
+
+# --- the shapes themselves ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("label", ["red_can", "yellow_ball"])
+def test_distances_are_zero_on_the_surface_and_grow_by_the_metre_outwards(label):
+    shape = CATALOGUE[label]
+    draws = np.random.default_rng(3)
+    points = draws.uniform(-0.2, 0.2, (500, 3))
+    distance, gradient = signed_distance(shape, points)
+    np.testing.assert_allclose(distance, distance_from(shape, points), atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(gradient, axis=1), 1.0, atol=1e-9)
+    onto = points - distance[:, None] * gradient
+    np.testing.assert_allclose(distance_from(shape, onto), 0.0, atol=1e-9)
+
+
+def test_a_can_is_inside_within_its_radius_and_half_height():
+    can = CATALOGUE[CAN]
+    inside = np.array([[0.0, 0.0, 0.0], [0.03, 0.0, 0.0], [0.0, 0.0, 0.055], [0.0, 0.032, -0.059]])
+    outside = np.array([[0.034, 0.0, 0.0], [0.0, 0.0, 0.061], [0.03, 0.03, 0.0]])
+    assert (distance_from(can, inside) < 0).all()
+    assert (distance_from(can, outside) > 0).all()
+    assert distance_from(can, np.array([[0.043, 0.0, 0.06 + 0.01]])) == pytest.approx(np.hypot(0.01, 0.01))
+
+
+def test_the_first_guess_pushes_the_surface_inwards_by_the_radius():
+    from services.perception.localise import first_guess
+
+    pose = ROBOT.chain("camera").pose({"neck_pan": 0.0, "neck_tilt": radians(-50)})
+    surface = np.array([0.0, 0.0, 0.7])
+    point = pose[:3, :3] @ surface + pose[:3, 3]
+    can = first_guess(CATALOGUE[CAN], surface, pose) - point
+    assert can == pytest.approx([0.033, 0.0, 0.0], abs=1e-9)
+    ball = first_guess(CATALOGUE["yellow_ball"], surface, pose) - point
+    assert ball == pytest.approx(0.03 * pose[:3, 2], abs=1e-9)
