@@ -118,7 +118,7 @@ def calliope_body(robot: Robot) -> Body:
     shoulder_x, arm_y, arm_z = robot.chain("arm_base").position({"arm_base": 0.0})
     parts: dict[str, list[Part]] = {
         "mount": [Part("mount", "box", tuple(float(v) for v in high - low), (0, 0, 0), _WHITE, 4.6)],
-        "riser": [Part("riser", "box", (0.06, 0.06, 0.03), (0, 0, 0), _DARK, 0.10)],
+        "riser": [Part("riser", "cylinder", (0.025, 0.03), (0, 0, 0), _DARK, 0.10)],
         "wheel_left": _wheel("wheel_left", wheel),
         "wheel_right": _wheel("wheel_right", wheel),
         "caster_front": [Part("caster_front", "sphere", (CASTER_RADIUS_M,), (0, 0, 0), _METAL, 0.03)],

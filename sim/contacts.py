@@ -25,7 +25,8 @@ Pair = tuple[str, str]
 def touching_pairs(
     points: Iterable[tuple[Any, ...]], robot_body: int, link_names: Mapping[int, str], names: Mapping[int, str]
 ) -> tuple[frozenset[Pair], list[tuple[float, float, float]]]:
-    """The names that press on each other, robot links first, and where something presses on the chassis.
+    """The names that press on each other, robot links first (of two, the one further from the root), and where
+    something presses on the chassis.
 
     A pair that is merely near is none: only contacts with a force count.
     """
@@ -37,7 +38,7 @@ def touching_pairs(
         (body_a, body_b), (link_a, link_b) = point[1:3], point[3:5]
         one = link_names[link_a] if body_a == robot_body else names[body_a]
         other = link_names[link_b] if body_b == robot_body else names[body_b]
-        if body_b == robot_body and body_a != robot_body:
+        if body_b == robot_body and (body_a != robot_body or link_a < link_b):
             one, other = other, one
         pairs.add((one, other))
         if body_a != body_b and one == CHASSIS and other != FLOOR:

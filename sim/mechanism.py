@@ -24,6 +24,9 @@ WHEEL_TORQUE_NM = 1.0
 """At the rim 33 N a wheel: a third of the robot's weight. Ours; the maker gives none."""
 WHEEL_LAG_RAD = 0.05
 """A blocked wheel is not wound up further behind its goal than this."""
+REST_LAG_RAD = 0.0005
+"""A wheel that is to stand, but is blocked before its goal, gives up what is more than this: it does not go on
+pressing against what stopped it. Enough against creep."""
 WHEEL_GAIN = 0.2
 """Share of a wheel's lag that is made up for in one step."""
 
@@ -83,7 +86,10 @@ class Mechanism:
         lags or creeps in one step is made up for in the next."""
         for number, speed_radps in enumerate((left_radps, right_radps)):
             lag = self._wheel_goal_rad[number] - self._wheel_rad[number]
-            goal = self._wheel_rad[number] + min(max(lag, -WHEEL_LAG_RAD), WHEEL_LAG_RAD)
+            lag = min(max(lag, -WHEEL_LAG_RAD), WHEEL_LAG_RAD)
+            if speed_radps == 0.0 and abs(lag) > REST_LAG_RAD:
+                lag *= 0.95
+            goal = self._wheel_rad[number] + lag
             self._wheel_goal_rad[number] = goal + speed_radps * dt_s
             self._bullet.setJointMotorControl2(
                 self.body,

@@ -43,12 +43,12 @@ class Stage:
             self._add(f"obstacle_{number}", obstacle, scene, obstacle.yaw_rad, 0.0)
         self.object_count = len(scene.objects)
 
-    def move(self, time_s: float) -> None:
-        """Carry what moves by itself to where it is at that time."""
+    def move(self, time_s: float, dt_s: float) -> None:
+        """Set what moves by itself on its way from where it is at a time to where it is `dt_s` later."""
         for body, mover in self._movers:
-            position, velocity = mover.at(time_s)
-            self._bullet.resetBasePositionAndOrientation(body, position, (0.0, 0.0, 0.0, 1.0))
-            self._bullet.resetBaseVelocity(body, velocity, (0.0, 0.0, 0.0))
+            here, there = mover.at(time_s), mover.at(time_s + dt_s)
+            self._bullet.resetBasePositionAndOrientation(body, here, (0.0, 0.0, 0.0, 1.0))
+            self._bullet.resetBaseVelocity(body, (there - here) / dt_s, (0.0, 0.0, 0.0))
 
     def pose(self, label: str) -> tuple[Vec3, tuple[float, float, float, float]]:
         """Centre and orientation (x, y, z, w) in the world."""
@@ -112,14 +112,14 @@ class Mover:
         self._last = corners[-1]
         self._loop = loop
 
-    def at(self, time_s: float) -> tuple[Array, Array]:
-        """Position and velocity in the world, each of shape (3,)."""
+    def at(self, time_s: float) -> Array:
+        """Position in the world, shape (3,)."""
         if self._loop and self._end_s:
             time_s %= self._end_s
         if time_s >= self._end_s:
-            return self._last, np.zeros(3)
+            return self._last
         start_s, origin, velocity = next(leg for leg in reversed(self._legs) if leg[0] <= time_s)
-        return origin + velocity * (time_s - start_s), velocity
+        return origin + velocity * (time_s - start_s)
 
 
 def _full(place: tuple[float, ...], height_m: float) -> Vec3:

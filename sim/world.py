@@ -11,7 +11,7 @@ import numpy as np
 from cocoro.kinematics import Array
 from cocoro.messages import BaseCommand, BaseState, LatchState, ServoCommand, ServoState, TrueObject, Truth
 from cocoro.robot import Robot
-from sim.base import MobileBase
+from sim.base import Bumper, MobileBase
 from sim.bullet import Bullet
 from sim.contacts import Pair, bumper, collisions, touching_pairs
 from sim.mechanism import Mechanism
@@ -28,7 +28,7 @@ SETTLE_S = 0.5
 SENSE_HZ = 60.0
 """How often contacts are looked at and the bodies' imperfections drawn anew."""
 CONTACT_MEMORY = 2
-"""What touched at one of so many looks touches: a contact that the solver lets go for one step is none lost."""
+"""What touched at one of the last so many looks touches: the solver lets go of a contact for a step at times."""
 NETWORKS = ("arm", "hand")
 
 
@@ -97,6 +97,7 @@ class World:
         )
         self._rolled_m = [0.0, 0.0]
         self._contacts: deque[frozenset[Pair]] = deque(maxlen=CONTACT_MEMORY)
+        self._pressed = Bumper()
         self._place_visuals()
         self.set_latch("unknown")
         self._settle()
@@ -158,7 +159,7 @@ class World:
             network.expire(now_ns)
         self._drive_servos()
 
-        self._stage.move((self._steps + 1) / self._hz)
+        self._stage.move(self._steps / self._hz, dt_s)
         self._bullet.stepSimulation()
         self._steps += 1
 
@@ -251,7 +252,6 @@ class World:
         """Let everything come to rest on the floor before time begins."""
         self._mechanism.spin(0.0, 0.0, self._dt_s)
         self._drive_servos()
-        self._stage.move(0.0)
         for _ in range(round(SETTLE_S * self._hz)):
             self._bullet.stepSimulation()
         readings = self._mechanism.read()
@@ -276,4 +276,6 @@ class World:
             self._bullet.getContactPoints(), self._mechanism.body, self._mechanism.link_names, self._names
         )
         self._contacts.append(pairs)
-        self._base.bumper = bumper(on_chassis, self._mechanism.root_pose())
+        pressed, before = bumper(on_chassis, self._mechanism.root_pose()), self._pressed
+        self._base.bumper = Bumper(pressed.left or before.left, pressed.right or before.right)
+        self._pressed = pressed
