@@ -7,7 +7,7 @@ import json
 import os
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, redirect_stdout
 from typing import Any
 
 import msgspec
@@ -39,8 +39,8 @@ def _output_to_stderr() -> Iterator[None]:
     stdout_fd = os.dup(1)
     os.dup2(2, 1)
     try:
-        yield
-        sys.stdout.flush()
+        with redirect_stdout(sys.stderr):
+            yield
     finally:
         os.dup2(stdout_fd, 1)
         os.close(stdout_fd)

@@ -130,6 +130,7 @@ def _stop(run_dir: RunDir) -> bool:
         with closing(target):
             found = found or target.pid is not None
             target.signal(signal.SIGTERM)
+            target.signal(signal.SIGCONT)  # a stopped process could not obey
             if not target.wait(launch.ORPHAN_S):
                 target.signal(signal.SIGKILL)
                 target.wait(launch.ORPHAN_S)

@@ -1,0 +1,159 @@
+"""What the tests of the command share: `cocoro` as a process of its own, and small components to start with it."""
+
+from __future__ import annotations
+
+import os
+import queue
+import shutil
+import subprocess
+import sys
+import tempfile
+import threading
+from pathlib import Path
+from types import TracebackType
+
+from cocoro.rundir import RunDir, Target
+
+PATIENCE_S = 60.0
+"""Far more than anything here takes: a test that waits so long has failed."""
+
+PARTS = """
+import asyncio, os, signal
+from pathlib import Path
+import msgspec
+from cocoro.processes import Process
+
+good = Process(name="good", module="parts.good", services=("good",), doc="Does nothing, well.", backoff_s=0.01)
+pair = Process(name="pair", module="parts.good", services=("left", "right"), doc="Two services in one process.")
+dies = Process(name="dies", module="parts.dies", services=("dies",), doc="Crashes at its start.")
+mute = Process(name="mute", module="parts.mute", services=("mute",), doc="Never gets ready.", start_s=0.5)
+slow = Process(name="slow", module="parts.mute", services=("slow",), doc="Takes for ever to get ready.")
+deaf = Process(name="deaf", module="parts.deaf", services=("deaf",), doc="Does not end when told.", stop_s=0.3)
+once = Process(name="once", module="parts.good", services=("once",), doc="Is not restarted.", restart="never")
+"""
+GOOD = """
+import asyncio, msgspec
+class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    pace_hz: float = 1.0
+async def run(node, config):
+    siblings = [node.sibling(name) for name in ("left", "right")] if node.name == "pair" else []
+    for part in (node, *siblings):
+        part.ready()
+    await asyncio.Event().wait()
+"""
+DIES = """
+import msgspec
+class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    pass
+async def run(node, config):
+    raise RuntimeError("the motor is on fire")
+"""
+MUTE = """
+import asyncio, msgspec
+class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    pass
+async def run(node, config):
+    await asyncio.Event().wait()
+"""
+DEAF = """
+import asyncio, msgspec
+class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    pass
+async def run(node, config):
+    node.ready()
+    while True:
+        try:
+            await asyncio.Event().wait()
+        except asyncio.CancelledError:
+            pass
+"""
+
+
+def install_parts(folder: Path) -> None:
+    """Make the parts a distribution below `folder`, with its entry points, as a third party's would be."""
+    package = folder / "parts"
+    package.mkdir()
+    (package / "__init__.py").write_text(PARTS)
+    for name, text in {"good": GOOD, "dies": DIES, "mute": MUTE, "deaf": DEAF}.items():
+        (package / f"{name}.py").write_text(text)
+    about = folder / "parts-1.0.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: parts\nVersion: 1.0\n")
+    rows = "".join(f"{name} = parts:{name}\n" for name in ("good", "pair", "dies", "mute", "slow", "deaf", "once"))
+    (about / "entry_points.txt").write_text(f"[cocoro.processes]\n{rows}")
+
+
+class Shell:
+    """A run directory of its own, and commands that use it. A context manager: what is up goes down at its end."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.root = Path(tempfile.mkdtemp(prefix="cocoro"))  # short: sockets live there
+        self.run_dir = RunDir("robbie", self.root)
+        install_parts(folder)
+
+    def __enter__(self) -> Shell:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self.run_dir.supervisor() or self.run_dir.claims():
+            self("down")
+        shutil.rmtree(self.root)
+
+    @property
+    def env(self) -> dict[str, str]:
+        return os.environ | {"COCORO_RUN_DIR": str(self.root), "PYTHONPATH": str(self.folder)}
+
+    def profile(self, *processes: str, extra: str = "") -> str:
+        path = self.folder / "robbie.toml"
+        path.write_text(f'robot = "robbie"\nprocesses = {list(processes)}\n{extra}')
+        return str(path)
+
+    def __call__(self, *arguments: str) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, "-m", "cocoro.cli.main", *arguments]
+        return subprocess.run(command, env=self.env, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
+
+    def start(self, *arguments: str) -> Running:
+        return Running([sys.executable, "-m", "cocoro.cli.main", *arguments], self.env)
+
+    def pid(self, service: str) -> int:
+        return self.run_dir.claims()[service].pid
+
+    def target(self, service: str) -> Target:
+        """The process that is a service now."""
+        return Target(self.run_dir.path / "claims" / service)
+
+
+class Running:
+    """A command that goes on, read line by line."""
+
+    def __init__(self, command: list[str], env: dict[str, str]) -> None:
+        self.process = subprocess.Popen(command, env=env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+        self.lines: list[str] = []
+        self._queue: queue.Queue[str | None] = queue.Queue()
+        threading.Thread(target=self._read, daemon=True).start()
+
+    def _read(self) -> None:
+        assert self.process.stdout is not None
+        with self.process.stdout as out:
+            for line in out:
+                self._queue.put(line.rstrip("\n"))
+        self._queue.put(None)
+
+    def until(self, text: str) -> str:
+        """Read on until a line has `text` in it; that line."""
+        while (line := self._queue.get(timeout=PATIENCE_S)) is not None:
+            self.lines.append(line)
+            if text in line:
+                return line
+        raise AssertionError(f"no {text!r} in:\n" + "\n".join(self.lines))
+
+    def end(self, signal_number: int | None = None) -> int:
+        """Signal it, if need be, read the rest and return the exit code."""
+        if signal_number is not None:
+            self.process.send_signal(signal_number)
+        while (line := self._queue.get(timeout=PATIENCE_S)) is not None:
+            self.lines.append(line)
+        return self.process.wait(PATIENCE_S)

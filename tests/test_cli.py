@@ -1,0 +1,208 @@
+"""The command's usage: options, mistakes, exit codes; no robot needed."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import types
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from cocoro.cli import rehearse
+from cocoro.cli.main import main
+from cocoro.cli.options import frames_of, latencies_of
+from cocoro.cli.running import overrides
+from cocoro.cli.table import table
+from cocoro.errors import ConfigError
+from cocoro.rehearsal import RehearsalRequest
+from cocoro.topics import TOPICS
+
+COMMANDS = (
+    "up", "down", "status", "fetch", "park", "put-down", "estop", "reset", "cancel", "objects", "snapshot", "run",
+    "rehearse", "topics",
+)  # fmt: skip
+ROOT = Path(__file__).parent.parent
+
+
+@pytest.fixture(autouse=True)
+def no_robot_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COCORO_RUN_DIR", str(tmp_path / "run"))
+
+
+def test_help_lists_every_command(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--help"]) == 0
+    out = capsys.readouterr().out
+    assert all(f" {command} " in out for command in COMMANDS)
+
+
+@pytest.mark.parametrize("command", [*COMMANDS, "stop"])
+def test_every_command_has_help(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([command, "--help"]) == 0
+    assert len(capsys.readouterr().out) > 100
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["no-such-command"],
+        ["fetch"],
+        ["fetch", "red_can", "--timeout", "-1"],
+        ["up", "--frames", "big"],
+        ["up", "--scene", "no_such_file.toml"],
+        ["up", "no_such_profile"],
+        ["up", "--latency", "perception"],
+        ["up", "--set", "seed"],
+        ["run", "no_such_process"],
+        ["snapshot", "picture.jpg"],
+        ["fetch", "red_can", "--snapshot", "picture.jpg"],
+        ["estop", "now"],
+        ["rehearse", "dance"],
+        ["rehearse", "fetch"],
+        ["rehearse", "fetch", "red_can", "--sensors", "good"],
+        ["rehearse", "fetch", "red_can", "--seed", "-1"],
+        ["rehearse", "fetch", "red_can", "--frames", "9x9@30"],
+        ["rehearse", "fetch", "red_can", "--scene", "no_such_file.toml"],
+    ],
+    ids=" ".join,
+)
+def test_bad_usage_exits_with_2_and_no_traceback(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(arguments) == 2
+    err = capsys.readouterr().err
+    assert err
+    assert "Traceback" not in err
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["fetch", "red_can"], ["park"], ["put-down"], ["cancel"], ["status"], ["objects"], ["snapshot", "out.png"],
+        ["estop"], ["stop"], ["estop", "--robot", "calliope"], ["reset"], ["fetch", "red_can", "--robot", "calliope"],
+    ],
+    ids=" ".join,
+)  # fmt: skip
+def test_without_a_robot_they_exit_with_4_and_say_what_to_start(
+    arguments: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(arguments) == 4
+    assert "cocoro up sim" in capsys.readouterr().err
+
+
+def test_down_without_a_robot_is_no_error(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["down"]) == 0
+    assert capsys.readouterr().out == "nothing was up\n"
+
+
+def test_the_options_of_up_are_settings_of_the_simulator(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("mine.toml").touch()
+    settings = overrides("mine.toml", 7, "real", "320x240@15", ["perception=0.5"], ["robot=robbie"])
+    assert settings == [
+        f'service.sim.scene="{tmp_path}/mine.toml"', "service.sim.seed=7", 'service.sim.sensors="real"',
+        "service.sim.width=320", "service.sim.height=240", "service.sim.frame_rate_hz=15.0",
+        "service.perception.latency_s=0.5", "robot=robbie",
+    ]  # fmt: skip
+    assert overrides("paper", None, None, None, [], []) == ['service.sim.scene="paper"']
+
+
+def test_frames_may_leave_the_rate_out() -> None:
+    assert frames_of("640x480") == {"width": 640, "height": 480}
+
+
+@pytest.mark.parametrize("text", ["perception", "=1", "perception=", "perception=soon"])
+def test_a_latency_that_is_none_shows_how_it_is_written(text: str) -> None:
+    with pytest.raises(ConfigError, match=r"perception=0\.5"):
+        latencies_of([text])
+
+
+def test_a_table_lines_up() -> None:
+    assert table(("name", "n"), [("a", "1"), ("long", "22")]) == "NAME  N\na     1\nlong  22\n"
+
+
+def test_topics_as_data_has_every_row(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["topics", "--json"]) == 0
+    assert [row["topic"] for row in json.loads(capsys.readouterr().out)] == [topic.name for topic in TOPICS]
+
+
+def test_the_topics_page_of_the_documentation_is_up_to_date(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["topics", "--markdown"]) == 0
+    page = (ROOT / "docs" / "topics.md").read_text(encoding="utf-8")
+    assert capsys.readouterr().out == page, "make it anew: cocoro topics --markdown > docs/topics.md"
+
+
+def test_the_emergency_stop_imports_next_to_nothing() -> None:
+    code = "import sys; from cocoro.cli.main import main; main(['estop']); print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    modules = set(done.stdout.split())
+    assert "zenoh" in modules
+    assert modules.isdisjoint(
+        {"numpy", "scipy", "cv2", "typer", "click", "rich", "uvloop", "cocoro.node", "cocoro.cli.app"}
+    )
+
+
+# --- rehearse -------------------------------------------------------------------------------------
+
+RESULT: dict[str, Any] = {
+    "task": "fetch", "label": "red_can", "seed": 3, "outcome": "done", "reason": "", "sim_s": 12.5, "wall_s": 5.0,
+    "phases": [{"name": "approach", "sim_s": 4.0}],
+    "truth": {"lifted_m": 0.17, "held": True, "knocked_over": [], "collisions": 0},
+}  # fmt: skip
+
+
+@pytest.fixture
+def simulator(monkeypatch: pytest.MonkeyPatch) -> list[RehearsalRequest]:
+    """Stands in for the simulator; the requests that it got. It prints, as libraries do."""
+    asked: list[RehearsalRequest] = []
+
+    def run(request: RehearsalRequest) -> dict[str, Any]:
+        asked.append(request)
+        print("pybullet build time: today", flush=True)
+        return RESULT | {"outcome": "failed" if request.label == "blue_can" else "done"}
+
+    module = types.ModuleType("fake_simulator")
+    module.rehearse = run  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+    monkeypatch.setattr(rehearse, "SIMULATOR", module.__name__)
+    return asked
+
+
+def test_every_option_of_rehearse_reaches_the_request(simulator: list[RehearsalRequest]) -> None:
+    options = "--scene paper --seed 3 --sensors real --latency perception=0.1 --latency planning=0.02 --lockstep"
+    code = main(["rehearse", "fetch", "red_can", *options.split(), "--frames", "320x240@15", "--timeout", "60"])
+    assert code == 0
+    assert simulator == [
+        RehearsalRequest(
+            task="fetch", label="red_can", scene="paper", seed=3, sensors="real",
+            latency={"perception": 0.1, "planning": 0.02}, lockstep=True,
+            width=320, height=240, frame_rate_hz=15.0, timeout_s=60.0,
+        )
+    ]  # fmt: skip
+
+
+def test_json_is_all_that_stands_on_the_output(
+    simulator: list[RehearsalRequest], capfd: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["rehearse", "fetch", "red_can", "--json"]) == 0
+    out, err = capfd.readouterr()
+    assert json.loads(out) == RESULT
+    assert "pybullet" in err
+
+
+def test_the_summary_says_outcome_phases_speed_and_truth(
+    simulator: list[RehearsalRequest], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["rehearse", "fetch", "blue_can"]) == 1
+    out = capsys.readouterr().out
+    assert "failed: fetch red_can in 12.5 s" in out
+    for fact in ("approach      4.0 s", "2.5 times real time", "held               yes", "knocked over       none"):
+        assert fact in out
+
+
+@pytest.mark.sim
+def test_a_scene_with_an_error_is_bad_usage_too(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene = tmp_path / "scene.toml"
+    scene.write_text('name = "x"\n[[object]]\nlabel = "red_can"\nshape = "cone"\n')
+    assert main(["rehearse", "fetch", "red_can", "--scene", str(scene)]) == 2
+    assert "shape" in capsys.readouterr().err

@@ -1,0 +1,281 @@
+"""How a task is asked for and followed, against a scripted executive on the local bus in virtual time."""
+
+from __future__ import annotations
+
+import asyncio
+import io
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from cocoro.bus.local import LocalMesh
+from cocoro.cli import exits
+from cocoro.cli.link import Link
+from cocoro.cli.progress import Lines, Live, View
+from cocoro.cli.tasks import Follower
+from cocoro.clock import VirtualClock
+from cocoro.errors import MeshError
+from cocoro.messages import CancelRequest, Latch, LatchState, Phase, TaskReply, TaskRequest, TaskState
+from cocoro.node import Node
+from cocoro.robot import Robot
+from cocoro.rundir import RunDir
+from cocoro.topics import CANCEL, LATCH, RUN, TASK
+from cocoro.vloop import run_virtual
+
+REQUEST = TaskRequest(task="fetch", label="red_can")
+ID = "fetch-1"
+
+
+@dataclass
+class Executive:
+    """Accepts one task and tells what the test lets it tell."""
+
+    node: Node
+    replies: list[TaskReply] = field(default_factory=lambda: [TaskReply(accepted=True, task_id=ID)])
+    asked: list[TaskRequest] = field(default_factory=list)
+    cancelled: list[str] = field(default_factory=list)
+    on_run: Callable[[], None] = lambda: None
+    on_cancel: Callable[[], None] = lambda: None
+
+    def __post_init__(self) -> None:
+        self.node.serve(RUN, self._run)
+        self.node.serve(CANCEL, self._cancel)
+        self.node.ready()
+
+    async def _run(self, request: TaskRequest) -> TaskReply:
+        self.asked.append(request)
+        self.on_run()
+        return self.replies.pop(0) if len(self.replies) > 1 else self.replies[0]
+
+    async def _cancel(self, request: CancelRequest) -> TaskReply:
+        self.cancelled.append(request.task_id)
+        self.on_cancel()
+        return TaskReply(accepted=True, task_id=request.task_id)
+
+    def tell(self, phase: str, elapsed_s: float, task_id: str = ID, **fields: Any) -> None:
+        self.node.publish(
+            TASK,
+            TaskState(
+                task_id=task_id, task="fetch", label="red_can", phase=phase, elapsed_s=elapsed_s,
+                phases=(Phase(name=phase, start_ns=0),), **fields,
+            ),
+        )  # fmt: skip
+
+
+class Scene:
+    """An operator's link and an executive on one mesh."""
+
+    def __init__(self) -> None:
+        self.mesh = LocalMesh()
+        self.bus = self.mesh.join()
+        self.node = Node("executive", self.bus, VirtualClock(), Robot.load())
+        self.link = Link(RunDir("calliope", Path("unused")), self.mesh.join())
+        self.out = io.StringIO()
+
+    def follower(self, view: View | None = None) -> Follower:
+        return Follower(self.link, REQUEST, view or Lines(self.out), None)
+
+
+def in_virtual_time(scenario: Callable[[Scene], Awaitable[None]]) -> Callable[[], None]:
+    async def run() -> None:
+        scene = Scene()
+        async with scene.node:
+            await scenario(scene)
+
+    def test() -> None:
+        run_virtual(run())
+
+    test.__name__, test.__doc__ = scenario.__name__, scenario.__doc__
+    return test
+
+
+async def following(follower: Follower) -> asyncio.Task[tuple[int, dict[str, object]]]:
+    """A follower whose task has been accepted."""
+    running = asyncio.create_task(follower.run())
+    await asyncio.sleep(0.01)
+    return running
+
+
+@in_virtual_time
+async def test_a_task_that_is_done_is_followed_phase_by_phase_and_exits_with_0(scene: Scene) -> None:
+    executive = Executive(scene.node)
+    running = await following(scene.follower())
+    told = ((0.2, "search", None), (0.4, "search", None), (3.0, "approach", 0.9), (3.2, "approach", 0.8))
+    for elapsed_s, phase, distance_m in told:
+        executive.tell(phase, elapsed_s, distance_m=distance_m, text="because")
+    executive.tell("end", 9.5, outcome="done")
+    code, result = await running
+    assert code == exits.DONE
+    assert executive.asked == [REQUEST]
+    assert scene.out.getvalue().splitlines() == [
+        "   0.4 s  search               because",
+        "   3.2 s  approach     0.80 m  because",
+        "done: fetch red_can in 9.5 s",
+    ]
+    assert (result["outcome"], result["elapsed_s"]) == ("done", 9.5)
+
+
+@in_virtual_time
+async def test_a_long_phase_is_told_of_again_every_two_seconds(scene: Scene) -> None:
+    executive = Executive(scene.node)
+    running = await following(scene.follower())
+    for tenths in range(1, 60):
+        executive.tell("approach", tenths / 10)
+    executive.tell("end", 6.0, outcome="done")
+    await running
+    assert [line.split(" s ")[0].strip() for line in scene.out.getvalue().splitlines()[:-1]] == ["0.2", "2.2", "4.2"]
+
+
+@in_virtual_time
+async def test_a_task_that_fails_says_why_and_exits_with_1(scene: Scene) -> None:
+    executive = Executive(scene.node)
+    running = await following(scene.follower())
+    executive.tell("end", 30.0, outcome="failed", reason="not_found: looked everywhere")
+    code, result = await running
+    assert (code, result["reason"]) == (exits.FAILED, "not_found: looked everywhere")
+    assert scene.out.getvalue() == "failed: fetch red_can after 30.0 s: not_found: looked everywhere\n"
+
+
+@in_virtual_time
+async def test_another_tasks_outcome_is_not_taken_for_this_ones(scene: Scene) -> None:
+    executive = Executive(scene.node)
+    running = await following(scene.follower())
+    executive.tell("end", 3.0, task_id="fetch-0", outcome="failed", reason="lost")
+    executive.tell("end", 4.0, outcome="done")
+    assert (await running)[0] == exits.DONE
+
+
+@in_virtual_time
+async def test_an_outcome_that_comes_with_the_reply_is_not_missed(scene: Scene) -> None:
+    executive = Executive(scene.node)
+    executive.on_run = lambda: executive.tell("end", 0.0, outcome="failed", reason="unreachable")
+    code, _ = await asyncio.wait_for(scene.follower().run(), 5.0)
+    assert code == exits.FAILED
+
+
+@in_virtual_time
+async def test_when_the_executive_dies_so_does_the_task(scene: Scene) -> None:
+    Executive(scene.node)
+    running = await following(scene.follower())
+    scene.bus.kill()
+    code, result = await running
+    assert (code, result["outcome"], result["reason"]) == (exits.FAILED, "failed", "executive died")
+    assert scene.out.getvalue() == "failed: fetch red_can: executive died\n"
+
+
+@in_virtual_time
+async def test_the_first_interrupt_cancels_on_the_robot_and_waits_for_the_outcome(scene: Scene) -> None:
+    executive = Executive(scene.node)
+    executive.on_cancel = lambda: executive.tell("end", 2.0, outcome="cancelled", reason="by the operator")
+    follower = scene.follower()
+    running = await following(follower)
+    follower.interrupt()
+    code, _ = await running
+    assert (code, executive.cancelled) == (exits.REFUSED, [ID])
+    assert scene.out.getvalue().splitlines()[-1] == "cancelled: fetch red_can after 2.0 s: by the operator"
+
+
+@in_virtual_time
+async def test_an_interrupt_before_the_robot_has_answered_cancels_as_soon_as_it_has(scene: Scene) -> None:
+    executive = Executive(scene.node)
+    executive.on_cancel = lambda: executive.tell("end", 0.1, outcome="cancelled")
+    follower = scene.follower()
+    follower.interrupt()
+    assert (await follower.run())[0] == exits.REFUSED
+    assert executive.cancelled == [ID]
+
+
+@in_virtual_time
+async def test_the_second_interrupt_leaves_at_once(scene: Scene) -> None:
+    follower = scene.follower()
+    follower.interrupt()
+    with pytest.raises(KeyboardInterrupt):
+        follower.interrupt()
+
+
+@in_virtual_time
+async def test_a_task_that_does_not_end_when_cancelled_points_to_the_emergency_stop(scene: Scene) -> None:
+    Executive(scene.node)
+    follower = scene.follower()
+    running = await following(follower)
+    follower.interrupt()
+    await asyncio.sleep(11.0)
+    assert "cocoro estop" in scene.out.getvalue().splitlines()[-1]
+    running.cancel()
+
+
+def refused(code: str, text: str) -> TaskReply:
+    return TaskReply(accepted=False, refusal=code, text=text)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("refusal", "code"),
+    [
+        ("unknown_label", exits.USAGE),
+        ("not_graspable", exits.USAGE),
+        ("busy", exits.REFUSED),
+        ("not_holding", exits.REFUSED),
+    ],
+)
+def test_a_refusal_gives_the_robots_words_and_its_code(
+    refusal: str, code: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    @in_virtual_time
+    async def scenario(scene: Scene) -> None:
+        Executive(scene.node, replies=[refused(refusal, "what it says")])
+        assert (await scene.follower().run())[0] == code
+
+    scenario()
+    assert capsys.readouterr().err == "cocoro: refused: what it says\n"
+
+
+@in_virtual_time
+async def test_a_robot_that_has_only_just_come_up_is_asked_again(scene: Scene) -> None:
+    unsettled = [refused("not_alive", "not yet"), refused("estop", "unknown"), TaskReply(accepted=True, task_id=ID)]
+    executive = Executive(scene.node, replies=unsettled)
+    running = asyncio.create_task(scene.follower().run())
+    await asyncio.sleep(0.5)
+    executive.tell("end", 1.0, outcome="done")
+    assert (await running)[0] == exits.DONE
+    assert len(executive.asked) == 3
+
+
+@pytest.mark.parametrize(("latch", "asked"), [("latched", 1), ("unknown", 30)])
+def test_a_latched_emergency_stop_is_not_asked_about_again_and_again(latch: LatchState, asked: int) -> None:
+    @in_virtual_time
+    async def scenario(scene: Scene) -> None:
+        executive = Executive(scene.node, replies=[refused("estop", "latched")])
+
+        async def say() -> None:
+            async for _ in scene.node.every(20.0):
+                scene.node.publish(LATCH, Latch(state=latch))
+
+        scene.node.spawn(say())
+        assert (await scene.follower().run())[0] == exits.REFUSED
+        assert len(executive.asked) == asked
+
+    scenario()
+
+
+@in_virtual_time
+async def test_without_an_executive_it_says_what_to_start(scene: Scene) -> None:
+    with pytest.raises(MeshError, match=r"no executive running: start one with `cocoro up sim`"):
+        await scene.follower().run()
+
+
+def test_on_a_terminal_one_line_is_written_over_and_each_phases_last_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "40")
+    out = io.StringIO()
+    live = Live(out)
+    for elapsed_s, phase in ((0.1, "search"), (0.5, "search"), (0.7, "approach")):
+        live.show(TaskState(phase=phase, elapsed_s=elapsed_s, text="a text that is much too long for this"))
+    live.result("done: fetch red_can in 0.9 s")
+    text = out.getvalue()
+    assert [line.rpartition("\x1b[K")[2] for line in text.rstrip("\n").split("\n")] == [
+        "   0.5 s  search               a text t",
+        "   0.7 s  approach             a text t",
+        "done: fetch red_can in 0.9 s",
+    ]
