@@ -109,6 +109,8 @@ async def _main(process: str, run_dir: RunDir, data: dict[str, Any], profile_nam
                 robot_name=profile.robot,
                 latency_s=launch.latency_s,
                 record_steps=launch.record_steps,
+                module=row.module,
+                config=config,
             ) as node,
         ):
             log.info("joined the mesh at %s", bus.where)

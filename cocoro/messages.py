@@ -8,7 +8,7 @@ wheels. A reader ignores fields that it does not know, so a field with a default
 from __future__ import annotations
 
 import math
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 from msgspec import Meta
@@ -421,6 +421,80 @@ class StepRecord(Message):
     consumed: tuple[tuple[str, int, int], ...] = ()
     """(topic, incarnation, seq) in the order in which the core was given them."""
     produced: tuple[tuple[str, int, int], ...] = ()
+
+
+# --- for the record -------------------------------------------------------------------------------
+
+
+class Exchange(Message):
+    """A request that a service was asked, and what it answered: only the two of them see it otherwise."""
+
+    request: str
+    """Its name, e.g. 'executive/run'."""
+    question: Any = None
+    """As it was asked; None when it could not be understood."""
+    answer: Any = None
+    error: str = ""
+    """In place of an answer."""
+    took_ms: NonNegative = 0.0
+
+
+class AboutRequest(msgspec.Struct, kw_only=True):
+    pass
+
+
+class AboutFile(msgspec.Struct, kw_only=True):
+    """A file that a service's configuration names: a learned model, known objects."""
+
+    field: str
+    """The configuration's field, e.g. 'objects'."""
+    path: str
+    sha256: str
+    """The file's fingerprint."""
+    content: bytes = b""
+    """Empty when the file is too large for a message."""
+
+
+class AboutReply(msgspec.Struct, kw_only=True):
+    """What a service is and what it was started with: all that its pure core can be made of again."""
+
+    service: str
+    robot: str
+    module: str = ""
+    """Python's name of the component; empty for what is none."""
+    config: Any = None
+    """The component's resolved Config, as a map."""
+    description: Any = None
+    """The robot description that it computes with, as a map."""
+    latency_s: NonNegative = 0.0
+    record_steps: bool = False
+    pid: int = 0
+    host: str = ""
+    versions: dict[str, str] = {}
+    files: tuple[AboutFile, ...] = ()
+
+
+class Recording(Message):
+    """How a recorder is getting on."""
+
+    file: str = ""
+    """The MCAP file that is being written."""
+    messages: Count = 0
+    """Written since the recorder's start, over all its files."""
+    size_bytes: Count = 0
+    """The same, as it takes room on the disk."""
+    raw_bytes: Count = 0
+    """The same, before compression."""
+    waiting_bytes: Count = 0
+    """Received, not yet written."""
+    dropped: dict[str, Count] = {}
+    """By key: received, but there was no room to keep them until the disk took them."""
+    lost: dict[str, Count] = {}
+    """By key: gaps in the sequence, so sent and never received."""
+    longest_sync_ms: NonNegative = 0.0
+    """That the disk took to make sure of what it was given."""
+    fault: str = ""
+    """Why nothing is recorded any more."""
 
 
 # --- truth: the simulator's own, for tests, the judge and viewers alone ---------------------------

@@ -20,6 +20,7 @@ import msgspec
 import numpy as np
 
 from cocoro import topics
+from cocoro.about import about
 from cocoro.bus.base import Bus, Handle, Payload, Reply
 from cocoro.clock import NS, Clock, FollowedClock, VirtualClock
 from cocoro.clock import sleep as clock_sleep
@@ -27,10 +28,10 @@ from cocoro.core import Core, Sample
 from cocoro.errors import CocoroError, MeshError, RemoteError
 from cocoro.inbox import Inbox, Intake, Latest, Rate, Stream
 from cocoro.loops import LoopMeter, Schedule, every
-from cocoro.messages import Health, Message, StepRecord, TopicHealth
+from cocoro.messages import AboutReply, AboutRequest, Exchange, Health, Message, StepRecord, TopicHealth
 from cocoro.meter import ProcessMeter
 from cocoro.robot import Robot
-from cocoro.topics import HEALTH, STEPS, Qos, Request, Topic
+from cocoro.topics import EXCHANGES, HEALTH, STEPS, Qos, Request, Topic
 
 M = TypeVar("M", bound=Message)
 Q = TypeVar("Q", bound=msgspec.Struct)
@@ -94,8 +95,11 @@ class Node:
         latency_s: float = 0.0,
         record_steps: bool = False,
         health_hz: float = 1.0,
+        module: str = "",
+        config: Any = None,
     ) -> None:
-        """`latency_s` is added to every step of a driven core that gives outputs, as if computing them took longer."""
+        """`latency_s` is added to every step of a driven core that gives outputs, as if computing them took longer.
+        `module` and `config` are the component that runs here, for those who ask (see `cocoro.about`)."""
         self.name = name
         self.bus = bus
         self.clock = clock
@@ -103,6 +107,8 @@ class Node:
         self.robot_name = robot_name or robot.name
         self.latency_s = latency_s
         self.record_steps = record_steps
+        self.module = module
+        self.config = config
         self.log = logging.getLogger(f"cocoro.{name}")
         self.state: str = "starting"
         self.text = ""
@@ -120,6 +126,7 @@ class Node:
     async def __aenter__(self) -> Node:
         if isinstance(self.clock, FollowedClock) and not self.clock.driven:
             self.inbox(topics.CLOCK).add(self._tick)
+        self.serve(topics.ABOUT.of(self.name), self._tell_about)
         self.spawn(self._tell_health())
         return self
 
@@ -165,7 +172,10 @@ class Node:
 
     def sibling(self, name: str) -> Node:
         """Another service in this process, on the same bus and clock: the simulator stands in for four."""
-        return Node(name, self.bus, self.clock, self.robot, robot_name=self.robot_name, health_hz=self._health_hz)
+        return Node(
+            name, self.bus, self.clock, self.robot, robot_name=self.robot_name, health_hz=self._health_hz,
+            module=self.module, config=self.config,
+        )  # fmt: skip
 
     # --- reading ----------------------------------------------------------------------------------
 
@@ -231,21 +241,27 @@ class Node:
         return await self.bus.call(request.key(self.robot_name), payload, wait_s)
 
     def serve(self, request: Request[Q, R], handler: Callable[[Q], Awaitable[R]]) -> None:
-        """Answer a request. A handler that raises CocoroError answers with its text."""
+        """Answer a request. A handler that raises CocoroError answers with its text. Question and answer are published
+        too, for the record."""
         decoder = msgspec.msgpack.Decoder(request.request)
 
         async def answer(_key: str, payload: Payload) -> bytes:
+            exchange = Exchange(request=request.name)
+            started = time.perf_counter()
             try:
-                question = decoder.decode(payload)
-            except (msgspec.MsgspecError, ValueError) as error:
-                raise CocoroError(f"{request.name}: not a good {request.request.__name__}: {error}") from error
-            try:
-                return msgspec.msgpack.encode(await handler(question))
-            except CocoroError:
+                exchange.question = question = _understood(decoder, payload, request)
+                exchange.answer = given = await handler(question)
+                return msgspec.msgpack.encode(given)
+            except CocoroError as error:
+                exchange.error = str(error)
                 raise
             except Exception as error:
                 self.log.exception("%s failed", request.name)
-                raise CocoroError(f"{request.name}: internal error in {self.name}: {error}") from error
+                exchange.error = f"{request.name}: internal error in {self.name}: {error}"
+                raise CocoroError(exchange.error) from error
+            finally:
+                exchange.took_ms = 0.0 if self._process is None else (time.perf_counter() - started) * 1e3
+                self.publish(EXCHANGES.of(self.name), exchange)
 
         self._handles.append(self.bus.serve(request.key(self.robot_name), answer))
 
@@ -315,6 +331,9 @@ class Node:
 
     # --- health -----------------------------------------------------------------------------------
 
+    async def _tell_about(self, _: AboutRequest) -> AboutReply:
+        return about(self)
+
     async def _tell_health(self) -> None:
         started_ns: int | None = None
         topic = HEALTH.of(self.name)
@@ -382,6 +401,13 @@ def _plain(value: object) -> object:
     if isinstance(value, np.generic):
         return value.item()
     raise TypeError(f"a {type(value).__name__} cannot be sent")
+
+
+def _understood(decoder: msgspec.msgpack.Decoder[Q], payload: Payload, request: Request[Q, Any]) -> Q:
+    try:
+        return decoder.decode(payload)
+    except (msgspec.MsgspecError, ValueError) as error:
+        raise CocoroError(f"{request.name}: not a good {request.request.__name__}: {error}") from error
 
 
 def _understand(request: Request[Q, R], reply: Reply) -> R:

@@ -155,6 +155,7 @@ class Robot:
     """The description, ready to compute with. Make it with `Robot.load()`."""
 
     def __init__(self, spec: _File) -> None:
+        self._spec = spec
         self.name = spec.name
         self.base = spec.base
         self.kinect = spec.kinect
@@ -194,6 +195,19 @@ class Robot:
             return cls(msgspec.convert(data, _File))
         except (tomllib.TOMLDecodeError, msgspec.ValidationError, OSError) as error:
             raise ConfigError(f"robot description {where}: {error}") from error
+
+    @classmethod
+    def from_data(cls, data: Any, where: str = "robot description") -> Robot:
+        """From what `to_data` gave. Raises ConfigError naming the field."""
+        try:
+            return cls(msgspec.convert(data, _File))
+        except msgspec.ValidationError as error:
+            raise ConfigError(f"{where}: {error}") from error
+
+    def to_data(self) -> dict[str, Any]:
+        """The description as plain data, everything resolved."""
+        data: dict[str, Any] = msgspec.to_builtins(msgspec.structs.replace(self._spec, base=self.base))
+        return data
 
     def with_base(self, **changes: float) -> Robot:
         """The same robot with other values in its `[base]` table."""

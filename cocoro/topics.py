@@ -148,9 +148,19 @@ STEPS = Topic(
     "What each step of a pure core consumed and gave (when recording of steps is on).",
 )  # fmt: skip
 
+EXCHANGES = Topic(
+    "{service}/requests", m.Exchange, Qos.EVENT, "*", None, 1.0,
+    "Every request that a service was asked, with its answer: for the record.", max_bytes=4 * 1024 * 1024,
+)  # fmt: skip
+RECORDING = Topic(
+    "{service}/recording", m.Recording, Qos.STATE, "*", 1.0, 3.0,
+    "How a recorder is getting on: its file, what it dropped, why it stopped.",
+)  # fmt: skip
+
 TOPICS: tuple[Topic[Any], ...] = (
     FRAME, BASE_STATE, BASE_COMMAND, ARM_STATE, ARM_COMMAND, HAND_STATE, HAND_COMMAND,
     DETECTIONS, OBSTACLES, PLAN, INTENT, TASK, LATCH, CLOCK, TRUTH, HEALTH, STEPS,
+    EXCHANGES, RECORDING,
 )  # fmt: skip
 
 RUN = Request(
@@ -171,7 +181,12 @@ ESTOP = Request(
     timeout_s=1.0,
 )  # fmt: skip
 
-REQUESTS: tuple[Request[Any, Any], ...] = (RUN, CANCEL, OBJECTS, ESTOP)
+ABOUT = Request(
+    "{service}/about", m.AboutRequest, m.AboutReply, "*",
+    "What a service is and what it was started with: answered by every service.",
+)  # fmt: skip
+
+REQUESTS: tuple[Request[Any, Any], ...] = (RUN, CANCEL, OBJECTS, ESTOP, ABOUT)
 
 HARDWARE = ("kinect", "base", "arm", "hand")
 """The services whose keys the simulator impersonates."""
