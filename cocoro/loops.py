@@ -69,7 +69,8 @@ class Schedule:
 
 
 async def every(clock: Clock, rate_hz: float, meter: LoopMeter) -> AsyncIterator[int]:
-    """Yields the clock's time at a fixed rate; the first time at once."""
+    """Yields the clock's time at a fixed rate; the first time at once, or when the clock starts."""
+    await clock.sleep_until(0)  # a followed clock that has not been heard yet starts anywhere
     schedule = Schedule(clock, rate_hz, meter)
     while True:
         await clock.sleep_until(schedule.deadline_ns)

@@ -13,23 +13,23 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta
 
-Finite = float  # checked by `_require_finite`: MessagePack can carry NaN and infinity
-NonNegative = Annotated[float, Meta(ge=0)]
+LARGEST = 1e12
+"""Beyond any quantity of a robot's in SI units: so large a number is a fault, and its square still a number."""
+Finite = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
+"""MessagePack can carry NaN and infinity; bounds refuse both when a message is decoded."""
+NonNegative = Annotated[float, Meta(ge=0, le=LARGEST)]
 Count = Annotated[int, Meta(ge=0)]
-Vec2 = tuple[float, float]
-Vec3 = tuple[float, float, float]
-Quaternion = tuple[float, float, float, float]
+Vec2 = tuple[Finite, Finite]
+Vec3 = tuple[Finite, Finite, Finite]
+Quaternion = tuple[Finite, Finite, Finite, Finite]
 """x, y, z, w."""
 
 
 def _require_finite(message: msgspec.Struct, *names: str) -> None:
-    """Refuse NaN and infinity in the named number, sequence or optional fields."""
+    """Refuse NaN and infinity in the named numbers or tuples already when a command is made."""
     for name in names:
         value = getattr(message, name)
-        if value is None:
-            continue
-        values = value if isinstance(value, (tuple, list)) else (value,)
-        if not all(v is None or math.isfinite(v) for v in values):
+        if not all(map(math.isfinite, value if isinstance(value, tuple) else (value,))):
             raise ValueError(f"{name} must be finite, not {value!r}")
 
 
@@ -77,11 +77,11 @@ class BaseState(Message):
 
     odometry_m: Vec2
     """x, y of the body in the odometry frame: where the body stood when the service started."""
-    odometry_yaw_rad: float
+    odometry_yaw_rad: Finite
     """Heading in the odometry frame, counter-clockwise, not wrapped."""
-    speed_mps: float
+    speed_mps: Finite
     """Forward speed, as odometry has it."""
-    turn_rate_radps: float
+    turn_rate_radps: Finite
     """Counter-clockwise, as odometry has it."""
     bump_left: bool = False
     bump_right: bool = False
@@ -97,15 +97,12 @@ class BaseState(Message):
     """Why the base refuses or zeroes wheel commands now ('' when it obeys): estop, latch unknown, bump,
     cliff, wheel drop, no command, mode."""
 
-    def __post_init__(self) -> None:
-        _require_finite(self, "odometry_m", "odometry_yaw_rad", "speed_mps", "turn_rate_radps")
-
 
 class BaseCommand(Message):
     """Wheel speeds. Valid for 0.2 s: a base that hears nothing newer commands zero."""
 
-    left_mps: float
-    right_mps: float
+    left_mps: Finite
+    right_mps: Finite
 
     def __post_init__(self) -> None:
         _require_finite(self, "left_mps", "right_mps")
@@ -115,13 +112,13 @@ class ServoState(Message):
     """One servo network, read at one time; every tuple is in the order of `joints`."""
 
     joints: tuple[str, ...]
-    position_rad: tuple[float, ...]
+    position_rad: tuple[Finite, ...]
     """In the kinematic chain's own sense and zero (the common reference frame), not the servo's counts."""
-    speed_radps: tuple[float, ...]
-    load: tuple[float, ...]
+    speed_radps: tuple[Finite, ...]
+    load: tuple[Finite, ...]
     """Signed share of the stall torque, -1 to 1, positive where the motor pushes towards greater angles."""
-    temperature_c: tuple[float, ...] = ()
-    voltage_v: tuple[float, ...] = ()
+    temperature_c: tuple[Finite, ...] = ()
+    voltage_v: tuple[Finite, ...] = ()
     torque_enabled: tuple[bool, ...] = ()
     faults: tuple[str, ...] = ()
     """Latched faults, each 'joint: what', e.g. 'elbow: overload'."""
@@ -133,7 +130,6 @@ class ServoState(Message):
         for name in ("position_rad", "speed_radps", "load"):
             if len(getattr(self, name)) != len(self.joints):
                 raise ValueError(f"{name} has {len(getattr(self, name))} values for {len(self.joints)} joints")
-        _require_finite(self, "position_rad", "speed_radps", "load")
 
 
 class ServoCommand(Message):
@@ -142,8 +138,8 @@ class ServoCommand(Message):
     that a held object stays held."""
 
     joints: tuple[str, ...]
-    goal_rad: tuple[float, ...]
-    speed_radps: tuple[Annotated[float, Meta(ge=0)], ...]
+    goal_rad: tuple[Finite, ...]
+    speed_radps: tuple[NonNegative, ...]
     """Speed limit on the way to the goal. 0 means hold where it is (never 'full speed', as the servo has it)."""
 
     def __post_init__(self) -> None:
@@ -160,13 +156,13 @@ class Detection(msgspec.Struct, kw_only=True):
     """One known object in one frame."""
 
     label: str
-    u_px: float
-    v_px: float
+    u_px: Finite
+    v_px: Finite
     """Centroid in the colour image, pixels right and down from the top left pixel's centre."""
     area_px: Count
     box_px: tuple[int, int, int, int]
     """left, top, right, bottom of the matching pixels, right and bottom exclusive."""
-    depth_m: float | None = None
+    depth_m: Finite | None = None
     """Along the optical axis, of the visible surface; None when the depth image has none there."""
     position_m: Vec3 | None = None
     """The object's centre (visible surface carried inwards by the known radius), body frame as the body
@@ -182,8 +178,8 @@ class Detections(Message):
     frame_incarnation: Count
     width: int
     height: int
-    pan_rad: float | None = None
-    tilt_rad: float | None = None
+    pan_rad: Finite | None = None
+    tilt_rad: Finite | None = None
     """The head angles that were used: interpolated at the frame's stamp."""
     detections: tuple[Detection, ...] = ()
 
@@ -229,9 +225,9 @@ class TargetEstimate(msgspec.Struct, kw_only=True):
     """Centre, body frame, now."""
     velocity_mps: Vec3 = (0.0, 0.0, 0.0)
     """In the odometry frame."""
-    sigma_m: float = 0.0
+    sigma_m: Finite = 0.0
     """Standard deviation of the horizontal position."""
-    age_s: float = 0.0
+    age_s: Finite = 0.0
     """Since the newest frame in which it was localised."""
     odometry_position_m: Vec3 = (0.0, 0.0, 0.0)
     """The same centre in the odometry frame."""
@@ -249,14 +245,14 @@ class PlannerStatus(Message):
     why: str = ""
     """One sentence for people: why it does what it does now."""
     target: TargetEstimate | None = None
-    distance_m: float | None = None
+    distance_m: Finite | None = None
     """What is left to go: to the stopping place when driving, hand to target when reaching."""
     hand_m: Vec3 | None = None
     """Centre between the pads, body frame, felt (from the joint angles)."""
     holding: bool = False
     """The claws are stopped by something between them."""
     body_m: Vec2 | None = None
-    body_yaw_rad: float = 0.0
+    body_yaw_rad: Finite = 0.0
     """Where the body stands in the odometry frame."""
     known: tuple[TargetEstimate, ...] = ()
     """Every object in memory."""
@@ -283,13 +279,13 @@ class TaskState(Message):
     phase: str = "idle"
     text: str = ""
     """What it does now, in words, with the planner's reason."""
-    distance_m: float | None = None
+    distance_m: Finite | None = None
     started_ns: int = 0
     phases: tuple[Phase, ...] = ()
     outcome: Outcome | None = None
     reason: str = ""
     """For failed and cancelled: not_found, lost, slipped, unreachable, timed_out, ... and words after a colon."""
-    elapsed_s: float = 0.0
+    elapsed_s: Finite = 0.0
 
 
 class TaskRequest(msgspec.Struct, kw_only=True):
@@ -366,7 +362,7 @@ class Latch(Message):
 class Clock(Message):
     """Simulated time is `stamp_ns`; a new incarnation is a new epoch."""
 
-    rate: float = 1.0
+    rate: Annotated[float, Meta(gt=0, le=1e3)] = 1.0
     """Simulated seconds a real second, as the simulator last measured it."""
     paused: bool = False
 
@@ -375,8 +371,8 @@ class TopicHealth(msgspec.Struct, kw_only=True):
     key: str
     direction: Literal["in", "out"]
     count: Count = 0
-    rate_hz: float = 0.0
-    age_s: float | None = None
+    rate_hz: Finite = 0.0
+    age_s: Finite | None = None
     """Of the newest sample by its stamp, when the health was taken; None when there was none."""
     skipped: Count = 0
     """State that was overwritten by newer state before it was read."""
@@ -391,10 +387,10 @@ class LoopHealth(msgspec.Struct, kw_only=True):
     """Of a fixed-rate loop or a driven core, over the last health period."""
 
     name: str
-    rate_hz: float = 0.0
-    period_median_ms: float = 0.0
-    period_p99_ms: float = 0.0
-    step_median_ms: float = 0.0
+    rate_hz: Finite = 0.0
+    period_median_ms: Finite = 0.0
+    period_p99_ms: Finite = 0.0
+    step_median_ms: Finite = 0.0
     overruns: Count = 0
     """Periods that were missed altogether since the start."""
 
@@ -404,10 +400,10 @@ class Health(Message):
     pid: int = 0
     state: Literal["starting", "ready", "degraded", "stopping"] = "starting"
     text: str = ""
-    uptime_s: float = 0.0
-    cpu_share: float = 0.0
+    uptime_s: Finite = 0.0
+    cpu_share: Finite = 0.0
     """Of one core, over the last health period."""
-    rss_mb: float = 0.0
+    rss_mb: Finite = 0.0
     topics: tuple[TopicHealth, ...] = ()
     loops: tuple[LoopHealth, ...] = ()
     faults: tuple[str, ...] = ()
@@ -514,7 +510,7 @@ class Truth(Message):
     body_m: Vec3
     """The body frame's origin in the world."""
     body_orientation: Quaternion
-    joints_rad: dict[str, float]
+    joints_rad: dict[str, Finite]
     """True joint angles."""
     objects: tuple[TrueObject, ...]
     collisions: tuple[str, ...] = ()
