@@ -1,125 +1,45 @@
-"""The renderers: what stands where in the picture, exactly; and that both show the same world."""
+"""The renderers: what stands where in the picture, exactly, and in what light."""
 
 from __future__ import annotations
 
-import hashlib
-import logging
-import subprocess
-import sys
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
-
+import cv2
 import numpy as np
 import pytest
+from pictures import (
+    BLUE_BOX,
+    CAMERA,
+    GREEN_BALL,
+    PLACES,
+    POSES,
+    ROBOT,
+    Lamp,
+    at,
+    floor_depth,
+    gl_renderer,
+    head,
+    look,
+    pixel_of,
+    reddish,
+    renderer_of,
+)
 
-from cocoro.errors import ConfigError
 from cocoro.kinematics import Array
 from cocoro.objects import Catalogue
-from cocoro.robot import Camera, Robot
 from sim.camera import moved
 from sim.render import Images, Renderer, make_renderer
-from sim.render import gl as gl_module
 from sim.render.room import FLOOR_RGB, OTHER_TILE_RGB, walls
 from sim.render.views import lamp_tint
 from sim.visual import Visual
 
-ROBOT = Robot.load()
-CAMERA = ROBOT.camera.scaled(320, 240)
-
-
-@dataclass(frozen=True)
-class Lamp:
-    ambient: float = 0.55
-    diffuse: float = 0.45
-    direction: tuple[float, float, float] = (0.3, 0.2, -1.0)
-    temperature_k: float = 6500.0
-
-
-RED_CAN = Visual("red", "cylinder", (0.033, 0.12), (0.8, 0.04, 0.05))
-BLUE_BOX = Visual("blue", "box", (0.2, 0.3, 0.25), (0.04, 0.14, 0.75))
-GREEN_BALL = Visual("green", "sphere", (0.05,), (0.03, 0.55, 0.1))
-VISUALS = [RED_CAN, BLUE_BOX, GREEN_BALL]
-PLACES = [(1.5, 0.0, 0.06), (1.8, 0.4, 0.125), (1.2, -0.3, 0.05)]
-
-
-def at(*position_m: float) -> Array:
-    pose = np.eye(4)
-    pose[:3, 3] = position_m
-    return pose
-
-
-POSES = np.array([at(*place) for place in PLACES])
-
-
-def head(tilt_rad: float = -0.45, pan_rad: float = 0.0) -> Array:
-    angles = dict.fromkeys(ROBOT.joints, 0.0) | {"neck_tilt": tilt_rad, "neck_pan": pan_rad}
-    return ROBOT.chain("camera").pose(angles)
-
-
-def look(
-    renderer: Renderer,
-    camera_pose: Array | None = None,
-    *,
-    poses: Array = POSES,
-    light: Lamp | None = None,
-    projector: bool = False,
-) -> Images:
-    """A frame as the Kinect takes it, kept beyond the next one."""
-    pose = head() if camera_pose is None else camera_pose
-    images = renderer.render(
-        poses,
-        pose,
-        moved(pose, np.array(ROBOT.kinect.depth_offset_m)),
-        light or Lamp(),
-        moved(pose, np.array(ROBOT.kinect.projector_offset_m)) if projector else None,
-    )
-    return Images(images.colour.copy(), images.depth_m.copy())
-
-
-def gl_renderer(visuals: list[Visual], camera: Camera = CAMERA) -> Renderer:
-    try:
-        return make_renderer(visuals, camera, "moderngl")
-    except ConfigError as error:
-        pytest.skip(str(error))
-
-
-@pytest.fixture(scope="module")
-def gl() -> Iterator[Renderer]:
-    renderer = gl_renderer(VISUALS)
-    yield renderer
-    renderer.close()
-
-
-@pytest.fixture(scope="module")
-def tiny() -> Iterator[Renderer]:
-    renderer = make_renderer(VISUALS, CAMERA, "tiny")
-    yield renderer
-    renderer.close()
-
 
 @pytest.fixture(params=["moderngl", "tiny"])
 def renderer(request: pytest.FixtureRequest) -> Renderer:
-    fixture: Renderer = request.getfixturevalue("gl" if request.param == "moderngl" else "tiny")
-    return fixture
+    return renderer_of(request.param)
 
 
-def pixel_of(point_m: tuple[float, ...], camera_pose: Array, camera: Camera = CAMERA) -> tuple[float, float]:
-    x, y, z, _ = np.linalg.inv(camera_pose) @ [*point_m, 1.0]
-    return camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
-
-
-def reddish(colour: np.ndarray) -> np.ndarray:
-    r, g, b = np.moveaxis(colour.astype(int), -1, 0)
-    return (r > 2 * g + 20) & (r > 2 * b + 20)
-
-
-def floor_depth(camera: Camera, camera_pose: Array) -> Array:
-    """Along the optical axis to z = 0 in every pixel's direction, by the camera's own `ray`."""
-    across = np.array([camera.ray(u, 0) for u in range(camera.width)])
-    down = np.array([camera.ray(0, v) for v in range(camera.height)])
-    up = camera_pose[2, :3]
-    slope = up[0] * across[None, :, 0] + up[1] * down[:, None, 1] + up[2]
-    return np.where(slope < 0, -camera_pose[2, 3] / np.minimum(slope, -1e-9), np.inf)
+@pytest.fixture
+def gl() -> Renderer:
+    return renderer_of("moderngl")
 
 
 # --- geometry -------------------------------------------------------------------------------------
@@ -277,145 +197,6 @@ def test_nothing_in_the_room_has_the_colour_of_a_known_object() -> None:
 
 
 def to_lab(rgb: Array) -> Array:
-    import cv2
 
     pixel: Array = cv2.cvtColor(rgb.astype(np.float32).reshape(1, 1, 3), cv2.COLOR_RGB2LAB)[0, 0].astype(float)
     return pixel
-
-
-# --- the infrared projector -----------------------------------------------------------------------
-
-
-def test_without_a_projector_depth_has_no_shadows(renderer: Renderer) -> None:
-    assert (look(renderer).depth_m > 0).all()
-
-
-def test_the_projectors_shadow_lies_left_of_a_near_thing_as_wide_as_the_disparity(renderer: Renderer) -> None:
-    # The projector stands to the right of the depth camera, so what it misses is to the left.
-    images = look(renderer, projector=True)
-    u, v = pixel_of((1.8 - 0.1, 0.4, 0.2), moved(head(), np.array(ROBOT.kinect.depth_offset_m)))
-    row = images.depth_m[round(v)]
-    shaded = np.flatnonzero(row[: round(u)] < 0)
-    box_m = row[round(u)]
-    behind_m = -row[shaded].mean()
-    assert behind_m > box_m + 0.2
-    left_edge = shaded.max() + 1
-    assert np.abs(row[left_edge] - box_m) < 0.05  # the shadow ends where the box begins
-    assert len(shaded) == pytest.approx(CAMERA.fx * 0.075 * (1 / box_m - 1 / behind_m), abs=1.5)
-    right = row[round(u) : round(u) + 60]
-    assert (right > 0).all()
-
-
-def test_shadow_has_the_metres_of_what_it_lies_on(renderer: Renderer) -> None:
-    plain = look(renderer).depth_m
-    np.testing.assert_array_equal(np.abs(look(renderer, projector=True).depth_m), plain)
-
-
-@pytest.mark.parametrize("tilt_rad", [-0.2, -0.6, -1.0])
-def test_a_plane_does_not_shade_itself(renderer: Renderer, tilt_rad: float) -> None:
-    far = POSES.copy()
-    far[:, 0, 3] = -5.0
-    assert (look(renderer, head(tilt_rad), poses=far, projector=True).depth_m > 0).all()
-
-
-# --- two renderers, one world ---------------------------------------------------------------------
-
-
-def away_from_edges(depth_m: np.ndarray) -> np.ndarray:
-    import cv2
-
-    spread = cv2.morphologyEx(1 / np.abs(depth_m), cv2.MORPH_GRADIENT, np.ones((5, 5), np.uint8))
-    flat: np.ndarray = spread < 0.02
-    return flat
-
-
-def test_both_renderers_show_the_same_world_up_to_shading(gl: Renderer, tiny: Renderer) -> None:
-    one, other = look(gl, projector=True), look(tiny, projector=True)
-    inside = away_from_edges(one.depth_m) & away_from_edges(other.depth_m)
-    near = inside & (np.abs(one.depth_m) < 3.5)
-    assert near.mean() > 0.6
-    assert np.abs(np.abs(one.depth_m) - np.abs(other.depth_m))[near].max() < 0.02
-    assert ((one.depth_m < 0) != (other.depth_m < 0)).mean() < 0.002
-    for place in PLACES:
-        u, v = (round(x) for x in pixel_of(place, head()))
-        a, b = one.colour[v, u].astype(float), other.colour[v, u].astype(float)
-        assert np.argmax(a) == np.argmax(b)
-        np.testing.assert_allclose(a / a.sum(), b / b.sum(), atol=0.03)
-        assert a.sum() == pytest.approx(b.sum(), rel=0.35)
-
-
-FRAME_OF_ITS_OWN = """
-import hashlib, sys
-sys.path.insert(0, {tests!r})
-from test_render import VISUALS, CAMERA, look, make_renderer
-images = look(make_renderer(VISUALS, CAMERA, {choice!r}), projector=True)
-print(hashlib.sha256(images.colour.tobytes() + images.depth_m.tobytes()).hexdigest())
-"""
-
-
-def fingerprint(images: Images) -> str:
-    return hashlib.sha256(images.colour.tobytes() + images.depth_m.tobytes()).hexdigest()
-
-
-def test_equal_inputs_give_equal_bytes_whatever_was_drawn_before(renderer: Renderer) -> None:
-    first = fingerprint(look(renderer, projector=True))
-    look(renderer, head(-1.0, 0.5))
-    assert fingerprint(look(renderer, projector=True)) == first
-    other = make_renderer(VISUALS, CAMERA, "tiny" if renderer.name == "tiny" else "moderngl")
-    look(other, head(-0.2))
-    assert fingerprint(look(other, projector=True)) == first
-    assert fingerprint(look(renderer, projector=True)) == first  # two side by side do not disturb one another
-    other.close()
-    assert fingerprint(look(renderer, projector=True)) == first
-
-
-def test_equal_inputs_give_equal_bytes_in_another_process(renderer: Renderer) -> None:
-    program = FRAME_OF_ITS_OWN.format(tests=str(__file__.rpartition("/")[0]), choice=renderer.name)
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    assert done.stdout.split()[-1] == fingerprint(look(renderer, projector=True))
-
-
-def test_any_resolution_shows_the_same_view(gl: Renderer) -> None:
-    small = gl_renderer(VISUALS, replace(CAMERA.scaled(160, 120)))
-    coarse = look(small).depth_m
-    fine = look(gl).depth_m
-    small.close()
-    u, v = pixel_of((1.7, 0.4, 0.15), moved(head(), np.array(ROBOT.kinect.depth_offset_m)))
-    assert coarse[round((v - 0.5) / 2), round((u - 0.5) / 2)] == pytest.approx(fine[round(v), round(u)], abs=0.01)
-
-
-# --- where OpenGL is missing ----------------------------------------------------------------------
-
-NO_LIBRARY = """
-import logging
-logging.basicConfig(format="%(levelname)s %(message)s")
-from sim.render import gl, make_renderer
-from cocoro.robot import Robot
-gl.LIBRARIES["libgl"] = "libGL-that-is-not-there.so.1"
-print(make_renderer([], Robot.load().camera).name)
-"""
-
-
-def test_a_missing_library_means_one_warning_and_the_slow_renderer() -> None:
-    done = subprocess.run([sys.executable, "-c", NO_LIBRARY], capture_output=True, text=True, check=True)
-    assert done.stdout.split() == ["tiny"]
-    assert "Traceback" not in done.stderr
-    (warning,) = [line for line in done.stderr.splitlines() if line.startswith("WARNING")]
-    assert "apt install libegl1 libgl1 libgl1-mesa-dri" in warning
-
-
-def test_a_context_that_cannot_be_made_is_said_once(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    def refuse() -> None:
-        raise Exception("eglInitialize failed")  # what glcontext raises is a plain Exception
-
-    monkeypatch.setattr(gl_module, "_context", refuse)
-    with caplog.at_level(logging.WARNING):
-        renderer = make_renderer([], CAMERA)
-    renderer.close()
-    assert renderer.name == "tiny"
-    assert len(caplog.records) == 1
-    assert "eglInitialize failed" in caplog.text
-    with pytest.raises(ConfigError, match="apt install"):
-        make_renderer([], CAMERA, "moderngl")
