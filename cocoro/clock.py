@@ -11,6 +11,14 @@ import time
 from typing import Protocol
 
 NS = 1_000_000_000
+CLOCKS_APART_NS = NS // 4
+"""A stamp may be this far ahead of our clock: two machines' clocks are never quite the same."""
+
+
+def is_fresh(stamp_ns: int, now_ns: int, max_age_s: float) -> bool:
+    """Whether what was stamped then may be acted on now. What lies ahead of our clock is of another epoch: what was
+    heard before a clock jumped back says nothing of now."""
+    return -CLOCKS_APART_NS <= now_ns - stamp_ns <= max_age_s * NS
 
 
 class Clock(Protocol):

@@ -10,14 +10,11 @@ from typing import Any, Generic, TypeVar
 import msgspec
 
 from cocoro.bus.base import Payload, Subscription
-from cocoro.clock import NS, Clock
+from cocoro.clock import NS, Clock, is_fresh
 from cocoro.messages import Message, TopicHealth
 from cocoro.topics import CLOCK, Qos, Topic
 
 M = TypeVar("M", bound=Message)
-
-_CLOCKS_APART_NS = NS // 4
-"""A stamp may be this far ahead of our clock: two machines' clocks are never quite the same."""
 
 
 class Rate:
@@ -105,9 +102,9 @@ class Inbox(Generic[M]):
         """A command beyond its age must not act, however it got here; nor one from the future."""
         if self.topic.qos is not Qos.COMMAND or self.topic.name == CLOCK.name:
             return True
-        age_ns = self._clock.now_ns() - message.stamp_ns
-        if age_ns > self.topic.max_age_s * NS or age_ns < -_CLOCKS_APART_NS:
-            self._reject(f"stale: stamped {age_ns / NS:.3f} s ago")
+        now_ns = self._clock.now_ns()
+        if not is_fresh(message.stamp_ns, now_ns, self.topic.max_age_s):
+            self._reject(f"stale: stamped {(now_ns - message.stamp_ns) / NS:.3f} s ago")
             return False
         return True
 
@@ -157,10 +154,10 @@ class Latest(Generic[M]):
         return self._message
 
     def fresh(self, max_age_s: float | None = None) -> M | None:
-        """The newest unless it is older than `max_age_s` (the topic's maximum age by default)."""
+        """The newest unless it is older than `max_age_s` (the topic's maximum age by default), or of another epoch."""
         message = self.value
         limit_s = self._inbox.topic.max_age_s if max_age_s is None else max_age_s
-        if message is None or self._clock.now_ns() - message.stamp_ns > limit_s * NS:
+        if message is None or not is_fresh(message.stamp_ns, self._clock.now_ns(), limit_s):
             return None
         return message
 

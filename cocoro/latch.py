@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from cocoro import topics
-from cocoro.clock import NS
+from cocoro.clock import NS, is_fresh
 from cocoro.messages import EstopReply, EstopRequest, Latch, LatchState
 from cocoro.node import Node
 
@@ -40,11 +40,14 @@ class LatchKeeper:
         return EstopReply(service=self._node.name, latch=self.state)
 
     def _heard(self, latch: Latch) -> None:
+        now_ns = self._node.now_ns()
+        if not is_fresh(latch.stamp_ns, now_ns, topics.LATCH.max_age_s):
+            return
         if latch.state == "released":
             if self.state == "unknown":
                 self._set("released", latch.by)
         elif latch.state == "latched" and self.state != "latched":
-            if self._reset_ns is not None and self._node.now_ns() - self._reset_ns < _IN_FLIGHT_NS:
+            if self._reset_ns is not None and 0 <= now_ns - self._reset_ns < _IN_FLIGHT_NS:
                 return
             self._set("latched", latch.by)
 

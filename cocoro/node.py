@@ -285,20 +285,25 @@ class Node:
     # --- driving a core ---------------------------------------------------------------------------
 
     async def drive(self, core: Core, name: str | None = None) -> None:
-        """Step a pure core for ever: at its rate, and at once when a triggering topic arrives."""
+        """Step a pure core for ever: at its rate, and at once when a triggering topic arrives.
+
+        An exception in the core ends the service: its state cannot be trusted any more, and the supervisor starts it
+        afresh. The hardware stops by itself meanwhile.
+        """
         step = self.stepper(core, name)
         meter = self._meter(name or self.name)
-        schedule = Schedule(self.clock, core.schedule.rate_hz, meter) if core.schedule.rate_hz else None
         if isinstance(self.clock, FollowedClock):
             await self.clock.wait_started()
+        schedule = Schedule(self.clock, core.schedule.rate_hz, meter) if core.schedule.rate_hz else None
         self.ready()
         epoch = self.clock.epoch
         while True:
-            due = schedule is None
-            if schedule is not None:
-                due = await self._wait(step.wake, schedule.deadline_ns)
-            else:
+            if schedule is None:
                 await step.wake.wait()
+                due = True
+            else:
+                # The clock may have begun anew in the middle of a step: the deadline is of the time before then.
+                due = self.clock.epoch != epoch or await self._wait(step.wake, schedule.deadline_ns)
             if self.clock.epoch != epoch:
                 epoch = self.clock.epoch
                 due = True
@@ -319,6 +324,7 @@ class Node:
     async def _wait(self, wake: asyncio.Event, deadline_ns: int) -> bool:
         """Wait for a deadline (True) or an earlier wake (False)."""
         if self.clock.now_ns() >= deadline_ns:
+            await asyncio.sleep(0)  # a core that is too slow for its rate must not keep everything else from running
             return True
         timer = asyncio.ensure_future(self.clock.sleep_until(deadline_ns))
         waker = asyncio.ensure_future(wake.wait())
@@ -380,7 +386,8 @@ class Stepper:
         outputs = self._core.step(samples, now_ns)
         stamp_ns = now_ns
         if outputs and node.latency_s > 0:
-            await node.sleep(node.latency_s)
+            if not await node.sleep(node.latency_s):
+                outputs = ()  # the clock began anew meanwhile: what was computed is of no time that there is
             # What takes longer to compute is said later; a command's age counts from when it could be given.
             stamp_ns += round(node.latency_s * NS)
         produced = []

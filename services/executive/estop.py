@@ -41,13 +41,13 @@ class Estop:
         self._heard[service] = latch
         now_ns = self._node.now_ns()
         if latch == "latched" and self.state != "latched":
-            if self._reset_ns is None or now_ns - self._reset_ns > _IN_FLIGHT_NS:
+            if self._reset_ns is None or not 0 <= now_ns - self._reset_ns <= _IN_FLIGHT_NS:
                 self._set("latched", f"{service}, which was latched already")
         elif self.state == "unknown":
             if latch == "released":
                 self._set("released", service)
             elif set(self._heard) == set(topics.STOPPABLE) and set(self._heard.values()) == {"unknown"}:
-                if self._all_unknown_since_ns is None:
+                if self._all_unknown_since_ns is None or now_ns < self._all_unknown_since_ns:
                     self._all_unknown_since_ns = now_ns
                 elif now_ns - self._all_unknown_since_ns > _COLD_START_NS:
                     self._set("released", "cold start")
