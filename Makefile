@@ -1,20 +1,15 @@
 PYTHON ?= python3
-VENV := .venv
-BIN := $(VENV)/bin
 
 .PHONY: demo test install clean
 
-install: $(VENV)/.installed
-
-$(VENV)/.installed: pyproject.toml constraints.txt deploy/install.sh
-	PYTHON=$(PYTHON) deploy/install.sh
-	touch $@
+install:
+	@PYTHON=$(PYTHON) deploy/install.sh
 
 demo: install
-	deploy/demo.sh
+	@deploy/demo.sh
 
 test: install
-	deploy/test.sh
+	@deploy/test.sh
 
 clean:
-	rm -rf $(VENV) out run build *.egg-info
+	rm -rf .venv out run build *.egg-info

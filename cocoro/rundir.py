@@ -3,7 +3,7 @@
     <run>/<robot>/profile.json     the resolved profile of the last start
                   supervisor       held by the supervisor
                   claims/<service> held by the process that is that service
-                  logs/            one file a process, of the last starts
+                  logs/            one file a process, of the last starts (or in $COCORO_LOG_DIR/<robot>)
                   (and the mesh's own register, see cocoro.bus.endpoints)
 
 "Held" means locked for as long as its process lives, however that ends: so a process number that is read from a
@@ -31,6 +31,8 @@ from cocoro.bus.endpoints import ZenohConfig, default, default_run_dir
 from cocoro.bus.members import members
 from cocoro.errors import ConfigError, RefusedError
 
+LOG_DIR = "COCORO_LOG_DIR"
+"""Environment variable with a place for the logs that outlives the run directory."""
 KEPT_LOGS = 5
 """Of earlier starts, for each process."""
 
@@ -107,15 +109,16 @@ class RunDir:
         self.root = root or default_run_dir()
         self.path = self.root / robot
         self.profile_file = self.path / "profile.json"
-        self.logs = self.path / "logs"
+        elsewhere = os.environ.get(LOG_DIR)
+        self.logs = Path(elsewhere) / robot if elsewhere else self.path / "logs"
 
     def make(self) -> None:
         try:
             self.path.mkdir(mode=0o700, parents=True, exist_ok=True)
-            self.logs.mkdir(exist_ok=True)
+            self.logs.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise ConfigError(
-                f"run directory {self.path}: {error.strerror}; choose another by COCORO_RUN_DIR"
+                f"run directory {error.filename}: {error.strerror}; choose another by COCORO_RUN_DIR"
             ) from error
 
     # --- who runs ---------------------------------------------------------------------------------

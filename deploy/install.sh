@@ -1,28 +1,53 @@
 #!/usr/bin/env bash
 # Makes .venv and installs the project into it, with the pinned versions. On Debian and Ubuntu it also installs
 # the GL libraries that the fast renderer needs; without them the simulator falls back to a slower renderer.
+# Does nothing when all that is done already.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 python=${PYTHON:-python3}
 
-"$python" - <<'PY' || { echo "Python 3.11 or newer is needed; name one with PYTHON=... make install" >&2; exit 2; }
-import sys
-sys.exit(sys.version_info < (3, 11))
-PY
+# A .venv knows its own path, so a checkout that has been moved needs a new one.
+installed=.venv/.installed
+wanted="$PWD $(cat pyproject.toml constraints.txt deploy/install.sh | sha256sum)"
+if [ "$(cat $installed 2>/dev/null)" = "$wanted" ] && .venv/bin/python -c '' 2>/dev/null; then
+    exit 0
+fi
 
-have_gl() { ldconfig -p 2>/dev/null | grep -q libEGL.so.1 && ldconfig -p | grep -q libGL.so.1 && ls /usr/lib/*/dri/*swrast* /usr/lib/*/libgallium* >/dev/null 2>&1; }
+"$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' || {
+    echo "Python 3.11 or newer is needed; name one with PYTHON=... make install" >&2
+    exit 2
+}
+
+have_gl() {
+    local libraries
+    libraries=$(ldconfig -p 2>/dev/null) || return 1
+    [[ $libraries == *libEGL.so.1* && $libraries == *libGL.so.1* ]] &&
+        { compgen -G '/usr/lib/*/dri/*swrast*' || compgen -G '/usr/lib/*/libgallium*'; } >/dev/null
+}
 if ! have_gl; then
     if command -v apt-get >/dev/null && { [ "$(id -u)" = 0 ] || sudo -n true 2>/dev/null; }; then
         sudo=$([ "$(id -u)" = 0 ] || echo sudo)
-        $sudo apt-get update -qq && $sudo apt-get install -y -qq libegl1 libgl1 libgl1-mesa-dri >/dev/null ||
+        echo "Installing the GL libraries libegl1 libgl1 libgl1-mesa-dri"
+        { $sudo apt-get update -qq && $sudo apt-get install -y -qq libegl1 libgl1 libgl1-mesa-dri; } >/dev/null ||
             echo "The GL libraries could not be installed: the simulator will render slowly." >&2
     else
         echo "For the fast renderer install libegl1 libgl1 libgl1-mesa-dri (or your system's equivalents)." >&2
     fi
 fi
 
-[ -x .venv/bin/python ] || "$python" -m venv .venv || {
-    echo "A virtual environment cannot be made; on Debian: apt-get install python3-venv" >&2
-    exit 2
-}
+if [[ "$(cat $installed 2>/dev/null)" != "$PWD "* ]] || ! .venv/bin/python -m pip --version >/dev/null 2>&1; then
+    echo "Making .venv"
+    rm -rf .venv
+    if ! "$python" -m venv .venv 2>/dev/null; then
+        # Debian keeps the part that brings pip in a package of its own (python3-venv): let our own pip do it.
+        rm -rf .venv
+        "$python" -m venv --without-pip .venv && "$python" -m pip --python .venv/bin/python install --quiet pip || {
+            echo "A virtual environment cannot be made; on Debian: apt-get install python3-venv" >&2
+            exit 2
+        }
+    fi
+fi
+
+echo "Installing the project and its libraries (about 0.8 GB)"
 .venv/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+echo "$wanted" >$installed
