@@ -11,10 +11,9 @@ from math import log, sqrt
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from cocoro.objects import Catalogue, KnownObject
-from services.perception.colours import Classes, ColourTable
+from services.perception.colours import ColourTable
 from services.perception.config import Config
 from services.perception.image import Box, RgbdImage
 from services.perception.region import Mask, Region, components
@@ -35,24 +34,30 @@ class BlobDetector:
 
     def detect(self, image: RgbdImage) -> list[Sighting]:
         classes = self._table.classify(image.colour)
-        present = int(np.bitwise_or.reduce(classes, axis=None))
-        found = (
-            self._find(known, _mask(classes, bit), image)
-            for bit, known in enumerate(self._catalogue)
-            if present >> bit & 1
-        )
-        return [sighting for sighting in found if sighting is not None]
+        # Which rows and columns have a pixel of which object: one pass for all of them.
+        rows, columns = np.bitwise_or.reduce(classes, axis=1), np.bitwise_or.reduce(classes, axis=0)
+        sightings = []
+        for bit, known in enumerate(self._catalogue):
+            own = classes.dtype.type(1 << bit)
+            across, down = np.flatnonzero(columns & own), np.flatnonzero(rows & own)
+            if len(across) and len(down):
+                left, top = int(across[0]), int(down[0])
+                crop = classes[top : int(down[-1]) + 1, left : int(across[-1]) + 1] & own
+                sighting = self._find(known, (crop != 0).view(np.uint8), (left, top), image)
+                if sighting is not None:
+                    sightings.append(sighting)
+        return sightings
 
-    def _find(self, known: KnownObject, mask: Mask, image: RgbdImage) -> Sighting | None:
-        min_area_px = self._config.min_area_px * image.scale**2
-        parts = _clean_components(mask, image, min_area_px)
+    def _find(self, known: KnownObject, mask: Mask, origin: tuple[int, int], image: RgbdImage) -> Sighting | None:
+        """The object in the part of the image whose first pixel is `origin` and whose matching pixels are `mask`."""
+        parts = _clean_components(mask, origin, image, self._config.min_area_px * image.scale**2)
         if not parts:
             return None
         fit = _Fit(known, image, self._config)
         regions: list[Region] = []
         for part in parts:
             region = Region(*part, image)
-            if fit.too_large(region) and region.diagonal_px < fit.largest_split_px:
+            if fit.too_large(region):
                 regions += [Region(*piece, image) for piece in region.split_by_depth()]
             else:
                 regions.append(region)
@@ -83,7 +88,6 @@ class _Fit:
         self._reach_m = reach_m(known)
         self._inwards_m = known.planar_radius_m
         self._min_area_px = config.min_area_px * image.scale**2
-        self.largest_split_px = 0.75 * image.width
 
     def _pixels(self, area_m2: float, depth_m: float) -> float:
         return counted_px(area_m2 * self._focal2 / (depth_m + self._inwards_m) ** 2)
@@ -126,22 +130,14 @@ class _Fit:
         return best
 
 
-def _mask(classes: Classes, bit: int) -> Mask:
-    """Non-zero where the bit is set."""
-    own = classes & classes.dtype.type(1 << bit)
-    return own if own.itemsize == 1 else np.asarray(own != 0, dtype=np.uint8)
-
-
-def _clean_components(mask: Mask, image: RgbdImage, min_area_px: float) -> list[tuple[Mask, Box]]:
+def _clean_components(
+    mask: Mask, origin: tuple[int, int], image: RgbdImage, min_area_px: float
+) -> list[tuple[Mask, Box]]:
     """The mask's connected regions, after specks and threads of noise are opened away."""
     if cv2.countNonZero(mask) < min_area_px:
         return []
-    left, top, width, height = cv2.boundingRect(mask)
-    crop = mask[top : top + height, left : left + width]
-    opened: NDArray[np.uint8] = np.asarray(
-        cv2.morphologyEx(crop, cv2.MORPH_OPEN, np.ones((3, 3), dtype=np.uint8)), dtype=np.uint8
-    )
-    return components(opened, (left, top), image, min_area_px)
+    opened = cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((3, 3), dtype=np.uint8))
+    return components(np.asarray(opened, dtype=np.uint8), origin, image, min_area_px)
 
 
 def _union(a: Region, b: Region) -> Region:

@@ -28,8 +28,8 @@ UNKNOWN_WITHIN_M = 1.0
 """Of a region's outline: next to something nearer, or next to no data, for more of the object to be hidden there. No
 data counts beside near regions alone, where it may be the robot's own hand, too near to be measured; farther
 away it is what lies out of range. An infrared shadow takes less of an outline."""
-MAX_SURFACE_POINTS = 180
-MAX_RAYS = 60
+MAX_SURFACE_POINTS = 140
+MAX_RAYS = 40
 
 
 _AROUND = np.ones((3, 3), dtype=np.uint8)
@@ -47,16 +47,13 @@ class Region:
         self.mask = mask
         self.box = box
         self.image = image
-        rows, columns = np.nonzero(mask)
-        self.area_px = len(rows)
-        self.u_px = float(columns.mean()) + box[0]
-        self.v_px = float(rows.mean()) + box[1]
-        self.bounds: Box = (
-            int(columns.min()) + box[0],
-            int(rows.min()) + box[1],
-            int(columns.max()) + box[0] + 1,
-            int(rows.max()) + box[1] + 1,
-        )
+        moments = cv2.moments(mask, binaryImage=True)
+        self.area_px = round(moments["m00"])
+        self.u_px = moments["m10"] / moments["m00"] + box[0]
+        self.v_px = moments["m01"] / moments["m00"] + box[1]
+        left, top, width, height = cv2.boundingRect(mask)
+        left, top = left + box[0], top + box[1]
+        self.bounds: Box = (left, top, left + width, top + height)
 
     @staticmethod
     def margin_px(image: RgbdImage) -> int:
@@ -115,7 +112,7 @@ class Region:
         known = np.isfinite(self.depth)
         step = NEARER_STEP_M + depth_doubt_m(beside)
         nearer = np.count_nonzero(around & known & (self.depth < beside - step))
-        unknown = np.count_nonzero(around & ~known)
+        unknown = int(np.count_nonzero(around & ~known))
         if self.depth_m is None or self.depth_m > UNKNOWN_WITHIN_M:
             unknown = 0
         return bool(nearer >= NEARER_SHARE * total or unknown >= UNKNOWN_SHARE * total)
