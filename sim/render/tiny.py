@@ -32,7 +32,7 @@ _TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 class TinyRenderer:
-    """See `interface.Renderer`. Plain floor and walls, no shadow of the lamp."""
+    """See `interface.Renderer`. Plain floor, no shadow of the lamp; sides that the projector just grazes have holes."""
 
     name = "tiny"
 
