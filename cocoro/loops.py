@@ -70,10 +70,11 @@ class Schedule:
 
 async def every(clock: Clock, rate_hz: float, meter: LoopMeter) -> AsyncIterator[int]:
     """Yields the clock's time at a fixed rate; the first time at once, or when the clock starts."""
-    await clock.sleep_until(0)  # a followed clock that has not been heard yet starts anywhere
-    schedule = Schedule(clock, rate_hz, meter)
+    schedule: Schedule | None = None
     while True:
-        await clock.sleep_until(schedule.deadline_ns)
+        await clock.sleep_until(schedule.deadline_ns if schedule is not None else 0)
+        if schedule is None:  # only now: a followed clock that was not heard before starts anywhere
+            schedule = Schedule(clock, rate_hz, meter)
         now_ns = clock.now_ns()
         meter.began(now_ns)
         yield now_ns
