@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from importlib import resources
-from math import cos, hypot, isfinite, sin
+from math import cos, hypot, isfinite, pi, sin
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -25,10 +25,19 @@ _COLOURS: dict[str, Vec3] = {
     "yellow": (0.90, 0.78, 0.03),
 }
 _GREY: Vec3 = (0.6, 0.6, 0.6)
+_SIZES: dict[Shape, tuple[str, ...]] = {
+    "box": ("size_m",),
+    "cylinder": ("radius_m", "height_m"),
+    "sphere": ("radius_m",),
+}
 
 
 class _Table(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A table of the file."""
+
+    def problem(self) -> str | None:
+        """What is wrong with its values, beginning with the field's name; None when nothing is."""
+        return None
 
 
 class _Body(_Table, frozen=True, kw_only=True):
@@ -41,6 +50,20 @@ class _Body(_Table, frozen=True, kw_only=True):
     rgb: Vec3 | None = None
     """0 to 1 a channel."""
 
+    def problem(self) -> str | None:
+        wanted = _SIZES[self.shape]
+        for field in ("radius_m", "height_m", "size_m"):
+            value = getattr(self, field)
+            if field in wanted and value is None:
+                return f"{field} is missing: a {self.shape} needs {' and '.join(wanted)}"
+            if field not in wanted and value is not None:
+                return f"{field} does not belong to a {self.shape}, which has {' and '.join(wanted)}"
+            if value is not None and any(number <= 0 for number in _numbers(value)):
+                return f"{field} must be > 0"
+        if self.rgb is not None and not all(0.0 <= channel <= 1.0 for channel in self.rgb):
+            return "rgb must be 0 to 1 a channel"
+        return None
+
     @property
     def colour(self) -> Vec3:
         return self.rgb if self.rgb is not None else _GREY
@@ -48,13 +71,7 @@ class _Body(_Table, frozen=True, kw_only=True):
     @property
     def dimensions_m(self) -> tuple[float, ...]:
         """box: full x, y, z; cylinder: radius, height; sphere: radius."""
-        sizes = {
-            "box": self.size_m,
-            "cylinder": (self.radius_m, self.height_m),
-            "sphere": (self.radius_m,),
-        }[self.shape]
-        assert sizes is not None
-        return tuple(float(size) for size in sizes if size is not None)
+        return tuple(number for field in _SIZES[self.shape] for number in _numbers(getattr(self, field)))
 
     @property
     def standing_height_m(self) -> float:
@@ -78,6 +95,19 @@ class SceneObject(_Body, frozen=True, kw_only=True):
     """After the last waypoint go back to the start and round again; else it stops there."""
     floating: bool = False
     """Stays in the air where it is put."""
+
+    def problem(self) -> str | None:
+        if not self.label or any(char in self.label for char in " ~,/"):
+            return "label must be one word, without '~', ',' or '/'"
+        if self.mass_kg <= 0:
+            return "mass_kg must be > 0"
+        if self.speed_mps < 0:
+            return "speed_mps must be >= 0"
+        if self.path_m and self.speed_mps == 0:
+            return "speed_mps must be > 0 for an object with a path_m"
+        if self.speed_mps and not self.path_m:
+            return "path_m is missing: an object with a speed_mps needs its waypoints"
+        return _Body.problem(self)
 
     @property
     def colour(self) -> Vec3:
@@ -116,6 +146,16 @@ class Light(_Table, frozen=True, kw_only=True):
     """The way the light travels, world frame; any length but zero."""
     temperature_k: float = 5500.0
 
+    def problem(self) -> str | None:
+        for field in ("ambient", "diffuse"):
+            if not 0.0 <= getattr(self, field) <= 1.0:
+                return f"{field} must be 0 to 1"
+        if hypot(*self.direction) == 0.0:
+            return "direction must not be zero"
+        if not 1000.0 <= self.temperature_k <= 40000.0:
+            return "temperature_k must be 1000 to 40000"
+        return None
+
 
 class Start(_Table, frozen=True, kw_only=True):
     """Where the robot starts, in the world."""
@@ -129,6 +169,9 @@ class Scatter(_Table, frozen=True, kw_only=True):
 
     position_m: float = 0.0
     """Each object that stands stands up to this far from its place, evenly over the disc."""
+
+    def problem(self) -> str | None:
+        return "position_m must be >= 0" if self.position_m < 0 else None
 
 
 class Scene(msgspec.Struct, frozen=True, kw_only=True):
@@ -223,58 +266,12 @@ def _table(data: Any, kind: type[_T], where: str) -> _T:
         what, _, place = str(error).partition(" - at `$")
         field = place.strip(".`")
         raise ConfigError(f"{where}: {field + ': ' if field else ''}{what}") from error
-    if problem := _problem(table):
+    for name in table.__struct_fields__:
+        if not all(isfinite(number) for number in _numbers(getattr(table, name))):
+            raise ConfigError(f"{where}: {name} must be finite")
+    if problem := table.problem():
         raise ConfigError(f"{where}: {problem}")
     return table
-
-
-def _problem(table: _Table) -> str | None:
-    """What is wrong with the values of a table, or None."""
-    for field in table.__struct_fields__:
-        if not all(isfinite(number) for number in _numbers(getattr(table, field))):
-            return f"{field} must be finite"
-    if isinstance(table, _Body):
-        return _body_problem(table) or (_object_problem(table) if isinstance(table, SceneObject) else None)
-    if isinstance(table, Light):
-        for field in ("ambient", "diffuse"):
-            if not 0.0 <= getattr(table, field) <= 1.0:
-                return f"{field} must be 0 to 1"
-        if hypot(*table.direction) == 0.0:
-            return "direction must not be zero"
-        if not 1000.0 <= table.temperature_k <= 40000.0:
-            return "temperature_k must be 1000 to 40000"
-    if isinstance(table, Scatter) and table.position_m < 0:
-        return "position_m must be >= 0"
-    return None
-
-
-def _body_problem(body: _Body) -> str | None:
-    wanted = {"cylinder": ("radius_m", "height_m"), "sphere": ("radius_m",), "box": ("size_m",)}[body.shape]
-    for field in ("radius_m", "height_m", "size_m"):
-        value = getattr(body, field)
-        if field in wanted and value is None:
-            return f"{field} is missing: a {body.shape} needs {' and '.join(wanted)}"
-        if field not in wanted and value is not None:
-            return f"{field} does not belong to a {body.shape}, which has {' and '.join(wanted)}"
-        if value is not None and any(number <= 0 for number in _numbers(value)):
-            return f"{field} must be > 0"
-    if body.rgb is not None and not all(0.0 <= channel <= 1.0 for channel in body.rgb):
-        return "rgb must be 0 to 1 a channel"
-    return None
-
-
-def _object_problem(item: SceneObject) -> str | None:
-    if not item.label or any(char in item.label for char in " ~,/"):
-        return "label must be one word, without '~', ',' or '/'"
-    if item.mass_kg <= 0:
-        return "mass_kg must be > 0"
-    if item.speed_mps < 0:
-        return "speed_mps must be >= 0"
-    if item.path_m and item.speed_mps == 0:
-        return "speed_mps must be > 0 for an object with a path_m"
-    if item.speed_mps and not item.path_m:
-        return "path_m is missing: an object with a speed_mps needs its waypoints"
-    return None
 
 
 def _check_labels(objects: list[SceneObject], where: str) -> None:
@@ -301,11 +298,8 @@ def _scattered(scene: Scene, scatter: Scatter, seed: int) -> Scene:
     draws = stream(seed, "scene scatter")
     moved = []
     for item in scene.objects:
-        turn, reach = draws.uniform(0.0, 6.283185307179586), scatter.position_m * draws.uniform() ** 0.5
-        if item.kinematic:
-            moved.append(item)
-            continue
+        turn, reach = draws.uniform(0.0, 2 * pi), scatter.position_m * draws.uniform() ** 0.5
         x, y, *height = item.position_m
-        place = (x + reach * cos(turn), y + reach * sin(turn), *height)
+        place = item.position_m if item.kinematic else (x + reach * cos(turn), y + reach * sin(turn), *height)
         moved.append(msgspec.structs.replace(item, position_m=place))
     return msgspec.structs.replace(scene, objects=tuple(moved))

@@ -307,6 +307,37 @@ def test_the_emergency_stop_halts_a_moving_robot(empty: World) -> None:
     assert empty.base_state().stopped_by == "estop"
 
 
+def test_each_hardware_service_has_a_latch_of_its_own(empty: World) -> None:
+    operator = Operator(empty)
+    empty.set_latch("latched", "arm")
+    operator.run(1.0, arm={"neck_pan": 1.0}, hand={"wrist_roll": -0.5}, wheels_mps=(-0.2, -0.2))
+    truth = empty.truth()
+    assert truth.joints_rad["neck_pan"] == pytest.approx(0.0, abs=SERVO_COUNT_RAD)
+    assert truth.joints_rad["wrist_roll"] < -0.4
+    assert truth.body_m[0] < -0.15
+    assert [empty.servo_state(name).stopped_by for name in ("arm", "hand")] == ["estop", ""]
+
+
+def test_nothing_flies_apart_when_everything_is_asked_of_it_at_once() -> None:
+    draws = np.random.default_rng(3)
+    scene = load_scene("paper", 3)
+    with World(ROBOT, scene, seed=3, sensors="real") as world:
+        operator = Operator(world)
+        for _ in range(20):
+            arm, hand = (
+                {joint: draws.uniform(*ROBOT.joints[joint].limits_rad) for joint in ROBOT.network_joints(name)}
+                for name in ("arm", "hand")
+            )
+            left, right = draws.uniform(-0.5, 0.5, 2)
+            operator.run(0.4, arm=arm, hand=hand, wheels_mps=(left, right), speed_radps=6.0)
+            truth = world.truth()
+            assert np.isfinite(world.visual_poses()).all()
+            assert truth.body_m[2] < 0.1
+            for joint, angle_rad in truth.joints_rad.items():
+                low, high = ROBOT.joints[joint].limits_rad
+                assert low - 0.05 < angle_rad < high + 0.05, joint
+
+
 @pytest.mark.parametrize(("y_m", "left", "right"), [(0.0, True, True), (0.16, True, False), (-0.16, False, True)])
 def test_a_bump_stops_it_until_it_backs_off(y_m: float, left: bool, right: bool) -> None:
     pillar = Obstacle(shape="cylinder", radius_m=0.04, height_m=0.08, position_m=(0.5, y_m))
@@ -345,11 +376,15 @@ def test_real_wheels_differ_from_what_odometry_believes_and_ideal_ones_do_not() 
 # --- grasping -------------------------------------------------------------------------------------
 
 
-def grasp_and_lift(world: World, at_m: tuple[float, float], pitch_rad: float, judge: Judge) -> Operator:
+def grasp_and_lift(
+    world: World, at_m: tuple[float, float], pitch_rad: float, judge: Judge, height_m: float = 0.06
+) -> Operator:
     """Open, reach along the ground to `at_m`, close, lift to 0.25 m and wait 3 s."""
     x, y = at_m
     operator = Operator(world, judge)
-    before, there, high = np.array([x - 0.09, y, 0.065]), np.array([x, y, 0.06]), np.array([x - 0.1, y, 0.25])
+    before, there, high = (
+        np.array(point) for point in ([x - 0.09, y, height_m + 0.005], [x, y, height_m], [x - 0.1, y, 0.25])
+    )
     above = before + np.array([0.02, 0.0, 0.14])
     angles = arm_angles(above, pitch_rad, READY)
     operator.run(2.5, arm=angles, hand={**LEVEL, **OPEN})
@@ -409,6 +444,16 @@ def test_a_held_can_survives_a_shake_and_the_end_of_commands() -> None:
         operator.run(0.5)
         assert the_can(world).position_m[2] < 0.12
         assert not judge.result().held
+
+
+def test_a_ball_is_held_too() -> None:
+    ball = SceneObject(label="yellow_ball", shape="sphere", radius_m=0.03, position_m=(0.58, -0.10), mass_kg=0.1)
+    scene = scene_with(ball)
+    judge = Judge(scene, "yellow_ball")
+    with World(ROBOT, scene, seed=1, sensors="real") as world:
+        operator = grasp_and_lift(world, (0.58, -0.10), 0.0, judge, height_m=0.035)
+        assert judge.result().held
+        assert operator.seen == set()
 
 
 def test_claws_that_close_on_nothing_meet_and_that_is_no_collision(empty: World) -> None:
