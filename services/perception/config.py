@@ -41,3 +41,12 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """The paper's tiles along each side of the image."""
     paper_threshold_px: Positive = 64.0
     """The paper's: an object is present above so many matching pixels in its fullest tile."""
+
+    floor_rate_hz: Positive = 10.0
+    """How often the floor is scanned for what stands on it; no more than once a frame."""
+    floor_range_m: Positive = 3.0
+    floor_tolerance_m: Positive = 0.025
+    floor_tolerance_per_m: Positive = 0.012
+    """Lower than this, growing with the distance, counts as floor."""
+    obstacle_height_m: Positive = 0.85
+    """Higher than this the robot passes beneath."""

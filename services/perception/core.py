@@ -7,14 +7,18 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from cocoro.core import Output, Sample, Schedule, Take
 from cocoro.history import History, Vector
-from cocoro.messages import Detections, Frame, ServoState
+from cocoro.messages import Detections, Frame, Obstacles, ServoState
 from cocoro.objects import Catalogue
 from cocoro.robot import Camera, Robot
-from cocoro.topics import ARM_STATE, DETECTIONS, FRAME, Topic
+from cocoro.topics import ARM_STATE, DETECTIONS, FRAME, OBSTACLES, Topic
 from services.perception.blob import BlobDetector
 from services.perception.config import Config
+from services.perception.floor import FloorScanner
 from services.perception.image import RgbdImage
 from services.perception.localise import Localiser
 from services.perception.paper import PaperDetector
@@ -36,6 +40,8 @@ class _Pending:
     frame_incarnation: int
     camera: Camera
     sightings: tuple[Sighting, ...]
+    floor_depth_m: NDArray[np.float32] | None
+    """The depth on a coarse grid, where the floor is due to be scanned."""
     deadline_ns: int
 
 
@@ -54,6 +60,8 @@ class PerceptionCore:
         self._head = History(len(self._localiser.joints))
         self._max_gap_ns = round(config.max_head_gap_s * NS)
         self._pending: deque[_Pending] = deque()
+        self._floor = FloorScanner(robot, config)
+        self._floor_ns: int | None = None
         self._now_ns = 0
         self.stale_frames = 0
         """Frames that were too old when they came, and were not looked at."""
@@ -72,6 +80,7 @@ class PerceptionCore:
         if now_ns < self._now_ns:  # a new epoch of the clock: what was before means nothing now
             self._pending.clear()
             self._head.clear()
+            self._floor_ns = None
         self._now_ns = now_ns
         for sample in inputs:
             if isinstance(sample.message, ServoState):
@@ -99,6 +108,7 @@ class PerceptionCore:
                 frame_incarnation=frame.incarnation,
                 camera=image.camera,
                 sightings=tuple(self._detector.detect(image)),
+                floor_depth_m=self._floor.sample(image) if self._floor_due(frame.stamp_ns) else None,
                 deadline_ns=now_ns + round(self._config.bracket_wait_s * NS),
             )
         )
@@ -112,7 +122,22 @@ class PerceptionCore:
                 break
             self._pending.popleft()
             outputs.append(Output(DETECTIONS, self._localised(pending, angles)))
+            if angles is not None and pending.floor_depth_m is not None:
+                outputs.append(Output(OBSTACLES, self._scanned(pending, angles)))
         return outputs
+
+    def _floor_due(self, stamp_ns: int) -> bool:
+        if self._floor_ns is not None and 0 <= stamp_ns - self._floor_ns < 0.99 * NS / self._config.floor_rate_hz:
+            return False
+        self._floor_ns = stamp_ns
+        return True
+
+    def _scanned(self, pending: _Pending, angles: Vector) -> Obstacles:
+        assert pending.floor_depth_m is not None
+        camera, pose = pending.camera, self._localiser.camera_pose(angles)
+        scan = self._floor.scan(pending.floor_depth_m, camera.width, camera.height, pose)
+        scan.stamp_ns = pending.stamp_ns
+        return scan
 
     def _may_still_come(self, pending: _Pending, now_ns: int) -> bool:
         newest = self._head.newest

@@ -115,7 +115,8 @@ def fit_centre(known: KnownObject, evidence: Evidence, pose: Array, start: Array
         centre = centre + move
         if float(np.abs(move).max()) < SETTLED_M:
             break
-    return centre + origin
+    wandered_m = float(np.linalg.norm(centre - guess))
+    return (centre if wandered_m < 2 * reach_m(known) else guess) + origin
 
 
 class _Rays:

@@ -160,8 +160,8 @@ def components(
     mask: Mask, origin: tuple[int, int], image: RgbdImage, min_area_px: float, at_most: int = 8
 ) -> list[tuple[Mask, Box]]:
     """The largest connected regions of a mask whose first pixel is the image's `origin`, each with a margin around."""
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8, ltype=cv2.CV_32S)
-    by_area = sorted(range(1, count), key=lambda i: -int(stats[i, cv2.CC_STAT_AREA]))
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8, ltype=cv2.CV_32S)
+    by_area = 1 + np.argsort(-stats[1:, cv2.CC_STAT_AREA], kind="stable")  # 0 is what is not in the mask
     found = []
     for i in by_area[:at_most]:
         left, top, width, height, area = (int(value) for value in stats[i])

@@ -43,7 +43,7 @@ class ArmController:
     def __init__(self, robot: Robot, config: Arm, reacher: Reacher) -> None:
         self._config = config
         self._reacher = reacher
-        self._clearance = Clearance(robot)
+        self.clearance = Clearance(robot)
         self._park = {name: robot.poses["park"][name] for name in ARM}
         self._reference: dict[str, float] | None = None
         self._roll_rad = 0.0
@@ -147,8 +147,8 @@ class ArmController:
     def _commit(self, trial: dict[str, float], left: float, dt_s: float, *, arrived: bool) -> Step:
         """Take a step unless it brings the arm nearer to what it must not touch."""
         assert self._reference is not None
-        clearance_m = self._clearance.of(trial)
-        before_m = self._clearance.of(self._reference)
+        clearance_m = self.clearance.of(trial)
+        before_m = self.clearance.of(self._reference)
         blocked = clearance_m < self._config.clearance_m and clearance_m < before_m - 1e-6
         if blocked:
             trial = self._reference

@@ -47,6 +47,18 @@ class Navigation(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     turn_acceleration_radps2: Positive = 2.5
     turn_in_place_rad: Positive = 0.9
     """Further off than this it turns on the spot first."""
+    detour_speed_mps: Positive = 0.28
+    clearance_m: Positive = 0.05
+    """The body keeps so far from what stands on the floor (half of it before it stops by itself)."""
+    comfort_m: Positive = 0.45
+    """Ways nearer to something than this cost more."""
+    hand_half_width_m: Positive = 0.10
+    """With open claws, and some room."""
+    last_stretch_m: Positive = 0.45
+    """Over so much before a target the hand is out and low."""
+    stuck_s: Positive = 8.0
+    glance_s: Positive = 1.5
+    """A place ahead that is still hidden after so long is passed over."""
     distance_tolerance_m: Positive = 0.012
     heading_tolerance_rad: Positive = 0.05
 
@@ -76,6 +88,8 @@ class Arm(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How much higher than where it was grasped a thing is carried."""
     clearance_m: Positive = 0.008
     """The arm's hull stays so far from the camera mount, the chassis and the floor."""
+    swing_room_m: Positive = 0.06
+    """To anything tall while the arm unfolds."""
     lead_rad: Positive = 0.25
     """A joint's goal never runs further ahead of where the joint is."""
 
@@ -93,6 +107,19 @@ class Hand(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     give_up_s: Positive = 2.0
 
 
+class Follow(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Of the pursuit of a moving target."""
+
+    distance_m: Positive = 0.80
+    """From the body's centre to the target, level; the Kinect is blind below 0.5 m."""
+    max_speed_mps: Positive = 0.48
+    gain_per_s: Positive = 1.2
+    turn_gain_per_s: Positive = 2.4
+    lost_s: Positive = 1.0
+    """Not seen for longer, it is looked for where it was going."""
+    give_up_s: Positive = 25.0
+
+
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     rate_hz: Positive = 50.0
     coordination: Literal["concurrent", "lockstep"] = "concurrent"
@@ -102,7 +129,10 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     navigation: Navigation = Navigation()
     arm: Arm = Arm()
     hand: Hand = Hand()
+    follow: Follow = Follow()
     odometry_gap_s: Positive = 0.1
     """Odometry is interpolated over no more than this."""
-    stale_target_s: Positive = 3.0
-    """While driving or reaching a target not seen for longer is lost."""
+    stale_target_s: Positive = 4.0
+    """On the last stretch or while reaching, a target not seen for longer is lost."""
+    stale_on_way_s: Positive = 45.0
+    """The same on the way around something, which may hide it."""

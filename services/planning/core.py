@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+import numpy as np
+
 from cocoro import topics
 from cocoro.clock import NS
 from cocoro.core import Output, Sample, Schedule, Take
+from cocoro.kinematics import Array
 from cocoro.messages import BaseCommand, Intent, PlannerStatus, ServoCommand
 from cocoro.robot import Robot
 from cocoro.topics import Topic
@@ -40,6 +43,7 @@ class PlanningCore:
         topics.ARM_STATE: "latest",
         topics.HAND_STATE: "latest",
         topics.DETECTIONS: "all",
+        topics.OBSTACLES: "all",
         topics.INTENT: "latest",
     }
 
@@ -63,10 +67,18 @@ class PlanningCore:
         hand = self._senses.hand
         assert hand is not None
         self._limbs.grip.feel(hand, now_ns)
+        self._senses.look_around(now_ns, self._own_hull())
         scene = Scene(now_ns, dt_s, self._senses, body, self._senses.angles(), self._limbs)
         plan = self._plan(scene)
         status = self._status(plan, scene)
         return [*self._commands(plan, scene), Output(topics.PLAN, status)]
+
+    def _own_hull(self) -> tuple[Array, Array]:
+        """Where the robot itself, and what it holds, is in its own view."""
+        angles = self._senses.angles()
+        centres, radii = self._limbs.arm.clearance.hull(angles)
+        held = self._limbs.reacher.position(angles)
+        return np.vstack([centres, held]), np.append(radii + 0.03, 0.09)
 
     def _elapsed(self, now_ns: int) -> float:
         last_ns, self._last_ns = self._last_ns, now_ns
@@ -91,7 +103,7 @@ class PlanningCore:
         if fresh is None:
             self._behaviour = Idle("the executive is silent")
         else:
-            self._behaviour = BEHAVIOURS[intent.behaviour](intent.label)
+            self._behaviour = BEHAVIOURS[intent.behaviour](intent)
 
     def _plan(self, scene: Scene) -> Plan:
         """Step the behaviour; once it has ended, hold still with its result."""
@@ -142,6 +154,8 @@ class PlanningCore:
             distance_m=plan.distance_m,
             hand_m=(float(x), float(y), float(z)),
             holding=scene.holding,
+            body_m=(scene.body.x_m, scene.body.y_m),
+            body_yaw_rad=scene.body.yaw_rad,
             known=self._senses.memory.all(scene.body, scene.now_ns),
         )
 

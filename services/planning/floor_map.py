@@ -67,6 +67,10 @@ class FloorMap:
             self._add(np.array(places_m), _HIT)
         self.changes += 1
 
+    def pass_over(self, place_m: tuple[float, float]) -> None:
+        """Count the floor within 10 cm of a place as looked at."""
+        self._looked |= self._disc(*place_m, 0.10)
+
     @staticmethod
     def _along(rays: Array, origin: Array, yaw_rad: float) -> Array:
         """Points every half cell along the rays (bearing, near, far), odometry frame."""

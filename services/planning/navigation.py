@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import asin, atan2, copysign, hypot, sin, sqrt
 
-from cocoro.frames import wrap_rad
+from cocoro.frames import Pose2, wrap_rad
 from cocoro.messages import BaseCommand
 from cocoro.robot import Base
 from services.planning.config import Navigation
@@ -59,8 +59,8 @@ class Driver:
             and abs(offset.heading_rad) <= config.heading_tolerance_rad
         )
 
-    def towards(self, offset: Offset, dt_s: float) -> BaseCommand:
-        """One step of the arc."""
+    def law(self, offset: Offset) -> tuple[float, float]:
+        """Speed and turn rate of the arc for what is left, before the limits of acceleration."""
         config = self._config
         ahead, heading = offset.ahead_m, offset.heading_rad
         if abs(ahead) <= config.distance_tolerance_m:
@@ -75,14 +75,37 @@ class Driver:
         arc = 2.0 * speed * sin(heading) / max(abs(ahead), 0.15) if ahead > 0 else 0.0
         align = 1.8 * heading if abs(heading) > config.heading_tolerance_rad / 2 else 0.0
         turn = arc if abs(arc) > abs(align) else align
-        return self.command(speed, turn, dt_s)
+        return speed, min(max(turn, -config.max_turn_radps), config.max_turn_radps)
 
-    def command(self, speed_mps: float, turn_radps: float, dt_s: float) -> BaseCommand:
-        """Approach a speed and turn rate within the acceleration limits; scaled together when a wheel saturates,
-        which keeps the arc."""
+    def preview(self, target_m: tuple[float, float], aim_m: tuple[float, float]) -> list[Pose2]:
+        """The poses, in the body frame of now, that the arc will pass, every 0.1 s; as far as 20 s."""
+        poses = [Pose2()]
+        for _ in range(200):
+            x, y, _z = poses[-1].inverse().apply((*target_m, 0.0))
+            offset = offset_to((x, y), aim_m)
+            if self.arrived(offset):
+                break
+            speed, turn = self.law(offset)
+            poses.append(poses[-1].compose(Pose2(speed * 0.1, 0.0, turn * 0.1)))
+        return poses
+
+    def stopping_poses(self, speed_mps: float, turn_radps: float) -> list[Pose2]:
+        """The poses, in the body frame of now, over the time that it takes to react and stop from a speed."""
+        time_s = 0.25 + abs(speed_mps) / self._config.acceleration_mps2 * 0.6
+        steps = max(2, round(time_s / 0.08))
+        poses = [Pose2()]
+        for _ in range(steps):
+            poses.append(poses[-1].compose(Pose2(speed_mps * time_s / steps, 0.0, turn_radps * time_s / steps)))
+        return poses[1:]
+
+    def command(self, speed_mps: float, turn_radps: float, dt_s: float, *, brisk: bool = False) -> BaseCommand:
+        """Approach a speed and turn rate within the acceleration limits (`brisk`: twice those, for pursuit); scaled
+        together when a wheel saturates, which keeps the arc."""
         config = self._config
-        self._speed_mps = _approach(self._speed_mps, speed_mps, config.acceleration_mps2 * dt_s)
-        turn_radps = min(max(turn_radps, -config.max_turn_radps), config.max_turn_radps)
+        more = 2.0 if brisk else 1.0
+        self._speed_mps = _approach(self._speed_mps, speed_mps, more * config.acceleration_mps2 * dt_s)
+        limit = more * config.max_turn_radps
+        turn_radps = min(max(turn_radps, -limit), limit)
         self._turn_radps = _approach(self._turn_radps, turn_radps, config.turn_acceleration_radps2 * dt_s)
         half = self._turn_radps * self._base.wheel_separation_m / 2
         left, right = self._speed_mps - half, self._speed_mps + half

@@ -11,10 +11,12 @@ from cocoro import topics
 from cocoro.clock import NS
 from cocoro.frames import Pose2
 from cocoro.history import History
-from cocoro.messages import BaseState, Detections, Intent, Message, ServoState
+from cocoro.kinematics import Array
+from cocoro.messages import BaseState, Detections, Intent, Message, Obstacles, ServoState
 from cocoro.topics import Topic
 from services.planning.config import Config
 from services.planning.memory import TargetMemory
+from services.planning.surroundings import Surroundings
 
 _WAIT_FOR_ODOMETRY_NS = NS // 5
 
@@ -32,7 +34,9 @@ class Senses:
         """Per label the stamp and the note of its newest detection without a position."""
         self._odometry = History(3, angular=(2,))
         self._gap_ns = round(config.odometry_gap_s * NS)
+        self.around = Surroundings()
         self._waiting: deque[Detections] = deque(maxlen=8)
+        self._floors: deque[Obstacles] = deque(maxlen=4)
         self.sight_lag_s = 0.0
         """How old a sighting is when the next one comes, smoothed: a fast perception makes it small."""
         self._looked_ns: int | None = None
@@ -46,6 +50,8 @@ class Senses:
             if self._odometry.resets != resets:
                 # The base restarted: its odometry frame is a new one, places in the old one mean nothing now.
                 self.memory.clear()
+                self.around.clear()
+                self._floors.clear()
                 self._waiting.clear()
         elif isinstance(message, ServoState):
             if topic.name == topics.ARM_STATE.name:
@@ -58,6 +64,8 @@ class Senses:
                 lag_s = min((now_ns - self._looked_ns) / NS, 5.0)
                 self.sight_lag_s += 0.3 * (lag_s - self.sight_lag_s)
             self._looked_ns = message.stamp_ns
+        elif isinstance(message, Obstacles):
+            self._floors.append(message)
         elif isinstance(message, Intent):
             self.intent = message
 
@@ -70,6 +78,17 @@ class Senses:
                 self._remember(detections, Pose2(*pose.tolist()))
             elif now_ns - detections.stamp_ns < _WAIT_FOR_ODOMETRY_NS:
                 self._waiting.append(detections)
+
+    def look_around(self, now_ns: int, own: tuple[Array, Array]) -> None:
+        """Enter what was seen of the floor where its odometry is known; `own` is the robot's own hull now."""
+        while self._floors:
+            seen = self._floors[0]
+            pose = self._odometry.at(seen.stamp_ns, self._gap_ns)
+            if pose is None and now_ns - seen.stamp_ns < _WAIT_FOR_ODOMETRY_NS:
+                return
+            self._floors.popleft()
+            if pose is not None and now_ns - seen.stamp_ns <= topics.OBSTACLES.max_age_s * NS:
+                self.around.floor.enter(seen, Pose2(*pose.tolist()), own)
 
     def _remember(self, detections: Detections, body: Pose2) -> None:
         for detection in detections.detections:

@@ -1,0 +1,108 @@
+"""What stands on the floor and where it is free, from one depth image.
+
+Each depth pixel of a coarse grid becomes a point of the body frame; near the floor's height it is floor, above it
+something stands. The tolerance grows with the distance as the sensor's noise and the head angles' error do (derived).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cocoro.kinematics import Array
+from cocoro.messages import Obstacles
+from cocoro.robot import Robot
+from services.perception.config import Config
+from services.perception.image import RgbdImage
+
+CELL_M = 0.04
+_RAY_DEG = 2.0
+_BEFORE_M = 0.06
+"""Free floor ends so much before what stands in it."""
+_MIN_POINTS = 2
+"""A single point above the floor is noise."""
+_MOST_CELLS = 600
+_RAYS = round(360 / _RAY_DEG)
+
+
+class FloorScanner:
+    def __init__(self, robot: Robot, config: Config) -> None:
+        self._robot = robot
+        self._config = config
+        self._offset_m = np.array(robot.kinect.depth_offset_m)
+        self._directions: dict[tuple[int, int], Array] = {}
+
+    def sample(self, image: RgbdImage) -> NDArray[np.float32]:
+        """Depth, metres, on a coarse grid (80 x 60 whatever the resolution); NaN without data. Kept until the head
+        angles of the frame are known."""
+        step = max(image.width // 80, 1)
+        return self._robot.depth_m(image.raw_depth[step // 2 :: step, step // 2 :: step])
+
+    def scan(self, depth_m: NDArray[np.float32], width: int, height: int, camera_pose: Array) -> Obstacles:
+        """The message, its stamp left to the caller. `camera_pose`: colour camera in the body frame, 4 x 4."""
+        config = self._config
+        rotation = camera_pose[:3, :3]
+        origin = camera_pose[:3, 3] + rotation @ self._offset_m
+        rays = self._rays(depth_m.shape, width, height)
+        seen = np.isfinite(depth_m)
+        points = (rays[seen] * depth_m[seen][:, None]) @ rotation.T + origin
+        level = points[:, :2] - origin[:2]
+        distance = np.hypot(level[:, 0], level[:, 1])
+        near = distance <= config.floor_range_m
+        points, level, distance = points[near], level[near], distance[near]
+        tolerance = config.floor_tolerance_m + config.floor_tolerance_per_m * distance
+        floor = np.abs(points[:, 2]) <= tolerance
+        standing = (points[:, 2] > tolerance) & (points[:, 2] < config.obstacle_height_m)
+        cells, heights = _cells(points[standing])
+        bearing = np.arctan2(level[:, 1], level[:, 0])
+        ray = np.floor(np.degrees(bearing) / _RAY_DEG).astype(np.int64) % _RAYS
+        return Obstacles(
+            points_m=tuple(
+                (round(float(x), 3), round(float(y), 3), round(float(z), 3))
+                for (x, y), z in zip(cells, heights, strict=True)
+            ),
+            free=_free(ray, distance, floor, standing),
+            origin_m=(float(origin[0]), float(origin[1])),
+        )
+
+    def _rays(self, shape: tuple[int, ...], width: int, height: int) -> Array:
+        """Directions of the grid's pixels, depth camera's frame, z = 1; shape (rows, columns, 3)."""
+        rays = self._directions.get((width, height))
+        if rays is None:
+            camera = self._robot.camera.scaled(width, height)
+            step = max(width // 80, 1)
+            v, u = np.mgrid[0 : shape[0], 0 : shape[1]] * step + step // 2
+            rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1)
+            self._directions[(width, height)] = rays
+        return rays
+
+
+def _cells(points: Array) -> tuple[Array, Array]:
+    """Middles (n, 2) of the floor cells in which enough points stand, and the highest point in each, (n,)."""
+    if not len(points):
+        return np.zeros((0, 2)), np.zeros(0)
+    numbers, inverse, counts = np.unique(
+        np.floor(points[:, :2] / CELL_M).astype(np.int64), axis=0, return_inverse=True, return_counts=True
+    )
+    heights = np.zeros(len(numbers))
+    np.maximum.at(heights, inverse.reshape(-1), points[:, 2])
+    enough = np.flatnonzero(counts >= _MIN_POINTS)[:_MOST_CELLS]
+    middles: Array = (numbers[enough] + 0.5) * CELL_M
+    return middles, heights[enough]
+
+
+def _free(
+    ray: NDArray[np.int64], distance: Array, floor: NDArray[np.bool_], standing: NDArray[np.bool_]
+) -> tuple[tuple[float, float, float], ...]:
+    """Bearing, nearest and farthest floor of each ray, ended before the first thing that stands on it."""
+    nearest, farthest = np.full(_RAYS, np.inf), np.zeros(_RAYS)
+    np.minimum.at(nearest, ray[floor], distance[floor])
+    np.maximum.at(farthest, ray[floor], distance[floor])
+    ends = np.full(_RAYS, np.inf)
+    np.minimum.at(ends, ray[standing], distance[standing] - _BEFORE_M)
+    farthest = np.minimum(farthest, ends)
+    bearings = np.radians((np.arange(_RAYS) + 0.5) * _RAY_DEG)
+    rays = np.flatnonzero(farthest > nearest)
+    return tuple(
+        (round(float(bearings[i]), 4), round(float(nearest[i]), 3), round(float(farthest[i]), 3)) for i in rays
+    )

@@ -1,0 +1,28 @@
+"""What the planner can be asked to do. Each behaviour is a small state machine that is stepped at the planner's rate,
+says what it wants of base, head, arm and hand, and why, and ends as done or failed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+from cocoro.messages import Intent
+from services.planning.behaviours.base import Behaviour, Limbs, Plan, Scene
+from services.planning.behaviours.driving import Approach, Carry, Follow
+from services.planning.behaviours.handling import Close, Lift, Place, Reach
+from services.planning.behaviours.looking import Explore, Idle, Park, Search
+
+__all__ = ["BEHAVIOURS", "Behaviour", "Idle", "Limbs", "Plan", "Scene"]
+
+BEHAVIOURS: Mapping[str, Callable[[Intent], Behaviour]] = {
+    "idle": lambda _intent: Idle(),
+    "park": lambda _intent: Park(),
+    "search": lambda intent: Search(intent.label),
+    "explore": lambda intent: Explore(intent.label),
+    "approach": lambda intent: Approach(intent.label),
+    "reach": lambda intent: Reach(intent.label),
+    "grasp": lambda _intent: Close(),
+    "lift": lambda _intent: Lift(),
+    "carry": lambda intent: Carry(intent.label, intent.place_m or (0.0, 0.0)),
+    "place": lambda _intent: Place(),
+    "follow": lambda intent: Follow(intent.label),
+}

@@ -1,0 +1,143 @@
+"""What every behaviour works with: the scene of one step, the limbs to command, the plan to give."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from math import hypot
+from typing import Literal, Protocol
+
+from cocoro.frames import Pose2
+from cocoro.kinematics import Array
+from cocoro.messages import BaseCommand, TargetEstimate
+from cocoro.robot import Robot
+from services.planning.arm import ArmController, Step
+from services.planning.config import Config
+from services.planning.hand import Grip
+from services.planning.head import Gaze
+from services.planning.navigation import Driver
+from services.planning.reach import ARM, HandPose, Reacher
+from services.planning.reachability import Reachability
+from services.planning.senses import Senses
+from services.planning.surroundings import Fields, placed, swept_by
+
+State = Literal["running", "done", "failed"]
+
+
+@dataclass
+class Limbs:
+    """What a behaviour commands with; one set for the planner's life, so that motion goes on smoothly from one
+    behaviour to the next."""
+
+    robot: Robot
+    config: Config
+    driver: Driver = field(init=False)
+    reacher: Reacher = field(init=False)
+    arm: ArmController = field(init=False)
+    grip: Grip = field(init=False)
+    gaze: Gaze = field(init=False)
+    reachability: Reachability = field(init=False)
+    grasp_height_m: float = 0.065
+    """At which height what is in the hand was grasped: there it is put down."""
+
+    def __post_init__(self) -> None:
+        config, robot = self.config, self.robot
+        self.driver = Driver(config.navigation, robot.base)
+        self.reacher = Reacher(robot, config.arm.damping)
+        self.arm = ArmController(robot, config.arm, self.reacher)
+        self.grip = Grip(robot, config.hand)
+        self.gaze = Gaze(robot)
+        self.reachability = Reachability(config.arm, self.reacher)
+
+    @cached_property
+    def unfolding(self) -> Array:
+        """The floor places (n, 2), body frame, over which the arm swings when it unfolds."""
+        arm = ArmController(self.robot, self.config.arm, self.reacher)
+        angles = dict.fromkeys(self.robot.joints, 0.0) | self.robot.poses["park"]
+        travel = self.config.arm
+        goal = HandPose(travel.travel_radius_m, 0.0, travel.travel_height_m, travel.pitch_rad)
+        hulls = []
+        for number in range(500):
+            step = arm.reach(goal, travel.hand_speed_mps, angles, 0.02)
+            angles.update(zip(ARM, step.goal_rad.tolist(), strict=True), wrist_roll=step.roll_rad)
+            if number % 5 == 0:
+                hulls.append(arm.clearance.hull(angles))
+            if step.arrived:
+                break
+        return swept_by(hulls)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One step's view: everything fresh, everything now."""
+
+    now_ns: int
+    dt_s: float
+    senses: Senses
+    body: Pose2
+    angles: Mapping[str, float]
+    limbs: Limbs
+
+    def target(self, label: str) -> TargetEstimate | None:
+        return self.senses.memory.estimate(label, self.body, self.now_ns)
+
+    def fields(self, label: str, ignore: tuple[tuple[float, float, float], ...] = ()) -> Fields:
+        """What body and arm must keep clear of on the way to a label."""
+        known = self.senses.memory.all(self.body, self.now_ns)
+        return self.senses.around.fields(label, known, self.now_ns, ignore)
+
+    def arm_may_swing(self, fields: Fields) -> bool:
+        """Whether the arm can unfold here and over the next half metre without meeting anything."""
+        places = self.limbs.unfolding
+        ahead = (0.0, 0.25, 0.5)
+        room_m = self.limbs.config.arm.swing_room_m
+        return all((fields.arm.at(placed(places, self.body.compose(Pose2(x)))) > room_m).all() for x in ahead)
+
+    @property
+    def holding(self) -> bool:
+        return self.limbs.grip.holding(self.now_ns)
+
+    @property
+    def standing(self) -> bool:
+        base = self.senses.base
+        return base is not None and abs(base.speed_mps) < 0.01 and abs(base.turn_rate_radps) < 0.03
+
+    def stand(self) -> BaseCommand:
+        return self.limbs.driver.brake(self.dt_s)
+
+    def still(self) -> Step:
+        return self.limbs.arm.hold(self.angles, self.dt_s)
+
+    def look_at(self, point_m: tuple[float, float, float]) -> tuple[float, float, float]:
+        pan, tilt = self.limbs.gaze.at(point_m, self.angles)
+        return pan, tilt, self.limbs.config.head.fixate_speed_radps
+
+
+@dataclass
+class Plan:
+    """What a behaviour wants now."""
+
+    base: BaseCommand
+    arm: Step
+    why: str
+    head: tuple[float, float, float] | None = None
+    """Pan, tilt, speed; None holds the head where it is."""
+    state: State = "running"
+    reason: str = ""
+    distance_m: float | None = None
+
+
+class Behaviour(Protocol):
+    def step(self, scene: Scene) -> Plan: ...
+
+
+def planar_m(target: TargetEstimate) -> float:
+    """Distance over the floor from the body's centre."""
+    return hypot(target.position_m[0], target.position_m[1])
+
+
+def hand_place(scene: Scene) -> tuple[float, float, float]:
+    """Where the pads' centre is, body frame."""
+    x, y, z = scene.limbs.reacher.position(scene.angles).tolist()
+    return x, y, z

@@ -1,0 +1,236 @@
+"""Driving behaviours: to a target, with something in the hand to a place, and after a moving target."""
+
+from __future__ import annotations
+
+from collections import deque
+from math import atan2, cos, hypot, sin
+
+from cocoro.clock import NS
+from cocoro.frames import Pose2
+from cocoro.messages import BaseState, TargetEstimate, Vec2
+from services.planning.arm import Step
+from services.planning.behaviours.base import Limbs, Plan, Scene, planar_m
+from services.planning.course import Course, Move
+from services.planning.head import PAN, TILT, Sweep
+from services.planning.reach import HandPose
+from services.planning.surroundings import Fields
+
+
+def grasp_aim(limbs: Limbs) -> tuple[float, float]:
+    """Where in the body frame a target stands best for the arm."""
+    x, y, _ = limbs.reacher.point(HandPose(limbs.config.arm.grasp_radius_m, 0.0, 0.0, 0.0)).tolist()
+    return x, y
+
+
+class BackOff:
+    """After a bump: remember what stands there and back away from it."""
+
+    BACK_M = 0.12
+    MAX_BUMPS = 3
+
+    def __init__(self) -> None:
+        self._from: Pose2 | None = None
+        self._bumps = 0
+
+    def step(self, scene: Scene, head: tuple[float, float, float]) -> Plan | None:
+        """What to do about a bump; None when there is nothing to back off from."""
+        base = scene.senses.base
+        if base is not None and (base.bump_left or base.bump_right) and self._from is None:
+            self._from = scene.body
+            self._bumps += 1
+            scene.senses.around.floor.bump(self._touched(scene, base))
+        if self._from is None:
+            return None
+        if self._bumps > self.MAX_BUMPS:
+            why = "the bumper touches something again and again"
+            return Plan(scene.stand(), scene.still(), why, head, "failed", "blocked")
+        if self._from.inverse().compose(scene.body).x_m <= -self.BACK_M:
+            self._from = None
+            return None
+        command = scene.limbs.driver.command(-0.08, 0.0, scene.dt_s)
+        return Plan(command, scene.still(), "the bumper touched something: backing off", head)
+
+    @staticmethod
+    def _touched(scene: Scene, base: BaseState) -> list[tuple[float, float]]:
+        radius = scene.limbs.robot.base.chassis_diameter_m / 2 + 0.02
+        bearings = [b for b, hit in ((0.6, base.bump_left), (-0.6, base.bump_right)) if hit]
+        if base.bump_left and base.bump_right:
+            bearings.append(0.0)
+        places = [scene.body.apply((radius * cos(b), radius * sin(b), 0.0)) for b in bearings]
+        return [(x, y) for x, y, _ in places]
+
+
+class Approach:
+    """Drive to where the arm reaches the target, around what is in the way; on the last stretch the hand gets ready
+    and comes down behind the target before it is near, so that it never comes down on it."""
+
+    def __init__(self, label: str) -> None:
+        self._label = label
+        self._course: Course | None = None
+        self._back_off = BackOff()
+
+    def step(self, scene: Scene) -> Plan:
+        limbs, config = scene.limbs, scene.limbs.config
+        target = scene.target(self._label)
+        if self._course is None:
+            self._course = Course(limbs.robot, config, grasp_aim(limbs), arm="last")
+        if target is None:
+            return Plan(scene.stand(), scene.still(), f"{self._label} is unknown", None, "failed", "lost")
+        fields = scene.fields(self._label)
+        head = scene.look_at(target.position_m)
+        backing = self._back_off.step(scene, head)
+        if backing is not None:
+            return backing
+        place = target.odometry_position_m[:2]
+        move = self._course.step(place, scene.body, scene.senses.around, fields, limbs.driver, scene.now_ns)
+        patience_s = config.stale_target_s if move.direct else config.stale_on_way_s
+        if target.age_s > patience_s + scene.senses.sight_lag_s:
+            why = f"{self._label} has not been seen for {target.age_s:.1f} s"
+            return Plan(scene.stand(), scene.still(), why, None, "failed", "lost")
+        if move.look_at is not None:
+            head = scene.look_at(scene.body.inverse().apply((*move.look_at, 0.0)))
+        arm, move = self._ready_hand(scene, target, move, fields)
+        if move.blocked:
+            return Plan(scene.stand(), arm, move.why, head, "failed", "blocked")
+        if arm.blocked:
+            return Plan(scene.stand(), arm, "the hand cannot get ready: its way is blocked", head, "failed", "blocked")
+        base = limbs.driver.command(move.speed_mps, move.turn_radps, scene.dt_s)
+        if move.arrived and scene.standing and arm.arrived:
+            return Plan(base, arm, f"{self._label} is in reach", head, "done", distance_m=move.left_m)
+        why = "there; waiting for base and hand to come to rest" if move.arrived else move.why
+        return Plan(base, arm, why, head, distance_m=move.left_m)
+
+    def _ready_hand(self, scene: Scene, target: TargetEstimate, move: Move, fields: Fields) -> tuple[Step, Move]:
+        limbs, config = scene.limbs, scene.limbs.config.arm
+        arm, angles, dt_s = limbs.arm, scene.angles, scene.dt_s
+        reference = arm.reference or angles
+        if limbs.config.coordination == "lockstep":
+            return arm.park(angles, dt_s), move
+        if not arm.folded(reference):
+            have = limbs.reacher.pose({**angles, **reference})
+            if have.height_m < config.travel_height_m - 0.05 and have.radius_m > config.retreat_radius_m + 0.02:
+                # Low and stretched out, perhaps around something: back out before anything else.
+                limbs.grip.open()
+                back = have._replace(radius_m=config.retreat_radius_m, pitch_rad=config.pitch_rad)
+                step = arm.reach(back, config.insert_speed_mps, angles, dt_s)
+                return step._replace(arrived=False), _waiting(move, "backing the hand out first")
+            if not move.direct:
+                return arm.park(angles, dt_s), _waiting(move, "folding the arm to go around")
+        elif not move.direct:
+            return arm.park(angles, dt_s), move
+        elif not scene.arm_may_swing(fields) and not move.arrived and move.left_m > 0.05:
+            return arm.park(angles, dt_s), move._replace(why=f"no room yet to unfold the arm; {move.why}")
+        limbs.grip.open()
+        if move.left_m < config.descend_at_m and abs(move.turn_radps) < 0.4:
+            goal = limbs.reachability.grasp(target.position_m).behind
+            low, high = config.grasp_azimuth_range_rad
+            goal = goal._replace(azimuth_rad=min(max(goal.azimuth_rad, low), high))
+            step = arm.reach(goal, config.hand_speed_mps, angles, dt_s)
+            late = move.left_m < 0.10 and not step.arrived and step.left > 0.03
+            # The hand must be behind the target before the target is between the fingers.
+            return step, _waiting(move, "waiting for the hand") if late and not move.arrived else move
+        goal = HandPose(config.travel_radius_m, 0.0, config.travel_height_m, config.pitch_rad)
+        return arm.reach(goal, config.hand_speed_mps, angles, dt_s)._replace(arrived=False), move
+
+
+class Carry:
+    """Drive, with something in the hand, to where it is to be put down (odometry frame)."""
+
+    def __init__(self, label: str, place_m: Vec2) -> None:
+        self._label = label
+        self._place_m = place_m
+        self._course: Course | None = None
+        self._back_off = BackOff()
+        self._loose_since_ns: int | None = None
+
+    def step(self, scene: Scene) -> Plan:
+        limbs = scene.limbs
+        if self._course is None:
+            self._course = Course(limbs.robot, limbs.config, grasp_aim(limbs), arm="out")
+        x, y, _ = scene.body.inverse().apply((*self._place_m, 0.0))
+        head = scene.look_at((x, y, 0.0))
+        if scene.holding:
+            self._loose_since_ns = None
+        elif self._loose_since_ns is None:
+            self._loose_since_ns = scene.now_ns
+        elif scene.now_ns - self._loose_since_ns > 0.3 * NS:
+            return Plan(scene.stand(), scene.still(), "the claws hold nothing any more", head, "failed", "slipped")
+        backing = self._back_off.step(scene, head)
+        if backing is not None:
+            return backing
+        fields = scene.fields(self._label)
+        move = self._course.step(self._place_m, scene.body, scene.senses.around, fields, limbs.driver, scene.now_ns)
+        if move.blocked:
+            return Plan(scene.stand(), scene.still(), move.why, head, "failed", "blocked")
+        if move.look_at is not None:
+            head = scene.look_at(scene.body.inverse().apply((*move.look_at, 0.0)))
+        base = limbs.driver.command(move.speed_mps, move.turn_radps, scene.dt_s)
+        plan = Plan(base, scene.still(), f"carrying: {move.why}", head, distance_m=move.left_m)
+        if move.arrived and scene.standing:
+            plan.state, plan.why = "done", "at the place to put it down"
+        return plan
+
+
+class Follow:
+    """Keep a set distance to a moving target, head and base together: its velocity is fed forward, so that the
+    distance does not lag, and when it is lost the head looks where it was going before it searches."""
+
+    def __init__(self, label: str) -> None:
+        self._label = label
+        self._trail: deque[tuple[int, tuple[float, float]]] = deque(maxlen=400)
+        self._sweep: Sweep | None = None
+
+    def step(self, scene: Scene) -> Plan:
+        limbs, config = scene.limbs, scene.limbs.config.follow
+        target = scene.target(self._label)
+        if target is None:
+            return Plan(scene.stand(), scene.still(), f"{self._label} is unknown", None, "failed", "lost")
+        if target.age_s > config.give_up_s:
+            why = f"{self._label} has not been seen for {target.age_s:.0f} s"
+            return Plan(scene.stand(), scene.still(), why, None, "failed", "lost")
+        arm = limbs.arm.park(scene.angles, scene.dt_s)
+        if target.age_s > config.lost_s + scene.senses.sight_lag_s:
+            return self._look_for(scene, target, arm)
+        self._sweep = None
+        self._trail.append((scene.now_ns, target.odometry_position_m[:2]))
+        x, y, _ = target.position_m
+        distance, bearing = hypot(x, y), atan2(y, x)
+        vx, vy, _ = scene.body.inverse().rotate(target.velocity_mps)
+        # Along and across the line of sight.
+        along = (vx * x + vy * y) / max(distance, 0.2)
+        across = (x * vy - y * vx) / max(distance, 0.2)
+        gap = distance - config.distance_m
+        speed = (along + config.gain_per_s * gap) * max(cos(bearing), 0.0)
+        speed = min(max(speed, -0.25), config.max_speed_mps)
+        turn = config.turn_gain_per_s * bearing + across / max(distance, 0.3)
+        move = Move(speed, turn, abs(gap), f"{distance:.2f} m behind it, {gap:+.2f} m to make up", False)
+        fields = scene.fields(self._label, self._ignored(scene.now_ns))
+        watcher = Course(limbs.robot, limbs.config, (0.0, 0.0), arm="folded")
+        if watcher.guarded(move, scene.body, fields, limbs.driver):
+            move = move._replace(speed_mps=0.0, why="something is between us")
+        base = limbs.driver.command(move.speed_mps, move.turn_radps, scene.dt_s, brisk=True)
+        return Plan(base, arm, move.why, scene.look_at(target.position_m), distance_m=distance)
+
+    def _look_for(self, scene: Scene, target: TargetEstimate, arm: Step) -> Plan:
+        pan, tilt = scene.angles[PAN], scene.angles[TILT]
+        if target.age_s < 3.0:
+            head = scene.look_at(target.position_m)
+            turn = 1.5 * atan2(target.position_m[1], target.position_m[0])
+            base = scene.limbs.driver.command(0.0, turn, scene.dt_s)
+            return Plan(base, arm, "lost it: looking where it was going", head, distance_m=planar_m(target))
+        if self._sweep is None or self._sweep.done:
+            self._sweep = Sweep(scene.limbs.config.head, pan)
+        head = (*self._sweep.next(pan, tilt), scene.limbs.config.head.sweep_speed_radps)
+        return Plan(scene.stand(), arm, "lost it: searching", head, distance_m=planar_m(target))
+
+    def _ignored(self, now_ns: int) -> tuple[tuple[float, float, float], ...]:
+        """Where the target has just been nothing stands, whatever the map still shows."""
+        while self._trail and now_ns - self._trail[0][0] > 8 * NS:
+            self._trail.popleft()
+        return tuple((x, y, 0.15) for _, (x, y) in list(self._trail)[::10]) + tuple(
+            (x, y, 0.15) for _, (x, y) in list(self._trail)[-1:]
+        )
+
+
+def _waiting(move: Move, why: str) -> Move:
+    return move._replace(speed_mps=0.0, turn_radps=0.0, arrived=False, why=why)

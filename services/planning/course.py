@@ -1,0 +1,270 @@
+"""The way to a target: on an arc where that is free, else around what stands there to a place from where it is free.
+
+Planned on the floor map for the round body with the arm folded; the last stretch, with the hand out, is an arc along
+which the arm's own footprint must be free too. Every wheel command passes `guard`, which never lets the robot run
+further than it can stop before something.
+"""
+
+from __future__ import annotations
+
+from math import atan2, cos, hypot, pi, sin
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from cocoro.clock import NS
+from cocoro.frames import Pose2, wrap_rad
+from cocoro.kinematics import Array
+from cocoro.robot import Robot
+from services.planning.config import Config
+from services.planning.navigation import Driver, Offset, offset_to
+from services.planning.surroundings import Fields, Surroundings, placed
+
+_HEADINGS = 48
+_REPLAN_NS = NS // 2
+_LOOKAHEAD_M = 0.35
+
+
+class Move(NamedTuple):
+    """What the course wants now."""
+
+    speed_mps: float
+    turn_radps: float
+    left_m: float
+    """Still to drive, by the way that is taken."""
+    why: str
+    direct: bool
+    """On the last stretch: the hand may get ready."""
+    arrived: bool = False
+    blocked: bool = False
+    look_at: tuple[float, float] | None = None
+    """A place ahead, in the odometry frame, that nobody has looked at yet."""
+
+
+class Detour(NamedTuple):
+    """A place to go to first, and the way there, odometry frame."""
+
+    before: Pose2
+    path: tuple[tuple[float, float], ...]
+
+
+class Course:
+    """One drive to a target. `aim_m` is where in the body frame the target shall end."""
+
+    def __init__(
+        self,
+        robot: Robot,
+        config: Config,
+        aim_m: tuple[float, float],
+        *,
+        arm: Literal["last", "out", "folded"],
+        arrive_m: float | None = None,
+    ) -> None:
+        """When the hand is out: on the `last` stretch only, all the way, or never. `arrive_m`: near enough, from
+        whichever side; by default the driver's own tolerances count."""
+        self._config = config.navigation
+        self._aim_m = aim_m
+        self._arm_out = arm == "out"
+        self._arrive_m = arrive_m
+        self._stretch_m = 0.0 if arm == "folded" else self._config.last_stretch_m
+        self._body_m = robot.base.chassis_diameter_m / 2
+        # The hand's footprint with open claws, along the arm's line before the robot.
+        reach = () if arm == "folded" else np.arange(0.22, aim_m[0] + 0.09, 0.04)
+        self._arm = np.array([[x, aim_m[1]] for x in reach]).reshape(-1, 2)
+        self._glance: tuple[tuple[float, float], int] | None = None
+        self._detour: Detour | None = None
+        self._planned_ns: int | None = None
+        self._stuck_since_ns: int | None = None
+        self._last_stretch = False
+
+    def step(
+        self,
+        target_m: tuple[float, float],
+        body: Pose2,
+        around: Surroundings,
+        fields: Fields,
+        driver: Driver,
+        now_ns: int,
+    ) -> Move:
+        """One step towards a target (odometry frame)."""
+        x, y, _ = body.inverse().apply((*target_m, 0.0))
+        offset = offset_to((x, y), self._aim_m)
+        near_enough = self._arrive_m is not None and hypot(x - self._aim_m[0], y - self._aim_m[1]) < self._arrive_m
+        if near_enough or driver.arrived(offset):
+            return Move(0.0, 0.0, abs(offset.ahead_m), "there", True, arrived=True)
+        if self._planned_ns is None or now_ns - self._planned_ns >= _REPLAN_NS:
+            self._planned_ns = now_ns
+            self._plan(target_m, body, around, fields, driver, offset)
+        if self._detour is None:
+            speed, turn = driver.law(offset)
+            why = f"{offset.ahead_m:.2f} m to drive, {offset.heading_rad:+.2f} rad to turn"
+            ahead = placed(np.array([[pose.x_m, pose.y_m] for pose in driver.preview((x, y), self._aim_m)]), body)
+            move = Move(speed, turn, abs(offset.ahead_m), why, self._last_stretch)
+        else:
+            move, ahead = self._along(self._detour, body, target_m, driver)
+        return self._watch(move, ahead, body, around, fields, driver, now_ns)
+
+    # --- planning ---------------------------------------------------------------------------------
+
+    def _plan(
+        self,
+        target_m: tuple[float, float],
+        body: Pose2,
+        around: Surroundings,
+        fields: Fields,
+        driver: Driver,
+        offset: Offset,
+    ) -> None:
+        x, y, _ = body.inverse().apply((*target_m, 0.0))
+        preview = [body.compose(pose) for pose in driver.preview((x, y), self._aim_m)]
+        if self._free(preview, fields, self._config.clearance_m, arm_from_m=self._stretch_m):
+            self._detour = None
+            self._last_stretch = True
+            return
+        self._last_stretch = False
+        if self._detour is not None and self._still_good(self._detour, fields, target_m):
+            return
+        self._detour = self._around(target_m, body, around, fields)
+
+    def _free(self, poses: list[Pose2], fields: Fields, margin_m: float, arm_from_m: float) -> bool:
+        """Whether body and, over the last `arm_from_m`, the hand pass all poses with a margin."""
+        centres = np.array([[pose.x_m, pose.y_m] for pose in poses])
+        clearance = fields.body.at(centres) - self._body_m
+        # From where it stands the robot may leave, however near something is.
+        leaving = np.hypot(*(centres - centres[0]).T) < 0.10
+        if (clearance[~leaving] < margin_m).any():
+            return False
+        end = centres[-1]
+        for pose in poses[::3] + poses[-1:]:
+            near_end = hypot(pose.x_m - end[0], pose.y_m - end[1]) <= arm_from_m
+            hand_out = len(self._arm) and (near_end or self._arm_out)
+            if hand_out and (fields.body.at(placed(self._arm, pose)) < self._config.hand_half_width_m).any():
+                return False
+        return True
+
+    def _around(
+        self, target_m: tuple[float, float], body: Pose2, around: Surroundings, fields: Fields
+    ) -> Detour | None:
+        """The cheapest pose before the target from which the last stretch is free, and the way there."""
+        config = self._config
+        radius = self._body_m + config.clearance_m
+        routes = around.routes(fields.body, body, radius, config.comfort_m)
+        best: tuple[float, Pose2] | None = None
+        for number in range(_HEADINGS):
+            yaw = -pi + 2 * pi * number / _HEADINGS
+            c, s = cos(yaw), sin(yaw)
+            end = Pose2(
+                target_m[0] - c * self._aim_m[0] + s * self._aim_m[1],
+                target_m[1] - s * self._aim_m[0] - c * self._aim_m[1],
+                yaw,
+            )
+            back = np.linspace(self._stretch_m, 0.0, 8)
+            stretch = [Pose2(end.x_m - c * step, end.y_m - s * step, yaw) for step in back]
+            cost = routes.cost(stretch[0].x_m, stretch[0].y_m)
+            if not np.isfinite(cost) or not self._free_stretch(stretch, fields):
+                continue
+            bearing = atan2(stretch[0].y_m - body.y_m, stretch[0].x_m - body.x_m)
+            cost += 0.25 * abs(wrap_rad(yaw - bearing))
+            if best is None or cost < best[0]:
+                best = (cost, stretch[0])
+        if best is None:
+            return None
+        path = routes.path(best[1].x_m, best[1].y_m)
+        return Detour(best[1], tuple(path))
+
+    def _free_stretch(self, stretch: list[Pose2], fields: Fields) -> bool:
+        centres = np.array([[pose.x_m, pose.y_m] for pose in stretch])
+        if (fields.body.at(centres) < self._body_m + self._config.clearance_m).any():
+            return False
+        if not len(self._arm):
+            return True
+        arm = np.concatenate([placed(self._arm, pose) for pose in stretch])
+        return not (fields.body.at(arm) < self._config.hand_half_width_m + 0.01).any()
+
+    def _still_good(self, detour: Detour, fields: Fields, target_m: tuple[float, float]) -> bool:
+        """Whether the way is still free and still leads to before the target."""
+        end = detour.before.compose(Pose2(self._stretch_m))
+        aim = end.apply((*self._aim_m, 0.0))
+        if hypot(aim[0] - target_m[0], aim[1] - target_m[1]) > 0.06:
+            return False
+        path = np.array(detour.path)
+        return bool((fields.body.at(path)[4:] >= self._body_m + 0.5 * self._config.clearance_m).all())
+
+    # --- driving ----------------------------------------------------------------------------------
+
+    def _along(self, detour: Detour, body: Pose2, target_m: tuple[float, float], driver: Driver) -> tuple[Move, Array]:
+        config = self._config
+        path = np.array(detour.path)
+        gaps = np.hypot(path[:, 0] - body.x_m, path[:, 1] - body.y_m)
+        nearest = int(gaps.argmin())
+        rest = path[nearest:]
+        left_m = hypot(detour.before.x_m - body.x_m, detour.before.y_m - body.y_m)
+        if left_m < 0.06 or (len(rest) <= 2 and left_m < 0.12):
+            turn = wrap_rad(detour.before.yaw_rad - body.yaw_rad)
+            if abs(turn) < 0.08:
+                # Here the last stretch begins, whether or not the next plan would see it so.
+                self._detour, self._last_stretch = None, True
+            return Move(0.0, 1.8 * turn, left_m, f"{turn:+.2f} rad to turn before the last stretch", False), rest
+        ahead = np.hypot(rest[:, 0] - body.x_m, rest[:, 1] - body.y_m)
+        beyond = np.flatnonzero(ahead >= _LOOKAHEAD_M)
+        point = rest[int(beyond[0])] if beyond.size else np.array([detour.before.x_m, detour.before.y_m])
+        heading = wrap_rad(atan2(point[1] - body.y_m, point[0] - body.x_m) - body.yaw_rad)
+        way_m = left_m + 0.05 * max(len(rest) - 2, 0) if len(rest) > 2 else left_m
+        speed = min(config.detour_speed_mps, (config.acceleration_mps2 * left_m) ** 0.5)
+        if abs(heading) > 0.6:
+            speed = 0.0
+        else:
+            speed *= 1.0 - abs(heading) / 0.6
+        return Move(speed, 1.8 * heading, way_m, f"{way_m:.2f} m to go around what is in the way", False), rest
+
+    def _watch(
+        self,
+        move: Move,
+        ahead: Array,
+        body: Pose2,
+        around: Surroundings,
+        fields: Fields,
+        driver: Driver,
+        now_ns: int,
+    ) -> Move:
+        """Look where nobody has looked, and stop before what is there."""
+        gaps = np.hypot(ahead[:, 0] - body.x_m, ahead[:, 1] - body.y_m)
+        near = ahead[(gaps > 0.30) & (gaps < 1.1)]
+        hidden = around.unseen(near) if len(near) else np.zeros(0, dtype=bool)
+        if hidden.any():
+            x, y = near[int(np.flatnonzero(hidden)[0])].tolist()
+            if self._glance is None or hypot(self._glance[0][0] - x, self._glance[0][1] - y) > 0.1:
+                self._glance = (x, y), now_ns
+            if now_ns - self._glance[1] > self._config.glance_s * NS:
+                # Looked at for long enough: something hides it, and nothing was seen to stand there.
+                around.floor.pass_over((x, y))
+            move = move._replace(look_at=(x, y))
+            if hypot(x - body.x_m, y - body.y_m) < 0.55 and move.speed_mps > 0:
+                move = move._replace(speed_mps=0.0, why=f"looking where to go; {move.why}")
+        if self.guarded(move, body, fields, driver):
+            move = move._replace(speed_mps=0.0, why=f"something is in the way; {move.why}")
+            self._planned_ns = None if self._planned_ns is None else min(self._planned_ns, now_ns - _REPLAN_NS // 2)
+        waiting = move.speed_mps == 0.0 and abs(move.turn_radps) < 0.05
+        if not waiting:
+            self._stuck_since_ns = None
+        elif self._stuck_since_ns is None:
+            self._stuck_since_ns = now_ns
+        elif (now_ns - self._stuck_since_ns) / NS > self._config.stuck_s:
+            return move._replace(blocked=True, why="there is no free way")
+        return move
+
+    def guarded(self, move: Move, body: Pose2, fields: Fields, driver: Driver) -> bool:
+        """Whether driving on would bring body or hand to something before the robot could stop."""
+        if move.speed_mps == 0.0:
+            return False
+        poses = [body.compose(pose) for pose in driver.stopping_poses(move.speed_mps, move.turn_radps)]
+        centres = np.array([[body.x_m, body.y_m], *([pose.x_m, pose.y_m] for pose in poses)])
+        clearance = fields.body.at(centres) - self._body_m
+        nearer = clearance[1:].min() < min(float(clearance[0]), self._config.clearance_m / 2)
+        if bool(nearer) and clearance[1:].min() < self._config.clearance_m / 2:
+            return True
+        if not len(self._arm) or not (move.direct or self._arm_out):
+            return False
+        now_m = float(fields.body.at(placed(self._arm, body)).min())
+        then_m = float(fields.body.at(placed(self._arm, poses[-1])).min())
+        return then_m < min(self._config.hand_half_width_m * 0.7, now_m)

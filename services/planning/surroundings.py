@@ -1,0 +1,90 @@
+"""The floor map together with what is known of objects: what body and arm must keep clear of."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from cocoro.clock import NS
+from cocoro.frames import Pose2
+from cocoro.kinematics import Array
+from cocoro.messages import TargetEstimate
+from services.planning.floor_map import ClearanceField, FloorMap
+from services.planning.routes import Routes
+
+_KEEP_NS = NS // 10
+_OBJECT_M = 0.033
+"""Radius at which a known object counts as standing in the way: the cans'."""
+_SMEAR_M = 0.05
+"""The map shows a known object up to so much wider than it is."""
+
+
+class Fields(NamedTuple):
+    body: ClearanceField
+    """Of everything but the target."""
+    arm: ClearanceField
+    """Of everything but the known objects, which are too low for the raised arm."""
+
+
+class Surroundings:
+    def __init__(self) -> None:
+        self.floor = FloorMap()
+        self._fields: Fields | None = None
+        self._built: tuple[int, str] | None = None
+        self._built_ns = 0
+
+    def clear(self) -> None:
+        self.floor.clear()
+        self._fields = None
+
+    def fields(
+        self,
+        label: str,
+        known: Sequence[TargetEstimate],
+        now_ns: int,
+        ignore: Sequence[tuple[float, float, float]] = (),
+    ) -> Fields:
+        """Clearances for going to `label` ('' for nowhere), rebuilt when the map has changed, at most at 10 Hz.
+        `ignore`: discs (x, y, radius) in which nothing counts."""
+        what = (self.floor.changes, label)
+        stale = self._built is None or self._built[1] != label or now_ns - self._built_ns >= _KEEP_NS
+        if self._fields is None or (stale and what != self._built):
+            discs = {item.label: (*item.odometry_position_m[:2], _OBJECT_M) for item in known}
+            seen = [(x, y, radius + _SMEAR_M) for x, y, radius in discs.values()]
+            target = [(x, y, radius + _SMEAR_M) for name, (x, y, radius) in discs.items() if name == label]
+            others = [disc for name, disc in discs.items() if name != label]
+            body = self.floor.add_discs(self.floor.occupied([*target, *ignore]), others)
+            arm = self.floor.occupied(seen)
+            self._fields = Fields(ClearanceField(self.floor, body), ClearanceField(self.floor, arm))
+            self._built, self._built_ns = what, now_ns
+        return self._fields
+
+    def unseen(self, places_m: Array) -> Array:
+        """Which of the places (n, 2) of the odometry frame nobody has looked at."""
+        looked = self.floor.looked_at()
+        hidden = []
+        for x, y in places_m:
+            cell = self.floor.cell(float(x), float(y))
+            hidden.append(cell is not None and not looked[cell])
+        return np.array(hidden, dtype=bool)
+
+    def routes(self, field: ClearanceField, body: Pose2, radius_m: float, comfort_m: float) -> Routes:
+        return Routes(self.floor, field, (body.x_m, body.y_m), radius_m, comfort_m)
+
+
+def placed(points_m: Array, pose: Pose2) -> Array:
+    """Points (n, 2) of a pose's frame in its parent; shape (n, 2)."""
+    c, s = np.cos(pose.yaw_rad), np.sin(pose.yaw_rad)
+    moved: Array = points_m @ np.array([[c, s], [-s, c]]) + np.array([pose.x_m, pose.y_m])
+    return moved
+
+
+def swept_by(hulls: Sequence[tuple[Array, Array]]) -> Array:
+    """The floor places, 3 cm apart, under a motion of the arm: shape (n, 2), body frame."""
+    points = np.concatenate([centres[:, :2] for centres, _ in hulls])
+    cells: Mapping[tuple[int, int], None] = dict.fromkeys(
+        (round(x / 0.03), round(y / 0.03)) for x, y in points.tolist()
+    )
+    return np.array(list(cells), dtype=np.float64) * 0.03
