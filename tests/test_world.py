@@ -1,138 +1,45 @@
-"""The PyBullet world: its robot is the described one, moves as commanded, and holds a can by friction alone."""
+"""The PyBullet world: its robot is the described one, its scene the given one, and it repeats itself to the bit."""
 
 from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping
-from math import asin, atan2, cos, hypot, pi, radians
+from collections.abc import Iterator
+from math import pi
 
 import msgspec
 import numpy as np
 import pytest
+from world_operator import (
+    EMPTY,
+    LEVEL,
+    OPEN,
+    READY,
+    ROBOT,
+    SHUT,
+    Operator,
+    arm_angles,
+    can,
+    scene_with,
+    the_can,
+    yaw_of,
+)
 
-from cocoro.kinematics import Array
-from cocoro.messages import BaseCommand, ServoCommand, TrueObject, Truth
-from cocoro.robot import SERVO_COUNT_RAD, Robot
+from cocoro.robot import SERVO_COUNT_RAD
 from sim.bullet import Bullet
 from sim.judge import Judge
 from sim.mechanism import Mechanism
 from sim.model import build_model
-from sim.scene import Obstacle, Scene, SceneObject, Start, load_scene
+from sim.scene import Scene, SceneObject, Start, load_scene
 from sim.world import World
 
 pytestmark = pytest.mark.sim
-
-ROBOT = Robot.load()
-EMPTY = Scene(name="empty")
-ARM = ("arm_base", "shoulder", "elbow", "wrist_pitch")
-LEVEL = {"wrist_roll": pi / 2}
-OPEN = {"claw_left": -radians(20), "claw_right": radians(20)}
-SHUT = {"claw_left": radians(15), "claw_right": -radians(15)}
-READY = {"arm_base": 0.0, "shoulder": 1.2, "elbow": -1.8, "wrist_pitch": 0.5}
-"""Above the floor before the robot: where the search for arm angles starts."""
-COMMAND_EVERY = 5
-
-
-class Operator:
-    """Commands a world at 48 Hz and feeds a judge."""
-
-    def __init__(self, world: World, judge: Judge | None = None) -> None:
-        self.world = world
-        self.judge = judge
-        self.seen: set[str] = set()
-        """Collisions so far."""
-        world.set_latch("released")
-
-    def run(
-        self,
-        seconds: float,
-        *,
-        arm: Mapping[str, float] | None = None,
-        hand: Mapping[str, float] | None = None,
-        wheels_mps: tuple[float, float] | None = None,
-        speed_radps: float = 1.5,
-    ) -> None:
-        for step in range(round(seconds * 240)):
-            if step % COMMAND_EVERY == 0:
-                for name, goals in (("arm", arm), ("hand", hand)):
-                    if goals:
-                        self.world.command_servos(
-                            name,
-                            ServoCommand(
-                                joints=tuple(goals),
-                                goal_rad=tuple(goals.values()),
-                                speed_radps=(speed_radps,) * len(goals),
-                            ),
-                        )
-                if wheels_mps:
-                    self.world.command_base(BaseCommand(left_mps=wheels_mps[0], right_mps=wheels_mps[1]))
-            self.world.step()
-            if step % 8 == 7:
-                truth = self.world.truth()
-                self.seen.update(truth.collisions)
-                if self.judge:
-                    self.judge.feed(truth)
-
-    def reach(
-        self, start_m: Array, end_m: Array, pitch_rad: float, seconds: float, arm: Mapping[str, float]
-    ) -> dict[str, float]:
-        """Carry the pad centre along a line; returns the arm's angles at its end."""
-        angles = dict(arm)
-        points = 8
-        for point in range(1, points + 1):
-            angles = arm_angles(start_m + (end_m - start_m) * point / points, pitch_rad, angles)
-            self.run(seconds / points, arm=angles)
-        return angles
-
-
-def arm_angles(target_m: Array, pitch_rad: float, start: Mapping[str, float]) -> dict[str, float]:
-    """Damped least squares: arm angles that bring the pad centre to a point of the body frame, the roll axis
-    pitched so (up positive), the claws level."""
-    chain = ROBOT.chain("pad_centre")
-    angles = {**start, **LEVEL}
-    for _ in range(100):
-        pose = chain.pose(angles)
-        axis, pitch = pose[:3, 2], asin(pose[2, 2])
-        error = np.append(target_m - pose[:3, 3], 0.3 * (pitch_rad - pitch))
-        if np.linalg.norm(error) < 1e-5:
-            return {joint: angles[joint] for joint in ARM}
-        jacobian = chain.jacobian(angles, ARM)
-        turn = np.cross(jacobian[3:].T, axis)[:, 2] / cos(pitch)
-        rows = np.vstack([jacobian[:3], 0.3 * turn])
-        move = rows.T @ np.linalg.solve(rows @ rows.T + 1e-5 * np.eye(4), error)
-        move *= min(1.0, 0.2 / float(np.abs(move).max()))
-        for joint, by in zip(ARM, move, strict=True):
-            low, high = ROBOT.joints[joint].limits_rad
-            angles[joint] = min(max(angles[joint] + float(by), low), high)
-    raise AssertionError(f"no arm angles for {target_m}")
-
-
-def can(x_m: float, y_m: float, mass_kg: float = 0.2) -> SceneObject:
-    return SceneObject(
-        label="red_can", shape="cylinder", radius_m=0.033, height_m=0.12, position_m=(x_m, y_m), mass_kg=mass_kg
-    )
-
-
-def scene_with(*objects: SceneObject, obstacles: tuple[Obstacle, ...] = ()) -> Scene:
-    return Scene(name="test", objects=objects, obstacles=obstacles)
-
-
-def the_can(world: World) -> TrueObject:
-    return world.truth().objects[0]
-
-
-def yaw_of(truth: Truth) -> float:
-    return 2.0 * atan2(truth.body_orientation[2], truth.body_orientation[3])
 
 
 @pytest.fixture
 def empty() -> Iterator[World]:
     with World(ROBOT, EMPTY) as world:
         yield world
-
-
-# --- the body ---------------------------------------------------------------------------------------
 
 
 def test_the_models_forward_kinematics_are_the_descriptions() -> None:
@@ -220,252 +127,6 @@ def test_an_arm_driven_into_the_mount_collides_with_it(empty: World) -> None:
     operator.run(2.0, arm={**ROBOT.poses["park"], "wrist_pitch": 0.6, "arm_base": 1.3, "shoulder": 2.6})
     operator.run(2.0, arm={"arm_base": -2.6, "shoulder": 2.0, "elbow": 0.0, "wrist_pitch": 0.0})
     assert any(pair.endswith("~mount") for pair in operator.seen)
-
-
-# --- motion ---------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("left_mps", "right_mps"), [(0.2, 0.2), (-0.2, -0.2), (0.5, 0.5), (0.3, 0.2), (-0.1, 0.1), (0.05, 0.06)]
-)
-def test_the_base_goes_where_its_wheels_roll(empty: World, left_mps: float, right_mps: float) -> None:
-    operator = Operator(empty)
-    operator.run(3.0, wheels_mps=(left_mps, right_mps))
-    operator.run(0.6)
-    truth, state = empty.truth(), empty.base_state()
-    way_m = 3.0 * max(abs(left_mps), abs(right_mps))
-    assert truth.body_m[0] == pytest.approx(state.odometry_m[0], abs=0.005 * way_m)
-    assert truth.body_m[1] == pytest.approx(state.odometry_m[1], abs=0.005 * way_m)
-    turned = state.odometry_yaw_rad - yaw_of(truth)
-    assert (turned + pi) % (2 * pi) - pi == pytest.approx(0.0, abs=0.005 * max(1.0, abs(state.odometry_yaw_rad)))
-    # 3 s of commands, 0.2 s of the deadman's patience, and what the two ramps take off and give back.
-    held_s = 3.0 + 0.2 - COMMAND_EVERY / 240
-    assert state.odometry_yaw_rad == pytest.approx(
-        (right_mps - left_mps) / ROBOT.base.wheel_separation_m * held_s, rel=0.01, abs=0.002
-    )
-    assert (state.speed_mps, state.turn_rate_radps) == pytest.approx((0.0, 0.0), abs=1e-3)
-
-
-def test_at_rest_it_neither_drifts_nor_creeps_while_the_arm_waves(empty: World) -> None:
-    operator = Operator(empty)
-    for _ in range(3):
-        operator.run(1.0, arm={"arm_base": -1.0, "shoulder": 0.9, "neck_pan": 1.0}, speed_radps=2.5)
-        operator.run(1.0, arm={"arm_base": 1.0, "shoulder": 1.5, "neck_pan": -1.0}, speed_radps=2.5)
-    operator.run(5.0)
-    truth = empty.truth()
-    assert hypot(*truth.body_m[:2]) < 0.002
-    assert abs(yaw_of(truth)) < radians(0.3)
-    assert abs(truth.body_m[2]) < 0.001
-
-
-def test_a_joint_goes_at_the_speed_and_to_the_count_that_it_is_told(empty: World) -> None:
-    operator = Operator(empty)
-    start = empty.truth().joints_rad["neck_pan"]
-    operator.run(1.0, arm={"neck_pan": 2.0}, speed_radps=0.5)
-    assert empty.truth().joints_rad["neck_pan"] - start == pytest.approx(0.5, rel=0.02)
-    state = empty.servo_state("arm")
-    assert state.speed_radps[state.joints.index("neck_pan")] == pytest.approx(0.5, rel=0.03)
-    operator.run(4.0, arm={"neck_pan": 2.0}, speed_radps=0.5)
-    goal = ROBOT.joints["neck_pan"].to_angle(ROBOT.joints["neck_pan"].to_count(2.0))
-    assert empty.truth().joints_rad["neck_pan"] == pytest.approx(goal, abs=1e-3)
-    assert empty.servo_state("arm").position_rad[state.joints.index("neck_pan")] == pytest.approx(goal)
-
-
-def test_silence_stops_wheels_and_arm(empty: World) -> None:
-    operator = Operator(empty)
-    operator.run(0.6, arm={"neck_pan": 2.0}, wheels_mps=(0.3, 0.3))
-    operator.run(0.5)
-    before = empty.truth()
-    operator.run(1.0)
-    after = empty.truth()
-    assert after.body_m == pytest.approx(before.body_m, abs=1e-4)
-    assert after.joints_rad["neck_pan"] == pytest.approx(before.joints_rad["neck_pan"], abs=1e-4)
-    assert before.joints_rad["neck_pan"] < 1.7
-    assert empty.base_state().stopped_by == "no command"
-
-
-def test_until_the_latch_is_known_nothing_moves(empty: World) -> None:
-    assert empty.command_base(BaseCommand(left_mps=0.2, right_mps=0.2)) == "latch unknown"
-    order = ServoCommand(joints=("neck_pan",), goal_rad=(1.0,), speed_radps=(1.0,))
-    assert empty.command_servos("arm", order) == "latch unknown"
-    for _ in range(60):
-        empty.step()
-    assert empty.truth().body_m == pytest.approx((0.0, 0.0, 0.0), abs=2e-4)
-    assert empty.base_state().stopped_by == empty.servo_state("arm").stopped_by == "latch unknown"
-
-
-def test_the_emergency_stop_halts_a_moving_robot(empty: World) -> None:
-    operator = Operator(empty)
-    operator.run(1.0, arm={"neck_pan": 2.0}, wheels_mps=(0.4, 0.4))
-    empty.set_latch("latched")
-    operator.run(0.3, arm={"neck_pan": 2.0}, wheels_mps=(0.4, 0.4))
-    before = empty.truth()
-    operator.run(0.5, arm={"neck_pan": 2.0}, wheels_mps=(0.4, 0.4))
-    after = empty.truth()
-    assert after.body_m == pytest.approx(before.body_m, abs=1e-4)
-    assert after.joints_rad["neck_pan"] == pytest.approx(before.joints_rad["neck_pan"], abs=1e-3)
-    assert empty.base_state().stopped_by == "estop"
-
-
-def test_each_hardware_service_has_a_latch_of_its_own(empty: World) -> None:
-    operator = Operator(empty)
-    empty.set_latch("latched", "arm")
-    operator.run(1.0, arm={"neck_pan": 1.0}, hand={"wrist_roll": -0.5}, wheels_mps=(-0.2, -0.2))
-    truth = empty.truth()
-    assert truth.joints_rad["neck_pan"] == pytest.approx(0.0, abs=SERVO_COUNT_RAD)
-    assert truth.joints_rad["wrist_roll"] < -0.4
-    assert truth.body_m[0] < -0.15
-    assert [empty.servo_state(name).stopped_by for name in ("arm", "hand")] == ["estop", ""]
-
-
-def test_nothing_flies_apart_when_everything_is_asked_of_it_at_once() -> None:
-    draws = np.random.default_rng(3)
-    scene = load_scene("paper", 3)
-    with World(ROBOT, scene, seed=3, sensors="real") as world:
-        operator = Operator(world)
-        for _ in range(20):
-            arm, hand = (
-                {joint: draws.uniform(*ROBOT.joints[joint].limits_rad) for joint in ROBOT.network_joints(name)}
-                for name in ("arm", "hand")
-            )
-            left, right = draws.uniform(-0.5, 0.5, 2)
-            operator.run(0.4, arm=arm, hand=hand, wheels_mps=(left, right), speed_radps=6.0)
-            truth = world.truth()
-            assert np.isfinite(world.visual_poses()).all()
-            assert truth.body_m[2] < 0.1
-            for joint, angle_rad in truth.joints_rad.items():
-                low, high = ROBOT.joints[joint].limits_rad
-                assert low - 0.05 < angle_rad < high + 0.05, joint
-
-
-@pytest.mark.parametrize(("y_m", "left", "right"), [(0.0, True, True), (0.16, True, False), (-0.16, False, True)])
-def test_a_bump_stops_it_until_it_backs_off(y_m: float, left: bool, right: bool) -> None:
-    pillar = Obstacle(shape="cylinder", radius_m=0.04, height_m=0.08, position_m=(0.5, y_m))
-    with World(ROBOT, scene_with(obstacles=(pillar,))) as world:
-        operator = Operator(world)
-        operator.run(2.5, wheels_mps=(0.2, 0.2))
-        state = world.base_state()
-        assert (state.bump_left, state.bump_right) == (left, right)
-        assert state.stopped_by == "bump"
-        assert "chassis~obstacle_1" in world.truth().collisions
-        stopped_m = world.truth().body_m[0]
-        operator.run(1.0, wheels_mps=(0.2, 0.2))
-        assert world.truth().body_m[0] == pytest.approx(stopped_m, abs=0.005)
-        operator.run(1.0, wheels_mps=(-0.2, -0.2))
-        assert not world.base_state().bump_left
-        assert not world.base_state().bump_right
-        assert world.truth().body_m[0] < stopped_m - 0.15
-
-
-def test_real_wheels_differ_from_what_odometry_believes_and_ideal_ones_do_not() -> None:
-    errors = []
-    for seed in range(3):
-        with World(ROBOT, EMPTY, seed=seed, sensors="real") as world:
-            operator = Operator(world)
-            operator.run(4.0, wheels_mps=(0.2, 0.2))
-            operator.run(0.6)
-            truth, state = world.truth(), world.base_state()
-            errors.append(truth.body_m[0] - state.odometry_m[0])
-            assert abs(truth.body_m[0] / state.odometry_m[0] - 1.0) < 0.03
-            assert abs(yaw_of(truth)) < 0.05 * 0.84 / ROBOT.base.wheel_separation_m
-            # What the wheels were told is all that a Create's driver can know; here they did it.
-            assert state.odometry_m[0] == pytest.approx(0.2 * (4.2 - COMMAND_EVERY / 240), rel=0.005)
-    assert np.std(errors) > 0.001
-
-
-# --- grasping -------------------------------------------------------------------------------------
-
-
-def grasp_and_lift(
-    world: World, at_m: tuple[float, float], pitch_rad: float, judge: Judge, height_m: float = 0.06
-) -> Operator:
-    """Open, reach along the ground to `at_m`, close, lift to 0.25 m and wait 3 s."""
-    x, y = at_m
-    operator = Operator(world, judge)
-    before, there, high = (
-        np.array(point) for point in ([x - 0.09, y, height_m + 0.005], [x, y, height_m], [x - 0.1, y, 0.25])
-    )
-    above = before + np.array([0.02, 0.0, 0.14])
-    angles = arm_angles(above, pitch_rad, READY)
-    operator.run(2.5, arm=angles, hand={**LEVEL, **OPEN})
-    angles = operator.reach(above, before, pitch_rad, 1.0, angles)
-    angles = operator.reach(before, there, pitch_rad, 1.5, angles)
-    operator.run(0.3, arm=angles)
-    operator.run(1.0, hand=SHUT)
-    angles = operator.reach(there, high, pitch_rad, 2.0, angles)
-    operator.run(3.0, arm=angles)
-    return operator
-
-
-@pytest.mark.parametrize("sensors", ["ideal", "real"])
-@pytest.mark.parametrize(
-    ("offset_m", "pitch_deg", "mass_kg"),
-    [
-        ((0.0, 0.0), 0.0, 0.2),
-        ((0.015, 0.015), -10.0, 0.2),
-        ((-0.015, -0.015), -15.0, 0.2),
-        ((0.0, 0.01), -5.0, 0.35),
-    ],
-)
-def test_a_can_is_held_by_friction_alone(
-    sensors: str, offset_m: tuple[float, float], pitch_deg: float, mass_kg: float
-) -> None:
-    scene = scene_with(can(0.58 + offset_m[0], -0.10 + offset_m[1], mass_kg))
-    judge = Judge(scene, "red_can")
-    with World(ROBOT, scene, seed=3, sensors=sensors) as world:  # type: ignore[arg-type]
-        operator = grasp_and_lift(world, (0.58, -0.10), radians(pitch_deg), judge)
-        verdict = judge.result()
-        assert verdict.held, the_can(world)
-        assert verdict.lifted_m > 0.15
-        assert verdict.knocked_over == ()
-        assert operator.seen == set()
-        hand = world.servo_state("hand")
-        assert hand.faults == ()
-        load = dict(zip(hand.joints, hand.load, strict=True))
-        assert load["claw_left"] > 0.3 < -load["claw_right"]  # each pushes inwards
-
-
-def test_a_held_can_survives_a_shake_and_the_end_of_commands() -> None:
-    scene = scene_with(can(0.58, -0.10))
-    judge = Judge(scene, "red_can")
-    with World(ROBOT, scene) as world:
-        operator = grasp_and_lift(world, (0.58, -0.10), radians(-5.0), judge)
-        hand = np.linalg.inv(world.link_pose("pad_centre"))
-        before = hand @ [*the_can(world).position_m, 1.0]
-        for sway in (0.25, -0.25, 0.25, 0.0):
-            operator.run(0.4, arm={"arm_base": sway}, speed_radps=2.0)
-        operator.run(0.5, wheels_mps=(-0.3, -0.3))
-        operator.run(0.5, wheels_mps=(-0.2, 0.2))
-        operator.run(3.0)
-        after = np.linalg.inv(world.link_pose("pad_centre")) @ [*the_can(world).position_m, 1.0]
-        assert judge.result().held
-        assert np.linalg.norm(after - before) < 0.01
-        operator.run(1.0, hand=OPEN)
-        operator.run(0.5)
-        assert the_can(world).position_m[2] < 0.12
-        assert not judge.result().held
-
-
-def test_a_ball_is_held_too() -> None:
-    ball = SceneObject(label="yellow_ball", shape="sphere", radius_m=0.03, position_m=(0.58, -0.10), mass_kg=0.1)
-    scene = scene_with(ball)
-    judge = Judge(scene, "yellow_ball")
-    with World(ROBOT, scene, seed=1, sensors="real") as world:
-        operator = grasp_and_lift(world, (0.58, -0.10), 0.0, judge, height_m=0.035)
-        assert judge.result().held
-        assert operator.seen == set()
-
-
-def test_claws_that_close_on_nothing_meet_and_that_is_no_collision(empty: World) -> None:
-    operator = Operator(empty)
-    operator.run(1.5, arm=READY, hand={**LEVEL, "claw_left": radians(40), "claw_right": -radians(40)})
-    angles = empty.truth().joints_rad
-    assert 0.0 < angles["claw_left"] < radians(25)
-    assert 0.0 < -angles["claw_right"] < radians(25)
-    assert operator.seen == set()
-
-
-# --- the stage -------------------------------------------------------------------------------------
 
 
 def test_an_object_with_a_path_goes_along_it_and_is_not_pushed_off() -> None:
