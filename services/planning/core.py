@@ -29,7 +29,7 @@ class PlanningCore:
 
     def __init__(self, robot: Robot, config: Config) -> None:
         self._config = config
-        self._senses = Senses(config)
+        self._senses = Senses(config, robot.joints)
         self._limbs = Limbs(robot, config)
         self._intent = Intent()
         self._behaviour: Behaviour = Idle()
@@ -128,7 +128,7 @@ class PlanningCore:
         self._limbs.driver.reset()
         self._limbs.grip.keep()
         self._head_goal = None
-        if self._missing_since_ns is None:
+        if self._missing_since_ns is None or now_ns < self._missing_since_ns:
             self._missing_since_ns = now_ns
         failed = self._intent.behaviour != "idle" and now_ns - self._missing_since_ns > _STALE_NS
         status = PlannerStatus(
@@ -138,6 +138,7 @@ class PlanningCore:
             state="failed" if failed else "running",
             reason="stale" if failed else "",
             why=f"standing still: {why}",
+            holding=self._limbs.grip.holding(now_ns),
         )
         return [Output(topics.PLAN, status)]
 

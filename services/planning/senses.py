@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 
 from cocoro import topics
-from cocoro.clock import NS
+from cocoro.clock import NS, is_fresh
 from cocoro.frames import Pose2
 from cocoro.history import History
 from cocoro.kinematics import Array
@@ -24,7 +24,8 @@ _WAIT_FOR_ODOMETRY_NS = NS // 5
 class Senses:
     """Takes every input of the planner; answers by time."""
 
-    def __init__(self, config: Config) -> None:
+    def __init__(self, config: Config, joints: Iterable[str]) -> None:
+        self._joints = tuple(joints)
         self.memory = TargetMemory(config.memory)
         self.base: BaseState | None = None
         self.arm: ServoState | None = None
@@ -61,7 +62,7 @@ class Senses:
         elif isinstance(message, Detections):
             self._waiting.append(message)
             if self._looked_ns is not None and message.stamp_ns > self._looked_ns:
-                lag_s = min((now_ns - self._looked_ns) / NS, 5.0)
+                lag_s = min(max((now_ns - self._looked_ns) / NS, 0.0), 5.0)
                 self.sight_lag_s += 0.3 * (lag_s - self.sight_lag_s)
             self._looked_ns = message.stamp_ns
         elif isinstance(message, Obstacles):
@@ -114,10 +115,11 @@ class Senses:
         ):
             if message is None:
                 return f"no {topic.name} yet"
-            age_s = (now_ns - message.stamp_ns) / NS
-            if age_s > topic.max_age_s:
-                return f"{topic.name} is {age_s:.2f} s old"
-        return ""
+            if not is_fresh(message.stamp_ns, now_ns, topic.max_age_s):
+                return f"{topic.name} is {(now_ns - message.stamp_ns) / NS:.2f} s old"
+        joints = self.angles()
+        lacking = [name for name in self._joints if name not in joints]
+        return f"no angle of {lacking[0]}" if lacking else ""
 
     def latched(self) -> str:
         """Which hardware stands still for the emergency stop ('' when none)."""
@@ -127,7 +129,7 @@ class Senses:
         return ""
 
     def fresh_intent(self, now_ns: int) -> Intent | None:
-        if self.intent is None or now_ns - self.intent.stamp_ns > topics.INTENT.max_age_s * NS:
+        if self.intent is None or not is_fresh(self.intent.stamp_ns, now_ns, topics.INTENT.max_age_s):
             return None
         return self.intent
 
