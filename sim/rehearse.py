@@ -28,7 +28,7 @@ from cocoro.rehearsal import RehearsalRequest
 from cocoro.robot import Robot
 from cocoro.vloop import run_virtual
 from sim.judge import Judge
-from sim.scene import load_scene
+from sim.random_scene import find_scene
 
 PROCESSES = ("sim", "perception", "planning", "executive")
 START_S = 5.0
@@ -98,7 +98,7 @@ class LockstepNode(Node):
 class _Rehearsal:
     def __init__(self, request: RehearsalRequest) -> None:
         self._request = request
-        scene = load_scene(request.scene, request.seed)
+        scene = find_scene(request.scene, request.seed, request.label)
         labels = [item.label for item in scene.objects]
         self._judge = Judge(scene, request.label if request.label in labels else "")
         self._frame: Frame | None = None
@@ -143,6 +143,7 @@ class _Rehearsal:
                 field: getattr(request, field)
                 for field in ("scene", "seed", "sensors", "width", "height", "frame_rate_hz")
             }
+            settings["target"] = request.label
             return settings | ({"command_timeout_s": _LONG_S} if request.lockstep else {})
         if request.lockstep:
             # The baseline's planner speaks once a cycle, however long that is: no penalty for it.

@@ -20,8 +20,8 @@ from cocoro.messages import Clock as ClockMessage
 from cocoro.node import Node, Publisher
 from cocoro.robot import Robot
 from sim.camera import Kinect
+from sim.random_scene import find_scene
 from sim.render import make_renderer
-from sim.scene import load_scene
 from sim.world import World
 
 __all__ = ["Config", "run"]
@@ -37,6 +37,8 @@ LATE_S = 0.1
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     scene: str = "paper"
+    target: str = ""
+    """An object that a random scene must have."""
     seed: Annotated[int, Meta(ge=0)] = 0
     sensors: Literal["ideal", "real"] = "ideal"
     width: Annotated[int, Meta(ge=16, le=4096)] = 640
@@ -148,7 +150,7 @@ class Simulator:
 
 async def run(node: Node, config: Config) -> None:
     """Simulate for ever: in real time, or as the loop's virtual time goes."""
-    scene = load_scene(config.scene, config.seed)
+    scene = find_scene(config.scene, config.seed, config.target)
     robot = node.robot
     with World(
         _with_timeout(robot, config.command_timeout_s),

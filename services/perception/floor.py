@@ -87,8 +87,7 @@ def _cells(points: Array) -> tuple[Array, Array]:
     heights = np.zeros(len(numbers))
     np.maximum.at(heights, inverse.reshape(-1), points[:, 2])
     enough = np.flatnonzero(counts >= _MIN_POINTS)[:_MOST_CELLS]
-    middles: Array = (numbers[enough] + 0.5) * CELL_M
-    return middles, heights[enough]
+    return np.asarray((numbers[enough] + 0.5) * CELL_M, dtype=np.float64), heights[enough]
 
 
 def _free(

@@ -93,14 +93,13 @@ def fit_centre(known: KnownObject, evidence: Evidence, pose: Array, start: Array
     before the depth that it is free to. The latter two are one-sided. Derived.
     """
     rotation, origin = pose[:3, :3], pose[:3, 3]
+    guess = start - origin  # from here on everything is relative to the camera, in the body's directions
     surface = evidence.surface_m @ rotation.T
-    rays = _Rays(known, evidence, rotation, start - origin)
+    rays = _Rays(known, evidence, rotation, guess)
     seen, met = len(surface), len(surface) + len(evidence.outline)
     points = np.concatenate([surface, rays.directions])
-    ray_doubt = RAY_DOUBT_M + RAY_DOUBT_RAD * float((start - origin) @ rotation[:, 2])
+    ray_doubt = RAY_DOUBT_M + RAY_DOUBT_RAD * float(guess @ rotation[:, 2])
     doubt = np.concatenate([depth_doubt_m(evidence.surface_m[:, 2]), np.full(len(points) - seen, ray_doubt)])
-    # To the centre from the camera, the origin of the points.
-    guess = start - origin
     centre = guess
     for _ in range(ITERATIONS):
         points[seen:] = rays.nearest(centre)

@@ -31,7 +31,6 @@ away it is what lies out of range. An infrared shadow takes less of an outline."
 MAX_SURFACE_POINTS = 140
 MAX_RAYS = 40
 
-
 _AROUND = np.ones((3, 3), dtype=np.uint8)
 
 

@@ -1,0 +1,115 @@
+"""Scenes that nobody has rehearsed: known objects and obstacles strewn around the robot, drawn from the seed."""
+
+from __future__ import annotations
+
+from math import cos, hypot, pi, radians, sin
+
+import numpy as np
+
+from cocoro.errors import ConfigError
+from cocoro.objects import Catalogue, KnownObject
+from sim.scene import Light, Obstacle, Scene, SceneObject, load_scene
+from sim.seeds import stream
+
+NAME = "random"
+DISTANCE_M = (0.8, 2.0)
+BEARING_DEG = 120.0
+APART_M = 0.25
+_SIGHT_M = 0.06
+"""An obstacle's edge keeps so far from the line from the robot to each object."""
+_BESIDE_M = 0.22
+"""An obstacle's edge keeps so far from an object's centre."""
+_BY_ROBOT_M = 0.30
+"""An obstacle's edge keeps so far from the middle of the robot."""
+_TRIES = 2000
+
+
+def random_scene(seed: int, target: str = "") -> Scene:
+    """1 to 4 known objects 0.8 to 2.0 m away within 120 degrees either side, at least 0.25 m apart, and in half of the
+    seeds 1 or 2 obstacles beside the straight lines of sight.
+
+    One object at least fits into the hand. `target`, when it is a known object, is among them: it takes the first
+    one's place, so that the places do not depend on what is asked for. Raises ConfigError for an unknown target.
+    """
+    rng = stream(seed, "random scene")
+    catalogue = Catalogue.load()
+    graspable = [known for known in catalogue.targets if known.graspable]
+    first = graspable[int(rng.integers(len(graspable)))]
+    others = [known for known in catalogue.targets if known.label != first.label]
+    rng.shuffle(others)
+    chosen = [first, *others[: int(rng.integers(0, 4))]]
+    if target:
+        wanted = catalogue.get(target)
+        if wanted is None:
+            raise ConfigError(f"scene random: no known object {target!r}; known are {', '.join(catalogue.labels)}")
+        if wanted not in chosen:
+            chosen[0] = wanted
+    places = _places(rng, len(chosen))
+    objects = tuple(_object(known, place) for known, place in zip(chosen, places, strict=True))
+    count = int(rng.integers(1, 3)) if rng.random() < 0.5 else 0
+    obstacles: list[Obstacle] = []
+    while len(obstacles) < count:
+        obstacles.append(_obstacle(rng, places, obstacles))
+    light = Light(ambient=float(rng.uniform(0.45, 0.65)), temperature_k=float(rng.uniform(4500, 6500)))
+    return Scene(name=NAME, objects=objects, obstacles=tuple(obstacles), light=light)
+
+
+def find_scene(name_or_path: str, seed: int, target: str = "") -> Scene:
+    """`random`, or what `load_scene` finds."""
+    return random_scene(seed, target) if name_or_path == NAME else load_scene(name_or_path, seed)
+
+
+def _places(rng: np.random.Generator, count: int) -> list[tuple[float, float]]:
+    places: list[tuple[float, float]] = []
+    while len(places) < count:
+        distance, bearing = rng.uniform(*DISTANCE_M), radians(rng.uniform(-BEARING_DEG, BEARING_DEG))
+        place = (distance * cos(bearing), distance * sin(bearing))
+        if all(hypot(place[0] - x, place[1] - y) >= APART_M for x, y in places):
+            places.append(place)
+    return places
+
+
+def _object(known: KnownObject, place: tuple[float, float]) -> SceneObject:
+    return SceneObject(
+        label=known.label,
+        shape=known.shape,
+        radius_m=known.radius_m,
+        height_m=known.height_m,
+        size_m=known.box_m,
+        mass_kg=known.mass_kg,
+        rgb=known.rgb,
+        position_m=place,
+    )
+
+
+def _obstacle(rng: np.random.Generator, objects: list[tuple[float, float]], others: list[Obstacle]) -> Obstacle:
+    for _ in range(_TRIES):
+        distance, bearing = rng.uniform(0.6, 1.8), radians(rng.uniform(-BEARING_DEG, BEARING_DEG))
+        x, y = distance * cos(bearing), distance * sin(bearing)
+        width, depth, height = (float(v) for v in rng.uniform((0.12, 0.12, 0.20), (0.35, 0.35, 0.60)))
+        reach = hypot(width, depth) / 2
+        clear = distance - reach >= _BY_ROBOT_M
+        for ox, oy in objects:
+            clear &= hypot(x - ox, y - oy) - reach >= _BESIDE_M
+            clear &= _off_line((x, y), (ox, oy)) - reach >= _SIGHT_M
+        for other in others:
+            other_x, other_y = other.position_m
+            clear &= hypot(x - other_x, y - other_y) >= 0.5
+        if clear:
+            grey = float(rng.uniform(0.35, 0.75))
+            return Obstacle(
+                shape="box",
+                size_m=(width, depth, height),
+                rgb=(grey, 0.9 * grey, 0.75 * grey),
+                position_m=(x, y),
+                yaw_rad=float(rng.uniform(-pi, pi)),
+            )
+    # Four objects around the robot can leave no room; a small post fits somewhere.
+    return Obstacle(shape="cylinder", radius_m=0.05, height_m=0.4, rgb=(0.5, 0.45, 0.4), position_m=(-1.2, 0.0))
+
+
+def _off_line(point: tuple[float, float], end: tuple[float, float]) -> float:
+    """Distance of a point from the segment between the origin and `end`."""
+    length2 = end[0] ** 2 + end[1] ** 2
+    share = min(max((point[0] * end[0] + point[1] * end[1]) / length2, 0.0), 1.0)
+    return hypot(point[0] - share * end[0], point[1] - share * end[1])
