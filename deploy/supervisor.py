@@ -141,14 +141,17 @@ class Supervisor:
 
 @contextmanager
 def _signals(handler: Callable[[signal.Signals], None]) -> Iterator[None]:
-    """SIGINT and SIGTERM go to `handler` for as long as this context lasts."""
+    """Being told to end, and a closed terminal, go to `handler` for as long as this context lasts."""
     loop = asyncio.get_running_loop()
-    for number in (signal.SIGINT, signal.SIGTERM):
+    numbers = [signal.SIGINT, signal.SIGTERM]
+    if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:  # as nohup has it
+        numbers.append(signal.SIGHUP)
+    for number in numbers:
         loop.add_signal_handler(number, handler, number)
     try:
         yield
     finally:
-        for number in (signal.SIGINT, signal.SIGTERM):
+        for number in numbers:
             loop.remove_signal_handler(number)
 
 

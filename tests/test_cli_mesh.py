@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 import json
 import shutil
+import signal
+import sys
 import tempfile
 import time
 from collections.abc import AsyncIterator, Iterator
@@ -19,9 +21,11 @@ from cocoro.bus.zenoh import ZenohBus
 from cocoro.cli import estop, exits, objects, reset, snapshot, status
 from cocoro.cli.link import Where
 from cocoro.clock import RealClock
+from cocoro.errors import ConfigError
 from cocoro.latch import LatchKeeper
 from cocoro.messages import (
     BaseState,
+    CancelRequest,
     Detection,
     Detections,
     EstopReply,
@@ -32,12 +36,14 @@ from cocoro.messages import (
     ObjectsReply,
     ObjectsRequest,
     PlannerStatus,
+    TaskReply,
+    TaskRequest,
     TaskState,
 )
 from cocoro.node import Node
 from cocoro.robot import Robot
 from cocoro.rundir import RunDir
-from cocoro.topics import BASE_STATE, DETECTIONS, ESTOP, FRAME, LATCH, OBJECTS, PLAN, STOPPABLE, TASK
+from cocoro.topics import BASE_STATE, CANCEL, DETECTIONS, ESTOP, FRAME, LATCH, OBJECTS, PLAN, RUN, STOPPABLE, TASK
 
 pytestmark = pytest.mark.zenoh
 
@@ -269,3 +275,48 @@ def test_a_snapshot_is_a_frame_with_what_was_detected_in_that_frame(
     asyncio.run(scenario())
     assert capsys.readouterr().out == f"{out}: {words}\n"
     assert out.read_bytes().startswith(b"\x89PNG")
+
+
+def test_ctrl_c_on_a_running_fetch_cancels_the_task_on_the_robot(root: Path) -> None:
+    cancelled: list[str] = []
+
+    async def scenario() -> None:
+        async with robot("executive") as calliope:
+            node = calliope.nodes["executive"]
+
+            async def run(request: TaskRequest) -> TaskReply:
+                node.spawn(tell())
+                return TaskReply(accepted=True, task_id="fetch-1")
+
+            async def tell() -> None:
+                async for _ in node.every(20.0):
+                    outcome = "cancelled" if cancelled else None
+                    node.publish(TASK, TaskState(task_id="fetch-1", phase="approach", outcome=outcome, elapsed_s=1.0))
+
+            async def cancel(request: CancelRequest) -> TaskReply:
+                cancelled.append(request.task_id)
+                return TaskReply(accepted=True, task_id=request.task_id)
+
+            node.serve(RUN, run)
+            node.serve(CANCEL, cancel)
+            fetch = await asyncio.create_subprocess_exec(
+                sys.executable, "-m", "cocoro.cli.main", "fetch", "red_can", stdout=asyncio.subprocess.PIPE
+            )
+            assert fetch.stdout is not None
+            assert b"approach" in await fetch.stdout.readline()
+            fetch.send_signal(signal.SIGINT)
+            rest = (await fetch.stdout.read()).decode().splitlines()
+            assert await fetch.wait() == exits.REFUSED
+        assert cancelled == ["fetch-1"]
+        assert rest[-1] == "cancelled: fetch red_can after 1.0 s"
+
+    asyncio.run(scenario())
+
+
+def test_of_several_robots_one_must_be_named(root: Path) -> None:
+    async def scenario() -> None:
+        async with robot("executive"), await ZenohBus.open(default("robbie", "robot")):
+            with pytest.raises(ConfigError, match=r"say which: --robot calliope, --robot robbie"):
+                await status.status(ANY, as_json=False)
+
+    asyncio.run(scenario())

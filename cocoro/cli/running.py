@@ -155,4 +155,7 @@ def run(process: str, profile: str | None, settings: list[str]) -> int:
 
 
 def _say(text: str) -> None:
-    print(text, flush=True)
+    try:
+        print(text, flush=True)
+    except BrokenPipeError:  # nobody reads any more, as with `cocoro up | head`; the robot must not mind
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
