@@ -54,8 +54,7 @@ class Publisher(Generic[M]):
         self.rate = Rate()
         self.newest_stamp_ns: int | None = None
         self._raw = bus.publisher(key, topic.qos)
-        self._incarnation = bus.new_incarnation()
-        self._encoder = msgspec.msgpack.Encoder(enc_hook=_plain)
+        self.incarnation = bus.new_incarnation()
         self._clock = clock
 
     def put(self, message: M, stamp_ns: int | None = None) -> M:
@@ -68,10 +67,10 @@ class Publisher(Generic[M]):
         elif message.stamp_ns == 0:
             message.stamp_ns = self._clock.now_ns()
         message.seq = self.rate.count
-        message.incarnation = self._incarnation
+        message.incarnation = self.incarnation
         self.rate.count += 1
         self.newest_stamp_ns = message.stamp_ns
-        self._raw.put(self._encoder.encode(message))
+        self._raw.put(encode(message))
         return message
 
     def health(self, now_ns: int) -> TopicHealth:
@@ -403,11 +402,19 @@ class Stepper:
         return len(produced)
 
 
+def encode(message: Message) -> bytes:
+    """A message as it travels."""
+    return _ENCODER.encode(message)
+
+
 def _plain(value: object) -> object:
     """NumPy's scalars as Python's, so that a component's author need not think of it."""
     if isinstance(value, np.generic):
         return value.item()
     raise TypeError(f"a {type(value).__name__} cannot be sent")
+
+
+_ENCODER = msgspec.msgpack.Encoder(enc_hook=_plain)
 
 
 def _understood(decoder: msgspec.msgpack.Decoder[Q], payload: Payload, request: Request[Q, Any]) -> Q:

@@ -1,0 +1,178 @@
+"""One service on a mesh of its own."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable, Mapping
+from types import TracebackType
+from typing import Any, TypeVar
+
+import msgspec
+
+from cocoro.bus.base import Handle
+from cocoro.bus.local import LocalMesh
+from cocoro.clock import NS, Clock, VirtualClock
+from cocoro.messages import Message, TopicHealth
+from cocoro.node import Node, alive_key
+from cocoro.processes import Component, Process, load
+from cocoro.robot import Robot
+from cocoro.testing.tap import Tap
+from cocoro.testing.virtual import settle
+from cocoro.topics import Request, Topic
+
+M = TypeVar("M", bound=Message)
+Q = TypeVar("Q", bound=msgspec.Struct)
+R = TypeVar("R", bound=msgspec.Struct)
+
+
+class ServiceUnderTest:
+    """One component on a mesh of its own. Use it as an asynchronous context manager, in virtual time."""
+
+    def __init__(
+        self,
+        component: str | Component,
+        config: Mapping[str, Any] | msgspec.Struct | None = None,
+        *,
+        name: str | None = None,
+        robot: Robot | None = None,
+        clock: Clock | None = None,
+        mesh: LocalMesh | None = None,
+        latency_s: float = 0.0,
+        record_steps: bool = False,
+    ) -> None:
+        """`component` is a module's name ('services.planning.service') or a loaded component; `config` its settings
+        (defaults where there are none). The service's name is that of the module's folder unless one is given."""
+        module = component if isinstance(component, str) else component.run.__module__
+        self.name = name or _service_name(module)
+        if isinstance(component, str):
+            component = load(Process(name=self.name, module=component, services=(self.name,), doc="under test"))
+        self.robot = robot or Robot.load()
+        self.mesh = mesh or LocalMesh()
+        self._component = component
+        if isinstance(config, msgspec.Struct):
+            self._config = config
+        else:
+            self._config = msgspec.convert(config or {}, component.config)
+        self._clock = clock or VirtualClock()
+        self._bus = self.mesh.join()
+        self.node = Node(
+            self.name, self._bus, self._clock, self.robot, latency_s=latency_s, record_steps=record_steps,
+            module=module, config=self._config,
+        )  # fmt: skip
+        self.tester = Node("tester", self.mesh.join(), self._clock, self.robot)
+        """Another participant of the mesh, for what this class has no word for."""
+        self.tap = Tap(self.mesh.join(), self.robot.name)
+        self._others: dict[str, Handle] = {}
+        self._work: asyncio.Future[None] | None = None
+
+    async def __aenter__(self) -> ServiceUnderTest:
+        await self.tester.__aenter__()
+        await self.node.__aenter__()
+        self._work = asyncio.ensure_future(self._component.run(self.node, self._config))
+        await self.settle()
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        await self._end()
+        await self.node.__aexit__()
+        await self.tester.__aexit__()
+
+    # --- feeding ------------------------------------------------------------------------------------
+
+    def feed(self, topic: Topic[M], message: M, stamp_ns: int | None = None) -> M:
+        """Publish to the service; stamped with now when neither the message nor `stamp_ns` says otherwise."""
+        return self.tester.publish(topic, message, stamp_ns)
+
+    def feed_raw(self, topic: Topic[Any], payload: bytes) -> None:
+        """Publish bytes as they are: something malformed, say."""
+        self.mesh.publish(topic.key(self.robot.name), payload)
+
+    async def ask(self, request: Request[Q, R], question: Q, timeout_s: float | None = None) -> R:
+        """Call the service. Raises as `Node.call` does."""
+        return await self.tester.call(request, question, timeout_s)
+
+    def serve(self, request: Request[Q, R], handler: Callable[[Q], Awaitable[R]]) -> None:
+        """Stand in for whoever answers the service's own requests."""
+        self.tester.serve(request, handler)
+
+    def others_live(self, *services: str) -> None:
+        """Have other services be alive."""
+        for service in services:
+            self._others[service] = self.tester.bus.declare_alive(alive_key(self.robot.name, service))
+
+    def other_dies(self, service: str) -> None:
+        self._others.pop(service).close()
+
+    # --- time ---------------------------------------------------------------------------------------
+
+    async def settle(self) -> None:
+        """Let the service take in what it was fed; no time passes. Raises what the service raised."""
+        await settle()
+        self._check()
+
+    async def advance(self, seconds: float) -> None:
+        """Let virtual time pass. Raises what the service raised meanwhile."""
+        await asyncio.sleep(seconds)
+        await self.settle()
+
+    async def until(self, content: Callable[[], object], timeout_s: float = 60.0) -> None:
+        """Let time pass until something holds; AssertionError when it does not come to be."""
+        end_ns = self.tester.now_ns() + round(timeout_s * NS)
+        while not content():
+            assert self.tester.now_ns() < end_ns, f"still not so after {timeout_s:g} s"
+            await self.advance(0.01)
+
+    # --- reading ------------------------------------------------------------------------------------
+
+    def outputs(self, topic: Topic[M]) -> list[M]:
+        """All that was published on a topic, by the service and not by this test, since the start or `forget`."""
+        mine = self.tester.publisher(topic).incarnation
+        return [message for message in self.tap.messages(topic) if message.incarnation != mine]
+
+    def latest(self, topic: Topic[M]) -> M:
+        """The newest output; AssertionError when there is none."""
+        outputs = self.outputs(topic)
+        assert outputs, f"{self.name} has published nothing on {topic.name}"
+        return outputs[-1]
+
+    def forget(self) -> None:
+        """Read only what comes from now on."""
+        self.tap.forget()
+
+    def received(self, topic: Topic[Any]) -> TopicHealth:
+        """How the service gets on with what arrives on a topic: counts of good, lost, skipped and rejected."""
+        return self.node.inbox(topic).health(self.node.now_ns())
+
+    @property
+    def running(self) -> bool:
+        return self._work is not None and not self._work.done()
+
+    @property
+    def alive(self) -> bool:
+        """Whether its liveliness token is there."""
+        return self.mesh.tokens[alive_key(self.robot.name, self.name)] > 0
+
+    # --- ending -------------------------------------------------------------------------------------
+
+    async def kill(self) -> None:
+        """End the service as SIGKILL would: at once, nothing said."""
+        self._bus.kill()
+        await self._end()
+
+    async def _end(self) -> None:
+        if self._work is not None:
+            self._work.cancel()
+            await asyncio.gather(self._work, return_exceptions=True)
+            self._work = None
+
+    def _check(self) -> None:
+        if self._work is not None and self._work.done():
+            self._work.result()
+            raise AssertionError(f"{self.name} ended by itself, though a component runs for ever")
+
+
+def _service_name(module: str) -> str:
+    folders = module.split(".")
+    return folders[-2] if folders[-1] == "service" and len(folders) > 1 else folders[-1]
