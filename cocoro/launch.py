@@ -1,7 +1,7 @@
 """Runs one process of the table: `python -m cocoro.launch PROCESS --run-dir DIR`, or `run` from one's own terminal.
 
-Exits with 0 when it was asked to end, 2 for an error that its user can mend (one line in the log), 1 for a crash
-(its traceback in the log).
+Exits with 0 when it was asked to end, 1 for a crash (its traceback in the log), 2 for an error that its user can
+mend and 3 when what is there already does not let it start (one line in the log).
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from cocoro.errors import CocoroError
+from cocoro.errors import CocoroError, RefusedError
 from cocoro.rundir import RunDir
 
-OK, CRASHED, MISCONFIGURED = 0, 1, 2
+OK, CRASHED, MISCONFIGURED, REFUSED = 0, 1, 2, 3
 ORPHAN_S = 5.0
 """How long a process may take to end once its supervisor is gone."""
 LEVEL = "COCORO_LOG"
@@ -73,7 +73,7 @@ def run(process: str, run_dir: RunDir, profile: dict[str, Any], profile_name: st
             return runner.run(_main(process, run_dir, profile, profile_name))
     except CocoroError as error:
         log.error("%s", error)
-        return MISCONFIGURED
+        return REFUSED if isinstance(error, RefusedError) else MISCONFIGURED
     except KeyboardInterrupt:
         return OK
     except Exception:

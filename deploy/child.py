@@ -11,20 +11,26 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 
-from cocoro.launch import MISCONFIGURED
+from cocoro.launch import CRASHED, MISCONFIGURED, REFUSED
 from cocoro.processes import BACKOFF_LIMIT_S, SETTLED_S, Process
 from cocoro.rundir import RunDir
 
-ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-"""The matrices here are small: more threads would only take each other's processors, and jitter."""
+SAID_WHY = (MISCONFIGURED, REFUSED)
+"""Exit codes with which a process's last line says it all."""
+ENVIRONMENT = {
+    # The matrices here are small: more threads would only take each other's processors, and jitter.
+    **dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"),
+    "PYTHONUNBUFFERED": "1",  # so that the log has what a killed process printed
+}
+"""What a process gets unless the environment says otherwise."""
 
 
 class StartError(Exception):
-    """A process did not become ready. `misconfigured` is set when it said itself that its user can mend it."""
+    """A process did not become ready. `code` is what to exit with for it."""
 
-    def __init__(self, text: str, misconfigured: bool = False) -> None:
+    def __init__(self, text: str, code: int = CRASHED) -> None:
         super().__init__(text)
-        self.misconfigured = misconfigured
+        self.code = code if code in SAID_WHY else CRASHED
 
 
 class Child:
@@ -54,9 +60,7 @@ class Child:
         if not await self._becomes_ready():
             if self._exit.done():
                 code = self._exit.result()
-                raise StartError(
-                    f"{self.row.name} {_ended(code)} at its start{self._last_words(code)}", code == MISCONFIGURED
-                )
+                raise StartError(f"{self.row.name} {_ended(code)} at its start{self._last_words(code)}", code)
             missing = ", ".join(sorted(set(self.row.services) - self._alive))
             raise StartError(
                 f"{self.row.name} was not ready after {self.row.start_s:g} s: no sign of {missing}{self._last_words()}"
@@ -135,7 +139,7 @@ class Child:
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,
-                env=ONE_THREAD | os.environ,
+                env=ENVIRONMENT | os.environ,
                 pass_fds=(self._parent_fd,),
                 start_new_session=True,  # so that Ctrl-C in a terminal is for the supervisor alone
             )
@@ -171,7 +175,7 @@ class Child:
         """The end of its log, to be put after a sentence: of a mistake the line that tells it, else a few."""
         log = self._run_dir.log(self.row.name)
         lines = [line for line in log.read_text(errors="replace").splitlines() if line.strip()]
-        if code == MISCONFIGURED and lines:
+        if code in SAID_WHY and lines:
             return f": {lines[-1].partition(f'{self.row.name}: ')[2] or lines[-1]}"
         return "".join(f"\n    {line}" for line in (f"{log}:", *lines[-3:]))
 

@@ -26,7 +26,7 @@ from cocoro.profiles import Profile, from_data
 from cocoro.rundir import RunDir
 from deploy.child import Child, StartError
 
-STOPPED, FAILED, MISCONFIGURED, REFUSED = 0, 1, 2, 3
+STOPPED, MISCONFIGURED, REFUSED = 0, 2, 3
 """Exit codes, as of every command."""
 LEFTOVER_S = 8.0
 """How long the processes of a killed supervisor may take to notice it and end."""
@@ -102,7 +102,7 @@ class Supervisor:
             starting.result()
         except StartError as error:
             self._tell(str(error))
-            return MISCONFIGURED if error.misconfigured else FAILED
+            return error.code
         self._tell(f"{self._profile.robot} is up ({self._profile.name})")
         self._on_up()
         _notify_service_manager("READY=1")

@@ -119,7 +119,7 @@ def test_of_two_that_start_one_robot_at_once_one_is_refused(shell: Shell) -> Non
 def test_a_second_process_for_the_same_service_is_refused(shell: Shell) -> None:
     assert shell("up", shell.profile("pair"), "--detach").returncode == 0
     second = shell("run", "pair")
-    assert second.returncode == 2
+    assert second.returncode == 3
     assert f"robbie has a left already (pair, pid {shell.pid('left')})" in second.stderr
     assert "Traceback" not in second.stderr
 
