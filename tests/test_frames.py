@@ -3,7 +3,7 @@
 from math import pi
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cocoro.frames import Pose2, Spherical, to_cartesian, to_spherical, wrap_rad
@@ -23,6 +23,7 @@ def test_the_origin_has_no_direction_and_no_error():
     assert to_spherical((0.0, 0.0, 0.0)) == Spherical(0.0, 0.0, 0.0)
 
 
+@settings(deadline=None)
 @given(st.tuples(metres, metres, metres))
 def test_spherical_and_back_is_the_same_point(point):
     assert to_cartesian(to_spherical(point)) == pytest.approx(point, abs=1e-9)
@@ -36,11 +37,13 @@ def test_a_velocity_turns_but_does_not_move():
     assert Pose2(1.0, 2.0, pi / 2).rotate((3.0, 0.0, 0.5)) == pytest.approx((0.0, 3.0, 0.5))
 
 
+@settings(deadline=None)
 @given(poses, poses, st.tuples(metres, metres, metres))
 def test_a_composed_pose_does_what_its_parts_do_in_turn(a, b, point):
     assert a.compose(b).apply(point) == pytest.approx(a.apply(b.apply(point)), abs=1e-9)
 
 
+@settings(deadline=None)
 @given(poses)
 def test_a_pose_and_its_inverse_cancel(pose):
     assert pose.compose(pose.inverse()) == pytest.approx((0.0, 0.0, 0.0), abs=1e-9)
@@ -61,6 +64,7 @@ def test_many_turns_stay_many_turns_until_they_are_wrapped():
     assert wrap_rad(total.yaw_rad) == pytest.approx(0.0)
 
 
+@settings(deadline=None)
 @given(angles)
 def test_a_wrapped_angle_is_the_same_direction_within_half_a_turn(angle):
     wrapped = wrap_rad(angle)

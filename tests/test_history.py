@@ -4,7 +4,7 @@ from math import pi, radians
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cocoro.history import History
@@ -29,6 +29,7 @@ def test_a_sample_of_exactly_that_stamp_is_returned_as_it_is():
     assert history.at(900 * MS, 1) == pytest.approx([900.0])
 
 
+@settings(deadline=None)
 @given(st.lists(st.integers(1, 50), min_size=2, max_size=30), st.data())
 def test_a_linear_motion_is_read_exactly_at_any_time_within(steps, data):
     stamps = np.cumsum(steps)

@@ -19,8 +19,8 @@ def frame(stamp_ns=STAMP_NS, **more):
 
 
 def messages(outputs):
-    assert all(output.topic is DETECTIONS for output in outputs)
-    return [output.message for output in outputs]
+    """The detections among what a step gave."""
+    return [output.message for output in outputs if output.topic is DETECTIONS]
 
 
 def test_it_reads_every_arm_state_but_only_the_newest_frame():

@@ -1,9 +1,11 @@
 """What the two detectors see in painted frames: what they are to find, and what they are not to be taken in by."""
 
+import msgspec
 import numpy as np
 import pytest
 from perception_scenes import CATALOGUE, ROBOT, Canvas, seen, the
 
+from cocoro.messages import Detections
 from services.perception.config import Config
 from services.perception.image import RgbdImage
 from services.perception.paper import PaperDetector
@@ -234,6 +236,27 @@ def test_the_same_small_patch_with_nothing_before_it_is_no_can():
     canvas = Canvas()
     canvas.rectangle("red_can", (310, 240), 1.0, size_m=(0.022, 0.12))
     assert seen(canvas.frame()).detections == ()
+
+
+@DETECTORS
+@pytest.mark.parametrize("size", [(1, 1), (3, 2), (17, 9), (160, 120), (641, 479)], ids=str)
+def test_no_frame_however_odd_is_an_error(size, detector):
+    draws = np.random.default_rng(7)
+    width, height = size
+    for trial in range(6):
+        canvas = Canvas(*size)
+        if trial == 0:
+            canvas.colour = draws.integers(0, 256, (height, width, 3)).astype(np.uint8)
+        else:
+            for _ in range(8):
+                left, top = draws.integers(0, width), draws.integers(0, height)
+                known = CATALOGUE.objects[draws.integers(len(CATALOGUE))]
+                canvas.colour[top : top + height // 3 + 1, left : left + width // 3 + 1] = np.array(known.rgb) * 200
+        frame = canvas.frame()
+        codes = draws.integers(0, 65536, height * width) if trial % 2 else np.full(height * width, 400 * trial)
+        frame.depth = memoryview(codes.astype("<u2").view(np.uint8))
+        found = seen(frame, 0.3, -0.6, detector=detector)
+        assert msgspec.msgpack.decode(msgspec.msgpack.encode(found), type=Detections) == found
 
 
 # --- the paper's detector, by its own rules -------------------------------------------------------
