@@ -45,6 +45,8 @@ class Process:
     """It must be ready by then."""
     stop_s: float = 5.0
     """From SIGTERM to SIGKILL."""
+    nice: int = 0
+    """Steps by which it yields the processor to others: what may be late must not make commands late."""
     cpu_share: float = 0.25
     """Budget, of one core, on the machine that the project is measured on."""
     rss_mb: float = 150.0
@@ -79,7 +81,7 @@ PROCESSES: tuple[Process, ...] = (
     Process(
         name="perception", module="services.perception.service", services=("perception",),
         doc="Finds the known objects in each frame.",
-        cpu_share=0.5, rss_mb=250.0,
+        nice=5, cpu_share=0.5, rss_mb=250.0,
     ),
     Process(
         name="planning", module="services.planning.service", services=("planning",),
@@ -94,7 +96,7 @@ PROCESSES: tuple[Process, ...] = (
     Process(
         name="capture", module="services.capture.service", services=("capture",),
         doc="Records the mesh into MCAP files.",
-        cpu_share=0.3, rss_mb=300.0,
+        nice=10, cpu_share=0.3, rss_mb=300.0,
     ),
 )  # fmt: skip
 
