@@ -31,6 +31,8 @@ class ZenohConfig:
     """What the process is called in the register and in logs."""
     directory: Path | None = None
     mode: Literal["peer", "client", "router"] = "peer"
+    """A client speaks through the router that it connects to. A peer speaks with just those that it connects to or
+    that connect to it: nobody is discovered."""
     listen: tuple[str, ...] = ()
     connect: tuple[str, ...] = ()
     lease_s: float = 4.0

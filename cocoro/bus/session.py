@@ -40,8 +40,8 @@ def options(config: ZenohConfig, identity: str, listen: list[str], connect: list
         "id": identity,
         "mode": config.mode,
         "scouting/multicast/enabled": False,
-        # By the register everyone connects to everyone; gossip would only make them do it twice.
-        "scouting/gossip/enabled": config.mode == "peer" and not local,
+        # Everyone connects to everyone, by the register or by the configured endpoints, and to nobody else.
+        "scouting/gossip/enabled": False,
         # The longest that opening as a peer waits for its endpoints. A router would wait all of it, always.
         "scouting/delay": patience_ms if config.mode == "peer" else 0,
         # Zenoh's own wait for what the others declared now and then misses its end and takes all of the delay, so

@@ -98,7 +98,8 @@ class ZenohBus:
         if awaited:
             with contextlib.closing(self.watch_alive(f"{MEMBER}/*", on_member)):
                 try:
-                    await asyncio.wait_for(complete.wait(), self._config.patience_s)
+                    async with asyncio.timeout(self._config.patience_s):
+                        await complete.wait()
                 except TimeoutError:
                     log.warning("no answer within %g s from %s", self._config.patience_s, ", ".join(awaited.values()))
         self.declare_alive(f"{MEMBER}/{identity}")
@@ -216,7 +217,8 @@ class ZenohBus:
             ask(final)
         except zenoh.ZError as error:
             raise MeshError(f"the mesh at {self.where} has been left: {error}") from error
-        await asyncio.wait_for(everyone.wait(), timeout_s)
+        async with asyncio.timeout(timeout_s):
+            await everyone.wait()
 
     async def close(self) -> None:
         if self._closed:
@@ -227,7 +229,8 @@ class ZenohBus:
         for declared in self._declared:
             declared.mute()
         try:
-            await asyncio.wait_for(in_thread(self._leave), LEAVE_S)
+            async with asyncio.timeout(LEAVE_S):
+                await in_thread(self._leave)
         except TimeoutError:
             log.warning("leaving the mesh at %s takes more than %g s: given up", self.where, LEAVE_S)
 

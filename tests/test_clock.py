@@ -1,0 +1,317 @@
+"""Clocks: what time it is, waiting for a time, and what a jump back means."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import Coroutine
+from typing import Any
+
+import pytest
+
+import cocoro.clock
+from cocoro.clock import NS, FollowedClock, RealClock, VirtualClock, sleep
+from cocoro.vloop import run_virtual
+
+
+@pytest.fixture
+def real_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The system's clocks as the virtual loop's time, from 100 s on, so that a test decides what passes."""
+
+    class Time:
+        offset_ns = 100 * NS
+
+        @classmethod
+        def monotonic_ns(cls) -> int:
+            return 100 * NS + round(asyncio.get_running_loop().time() * NS)
+
+        @classmethod
+        def time_ns(cls) -> int:
+            return cls.offset_ns + round(asyncio.get_running_loop().time() * NS)
+
+    monkeypatch.setattr(cocoro.clock, "time", Time)
+
+
+def step_system_clock(seconds: float) -> None:
+    cocoro.clock.time.offset_ns += round(seconds * NS)  # type: ignore[attr-defined]
+
+
+def loop_s() -> float:
+    return asyncio.get_running_loop().time()
+
+
+async def started(waiting: Coroutine[Any, Any, bool]) -> asyncio.Task[bool]:
+    """A task that has come to its first wait."""
+    task = asyncio.create_task(waiting)
+    for _ in range(5):
+        await asyncio.sleep(0)
+    return task
+
+
+# The virtual clock
+
+
+def test_the_virtual_clock_is_the_loop_s_time() -> None:
+    async def main() -> None:
+        clock = VirtualClock()
+        assert (clock.now_ns(), clock.epoch) == (0, 0)
+        assert await clock.sleep_until(1_500_000_000)
+        assert clock.now_ns() == 1_500_000_000
+        assert await sleep(clock, 0.25)
+        assert clock.now_ns() == 1_750_000_000
+
+    run_virtual(main())
+
+
+def test_virtual_deadlines_are_met_to_the_nanosecond() -> None:
+    async def main() -> None:
+        clock = VirtualClock()
+        for when_ns in (1, 2, 333_333_333, 333_333_334, 86_400 * NS + 1, 86_400 * NS + 2):
+            assert await clock.sleep_until(when_ns)
+            assert clock.now_ns() == when_ns
+
+    run_virtual(main())
+
+
+def test_two_virtual_sleepers_a_nanosecond_apart_wake_at_their_own_times() -> None:
+    async def main() -> None:
+        clock, woke = VirtualClock(), []
+
+        async def sleeper(when_ns: int) -> None:
+            await clock.sleep_until(when_ns)
+            woke.append(clock.now_ns())
+
+        await asyncio.gather(sleeper(NS + 1), sleeper(NS), sleeper(NS + 1))
+        assert woke == [NS, NS + 1, NS + 1]
+
+    run_virtual(main())
+
+
+def test_a_cancelled_virtual_sleep_leaves_no_timer() -> None:
+    async def main() -> None:
+        clock = VirtualClock()
+        task = await started(clock.sleep_until(1000 * NS))
+        task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await task
+        await asyncio.sleep(1.0)
+        assert clock.now_ns() == NS
+
+    run_virtual(main())
+
+
+@pytest.mark.usefixtures("real_time")
+@pytest.mark.parametrize("kind", [VirtualClock, RealClock, FollowedClock])
+def test_sleeping_until_the_past_gives_others_their_turn(kind: type[VirtualClock | RealClock | FollowedClock]) -> None:
+    async def main() -> None:
+        clock, turns = kind(), []
+        if isinstance(clock, FollowedClock):
+            clock.tick(5 * NS, 1)
+        asyncio.get_running_loop().call_soon(turns.append, "other")
+        assert await clock.sleep_until(0)
+        assert turns == ["other"]
+        assert loop_s() == 0.0
+
+    run_virtual(main())
+
+
+# The real clock
+
+
+@pytest.mark.usefixtures("real_time")
+def test_the_real_clock_sleeps_until_its_time() -> None:
+    async def main() -> None:
+        clock = RealClock()
+        assert clock.now_ns() == 100 * NS
+        assert await clock.sleep_until(103 * NS + 500)
+        assert clock.now_ns() == 103 * NS + 500
+        assert clock.epoch == 0
+
+    run_virtual(main())
+
+
+@pytest.mark.usefixtures("real_time")
+def test_a_small_step_back_of_the_system_holds_the_real_clock_still() -> None:
+    async def main() -> None:
+        clock = RealClock()
+        before_ns = clock.now_ns()
+        step_system_clock(-0.2)
+        assert (clock.now_ns(), clock.epoch) == (before_ns, 0)
+        await asyncio.sleep(0.1)
+        assert (clock.now_ns(), clock.epoch) == (before_ns, 0)
+        await asyncio.sleep(0.3)
+        assert clock.now_ns() == before_ns + 200_000_000
+
+    run_virtual(main())
+
+
+@pytest.mark.usefixtures("real_time")
+def test_a_large_step_back_is_a_new_epoch_and_ends_waits() -> None:
+    async def main() -> None:
+        clock = RealClock()
+        waiting = await started(clock.sleep_until(clock.now_ns() + 10 * NS))
+        await asyncio.sleep(0.5)
+        step_system_clock(-3600.0)
+        assert not await waiting
+        assert loop_s() <= 1.0
+        assert clock.epoch == 1
+        assert clock.now_ns() < 100 * NS
+
+    run_virtual(main())
+
+
+@pytest.mark.usefixtures("real_time")
+def test_a_step_forward_is_noticed_within_a_second() -> None:
+    async def main() -> None:
+        clock = RealClock()
+        waiting = await started(clock.sleep_until(clock.now_ns() + 3600 * NS))
+        await asyncio.sleep(0.5)
+        step_system_clock(+3600.0)
+        assert await waiting
+        assert loop_s() <= 1.5
+        assert clock.epoch == 0
+
+    run_virtual(main())
+
+
+# The clock that follows the simulator's
+
+
+@pytest.mark.usefixtures("real_time")
+def test_a_followed_clock_starts_with_the_first_tick() -> None:
+    async def main() -> None:
+        clock = FollowedClock()
+        assert (clock.started, clock.now_ns(), clock.epoch) == (False, 0, 0)
+        waiting = asyncio.create_task(clock.wait_started())
+        await asyncio.sleep(1.0)
+        assert not waiting.done()
+        clock.tick(7 * NS, incarnation=3)
+        await waiting
+        assert (clock.started, clock.now_ns(), clock.epoch) == (True, 7 * NS, 0)
+
+    run_virtual(main())
+
+
+@pytest.mark.usefixtures("real_time")
+def test_between_ticks_it_runs_on_at_the_simulator_s_rate_and_then_stands() -> None:
+    async def main() -> None:
+        clock = FollowedClock(run_on_s=0.03)
+        clock.tick(1 * NS, 1, rate=0.5)
+        await asyncio.sleep(0.02)
+        assert clock.now_ns() == NS + 10_000_000
+        await asyncio.sleep(10.0)
+        assert clock.now_ns() == NS + 30_000_000
+
+    run_virtual(main())
+
+
+@pytest.mark.usefixtures("real_time")
+def test_a_followed_clock_never_goes_back_within_an_incarnation() -> None:
+    async def main() -> None:
+        clock, seen = FollowedClock(), []
+        for stamp_ms in (0, 8, 17, 20, 15, 33, 34, 34, 50):
+            clock.tick(stamp_ms * 1_000_000, 1)
+            seen.append(clock.now_ns())
+            await asyncio.sleep(0.02)
+            seen.append(clock.now_ns())
+        assert seen == sorted(seen)
+        assert clock.epoch == 0
+
+    run_virtual(main())
+
+
+@pytest.mark.usefixtures("real_time")
+def test_a_late_tick_is_ignored() -> None:
+    async def main() -> None:
+        clock = FollowedClock()
+        clock.tick(2 * NS, 1)
+        clock.tick(1 * NS, 1, rate=0.01)
+        await asyncio.sleep(0.01)
+        assert clock.now_ns() == 2 * NS + 10_000_000
+
+    run_virtual(main())
+
+
+@pytest.mark.usefixtures("real_time")
+def test_another_incarnation_is_a_new_epoch_wherever_its_time_stands() -> None:
+    async def main() -> None:
+        clock = FollowedClock()
+        clock.tick(50 * NS, 1)
+        await asyncio.sleep(0.01)
+        clock.tick(0, 2)
+        assert (clock.now_ns(), clock.epoch) == (0, 1)
+        clock.tick(90 * NS, 3)
+        assert (clock.now_ns(), clock.epoch) == (90 * NS, 2)
+        clock.tick(91 * NS, 3)
+        assert clock.epoch == 2
+
+    run_virtual(main())
+
+
+@pytest.mark.usefixtures("real_time")
+def test_sleeping_follows_the_simulator_however_slow_it_is() -> None:
+    async def main() -> None:
+        clock = FollowedClock()
+        clock.tick(0, 1, rate=0.1)
+        waiting = await started(clock.sleep_until(1 * NS))
+        for tick in range(1, 121):
+            await asyncio.sleep(10 / 120)
+            clock.tick(tick * NS // 120, 1, rate=0.1)
+        assert await waiting
+        assert loop_s() == pytest.approx(10.0, abs=0.1)
+        assert clock.now_ns() >= NS
+
+    run_virtual(main())
+
+
+@pytest.mark.usefixtures("real_time")
+def test_a_sleep_does_not_end_while_the_simulator_stands() -> None:
+    async def main() -> None:
+        clock = FollowedClock()
+        clock.tick(0, 1)
+        waiting = await started(clock.sleep_until(40_000_000))
+        await asyncio.sleep(3600.0)
+        assert not waiting.done()
+        clock.tick(20_000_000, 1)
+        assert await waiting
+        assert clock.now_ns() >= 40_000_000
+
+    run_virtual(main())
+
+
+@pytest.mark.usefixtures("real_time")
+def test_a_short_sleep_ends_between_ticks() -> None:
+    async def main() -> None:
+        clock = FollowedClock()
+        clock.tick(0, 1)
+        assert await clock.sleep_until(5_000_000)
+        assert loop_s() == pytest.approx(0.005)
+
+    run_virtual(main())
+
+
+@pytest.mark.usefixtures("real_time")
+def test_a_tick_that_says_time_is_faster_ends_a_sleep_early() -> None:
+    async def main() -> None:
+        clock = FollowedClock()
+        clock.tick(0, 1, rate=0.01)
+        waiting = await started(clock.sleep_until(20_000_000))
+        await asyncio.sleep(0.1)
+        clock.tick(25_000_000, 1, rate=1.0)
+        assert await waiting
+        assert loop_s() == pytest.approx(0.1)
+
+    run_virtual(main())
+
+
+@pytest.mark.usefixtures("real_time")
+@pytest.mark.parametrize("deadline_ns", [10_000_000, 500_000_000])
+def test_a_new_epoch_ends_a_sleep_and_says_so(deadline_ns: int) -> None:
+    async def main() -> None:
+        clock = FollowedClock()
+        clock.tick(0, 1)
+        waiting = await started(clock.sleep_until(deadline_ns))
+        clock.tick(0, 2)
+        assert not await waiting
+
+    run_virtual(main())
