@@ -17,6 +17,8 @@ from cocoro.rundir import RunDir
 
 SAID_WHY = (MISCONFIGURED, REFUSED)
 """Exit codes with which a process's last line says it all."""
+LAST_BYTES = 8192
+"""As much of a log's end is looked at for its last words."""
 ENVIRONMENT = {
     # The matrices here are small: more threads would only take each other's processors, and jitter.
     **dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"),
@@ -45,6 +47,7 @@ class Child:
         self._alive: set[str] = set()
         self._ready = asyncio.Event()
         self._was_ready = False
+        self._silent = False
         self._process: subprocess.Popen[bytes] | None = None
         self._exit: asyncio.Future[int] = asyncio.get_running_loop().create_future()
         self._started_s = 0.0
@@ -116,11 +119,9 @@ class Child:
             self._ready.set()
         else:
             self._ready.clear()
-        if self._was_ready and self.pid is not None and not self._stopping:
-            if ready:
-                self._tell(f"{self.row.name} is back")
-            elif not alive:
-                self._tell(f"{self.row.name} is silent: no sign of {service}")
+        if self._was_ready and self.pid is not None and not self._stopping and ready == self._silent:
+            self._silent = not ready
+            self._tell(f"{self.row.name} is back" if ready else f"{self.row.name} is silent: no sign of {service}")
 
     # --- the process ------------------------------------------------------------------------------
 
@@ -167,14 +168,16 @@ class Child:
         return self._ready.is_set() and not self._exit.done()
 
     def _say_ready(self) -> None:
-        self._was_ready = True
+        self._was_ready, self._silent = True, False
         services = "" if self.row.services == (self.row.name,) else f" ({', '.join(self.row.services)})"
         self._tell(f"{self.row.name}{services} ready in {time.monotonic() - self._started_s:.1f} s")
 
     def _last_words(self, code: int | None = None) -> str:
         """The end of its log, to be put after a sentence: of a mistake the line that tells it, else a few."""
         log = self._run_dir.log(self.row.name)
-        lines = [line for line in log.read_text(errors="replace").splitlines() if line.strip()]
+        with log.open("rb") as file:
+            file.seek(max(file.seek(0, os.SEEK_END) - LAST_BYTES, 0))
+            lines = [line for line in file.read().decode(errors="replace").splitlines() if line.strip()]
         if code in SAID_WHY and lines:
             return f": {lines[-1].partition(f'{self.row.name}: ')[2] or lines[-1]}"
         return "".join(f"\n    {line}" for line in (f"{log}:", *lines[-3:]))
@@ -182,5 +185,5 @@ class Child:
 
 def _ended(code: int) -> str:
     if code < 0:
-        return f"was killed by {signal.Signals(-code).name}"
+        return f"was killed by {signal.Signals(-code).name if -code in set(signal.Signals) else f'signal {-code}'}"
     return f"ended (exit code {code})"

@@ -5,11 +5,9 @@ from __future__ import annotations
 import asyncio
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
-
-from cocoro.cli import exits
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -44,14 +42,13 @@ Timeout = Annotated[float | None, typer.Option(min=0.1, max=3600.0, metavar="SEC
 # --- tasks ----------------------------------------------------------------------------------------
 
 
-def _task(
-    task: str, label: str, robot: str | None, profile: str | None, timeout: float | None, as_json: bool,
-    snapshot: Path | None = None,
-) -> None:  # fmt: skip
+def _task(where: tuple[str | None, str | None], as_json: bool, snapshot: Path | None = None, **request: Any) -> None:
+    """`request`: the fields of a TaskRequest."""
     from cocoro.cli import tasks
     from cocoro.cli.link import Where
+    from cocoro.messages import TaskRequest
 
-    sys.exit(asyncio.run(tasks.run(Where(robot, profile), task, label, timeout, as_json, snapshot)))
+    sys.exit(asyncio.run(tasks.run(Where(*where), TaskRequest(**request), as_json, snapshot)))
 
 
 @app.command(rich_help_panel=TASKS)
@@ -66,19 +63,19 @@ def fetch(
     json: Json = False,
 ) -> None:
     """Find an object, drive there, grasp it and lift it. Ctrl-C cancels it on the robot."""
-    _task("fetch", label, robot, profile, timeout, json, snapshot)
+    _task((robot, profile), json, snapshot, task="fetch", label=label, timeout_s=timeout)
 
 
 @app.command(rich_help_panel=TASKS)
 def park(timeout: Timeout = None, robot: Robot = None, profile: Reach = None, json: Json = False) -> None:
     """Fold the arm. Ctrl-C cancels it on the robot."""
-    _task("park", "", robot, profile, timeout, json)
+    _task((robot, profile), json, task="park", timeout_s=timeout)
 
 
 @app.command("put-down", rich_help_panel=TASKS)
 def put_down(timeout: Timeout = None, robot: Robot = None, profile: Reach = None, json: Json = False) -> None:
     """Set down what the hand holds. Ctrl-C cancels it on the robot."""
-    _task("put-down", "", robot, profile, timeout, json)
+    _task((robot, profile), json, task="put-down", timeout_s=timeout)
 
 
 @app.command(rich_help_panel=TASKS)
@@ -234,6 +231,3 @@ def reset(robot: Robot = None, profile: Reach = None) -> None:
     from cocoro.cli.link import Where
 
     sys.exit(asyncio.run(releasing.reset(Where(robot, profile))))
-
-
-__all__ = ["app", "exits"]

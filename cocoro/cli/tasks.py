@@ -9,7 +9,6 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import cast
 
 import msgspec
 
@@ -18,7 +17,7 @@ from cocoro.cli.link import Link, Where, joined
 from cocoro.cli.progress import View, view
 from cocoro.cli.snapshot import Snapshot, check
 from cocoro.errors import CallTimeoutError, CocoroError
-from cocoro.messages import CancelRequest, TaskName, TaskReply, TaskRequest, TaskState
+from cocoro.messages import CancelRequest, TaskReply, TaskRequest, TaskState
 from cocoro.topics import CANCEL, LATCH, RUN, TASK
 
 USAGE_REFUSALS = ("unknown_label", "not_graspable", "bad_request")
@@ -33,11 +32,10 @@ CANCEL_S = 10.0
 """How long a cancelled task may take to say its outcome."""
 
 
-async def run(where: Where, task: str, label: str, timeout_s: float | None, as_json: bool, picture: Path | None) -> int:
-    """Run a task to its outcome and return the exit code."""
+async def run(where: Where, request: TaskRequest, as_json: bool, picture: Path | None) -> int:
+    """Run a task to its outcome and return the exit code. `picture`: where to write what is seen at the grasp."""
     if picture is not None:
         check(picture)
-    request = TaskRequest(task=cast(TaskName, task), label=label, timeout_s=timeout_s)
     async with joined(where) as link:
         follower = Follower(link, request, view(as_json), picture)
         with _interrupts(follower.interrupt):
@@ -79,9 +77,8 @@ class Follower:
 
     async def run(self) -> tuple[int, dict[str, object]]:
         """The exit code, and the result as data."""
-        self._link.inbox(TASK).add(
-            lambda _key, state: self._news.put_nowait(state)
-        )  # before the call: nothing is missed
+        news = self._link.inbox(TASK)  # before the call, so that nothing is missed
+        news.add(lambda _key, state: self._news.put_nowait(state))
         alive = self._link.watch_alive("executive", lambda alive: None if alive else self._news.put_nowait(None))
         reply = await self._ask()
         if not reply.accepted:
