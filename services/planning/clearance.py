@@ -6,6 +6,7 @@ The arm's hull is a chain of balls along its links; distances are to their surfa
 from __future__ import annotations
 
 from collections.abc import Mapping
+from math import cos, radians, sin
 
 import numpy as np
 
@@ -18,15 +19,19 @@ _TUBES = (
     ("wrist_pitch", "wrist_roll", 0.025, 2),
     ("wrist_roll", "gripper", 0.030, 5),
 )
-_TIPS = ("claw_left", "claw_right")
-_TIP_M = 0.085
-_TIP_RADIUS_M = 0.015
+_FINGER_TURN_RAD = {"claw_left": radians(80.0), "claw_right": radians(-80.0)}
+"""From the claw's x axis to its finger (Tekkotsu Calliope5KP.kin)."""
+_FINGER_M = 0.11
+_FINGER_RADIUS_M = 0.02
 
 
 class Clearance:
     def __init__(self, robot: Robot) -> None:
         self._chains = {name: robot.chain(name) for name in {t[0] for t in _TUBES} | {t[1] for t in _TUBES}}
-        self._tips = [robot.chain(name) for name in _TIPS]
+        # A finger lies across its claw's own x axis, towards the hand's tip.
+        self._tips = [
+            (robot.chain(name), np.array([cos(turn), sin(turn), 0.0])) for name, turn in _FINGER_TURN_RAD.items()
+        ]
         self._mount_min = np.array(robot.kinect.mount_min_m)
         self._mount_max = np.array(robot.kinect.mount_max_m)
         self._chassis_radius_m = robot.base.chassis_diameter_m / 2
@@ -34,7 +39,7 @@ class Clearance:
 
     def hull(self, angles: Mapping[str, float]) -> tuple[Array, Array]:
         """Centres (n, 3) in the body frame and radii (n,) of the arm's balls. The claws' angles may be left out."""
-        angles = dict.fromkeys(_TIPS, 0.0) | dict(angles)
+        angles = dict.fromkeys(_FINGER_TURN_RAD, 0.0) | dict(angles)
         places = {name: chain.position(angles) for name, chain in self._chains.items()}
         centres: list[Array] = []
         radii: list[float] = []
@@ -42,14 +47,12 @@ class Clearance:
             for share in np.linspace(0.0, 1.0, count):
                 centres.append((1 - share) * places[start] + share * places[end])
                 radii.append(radius_m)
-        for chain in self._tips:
+        for chain, turn in self._tips:
             pose = chain.pose(angles)
-            # The finger lies across the claw's own x axis, towards the hand's tip.
-            centres.append(pose[:3, 3])
-            radii.append(0.022)
-        hand = self._chains["gripper"].pose(angles)
-        centres.append(hand[:3, 3] + hand[:3, 2] * (_TIP_M - 0.03))
-        radii.append(_TIP_RADIUS_M)
+            along = pose[:3, :3] @ turn
+            for reach_m in (0.0, 0.5 * _FINGER_M, _FINGER_M):
+                centres.append(pose[:3, 3] + reach_m * along)
+                radii.append(_FINGER_RADIUS_M)
         return np.array(centres), np.array(radii)
 
     def of(self, angles: Mapping[str, float]) -> float:

@@ -40,8 +40,8 @@ class PlanningCore:
 
     reads: Mapping[Topic, Take] = {  # type: ignore[type-arg]
         topics.BASE_STATE: "all",
-        topics.ARM_STATE: "latest",
-        topics.HAND_STATE: "latest",
+        topics.ARM_STATE: "all",
+        topics.HAND_STATE: "all",
         topics.DETECTIONS: "all",
         topics.OBSTACLES: "all",
         topics.INTENT: "latest",
@@ -67,15 +67,14 @@ class PlanningCore:
         hand = self._senses.hand
         assert hand is not None
         self._limbs.grip.feel(hand, now_ns)
-        self._senses.look_around(now_ns, self._own_hull())
+        self._senses.look_around(now_ns, self._own_hull)
         scene = Scene(now_ns, dt_s, self._senses, body, self._senses.angles(), self._limbs)
         plan = self._plan(scene)
         status = self._status(plan, scene)
         return [*self._commands(plan, scene), Output(topics.PLAN, status)]
 
-    def _own_hull(self) -> tuple[Array, Array]:
-        """Where the robot itself, and what it holds, is in its own view."""
-        angles = self._senses.angles()
+    def _own_hull(self, angles: Mapping[str, float]) -> tuple[Array, Array]:
+        """Where the robot itself, and what it holds, is in its own view in a posture."""
         centres, radii = self._limbs.arm.clearance.hull(angles)
         held = self._limbs.reacher.position(angles)
         return np.vstack([centres, held]), np.append(radii + 0.03, 0.09)

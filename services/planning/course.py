@@ -117,7 +117,9 @@ class Course:
     ) -> None:
         x, y, _ = body.inverse().apply((*target_m, 0.0))
         preview = [body.compose(pose) for pose in driver.preview((x, y), self._aim_m)]
-        if self._free(preview, fields, self._config.clearance_m, arm_from_m=self._stretch_m):
+        # Once on the last stretch, with the hand out, it takes more to turn back than it took to start.
+        share = 0.5 if self._last_stretch else 1.0
+        if self._free(preview, fields, share, arm_from_m=self._stretch_m):
             self._detour = None
             self._last_stretch = True
             return
@@ -126,19 +128,20 @@ class Course:
             return
         self._detour = self._around(target_m, body, around, fields)
 
-    def _free(self, poses: list[Pose2], fields: Fields, margin_m: float, arm_from_m: float) -> bool:
-        """Whether body and, over the last `arm_from_m`, the hand pass all poses with a margin."""
+    def _free(self, poses: list[Pose2], fields: Fields, share: float, arm_from_m: float) -> bool:
+        """Whether body and, over the last `arm_from_m`, the hand pass all poses with that share of their margins."""
         centres = np.array([[pose.x_m, pose.y_m] for pose in poses])
         clearance = fields.body.at(centres) - self._body_m
         # From where it stands the robot may leave, however near something is.
         leaving = np.hypot(*(centres - centres[0]).T) < 0.10
-        if (clearance[~leaving] < margin_m).any():
+        if (clearance[~leaving] < share * self._config.clearance_m).any():
             return False
         end = centres[-1]
         for pose in poses[::3] + poses[-1:]:
             near_end = hypot(pose.x_m - end[0], pose.y_m - end[1]) <= arm_from_m
             hand_out = len(self._arm) and (near_end or self._arm_out)
-            if hand_out and (fields.body.at(placed(self._arm, pose)) < self._config.hand_half_width_m).any():
+            half_m = self._config.hand_half_width_m * (0.4 + 0.6 * share)
+            if hand_out and (fields.body.at(placed(self._arm, pose)) < half_m).any():
                 return False
         return True
 

@@ -22,7 +22,7 @@ Cells = NDArray[np.bool_]
 CELL_M = 0.05
 SIZE = 160
 """Cells along each side: 8 m."""
-_HIT, _FREE, _MOST, _LEAST, _OCCUPIED = 3, 1, 9, -4, 3
+_HIT, _FREE, _MOST, _LEAST, _OCCUPIED = 2, 1, 8, -4, 4
 _EDGE_CELLS = 40
 """Nearer to the edge than this, the map moves along with the robot."""
 

@@ -34,6 +34,7 @@ class Senses:
         self.unlocalised: dict[str, tuple[int, str]] = {}
         """Per label the stamp and the note of its newest detection without a position."""
         self._odometry = History(3, angular=(2,))
+        self._postures: dict[str, tuple[tuple[str, ...], History]] = {}
         self._gap_ns = round(config.odometry_gap_s * NS)
         self.around = Surroundings()
         self._waiting: deque[Detections] = deque(maxlen=8)
@@ -55,6 +56,7 @@ class Senses:
                 self._floors.clear()
                 self._waiting.clear()
         elif isinstance(message, ServoState):
+            self._keep_posture(topic.name, message)
             if topic.name == topics.ARM_STATE.name:
                 self.arm = message
             else:
@@ -70,6 +72,22 @@ class Senses:
         elif isinstance(message, Intent):
             self.intent = message
 
+    def _keep_posture(self, network: str, state: ServoState) -> None:
+        joints, history = self._postures.get(network, ((), None))
+        if history is None or joints != state.joints:
+            history = History(len(state.joints), capacity=64)
+            self._postures[network] = state.joints, history
+        history.add(state.stamp_ns, state.position_rad, state.incarnation)
+
+    def posture(self, stamp_ns: int) -> dict[str, float]:
+        """Every joint's angle at a time; where that time is not held, the newest."""
+        angles = dict(self.angles())
+        for joints, history in self._postures.values():
+            then = history.at(stamp_ns, self._gap_ns)
+            if then is not None:
+                angles.update(zip(joints, then.tolist(), strict=True))
+        return angles
+
     def localise(self, now_ns: int) -> None:
         """Enter the detections whose odometry is known; the others wait, briefly."""
         for _ in range(len(self._waiting)):
@@ -80,8 +98,8 @@ class Senses:
             elif now_ns - detections.stamp_ns < _WAIT_FOR_ODOMETRY_NS:
                 self._waiting.append(detections)
 
-    def look_around(self, now_ns: int, own: tuple[Array, Array]) -> None:
-        """Enter what was seen of the floor where its odometry is known; `own` is the robot's own hull now."""
+    def look_around(self, now_ns: int, own: Callable[[Mapping[str, float]], tuple[Array, Array]]) -> None:
+        """Enter what was seen of the floor where its odometry is known; `own` gives the robot's hull in a posture."""
         while self._floors:
             seen = self._floors[0]
             pose = self._odometry.at(seen.stamp_ns, self._gap_ns)
@@ -89,7 +107,7 @@ class Senses:
                 return
             self._floors.popleft()
             if pose is not None and now_ns - seen.stamp_ns <= topics.OBSTACLES.max_age_s * NS:
-                self.around.floor.enter(seen, Pose2(*pose.tolist()), own)
+                self.around.floor.enter(seen, Pose2(*pose.tolist()), own(self.posture(seen.stamp_ns)))
 
     def _remember(self, detections: Detections, body: Pose2) -> None:
         for detection in detections.detections:
