@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import fcntl
 import os
 import signal
 import subprocess
@@ -35,10 +36,6 @@ from pathlib import Path
 from cocoro.bus.endpoints import ZenohConfig
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.topics import Qos
-
-def left_in(directory: Path) -> list[str]:
-    return [path.name for path in directory.iterdir()]
-
 
 async def echo(key, payload):
     return NAME.encode()
@@ -189,6 +186,12 @@ def test_a_directory_that_others_may_write_to_is_refused(directory: Path) -> Non
         Membership.register(directory, "x")
 
 
+def test_a_directory_that_others_may_replace_is_refused(directory: Path) -> None:
+    directory.parent.chmod(0o777)
+    with pytest.raises(ConfigError, match="only this user can write to or replace"):
+        Membership.register(directory, "x")
+
+
 def test_a_directory_that_cannot_be_made_is_refused(directory: Path) -> None:
     directory.write_text("a file")
     with pytest.raises(ConfigError, match="choose another run directory"):
@@ -219,6 +222,33 @@ def test_the_default_mesh_is_a_directory_for_each_robot(monkeypatch: pytest.Monk
     assert default_run_dir() == Path("/run/user/7/cocoro")
     monkeypatch.delenv("XDG_RUNTIME_DIR")
     assert default_run_dir().name == f"cocoro-{os.getuid()}"
+
+
+@pytest.mark.parametrize("robot", ["", "a/b", "*", "..", "a b", "@a", "-a"])
+def test_a_robot_s_name_must_do_as_path_and_key(robot: str, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="robot name"):
+        default(robot, "base", tmp_path)
+
+
+def test_a_fork_does_not_take_its_parent_out_of_the_mesh(directory: Path) -> None:
+    script = """
+import atexit, os
+async def main():
+    bus = await join()
+    if os.fork() == 0:
+        atexit._run_exitfuncs()
+        os._exit(0)
+    os.wait()
+    from cocoro.bus.members import members
+    say(*(member.name for member in members(Path(sys.argv[1]))))
+    assert len(await bus.alive("@cocoro/member/*")) == 1
+    await bus.close()
+asyncio.run(main())
+"""
+    run = subprocess.run(
+        [sys.executable, "-c", CHILD + script, str(directory), "parent"], stdout=subprocess.PIPE, timeout=PATIENCE_S
+    )
+    assert (run.returncode, run.stdout.strip()) == (0, b"parent")
 
 
 # Joining
@@ -292,6 +322,30 @@ async def test_joining_that_is_cancelled_leaves_nothing_behind(directory: Path) 
         with pytest.raises(asyncio.CancelledError):
             await joining
         assert [member.name for member in members(directory)] == ["stuck"]
+
+
+@scenario
+async def test_a_member_that_leaves_meanwhile_is_not_waited_for(
+    directory: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    leaver = Membership.register(directory, "leaver")
+    joining = asyncio.create_task(ZenohBus.open(local(directory, patience_s=10 * PATIENCE_S)))
+    while len(members(directory)) < 2:
+        await asyncio.wait({joining}, timeout=0.01)
+    leaver.leave()
+    async with await joining:
+        assert [member.name for member in members(directory)] == ["test"]
+        assert "no answer" not in caplog.text
+
+
+@scenario
+async def test_who_cannot_have_the_register_s_lock_joins_all_the_same(directory: Path) -> None:
+    async with await ZenohBus.open(local(directory, "first")) as first:
+        first.serve("robot/first/who", echo)
+        with (directory / "lock").open() as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            async with await ZenohBus.open(local(directory, "second"), expect_mesh=True) as second:
+                assert await second.call("robot/*/who", b"?", PATIENCE_S) == [("robot/first/who", True, b"?")]
 
 
 @scenario

