@@ -13,9 +13,19 @@ was recorded of it.
 """
 
 from cocoro.testing.again import Executed, execute_again
+from cocoro.testing.clock import JumpingClock
 from cocoro.testing.core import CoreUnderTest
 from cocoro.testing.service import ServiceUnderTest
 from cocoro.testing.tap import Tap
 from cocoro.testing.virtual import in_virtual_time, settle
 
-__all__ = ["CoreUnderTest", "Executed", "ServiceUnderTest", "Tap", "execute_again", "in_virtual_time", "settle"]
+__all__ = [
+    "CoreUnderTest",
+    "Executed",
+    "JumpingClock",
+    "ServiceUnderTest",
+    "Tap",
+    "execute_again",
+    "in_virtual_time",
+    "settle",
+]

@@ -1,0 +1,114 @@
+"""Any message of any type, for property-based tests: as plain data, the way it travels."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import msgspec
+from hypothesis import strategies as st
+from msgspec import inspect
+
+from cocoro.messages import LARGEST, Frame, Message, ServoCommand, ServoState
+from cocoro.topics import REQUESTS, TOPICS
+
+MESSAGES: tuple[type[Message], ...] = tuple(dict.fromkeys(topic.type for topic in TOPICS))
+QUESTIONS = tuple(dict.fromkeys(kind for request in REQUESTS for kind in (request.request, request.reply)))
+
+Data = dict[str, Any]
+Path = tuple[str | int, ...]
+
+
+def data_of(kind: type[msgspec.Struct]) -> st.SearchStrategy[Data]:
+    """Plain data that is a good message of that type."""
+    fields = _fields(inspect.type_info(kind))
+    if issubclass(kind, Frame):
+        return st.builds(_frame, fields, st.integers(1, 4), st.integers(1, 4))
+    if issubclass(kind, ServoState | ServoCommand):
+        return st.builds(_servos, st.just(kind), fields, st.integers(0, 9))
+    return fields
+
+
+def numbers_in(data: Any, path: Path = ()) -> Iterator[Path]:
+    """Where the floating point numbers are."""
+    if isinstance(data, float):
+        yield path
+    for key, value in _children(data):
+        yield from numbers_in(value, (*path, key))
+
+
+def leaves_in(data: Any, path: Path = ()) -> Iterator[Path]:
+    """Where everything is that is no map and no list."""
+    children = list(_children(data))
+    if path and not children:
+        yield path
+    for key, value in children:
+        yield from leaves_in(value, (*path, key))
+
+
+def replaced(data: Any, path: Path, value: Any) -> Any:
+    """The same with another value at one place."""
+    if not path:
+        return value
+    if isinstance(data, dict):
+        return data | {path[0]: replaced(data[path[0]], path[1:], value)}
+    index = path[0]
+    assert isinstance(index, int)
+    return [*data[:index], replaced(data[index], path[1:], value), *data[index + 1 :]]
+
+
+def _children(data: Any) -> list[tuple[str | int, Any]]:
+    if isinstance(data, dict):
+        return list(data.items())
+    return list(enumerate(data)) if isinstance(data, list) else []
+
+
+def _frame(fields: Data, width: int, height: int) -> Data:
+    pixels = width * height
+    return fields | {"width": width, "height": height, "colour": bytes(3 * pixels), "depth": bytes(2 * pixels)}
+
+
+def _servos(kind: type[Message], fields: Data, joints: int) -> Data:
+    """As many values as joints."""
+    per_joint = ("goal_rad", "speed_radps") if kind is ServoCommand else ("position_rad", "speed_radps", "load")
+    names = {"joints": [f"joint_{number}" for number in range(joints)]}
+    return fields | names | {name: [(fields[name] or [0.5])[0]] * joints for name in per_joint}
+
+
+def _fields(kind: inspect.Type) -> st.SearchStrategy[Any]:
+    match kind:
+        case inspect.StructType(fields=fields):
+            required = {field.encode_name: _fields(field.type) for field in fields if field.required}
+            optional = {field.encode_name: _fields(field.type) for field in fields if not field.required}
+            own = {name: optional.pop(name) for name in ("stamp_ns", "seq", "incarnation") if name in optional}
+            return st.fixed_dictionaries(required | own, optional=optional)
+        case inspect.FloatType():
+            low = (
+                -LARGEST if kind.ge is None and kind.gt is None else max(v for v in (kind.ge, kind.gt) if v is not None)
+            )
+            high = kind.le if kind.le is not None else LARGEST
+            return st.floats(low, high, exclude_min=kind.gt is not None)
+        case inspect.IntType():
+            low_int = 0 if kind.ge is not None and kind.ge >= 0 else -(2**63)
+            return st.integers(max(low_int, kind.ge or low_int), kind.le if kind.le is not None else 2**63 - 1)
+        case inspect.StrType():
+            return st.text(max_size=12)
+        case inspect.BoolType():
+            return st.booleans()
+        case inspect.NoneType():
+            return st.none()
+        case inspect.LiteralType(values=values):
+            return st.sampled_from(values)
+        case inspect.BytesType() | inspect.MemoryViewType():
+            return st.binary(max_size=8)
+        case inspect.AnyType():
+            return st.none() | st.text(max_size=4) | st.integers(0, 9)
+        case inspect.UnionType(types=types):
+            return st.one_of(*map(_fields, types))
+        case inspect.TupleType(item_types=types):
+            return st.tuples(*map(_fields, types)).map(list)
+        case inspect.VarTupleType(item_type=item) | inspect.ListType(item_type=item):
+            return st.lists(_fields(item), max_size=3)
+        case inspect.DictType(key_type=key, value_type=value):
+            return st.dictionaries(_fields(key), _fields(value), max_size=3)
+    raise NotImplementedError(f"no samples of {kind}")
