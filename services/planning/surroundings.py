@@ -18,7 +18,7 @@ _KEEP_NS = NS // 10
 _OBJECT_M = 0.033
 """Radius at which a known object counts as standing in the way: the cans'."""
 _SMEAR_M = 0.09
-"""The map shows a known object up to so much wider than it is: cells, depth noise, and odometry that drifts meanwhile."""
+"""The map shows a known object up to so much wider than it is: cells, depth noise, odometry that drifts."""
 
 
 class Fields(NamedTuple):
