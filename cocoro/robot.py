@@ -87,6 +87,10 @@ class Joint(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     direction: Literal[-1, 1] = 1
     centre_count: float = (SERVO_COUNTS - 1) / 2
 
+    def __post_init__(self) -> None:
+        if not self.limits_deg[0] < self.limits_deg[1]:
+            raise ValueError(f"joint {self.name}: limits_deg must rise, not {self.limits_deg}")
+
     @property
     def limits_rad(self) -> tuple[float, float]:
         return radians(self.limits_deg[0]), radians(self.limits_deg[1])
@@ -122,6 +126,28 @@ class _File(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     joint: list[Joint]
     claw: Claw
     pose: dict[str, dict[str, float]]
+
+    def __post_init__(self) -> None:
+        """Names must mean something: a link's parent and joint, and whatever else refers to one of them."""
+        parents = {row.name: row.parent for row in self.link}
+        joints = {joint.name for joint in self.joint}
+        for row in self.link:
+            above, passed = row.parent, {row.name}
+            while above != "body":
+                if above not in parents:
+                    raise ValueError(f"link {row.name}: there is no link {above!r} to stand on")
+                if above in passed:
+                    raise ValueError(f"link {row.name}: its parents go in a circle at {above!r}")
+                passed.add(above)
+                above = parents[above]
+            if row.joint is not None and row.joint not in joints:
+                raise ValueError(f"link {row.name}: there is no joint {row.joint!r}")
+        if self.marker.link not in parents:
+            raise ValueError(f"marker: there is no link {self.marker.link!r}")
+        poses = [(f"pose {name}", set(angles)) for name, angles in self.pose.items()]
+        for where, named in [*poses, ("claw", set(self.claw.open_sign))]:
+            if unknown := sorted(named - joints):
+                raise ValueError(f"{where}: there is no joint {unknown[0]!r}")
 
 
 @dataclass(frozen=True)
@@ -185,15 +211,15 @@ class Robot:
         `override` is a robot's own file with just the values that were measured on that robot; tables are
         merged, and `[[link]]` and `[[joint]]` rows by their name. Raises ConfigError naming file and field.
         """
-        text = path.read_text() if path else resources.files("cocoro").joinpath("calliope.toml").read_text()
-        where = str(path) if path else "calliope.toml"
+        file = path or resources.files("cocoro").joinpath("calliope.toml")
+        where = str(path or "calliope.toml")
         try:
-            data = tomllib.loads(text)
+            data = tomllib.loads(file.read_text(encoding="utf-8"))
             if override is not None:
                 where = str(override)
-                _merge(data, tomllib.loads(override.read_text()))
+                _merge(data, tomllib.loads(override.read_text(encoding="utf-8")))
             return cls(msgspec.convert(data, _File))
-        except (tomllib.TOMLDecodeError, msgspec.ValidationError, OSError) as error:
+        except (ValueError, OSError) as error:  # not UTF-8, not TOML, not a description, not there
             raise ConfigError(f"robot description {where}: {error}") from error
 
     @classmethod

@@ -1,0 +1,169 @@
+"""The robot's description, and the errors that a file of one's own can have."""
+
+from __future__ import annotations
+
+from importlib import resources
+from math import radians, tan
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cocoro.errors import ConfigError
+from cocoro.robot import SERVO_COUNT_RAD, Camera, Robot
+
+ROBOT = Robot.load()
+TEXT = resources.files("cocoro").joinpath("calliope.toml").read_text()
+
+
+def test_it_has_the_papers_eleven_degrees_of_freedom() -> None:
+    assert ROBOT.network_joints("arm") == ("neck_pan", "neck_tilt", "arm_base", "shoulder", "elbow", "wrist_pitch")
+    assert ROBOT.network_joints("hand") == ("wrist_roll", "claw_left", "claw_right")
+    assert len(ROBOT.joints) + 2 == 11
+
+
+def test_the_park_pose_is_within_the_limits() -> None:
+    for name, angle_rad in ROBOT.poses["park"].items():
+        low, high = ROBOT.joints[name].limits_rad
+        assert low <= angle_rad <= high
+
+
+# --- servos ---------------------------------------------------------------------------------------
+
+joints = pytest.mark.parametrize("name", ROBOT.joints)
+
+
+@joints
+def test_the_middle_of_a_servos_range_is_zero_and_its_ends_are_150_degrees(name: str) -> None:
+    joint = ROBOT.joints[name]
+    assert joint.to_angle((1024 - 1) / 2) == 0.0
+    assert [joint.to_angle(0), joint.to_angle(1023)] == pytest.approx([-radians(150), radians(150)])
+
+
+@joints
+@given(count=st.integers(0, 1023))
+def test_a_servo_position_comes_back_as_it_was(name: str, count: int) -> None:
+    joint = ROBOT.joints[name]
+    assert joint.to_count(joint.to_angle(count)) == count
+
+
+@joints
+@given(angle_rad=st.floats(-10, 10))
+def test_a_goal_is_met_to_half_a_count_or_to_the_range_s_end(name: str, angle_rad: float) -> None:
+    joint = ROBOT.joints[name]
+    goal_rad = min(max(angle_rad, -radians(150)), radians(150))
+    assert abs(joint.to_angle(joint.to_count(angle_rad)) - goal_rad) <= SERVO_COUNT_RAD / 2 + 1e-12
+
+
+# --- camera ---------------------------------------------------------------------------------------
+
+
+def test_the_camera_has_the_papers_field_of_view() -> None:
+    camera = ROBOT.camera
+    assert (camera.fx, camera.fy) == pytest.approx((585.8, 609.7), abs=0.05)
+    left, right = camera.ray(-0.5, camera.cy), camera.ray(camera.width - 0.5, camera.cy)
+    assert [left[0], right[0]] == pytest.approx([-tan(0.5), tan(0.5)])
+    assert camera.ray(camera.cx, -0.5)[1] == pytest.approx(-tan(0.375))
+
+
+@given(width=st.sampled_from([160, 320, 1280]), share=st.floats(0, 1), down=st.floats(0, 1))
+def test_at_another_size_the_same_share_of_the_image_is_the_same_ray(width: int, share: float, down: float) -> None:
+    def ray(camera: Camera) -> list[float]:
+        return camera.ray(share * camera.width - 0.5, down * camera.height - 0.5).tolist()
+
+    assert ray(ROBOT.camera.scaled(width, width * 3 // 4)) == pytest.approx(ray(ROBOT.camera))
+
+
+# --- depth ----------------------------------------------------------------------------------------
+
+
+@given(depth_m=st.floats(0.5, 3.5))
+def test_a_depth_comes_back_within_a_step_of_the_code(depth_m: float) -> None:
+    code = ROBOT.depth_code(np.array([depth_m]))
+    here, beside = ROBOT.depth_m(code), ROBOT.depth_m(code + np.uint16(1))
+    assert abs(float(here[0]) - depth_m) <= 0.51 * abs(float(beside[0] - here[0]))
+
+
+@given(code=st.integers(0, 2046))
+def test_a_code_comes_back_as_it_was(code: int) -> None:
+    depth = ROBOT.depth_m(np.array([code], dtype=np.uint16))
+    if ROBOT.kinect.min_range_m <= depth[0] <= ROBOT.kinect.max_range_m:
+        assert ROBOT.depth_code(depth.astype(float))[0] == code
+
+
+@pytest.mark.parametrize("depth_m", [0.0, 0.499, 3.501, 100.0, float("nan"), float("inf")])
+def test_what_the_kinect_cannot_measure_has_no_code(depth_m: float) -> None:
+    assert ROBOT.depth_code(np.array([depth_m]))[0] == 2047
+
+
+def test_no_code_is_no_depth() -> None:
+    assert np.isnan(ROBOT.depth_m(np.array([2047, 2048, 65535], dtype=np.uint16))).all()
+
+
+# --- a robot's own file ---------------------------------------------------------------------------
+
+
+def written(folder: Path, text: str) -> Path:
+    file = folder / "own.toml"
+    file.write_text(text)
+    return file
+
+
+def test_a_robots_own_file_changes_what_was_measured_and_nothing_else(tmp_path: Path) -> None:
+    own = written(tmp_path, '[base]\nwheel_separation_m = 0.258\n[[joint]]\nname = "elbow"\ncentre_count = 515.0\n')
+    robot = Robot.load(override=own)
+    assert robot.base.wheel_separation_m == 0.258
+    assert robot.base.wheel_radius_m == ROBOT.base.wheel_radius_m
+    assert robot.joints["elbow"].centre_count == 515.0
+    assert robot.joints["elbow"].limits_deg == ROBOT.joints["elbow"].limits_deg
+    assert list(robot.joints) == list(ROBOT.joints)
+    assert list(robot.links) == list(ROBOT.links)
+
+
+def test_a_description_comes_back_from_plain_data() -> None:
+    robot = Robot.from_data(ROBOT.with_base(command_timeout_s=9.0).to_data())
+    assert robot.base.command_timeout_s == 9.0
+    assert robot.joints == ROBOT.joints
+    assert robot.links == ROBOT.links
+
+
+def test_another_deadman_leaves_the_robot_itself_alone() -> None:
+    assert ROBOT.with_base(command_timeout_s=9.0).base.command_timeout_s == 9.0
+    assert ROBOT.base.command_timeout_s == 0.2
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("[base]\nwheel_separation_m = 'wide'\n", r"own\.toml.*\$\.base\.wheel_separation_m"),
+        ("[base]\nwheel_separation_m = -0.1\n", r"\$\.base\.wheel_separation_m"),
+        ("[base]\nwheels = 3\n", r"wheels"),
+        ("[base\n", r"own\.toml"),
+        ('[[joint]]\nname = "tail"\n', r"\$\.joint\[9\]"),
+        ('[[link]]\nname = "shoulder"\nparent = "nowhere"\n', r"shoulder.*nowhere"),
+        ('[[link]]\nname = "arm_base"\nparent = "gripper"\n', r"arm_base.*circle"),
+        ('[[link]]\nname = "elbow"\njoint = "knee"\n', r"elbow.*knee"),
+        ('[[joint]]\nname = "elbow"\nlimits_deg = [10.0, -10.0]\n', r"elbow.*limits"),
+        ('[marker]\nlink = "tail"\n', r"marker.*tail"),
+        ("[pose.park]\ntail = 1.0\n", r"park.*tail"),
+    ],
+)
+def test_a_mistake_is_named_with_its_file_and_field(tmp_path: Path, text: str, says: str) -> None:
+    with pytest.raises(ConfigError, match=f"(?s){says}"):
+        Robot.load(override=written(tmp_path, text))
+
+
+def test_a_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:
+    for missing in ({"path": tmp_path / "none.toml"}, {"override": tmp_path / "none.toml"}):
+        with pytest.raises(ConfigError, match=r"none\.toml"):
+            Robot.load(**missing)
+    unreadable = tmp_path / "binary.toml"
+    unreadable.write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(ConfigError, match=r"binary\.toml"):
+        Robot.load(unreadable)
+
+
+def test_a_whole_description_of_ones_own_is_read(tmp_path: Path) -> None:
+    assert Robot.load(written(tmp_path, TEXT.replace('name = "calliope"', 'name = "ada"', 1))).name == "ada"
