@@ -77,7 +77,9 @@ class PlanningCore:
         """Where the robot itself, and what it holds, is in its own view in a posture."""
         centres, radii = self._limbs.arm.clearance.hull(angles)
         held = self._limbs.reacher.position(angles)
-        return np.vstack([centres, held]), np.append(radii + 0.03, 0.09)
+        chassis = np.array([0.0, 0.0, 0.0])
+        own_m = self._limbs.robot.base.chassis_diameter_m / 2 + 0.03
+        return np.vstack([centres, held, chassis]), np.append(radii + 0.03, [0.09, own_m])
 
     def _elapsed(self, now_ns: int) -> float:
         last_ns, self._last_ns = self._last_ns, now_ns

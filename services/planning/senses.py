@@ -36,7 +36,7 @@ class Senses:
         self._odometry = History(3, angular=(2,))
         self._postures: dict[str, tuple[tuple[str, ...], History]] = {}
         self._gap_ns = round(config.odometry_gap_s * NS)
-        self.around = Surroundings()
+        self.around = Surroundings(config.marker)
         self._waiting: deque[Detections] = deque(maxlen=8)
         self._floors: deque[Obstacles] = deque(maxlen=4)
         self.sight_lag_s = 0.0

@@ -29,7 +29,9 @@ class Fields(NamedTuple):
 
 
 class Surroundings:
-    def __init__(self) -> None:
+    def __init__(self, marker: str) -> None:
+        """`marker`: the label of the ball on the robot's own hand."""
+        self._marker = marker
         self.floor = FloorMap()
         self._fields: Fields | None = None
         self._built: tuple[int, str] | None = None
@@ -51,7 +53,9 @@ class Surroundings:
         what = (self.floor.changes, label)
         stale = self._built is None or self._built[1] != label or now_ns - self._built_ns >= _KEEP_NS
         if self._fields is None or (stale and what != self._built):
-            discs = {item.label: (*item.odometry_position_m[:2], _OBJECT_M) for item in known}
+            discs = {
+                item.label: (*item.odometry_position_m[:2], _OBJECT_M) for item in known if item.label != self._marker
+            }
             seen = [(x, y, radius + _SMEAR_M) for x, y, radius in discs.values()]
             target = [(x, y, radius + _SMEAR_M) for name, (x, y, radius) in discs.items() if name == label]
             others = [disc for name, disc in discs.items() if name != label]
