@@ -70,7 +70,12 @@ def free_port() -> int:
 async def serve(way: Way, name: str) -> None:
     """Echo pings, answer calls, send frames when asked to; or just route. Until standard input ends."""
     ended = asyncio.Event()
-    asyncio.get_running_loop().add_reader(sys.stdin.fileno(), lambda: os.read(sys.stdin.fileno(), 1) or ended.set())
+
+    def end() -> None:
+        if not os.read(sys.stdin.fileno(), 1):
+            ended.set()
+
+    asyncio.get_running_loop().add_reader(sys.stdin.fileno(), end)
     async with await ZenohBus.open(way.config(name)) as bus:
         if name == "router":
             await ended.wait()
