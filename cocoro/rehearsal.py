@@ -17,6 +17,10 @@ class RehearsalRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
 
     task: TaskName
     label: str = ""
+    bring: bool = False
+    """Fetch: bring it back to where the task began."""
+    for_s: Annotated[float, Meta(gt=0, le=3600)] | None = None
+    """Follow: for so long."""
     scene: str = "paper"
     """A scene's name, or the path of a scene file."""
     seed: Annotated[int, Meta(ge=0)] = 0

@@ -161,7 +161,13 @@ class _Rehearsal:
         if request.picture is not None:
             operator.on(topics.FRAME, self._keep_frame)
             operator.on(topics.DETECTIONS, self._keep_seen)
-        question = TaskRequest(task=request.task, label=request.label, timeout_s=request.timeout_s)
+        question = TaskRequest(
+            task=request.task,
+            label=request.label,
+            timeout_s=request.timeout_s,
+            bring=request.bring,
+            for_s=request.for_s,
+        )
         reply = await self._ask(operator, question)
         while reply.refusal in ("not_alive", "estop") and operator.now_ns() < START_S * NS:
             await operator.sleep(0.1)

@@ -20,7 +20,11 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     latch_hz: Positive = 5.0
     task_timeout_s: Positive = 180.0
     search_timeout_s: Positive = 60.0
+    viewpoints: Annotated[int, Meta(ge=1)] = 3
+    """Places from which a target is looked for before it is not found."""
+    explore_timeout_s: Positive = 20.0
     approach_timeout_s: Positive = 60.0
+    carry_timeout_s: Positive = 90.0
     reach_timeout_s: Positive = 20.0
     grasp_timeout_s: Positive = 6.0
     lift_timeout_s: Positive = 15.0

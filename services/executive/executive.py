@@ -26,12 +26,13 @@ from cocoro.objects import Catalogue
 from services.executive.config import Config
 from services.executive.estop import Estop
 from services.executive.skills import PlannerSkills, Skills, TaskFailedError
-from services.executive.tasks import fetch, park, put_down
+from services.executive.tasks import fetch, follow, park, put_down
 
-Task = Callable[[Skills, str, Config], Awaitable[None]]
+Task = Callable[[Skills, TaskRequest, Config], Awaitable[None]]
 _CLOCK_STANDS_S = 1.0
 """When 20 ms of the clock take longer than this, it stands still."""
-TASKS: dict[str, Task] = {"fetch": fetch, "park": park, "put-down": put_down}
+_VERY_LONG_S = 86_400.0
+TASKS: dict[str, Task] = {"fetch": fetch, "follow": follow, "park": park, "put-down": put_down}
 
 
 class Executive:
@@ -76,12 +77,13 @@ class Executive:
         return TaskReply(accepted=True, task_id=task_id)
 
     def _refusal(self, request: TaskRequest) -> tuple[RefusalCode, str] | None:
-        if request.task == "fetch":
+        if request.task in ("fetch", "follow"):
             known = self._catalogue.get(request.label)
-            targets = [target.label for target in self._catalogue.targets if target.graspable]
+            fetching = request.task == "fetch"
+            targets = [target.label for target in self._catalogue.targets if target.graspable or not fetching]
             if known is None or known.marker:
                 return "unknown_label", f"unknown object {request.label!r}; known are {', '.join(targets)}"
-            if not known.graspable:
+            if fetching and not known.graspable:
                 return "not_graspable", f"{request.label} does not fit into the hand; what does: {', '.join(targets)}"
         if self._running is not None:
             return "busy", f"{self._what()} is running; cancel it first (cocoro cancel)"
@@ -93,7 +95,7 @@ class Executive:
         status = self._skills.status
         if status is None:
             return "not_alive", "the planner says nothing; see cocoro status"
-        if request.task in ("fetch", "park") and status.holding:
+        if request.task in ("fetch", "follow", "park") and status.holding:
             return "holding", "the hand holds something; put it down first (cocoro put-down)"
         if request.task == "put-down" and not status.holding:
             return "not_holding", "the hand holds nothing"
@@ -127,8 +129,11 @@ class Executive:
         """From the request to the outcome. What ends it from outside says so by `ended` and never cancels this
         coroutine, so that every task comes to its end, whenever that happens."""
         timeout_s = request.timeout_s or self._config.task_timeout_s
+        if request.task == "follow" and request.timeout_s is None:
+            # It has no end of its own.
+            timeout_s = (request.for_s or _VERY_LONG_S) + self._config.search_timeout_s
         self._skills.want("idle", "", self.state.task_id)
-        work = asyncio.ensure_future(TASKS[request.task](self._skills, request.label, self._config))
+        work = asyncio.ensure_future(TASKS[request.task](self._skills, request, self._config))
         timer = asyncio.ensure_future(self._node.sleep(timeout_s))
         try:
             await asyncio.wait((ended, work, timer), return_when=asyncio.FIRST_COMPLETED)

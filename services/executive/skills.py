@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
+from copy import copy
 from typing import Protocol
 
 from cocoro import topics
 from cocoro.clock import NS
-from cocoro.messages import Behaviour, Intent, PlannerStatus
+from cocoro.messages import Behaviour, Intent, PlannerStatus, Vec2
 from cocoro.node import Node
 
 
@@ -24,12 +25,22 @@ class TaskFailedError(Exception):
 class Skills(Protocol):
     """The steps that tasks are made of."""
 
-    async def do(self, behaviour: Behaviour, label: str = "", *, timeout_s: float) -> PlannerStatus:
+    async def do(
+        self, behaviour: Behaviour, label: str = "", *, timeout_s: float, place_m: Vec2 | None = None
+    ) -> PlannerStatus:
         """Have the planner do something until it is done. Raises TaskFailedError with the planner's reason, or
         `timed_out`, or `not_alive` when the planner falls silent."""
 
+    async def keep_doing(self, behaviour: Behaviour, label: str, *, until_s: float) -> None:
+        """Have the planner do something that has no end, until a time; raises as `do` does."""
+
     async def watch_hold(self, seconds: float) -> None:
         """Hold still for a while; raises TaskFailedError('slipped') when the hand loses what it holds."""
+
+    def place(self) -> Vec2:
+        """Where the body stands in the odometry frame."""
+
+    def now_s(self) -> float: ...
 
     @property
     def status(self) -> PlannerStatus | None: ...
@@ -53,43 +64,63 @@ class PlannerSkills:
         """The planner's newest word, if it is not too old."""
         return self._plan.fresh()
 
-    def want(self, behaviour: Behaviour, label: str, task_id: str) -> None:
+    def place(self) -> Vec2:
+        status = self.status
+        if status is None or status.body_m is None:
+            raise TaskFailedError("not_alive", "the planner does not say where the robot stands")
+        return status.body_m
+
+    def now_s(self) -> float:
+        return self._node.now_ns() / NS
+
+    def want(self, behaviour: Behaviour, label: str, task_id: str, place_m: Vec2 | None = None) -> None:
         """Publish a new intent now; it is repeated until the next."""
         self._step += 1
-        self.intent = Intent(task_id=task_id, step=self._step, behaviour=behaviour, label=label)
+        self.intent = Intent(task_id=task_id, step=self._step, behaviour=behaviour, label=label, place_m=place_m)
         self._publish()
 
     def _publish(self) -> None:
-        intent = self.intent
-        self._publisher.put(
-            Intent(task_id=intent.task_id, step=intent.step, behaviour=intent.behaviour, label=intent.label)
-        )
+        self._publisher.put(copy(self.intent))
 
     async def _repeat(self, rate_hz: float) -> None:
         async for _ in self._node.every(rate_hz, "intent"):
             self._publish()
 
-    async def do(self, behaviour: Behaviour, label: str = "", *, timeout_s: float) -> PlannerStatus:
+    async def do(
+        self, behaviour: Behaviour, label: str = "", *, timeout_s: float, place_m: Vec2 | None = None
+    ) -> PlannerStatus:
+        self._phase(behaviour)
+        self.want(behaviour, label, self.intent.task_id, place_m)
+        ended = await self._watch(self.now_s() + timeout_s)
+        if ended is None:
+            status = self.status
+            why = status.why if status is not None else ""
+            raise TaskFailedError("timed_out", f"{behaviour} took over {timeout_s:g} s: {why}")
+        return ended
+
+    async def keep_doing(self, behaviour: Behaviour, label: str, *, until_s: float) -> None:
         self._phase(behaviour)
         self.want(behaviour, label, self.intent.task_id)
-        deadline_ns = self._node.now_ns() + round(timeout_s * NS)
-        heard_ns = self._node.now_ns()
+        await self._watch(until_s)
+
+    async def _watch(self, until_s: float) -> PlannerStatus | None:
+        """Wait for the planner's word that what is wanted is done; None when it is not by then."""
+        heard_s = self.now_s()
         while True:
             status = await self._next_status()
-            now_ns = self._node.now_ns()
+            now_s = self.now_s()
             if status is None:
-                if now_ns - heard_ns > self._silence_s * NS:
+                if now_s - heard_s > self._silence_s:
                     raise TaskFailedError("not_alive", "the planner is silent")
             else:
-                heard_ns = now_ns
+                heard_s = now_s
                 if self._answers(status):
                     if status.state == "done":
                         return status
                     if status.state == "failed":
                         raise TaskFailedError(status.reason, status.why)
-            if now_ns > deadline_ns:
-                why = status.why if status is not None else ""
-                raise TaskFailedError("timed_out", f"{behaviour} took over {timeout_s:g} s: {why}")
+            if now_s > until_s:
+                return None
 
     def _answers(self, status: PlannerStatus) -> bool:
         """Whether a status is of what is wanted now; a planner that did not hear for a while is idle meanwhile."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 
+from cocoro.messages import TaskRequest
 from services.executive.config import Config
 from services.executive.skills import Skills, TaskFailedError
 
@@ -11,12 +12,43 @@ _LOOK_AGAIN = ("lost", "unreachable")
 _TRY_AGAIN = ("slipped", "no_grip")
 
 
-async def fetch(robot: Skills, label: str, config: Config) -> None:
-    """Find it, drive there, reach, grasp, lift, and see that it stays held."""
+async def fetch(robot: Skills, request: TaskRequest, config: Config) -> None:
+    """Find it, drive there, reach, grasp, lift, and see that it stays held; bring it back if that was asked."""
+    begun = robot.place()
+    await _pick_up(robot, request.label, config)
+    if request.bring:
+        await robot.do("carry", request.label, place_m=begun, timeout_s=config.carry_timeout_s)
+        await robot.do("place", timeout_s=config.place_timeout_s)
+
+
+async def follow(robot: Skills, request: TaskRequest, config: Config) -> None:
+    """Find it and stay behind it, for the time that was asked or until cancelled; look for it when it is lost."""
+    end_s = robot.now_s() + (request.for_s or float("inf"))
+    await _find(robot, request.label, config)
+    while robot.now_s() < end_s:
+        try:
+            await robot.keep_doing("follow", request.label, until_s=end_s)
+        except TaskFailedError as failed:
+            if failed.reason != "lost":
+                raise
+            await _find(robot, request.label, config)
+
+
+async def park(robot: Skills, request: TaskRequest, config: Config) -> None:
+    """Fold the arm up."""
+    await robot.do("park", timeout_s=config.park_timeout_s)
+
+
+async def put_down(robot: Skills, request: TaskRequest, config: Config) -> None:
+    """Set down what is in the hand, here."""
+    await robot.do("place", timeout_s=config.place_timeout_s)
+
+
+async def _pick_up(robot: Skills, label: str, config: Config) -> None:
     tries: Counter[str] = Counter()
     while True:
         try:
-            await robot.do("search", label, timeout_s=config.search_timeout_s)
+            await _find(robot, label, config)
             await robot.do("approach", label, timeout_s=config.approach_timeout_s)
             await robot.do("reach", label, timeout_s=config.reach_timeout_s)
             await robot.do("grasp", label, timeout_s=config.grasp_timeout_s)
@@ -31,11 +63,13 @@ async def fetch(robot: Skills, label: str, config: Config) -> None:
                 raise
 
 
-async def park(robot: Skills, label: str, config: Config) -> None:
-    """Fold the arm up."""
-    await robot.do("park", timeout_s=config.park_timeout_s)
-
-
-async def put_down(robot: Skills, label: str, config: Config) -> None:
-    """Set down what is in the hand, here."""
-    await robot.do("place", timeout_s=config.place_timeout_s)
+async def _find(robot: Skills, label: str, config: Config) -> None:
+    """Look all around; where it is not in view, go and look from elsewhere."""
+    for left in reversed(range(config.viewpoints)):
+        try:
+            await robot.do("search", label, timeout_s=config.search_timeout_s)
+            return
+        except TaskFailedError as failed:
+            if failed.reason != "not_found" or left == 0:
+                raise
+        await robot.do("explore", label, timeout_s=config.explore_timeout_s)
