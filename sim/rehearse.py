@@ -28,6 +28,7 @@ from cocoro.rehearsal import RehearsalRequest
 from cocoro.robot import Robot
 from cocoro.vloop import run_virtual
 from sim.judge import Judge
+from sim.pursuit import PursuitJudge
 from sim.random_scene import find_scene
 
 PROCESSES = ("sim", "perception", "planning", "executive")
@@ -100,7 +101,12 @@ class _Rehearsal:
         self._request = request
         scene = find_scene(request.scene, request.seed, request.label)
         labels = [item.label for item in scene.objects]
-        self._judge = Judge(scene, request.label if request.label in labels else "")
+        present = request.label if request.label in labels else ""
+        self._judge: Judge | PursuitJudge = (
+            PursuitJudge(Robot.load(), scene, present)
+            if request.task == "follow" and present
+            else Judge(scene, present)
+        )
         self._frame: Frame | None = None
         self._seen: Detections | None = None
 
@@ -178,6 +184,8 @@ class _Rehearsal:
         async for state in states:
             if state.task_id != reply.task_id:
                 continue
+            if isinstance(self._judge, PursuitJudge) and state.phase == "follow":
+                self._judge.begin()
             if not pictured and state.phase == "lift":
                 self._take_picture()
                 pictured = True
