@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
+from cocoro.clock import VirtualClock
 from cocoro.messages import AboutFile, AboutReply
 from cocoro.objects import DEFAULT_FILE
 
@@ -27,6 +28,7 @@ DISTRIBUTIONS = ("cocoro-mesh", "eclipse-zenoh", "msgspec", "numpy", "scipy", "o
 
 
 def about(node: Node) -> AboutReply:
+    virtual = isinstance(node.clock, VirtualClock)  # then everything is the same at each run
     return AboutReply(
         service=node.name,
         robot=node.robot_name,
@@ -35,8 +37,8 @@ def about(node: Node) -> AboutReply:
         description=node.robot.to_data(),
         latency_s=node.latency_s,
         record_steps=node.record_steps,
-        pid=os.getpid(),
-        host=socket.gethostname(),
+        pid=0 if virtual else os.getpid(),
+        host="" if virtual else socket.gethostname(),
         versions=versions(),
         files=tuple(_files(node.config)),
     )

@@ -37,12 +37,19 @@ M = TypeVar("M", bound=Message)
 Q = TypeVar("Q", bound=msgspec.Struct)
 R = TypeVar("R", bound=msgspec.Struct)
 
+RECORDER_S = 5.0
+"""How long a service whose steps are to be recorded waits for a recorder before its first."""
 ALIVE = "{service}/alive"
 """The liveliness token's place under the robot's name."""
 
 
 def alive_key(robot: str, service: str) -> str:
     return f"{robot}/{ALIVE.format(service=service)}"
+
+
+def recorder_key(robot: str, service: str) -> str:
+    """The token of a service that records the mesh, declared once it hears everything."""
+    return f"{robot}/{service}/recorder"
 
 
 class Publisher(Generic[M]):
@@ -319,6 +326,23 @@ class Node:
     def stepper(self, core: Core, name: str | None = None) -> Stepper:
         """What gathers a core's inputs, steps it and publishes, for those who drive it themselves."""
         return Stepper(self, core, name or self.name)
+
+    async def _until_recorded(self) -> None:
+        """A record of steps is whole only when a recorder hears the first; wait for one, but not for ever."""
+        heard = asyncio.Event()
+
+        def on_token(_key: str, alive: bool) -> None:
+            if alive:
+                heard.set()
+
+        watch = self.bus.watch_alive(recorder_key(self.robot_name, "*"), on_token)
+        try:
+            async with asyncio.timeout(RECORDER_S):
+                await heard.wait()
+        except TimeoutError:
+            self.log.warning("steps are to be recorded, but within %g s there was no recorder", RECORDER_S)
+        finally:
+            watch.close()
 
     async def _wait(self, wake: asyncio.Event, deadline_ns: int) -> bool:
         """Wait for a deadline (True) or an earlier wake (False)."""

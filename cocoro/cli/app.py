@@ -9,6 +9,8 @@ from typing import Annotated, Any
 
 import typer
 
+from cocoro.cli import capture_app
+
 app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
@@ -159,6 +161,10 @@ def topics(
 
     print(listing.markdown() if markdown else listing.as_json() if json else listing.table(), end="")
 
+
+# --- captures -------------------------------------------------------------------------------------
+
+capture_app.add_to(app)
 
 # --- starting and stopping ------------------------------------------------------------------------
 

@@ -48,7 +48,7 @@ class Link:
     def __init__(self, run_dir: RunDir, bus: Bus) -> None:
         self.run_dir = run_dir
         self.robot = run_dir.robot
-        self._bus = bus
+        self.bus = bus
         self._clock = RealClock()
 
     async def call(self, request: Request[Q, R], question: Q, timeout_s: float | None = None) -> R:
@@ -70,7 +70,7 @@ class Link:
 
     async def _ask(self, request: Request[Q, R], question: Q, timeout_s: float | None) -> list[Reply]:
         wait_s = request.timeout_s if timeout_s is None else timeout_s
-        return await self._bus.call(request.key(self.robot), msgspec.msgpack.encode(question), wait_s)
+        return await self.bus.call(request.key(self.robot), msgspec.msgpack.encode(question), wait_s)
 
     def stream(self, topic: Topic[M]) -> Stream[M]:
         return Stream(self.inbox(topic))
@@ -81,15 +81,15 @@ class Link:
     def inbox(self, topic: Topic[M]) -> Inbox[M]:
         """Everything that arrives on a topic from now on; `close` its subscription to end that."""
         inbox = Inbox(topic, topic.key(self.robot), self._clock)
-        inbox.subscription = self._bus.subscribe(inbox.keyexpr, topic.qos, inbox.deliver, depth=64)
+        inbox.subscription = self.bus.subscribe(inbox.keyexpr, topic.qos, inbox.deliver, depth=64)
         return inbox
 
     async def alive(self) -> list[str]:
         """The services that live now."""
-        return sorted(key.split("/")[1] for key in await self._bus.alive(f"{self.robot}/*/alive"))
+        return sorted(key.split("/")[1] for key in await self.bus.alive(f"{self.robot}/*/alive"))
 
     def watch_alive(self, service: str, handler: Callable[[bool], None]) -> Handle:
-        return self._bus.watch_alive(f"{self.robot}/{service}/alive", lambda _key, alive: handler(alive))
+        return self.bus.watch_alive(f"{self.robot}/{service}/alive", lambda _key, alive: handler(alive))
 
 
 def _understood(request: Request[Q, R], reply: Reply) -> Answer[R]:

@@ -1,0 +1,13 @@
+"""What can be wrong with a capture."""
+
+from __future__ import annotations
+
+from cocoro.errors import CocoroError
+
+
+class CaptureError(CocoroError):
+    """A capture cannot be read, or written; the text names the file."""
+
+
+class DamageError(Exception):
+    """Bytes that cannot be what they should be. Readers catch it and go on with what is whole."""

@@ -1,0 +1,233 @@
+"""A run's captures: one MCAP file after another, each whole in itself, without a message lost in between."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+
+from cocoro.about import versions
+from cocoro.capture.compression import Packer
+from cocoro.capture.errors import CaptureError
+from cocoro.capture.file import CaptureFile
+from cocoro.capture.keys import KeyInfo
+from cocoro.capture.schema import TypeSchema
+from cocoro.clock import NS
+
+TALLY = "tally"
+"""The metadata record that a whole file ends with: what it has of each key, and what is missing."""
+LIBRARY = f"cocoro {versions().get('cocoro-mesh', '')}".strip()
+MB = 1_000_000
+
+
+class Entry(NamedTuple):
+    """A message on its way into a capture."""
+
+    key: str
+    sequence: int
+    log_ns: int
+    publish_ns: int
+    payload: bytes
+    info: KeyInfo | None = None
+    """What to write of the key, where that is not to be seen from the payload."""
+
+
+class Prepared(NamedTuple):
+    """What is written in place of an entry."""
+
+    entry: Entry
+    schema: TypeSchema | None
+    """In place of the key's own, where the payload is of another type now."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """When a file is closed and the next one begun, and when to stop."""
+
+    file_bytes: float = float("inf")
+    file_s: float = float("inf")
+    min_free_bytes: int = 0
+    """Recording stops when the disk has less room left, so that the robot has some."""
+
+
+def sync_and_close(fd: int) -> None:
+    try:
+        os.fdatasync(fd)
+    finally:
+        os.close(fd)
+
+
+class Missing(NamedTuple):
+    """By key: what did not get into the captures."""
+
+    dropped: Mapping[str, int]
+    lost: Mapping[str, int]
+
+
+class Writer:
+    """Takes entries in order of their log times. Raises CaptureError when the disk does not take them; what was
+    written until then is closed as well as can be, and the writer is of no more use."""
+
+    def __init__(
+        self,
+        place: Callable[[int], Path],
+        packer: Packer,
+        limits: Limits,
+        info: Callable[[str, bytes], KeyInfo],
+        missing: Callable[[], Missing] = lambda: Missing({}, {}),
+        release: Callable[[int], None] = sync_and_close,
+        prepare: Callable[[Entry], Prepared] | None = None,
+    ) -> None:
+        """`place(n)` is the nth file's path, from 1 on; `info(key, payload)` says what to write of a key; `release`
+        gets the descriptor of a file that is whole; `prepare` may put something else in an entry's place."""
+        self._place = place
+        self._packer = packer
+        self._limits = limits
+        self._info = info
+        self._missing = missing
+        self._release = release
+        self._prepare = prepare
+        self._metadata: dict[str, dict[str, str]] = {}
+        self._infos: dict[str, KeyInfo] = {}
+        self._number = 0
+        self._first_ns: int | None = None
+        self._closed_bytes = 0
+        self._closed_raw_bytes = 0
+        self.messages = 0
+        self.file = self._open()
+
+    @property
+    def size_bytes(self) -> int:
+        return self._closed_bytes + self.file.size_bytes
+
+    @property
+    def raw_bytes(self) -> int:
+        return self._closed_raw_bytes + self.file.raw_bytes
+
+    def put(self, entry: Entry) -> None:
+        if self._first_ns is None:
+            self._first_ns = entry.log_ns
+        elif (
+            self.file.size_bytes >= self._limits.file_bytes or entry.log_ns - self._first_ns >= self._limits.file_s * NS
+        ):
+            self._rotate()
+            self._first_ns = entry.log_ns
+        schema = None
+        if self._prepare is not None:
+            entry, schema = self._prepare(entry)
+        try:
+            if not self.file.has(entry.key):
+                info = self._infos.get(entry.key)
+                if info is None:
+                    info = entry.info or self._info(entry.key, entry.payload)
+                    info = self._infos[entry.key] = info if schema is None else info._replace(schema=schema)
+                self.file.channel(entry.key, *info)
+            self.file.add(entry.key, entry.sequence, entry.log_ns, entry.publish_ns, entry.payload)
+        except OSError as error:
+            raise self._failed(error) from error
+        self.messages += 1
+
+    def flush(self) -> None:
+        """Give everything to the system; and see whether the disk has room for more."""
+        try:
+            self.file.flush()
+            room = os.statvfs(self.file.path.parent)
+        except OSError as error:
+            raise self._failed(error) from error
+        if room.f_bavail * room.f_frsize < self._limits.min_free_bytes:
+            self.close()
+            raise CaptureError(
+                f"{self.file.path.parent}: less than {self._limits.min_free_bytes / MB:.0f} MB are free, "
+                f"so recording has stopped; make room or record elsewhere"
+            )
+
+    def remember(self, name: str, entries: Mapping[str, str]) -> None:
+        """Metadata for this file and those that follow. What is remembered already is not written again."""
+        if self._metadata.get(name) == entries:
+            return
+        self._metadata[name] = dict(entries)
+        try:
+            self.file.metadata(name, entries)
+        except OSError as error:
+            raise self._failed(error) from error
+
+    def close(self) -> None:
+        """Make the file whole."""
+        try:
+            self._finish(self.file)
+        except OSError as error:
+            self.file.abandon()
+            raise _told(error, self.file.path) from error
+
+    def _open(self) -> CaptureFile:
+        self._number += 1
+        path = self._place(self._number)
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            file = CaptureFile(path, self._packer, LIBRARY)
+            try:
+                for name, entries in self._metadata.items():
+                    file.metadata(name, entries)
+                _sync_folder(path.parent)
+            except OSError:
+                file.abandon()
+                raise
+        except OSError as error:
+            raise _told(error, path) from error
+        return file
+
+    def _rotate(self) -> None:
+        """The next file stands before the last one ends."""
+        before = self.file
+        try:
+            after = self._open()
+        except CaptureError:
+            self.close()
+            raise
+        self.file = after
+        try:
+            self._finish(before)
+        except OSError as error:
+            before.abandon()
+            raise self._failed(error) from error
+        self._closed_bytes += before.size_bytes
+        self._closed_raw_bytes += before.raw_bytes
+
+    def _finish(self, file: CaptureFile) -> None:
+        file.flush()
+        missing = self._missing()
+        file.metadata(
+            TALLY,
+            {
+                "keys": json.dumps(msgspec.to_builtins(file.tallies)),
+                "dropped": json.dumps(missing.dropped),
+                "lost": json.dumps(missing.lost),
+            },
+        )
+        self._release(file.finish())
+
+    def _failed(self, error: OSError) -> CaptureError:
+        """Leave the file as good as it can be."""
+        try:
+            self._finish(self.file)
+        except OSError:
+            self.file.abandon()
+        return _told(error, self.file.path)
+
+
+def _told(error: OSError, path: Path) -> CaptureError:
+    return CaptureError(f"{path}: {error.strerror or error}; recording has stopped")
+
+
+def _sync_folder(folder: Path) -> None:
+    """A new file's name is lost with the power as its bytes are."""
+    fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(fd)
+    finally:
+        os.close(fd)

@@ -1,0 +1,88 @@
+"""The commands about captures and their options; `app` takes them in."""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+PANEL = "Captures"
+
+capture = typer.Typer(no_args_is_help=True, help="Look at, mend and execute captures.")
+
+Robot = Annotated[str | None, typer.Option(help="Which robot; needed only when several are up here.")]
+Reach = Annotated[
+    str | None,
+    typer.Option("--profile", metavar="PROFILE", help="Reach the robot as this profile says, on another machine."),
+]
+Json = Annotated[bool, typer.Option("--json", help="Print JSON, for scripts.")]
+File = Annotated[Path, typer.Argument(metavar="FILE", help="A capture: an MCAP file.")]
+Only = Annotated[
+    list[str] | None,
+    typer.Option("--only", metavar="KEYEXPR", help="Only these keys: base/state, */health, frames. Repeatable."),
+]
+Without = Annotated[
+    list[str] | None, typer.Option("--without", metavar="KEYEXPR", help="All keys but these. Repeatable.")
+]
+From = Annotated[float | None, typer.Option("--from", metavar="S", help="Seconds from the capture's start.")]
+To = Annotated[float | None, typer.Option("--to", metavar="S", help="Likewise; exclusive.")]
+
+
+def add_to(app: typer.Typer) -> None:
+    app.add_typer(capture, name="capture", rich_help_panel=PANEL)
+    app.command(rich_help_panel=PANEL)(record)
+
+
+def record(
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Where the files go.")] = Path(),
+    only: Only = None,
+    without: Without = None,
+    compression: Annotated[str, typer.Option(metavar="zstd|lz4|none", help="Without loss.")] = "zstd",
+    jpeg: Annotated[
+        int | None, typer.Option(min=1, max=100, metavar="QUALITY", help="The pictures with loss, far smaller.")
+    ] = None,
+    seconds: Annotated[float | None, typer.Option("--for", min=0.1, metavar="S", help="Stop by itself.")] = None,
+    robot: Robot = None,
+    profile: Reach = None,
+) -> None:
+    """Record what travels on the mesh into MCAP files, until Ctrl-C, beside what the robot's own recorder does."""
+    from cocoro.cli import capture_record
+    from cocoro.cli.link import Where
+
+    settings = {
+        "folder": str(out.resolve()), "only": only or (), "without": without or (),
+        "compression": compression, "jpeg_quality": jpeg,
+    }  # fmt: skip
+    sys.exit(asyncio.run(capture_record.record(Where(robot, profile), settings, seconds)))
+
+
+@capture.command()
+def info(
+    file: File,
+    check: Annotated[bool, typer.Option("--check", help="Read every byte, instead of believing the summary.")] = False,
+    json: Json = False,
+) -> None:
+    """What a capture has: keys, counts, rates, gaps, losses and where it is from. Exit code 1 when it is damaged."""
+    from cocoro.cli import capture_info
+
+    sys.exit(capture_info.info(file, check, json))
+
+
+@capture.command()
+def repair(
+    file: File,
+    out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="By default FILE.repaired.mcap.")] = None,
+    compression: Annotated[str, typer.Option(metavar="zstd|lz4|none", help="Of the new file.")] = "zstd",
+    level: Annotated[int, typer.Option(min=1, max=19, help="Of zstd; 19 is small and slow.")] = 1,
+    only: Only = None,
+    without: Without = None,
+    start: From = None,
+    end: To = None,
+) -> None:
+    """Write a whole capture with all that can be read of a damaged or unfinished one; the old file stays."""
+    from cocoro.cli import capture_repair
+
+    sys.exit(capture_repair.repair(file, out, compression, level, only or [], without or [], start, end))

@@ -1,0 +1,86 @@
+"""`cocoro capture info`: what a capture has."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from pathlib import Path
+
+import msgspec
+
+from cocoro.capture.info import Report, report
+from cocoro.capture.reader import Capture
+from cocoro.cli import exits
+from cocoro.cli.table import table
+from cocoro.clock import NS
+
+MB = 1e6
+
+
+def info(file: Path, check: bool, as_json: bool) -> int:
+    with Capture.open(file) as capture:
+        found = report(capture, check)
+    print(msgspec.json.encode(found).decode() if as_json else text(found), end="\n" if as_json else "")
+    return exits.FAILED if found.problems else exits.DONE
+
+
+def text(found: Report) -> str:
+    rows = [
+        (
+            key.key, key.type, str(key.messages), f"{key.rate_hz:.1f} Hz", f"{key.size_bytes / MB:.2f} MB",
+            f"{key.longest_gap_s:.3f} s at {key.longest_gap_from_s:.1f}" if key.longest_gap_s else "",
+            str(key.lost or ""), str(key.dropped or ""),
+        )
+        for key in found.keys
+    ]  # fmt: skip
+    heads = ("key", "type", "messages", "rate", "size", "longest gap", "lost", "dropped")
+    return "\n".join(
+        [
+            *_head(found),
+            "",
+            table(heads, rows).rstrip(),
+            *(f"{key.key}: {change}" for key in found.keys for change in key.changed),
+            *(f"damaged: {problem}" for problem in found.problems),
+            "",
+        ]
+    )
+
+
+def _head(found: Report) -> list[str]:
+    run = found.metadata.get("run", {})
+    unix = run.get("log_clock", "unix") == "unix"
+    start = datetime.fromtimestamp(found.start_ns / NS, UTC).isoformat(timespec="milliseconds") if unix else "0"
+    services = sorted(name.partition("/")[2] for name in found.metadata if name.startswith("service/"))
+    versions = run.get("versions", {})
+    lines = [
+        ("file", found.path),
+        ("robot", found.robot or "unknown"),
+        ("started", start if found.messages else ""),
+        ("lasts", f"{found.duration_s:.3f} s"),
+        ("messages", f"{found.messages}"),
+        ("size", f"{found.size_bytes / MB:.1f} MB, of {found.raw_bytes / MB:.1f} MB of payloads"),
+        ("state", _state(found)),
+        ("recorder", " on ".join(filter(None, (run.get("recorder", ""), run.get("host", ""))))),
+        ("services", ", ".join(services)),
+        ("files", "; ".join(_files(found))),
+        ("versions", ", ".join(f"{name} {version}" for name, version in versions.items())),
+        ("metadata", ", ".join(found.metadata)),
+    ]
+    return [f"{name:<9} {value}" for name, value in lines if value]
+
+
+def _state(found: Report) -> str:
+    if found.problems:
+        return "damaged: what can be read is below"
+    if not found.closed:
+        return "not closed: it is still being written, or its recorder was killed; all that is there is readable"
+    return "whole, every byte read" if found.checked else "whole"
+
+
+def _files(found: Report) -> list[str]:
+    """The files that services were configured with, by their fingerprints."""
+    return [
+        f"{name.partition('/')[2]} {file['field']} {file['path']} (sha256 {file['sha256'][:12]})"
+        for name, entries in found.metadata.items()
+        if name.startswith("service/")
+        for file in entries.get("files", ())
+    ]

@@ -1,0 +1,109 @@
+"""`cocoro record`: the recorder in the operator's terminal."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from cocoro import processes
+from cocoro.cli import exits
+from cocoro.cli.link import Where, joined
+from cocoro.clock import FollowedClock, RealClock
+from cocoro.errors import ConfigError
+from cocoro.messages import Recording
+from cocoro.node import Node
+from cocoro.robot import Robot
+from cocoro.topics import RECORDING
+
+RECORDER = "capture"
+"""The process whose component does it: loaded by name, since the API knows no services."""
+CLEAR = "\r\x1b[K"
+
+
+async def record(where: Where, settings: dict[str, Any], seconds: float | None) -> int:
+    """Record until interrupted, or for so long. Raises MeshError when there is no mesh."""
+    row = processes.named(RECORDER)
+    component = processes.load(row)
+    try:
+        config = msgspec.convert(settings, component.config)
+    except msgspec.ValidationError as error:
+        raise ConfigError(f"record: {error}") from error
+    async with joined(where) as link:
+        resolved = link.run_dir.resolved()
+        description, measured = (Path(file) if (file := resolved.get(name)) else None for name in _DESCRIPTIONS)
+        clock = FollowedClock() if resolved.get("clock") == "sim" else RealClock()
+        robot = Robot.load(description, measured)
+        name = f"record-{os.getpid()}"
+        async with Node(name, link.bus, clock, robot, robot_name=link.robot, module=row.module, config=config) as node:
+            view = _View()
+            node.on(RECORDING.of(name), view.show)
+            with _ends() as end:
+                await _work(component.run(node, config), end, view.failed, seconds)
+    return view.last_words()
+
+
+_DESCRIPTIONS = ("description", "measured")
+
+
+async def _work(work: Any, end: asyncio.Event, failed: asyncio.Event, seconds: float | None) -> None:
+    """Run until it is told to end; the recorder then closes its file."""
+    waits = [asyncio.ensure_future(event.wait()) for event in (end, failed)]
+    working = asyncio.ensure_future(work)
+    await asyncio.wait((working, *waits), timeout=seconds, return_when=asyncio.FIRST_COMPLETED)
+    for task in (*waits, working):
+        task.cancel()
+    with suppress(asyncio.CancelledError):
+        await working
+
+
+class _View:
+    """A line that is written over, on a terminal; elsewhere each file's name."""
+
+    def __init__(self) -> None:
+        self.failed = asyncio.Event()
+        self._newest: Recording | None = None
+
+    def show(self, recording: Recording) -> None:
+        before, self._newest = self._newest, recording
+        if recording.fault:
+            self.failed.set()
+        elif sys.stdout.isatty():
+            print(f"{CLEAR}{_line(recording)}", end="", flush=True)
+        elif recording.file and (before is None or before.file != recording.file):
+            print(recording.file, flush=True)
+
+    def last_words(self) -> int:
+        if self._newest is None:
+            print("nothing was recorded")
+            return exits.FAILED
+        print(f"{CLEAR if sys.stdout.isatty() else ''}{_line(self._newest)}")
+        if self._newest.fault:
+            print(f"cocoro: {self._newest.fault}", file=sys.stderr)
+        return exits.FAILED if self._newest.fault else exits.DONE
+
+
+def _line(recording: Recording) -> str:
+    missing = sum(recording.dropped.values()), sum(recording.lost.values())
+    told = "".join(f", {count} {word}" for count, word in zip(missing, ("dropped", "lost"), strict=True) if count)
+    return f"{recording.file}: {recording.messages} messages, {recording.size_bytes / 1e6:.1f} MB{told}"
+
+
+@contextmanager
+def _ends() -> Iterator[asyncio.Event]:
+    """Set by Ctrl-C and by being told to end."""
+    loop, end = asyncio.get_running_loop(), asyncio.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, end.set)
+    try:
+        yield end
+    finally:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            loop.remove_signal_handler(number)

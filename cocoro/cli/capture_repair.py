@@ -1,0 +1,52 @@
+"""`cocoro capture repair`: a whole capture from one that is not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from cocoro.capture.compression import COMPRESSIONS, Compression, Packer
+from cocoro.capture.keys import Choice
+from cocoro.capture.reader import Capture
+from cocoro.capture.rewrite import rewrite
+from cocoro.cli import exits
+from cocoro.clock import NS
+from cocoro.errors import ConfigError
+
+
+def repair(
+    file: Path,
+    out: Path | None,
+    compression: str,
+    level: int,
+    only: list[str],
+    without: list[str],
+    start_s: float | None,
+    end_s: float | None,
+) -> int:
+    """Raises CaptureError, and ConfigError for options that cannot be."""
+    packer = Packer(_compression(compression), level)
+    with Capture.open(file) as capture:
+        choice = Choice(capture.robot, only, without)
+        done = rewrite(
+            capture,
+            out or file.with_suffix(".repaired.mcap"),
+            packer,
+            keep=lambda record: record.key in choice,
+            start_ns=_at(capture, start_s),
+            end_ns=_at(capture, end_s),
+        )
+    print(f"{done.path}: {done.messages} messages, {done.size_bytes / 1e6:.1f} MB")
+    for problem in done.problems:
+        print(f"missing: {problem}")
+    return exits.DONE
+
+
+def _at(capture: Capture, seconds: float | None) -> int | None:
+    return None if seconds is None else capture.start_ns + round(seconds * NS)
+
+
+def _compression(text: str) -> Compression:
+    for known in COMPRESSIONS:
+        if text == known:
+            return known
+    raise ConfigError(f"--compression {text}: known are {', '.join(COMPRESSIONS)}")

@@ -1,0 +1,1 @@
+"""The recorder: everything that travels on the mesh, into MCAP files (see `cocoro.capture`)."""

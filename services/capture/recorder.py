@@ -1,0 +1,198 @@
+"""Hears all that travels on one robot's mesh and hands it to a sink, with what happened besides."""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import json
+import platform
+import time
+from datetime import UTC, datetime
+from typing import Any
+
+import msgspec
+
+from cocoro.about import about, versions
+from cocoro.bus.base import Handle, Payload
+from cocoro.capture.keys import ALIVE_INFO, Alive, Choice, KeyInfo
+from cocoro.capture.writer import Entry, Missing
+from cocoro.clock import VirtualClock
+from cocoro.errors import CocoroError
+from cocoro.messages import AboutReply, AboutRequest, Recording
+from cocoro.node import Node, recorder_key
+from cocoro.rundir import RunDir
+from cocoro.topics import ABOUT, RECORDING, Qos
+from services.capture.sink import Sink
+
+TELL_S = 1.0
+"""How often the recorder tells how it is getting on."""
+LOOK_S = 0.1
+"""How often it looks whether a fault has come up."""
+
+
+class Head(msgspec.Struct, gc=False):
+    """What every message of ours says of itself; other messages may have none of it."""
+
+    stamp_ns: int = 0
+    seq: int = 0
+    incarnation: int = 0
+
+
+class Source:
+    """One key, as it is heard."""
+
+    def __init__(self) -> None:
+        self.heard = 0
+        self.lost = 0
+        self.dropped = 0
+        self._incarnation: int | None = None
+        self._seq = -1
+
+    def hear(self, head: Head) -> None:
+        self.heard += 1
+        if head.incarnation == self._incarnation and head.seq > self._seq:
+            self.lost += head.seq - self._seq - 1
+        self._incarnation, self._seq = head.incarnation, head.seq
+
+
+class Ledger:
+    """What was heard of each key, and what was not."""
+
+    def __init__(self, choice: Choice) -> None:
+        self._choice = choice
+        self._sources: dict[str, Source | None] = {}
+
+    def source(self, key: str) -> Source | None:
+        """None for a key that is not chosen."""
+        if key not in self._sources:
+            self._sources[key] = Source() if key in self._choice else None
+        return self._sources[key]
+
+    def missing(self) -> Missing:
+        """Where there is any. (From any thread: the newest numbers, or nearly.)"""
+        sources = [(key, source) for key, source in list(self._sources.items()) if source is not None]
+        return Missing(
+            dropped={key: source.dropped for key, source in sources if source.dropped},
+            lost={key: source.lost for key, source in sources if source.lost},
+        )
+
+
+class Recorder:
+    """`start` it, and `tell` for ever; `close` takes its ears off the mesh."""
+
+    def __init__(self, node: Node, ledger: Ledger, sink: Sink) -> None:
+        self._node = node
+        self._ledger = ledger
+        self._sink = sink
+        self._handles: list[Handle] = []
+        self._head = msgspec.msgpack.Decoder(Head)
+        self._newest_ns = 0
+        self._alive: dict[str, bool] = {}
+        self._virtual = isinstance(node.clock, VirtualClock)
+
+    def start(self) -> None:
+        robot, bus = self._node.robot_name, self._node.bus
+        self._remember_run()
+        # As events, nothing is dropped before this loop has seen it; the sink bounds what may wait.
+        self._handles.append(bus.subscribe(f"{robot}/**", Qos.EVENT, self._on_sample, depth=0))
+        self._handles.append(bus.watch_alive(f"{robot}/**", self._on_alive))
+        self._handles.append(bus.declare_alive(recorder_key(robot, self._node.name)))
+
+    def close(self) -> None:
+        for handle in self._handles:
+            handle.close()
+
+    async def tell(self) -> None:
+        """Say on the mesh how the recording goes, and at once when it has stopped."""
+        fault, told_s = "", -TELL_S
+        loop = asyncio.get_running_loop()
+        while True:
+            progress = self._sink.progress()
+            if progress.fault != fault:
+                fault, told_s = progress.fault, -TELL_S
+                self._node.log.error("%s", fault)
+                self._node.faults = (fault,)
+                self._node.degraded("not recording")
+            if loop.time() - told_s >= TELL_S:
+                told_s = loop.time()
+                missing = self._ledger.missing()
+                self._node.publish(
+                    RECORDING.of(self._node.name),
+                    Recording(**progress._asdict(), dropped=dict(missing.dropped), lost=dict(missing.lost)),
+                )
+            await asyncio.sleep(LOOK_S)
+
+    # --- what is heard ----------------------------------------------------------------------------
+
+    def _on_sample(self, key: str, payload: Payload) -> None:
+        source = self._ledger.source(key)
+        if source is None:
+            return
+        try:
+            head = self._head.decode(payload)
+        except (msgspec.MsgspecError, ValueError, RecursionError):
+            head = Head(seq=source.heard)
+        source.hear(head)
+        self._put(source, key, head.seq, head.stamp_ns, payload)
+
+    def _on_alive(self, key: str, alive: bool) -> None:
+        source = self._ledger.source(key)
+        if source is not None and self._alive.get(key) != alive:
+            self._alive[key] = alive
+            message = Alive(alive=alive, seq=source.heard, stamp_ns=self._node.now_ns())
+            source.heard += 1
+            self._put(source, key, message.seq, message.stamp_ns, msgspec.msgpack.encode(message), ALIVE_INFO)
+        _, _, rest = key.partition("/")
+        service, _, what = rest.partition("/")
+        if alive and what == "alive" and service != self._node.name:
+            self._node.spawn(self._ask(service))
+
+    def _put(
+        self, source: Source, key: str, sequence: int, stamp_ns: int, payload: Payload, info: KeyInfo | None = None
+    ) -> None:
+        log_ns = self._log_ns()
+        data = payload if isinstance(payload, bytes) else bytes(payload)
+        if not self._sink.offer(Entry(key, sequence, log_ns, stamp_ns or log_ns, data, info)):
+            source.dropped += 1
+
+    def _log_ns(self) -> int:
+        """When something was heard; each time later than the last, so that the order can be told by it."""
+        now_ns = self._node.now_ns() if self._virtual else time.time_ns()
+        self._newest_ns = max(now_ns, self._newest_ns + 1)
+        return self._newest_ns
+
+    # --- what is known besides --------------------------------------------------------------------
+
+    async def _ask(self, service: str) -> None:
+        """What a service that has come up was started with."""
+        try:
+            reply = await self._node.call(ABOUT.of(service), AboutRequest())
+        except CocoroError as error:
+            self._node.log.info("%s does not say what it was started with: %s", service, error)
+            return
+        self._sink.remember(f"service/{service}", _entries(reply))
+
+    def _remember_run(self) -> None:
+        node = self._node
+        started = {} if self._virtual else {"started": datetime.now(UTC).isoformat(), "host": platform.node()}
+        run = {
+            "robot": node.robot_name,
+            "recorder": node.name,
+            "log_clock": "robot" if self._virtual else "unix",
+            "versions": json.dumps(versions()),
+            **started,
+        }
+        self._sink.remember("run", run)
+        self._sink.remember("robot", {"description": json.dumps(node.robot.to_data())})
+        self._sink.remember(f"service/{node.name}", _entries(about(node)))
+        profile = {} if self._virtual else RunDir(node.robot_name).resolved()
+        if profile:
+            self._sink.remember("profile", {"profile": json.dumps(profile)})
+
+
+def _entries(about: AboutReply) -> dict[str, str]:
+    """As metadata: texts stay as they are, everything else is JSON."""
+    entries: dict[str, Any] = msgspec.to_builtins(about, builtin_types=(bytes,))
+    for file in entries["files"]:
+        file["content"] = base64.b64encode(file["content"]).decode()
+    return {name: value if isinstance(value, str) else json.dumps(value) for name, value in entries.items()}

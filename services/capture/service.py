@@ -1,0 +1,78 @@
+"""The recorder as a service."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+from functools import partial
+from pathlib import Path
+
+from cocoro.capture.compression import Packer
+from cocoro.capture.keys import Choice, info_of
+from cocoro.capture.pictures import lossy
+from cocoro.capture.retention import file_name, make_room
+from cocoro.capture.writer import MB, Limits, Writer, sync_and_close
+from cocoro.clock import VirtualClock
+from cocoro.node import Node
+from services.capture.config import Config, folder_of
+from services.capture.recorder import Ledger, Recorder
+from services.capture.sink import DirectSink, ThreadedSink
+
+__all__ = ["Config", "run"]
+
+
+async def run(node: Node, config: Config) -> None:
+    """Record until cancelled. A disk that does not take it is a fault that the mesh hears of, not the end."""
+    ledger = Ledger(Choice(node.robot_name, config.only, config.without))
+    make = partial(_writer, node.robot_name, config, ledger)
+    sink: ThreadedSink | DirectSink
+    if isinstance(node.clock, VirtualClock):
+        sink = DirectSink(make, config.flush_s)
+    else:
+        sink = ThreadedSink(make, round(config.memory_mb * MB), config.flush_s, config.sync_s)
+    recorder = Recorder(node, ledger, sink)
+    try:
+        recorder.start()
+        node.ready()
+        await recorder.tell()
+    finally:
+        recorder.close()
+        if isinstance(sink, ThreadedSink):
+            await asyncio.to_thread(sink.close)
+        else:
+            sink.close()
+
+
+def _writer(robot: str, config: Config, ledger: Ledger, release: Callable[[int], None] | None) -> Writer:
+    limits = Limits(min_free_bytes=round(config.min_free_mb * MB))
+    if config.file is None:
+        limits = replace(limits, file_bytes=config.rotate_mb * MB, file_s=config.rotate_s)
+    return Writer(
+        _place(robot, config),
+        Packer(config.compression, config.level),
+        limits,
+        lambda key, payload: info_of(key, robot, payload),
+        ledger.missing,
+        release or sync_and_close,
+        None if config.jpeg_quality is None else lossy(config.jpeg_quality),
+    )
+
+
+def _place(robot: str, config: Config) -> Callable[[int], Path]:
+    """Where the nth file goes."""
+    if config.file is not None:
+        path = Path(config.file)
+        return lambda _: path
+    folder = folder_of(config)
+    started = datetime.now(UTC)
+    while (folder / file_name(robot, started, 1)).exists():
+        started += timedelta(seconds=1)
+
+    def place(number: int) -> Path:
+        if config.keep_gb is not None:
+            make_room(folder, robot, round(config.keep_gb * 1000 * MB))
+        return folder / file_name(robot, started, number)
+
+    return place

@@ -1,0 +1,273 @@
+"""Where entries go: to the disk from a thread of its own, or, in virtual time, at once."""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from typing import NamedTuple, Protocol
+
+from cocoro.capture.errors import CaptureError
+from cocoro.capture.file import LARGE_BYTES
+from cocoro.capture.writer import Entry, Writer
+
+log = logging.getLogger(__name__)
+
+POLL_S = 0.02
+"""How often the thread looks for entries: it takes many at once, and the loop never has to wake it."""
+RESERVE_BYTES = 16 * 1024 * 1024
+"""For small messages, when the large ones have filled the rest."""
+
+
+class Progress(NamedTuple):
+    file: str = ""
+    messages: int = 0
+    size_bytes: int = 0
+    raw_bytes: int = 0
+    waiting_bytes: int = 0
+    longest_sync_ms: float = 0.0
+    fault: str = ""
+    """Why nothing is written any more."""
+
+
+class Sink(Protocol):
+    def offer(self, entry: Entry) -> bool:
+        """Whether it was taken; there may be no room. What comes after a fault is taken and forgotten."""
+
+    def remember(self, name: str, entries: Mapping[str, str]) -> None:
+        """Metadata of the run."""
+
+    def progress(self) -> Progress: ...
+
+    def close(self) -> None:
+        """Write what waits, and make the file whole. Blocks."""
+
+
+class DirectSink:
+    """Writes at once, for virtual time: there is no thread, and no hurry."""
+
+    def __init__(self, make: Callable[[Callable[[int], None] | None], Writer], flush_s: float) -> None:
+        self._writer: Writer | None = None
+        self._fault = ""
+        self._flush_ns = round(flush_s * 1e9)
+        self._flushed_ns = 0
+        with self._guarded():
+            self._writer = make(None)
+
+    def offer(self, entry: Entry) -> bool:
+        if self._writer is not None and not self._fault:
+            with self._guarded():
+                self._writer.put(entry)
+                if entry.log_ns - self._flushed_ns >= self._flush_ns:
+                    self._flushed_ns = entry.log_ns
+                    self._writer.flush()
+        return True
+
+    def remember(self, name: str, entries: Mapping[str, str]) -> None:
+        if self._writer is not None and not self._fault:
+            with self._guarded():
+                self._writer.remember(name, entries)
+
+    def progress(self) -> Progress:
+        return _progress(self._writer, 0, 0.0, self._fault)
+
+    def close(self) -> None:
+        if self._writer is not None and not self._fault:
+            with self._guarded():
+                self._writer.close()
+
+    def _guarded(self) -> _Guard:
+        return _Guard(self._set_fault)
+
+    def _set_fault(self, fault: str) -> None:
+        self._fault = fault
+
+
+class ThreadedSink:
+    """Keeps what is offered until its thread has written it, within a bound."""
+
+    def __init__(
+        self,
+        make: Callable[[Callable[[int], None] | None], Writer],
+        capacity_bytes: int,
+        flush_s: float,
+        sync_s: float,
+    ) -> None:
+        """`make(release)` opens the writer, in the thread: what is slow or fails there does not hold up the loop."""
+        self._make = make
+        self._capacity_bytes = capacity_bytes
+        self._flush_s = flush_s
+        self._waiting: deque[Entry | tuple[str, Mapping[str, str]]] = deque()
+        self._taken_bytes = 0  # by the loop
+        self._done_bytes = 0  # by the thread: each number has one writer, so no lock is needed
+        self._fault = ""
+        self._writer: Writer | None = None
+        self._closing = threading.Event()
+        self._syncer = Syncer(sync_s, self._current)
+        self._thread = threading.Thread(target=self._run, name="capture writer", daemon=True)
+        self._thread.start()
+
+    def offer(self, entry: Entry) -> bool:
+        if self._fault:
+            return True
+        size = len(entry.payload)
+        room = self._capacity_bytes + (RESERVE_BYTES if size < LARGE_BYTES else 0)
+        if self._taken_bytes - self._done_bytes + size > room:
+            return False
+        self._taken_bytes += size
+        self._waiting.append(entry)
+        return True
+
+    def remember(self, name: str, entries: Mapping[str, str]) -> None:
+        self._waiting.append((name, entries))
+
+    def progress(self) -> Progress:
+        waiting_bytes = self._taken_bytes - self._done_bytes
+        return _progress(self._writer, waiting_bytes, self._syncer.longest_ms, self._fault)
+
+    def close(self) -> None:
+        self._closing.set()
+        self._thread.join()
+        self._syncer.close()
+
+    def _current(self) -> int | None:
+        return None if self._writer is None else self._writer.file.fileno()
+
+    def _run(self) -> None:
+        with _Guard(self._failed):
+            self._writer = writer = self._make(self._syncer.release)
+            self._syncer.start()
+            flush_at_s = 0.0
+            while True:
+                last = self._closing.wait(POLL_S)
+                self._write(writer)
+                if time.monotonic() >= flush_at_s:
+                    writer.flush()
+                    flush_at_s = time.monotonic() + self._flush_s
+                if last:
+                    writer.close()
+                    return
+
+    def _write(self, writer: Writer) -> None:
+        """What waits now; and flush meanwhile, when that is much."""
+        flush_at_s = time.monotonic() + self._flush_s
+        for _ in range(len(self._waiting)):
+            item = self._waiting.popleft()
+            if isinstance(item, Entry):
+                writer.put(item)
+                self._done_bytes += len(item.payload)
+            else:
+                writer.remember(*item)
+            if time.monotonic() >= flush_at_s:
+                writer.flush()
+                flush_at_s = time.monotonic() + self._flush_s
+
+    def _failed(self, fault: str) -> None:
+        self._fault = fault
+        self._waiting.clear()
+        self._done_bytes = self._taken_bytes
+
+
+class Syncer:
+    """Has the disk make sure of what it was given, again and again; in a thread of its own, since that takes long."""
+
+    def __init__(
+        self,
+        period_s: float,
+        current: Callable[[], int | None],
+        sync: Callable[[int], None] = os.fdatasync,
+        wait: Callable[[threading.Event, float], bool] = threading.Event.wait,
+    ) -> None:
+        """`current` tells the file that is being written."""
+        self.longest_ms = 0.0
+        self.count = 0
+        self._period_s = period_s
+        self._current = current
+        self._sync = sync
+        self._wait = wait
+        self._whole: deque[int] = deque()
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self.run, name="capture syncer", daemon=True)
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def release(self, fd: int) -> None:
+        """A file that is whole: sync it and close it, soon."""
+        self._whole.append(fd)
+
+    def run(self) -> None:
+        while True:
+            last = self._wait(self._closing, self._period_s)
+            self.sync()
+            if last:
+                return
+
+    def sync(self) -> None:
+        """Sync the current file, and those that are whole."""
+        current = self._current()
+        with suppress(OSError):  # it has just been closed, and then it was released
+            if current is not None:
+                fd = os.dup(current)
+                try:
+                    self._timed(fd)
+                finally:
+                    os.close(fd)
+        while self._whole:
+            fd = self._whole.popleft()
+            try:
+                self._timed(fd)
+            finally:
+                os.close(fd)
+
+    def close(self) -> None:
+        """Sync what is left."""
+        self._closing.set()
+        if self._thread.is_alive():
+            self._thread.join()
+        self.sync()
+
+    def _timed(self, fd: int) -> None:
+        started = time.perf_counter()
+        with suppress(OSError):  # what the disk cannot keep, the writer will hear of
+            self._sync(fd)
+        self.count += 1
+        self.longest_ms = max(self.longest_ms, (time.perf_counter() - started) * 1e3)
+
+
+class _Guard:
+    """Turns a CaptureError into a fault that is told; so too a bug, so that the recorder says that it is dead."""
+
+    def __init__(self, tell: Callable[[str], None]) -> None:
+        self._tell = tell
+
+    def __enter__(self) -> None:
+        return None
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> bool:
+        if isinstance(error, CaptureError):
+            self._tell(str(error))
+            return True
+        if isinstance(error, Exception):
+            log.exception("the recorder has failed", exc_info=error)
+            self._tell(f"the recorder has failed: {type(error).__name__}: {error}")
+            return True
+        return False
+
+
+def _progress(writer: Writer | None, waiting_bytes: int, longest_sync_ms: float, fault: str) -> Progress:
+    if writer is None:
+        return Progress(waiting_bytes=waiting_bytes, fault=fault)
+    return Progress(
+        file=str(writer.file.path),
+        messages=writer.messages,
+        size_bytes=writer.size_bytes,
+        raw_bytes=writer.raw_bytes,
+        waiting_bytes=waiting_bytes,
+        longest_sync_ms=longest_sync_ms,
+        fault=fault,
+    )
