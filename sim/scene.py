@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from functools import cache
 from importlib import resources
 from math import cos, hypot, isfinite, pi, sin
 from pathlib import Path
@@ -12,6 +13,7 @@ import msgspec
 from msgspec import Meta
 
 from cocoro.errors import ConfigError
+from cocoro.objects import Catalogue
 from sim.seeds import stream
 
 Vec3 = tuple[float, float, float]
@@ -30,6 +32,11 @@ _SIZES: dict[Shape, tuple[str, ...]] = {
     "cylinder": ("radius_m", "height_m"),
     "sphere": ("radius_m",),
 }
+
+
+@cache
+def _known() -> Catalogue:
+    return Catalogue.load()
 
 
 class _Table(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -111,8 +118,11 @@ class SceneObject(_Body, frozen=True, kw_only=True):
 
     @property
     def colour(self) -> Vec3:
-        """Its own, or the one that its label names ('red_can'), or grey."""
-        return self.rgb if self.rgb is not None else _COLOURS.get(self.label.split("_")[0], _GREY)
+        """Its own, or that of the known object of its label, or the one that the label names ('red_box'), or grey."""
+        if self.rgb is not None:
+            return self.rgb
+        known = _known().get(self.label)
+        return known.rgb if known is not None else _COLOURS.get(self.label.split("_")[0], _GREY)
 
     @property
     def kinematic(self) -> bool:
