@@ -90,6 +90,7 @@ class Shell:
         self.folder = folder
         self.root = Path(tempfile.mkdtemp(prefix="cocoro"))  # short: sockets live there
         self.run_dir = RunDir("robbie", self.root)
+        self._started: list[Running] = []
         install_parts(folder)
 
     def __enter__(self) -> Shell:
@@ -100,6 +101,9 @@ class Shell:
     ) -> None:
         if self.run_dir.supervisor() or self.run_dir.claims():
             self("down")
+        for running in self._started:
+            running.process.kill()
+            running.process.wait()
         shutil.rmtree(self.root)
 
     @property
@@ -116,7 +120,8 @@ class Shell:
         return subprocess.run(command, env=self.env, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
 
     def start(self, *arguments: str) -> Running:
-        return Running([sys.executable, "-m", "cocoro.cli.main", *arguments], self.env)
+        self._started.append(Running([sys.executable, "-m", "cocoro.cli.main", *arguments], self.env))
+        return self._started[-1]
 
     def pid(self, service: str) -> int:
         return self.run_dir.claims()[service].pid

@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+import tempfile
 import types
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -28,8 +30,10 @@ ROOT = Path(__file__).parent.parent
 
 
 @pytest.fixture(autouse=True)
-def no_robot_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("COCORO_RUN_DIR", str(tmp_path / "run"))
+def no_robot_here(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    with tempfile.TemporaryDirectory(prefix="cocoro") as folder:  # a short path: sockets could live there
+        monkeypatch.setenv("COCORO_RUN_DIR", folder)
+        yield
 
 
 def test_help_lists_every_command(capsys: pytest.CaptureFixture[str]) -> None:
