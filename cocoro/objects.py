@@ -55,6 +55,8 @@ class KnownObject(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     """Surface colour under full white light, sRGB, 0 to 1 a channel."""
     lab: Annotated[tuple[LabBox, ...], Meta(min_length=1)]
     """A pixel is the object's when any of these boxes holds its colour."""
+    lab_by_shape: tuple[LabBox, ...] = ()
+    """Colours that it shares with another object: they count only for a detector that tells the two apart by shape."""
 
     def __post_init__(self) -> None:
         wanted = {"cylinder": {"radius_m", "height_m"}, "sphere": {"radius_m"}, "box": {"size_m"}}[self.shape]

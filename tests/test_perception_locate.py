@@ -4,7 +4,7 @@ from math import cos, radians, sin
 
 import numpy as np
 import pytest
-from perception_scenes import CATALOGUE, MS, ROBOT, STAMP_NS, Scene, block, error_mm, facing, known, seen, the
+from perception_scenes import CATALOGUE, MS, ROBOT, STAMP_NS, Scene, Thing, block, error_mm, facing, known, seen, the
 
 from services.perception.shapes import distance_from, signed_distance
 from sim.scene import Light
@@ -167,6 +167,47 @@ def test_other_red_things_do_not_draw_the_can_away(other):
 def test_a_red_patch_alone_is_no_can():
     with Scene([block(1.8, -0.4, 0.3, (0.02, 0.05, 0.05), RED)], "real") as scene:
         assert seen(scene.frame(0.0, -0.45), 0.0, -0.45).detections == ()
+
+
+# --- one colour, two shapes ------------------------------------------------------------------------
+
+BLUE = CATALOGUE["blue_can"].rgb
+
+
+def blue_ball(x: float, y: float, z: float = 0.04) -> Thing:
+    """As blue as the blue can."""
+    return Thing("blue_ball", "sphere", (0.04,), BLUE, (x, y, z))
+
+
+@pytest.mark.parametrize("sensors", ["ideal", "real"])
+@pytest.mark.parametrize("distance_m", [0.6, 1.0, 1.5, 2.0])
+def test_a_ball_as_blue_as_the_can_is_known_by_its_shape(distance_m, sensors):
+    for number, thing in enumerate(
+        (blue_ball(distance_m, 0.1), blue_ball(distance_m, 0.1, 0.7), known("blue_can", distance_m, 0.1))
+    ):
+        pan, tilt = facing(thing)
+        with Scene([thing], sensors, number) as scene:
+            detections = seen(scene.frame(pan, tilt), pan, tilt)
+        assert [d.label for d in detections.detections] == [thing.name]
+        assert error_mm(the(thing.name, detections), thing)[0] < 2.0 + 3.0 * distance_m**2
+
+
+def test_side_by_side_each_keeps_its_name():
+    things = [blue_ball(1.2, -0.2), known("blue_can", 1.2, 0.2)]
+    with Scene(things, "real") as scene:
+        detections = seen(scene.frame(0.0, -0.5), 0.0, -0.5)
+    for thing in things:
+        assert max(error_mm(the(thing.name, detections), thing)) < 4.0
+
+
+@pytest.mark.parametrize("left_m", [0.05, 0.04, 0.03])
+def test_a_half_hidden_can_is_not_taken_for_a_ball(left_m):
+    can = known("blue_can", 0.75, 0.0)
+    cover = block(0.62, left_m, 0.10, (0.02, 0.10, 0.20), GREY)
+    with Scene([can, cover], "real") as scene:
+        detections = seen(scene.frame(0.0, -0.7), 0.0, -0.7)
+    assert [d.label for d in detections.detections] == ["blue_can"]
+    assert error_mm(the("blue_can", detections), can)[0] < 4.0
 
 
 # --- the shapes themselves ------------------------------------------------------------------------

@@ -55,13 +55,17 @@ class BlobDetector:
             return None
         fit = _Fit(known, image, self._config)
         regions: list[Region] = []
+        plausible: list[Region] = []
         for part in parts:
             region = Region(*part, image)
             if fit.too_large(region):
-                regions += [Region(*piece, image) for piece in region.split_by_depth()]
+                pieces = [Region(*piece, image) for piece in region.split_by_depth()]
+                regions += pieces
+                plausible += [piece for piece in pieces if fit.whole(piece)]
             else:
                 regions.append(region)
-        plausible = [region for region in regions if fit.plausible(region)]
+                if fit.whole(region) or fit.partly_hidden(region):
+                    plausible.append(region)
         if not plausible:
             return None
         best = fit.completed(max(plausible, key=fit.score), regions)
@@ -73,6 +77,7 @@ class BlobDetector:
             box_px=best.bounds,
             depth_m=best.depth_m,
             cut=best.cut,
+            hidden=fit.too_small(best) and best.hidden,
             evidence=best.evidence(reach_m(known)),
         )
 
@@ -100,15 +105,21 @@ class _Fit:
         most = self._config.max_share * self._pixels(self._greatest_m2, depth_m)
         return region.area_px > most or region.diagonal_px > self._diagonal_px(depth_m)
 
-    def plausible(self, region: Region) -> bool:
+    def whole(self, region: Region) -> bool:
+        """It may be the whole object; without depth, for all that is known."""
         if region.area_px < self._min_area_px or self.too_large(region):
             return False
-        if region.depth_m is None:
-            return True
-        whole_px = self._pixels(self._least_m2, region.depth_m)
-        if region.area_px >= self._config.min_share * whole_px:
-            return True
-        return region.area_px >= self._config.min_hidden_share * whole_px and (region.cut or region.hidden)
+        return not self.too_small(region, self._config.min_share)
+
+    def partly_hidden(self, region: Region) -> bool:
+        """It may be a part of the object, whose rest the image's edge or something nearer hides."""
+        if region.area_px < 2 * self._min_area_px or self.too_small(region, self._config.min_hidden_share):
+            return False
+        return region.cut or region.hidden
+
+    def too_small(self, region: Region, share: float = 0.85) -> bool:
+        """It has a smaller share of the pixels that the whole object would have at that depth."""
+        return region.depth_m is not None and region.area_px < share * self._pixels(self._least_m2, region.depth_m)
 
     def score(self, region: Region) -> tuple[bool, float, int]:
         """Greater is better: with depth before without, then by how near it comes to the expected size."""

@@ -21,17 +21,17 @@ def lab_of(colour: Pixels) -> NDArray[np.float32]:
     return np.asarray(cv2.cvtColor(flat, cv2.COLOR_RGB2Lab), dtype=np.float32).reshape(colour.shape)
 
 
-def matches(known: KnownObject, lab: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Whether each colour (..., 3) lies in one of the object's boxes."""
+def matches(known: KnownObject, lab: NDArray[np.float32], *, by_shape: bool = False) -> NDArray[np.bool_]:
+    """Whether each colour (..., 3) lies in one of the object's boxes; with `by_shape` in one that it shares, too."""
     found = np.zeros(lab.shape[:-1], dtype=np.bool_)
-    for box in known.lab:
+    for box in known.lab + known.lab_by_shape if by_shape else known.lab:
         low, high = np.array(box.low, dtype=np.float32), np.array(box.high, dtype=np.float32)
         found |= np.all((lab >= low) & (lab <= high), axis=-1)
     return found
 
 
 class ColourTable:
-    """The catalogue's CIELAB boxes, tabulated over RGB with 5, 6 and 5 bits.
+    """The catalogue's CIELAB boxes, shared ones included, tabulated over RGB with 5, 6 and 5 bits.
 
     Converting a frame to CIELAB and comparing it with every box costs milliseconds; OpenCV packs it to
     5-6-5 bits in a tenth of one, and one look-up then answers for all objects.
@@ -49,7 +49,7 @@ class ColourTable:
         lab = lab_of((corner & kept) + half).reshape(-1, 3)
         table = np.zeros(65536, dtype=np.uint32)
         for bit, known in enumerate(catalogue):
-            table |= matches(known, lab).astype(np.uint32) << np.uint32(bit)
+            table |= matches(known, lab, by_shape=True).astype(np.uint32) << np.uint32(bit)
         self._table: Classes = table.astype(dtype)
 
     def classify(self, colour: Pixels) -> Classes:

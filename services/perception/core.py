@@ -156,7 +156,5 @@ class PerceptionCore:
             height=pending.camera.height,
             pan_rad=head.get("neck_pan"),
             tilt_rad=head.get("neck_tilt"),
-            detections=tuple(
-                self._localiser.locate(sighting, pending.camera, angles) for sighting in pending.sightings
-            ),
+            detections=tuple(self._localiser.locate(pending.sightings, pending.camera, angles)),
         )

@@ -7,12 +7,17 @@ visible, and to the rays beside it that are known to pass freely. Hidden parts s
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from math import log
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
 from cocoro.messages import Detection, Vec3
 from cocoro.objects import Catalogue, KnownObject
 from cocoro.robot import Camera, Robot
+from services.perception.image import Box
 from services.perception.region import depth_doubt_m
 from services.perception.shapes import counted_px, distance_from, reach_m, seen_area_m2, signed_distance
 from services.perception.sighting import Evidence, Sighting
@@ -28,6 +33,10 @@ RAY_SAMPLES = 5
 RAY_DOUBT_M, RAY_DOUBT_RAD = 0.001, 0.002
 """How far the outline may be off: at a distance about a pixel."""
 HUBER = 1.5
+SAME_PLACE = 0.5
+"""Overlap of two boxes, common area over area together."""
+SIZE_DOUBT = 0.2
+"""How far the number of pixels may be off, as a share (its logarithm), where nothing hides any."""
 
 
 class Localiser:
@@ -42,26 +51,41 @@ class Localiser:
         """4 x 4, camera frame (x right, y down, z forward) to body frame."""
         return self._chain.pose(dict(zip(self.joints, angles_rad, strict=True)))
 
-    def locate(self, sighting: Sighting, camera: Camera, angles_rad: Array | None) -> Detection:
-        """The detection as it is published: with the centre's position, or with a note of why there is none."""
+    def locate(self, sightings: Sequence[Sighting], camera: Camera, angles_rad: Array | None) -> list[Detection]:
+        """The detections as they are published: with the centre's position, or with a note of why there is none.
+
+        Where two objects share a colour, both may have been sighted in one place: the one stays whose shape and size
+        go better with it.
+        """
+        pose = None if angles_rad is None else self.camera_pose(angles_rad)
+        placed = [self._place(sighting, camera, pose) for sighting in sightings]
+        return [one.detection for one in placed if not any(other.displaces(one) for other in placed)]
+
+    def _place(self, sighting: Sighting, camera: Camera, pose: Array | None) -> _Placed:
         position: Vec3 | None = None
+        fit: _Fit | None = None
         note = ""
         if sighting.depth_m is None:
             note = "no depth"
-        elif angles_rad is None:
+        elif pose is None:
             note = "no head angles"
         else:
             known = self._catalogue[sighting.label]
-            pose = self.camera_pose(angles_rad)
+            misfit = 0.0
             centre = first_guess(known, camera.ray(sighting.u_px, sighting.v_px) * sighting.depth_m, pose)
-            if sighting.evidence is not None and len(sighting.evidence.surface_m) >= MIN_SURFACE_POINTS:
-                centre = fit_centre(known, sighting.evidence, pose, centre)
+            evidence = sighting.evidence
+            if evidence is not None and len(evidence.surface_m) >= MIN_SURFACE_POINTS:
+                centre, misfit = fit_centre(known, evidence, pose, centre)
             position = float(centre[0]), float(centre[1]), float(centre[2])
-            if sighting.cut:
-                note = "cut"
-            elif sighting.area_px < self._occluded_share * counted_px(expected_area_px(known, centre, camera, pose)):
-                note = "occluded"
-        return Detection(
+            most_px = expected_area_px(known, centre, camera, pose)
+            least_px = counted_px(most_px)
+            if evidence is not None:
+                whole = not (sighting.cut or sighting.hidden)
+                size_misfit = _size_misfit(sighting.area_px, least_px, most_px) if whole else 0.0
+                fit = _Fit(misfit, size_misfit, evidence.count)
+            occluded = sighting.area_px < self._occluded_share * least_px
+            note = "cut" if sighting.cut else "occluded" if occluded else ""
+        detection = Detection(
             label=sighting.label,
             u_px=sighting.u_px,
             v_px=sighting.v_px,
@@ -71,6 +95,42 @@ class Localiser:
             position_m=position,
             note=note,
         )
+        return _Placed(detection, fit)
+
+
+class _Fit(NamedTuple):
+    misfit: float
+    """Of one piece of evidence, in the mean: half the squared residual against its own doubt, Huber's beyond some."""
+    size_misfit: float
+    """Of the number of pixels, likewise."""
+    pieces: int
+
+
+class _Placed(NamedTuple):
+    detection: Detection
+    fit: _Fit | None
+    """None where no shape was fitted."""
+
+    def displaces(self, other: _Placed) -> bool:
+        """It is another object in the same place, and goes better with what is seen there."""
+        if self is other or self.fit is None or other.fit is None:
+            return False
+        if _overlap(self.detection.box_px, other.detection.box_px) < SAME_PLACE:
+            return False
+        pieces = min(self.fit.pieces, other.fit.pieces)
+        own, others = (fit.misfit * pieces + fit.size_misfit for fit in (self.fit, other.fit))
+        return own < others
+
+
+def _size_misfit(area_px: float, least_px: float, most_px: float) -> float:
+    return 0.5 * (log(area_px / min(max(area_px, least_px), most_px)) / SIZE_DOUBT) ** 2
+
+
+def _overlap(a: Box, b: Box) -> float:
+    """What two boxes have in common, as a share of what they cover together."""
+    across, down = min(a[2], b[2]) - max(a[0], b[0]), min(a[3], b[3]) - max(a[1], b[1])
+    common = max(across, 0) * max(down, 0)
+    return common / ((a[2] - a[0]) * (a[3] - a[1]) + (b[2] - b[0]) * (b[3] - b[1]) - common)
 
 
 def first_guess(known: KnownObject, surface_m: Array, pose: Array) -> Array:
@@ -85,8 +145,8 @@ def first_guess(known: KnownObject, surface_m: Array, pose: Array) -> Array:
     return point + inwards * (known.planar_radius_m / max(float(np.linalg.norm(inwards)), 1e-9))
 
 
-def fit_centre(known: KnownObject, evidence: Evidence, pose: Array, start: Array) -> Array:
-    """The centre, body frame, of the upright shape that goes best with the evidence, shape (3,).
+def fit_centre(known: KnownObject, evidence: Evidence, pose: Array, start: Array) -> tuple[Array, float]:
+    """The centre, body frame, of the upright shape that goes best with the evidence, shape (3,), and its misfit.
 
     Gauss-Newton on signed distances, with Huber weights: surface points want distance 0, each against its
     depth's doubt; a ray of the outline wants to meet the shape; a ray beside it wants not to enter the shape
@@ -108,14 +168,16 @@ def fit_centre(known: KnownObject, evidence: Evidence, pose: Array, start: Array
         np.minimum(distance[met:], 0.0, out=distance[met:])
         residual = distance / doubt
         rows = gradient / -doubt[:, None]
-        weight = HUBER / np.maximum(np.abs(residual), HUBER) * (residual != 0.0)
+        size = np.abs(residual)
+        weight = HUBER / np.maximum(size, HUBER) * (residual != 0.0)
         weighted = rows * weight[:, None]
         move = np.linalg.solve(weighted.T @ rows + PRIOR, -weighted.T @ residual - PRIOR @ (centre - guess))
         centre = centre + move
         if float(np.abs(move).max()) < SETTLED_M:
             break
+    misfit = float(np.where(size < HUBER, 0.5 * size**2, HUBER * (size - 0.5 * HUBER)).mean())
     wandered_m = float(np.linalg.norm(centre - guess))
-    return (centre if wandered_m < 2 * reach_m(known) else guess) + origin
+    return (centre if wandered_m < 2 * reach_m(known) else guess) + origin, misfit
 
 
 class _Rays:

@@ -26,6 +26,10 @@ class Evidence:
     free_to_m: Points
     """How far along the optical axis each ray beside is known to pass through nothing, (m,)."""
 
+    @property
+    def count(self) -> int:
+        return len(self.surface_m) + len(self.outline) + len(self.beside)
+
 
 @dataclass(frozen=True)
 class Sighting:
@@ -38,6 +42,8 @@ class Sighting:
     """Of the visible surface, along the optical axis."""
     cut: bool = False
     """It touches the image's edge."""
+    hidden: bool = False
+    """It is smaller than the whole object, and something nearer may hide the rest."""
     evidence: Evidence | None = None
     """Only from a detector that looks beyond the centroid."""
 
