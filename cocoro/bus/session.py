@@ -20,7 +20,7 @@ T = TypeVar("T")
 
 LEAVE_S = 2.0
 """How long leaving the mesh may take before it is given up; the process can end all the same."""
-FRAGMENT_WAIT_US = 10_000
+FRAGMENT_WAIT_US = 25_000
 """How long a large sample without shared memory may wait for a receiver on this machine that does not read."""
 
 PACKETS = 16
