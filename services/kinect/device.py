@@ -1,0 +1,50 @@
+"""What a depth camera's driver has to offer; a driver is one entry in `DEVICES`."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Callable
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cocoro.clock import Clock
+from cocoro.errors import ConfigError
+
+
+class Shot(NamedTuple):
+    """One colour and depth pair."""
+
+    stamp_ns: int
+    """Of the middle of the exposure, by the robot's clock."""
+    colour: NDArray[np.uint8]
+    """RGB, (height, width, 3)."""
+    depth: NDArray[np.uint16]
+    """Raw 11-bit codes as the depth camera sees them, (height, width); 2047 is no data."""
+
+
+class DepthCamera(Protocol):
+    """A device that is open. It may lose its cable: `shots` then waits until it is back."""
+
+    def shots(self) -> AsyncIterator[Shot]:
+        """Every pair as it comes; a pair that nobody took in time is dropped for the next."""
+
+    def tilt(self, angle_rad: float) -> None:
+        """Move the device's own tilt motor (the Calliope's stays at 0: its neck tilts)."""
+
+    def close(self) -> None: ...
+
+
+DEVICES: dict[str, Callable[[Clock], DepthCamera]] = {}
+"""Drivers by name. Raise ConfigError, naming the package to install, when their library is missing."""
+
+
+def open_device(name: str, clock: Clock) -> DepthCamera:
+    """Raises ConfigError for a driver that is not there."""
+    if name not in DEVICES:
+        known = ", ".join(DEVICES) or "none"
+        raise ConfigError(
+            f"kinect: there is no driver {name!r} (known: {known}); on the simulated robot the simulator takes"
+            " the Kinect's place: cocoro up sim"
+        )
+    return DEVICES[name](clock)

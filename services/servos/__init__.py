@@ -1,0 +1,1 @@
+"""The servos: both Dynamixel networks, arm and neck, and hand."""
