@@ -70,5 +70,5 @@ def test_every_pair_is_published_with_its_own_stamp_and_pixels(monkeypatch: pyte
 
 
 def test_a_driver_that_is_not_there_is_said_with_what_to_do() -> None:
-    with pytest.raises(ConfigError, match="no driver 'nonesuch'.*cocoro up sim"):
+    with pytest.raises(ConfigError, match=r"no driver 'nonesuch'.*cocoro up sim"):
         device.open_device("nonesuch", VirtualClock())
