@@ -34,6 +34,7 @@ To = Annotated[float | None, typer.Option("--to", metavar="S", help="Likewise; e
 def add_to(app: typer.Typer) -> None:
     app.add_typer(capture, name="capture", rich_help_panel=PANEL)
     app.command(rich_help_panel=PANEL)(record)
+    app.command(rich_help_panel=PANEL)(replay)
 
 
 def record(
@@ -57,6 +58,28 @@ def record(
         "compression": compression, "jpeg_quality": jpeg,
     }  # fmt: skip
     sys.exit(asyncio.run(capture_record.record(Where(robot, profile), settings, seconds)))
+
+
+def replay(
+    file: File,
+    rate: Annotated[float, typer.Option(min=0.01, max=100.0, help="How many times as fast.")] = 1.0,
+    start: From = None,
+    end: To = None,
+    loop: Annotated[bool, typer.Option("--loop", help="Again and again.")] = False,
+    only: Only = None,
+    paused: Annotated[bool, typer.Option("--paused", help="Begin with a pause; needs a terminal.")] = False,
+    hardware: Annotated[
+        bool, typer.Option("--hardware", help="Only what the robot's hardware said: be the robot.")
+    ] = False,
+) -> None:
+    """Send a capture into the mesh again. With --hardware, `cocoro up replay` in another terminal works on it.
+
+    Keys: space pauses, . goes to the next picture, left and right 5 s, + and - change the rate, q ends.
+    """
+    from cocoro.cli import capture_replay
+
+    options = {"start_s": start or 0.0, "end_s": end, "rate": rate, "loop": loop, "paused": paused}
+    sys.exit(asyncio.run(capture_replay.replay(file, only or [], hardware, options)))
 
 
 @capture.command()

@@ -1,0 +1,155 @@
+"""A capture's time line: where it stands, how fast it goes, and what is due. Pure: it is told what time it is."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterator
+
+from cocoro.capture.reader import Capture, Record
+from cocoro.clock import NS
+from cocoro.topics import FRAME
+
+SLOWEST, FASTEST = 0.01, 100.0
+AT_ONCE = 256
+"""Messages that one `due` gives at most, so that nobody else has to wait for long."""
+
+
+class Player:
+    """Plays records by the spacing of their log times. All times given to it are seconds of one steady clock."""
+
+    def __init__(
+        self,
+        capture: Capture,
+        chosen: Callable[[str], bool],
+        *,
+        start_s: float = 0.0,
+        end_s: float | None = None,
+        rate: float = 1.0,
+        loop: bool = False,
+        paused: bool = False,
+    ) -> None:
+        """`start_s` and `end_s` are seconds of the capture; `chosen(key)` says which keys are played."""
+        self.keys = tuple(key for key in capture.keys if chosen(key))
+        self.rate = rate
+        self.loop = loop
+        self.paused = paused
+        self.passes = 0
+        """Times that the time line has gone back: by the loop or by hand."""
+        self._capture = capture
+        self._start_ns = capture.start_ns + round(start_s * NS)
+        self._end_ns = capture.end_ns if end_s is None else capture.start_ns + round(end_s * NS) - 1
+        self._next: deque[Record] = deque(maxlen=1)
+        self._records: Iterator[Record] = iter(())
+        self._position_ns = self._start_ns
+        self._anchor_s: float | None = None
+        self._step_key = next((key for key in self.keys if key.endswith(f"/{FRAME.name}")), None)
+        self._stepping = False
+        self._go_to(self._start_ns)
+
+    @property
+    def ended(self) -> bool:
+        return not self._next and not self.loop
+
+    @property
+    def length_s(self) -> float:
+        return (self._capture.end_ns - self._capture.start_ns) / NS
+
+    def position_s(self, now_s: float) -> float:
+        """Seconds of the capture."""
+        return (min(self._now_ns(now_s), self._end_ns) - self._capture.start_ns) / NS
+
+    def position_ns(self, now_s: float) -> int:
+        """As a log time."""
+        return min(self._now_ns(now_s), self._end_ns)
+
+    # --- what is due ------------------------------------------------------------------------------
+
+    def due(self, now_s: float) -> list[Record]:
+        """What is to be sent now, in order; at most `AT_ONCE`."""
+        if self._anchor_s is None:
+            self._anchor_s = now_s
+        if self._stepping:
+            return self._one_step()
+        position_ns = self._now_ns(now_s)
+        found: list[Record] = []
+        while not self.paused and self._next and self._next[0].log_ns <= position_ns and len(found) < AT_ONCE:
+            found.append(self._take())
+        if not self._next and self.loop and not self.paused and self._now_ns(now_s) >= self._end_ns:
+            self._anchor(now_s, self._start_ns)
+            self.passes += 1
+            self._go_to(self._start_ns)
+        return found
+
+    def wait_s(self, now_s: float) -> float | None:
+        """Until something is due; None while it stands still."""
+        if self._stepping:
+            return 0.0
+        if self.paused or self.ended:
+            return None
+        if not self._next:  # the loop's end; a capture of no length is not played without a breath
+            return max((self._end_ns - self._now_ns(now_s)) / NS / self.rate, 0.01)
+        next_ns = self._next[0].log_ns
+        return max((next_ns - self._now_ns(now_s)) / NS / self.rate, 0.0)
+
+    def _one_step(self) -> list[Record]:
+        self._stepping = False
+        found = []
+        while self._next:
+            record = self._take()
+            found.append(record)
+            self._position_ns = record.log_ns
+            if self._step_key in (None, record.key):
+                break
+        return found
+
+    # --- by hand ----------------------------------------------------------------------------------
+
+    def toggle(self, now_s: float) -> None:
+        """Pause, or go on."""
+        self._anchor(now_s, self._now_ns(now_s))
+        self.paused = not self.paused
+
+    def step(self, now_s: float) -> None:
+        """Pause, after all up to the next picture (or the next message, where there are no pictures)."""
+        if not self.paused:
+            self.toggle(now_s)
+        self._stepping = True
+
+    def change_rate(self, now_s: float, rate: float) -> None:
+        self._anchor(now_s, self._now_ns(now_s))
+        self.rate = min(max(rate, SLOWEST), FASTEST)
+
+    def seek(self, now_s: float, to_s: float) -> None:
+        """Go to a second of the capture, within what is played."""
+        to_ns = min(max(self._capture.start_ns + round(to_s * NS), self._start_ns), self._end_ns)
+        if to_ns < self._now_ns(now_s):
+            self.passes += 1
+        self._anchor(now_s, to_ns)
+        self._go_to(to_ns)
+
+    # --- the time line ----------------------------------------------------------------------------
+
+    def _now_ns(self, now_s: float) -> int:
+        if self.paused or self._anchor_s is None:
+            return self._position_ns
+        return self._position_ns + round((now_s - self._anchor_s) * self.rate * NS)
+
+    def _anchor(self, now_s: float, position_ns: int) -> None:
+        self._anchor_s, self._position_ns = now_s, position_ns
+
+    def _go_to(self, start_ns: int) -> None:
+        self._records = (
+            self._capture.messages(*self.keys, start_ns=start_ns, end_ns=self._end_ns + 1) if self.keys else iter(())
+        )
+        self._next.clear()
+        self._advance()
+
+    def _take(self) -> Record:
+        record = self._next.popleft()
+        self._advance()
+        return record
+
+    def _advance(self) -> None:
+        record = next(self._records, None)
+        if record is not None:
+            self._next.append(record)
