@@ -99,7 +99,7 @@ class BaseState(Message):
 
 
 class BaseCommand(Message):
-    """Wheel speeds. Valid for 0.2 s: a base that hears nothing newer commands zero."""
+    """Wheel speeds. Valid for 0.15 s: a base that hears nothing newer commands zero."""
 
     left_mps: Finite
     right_mps: Finite
@@ -133,7 +133,7 @@ class ServoState(Message):
 
 
 class ServoCommand(Message):
-    """Goals for the named joints of one network; a joint that is not named keeps its goal. Valid for 0.2 s:
+    """Goals for the named joints of one network; a joint that is not named keeps its goal. Valid for 0.15 s:
     then an arm or neck joint that is still on its way holds where it is; the hand keeps its goal, so
     that a held object stays held."""
 

@@ -87,7 +87,7 @@ BASE_STATE = Topic(
     "Odometry, bumpers, battery. Beyond its age the planner stops the base.",
 )  # fmt: skip
 BASE_COMMAND = Topic(
-    "base/command", m.BaseCommand, Qos.COMMAND, "planning", 50.0, 0.2,
+    "base/command", m.BaseCommand, Qos.COMMAND, "planning", 50.0, 0.15,
     "Wheel speeds. Beyond its age the base commands zero.",
 )  # fmt: skip
 ARM_STATE = Topic(
@@ -95,7 +95,7 @@ ARM_STATE = Topic(
     "Neck and arm servos. Beyond its age the planner commands nothing and detections stay unlocalised.",
 )  # fmt: skip
 ARM_COMMAND = Topic(
-    "arm/command", m.ServoCommand, Qos.COMMAND, "planning", 50.0, 0.2,
+    "arm/command", m.ServoCommand, Qos.COMMAND, "planning", 50.0, 0.15,
     "Neck and arm goals. Beyond its age the joints hold where they are.",
 )  # fmt: skip
 HAND_STATE = Topic(
@@ -103,7 +103,7 @@ HAND_STATE = Topic(
     "Wrist roll and claws. Beyond its age the planner does not start to grasp.",
 )  # fmt: skip
 HAND_COMMAND = Topic(
-    "hand/command", m.ServoCommand, Qos.COMMAND, "planning", 50.0, 0.2,
+    "hand/command", m.ServoCommand, Qos.COMMAND, "planning", 50.0, 0.15,
     "Wrist roll and claw goals. Beyond its age the hand keeps its goal: what is held stays held.",
 )  # fmt: skip
 DETECTIONS = Topic(
@@ -120,8 +120,8 @@ PLAN = Topic(
     "What the planner does and why. Beyond its age the running task fails: planner silent.",
 )  # fmt: skip
 INTENT = Topic(
-    "executive/intent", m.Intent, Qos.COMMAND, "executive", 20.0, 0.3,
-    "The behaviour that is wanted. Beyond its age the planner goes idle and the robot stands still.",
+    "executive/intent", m.Intent, Qos.COMMAND, "executive", 50.0, 0.3,
+    "The behaviour that is wanted. The wheels stand when it is 0.12 s old; beyond its age the planner goes idle.",
 )  # fmt: skip
 TASK = Topic(
     "executive/task", m.TaskState, Qos.EVENT, "executive", 5.0, 2.0,

@@ -131,7 +131,7 @@ def test_a_description_comes_back_from_plain_data() -> None:
 
 def test_another_deadman_leaves_the_robot_itself_alone() -> None:
     assert ROBOT.with_base(command_timeout_s=9.0).base.command_timeout_s == 9.0
-    assert ROBOT.base.command_timeout_s == 0.2
+    assert ROBOT.base.command_timeout_s == 0.15
 
 
 @pytest.mark.parametrize(

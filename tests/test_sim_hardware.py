@@ -223,7 +223,7 @@ def test_wheel_speeds_are_ramped_and_clipped() -> None:
 def test_the_base_stops_when_commands_stop() -> None:
     base = MobileBase(ROBOT.base, exact=True)
     now_ns, _ = run(base, 1.0, BaseCommand(left_mps=0.2, right_mps=0.2))
-    now_ns, _ = run(base, 0.15, None, now_ns)
+    now_ns, _ = run(base, 0.7 * ROBOT.base.command_timeout_s, None, now_ns)
     assert base.ramp.left_mps == pytest.approx(0.2)
     assert base.state(now_ns).stopped_by == ""
     now_ns, _ = run(base, 0.2, None, now_ns)

@@ -15,7 +15,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A catalogue of known objects; empty is the project's own."""
     needed: tuple[str, ...] = ("kinect", "base", "arm", "hand", "perception", "planning")
     """Services without which no task starts, and at whose death a running one fails."""
-    intent_hz: Positive = 20.0
+    intent_hz: Positive = 50.0
     progress_hz: Positive = 5.0
     latch_hz: Positive = 5.0
     task_timeout_s: Positive = 180.0

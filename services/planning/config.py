@@ -132,6 +132,8 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     arm: Arm = Arm()
     hand: Hand = Hand()
     follow: Follow = Follow()
+    hesitate_s: Positive = 0.12
+    """An executive that is silent for longer may be dead: the wheels stand until it speaks again, or for good."""
     odometry_gap_s: Positive = 0.1
     """Odometry is interpolated over no more than this."""
     stale_target_s: Positive = 4.0

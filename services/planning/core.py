@@ -119,6 +119,8 @@ class PlanningCore:
                 self._ended.distance_m,
             )
         plan = self._behaviour.step(scene)
+        if self._senses.intent_age_s(scene.now_ns) > self._config.hesitate_s:
+            plan.base, plan.why = self._limbs.driver.halt(), "standing still: the executive is silent"
         if plan.state != "running" and not isinstance(self._behaviour, Idle):
             self._ended = plan
         return plan

@@ -114,6 +114,11 @@ class Driver:
             left, right = left / excess, right / excess
         return BaseCommand(left_mps=left, right_mps=right)
 
+    def halt(self) -> BaseCommand:
+        """Zero at once: the base's own ramp is all that there is between this and standing."""
+        self.reset()
+        return BaseCommand(left_mps=0.0, right_mps=0.0)
+
     def brake(self, dt_s: float) -> BaseCommand:
         return self.command(0.0, 0.0, dt_s)
 

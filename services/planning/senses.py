@@ -146,6 +146,10 @@ class Senses:
                 return f"{name}: emergency stop {state.latch}"
         return ""
 
+    def intent_age_s(self, now_ns: int) -> float:
+        """Since the executive last said what it wants."""
+        return (now_ns - self.intent.stamp_ns) / NS if self.intent is not None else float("inf")
+
     def fresh_intent(self, now_ns: int) -> Intent | None:
         if self.intent is None or not is_fresh(self.intent.stamp_ns, now_ns, topics.INTENT.max_age_s):
             return None

@@ -13,13 +13,13 @@ from services.planning.head import PAN, TILT, Sweep
 
 
 class Idle:
-    """Stand still and hold everything as it is."""
+    """Stand still, at once, and hold everything as it is."""
 
     def __init__(self, why: str = "nothing is asked") -> None:
         self._why = why
 
     def step(self, scene: Scene) -> Plan:
-        return Plan(scene.stand(), scene.still(), self._why, state="done")
+        return Plan(scene.limbs.driver.halt(), scene.still(), self._why, state="done")
 
 
 class Park:

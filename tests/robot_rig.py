@@ -1,0 +1,222 @@
+"""The whole robot in one process, in virtual time, for tests that break it: services are killed and started again,
+the emergency stop is pressed, and the simulator's truth says what became of it."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Mapping
+from math import atan2, hypot
+from typing import Any, NamedTuple
+
+import msgspec
+
+from cocoro import topics
+from cocoro.bus.local import LocalBus, LocalMesh
+from cocoro.clock import NS, VirtualClock
+from cocoro.frames import wrap_rad
+from cocoro.messages import (
+    BaseState,
+    CancelRequest,
+    EstopRequest,
+    TaskName,
+    TaskReply,
+    TaskRequest,
+    TaskState,
+    TrueObject,
+    Truth,
+)
+from cocoro.node import Node
+from cocoro.processes import load, named
+from cocoro.robot import Robot
+from cocoro.testing import Tap, settle
+
+SERVICES = ("sim", "perception", "planning", "executive")
+HALTED_MPS = 0.01
+SMALL_FRAMES = {"width": 320, "height": 240, "frame_rate_hz": 15.0}
+CLAWS = {"claw_left", "claw_right"}
+
+
+class _Running(NamedTuple):
+    bus: LocalBus
+    node: Node
+    work: asyncio.Future[None]
+
+
+class RobotRig:
+    """Use it as an asynchronous context manager, in virtual time."""
+
+    def __init__(
+        self,
+        *,
+        settings: Mapping[str, Mapping[str, Any]] | None = None,
+        latency_s: Mapping[str, float] | None = None,
+        record_steps: bool = False,
+    ) -> None:
+        """`settings` by service; frames are small unless those of 'sim' say otherwise."""
+        self._settings = {"sim": SMALL_FRAMES} | dict(settings or {})
+        self._latency_s = latency_s or {}
+        self._record_steps = record_steps
+        self._clock = VirtualClock()
+        self._robot = Robot.load()
+        self.mesh = LocalMesh()
+        self._services: dict[str, _Running] = {}
+        self.operator = Node("operator", self.mesh.join(), self._clock, self._robot)
+        self.tap = Tap(self.mesh.join(), self._robot.name)
+        self.truths: list[Truth] = []
+        self._base: list[BaseState] = []
+        self._tasks: dict[str, TaskState] = {}
+
+    async def __aenter__(self) -> RobotRig:
+        await self.operator.__aenter__()
+        self.operator.on(topics.TRUTH, self.truths.append)
+        self.operator.on(topics.BASE_STATE, self._base.append)
+        self.operator.on(topics.TASK, lambda state: self._tasks.update({state.task_id: state}))
+        for name in SERVICES:
+            await self.start(name)
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        for name in list(self._services):
+            await self.kill(name)
+        await self.operator.__aexit__()
+
+    # --- services -----------------------------------------------------------------------------------
+
+    async def start(self, name: str) -> None:
+        component = load(named(name))
+        config = msgspec.convert(self._settings.get(name, {}), component.config)
+        bus = self.mesh.join()
+        node = Node(
+            name, bus, self._clock, self._robot,
+            latency_s=self._latency_s.get(name, 0.0), record_steps=self._record_steps,
+        )  # fmt: skip
+        await node.__aenter__()
+        self._services[name] = _Running(bus, node, asyncio.ensure_future(component.run(node, config)))
+        await settle()
+
+    async def kill(self, name: str) -> None:
+        """As SIGKILL does: at once, nothing said."""
+        bus, node, work = self._services.pop(name)
+        bus.kill()
+        work.cancel()
+        await asyncio.gather(work, return_exceptions=True)
+        await node.__aexit__()
+
+    # --- time ---------------------------------------------------------------------------------------
+
+    @property
+    def now_s(self) -> float:
+        return self.operator.now_ns() / NS
+
+    async def advance(self, seconds: float) -> None:
+        """Let time pass. Raises what a service raised meanwhile."""
+        await asyncio.sleep(seconds)
+        self._check()
+
+    async def until(self, content: Callable[[], object], timeout_s: float = 60.0) -> None:
+        """Let time pass until something holds."""
+        end_s = self.now_s + timeout_s
+        while not content():
+            assert self.now_s < end_s, f"still not so after {timeout_s:g} s"
+            await self.advance(0.01)
+
+    def _check(self) -> None:
+        for name, service in self._services.items():
+            if service.work.done():
+                service.work.result()
+                raise AssertionError(f"{name} ended by itself")
+
+    # --- the operator ---------------------------------------------------------------------------------
+
+    async def ask(self, task: TaskName, label: str = "", timeout_s: float | None = None) -> TaskReply:
+        return await self.operator.call(topics.RUN, TaskRequest(task=task, label=label, timeout_s=timeout_s))
+
+    async def begin(self, task: TaskName, label: str = "", timeout_s: float | None = None) -> str:
+        """Have a task accepted, as soon as the robot is ready for one; its id."""
+        reply = await self.ask(task, label, timeout_s)
+        while reply.refusal in ("not_alive", "estop") and self.now_s < 3.0:
+            await self.advance(0.05)
+            reply = await self.ask(task, label, timeout_s)
+        assert reply.accepted, reply.text
+        return reply.task_id
+
+    def state(self, task_id: str) -> TaskState:
+        """What the executive said last of a task."""
+        return self._tasks[task_id]
+
+    async def outcome(self, task_id: str, timeout_s: float = 120.0) -> TaskState:
+        """Wait for a task's end."""
+        await self.until(lambda: task_id in self._tasks and self._tasks[task_id].outcome is not None, timeout_s)
+        return self._tasks[task_id]
+
+    async def run(self, task: TaskName, label: str = "", timeout_s: float | None = None) -> TaskState:
+        return await self.outcome(await self.begin(task, label, timeout_s))
+
+    async def phase(self, task_id: str, phase: str) -> None:
+        """Wait for a task to come to a phase."""
+        await self.until(lambda: task_id in self._tasks and self._tasks[task_id].phase == phase)
+
+    async def cancel(self) -> TaskReply:
+        return await self.operator.call(topics.CANCEL, CancelRequest())
+
+    async def estop(self, latched: bool) -> set[str]:
+        """Press or reset the emergency stop; who acknowledged that it is so."""
+        question = EstopRequest(latched=latched, by="test")
+        replies = await self.operator.call_all(topics.ESTOP.of("*"), question)
+        return {reply.service for reply in replies if reply.latch == ("latched" if latched else "released")}
+
+    async def driving(self, speed_mps: float = 0.25) -> str:
+        """Fetch the red can, and be on the way to it at some speed; the task's id."""
+        task_id = await self.begin("fetch", "red_can")
+        await self.until(lambda: self.speed_mps > speed_mps)
+        return task_id
+
+    async def holding(self) -> None:
+        """Have the red can in the hand, lifted."""
+        assert (await self.run("fetch", "red_can")).outcome == "done"
+
+    # --- the truth ------------------------------------------------------------------------------------
+
+    @property
+    def speed_mps(self) -> float:
+        """Of the body, truly, over the last step of the truth."""
+        return self.speeds_since(-1.0)[-1] if len(self.truths) > 1 else 0.0
+
+    def speeds_since(self, when_s: float) -> list[float]:
+        """True speeds of the body over each step of the truth that lies after then."""
+        after = [truth for truth in self.truths[-300:] if truth.stamp_ns >= when_s * NS]
+        return [
+            hypot(b.body_m[0] - a.body_m[0], b.body_m[1] - a.body_m[1]) / ((b.stamp_ns - a.stamp_ns) / NS)
+            for a, b in zip(after, after[1:], strict=False)
+        ]
+
+    def turned_since(self, when_s: float) -> float:
+        """How far the body's heading truly changed, radians."""
+        after = [truth for truth in self.truths if truth.stamp_ns >= when_s * NS]
+        first, last = (_yaw_rad(truth) for truth in (after[0], after[-1]))
+        return abs(wrap_rad(last - first))
+
+    def commanded_since(self, when_s: float) -> list[tuple[float, float]]:
+        """The wheel commands published after then."""
+        return [
+            (command.left_mps, command.right_mps)
+            for command in self.tap.messages(topics.BASE_COMMAND)
+            if command.stamp_ns > when_s * NS
+        ]
+
+    def base_obeys_since(self, when_s: float) -> bool:
+        """Whether the base, by its own word, obeyed anyone's wheel commands after then."""
+        return any(state.stopped_by == "" for state in self._base if state.stamp_ns > when_s * NS)
+
+    def thing(self, label: str) -> TrueObject:
+        """An object as it truly is now."""
+        return next(item for item in self.truths[-1].objects if item.label == label)
+
+    def held(self, label: str) -> bool:
+        """Truly between both claws, touching nothing else, and off the floor."""
+        return set(self.thing(label).touching) == CLAWS
+
+
+def _yaw_rad(truth: Truth) -> float:
+    x, y, z, w = truth.body_orientation
+    return atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
