@@ -18,13 +18,13 @@ from cocoro.cli.main import main
 from cocoro.cli.options import frames_of, latencies_of
 from cocoro.cli.running import overrides
 from cocoro.cli.table import table
-from cocoro.errors import ConfigError
+from cocoro.errors import CocoroError, ConfigError
 from cocoro.rehearsal import RehearsalRequest
 from cocoro.topics import TOPICS
 
 COMMANDS = (
-    "up", "down", "status", "fetch", "park", "put-down", "estop", "reset", "cancel", "objects", "snapshot", "run",
-    "rehearse", "topics",
+    "up", "down", "status", "fetch", "follow", "park", "put-down", "estop", "reset", "cancel", "objects", "snapshot",
+    "run", "rehearse", "topics",
 )  # fmt: skip
 ROOT = Path(__file__).parent.parent
 
@@ -65,6 +65,7 @@ def test_every_command_has_help(command: str, capsys: pytest.CaptureFixture[str]
         ["estop", "now"],
         ["rehearse", "dance"],
         ["rehearse", "fetch"],
+        ["rehearse", "follow"],
         ["rehearse", "fetch", "red_can", "--sensors", "good"],
         ["rehearse", "fetch", "red_can", "--seed", "-1"],
         ["rehearse", "fetch", "red_can", "--frames", "9x9@30"],
@@ -173,12 +174,14 @@ def simulator(monkeypatch: pytest.MonkeyPatch) -> list[RehearsalRequest]:
 
 
 def test_every_option_of_rehearse_reaches_the_request(simulator: list[RehearsalRequest]) -> None:
-    options = "--scene paper --seed 3 --sensors real --latency perception=0.1 --latency planning=0.02 --lockstep"
+    options = (
+        "--bring --scene paper --seed 3 --sensors real --latency perception=0.1 --latency planning=0.02 --lockstep"
+    )
     code = main(["rehearse", "fetch", "red_can", *options.split(), "--frames", "320x240@15", "--timeout", "60"])
     assert code == 0
     assert simulator == [
         RehearsalRequest(
-            task="fetch", label="red_can", scene="paper", seed=3, sensors="real",
+            task="fetch", label="red_can", bring=True, scene="paper", seed=3, sensors="real",
             latency={"perception": 0.1, "planning": 0.02}, lockstep=True,
             width=320, height=240, frame_rate_hz=15.0, timeout_s=60.0,
         )
@@ -202,6 +205,19 @@ def test_the_summary_says_outcome_phases_speed_and_truth(
     assert "failed: fetch red_can in 12.5 s" in out
     for fact in ("approach      4.0 s", "2.5 times real time", "held               yes", "knocked over       none"):
         assert fact in out
+
+
+@pytest.mark.parametrize(("refusal", "code"), [("unknown_label", 2), ("busy", 3)])
+def test_a_refused_rehearsal_exits_as_the_refused_task_would(
+    simulator: list[RehearsalRequest], monkeypatch: pytest.MonkeyPatch, refusal: str, code: int
+) -> None:
+    def refuse(request: RehearsalRequest) -> dict[str, Any]:
+        error = CocoroError("known are red_can")
+        error.code = refusal  # type: ignore[attr-defined]
+        raise error
+
+    monkeypatch.setattr(sys.modules[rehearse.SIMULATOR], "rehearse", refuse)
+    assert main(["rehearse", "fetch", "grey_can"]) == code
 
 
 @pytest.mark.sim

@@ -40,6 +40,10 @@ Latency = Annotated[
 Frames = Annotated[str | None, typer.Option(metavar="WxH@HZ", help="The camera's frames: 320x240@15.")]
 Timeout = Annotated[float | None, typer.Option(min=0.1, max=3600.0, metavar="SECONDS", help="Give up after this.")]
 
+For = Annotated[
+    float | None, typer.Option("--for", min=0.1, max=3600.0, metavar="SECONDS", help="Follow for so long, then stop.")
+]
+
 
 # --- tasks ----------------------------------------------------------------------------------------
 
@@ -56,6 +60,7 @@ def _task(where: tuple[str | None, str | None], as_json: bool, snapshot: Path | 
 @app.command(rich_help_panel=TASKS)
 def fetch(
     label: Annotated[str, typer.Argument(help="What to fetch; `cocoro objects` lists what the robot knows.")],
+    bring: Annotated[bool, typer.Option("--bring", help="Bring it to where the task began and put it down.")] = False,
     timeout: Timeout = None,
     snapshot: Annotated[
         Path | None, typer.Option(metavar="OUT.png", help="Write what the robot sees when it grasps.")
@@ -65,7 +70,19 @@ def fetch(
     json: Json = False,
 ) -> None:
     """Find an object, drive there, grasp it and lift it. Ctrl-C cancels it on the robot."""
-    _task((robot, profile), json, snapshot, task="fetch", label=label, timeout_s=timeout)
+    _task((robot, profile), json, snapshot, task="fetch", label=label, bring=bring, timeout_s=timeout)
+
+
+@app.command(rich_help_panel=TASKS)
+def follow(
+    label: Annotated[str, typer.Argument(help="What to follow; `cocoro objects` lists what the robot knows.")],
+    for_: For = None,
+    robot: Robot = None,
+    profile: Reach = None,
+    json: Json = False,
+) -> None:
+    """Keep behind an object that moves, at a distance, until Ctrl-C or for a time."""
+    _task((robot, profile), json, task="follow", label=label, for_s=for_)
 
 
 @app.command(rich_help_panel=TASKS)
@@ -91,8 +108,10 @@ def cancel(robot: Robot = None, profile: Reach = None) -> None:
 
 @app.command(rich_help_panel=TASKS)
 def rehearse(
-    task: Annotated[str, typer.Argument(help="fetch, park or put-down.")],
-    label: Annotated[str, typer.Argument(help="What to fetch.")] = "",
+    task: Annotated[str, typer.Argument(help="fetch, follow, park or put-down.")],
+    label: Annotated[str, typer.Argument(help="What to fetch or to follow.")] = "",
+    bring: Annotated[bool, typer.Option("--bring", help="Fetch: bring it to where the task began.")] = False,
+    for_: For = None,
     scene: Annotated[str, typer.Option(help="A scene's name, or its file.")] = "paper",
     seed: Annotated[int, typer.Option(min=0, help="Everything that is drawn comes from it.")] = 0,
     sensors: Annotated[
@@ -111,8 +130,8 @@ def rehearse(
     from cocoro.cli import rehearse as rehearsing
 
     options = {
-        "task": task, "label": label, "scene": scene, "seed": seed, "sensors": sensors, "lockstep": lockstep,
-        "timeout_s": timeout, "picture": None if picture is None else str(picture),
+        "task": task, "label": label, "bring": bring, "for_s": for_, "scene": scene, "seed": seed, "sensors": sensors,
+        "lockstep": lockstep, "timeout_s": timeout, "picture": None if picture is None else str(picture),
     }  # fmt: skip
     sys.exit(rehearsing.rehearse(options, latency or [], frames, json))
 

@@ -109,3 +109,21 @@ def repair(
     from cocoro.cli import capture_repair
 
     sys.exit(capture_repair.repair(file, out, compression, level, only or [], without or [], start, end))
+
+
+@capture.command()
+def rerun(
+    files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="The captures of one run, in order.")],
+    service: Annotated[str, typer.Option("--service", help="perception, planning, or another with a pure core.")],
+    against: Annotated[
+        str, typer.Option(metavar="recorded|nothing", help="What to compare the outputs with.")
+    ] = "recorded",
+    tolerance: Annotated[
+        float, typer.Option(min=0.0, max=0.1, help="Of numbers, relative to the largest of 1 and them; 0 is exact.")
+    ] = 0.0,
+    json: Json = False,
+) -> None:
+    """Execute a service again over what it was given then, and compare what it gives. Exit code 1 when it differs."""
+    from cocoro.cli import capture_rerun
+
+    sys.exit(capture_rerun.rerun(files, service, against, tolerance, json))

@@ -15,7 +15,8 @@ import msgspec
 from cocoro.cli import exits
 from cocoro.cli.options import frames_of, latencies_of
 from cocoro.cli.running import scene_of
-from cocoro.errors import ConfigError
+from cocoro.cli.tasks import USAGE_REFUSALS
+from cocoro.errors import CocoroError, ConfigError
 from cocoro.rehearsal import RehearsalRequest
 
 SIMULATOR = "sim.rehearse"
@@ -26,8 +27,15 @@ def rehearse(options: dict[str, Any], latency: list[str], frames: str | None, as
     """`options` are fields of the request. Raises ConfigError for what cannot be."""
     request = request_of(options, latency, frames)
     rehearsing = importlib.import_module(SIMULATOR)
-    with _output_to_stderr() if as_json else nullcontext():
-        result: dict[str, Any] = rehearsing.rehearse(request)
+    try:
+        with _output_to_stderr() if as_json else nullcontext():
+            result: dict[str, Any] = rehearsing.rehearse(request)
+    except CocoroError as error:
+        refusal = getattr(error, "code", None)  # of the executive, which would not start the task
+        if refusal is None:
+            raise
+        print(f"cocoro: refused: {error}", file=sys.stderr)
+        return exits.USAGE if refusal in USAGE_REFUSALS else exits.REFUSED
     print(json.dumps(result) if as_json else summary(result))
     return exits.DONE if result["outcome"] == "done" else exits.FAILED
 
@@ -49,8 +57,8 @@ def _output_to_stderr() -> Iterator[None]:
 def request_of(options: dict[str, Any], latency: list[str], frames: str | None) -> RehearsalRequest:
     fields = {**options, "latency": latencies_of(latency), **(frames_of(frames) if frames else {})}
     fields["scene"] = scene_of(fields["scene"])
-    if fields["task"] == "fetch" and not fields["label"]:
-        raise ConfigError("fetch needs a label: cocoro rehearse fetch red_can")
+    if fields["task"] in ("fetch", "follow") and not fields["label"]:
+        raise ConfigError(f"{fields['task']} needs a label: cocoro rehearse {fields['task']} red_can")
     try:
         return msgspec.convert(fields, RehearsalRequest)
     except msgspec.ValidationError as error:
