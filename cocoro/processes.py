@@ -1,8 +1,9 @@
 """What runs: one table. Profiles name its rows, the supervisor, `top`, the unit files and the budget test read it.
 
 A component is a module with a `Config` (a frozen msgspec struct, all fields with defaults, unknown fields
-forbidden) and `async def run(node, config)`, which never returns. Third parties add rows of their own by the
-entry point group `cocoro.processes`; the entry point is named as its process and points to a `Process`.
+forbidden) and `async def run(node, config)`, which never returns. One that drives a pure core also has
+`def core(robot, config)` that makes it, so that its captures can be executed again. Third parties add rows of their
+own by the entry point group `cocoro.processes`; the entry point is named as its process and points to a `Process`.
 """
 
 from __future__ import annotations
@@ -19,10 +20,13 @@ import msgspec
 from cocoro.errors import ConfigError
 
 if TYPE_CHECKING:
+    from cocoro.core import Core
     from cocoro.node import Node
+    from cocoro.robot import Robot
 
 Restart = Literal["never", "on-failure", "always"]
 Run = Callable[["Node", Any], Awaitable[None]]
+MakeCore = Callable[["Robot", Any], "Core"]
 
 GROUP = "cocoro.processes"
 """The entry point group of third parties' rows."""
@@ -106,6 +110,7 @@ class Component(NamedTuple):
 
     config: type[Any]
     run: Run
+    core: MakeCore | None = None
 
 
 @cache
@@ -151,4 +156,4 @@ def load(process: Process) -> Component:
         raise ConfigError(f"process {process.name}: {process.module} has no Config (a msgspec.Struct)")
     if not inspect.iscoroutinefunction(run):
         raise ConfigError(f"process {process.name}: {process.module} has no `async def run(node, config)`")
-    return Component(config, run)
+    return Component(config, run, getattr(module, "core", None))

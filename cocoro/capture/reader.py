@@ -118,7 +118,11 @@ class Capture:
         """By name; of several of one name the newest."""
         return {name: dict(entries) for name, entries in self._contents.metadata}
 
-    @property
+    def every_metadata(self, name: str) -> list[dict[str, str]]:
+        """All of one name, in the order in which they were written."""
+        return [dict(entries) for other, entries in self._contents.metadata if other == name]
+
+    @cached_property
     def robot(self) -> str:
         """The robot's name: keys begin with it. '' when the capture does not say."""
         return self.metadata.get("run", {}).get("robot", "")
