@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Mapping
+from itertools import pairwise
 from math import atan2, hypot
 from typing import Any, NamedTuple
 
@@ -187,7 +188,7 @@ class RobotRig:
         after = [truth for truth in self.truths[-300:] if truth.stamp_ns >= when_s * NS]
         return [
             hypot(b.body_m[0] - a.body_m[0], b.body_m[1] - a.body_m[1]) / ((b.stamp_ns - a.stamp_ns) / NS)
-            for a, b in zip(after, after[1:], strict=False)
+            for a, b in pairwise(after)
         ]
 
     def turned_since(self, when_s: float) -> float:

@@ -167,5 +167,6 @@ def test_real_wheels_differ_from_what_odometry_believes_and_ideal_ones_do_not() 
             assert abs(truth.body_m[0] / state.odometry_m[0] - 1.0) < 0.03
             assert abs(yaw_of(truth)) < 0.05 * 0.84 / ROBOT.base.wheel_separation_m
             # What the wheels were told is all that a Create's driver can know; here they did it.
-            assert state.odometry_m[0] == pytest.approx(0.2 * (4.0 + ROBOT.base.command_timeout_s - COMMAND_EVERY / 240), rel=0.005)
+            held_s = 4.0 + ROBOT.base.command_timeout_s - COMMAND_EVERY / 240
+            assert state.odometry_m[0] == pytest.approx(0.2 * held_s, rel=0.005)
     assert np.std(errors) > 0.001
