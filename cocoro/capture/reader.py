@@ -12,7 +12,9 @@ from __future__ import annotations
 import heapq
 import json
 import os
+from collections import deque
 from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cached_property
 from pathlib import Path
 from types import TracebackType
@@ -27,6 +29,9 @@ from cocoro.capture.keys import JSON, MSGPACK
 from cocoro.capture.scan import ChunkPlace, Contents, Disk, contents, read_chunk
 from cocoro.capture.types import NotReadableError, reader_of
 
+Chunk = tuple[int, bytes | memoryview]
+AHEAD = 4
+"""Chunks that are read before they are asked for."""
 MOST_PROBLEMS = 20
 """Told one by one; of further ones there is a count."""
 
@@ -154,10 +159,10 @@ class Capture:
             and (place.channels is None or place.channels & wanted or not place.channels <= self.channels.keys())
         ]
         waiting: list[tuple[int, int, int, Record]] = []
-        for number, place in enumerate(places):
+        for number, (place, chunk) in enumerate(self._read_ahead(places)):
             while waiting and waiting[0][0] < place.start_ns:
                 yield heapq.heappop(waiting)[3]
-            for order, message in enumerate(self._chunk_messages(place)):
+            for order, message in enumerate(self._chunk_messages(place, chunk)):
                 if message.channel_id not in wanted:
                     continue
                 if (start_ns is None or message.log_ns >= start_ns) and (end_ns is None or message.log_ns < end_ns):
@@ -173,9 +178,23 @@ class Capture:
         topic = self.channels[message.channel_id].topic
         return Record(topic, message.log_ns, message.publish_ns, message.sequence, message.payload)
 
-    def _chunk_messages(self, place: ChunkPlace) -> Iterator[mcap.Message]:
+    def _read_ahead(self, places: list[ChunkPlace]) -> Iterator[tuple[ChunkPlace, Future[Chunk]]]:
+        """Read and unpack in a thread what is wanted next, while this one works on what it has."""
+        with ThreadPoolExecutor(1, "capture reader") as pool:
+            ahead: deque[tuple[ChunkPlace, Future[Chunk]]] = deque()
+            try:
+                for place in places:
+                    ahead.append((place, pool.submit(read_chunk, self._disk, place.offset)))
+                    if len(ahead) > AHEAD:
+                        yield ahead.popleft()
+                while ahead:
+                    yield ahead.popleft()
+            finally:
+                pool.shutdown(cancel_futures=True)
+
+    def _chunk_messages(self, place: ChunkPlace, chunk: Future[Chunk]) -> Iterator[mcap.Message]:
         try:
-            _, raw = read_chunk(self._disk, place.offset)
+            _, raw = chunk.result()
             for op, content, _ in mcap.records(raw):
                 if op == mcap.Op.MESSAGE:
                     message = mcap.message(content)
