@@ -138,7 +138,8 @@ def _type_section(kind: _Type) -> str:
     also = " With the fields of `Message`." if "Message" in kind.bases else ""
     rows = [(f"`{field.name}`", f"`{field.type}`", _code(field.default), field.doc) for field in kind.fields]
     table = _markdown_table(("field", "type", "default", ""), rows) if rows else ""
-    return f"### {kind.name}\n\n{(kind.doc + also).strip()}\n\n{table}".replace("\n\n\n", "\n\n")
+    parts = (f"### {kind.name}", f"{kind.doc}{also}".strip(), table.rstrip("\n"))
+    return "\n\n".join(part for part in parts if part) + "\n"
 
 
 def _code(text: str) -> str:
