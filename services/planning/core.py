@@ -59,14 +59,14 @@ class PlanningCore:
         self._senses.localise(now_ns)
         dt_s = self._elapsed(now_ns)
         self._follow_intent(now_ns)
-        halted = self._senses.missing(now_ns) or self._senses.latched()
-        body = self._senses.body()
-        if halted or body is None:
-            return self._halt(halted or "no odometry yet", now_ns)
-        self._missing_since_ns = None
-        hand = self._senses.hand
-        assert hand is not None
+        missing, hand, body = self._senses.missing(now_ns), self._senses.hand, self._senses.body()
+        if missing or hand is None or body is None:
+            return self._halt(missing or "no odometry yet", now_ns)
         self._limbs.grip.feel(hand, now_ns)
+        latched = self._senses.latched()
+        if latched:
+            return self._halt(latched, now_ns)
+        self._missing_since_ns = None
         self._senses.look_around(now_ns, self._own_hull)
         scene = Scene(now_ns, dt_s, self._senses, body, self._senses.angles(), self._limbs)
         plan = self._plan(scene)
@@ -134,6 +134,7 @@ class PlanningCore:
         if self._missing_since_ns is None or now_ns < self._missing_since_ns:
             self._missing_since_ns = now_ns
         failed = self._intent.behaviour != "idle" and now_ns - self._missing_since_ns > _STALE_NS
+        body = self._senses.body()
         status = PlannerStatus(
             task_id=self._intent.task_id,
             step=self._intent.step,
@@ -142,6 +143,8 @@ class PlanningCore:
             reason="stale" if failed else "",
             why=f"standing still: {why}",
             holding=self._limbs.grip.holding(now_ns),
+            body_m=(body.x_m, body.y_m) if body is not None else None,
+            body_yaw_rad=body.yaw_rad if body is not None else 0.0,
         )
         return [Output(topics.PLAN, status)]
 
