@@ -19,7 +19,7 @@ from cocoro.bus.local import LocalMesh
 from cocoro.clock import NS, VirtualClock
 from cocoro.core import Core
 from cocoro.errors import CocoroError, ConfigError
-from cocoro.messages import Detections, Frame, TaskReply, TaskRequest, TaskState
+from cocoro.messages import Detections, Frame, Recording, TaskReply, TaskRequest, TaskState
 from cocoro.node import Node, Stepper
 from cocoro.objects import Catalogue
 from cocoro.picture import draw, save_png
@@ -31,6 +31,7 @@ from sim.judge import Judge
 from sim.pursuit import PursuitJudge
 from sim.random_scene import find_scene
 
+RECORDER = "capture"
 PROCESSES = ("sim", "perception", "planning", "executive")
 START_S = 5.0
 """So long the robot may take until it accepts a task."""
@@ -44,6 +45,8 @@ def rehearse(request: RehearsalRequest) -> dict[str, Any]:
     unknown = sorted(set(request.latency) - set(PROCESSES))
     if unknown:
         raise ConfigError(f"--latency {unknown[0]}: no such service; known are {', '.join(PROCESSES)}")
+    if request.record is not None and Path(request.record).exists():
+        raise ConfigError(f"--record {request.record}: there is such a file already")
     result = run_virtual(_Rehearsal(request).run())
     result["wall_s"] = round(time.perf_counter() - started, 3)
     return result
@@ -109,6 +112,7 @@ class _Rehearsal:
         )
         self._frame: Frame | None = None
         self._seen: Detections | None = None
+        self._recording: Recording | None = None
 
     async def run(self) -> dict[str, Any]:
         request = self._request
@@ -116,18 +120,23 @@ class _Rehearsal:
         cycle = LockstepCycle()
         async with AsyncExitStack() as stack:
             services = []
-            for name in PROCESSES:
-                component = load(named(name))
+            for name in (*((RECORDER,) if request.record else ()), *PROCESSES):
+                row = named(name)
+                component = load(row)
                 config = msgspec.convert(self._settings(name), component.config)
                 lockstep = request.lockstep and name in LockstepCycle.ORDER
                 kind = LockstepNode if lockstep else Node
-                node = kind(name, mesh.join(), clock, robot, latency_s=request.latency.get(name, 0.0))
+                node = kind(
+                    name, mesh.join(), clock, robot, latency_s=request.latency.get(name, 0.0),
+                    record_steps=request.record is not None, module=row.module, config=config,
+                )  # fmt: skip
                 if isinstance(node, LockstepNode):
                     node.cycle = cycle
                 await stack.enter_async_context(node)
                 services.append(asyncio.ensure_future(component.run(node, config)))
             operator = await stack.enter_async_context(Node("operator", mesh.join(), clock, robot))
             operator.on(topics.TRUTH, self._judge.feed)
+            operator.on(topics.RECORDING.of(RECORDER), self._keep_recording)
             task = asyncio.ensure_future(self._operate(operator))
             try:
                 await asyncio.wait((task, *services), return_when=asyncio.FIRST_COMPLETED)
@@ -140,10 +149,14 @@ class _Rehearsal:
                 for future in (task, *services):
                     future.cancel()
                 await asyncio.gather(task, *services, return_exceptions=True)
+        if self._recording is not None and self._recording.fault:
+            raise CocoroError(self._recording.fault)
         return self._result(state)
 
     def _settings(self, name: str) -> dict[str, Any]:
         request = self._request
+        if name == RECORDER:
+            return {"file": request.record}
         if name == "sim":
             settings: dict[str, Any] = {
                 field: getattr(request, field)
@@ -199,6 +212,9 @@ class _Rehearsal:
             return await operator.call(topics.RUN, question)
         except CocoroError as error:
             return TaskReply(accepted=False, refusal="not_alive", text=str(error))
+
+    def _keep_recording(self, recording: Recording) -> None:
+        self._recording = recording
 
     def _keep_frame(self, frame: Frame) -> None:
         self._frame = frame

@@ -124,6 +124,7 @@ def rehearse(
     picture: Annotated[
         Path | None, typer.Option(metavar="OUT.png", help="Write what the robot saw when it grasped.")
     ] = None,
+    record: Annotated[Path | None, typer.Option(metavar="OUT.mcap", help="Record everything.")] = None,
     json: Json = False,
 ) -> None:
     """Try a task in simulation: the whole robot in one process, in virtual time."""
@@ -132,6 +133,7 @@ def rehearse(
     options = {
         "task": task, "label": label, "bring": bring, "for_s": for_, "scene": scene, "seed": seed, "sensors": sensors,
         "lockstep": lockstep, "timeout_s": timeout, "picture": None if picture is None else str(picture),
+        "record": None if record is None else str(record),
     }  # fmt: skip
     sys.exit(rehearsing.rehearse(options, latency or [], frames, json))
 
