@@ -46,7 +46,7 @@ class ArmController:
         self.clearance = Clearance(robot)
         self._park = {name: robot.poses["park"][name] for name in ARM}
         self._reference: dict[str, float] | None = None
-        self._roll_rad = 0.0
+        self._stalled_s = 0.0
 
     @property
     def reference(self) -> dict[str, float] | None:
@@ -56,6 +56,7 @@ class ArmController:
     def resync(self) -> None:
         """Start from the measured angles at the next step: something else has moved or stopped the arm."""
         self._reference = None
+        self._stalled_s = 0.0
 
     def folded(self, angles: Mapping[str, float]) -> bool:
         """Whether the arm is in, or near, the plane that it parks in."""
@@ -65,13 +66,13 @@ class ArmController:
         return all(abs(angles[name] - self._park[name]) < 0.08 for name in ARM)
 
     def hold(self, measured: Mapping[str, float], dt_s: float) -> Step:
-        reference = self._sync(measured)
+        reference = self._sync(measured, dt_s)
         goal = np.array([reference[name] for name in ARM])
         return Step(goal, np.full(4, 0.5), reference[ROLL], 0.0, True)
 
     def park(self, measured: Mapping[str, float], dt_s: float) -> Step:
         """Fold the arm up beside the camera mount."""
-        reference = self._sync(measured)
+        reference = self._sync(measured, dt_s)
         if not self.folded(reference):
             pose = self._reacher.pose(reference)
             out = all(abs(reference[name] - angle) < _NEAR_RAD for name, angle in _OUT.items())
@@ -94,7 +95,7 @@ class ArmController:
 
     def reach(self, goal: HandPose, speed_mps: float, measured: Mapping[str, float], dt_s: float) -> Step:
         """Move the hand towards a pose in front of the robot; unfolds the arm first where it is folded."""
-        reference = self._sync(measured)
+        reference = self._sync(measured, dt_s)
         stage: dict[str, float] | None = None
         if self.folded(reference):
             out = all(abs(reference[name] - angle) < _NEAR_RAD for name, angle in _OUT.items())
@@ -107,14 +108,22 @@ class ArmController:
         left_m = float(np.linalg.norm(self._reacher.point(goal) - self._reacher.position(reference)))
         return self._joints(stage, dt_s)._replace(arrived=False, left=left_m)
 
-    def _sync(self, measured: Mapping[str, float]) -> dict[str, float]:
+    @property
+    def stalled(self) -> bool:
+        """Something has held a joint up for a while: it does not follow."""
+        return self._stalled_s > self._config.stall_s
+
+    def _sync(self, measured: Mapping[str, float], dt_s: float) -> dict[str, float]:
         names = (*ARM, ROLL)
         if self._reference is None:
             self._reference = {name: measured[name] for name in names}
+        behind = False
         for name in names:
             lead = self._reference[name] - measured[name]
             if abs(lead) > self._config.lead_rad:
+                behind = True
                 self._reference[name] = measured[name] + float(np.sign(lead)) * self._config.lead_rad
+        self._stalled_s = self._stalled_s + dt_s if behind else 0.0
         return self._reference
 
     def _joints(self, goals: Mapping[str, float], dt_s: float) -> Step:

@@ -35,6 +35,8 @@ class Head(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How far to the first side it looks before it looks everywhere."""
     sweep_tilts_rad: tuple[float, float] = (-0.30, -0.75)
     """For the floor from 0.9 m on, and for the floor up to 1.8 m (the camera stands 0.73 m high)."""
+    tilt_range_rad: tuple[float, float] = (-1.2, 0.5)
+    """Further down it would look at itself, and the camera's housing comes near its mount."""
     fixate_speed_radps: Positive = 4.0
     look_where_it_was_s: Positive = 1.5
     """A remembered object is looked for at its place for so long before sweeping."""
@@ -88,6 +90,8 @@ class Arm(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How much higher than where it was grasped a thing is carried."""
     clearance_m: Positive = 0.008
     """The arm's hull stays so far from the camera mount, the chassis and the floor."""
+    stall_s: Positive = 1.0
+    """A joint that cannot follow for so long is held up by something."""
     swing_room_m: Positive = 0.06
     """To anything tall while the arm unfolds."""
     lead_rad: Positive = 0.25

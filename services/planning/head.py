@@ -16,24 +16,25 @@ PAN, TILT = "neck_pan", "neck_tilt"
 class Gaze:
     """Solves for the pan and tilt that bring a point of the body frame into the centre of the image."""
 
-    def __init__(self, robot: Robot) -> None:
+    def __init__(self, robot: Robot, config: Head) -> None:
         self._chain = robot.chain("camera")
-        self._limits = [robot.joints[name].limits_rad for name in (PAN, TILT)]
+        self._limits = [robot.joints[PAN].limits_rad, config.tilt_range_rad]
 
     def at(self, point_m: tuple[float, float, float], start: Mapping[str, float]) -> tuple[float, float]:
         """(pan, tilt) in radians, within the limits; Newton's method from the present angles (derived): the neck's axes
         are nearly those of the image, so each angle is corrected by its own image angle."""
         pan, tilt = start.get(PAN, 0.0), start.get(TILT, 0.0)
         point = np.array([*point_m, 1.0])
-        for _ in range(4):
+        for _ in range(5):
             pose = self._chain.pose({PAN: pan, TILT: tilt})
             x, y, z = pose[:3, :3].T @ (point[:3] - pose[:3, 3])
             if z < 1e-3:
-                # Behind the camera: turn by the bearing first.
-                pan += atan2(-x, z)
+                # Behind the camera: turn by the bearing first, from a level look.
+                pan, tilt = pan + atan2(-x, z), 0.0
                 continue
             pan -= atan2(x, z * max(cos(tilt), 0.2))
             tilt -= atan2(y, z)
+            tilt = min(max(tilt, self._limits[1][0]), self._limits[1][1])
         (pan_min, pan_max), (tilt_min, tilt_max) = self._limits
         pan = (pan + np.pi) % (2 * np.pi) - np.pi
         return float(min(max(pan, pan_min), pan_max)), float(min(max(tilt, tilt_min), tilt_max))

@@ -8,6 +8,8 @@ from functools import cached_property
 from math import hypot
 from typing import Literal, Protocol
 
+import numpy as np
+
 from cocoro.frames import Pose2
 from cocoro.kinematics import Array
 from cocoro.messages import BaseCommand, TargetEstimate
@@ -47,7 +49,7 @@ class Limbs:
         self.reacher = Reacher(robot, config.arm.damping)
         self.arm = ArmController(robot, config.arm, self.reacher)
         self.grip = Grip(robot, config.hand)
-        self.gaze = Gaze(robot)
+        self.gaze = Gaze(robot, config.head)
         self.reachability = Reachability(config.arm, self.reacher)
 
     @cached_property
@@ -88,11 +90,21 @@ class Scene:
         return self.senses.around.fields(label, known, self.now_ns, ignore)
 
     def arm_may_swing(self, fields: Fields) -> bool:
-        """Whether the arm can unfold here and over the next half metre without meeting anything."""
-        places = self.limbs.unfolding
-        ahead = (0.0, 0.25, 0.5)
-        room_m = self.limbs.config.arm.swing_room_m
-        return all((fields.arm.at(placed(places, self.body.compose(Pose2(x)))) > room_m).all() for x in ahead)
+        """Whether the arm can unfold here and over the next half metre without meeting anything that is known."""
+        swing = self.limbs.unfolding
+        places = np.concatenate([placed(swing, self.body.compose(Pose2(x))) for x in (0.0, 0.25, 0.5)])
+        return bool((fields.arm.at(places) > self.limbs.config.arm.swing_room_m).all())
+
+    def unseen_under_swing(self) -> tuple[float, float] | None:
+        """The middle of the floor under the arm's swing that nobody has looked at, odometry frame; None when all was
+        seen. What is under the robot itself cannot be seen, nor need it be."""
+        places = placed(self.limbs.unfolding, self.body)
+        away = places[np.hypot(places[:, 0] - self.body.x_m, places[:, 1] - self.body.y_m) > 0.33]
+        hidden = away[self.senses.around.unseen(away)]
+        if len(hidden) < 4:
+            return None
+        x, y = hidden.mean(axis=0).tolist()
+        return x, y
 
     @property
     def holding(self) -> bool:

@@ -9,7 +9,7 @@ from cocoro.clock import NS
 from cocoro.frames import Pose2
 from cocoro.messages import BaseState, TargetEstimate, Vec2
 from services.planning.arm import Step
-from services.planning.behaviours.base import Limbs, Plan, Scene, planar_m
+from services.planning.behaviours.base import Limbs, Plan, Scene, hand_place, planar_m
 from services.planning.course import Course, Move
 from services.planning.head import PAN, TILT, Sweep
 from services.planning.reach import HandPose
@@ -68,6 +68,8 @@ class Approach:
         self._label = label
         self._course: Course | None = None
         self._back_off = BackOff()
+        self._stalls = 0
+        self._glance_since_ns: int | None = None
 
     def step(self, scene: Scene) -> Plan:
         limbs, config = scene.limbs, scene.limbs.config
@@ -87,9 +89,14 @@ class Approach:
         if target.age_s > patience_s + scene.senses.sight_lag_s:
             why = f"{self._label} has not been seen for {target.age_s:.1f} s"
             return Plan(scene.stand(), scene.still(), why, None, "failed", "lost")
+        if limbs.arm.stalled:
+            self._touched(scene)
+        if self._stalls > self.MAX_STALLS:
+            why = "the arm is held up again and again"
+            return Plan(scene.stand(), scene.still(), why, head, "failed", "blocked")
+        arm, move = self._ready_hand(scene, target, move, fields)
         if move.look_at is not None:
             head = scene.look_at(scene.body.inverse().apply((*move.look_at, 0.0)))
-        arm, move = self._ready_hand(scene, target, move, fields)
         if move.blocked:
             return Plan(scene.stand(), arm, move.why, head, "failed", "blocked")
         if arm.blocked:
@@ -99,6 +106,24 @@ class Approach:
             return Plan(base, arm, f"{self._label} is in reach", head, "done", distance_m=move.left_m)
         why = "there; waiting for base and hand to come to rest" if move.arrived else move.why
         return Plan(base, arm, why, head, distance_m=move.left_m)
+
+    MAX_STALLS = 2
+
+    def _touched(self, scene: Scene) -> None:
+        """The arm meets something that was not seen: remember it where the hand is, and fold the arm."""
+        self._stalls += 1
+        x, y, _ = scene.body.apply(hand_place(scene))
+        scene.senses.around.floor.bump([(x, y)])
+        scene.limbs.arm.resync()
+
+    def _unseen_swing(self, scene: Scene) -> tuple[float, float] | None:
+        """A place to look at before the arm unfolds; looked for once, for as long as a glance takes."""
+        if self._glance_since_ns is None:
+            self._glance_since_ns = scene.now_ns
+        glance_s = scene.limbs.config.navigation.glance_s + scene.senses.sight_lag_s
+        if scene.now_ns - self._glance_since_ns > glance_s * NS:
+            return None
+        return scene.unseen_under_swing()
 
     def _ready_hand(self, scene: Scene, target: TargetEstimate, move: Move, fields: Fields) -> tuple[Step, Move]:
         limbs, config = scene.limbs, scene.limbs.config.arm
@@ -118,8 +143,14 @@ class Approach:
                 return arm.park(angles, dt_s), _waiting(move, "folding the arm to go around")
         elif not move.direct:
             return arm.park(angles, dt_s), move
-        elif not scene.arm_may_swing(fields) and not move.arrived and move.left_m > 0.05:
-            return arm.park(angles, dt_s), move._replace(why=f"no room yet to unfold the arm; {move.why}")
+        elif not scene.arm_may_swing(fields) and not move.arrived:
+            why = f"no room yet to unfold the arm; {move.why}"
+            return arm.park(angles, dt_s)._replace(arrived=False), move._replace(why=why)
+        elif arm.parked(reference) and (place := self._unseen_swing(scene)) is not None:
+            why = "looking where to unfold the arm"
+            # It goes on driving meanwhile, but not up to the target.
+            held = _waiting(move, why) if move.left_m < 0.35 else move._replace(why=f"{why}; {move.why}")
+            return arm.park(angles, dt_s)._replace(arrived=False), held._replace(look_at=place)
         limbs.grip.open()
         if move.left_m < config.descend_at_m and abs(move.turn_radps) < 0.4:
             goal = limbs.reachability.grasp(target.position_m).behind
