@@ -184,6 +184,7 @@ class Executive:
     def _finish(self, outcome: Outcome, reason: str) -> None:
         self._close_phase()
         self._running = None
+        self.state.elapsed_s = self._elapsed_s()
         self.state.outcome = outcome
         self.state.reason = reason
         self.state.phase = "end"
@@ -227,11 +228,14 @@ class Executive:
             ended = Phase(name=last.name, start_ns=last.start_ns, end_ns=self._node.now_ns())
             self.state.phases = (*self.state.phases[:-1], ended)
 
+    def _elapsed_s(self) -> float:
+        return max(self._node.now_ns() - self.state.started_ns, 0) / NS
+
     def _publish(self) -> None:
         status = self._skills.status
         state = self.state
         if self._running is not None:
-            state.elapsed_s = max(self._node.now_ns() - state.started_ns, 0) / NS
+            state.elapsed_s = self._elapsed_s()
             if status is not None:
                 state.text, state.distance_m = status.why, status.distance_m
         state.stamp_ns = self._node.now_ns()
