@@ -58,6 +58,10 @@ class Navigation(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """With open claws, and some room."""
     last_stretch_m: Positive = 0.45
     """Over so much before a target the hand is out and low."""
+    swing_room_m: Positive = 0.06
+    """To anything tall while the arm unfolds."""
+    unfold_by_m: Positive = 0.30
+    """Before so much is left to drive the arm has to be out."""
     stuck_s: Positive = 8.0
     glance_s: Positive = 1.5
     """A place ahead that is still hidden after so long is passed over."""
@@ -92,8 +96,6 @@ class Arm(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The arm's hull stays so far from the camera mount, the chassis and the floor."""
     stall_s: Positive = 1.0
     """A joint that cannot follow for so long is held up by something."""
-    swing_room_m: Positive = 0.06
-    """To anything tall while the arm unfolds."""
     lead_rad: Positive = 0.25
     """A joint's goal never runs further ahead of where the joint is."""
 

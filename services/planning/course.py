@@ -59,9 +59,12 @@ class Course:
         *,
         arm: Literal["last", "out", "folded"],
         arrive_m: float | None = None,
+        swing_m: Array | None = None,
     ) -> None:
         """When the hand is out: on the `last` stretch only, all the way, or never. `arrive_m`: near enough, from
-        whichever side; by default the driver's own tolerances count."""
+        whichever side; by default the driver's own tolerances count. `swing_m`: the floor places (n, 2), body frame,
+        over which a folded arm unfolds; before the last stretch there must be room for that."""
+        self._swing = swing_m
         self._config = config.navigation
         self._aim_m = aim_m
         self._arm_out = arm == "out"
@@ -72,6 +75,7 @@ class Course:
         reach = () if arm == "folded" else np.arange(0.22, aim_m[0] + 0.09, 0.04)
         self._arm = np.array([[x, aim_m[1]] for x in reach]).reshape(-1, 2)
         self._glance: tuple[tuple[float, float], int] | None = None
+        self._folded = False
         self._detour: Detour | None = None
         self._planned_ns: int | None = None
         self._stuck_since_ns: int | None = None
@@ -85,8 +89,11 @@ class Course:
         fields: Fields,
         driver: Driver,
         now_ns: int,
+        *,
+        folded: bool = False,
     ) -> Move:
-        """One step towards a target (odometry frame)."""
+        """One step towards a target (odometry frame). `folded`: the arm has yet to unfold."""
+        self._folded = folded
         x, y, _ = body.inverse().apply((*target_m, 0.0))
         offset = offset_to((x, y), self._aim_m)
         near_enough = self._arrive_m is not None and hypot(x - self._aim_m[0], y - self._aim_m[1]) < self._arrive_m
@@ -119,7 +126,7 @@ class Course:
         preview = [body.compose(pose) for pose in driver.preview((x, y), self._aim_m)]
         # Once on the last stretch, with the hand out, it takes more to turn back than it took to start.
         share = 0.5 if self._last_stretch else 1.0
-        if self._free(preview, fields, share, arm_from_m=self._stretch_m):
+        if self._free(preview, fields, share, arm_from_m=self._stretch_m) and self._unfolds_on(preview, fields):
             self._detour = None
             self._last_stretch = True
             return
@@ -145,6 +152,20 @@ class Course:
                 return False
         return True
 
+    def _unfolds_on(self, poses: list[Pose2], fields: Fields) -> bool:
+        """Whether the arm, where it is folded still, finds room to unfold before it must be out."""
+        if not self._folded or self._swing is None:
+            return True
+        end = poses[-1]
+        early = [p for p in poses if hypot(p.x_m - end.x_m, p.y_m - end.y_m) >= self._config.unfold_by_m] or poses[:1]
+        return any(self.roomy(pose, fields) for pose in early[:: max(len(early) // 6, 1)])
+
+    def roomy(self, pose: Pose2, fields: Fields) -> bool:
+        """Whether the arm can unfold at a pose without meeting anything that is known."""
+        if self._swing is None:
+            return True
+        return bool((fields.arm.at(placed(self._swing, pose)) > self._config.swing_room_m).all())
+
     def _around(
         self, target_m: tuple[float, float], body: Pose2, around: Surroundings, fields: Fields
     ) -> Detour | None:
@@ -165,6 +186,8 @@ class Course:
             stretch = [Pose2(end.x_m - c * step, end.y_m - s * step, yaw) for step in back]
             cost = routes.cost(stretch[0].x_m, stretch[0].y_m)
             if not np.isfinite(cost) or not self._free_stretch(stretch, fields):
+                continue
+            if not self.roomy(stretch[0], fields):
                 continue
             bearing = atan2(stretch[0].y_m - body.y_m, stretch[0].x_m - body.x_m)
             cost += 0.25 * abs(wrap_rad(yaw - bearing))

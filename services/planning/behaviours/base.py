@@ -89,12 +89,6 @@ class Scene:
         known = self.senses.memory.all(self.body, self.now_ns)
         return self.senses.around.fields(label, known, self.now_ns, ignore)
 
-    def arm_may_swing(self, fields: Fields) -> bool:
-        """Whether the arm can unfold here and over the next half metre without meeting anything that is known."""
-        swing = self.limbs.unfolding
-        places = np.concatenate([placed(swing, self.body.compose(Pose2(x))) for x in (0.0, 0.25, 0.5)])
-        return bool((fields.arm.at(places) > self.limbs.config.arm.swing_room_m).all())
-
     def unseen_under_swing(self) -> tuple[float, float] | None:
         """The middle of the floor under the arm's swing that nobody has looked at, odometry frame; None when all was
         seen. What is under the robot itself cannot be seen, nor need it be."""

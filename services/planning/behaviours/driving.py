@@ -75,7 +75,7 @@ class Approach:
         limbs, config = scene.limbs, scene.limbs.config
         target = scene.target(self._label)
         if self._course is None:
-            self._course = Course(limbs.robot, config, grasp_aim(limbs), arm="last")
+            self._course = Course(limbs.robot, config, grasp_aim(limbs), arm="last", swing_m=limbs.unfolding)
         if target is None:
             return Plan(scene.stand(), scene.still(), f"{self._label} is unknown", None, "failed", "lost")
         fields = scene.fields(self._label)
@@ -84,7 +84,10 @@ class Approach:
         if backing is not None:
             return backing
         place = target.odometry_position_m[:2]
-        move = self._course.step(place, scene.body, scene.senses.around, fields, limbs.driver, scene.now_ns)
+        folded = limbs.arm.folded(limbs.arm.reference or scene.angles)
+        move = self._course.step(
+            place, scene.body, scene.senses.around, fields, limbs.driver, scene.now_ns, folded=folded
+        )
         patience_s = config.stale_target_s if move.direct else config.stale_on_way_s
         if target.age_s > patience_s + scene.senses.sight_lag_s:
             why = f"{self._label} has not been seen for {target.age_s:.1f} s"
@@ -116,6 +119,15 @@ class Approach:
         scene.senses.around.floor.bump([(x, y)])
         scene.limbs.arm.resync()
 
+    def _room_here(self, scene: Scene, fields: Fields) -> bool:
+        assert self._course is not None
+        return self._course.roomy(scene.body, fields)
+
+    def _room_ahead(self, scene: Scene, fields: Fields) -> bool:
+        """Whether the arm can go on unfolding while the robot drives."""
+        assert self._course is not None
+        return all(self._course.roomy(scene.body.compose(Pose2(ahead)), fields) for ahead in (0.25, 0.5))
+
     def _unseen_swing(self, scene: Scene) -> tuple[float, float] | None:
         """A place to look at before the arm unfolds; looked for once, for as long as a glance takes."""
         if self._glance_since_ns is None:
@@ -143,14 +155,18 @@ class Approach:
                 return arm.park(angles, dt_s), _waiting(move, "folding the arm to go around")
         elif not move.direct:
             return arm.park(angles, dt_s), move
-        elif not scene.arm_may_swing(fields) and not move.arrived:
-            why = f"no room yet to unfold the arm; {move.why}"
-            return arm.park(angles, dt_s)._replace(arrived=False), move._replace(why=why)
+        elif not self._room_here(scene, fields):
+            step = arm.park(angles, dt_s)._replace(arrived=False)
+            if move.arrived:
+                return step, move._replace(arrived=False, blocked=True, why="no room to unfold the arm")
+            return step, move._replace(why=f"no room yet to unfold the arm; {move.why}")
         elif arm.parked(reference) and (place := self._unseen_swing(scene)) is not None:
             why = "looking where to unfold the arm"
             # It goes on driving meanwhile, but not up to the target.
             held = _waiting(move, why) if move.left_m < 0.35 else move._replace(why=f"{why}; {move.why}")
             return arm.park(angles, dt_s)._replace(arrived=False), held._replace(look_at=place)
+        if arm.folded(reference) and not self._room_ahead(scene, fields):
+            move = _waiting(move, "unfolding the arm here, where there is room")
         limbs.grip.open()
         if move.left_m < config.descend_at_m and abs(move.turn_radps) < 0.4:
             goal = limbs.reachability.grasp(target.position_m).behind
