@@ -10,6 +10,7 @@ from msgspec import Meta
 from cocoro.messages import TaskName
 
 Sensors = Literal["ideal", "real"]
+Body = Literal["nominal", "worn"]
 
 
 class RehearsalRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -25,6 +26,8 @@ class RehearsalRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
     """A scene's name, or the path of a scene file."""
     seed: Annotated[int, Meta(ge=0)] = 0
     sensors: Sensors = "ideal"
+    body: Body = "nominal"
+    """Worn: lengths, joint zeros, camera, marker and wheels are off what the drawing says, as the seed says."""
     latency: dict[str, Annotated[float, Meta(ge=0, le=60)]] = {}
     """Seconds that are added to every step of a service, by the service's name."""
     lockstep: bool = False

@@ -160,7 +160,7 @@ class _Rehearsal:
         if name == "sim":
             settings: dict[str, Any] = {
                 field: getattr(request, field)
-                for field in ("scene", "seed", "sensors", "width", "height", "frame_rate_hz")
+                for field in ("scene", "seed", "sensors", "body", "width", "height", "frame_rate_hz")
             }
             settings["target"] = request.label
             return settings | ({"command_timeout_s": _LONG_S} if request.lockstep else {})

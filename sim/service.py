@@ -22,6 +22,7 @@ from cocoro.robot import Robot
 from sim.camera import Kinect
 from sim.random_scene import find_scene
 from sim.render import make_renderer
+from sim.wear import BodyKind, body_of
 from sim.world import World
 
 __all__ = ["Config", "run"]
@@ -49,6 +50,10 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     command_timeout_s: Annotated[float, Meta(gt=0)] | None = None
     """Instead of the robot's own deadman; only the lock-step baseline asks for one."""
     renderer: Literal["auto", "moderngl", "tiny"] = "auto"
+    body: BodyKind = "nominal"
+    """Worn: the body differs from its drawing, as the seed says; no service knows how."""
+    bend_at_s: Annotated[float, Meta(ge=0)] | None = None
+    """When somebody bends the forearm, by 3 cm at the hand."""
 
 
 class _Outbox:
@@ -158,6 +163,7 @@ async def run(node: Node, config: Config) -> None:
         seed=config.seed,
         sensors=config.sensors,
         physics_hz=config.physics_hz,
+        wear=body_of(robot, config.body, config.seed, config.bend_at_s),
     ) as world:
         camera = robot.camera.scaled(config.width, config.height)
         renderer = make_renderer(world.visuals, camera, config.renderer)

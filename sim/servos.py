@@ -62,6 +62,8 @@ class Servo:
         self._play = Play(backlash_rad, angle_rad)
         self.angle_rad = angle_rad
         """True angle of the joint."""
+        self.slip_rad = 0.0
+        """By how much the joint has slipped on the shaft: it stands so far beyond what the shaft says."""
         self._speed_radps = 0.0
         self._torque_nm = 0.0
         self._valid_until_ns: int | None = None
@@ -117,7 +119,7 @@ class Servo:
         self.angle_rad = angle_rad
         self._speed_radps = speed_radps
         self._torque_nm = torque_nm
-        self._play.follow(angle_rad)
+        self._play.follow(angle_rad - self.slip_rad)
         if abs(torque_nm) < OVERLOAD_SHARE * self.joint.torque_nm:
             self._straining_since_ns = None
         elif self._straining_since_ns is None:

@@ -22,6 +22,7 @@ from sim.seeds import stream
 from sim.servos import Drive, ServoNetwork
 from sim.stage import Stage
 from sim.visual import Visual
+from sim.wear import Wear
 
 SOLVER_ITERATIONS = 50
 SETTLE_S = 0.5
@@ -47,7 +48,9 @@ class World:
         seed: int = 0,
         sensors: Sensors = "ideal",
         physics_hz: int = 240,
+        wear: Wear | None = None,
     ) -> None:
+        """`robot` is the drawing, which base and servos go by; `wear` the body as it really is (None: as drawn)."""
         self.robot = robot
         self.scene = scene
         self._hz = physics_hz
@@ -64,9 +67,10 @@ class World:
             deterministicOverlappingPairs=1,
         )
         self._stage = Stage(self._bullet, scene)
-        self._model = build_model(robot)
+        self._wear = wear if wear is not None else Wear(robot)
+        self._model = build_model(self._wear.robot)
         angles = dict.fromkeys(robot.joints, 0.0) | robot.poses["park"]
-        self._mechanism = Mechanism(self._bullet, robot, self._model, scene.robot, angles)
+        self._mechanism = Mechanism(self._bullet, self._wear.robot, self._model, scene.robot, angles)
         self._names = {body: name for name, body in self._stage.bodies.items()}
 
         self._base = MobileBase(robot.base, exact=realism.exact_odometry)
@@ -151,6 +155,8 @@ class World:
             self._look_at_contacts()
             self._slip.step()
             self._scatter.step()
+            for joint, servo in zip(self._mechanism.joints, self._servos, strict=True):
+                servo.slip_rad = self._wear.slip_rad(joint, self._steps / self._hz)
         stretch = self._wheel_scale * (1.0 + self._slip.values)
         radius_m = self.robot.base.wheel_radius_m
         left_mps, right_mps = self._base.wheels(now_ns, dt_s)

@@ -103,13 +103,14 @@ def test_down_without_a_robot_is_no_error(capsys: pytest.CaptureFixture[str]) ->
 def test_the_options_of_up_are_settings_of_the_simulator(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     Path("mine.toml").touch()
-    settings = overrides("mine.toml", 7, "real", "320x240@15", ["perception=0.5"], ["robot=robbie"])
+    settings = overrides("mine.toml", 7, "real", "worn", "320x240@15", ["perception=0.5"], ["robot=robbie"])
     assert settings == [
         f'service.sim.scene="{tmp_path}/mine.toml"', "service.sim.seed=7", 'service.sim.sensors="real"',
+        'service.sim.body="worn"',
         "service.sim.width=320", "service.sim.height=240", "service.sim.frame_rate_hz=15.0",
         "service.perception.latency_s=0.5", "robot=robbie",
     ]  # fmt: skip
-    assert overrides("paper", None, None, None, [], []) == ['service.sim.scene="paper"']
+    assert overrides("paper", None, None, None, None, [], []) == ['service.sim.scene="paper"']
 
 
 def test_frames_may_leave_the_rate_out() -> None:

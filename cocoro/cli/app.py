@@ -40,6 +40,8 @@ Latency = Annotated[
 Frames = Annotated[str | None, typer.Option(metavar="WxH@HZ", help="The camera's frames: 320x240@15.")]
 Timeout = Annotated[float | None, typer.Option(min=0.1, max=3600.0, metavar="SECONDS", help="Give up after this.")]
 
+Body = Annotated[str, typer.Option(metavar="nominal|worn", help="A body as drawn, or one that differs from it.")]
+
 For = Annotated[
     float | None, typer.Option("--for", min=0.1, max=3600.0, metavar="SECONDS", help="Follow for so long, then stop.")
 ]
@@ -117,6 +119,7 @@ def rehearse(
     sensors: Annotated[
         str, typer.Option(metavar="ideal|real", help="Perfect camera and body, or real ones.")
     ] = "ideal",
+    body: Body = "nominal",
     latency: Latency = None,
     lockstep: Annotated[bool, typer.Option("--lockstep", help="One serial cycle over all, as in the paper.")] = False,
     frames: Frames = None,
@@ -132,7 +135,7 @@ def rehearse(
 
     options = {
         "task": task, "label": label, "bring": bring, "for_s": for_, "scene": scene, "seed": seed, "sensors": sensors,
-        "lockstep": lockstep, "timeout_s": timeout, "picture": None if picture is None else str(picture),
+        "body": body, "lockstep": lockstep, "timeout_s": timeout, "picture": None if picture is None else str(picture),
         "record": None if record is None else str(record),
     }  # fmt: skip
     sys.exit(rehearsing.rehearse(options, latency or [], frames, json))
@@ -197,6 +200,9 @@ def up(
     scene: Annotated[str | None, typer.Option(help="Simulator: a scene's name, or its file.")] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Simulator: the seed of all that is drawn.")] = None,
     sensors: Annotated[str | None, typer.Option(metavar="ideal|real", help="Simulator: perfect or real.")] = None,
+    body: Annotated[
+        str | None, typer.Option(metavar="nominal|worn", help="Simulator: a body as drawn, or not.")
+    ] = None,
     frames: Frames = None,
     latency: Latency = None,
     set_: Set = None,
@@ -205,7 +211,7 @@ def up(
     from cocoro import profiles
     from cocoro.cli import running
 
-    overrides = running.overrides(scene, seed, sensors, frames, latency or [], set_ or [])
+    overrides = running.overrides(scene, seed, sensors, body, frames, latency or [], set_ or [])
     read = profiles.read(profile, overrides)
     sys.exit(running.up_detached(read) if detach else running.up(read))
 

@@ -31,6 +31,7 @@ def overrides(
     scene: str | None,
     seed: int | None,
     sensors: str | None,
+    body: str | None,
     frames: str | None,
     latency: list[str],
     settings: list[str],
@@ -43,6 +44,8 @@ def overrides(
         sim["seed"] = seed
     if sensors is not None:
         sim["sensors"] = sensors
+    if body is not None:
+        sim["body"] = body
     if frames is not None:
         sim.update(frames_of(frames))
     found = [f"service.sim.{name}={json.dumps(value)}" for name, value in sim.items()]  # JSON's values are TOML's here
