@@ -296,6 +296,8 @@ class Node:
         An exception in the core ends the service: its state cannot be trusted any more, and the supervisor starts it
         afresh. The hardware stops by itself meanwhile.
         """
+        if self.record_steps:
+            await self._until_recorded()
         step = self.stepper(core, name)
         meter = self._meter(name or self.name)
         if isinstance(self.clock, FollowedClock):

@@ -129,8 +129,12 @@ class Capture:
 
     @cached_property
     def robot(self) -> str:
-        """The robot's name: keys begin with it. '' when the capture does not say."""
-        return self.metadata.get("run", {}).get("robot", "")
+        """The robot's name: keys begin with it. '' when the capture does not say, and its keys begin differently."""
+        told = self.metadata.get("run", {}).get("robot")
+        if told is not None:
+            return told
+        names = {key.partition("/")[0] for key in self.keys if "/" in key}
+        return names.pop() if len(names) == 1 else ""
 
     @property
     def start_ns(self) -> int:
