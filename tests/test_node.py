@@ -306,10 +306,10 @@ async def test_a_record_says_what_a_step_consumed_and_gave_in_order() -> None:
         states, detections = (driven.feeder.publisher(t).incarnation for t in (topics.BASE_STATE, topics.DETECTIONS))
         commands = driven.node.publisher(topics.BASE_COMMAND).incarnation
         assert record == StepRecord(
-            stamp_ns=NS,
+            stamp_ns=now_ns,
             seq=0,
             incarnation=record.incarnation,
-            now_ns=NS,
+            now_ns=now_ns,
             core="planning",
             consumed=(
                 ("base/state", states, 1),
