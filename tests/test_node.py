@@ -298,6 +298,7 @@ async def test_a_core_that_is_too_slow_for_its_rate_leaves_others_their_turn() -
 async def test_a_record_says_what_a_step_consumed_and_gave_in_order() -> None:
     async with Driven(Echo(rate_hz=None), record_steps=True) as driven:
         await asyncio.sleep(RECORDER_S + 1.0)  # it waits for a recorder first, and there is none
+        now_ns = driven.node.now_ns()
         for _ in range(2):
             driven.feeder.publish(topics.BASE_STATE, state())
             driven.feeder.publish(topics.DETECTIONS, seen())
