@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from cocoro.cli import capture_app
+from cocoro.cli import capture_app, tools_app
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -189,6 +189,10 @@ def topics(
 # --- captures -------------------------------------------------------------------------------------
 
 capture_app.add_to(app)
+
+# --- tools ----------------------------------------------------------------------------------------
+
+tools_app.add_to(app)
 
 # --- starting and stopping ------------------------------------------------------------------------
 

@@ -60,7 +60,7 @@ class Survey:
 
     def _report(self, alive: set[str]) -> dict[str, Any]:
         resolved = self._link.run_dir.resolved()
-        names = list(dict.fromkeys([*_expected(resolved), *sorted(alive)]))
+        names = list(dict.fromkeys([*expected(resolved), *sorted(alive)]))
         return {
             "robot": self._link.robot,
             "profile": resolved.get("name", ""),
@@ -79,7 +79,7 @@ class Survey:
         return msgspec.to_builtins(self._newest[topic]) if topic in self._newest else None
 
 
-def _expected(resolved: dict[str, Any]) -> tuple[str, ...]:
+def expected(resolved: dict[str, Any]) -> tuple[str, ...]:
     """What the last start's profile says should be alive."""
     try:
         return profiles.from_data(resolved, resolved.get("name", "")).services() if resolved else ()

@@ -1,0 +1,148 @@
+"""`cocoro logs`: what the processes of a robot wrote, in the order in which they wrote it."""
+
+from __future__ import annotations
+
+import heapq
+import os
+import re
+from collections import deque
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+from cocoro.bus.endpoints import default_run_dir
+from cocoro.cli import exits
+from cocoro.cli.ending import passed, told_to_end
+from cocoro.errors import ConfigError
+from cocoro.processes import PROCESSES
+from cocoro.rundir import RunDir
+
+LOOK_S = 0.2
+"""How often it looks for more."""
+LEVELS = ("debug", "info", "warning", "error", "critical")
+_STAMP = re.compile(r"(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d:\d\d)[.,](\d{3}) +(\w+) ")
+_CRASHES = ("Traceback (most recent call last)", "Fatal Python error")
+"""Written without a level, by Python itself, and worth one."""
+
+
+class Entry(NamedTuple):
+    """What was written at once: a line with a time, and those without one that follow it (a traceback, say)."""
+
+    stamp: str
+    """Sorts by time; that of the line before when the first lines of a file have none."""
+    level: str
+    """Empty for lines that have none."""
+    lines: tuple[str, ...]
+
+
+def robot_of(robot: str | None) -> RunDir:
+    """The robot whose logs are meant, up or not. Raises ConfigError when that is not clear, or there are none."""
+    if robot is not None:
+        run_dir = RunDir(robot)
+        if not run_dir.logs.is_dir():
+            raise ConfigError(f"there are no logs of {robot} in {run_dir.logs}")
+        return run_dir
+    root = default_run_dir()
+    folders = sorted(root.iterdir()) if root.is_dir() else []
+    found = [run_dir for folder in folders if (run_dir := RunDir(folder.name, root)).logs.is_dir()]
+    up = [run_dir for run_dir in found if run_dir.populated]
+    if len(up or found) == 1:
+        return (up or found)[0]
+    if not found:
+        raise ConfigError(f"there are no logs in {root}: no robot has been up here (`cocoro up sim`)")
+    raise ConfigError(f"logs of several robots, say which: {', '.join(f'--robot {r.robot}' for r in up or found)}")
+
+
+def files_of(run_dir: RunDir, name: str | None) -> list[Path]:
+    """The logs of all processes, or that of one, by its own name or a service's. Raises ConfigError for no such one."""
+    known = {path.name.removesuffix(".log"): path for path in sorted(run_dir.logs.glob("*.log"))}
+    if name is None:
+        return list(known.values())
+    process = name if name in known else _process_of(run_dir, name)
+    if process not in known:
+        raise ConfigError(f"{run_dir.robot} has no log of {name}; there are {', '.join(known) or 'none'}")
+    return [known[process]]
+
+
+def _process_of(run_dir: RunDir, service: str) -> str:
+    """The process that is a service: now, or by the last start's profile."""
+    if service in (claims := run_dir.claims()):
+        return claims[service].name
+    started = run_dir.resolved().get("processes", ())
+    rows = [row for row in PROCESSES if service in row.services]
+    return next((row.name for row in rows if row.name in started), rows[0].name if rows else service)
+
+
+def entries(lines: Iterable[str], stamp: str = "") -> Iterator[Entry]:
+    """Lines as entries; `stamp` is that of what was before them."""
+    level, gathered = "", list[str]()
+    for line in lines:
+        match = _STAMP.match(line)
+        if match is not None:
+            if gathered:
+                yield Entry(stamp, level, tuple(gathered))
+            stamp, level, gathered = f"{match[1]}T{match[2]}.{match[3]}", match[4].lower(), []
+        elif line.startswith(_CRASHES):
+            level = "critical"
+        gathered.append(line)
+    if gathered:
+        yield Entry(stamp, level, tuple(gathered))
+
+
+class Tail:
+    """One file, read on as it grows, and from the start again when a new one takes its place."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._inode: int | None = None
+        self._position = 0
+        self._stamp = ""
+        self._part = ""
+
+    def read(self) -> list[Entry]:
+        """What is new. A last line that has no end yet waits for it."""
+        try:
+            with self.path.open(encoding="utf-8", errors="replace") as file:
+                about = os.fstat(file.fileno())
+                if about.st_ino != self._inode or about.st_size < self._position:
+                    self._inode, self._position, self._part = about.st_ino, 0, ""
+                file.seek(self._position)
+                text = self._part + file.read()
+                self._position = file.tell()
+        except FileNotFoundError:  # between two starts
+            return []
+        *whole, self._part = text.split("\n")
+        found = list(entries(whole, self._stamp))
+        if found:
+            self._stamp = found[-1].stamp
+        return found
+
+
+async def logs(robot: str | None, name: str | None, follow: bool, count: int, level: str | None) -> int:
+    """Print the newest entries, and with `follow` those that come, until interrupted."""
+    if level is not None and level not in LEVELS:
+        raise ConfigError(f"--level {level}: it is one of {', '.join(LEVELS)}")
+    run_dir = robot_of(robot)
+    wanted = {*LEVELS, ""} if level is None else set(LEVELS[LEVELS.index(level) :])
+    tails = {path: Tail(path) for path in files_of(run_dir, name)}
+    newest = deque(_chosen(tails.values(), wanted), maxlen=count)
+    _print(newest)
+    if not follow:
+        return exits.DONE
+    with told_to_end() as end:
+        while await passed(end, LOOK_S):
+            if name is None:
+                tails |= {path: Tail(path) for path in files_of(run_dir, None) if path not in tails}
+            _print(_chosen(tails.values(), wanted))
+    return exits.DONE
+
+
+def _chosen(tails: Iterable[Tail], wanted: set[str]) -> Iterator[Entry]:
+    """What is new in all of them, by time."""
+    merged = heapq.merge(*(tail.read() for tail in tails), key=lambda entry: entry.stamp)
+    return (entry for entry in merged if entry.level in wanted)
+
+
+def _print(found: Iterable[Entry]) -> None:
+    for entry in found:
+        print(*entry.lines, sep="\n", flush=True)

@@ -1,0 +1,205 @@
+"""How `cocoro top` looks: a line of what matters, a table of services, a table of topics."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rich.console import Console, Group, RenderableType
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+SLOW, STALLED = 0.85, 0.4
+"""Of the nominal rate: below the one a rate is marked, below the other it is marked red."""
+BAD, DOUBTFUL, GOOD, FAINT = "bold red", "yellow", "green", "dim"
+COUNTED = ("skipped", "lost", "rejected")
+PLAIN_WIDTH = 200
+"""Columns where nobody watches: nothing is cut."""
+
+
+class Screen:
+    """The whole terminal, while it is open."""
+
+    def __init__(self) -> None:
+        self._live = Live(auto_refresh=False, screen=True, vertical_overflow="crop")
+
+    def __enter__(self) -> Screen:
+        self._live.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._live.stop()
+
+    def show(self, report: dict[str, Any]) -> None:
+        self._live.update(render(report), refresh=True)
+
+
+def print_report(report: dict[str, Any]) -> None:
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=PLAIN_WIDTH)
+    console.print(render(report))
+
+
+def render(report: dict[str, Any]) -> RenderableType:
+    return Group(_headline(report), Text(), _services(report["services"]), Text(), _topics(report["topics"]))
+
+
+# --- what matters ---------------------------------------------------------------------------------
+
+
+def _headline(report: dict[str, Any]) -> Text:
+    text = Text(no_wrap=True, overflow="ellipsis")
+    text.append(report["robot"], "bold")
+    if report["profile"]:
+        text.append(f" ({report['profile']})")
+    machine = report["machine"]
+    text.append(f"  cpu {100 * machine['cpu_share']:.0f}% of {machine['cores']} cores")
+    if (clock := report["clock"]) is not None:
+        slow = clock["paused"] or clock["rate"] < SLOW
+        rate = "stands" if clock["paused"] else f"x{clock['rate']:.2f}"
+        text.append(f"  clock {clock['stamp_ns'] / 1e9:.1f} s {rate}", DOUBTFUL if slow else "")
+    if (base := report["base"]) is not None:
+        text.append(f"  battery {100 * base['battery_fraction']:.0f}%")
+    if (latch := report["latch"]) is not None and latch["state"] != "released":
+        text.append(f"  EMERGENCY STOP {latch['state']}", BAD)
+    text.append("\n")
+    task, plan = report["task"], report["plan"]
+    if task is not None and task["task_id"]:
+        name = f"{task['task']} {task['label']}".strip()
+        outcome = f"{task['outcome']} after" if task["outcome"] else f"{task['phase']},"
+        text.append(f"{name}: {outcome} {task['elapsed_s']:.1f} s", "bold")
+        text.append(f"  {task['reason'] or task['text']}")
+    elif plan is not None:
+        text.append(f"{plan['behaviour']}  {plan['why']}")
+    return text
+
+
+# --- services -------------------------------------------------------------------------------------
+
+
+def _services(services: list[dict[str, Any]]) -> Table:
+    table = Table(box=None, pad_edge=False, header_style=FAINT)
+    for head, right in (
+        ("SERVICE", False), ("STATE", False), ("PID", True), ("CPU", True), ("MEMORY", True), ("LOOP", True),
+        ("P99", True), ("STEP", True), ("MISSED", True), ("UP", True), ("", False),
+    ):  # fmt: skip
+        table.add_column(head, justify="right" if right else "left", no_wrap=True)
+    shown: dict[int, str] = {}
+    for service in services:
+        table.add_row(*_service(service, shown))
+    return table
+
+
+def _service(service: dict[str, Any], shown: dict[int, str]) -> list[RenderableType]:
+    health = service["health"]
+    style = BAD if service["state"] in ("not alive", "silent") else GOOD if service["state"] == "ready" else DOUBTFUL
+    state = Text(service["state"] or "?", style)
+    if health is None:
+        return [service["service"], state, *[""] * 9]
+    loop = max(health["loops"], key=lambda loop: loop["rate_hz"], default=None)
+    text = "; ".join(filter(None, (health["text"], *health["faults"])))
+    if service["state"] == "silent" and service["silent_s"] is not None:
+        text = f"no sign for {service['silent_s']:.0f} s"
+    pid = health["pid"]
+    costs: list[RenderableType]
+    if pid in shown:  # several services in one process: what it costs is told once
+        costs = [Text(str(pid), FAINT), Text(f"as {shown[pid]}", FAINT), ""]
+    else:
+        shown[pid] = service["service"]
+        costs = [
+            str(pid),
+            _cost(100 * health["cpu_share"], 100 * (service["cpu_budget"] or 0), "%"),
+            _cost(health["rss_mb"], service["rss_budget_mb"] or 0, " MB"),
+        ]
+    dead = not service["alive"]
+    row = [
+        service["service"], state, *costs,
+        "" if loop is None else f"{loop['rate_hz']:.1f} Hz",
+        "" if loop is None else f"{loop['period_p99_ms']:.1f} ms",
+        "" if loop is None else f"{loop['step_median_ms']:.1f} ms",
+        "" if loop is None else str(loop["overruns"]),
+        _duration(health["uptime_s"]), text,
+    ]  # fmt: skip
+    return [row[0], row[1], *[""] * 8, Text(f"was {pid}", FAINT)] if dead else row
+
+
+def _cost(value: float, budget: float, unit: str) -> Text:
+    return Text(f"{value:.0f}{unit}", BAD if budget and value > budget else "")
+
+
+def _duration(seconds: float) -> str:
+    minutes, rest = divmod(int(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"
+
+
+# --- topics ---------------------------------------------------------------------------------------
+
+
+def _topics(topics: list[dict[str, Any]]) -> Table:
+    table = Table(box=None, pad_edge=False, header_style=FAINT)
+    for head, right in (
+        ("TOPIC", False), ("FROM", False), ("RATE", True), ("NOMINAL", True), ("AGE", True), ("SKIPPED", True),
+        ("LOST", True), ("REJECTED", True), ("READ BY", False),
+    ):  # fmt: skip
+        table.add_column(head, justify="right" if right else "left", no_wrap=True)
+    for topic in topics:
+        table.add_row(*_topic(topic))
+    return table
+
+
+def _topic(topic: dict[str, Any]) -> list[RenderableType]:
+    readers = topic["readers"]
+    idle = topic["count"] == 0
+    rate: RenderableType = Text("-", FAINT) if idle else _rate(topic["rate_hz"], topic["nominal_hz"])
+    nominal = "" if topic["nominal_hz"] is None else f"{topic['nominal_hz']:g}"
+    counts = [_count(readers, what) for what in COUNTED]
+    publisher = topic["publisher"] if topic["published"] else f"({topic['publisher'] or 'nobody'})"
+    return [
+        Text(topic["topic"], FAINT if idle else ""),
+        Text(publisher, "" if topic["published"] else FAINT),
+        rate,
+        Text(nominal, FAINT),
+        _age(topic),
+        *counts,
+        _read_by(readers),
+    ]
+
+
+def _rate(rate_hz: float, nominal_hz: float | None) -> Text:
+    share = 1.0 if not nominal_hz else rate_hz / nominal_hz
+    return Text(f"{rate_hz:.1f} Hz", BAD if share < STALLED else DOUBTFUL if share < SLOW else "")
+
+
+def _age(topic: dict[str, Any]) -> Text:
+    """Of the newest message when its publisher last told; red when a reader would no longer act on it."""
+    age_s = topic["age_s"]
+    if age_s is None:
+        return Text("")
+    regular = topic["nominal_hz"] is not None
+    late = regular and topic["max_age_s"] is not None and age_s > topic["max_age_s"]
+    return Text(f"{1e3 * age_s:.0f} ms" if age_s < 10 else f"{age_s:.0f} s", BAD if late else "" if regular else FAINT)
+
+
+def _count(readers: list[dict[str, Any]], what: str) -> Text:
+    """Of all readers together, since they started. To skip state that has been overtaken is no fault."""
+    total = sum(reader[what] for reader in readers)
+    if not total:
+        return Text("0" if readers else "", FAINT)
+    grows = what != "skipped" and any(reader[what] and reader["growing"] for reader in readers)
+    return Text(str(total), BAD if grows else "")
+
+
+def _read_by(readers: list[dict[str, Any]]) -> Text:
+    """Who reads it; of those that miss something how much, and what the last rejected one was."""
+    text = Text(no_wrap=True, overflow="ellipsis")
+    for number, reader in enumerate(readers):
+        text.append(", " if number else "")
+        text.append(reader["service"])
+        missed = [f"{reader[what]} {what}" for what in COUNTED if reader[what]]
+        if missed and len(readers) > 1:
+            text.append(f" ({', '.join(missed)})", FAINT)
+        if reader["rejected"] and reader["last_error"]:
+            text.append(f" [{reader['last_error']}]", BAD)
+    return text
