@@ -99,3 +99,32 @@ class Chain:
                 jac[:3, i] = np.cross(axis, tip - origin)
                 jac[3:, i] = axis
         return jac
+
+
+class Tree:
+    """The links from the body to several tips, each computed once.
+
+    Raises KeyError (naming the link) when a tip or one of its parents is not in the table.
+    """
+
+    def __init__(self, links: Mapping[str, Link], tips: Iterable[str], root: str = "body") -> None:
+        rows: dict[str, Link] = {}
+        for tip in tips:
+            branch: list[Link] = []
+            name = tip
+            while name != root and name not in rows:
+                if name not in links:
+                    raise KeyError(f"link {name!r} is not in the robot description")
+                branch.append(links[name])
+                name = links[name].parent
+            rows.update((row.name, row) for row in reversed(branch))
+        self._root = root
+        self._steps = [(row.name, row.parent, row.fixed(), row.joint, row.offset_rad) for row in rows.values()]
+
+    def poses(self, angles_rad: Mapping[str, float]) -> dict[str, Array]:
+        """4 x 4 transforms from each link's frame on the way to the tips to the root's, by the link's name."""
+        poses: dict[str, Array] = {self._root: np.eye(4)}
+        for name, parent, fixed, joint, offset in self._steps:
+            pose = poses[parent] @ fixed
+            poses[name] = pose if joint is None else pose @ turn_z(angles_rad[joint] + offset)
+        return poses

@@ -17,7 +17,7 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from cocoro.errors import ConfigError
-from cocoro.kinematics import Array, Chain, Link
+from cocoro.kinematics import Array, Chain, Link, Tree
 
 Positive = Annotated[float, Meta(gt=0)]
 Vec3 = tuple[float, float, float]
@@ -248,6 +248,9 @@ class Robot:
 
     def chain(self, tip: str) -> Chain:
         return Chain(self.links, tip)
+
+    def tree(self, *tips: str) -> Tree:
+        return Tree(self.links, tips)
 
     @cached_property
     def camera(self) -> Camera:

@@ -34,7 +34,8 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A lifted thing must stay held for so long before a fetch is done."""
     settle_s: Positive = 3.0
     """After a task the robot is given so long to come to rest."""
-    planner_silence_s: Positive = 0.5
+    planner_silence_s: Positive = 1.5
+    """A planner that says nothing for so long fails the task. What moves has stopped long before, by the hardware."""
     relocate_tries: int = 3
     """Times that a target may be lost or out of reach and be approached again."""
     grasp_tries: int = 2

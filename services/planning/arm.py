@@ -47,6 +47,8 @@ class ArmController:
         self._park = {name: robot.poses["park"][name] for name in ARM}
         self._reference: dict[str, float] | None = None
         self._stalled_s = 0.0
+        self._clearance_m: float | None = None
+        """Of the reference, where it is known."""
 
     @property
     def reference(self) -> dict[str, float] | None:
@@ -57,6 +59,7 @@ class ArmController:
         """Start from the measured angles at the next step: something else has moved or stopped the arm."""
         self._reference = None
         self._stalled_s = 0.0
+        self._clearance_m = None
 
     def folded(self, angles: Mapping[str, float]) -> bool:
         """Whether the arm is in, or near, the plane that it parks in."""
@@ -122,6 +125,7 @@ class ArmController:
             lead = self._reference[name] - measured[name]
             if abs(lead) > self._config.lead_rad:
                 behind = True
+                self._clearance_m = None
                 self._reference[name] = measured[name] + float(np.sign(lead)) * self._config.lead_rad
         self._stalled_s = self._stalled_s + dt_s if behind else 0.0
         return self._reference
@@ -157,7 +161,7 @@ class ArmController:
         """Take a step unless it brings the arm nearer to what it must not touch."""
         assert self._reference is not None
         clearance_m = self.clearance.of(trial)
-        before_m = self.clearance.of(self._reference)
+        before_m = self._clearance_m if self._clearance_m is not None else self.clearance.of(self._reference)
         blocked = clearance_m < self._config.clearance_m and clearance_m < before_m - 1e-6
         if blocked:
             trial = self._reference
@@ -166,4 +170,5 @@ class ArmController:
         # A little faster than the reference, so that a servo that lags can catch up.
         speed = np.maximum(1.5 * moved / dt_s, 0.3)
         self._reference = trial
+        self._clearance_m = before_m if blocked else clearance_m
         return Step(goal, speed, trial[ROLL], left, arrived and not blocked, blocked)

@@ -27,11 +27,9 @@ _FINGER_RADIUS_M = 0.02
 
 class Clearance:
     def __init__(self, robot: Robot) -> None:
-        self._chains = {name: robot.chain(name) for name in {t[0] for t in _TUBES} | {t[1] for t in _TUBES}}
+        self._tree = robot.tree(*(name for tube in _TUBES for name in tube[:2]), *_FINGER_TURN_RAD)
         # A finger lies across its claw's own x axis, towards the hand's tip.
-        self._tips = [
-            (robot.chain(name), np.array([cos(turn), sin(turn), 0.0])) for name, turn in _FINGER_TURN_RAD.items()
-        ]
+        self._fingers = {name: np.array([cos(turn), sin(turn), 0.0]) for name, turn in _FINGER_TURN_RAD.items()}
         self._mount_min = np.array(robot.kinect.mount_min_m)
         self._mount_max = np.array(robot.kinect.mount_max_m)
         self._chassis_radius_m = robot.base.chassis_diameter_m / 2
@@ -40,15 +38,15 @@ class Clearance:
     def hull(self, angles: Mapping[str, float]) -> tuple[Array, Array]:
         """Centres (n, 3) in the body frame and radii (n,) of the arm's balls. The claws' angles may be left out."""
         angles = dict.fromkeys(_FINGER_TURN_RAD, 0.0) | dict(angles)
-        places = {name: chain.position(angles) for name, chain in self._chains.items()}
+        poses = self._tree.poses(angles)
         centres: list[Array] = []
         radii: list[float] = []
         for start, end, radius_m, count in _TUBES:
             for share in np.linspace(0.0, 1.0, count):
-                centres.append((1 - share) * places[start] + share * places[end])
+                centres.append((1 - share) * poses[start][:3, 3] + share * poses[end][:3, 3])
                 radii.append(radius_m)
-        for chain, turn in self._tips:
-            pose = chain.pose(angles)
+        for name, turn in self._fingers.items():
+            pose = poses[name]
             along = pose[:3, :3] @ turn
             for reach_m in (0.0, 0.5 * _FINGER_M, _FINGER_M):
                 centres.append(pose[:3, 3] + reach_m * along)

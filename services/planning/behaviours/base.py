@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
 from math import hypot
 from typing import Literal, Protocol
 
@@ -40,6 +39,8 @@ class Limbs:
     grip: Grip = field(init=False)
     gaze: Gaze = field(init=False)
     reachability: Reachability = field(init=False)
+    unfolding: Array = field(init=False)
+    """The floor places (n, 2), body frame, over which the arm swings when it unfolds."""
     grasp_height_m: float = 0.065
     """At which height what is in the hand was grasped: there it is put down."""
 
@@ -51,10 +52,9 @@ class Limbs:
         self.grip = Grip(robot, config.hand)
         self.gaze = Gaze(robot, config.head)
         self.reachability = Reachability(config.arm, self.reacher)
+        self.unfolding = self._unfolding()
 
-    @cached_property
-    def unfolding(self) -> Array:
-        """The floor places (n, 2), body frame, over which the arm swings when it unfolds."""
+    def _unfolding(self) -> Array:
         arm = ArmController(self.robot, self.config.arm, self.reacher)
         angles = dict.fromkeys(self.robot.joints, 0.0) | self.robot.poses["park"]
         travel = self.config.arm
