@@ -15,6 +15,7 @@ from cocoro.robot import Robot
 
 _TUBES = (
     # from, to, radius of the hull, balls
+    ("shoulder", "elbow", 0.025, 5),
     ("elbow", "wrist_pitch", 0.025, 4),
     ("wrist_pitch", "wrist_roll", 0.025, 2),
     ("wrist_roll", "gripper", 0.030, 5),
@@ -61,5 +62,6 @@ class Clearance:
         floor = centres[:, 2] - radii
         over = np.maximum(np.hypot(centres[:, 0], centres[:, 1]) - self._chassis_radius_m, 0.0)
         above = np.maximum(centres[:, 2] - self._chassis_top_m, 0.0)
-        chassis = np.hypot(over, above) - radii
+        # The upper arm turns on the chassis, which nothing can bring it nearer to.
+        chassis = (np.hypot(over, above) - radii)[_TUBES[0][3] :]
         return float(min(mount.min(), floor.min(), chassis.min()))

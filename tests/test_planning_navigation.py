@@ -1,0 +1,141 @@
+"""Arcs that bring a target beside the robot, and the wheels' limits."""
+
+from __future__ import annotations
+
+from math import atan2, cos, hypot, pi, sin
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cocoro.frames import Pose2
+from cocoro.messages import BaseCommand
+from cocoro.robot import Robot
+from services.planning.config import Config
+from services.planning.navigation import Driver, offset_to
+
+ROBOT = Robot.load()
+CONFIG = Config().navigation
+AIM_M = (0.58, -0.10)
+TICK_S = 0.02
+
+
+class Base:
+    """A base that does what it is told."""
+
+    def __init__(self) -> None:
+        self.pose = Pose2()
+        self.commands: list[BaseCommand] = []
+
+    def obey(self, command: BaseCommand) -> None:
+        self.commands.append(command)
+        speed = (command.left_mps + command.right_mps) / 2
+        turn = (command.right_mps - command.left_mps) / ROBOT.base.wheel_separation_m
+        half = turn * TICK_S / 2
+        way = speed * TICK_S
+        self.pose = self.pose.compose(Pose2(way * cos(half), way * sin(half), 2 * half))
+
+    @property
+    def speeds(self) -> list[tuple[float, float]]:
+        """Speed and turn rate of each command."""
+        width = ROBOT.base.wheel_separation_m
+        return [((c.left_mps + c.right_mps) / 2, (c.right_mps - c.left_mps) / width) for c in self.commands]
+
+
+def driven(distance_m: float, bearing_rad: float, most_s: float = 40.0) -> tuple[Base, bool]:
+    """Drive until the target stands at the aim; whether it ever did."""
+    driver, base = Driver(CONFIG, ROBOT.base), Base()
+    target = (distance_m * cos(bearing_rad), distance_m * sin(bearing_rad), 0.0)
+    for _ in range(round(most_s / TICK_S)):
+        x, y, _z = base.pose.inverse().apply(target)
+        offset = offset_to((x, y), AIM_M)
+        if driver.arrived(offset) and not driver.moving:
+            return base, True
+        speed, turn = (0.0, 0.0) if driver.arrived(offset) else driver.law(offset)
+        base.obey(driver.command(speed, turn, TICK_S))
+    return base, False
+
+
+@settings(max_examples=60)
+@given(distance_m=st.floats(0.7, 3.0), bearing_rad=st.floats(-pi, pi))
+def test_from_every_bearing_the_target_comes_to_where_the_arm_reaches(distance_m: float, bearing_rad: float) -> None:
+    base, arrived = driven(distance_m, bearing_rad)
+    assert arrived
+    target = (distance_m * cos(bearing_rad), distance_m * sin(bearing_rad), 0.0)
+    x, y, _ = base.pose.inverse().apply(target)
+    assert hypot(x - AIM_M[0], y - AIM_M[1]) < 0.05
+    lead = max(CONFIG.acceleration_mps2, CONFIG.turn_acceleration_radps2 * ROBOT.base.wheel_separation_m / 2) * TICK_S
+    assert max(abs(v) for c in base.commands for v in (c.left_mps, c.right_mps)) <= ROBOT.base.max_wheel_speed_mps
+    assert base.speeds[-1] == pytest.approx((0.0, 0.0), abs=lead)
+
+
+@given(x=st.floats(-3, 3), y=st.floats(-3, 3))
+def test_what_is_left_is_what_turning_and_driving_straight_would_do(x: float, y: float) -> None:
+    if hypot(x, y) < abs(AIM_M[1]) + 0.01:
+        return
+    offset = offset_to((x, y), AIM_M)
+    gone = Pose2(0.0, 0.0, offset.heading_rad).compose(Pose2(offset.ahead_m, 0.0, 0.0))
+    assert gone.inverse().apply((x, y, 0.0))[:2] == pytest.approx(AIM_M, abs=1e-9)
+
+
+def test_a_target_under_the_robot_gives_no_error() -> None:
+    offset = offset_to((0.0, 0.0), AIM_M)
+    assert offset.ahead_m < 0
+
+
+def test_a_target_that_is_too_near_is_backed_away_from() -> None:
+    speed, _ = Driver(CONFIG, ROBOT.base).law(offset_to((0.4, -0.10), AIM_M))
+    assert speed < 0
+
+
+def test_what_lies_behind_is_turned_to_first() -> None:
+    driver = Driver(CONFIG, ROBOT.base)
+    speed, turn = driver.law(offset_to((-1.0, 0.5), AIM_M))
+    assert speed == 0.0
+    assert turn > 0
+
+
+@given(speed=st.floats(-2, 2), turn=st.floats(-5, 5), seconds=st.floats(0.0, 3.0))
+def test_a_wheel_that_cannot_go_faster_slows_the_other_and_the_arc_is_kept(
+    speed: float, turn: float, seconds: float
+) -> None:
+    driver = Driver(CONFIG, ROBOT.base)
+    command = driver.command(0.0, 0.0, TICK_S)
+    for _ in range(round(seconds / TICK_S)):
+        command = driver.command(speed, turn, TICK_S, brisk=True)
+    fastest = max(abs(command.left_mps), abs(command.right_mps))
+    assert fastest <= ROBOT.base.max_wheel_speed_mps + 1e-9
+    asked_speed, asked_turn = driver._speed_mps, driver._turn_radps
+    width = ROBOT.base.wheel_separation_m
+    is_speed, is_turn = (command.left_mps + command.right_mps) / 2, (command.right_mps - command.left_mps) / width
+    assert is_speed * asked_turn == pytest.approx(is_turn * asked_speed, abs=1e-9)
+
+
+def test_speeds_change_no_faster_than_they_may() -> None:
+    driver, before = Driver(CONFIG, ROBOT.base), (0.0, 0.0)
+    for goal in [(0.35, 0.9)] * 60 + [(-0.3, -0.9)] * 90 + [(0.0, 0.0)] * 60:
+        command = driver.command(*goal, TICK_S)
+        width = ROBOT.base.wheel_separation_m
+        now = ((command.left_mps + command.right_mps) / 2, (command.right_mps - command.left_mps) / width)
+        assert abs(now[0] - before[0]) <= CONFIG.acceleration_mps2 * TICK_S + 1e-9
+        assert abs(now[1] - before[1]) <= CONFIG.turn_acceleration_radps2 * TICK_S + 1e-9
+        before = now
+    assert before == pytest.approx((0.0, 0.0), abs=1e-9)
+
+
+def test_a_halt_is_zero_at_once_and_nothing_is_left_of_the_motion() -> None:
+    driver = Driver(CONFIG, ROBOT.base)
+    for _ in range(50):
+        driver.command(0.35, 0.5, TICK_S)
+    assert driver.halt() == BaseCommand(left_mps=0.0, right_mps=0.0)
+    assert not driver.moving
+    assert driver.brake(TICK_S) == BaseCommand(left_mps=0.0, right_mps=0.0)
+
+
+def test_the_preview_is_the_way_that_is_driven() -> None:
+    target = (1.2, 0.8)
+    preview = Driver(CONFIG, ROBOT.base).preview(target, AIM_M)
+    base, arrived = driven(hypot(*target), atan2(target[1], target[0]))
+    assert arrived
+    end = preview[-1]
+    assert (end.x_m, end.y_m, end.yaw_rad) == pytest.approx((base.pose.x_m, base.pose.y_m, base.pose.yaw_rad), abs=0.06)
