@@ -88,6 +88,8 @@ class BaseState(Message):
     wheel_drop: bool = False
     cliff: bool = False
     overcurrent: bool = False
+    buttons: tuple[str, ...] = ()
+    """Those of the Create's own that are pressed: play, advance."""
     mode: Literal["off", "passive", "safe", "full"] = "full"
     battery_fraction: Annotated[float, Meta(ge=0, le=1)] = 1.0
     battery_v: NonNegative = 16.0
@@ -95,7 +97,7 @@ class BaseState(Message):
     latch: LatchState = "unknown"
     stopped_by: str = ""
     """Why the base refuses or zeroes wheel commands now ('' when it obeys): estop, latch unknown, bump,
-    cliff, wheel drop, no command, mode."""
+    cliff, wheel drop, overcurrent, no command, mode (the Create left the mode that obeys), link."""
 
 
 class BaseCommand(Message):
@@ -347,6 +349,31 @@ class EstopReply(msgspec.Struct, kw_only=True):
     service: str
     latch: LatchState
     text: str = ""
+
+
+class RecoverRequest(msgspec.Struct, kw_only=True):
+    """Put a Create that left its mode by itself (a cliff, a wheel drop, the charger) back into it."""
+
+
+class RecoverReply(msgspec.Struct, kw_only=True):
+    recovered: bool
+    text: str = ""
+    """Why not, and what to do."""
+
+
+class ServoRequest(msgspec.Struct, kw_only=True):
+    """Clear latched faults, let joints go limp, or hold them again where they are."""
+
+    action: Literal["clear", "relax", "hold"]
+    joints: tuple[str, ...] = ()
+    """Of the network that is asked; empty is all of it."""
+
+
+class ServoReply(msgspec.Struct, kw_only=True):
+    joints: tuple[str, ...] = ()
+    """For which it was done."""
+    text: str = ""
+    """What could not be done, and why."""
 
 
 class Latch(Message):

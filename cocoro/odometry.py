@@ -65,6 +65,11 @@ class Odometry:
         self.speed_mps = way_m / dt_s
         self.turn_rate_radps = turn_rad / dt_s
 
+    def unreported(self) -> None:
+        """The Create's report of the time since the last was lost: what was integrated stands as it is."""
+        self._way_m = self._turn_rad = 0.0
+        self._report_x_m, self._report_y_m, self._report_yaw_rad = self.x_m, self.y_m, self.yaw_rad
+
     def report(self, distance_mm: int, angle_deg: int) -> None:
         """Correct what was integrated since the last report by what the Create says of the same time."""
         way_m = _within(self._way_m, distance_mm, MILLIMETRE_M)
@@ -72,8 +77,7 @@ class Odometry:
         extra_m, extra_rad = way_m - self._way_m, turn_rad - self._turn_rad
         if extra_m or extra_rad:
             self._correct(extra_m, extra_rad)
-        self._way_m = self._turn_rad = 0.0
-        self._report_x_m, self._report_y_m, self._report_yaw_rad = self.x_m, self.y_m, self.yaw_rad
+        self.unreported()
 
     def _correct(self, extra_m: float, extra_rad: float) -> None:
         """Bend and stretch the path since the last report: the missing turn is spread evenly along it."""

@@ -181,12 +181,22 @@ ESTOP = Request(
     timeout_s=1.0,
 )  # fmt: skip
 
+RECOVER = Request(
+    "base/recover", m.RecoverRequest, m.RecoverReply, "base",
+    "Put a Create that left its mode back into it; answered by the real base.",
+    timeout_s=3.0,
+)  # fmt: skip
+SERVOS = Request(
+    "{service}/servos", m.ServoRequest, m.ServoReply, "*",
+    "Clear faults, relax or hold joints; answered by each real servo network.",
+    timeout_s=3.0,
+)  # fmt: skip
 ABOUT = Request(
     "{service}/about", m.AboutRequest, m.AboutReply, "*",
     "What a service is and what it was started with: answered by every service.",
 )  # fmt: skip
 
-REQUESTS: tuple[Request[Any, Any], ...] = (RUN, CANCEL, OBJECTS, ESTOP, ABOUT)
+REQUESTS: tuple[Request[Any, Any], ...] = (RUN, CANCEL, OBJECTS, ESTOP, RECOVER, SERVOS, ABOUT)
 
 HARDWARE = ("kinect", "base", "arm", "hand")
 """The services whose keys the simulator impersonates."""

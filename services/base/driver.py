@@ -1,0 +1,186 @@
+"""What the base service makes of the guard's reports: odometry, health, and what to ask of the wheels. Pure."""
+
+from __future__ import annotations
+
+import msgspec
+
+from cocoro.clock import NS, is_fresh
+from cocoro.messages import BaseCommand, BaseState, LatchState
+from cocoro.odometry import Odometry, WheelRamp
+from cocoro.robot import Base
+from cocoro.topics import BASE_COMMAND
+from services.base import oi
+from services.base.keeper import Link
+
+FRESH_NS = 150_000_000
+"""The state is told as long as the Create was heard within this time."""
+LONGEST_S = 0.25
+"""For longer than this nobody knows what the wheels did: then it is the Create's own count that tells."""
+BATTERY_LOW = 0.15
+
+
+class Report(msgspec.Struct):
+    """What the guard tells: a frame of the Create's, or that there is none."""
+
+    t: int
+    """CLOCK_MONOTONIC, ns."""
+    link: Link
+    why: str
+    """What keeps the wheels from turning as they were asked to, or the port from working."""
+    left: int
+    """mm/s, as the Create was told last."""
+    right: int
+    readings: dict[int, int] | None = None
+    counts_lost: bool = False
+
+
+class BaseDriver:
+    """Told the time (the robot's clock) with every call."""
+
+    def __init__(self, base: Base) -> None:
+        self.latch: LatchState = "unknown"
+        self.link: Link = "closed"
+        self.why = "the guard has not reported yet"
+        self._base = base
+        self._timeout_ns = round(base.command_timeout_s * NS)
+        self._odometry = Odometry(base)
+        self._ramp = WheelRamp(base)
+        self._wanted_mmps = (0, 0)
+        self._until_ns = -1
+        self._readings: oi.Readings = {}
+        self._frame_ns: int | None = None
+
+    # --- commands -----------------------------------------------------------------------------------
+
+    def command(self, command: BaseCommand, now_ns: int) -> None:
+        """Take wheel speeds; they count from when they were said."""
+        if self.latch != "released" or not is_fresh(command.stamp_ns, now_ns, BASE_COMMAND.max_age_s):
+            return
+        limit_mmps = self._base.max_wheel_speed_mps * 1000.0
+        left, right = (
+            round(min(max(speed_mps * 1000.0, -limit_mmps), limit_mmps))
+            for speed_mps in (command.left_mps, command.right_mps)
+        )
+        self._wanted_mmps = left, right
+        self._until_ns = min(command.stamp_ns, now_ns) + self._timeout_ns
+
+    def set_latch(self, state: LatchState) -> None:
+        """Latched and unknown stop the wheels; a command from before counts no more after the release."""
+        if state != "released":
+            self._until_ns = -1
+        self.latch = state
+
+    def new_epoch(self) -> None:
+        """The clock began anew: what was commanded and heard before is of no time that there is."""
+        self._until_ns = -1
+        self._frame_ns = None
+
+    def wheels(self, now_ns: int) -> tuple[int, int, int]:
+        """Left and right speed in mm/s to ask of the guard, and for how many ns from now."""
+        left_ns = self._until_ns - now_ns
+        if self.latch != "released" or left_ns < 0:
+            return 0, 0, self._timeout_ns
+        return *self._wanted_mmps, min(left_ns, self._timeout_ns)
+
+    # --- reports ------------------------------------------------------------------------------------
+
+    def take(self, report: Report, now_ns: int) -> None:
+        """A report that was made at `now_ns`."""
+        self.link, self.why = report.link, report.why
+        readings = report.readings
+        if readings is None:
+            return
+        self._readings = readings
+        self._roll(readings, now_ns)
+        if report.counts_lost:
+            self._odometry.unreported()
+        elif oi.DISTANCE in readings:
+            self._odometry.report(readings[oi.DISTANCE], readings[oi.ANGLE])
+        self._frame_ns = now_ns
+
+    def _roll(self, readings: oi.Readings, now_ns: int) -> None:
+        """Carry the pose on by what the wheels are told to do: by the Create's own word, which comes with the frame."""
+        if self._frame_ns is None or now_ns <= self._frame_ns:
+            return
+        dt_s = min((now_ns - self._frame_ns) / NS, LONGEST_S)
+        obeying = oi.MODES[readings[oi.MODE]] in ("safe", "full")
+        left_mps, right_mps = (readings[side] / 1000.0 if obeying else 0.0 for side in (oi.LEFT_SPEED, oi.RIGHT_SPEED))
+        before = self._ramp.left_mps, self._ramp.right_mps
+        self._ramp.advance(left_mps, right_mps, dt_s)
+        self._odometry.advance(
+            (before[0] + self._ramp.left_mps) / 2 * dt_s, (before[1] + self._ramp.right_mps) / 2 * dt_s, dt_s
+        )
+
+    # --- what it is like ----------------------------------------------------------------------------
+
+    def state(self, now_ns: int) -> BaseState | None:
+        """As of the newest frame; None when the Create was not heard of late."""
+        if self._frame_ns is None or not 0 <= now_ns - self._frame_ns <= FRESH_NS:
+            return None
+        readings, odometry = self._readings, self._odometry
+        bumps = readings[oi.BUMPS]
+        return BaseState(
+            stamp_ns=self._frame_ns,
+            odometry_m=(odometry.x_m, odometry.y_m),
+            odometry_yaw_rad=odometry.yaw_rad,
+            speed_mps=odometry.speed_mps,
+            turn_rate_radps=odometry.turn_rate_radps,
+            bump_left=bool(bumps & oi.BUMP_LEFT),
+            bump_right=bool(bumps & oi.BUMP_RIGHT),
+            wheel_drop=bool(bumps & oi.WHEEL_DROPS),
+            cliff=any(readings[packet] for packet in oi.CLIFFS),
+            overcurrent=bool(readings[oi.OVERCURRENTS] & oi.WHEEL_OVERCURRENTS),
+            buttons=tuple(
+                name for name, bit in (("play", oi.PLAY), ("advance", oi.ADVANCE)) if readings[oi.BUTTONS] & bit
+            ),
+            mode=self.mode,
+            battery_fraction=self.battery_fraction,
+            battery_v=readings[oi.VOLTAGE] / 1000.0,
+            charging=readings[oi.CHARGING] in oi.CHARGES,
+            latch=self.latch,
+            stopped_by=self.stopped_by(now_ns),
+        )
+
+    @property
+    def mode(self) -> oi.Mode:
+        return oi.MODES[self._readings.get(oi.MODE, 0)]
+
+    @property
+    def battery_fraction(self) -> float:
+        capacity = self._readings.get(oi.CAPACITY, 0)
+        return min(self._readings[oi.CHARGE] / capacity, 1.0) if capacity else 0.0
+
+    def stopped_by(self, now_ns: int) -> str:
+        if self.latch != "released":
+            return "estop" if self.latch == "latched" else "latch unknown"
+        if self.link != "up":
+            return "mode" if self.link == "fallen" else "link"
+        if now_ns > self._until_ns:
+            return "no command"
+        return self.why
+
+    def faults(self) -> tuple[str, ...]:
+        """What is wrong with the base, for people; in the order in which one would look for it."""
+        if self.link in ("closed", "silent"):
+            return (f"no word from the Create: {self.why}" if self.link == "closed" else SILENT,)
+        if not self._readings:
+            return ()
+        found = []
+        if self.link == "fallen":
+            found.append(f"the Create fell back to {self.mode} mode{self._fall()}; `cocoro base recover`")
+        bumps = self._readings[oi.BUMPS]
+        if bumps & oi.WHEEL_DROPS:
+            found.append("a wheel hangs in the air")
+        if any(self._readings[packet] for packet in oi.CLIFFS):
+            found.append("a cliff is below a sensor")
+        if self._readings[oi.OVERCURRENTS] & oi.WHEEL_OVERCURRENTS:
+            found.append("a wheel draws too much current: is it blocked?")
+        if self.battery_fraction < BATTERY_LOW:
+            found.append(f"the battery is low: {100 * self.battery_fraction:.0f}%")
+        return tuple(found)
+
+    def _fall(self) -> str:
+        return " at the charger" if self._readings[oi.CHARGERS] else ""
+
+
+SILENT = "the Create does not answer: is it switched on, is its cable plugged in?"

@@ -1,0 +1,200 @@
+"""The guard: the one process that has the Create's serial port open.
+
+A Create goes on driving when its driver dies. So what decides whether its wheels may turn is this small process, below
+the base service: it passes on what the service asks of the wheels while the service keeps asking, and stops them
+
+- 0.2 s after the service has asked last (it hangs, it was stopped, it has too much to do),
+- at once when the service's end of the socket closes (it crashed, it was killed),
+- at once on SIGTERM, and on any error of its own,
+- by the reflexes of `services.base.keeper`: bumpers, cliffs, wheel drops, a Create that left its mode.
+
+    python -m services.base.guard PORT --fd N --mode safe --deadman-ms 200
+
+`--fd` is its end of a SOCK_SEQPACKET pair. Down come {"left": mm/s, "right": mm/s, "until": ns} and {"recover": true},
+up goes a report for each frame, and ten a second when there are none (`Report` in `services.base.driver`). Times are
+CLOCK_MONOTONIC, which all processes of a machine share. It needs pyserial and nothing else beyond Python.
+"""
+
+from __future__ import annotations
+
+import argparse
+import errno
+import fcntl
+import json
+import os
+import select
+import signal
+import socket
+import sys
+import time
+from contextlib import suppress
+
+import serial
+
+from services.base import oi
+from services.base.keeper import MS, Keeper
+
+TURN_S = 0.005
+"""How long it sleeps at most between two looks at the clock."""
+QUIET_NS = 100 * MS
+REOPEN_NS = 200 * MS
+PRIORITY = 20
+SENTENCES = {
+    errno.ENOENT: "there is no such port: is the adapter plugged in?",
+    errno.EACCES: "no permission: add the user to the group dialout, and log in anew",
+    errno.EAGAIN: "another program has it open",
+    errno.EWOULDBLOCK: "another program has it open",
+    errno.EIO: "the adapter does not answer: is it plugged in?",
+}
+
+
+class Guard:
+    """Keeps one port by one `Keeper`."""
+
+    def __init__(self, path: str, keeper: Keeper, channel: socket.socket) -> None:
+        self._path = path
+        self._keeper = keeper
+        self._channel = channel
+        self._port: serial.Serial | None = None
+        self._why = "not opened yet"
+        self._reported_ns = 0
+        self._tried_ns = -REOPEN_NS
+
+    def turn(self) -> bool:
+        """Take what has come in, write what is due. False when the service is gone."""
+        if self._port is None:
+            self._open()
+        descriptors = [self._channel] if self._port is None else [self._channel, self._port]
+        readable, _, _ = select.select(descriptors, [], [], TURN_S)
+        if self._channel in readable and not self._take_commands():
+            return False
+        now_ns = time.monotonic_ns()
+        if self._port is not None:
+            try:
+                if self._port in readable:
+                    self._take_bytes(self._port, now_ns)
+                self._write(self._port, self._keeper.poll(now_ns))
+            except OSError as error:  # pyserial's own errors are such, too
+                self._lose(_plain(error, self._path))
+        if now_ns - self._reported_ns > QUIET_NS:
+            self._report(now_ns)
+        return True
+
+    def stop(self) -> None:
+        """Stop the wheels, and see to it that the command has left before the port closes."""
+        if self._port is not None:
+            with suppress(OSError):
+                self._port.write(oi.drive_direct(0, 0))
+                self._port.flush()
+            with suppress(OSError):
+                self._port.close()
+
+    def _open(self) -> None:
+        now_ns = time.monotonic_ns()
+        if now_ns - self._tried_ns < REOPEN_NS:
+            return
+        self._tried_ns = now_ns
+        try:
+            port = serial.Serial(self._path, oi.BAUD, timeout=0, write_timeout=0, exclusive=True)
+        except (OSError, ValueError) as error:
+            self._why = _plain(error, self._path)
+            return
+        self._port = port
+        self._why = ""
+        self._keeper.opened(now_ns)
+
+    def _lose(self, why: str) -> None:
+        if self._port is not None:
+            with suppress(OSError):
+                self._port.close()
+        self._port = None
+        self._why = why
+        self._keeper.closed()
+
+    def _take_bytes(self, port: serial.Serial, now_ns: int) -> None:
+        data = os.read(port.fileno(), 4096)
+        if not data:
+            raise OSError(errno.EIO, "end of file")
+        for readings in self._keeper.heard(data, now_ns):
+            self._report(now_ns, readings)
+
+    def _write(self, port: serial.Serial, data: bytes) -> None:
+        """All of it, or nothing more of it: what the line does not take now would be late."""
+        if data:
+            with suppress(BlockingIOError):
+                os.write(port.fileno(), data)
+
+    def _take_commands(self) -> bool:
+        """False when the other end is closed."""
+        for _ in range(16):
+            try:
+                message = self._channel.recv(4096)
+            except BlockingIOError:
+                return True
+            except ConnectionError:
+                return False
+            if not message:
+                return False
+            self._obey(message)
+        return True
+
+    def _obey(self, message: bytes) -> None:
+        now_ns = time.monotonic_ns()
+        try:
+            command = json.loads(message)
+            if "until" in command:
+                self._keeper.ask(int(command["left"]), int(command["right"]), int(command["until"]), now_ns)
+            elif command.get("recover"):
+                self._keeper.recover(now_ns)
+        except (ValueError, TypeError, KeyError, AttributeError, OverflowError):
+            return  # not understood, so not obeyed
+
+    def _report(self, now_ns: int, readings: oi.Readings | None = None) -> None:
+        self._reported_ns = now_ns
+        wheels = self._keeper.wheels
+        report = {
+            "t": now_ns,
+            "link": self._keeper.link,
+            "why": self._why or self._keeper.allowed(now_ns).why,
+            "left": wheels.left_mmps,
+            "right": wheels.right_mmps,
+            "readings": readings,
+            "counts_lost": self._keeper.take_counts_lost() if readings is not None else False,
+        }
+        with suppress(BlockingIOError, ConnectionError):
+            self._channel.send(json.dumps(report).encode())
+
+
+def _plain(error: Exception, path: str) -> str:
+    number: int = getattr(error, "errno", None) or 0
+    what = SENTENCES.get(number) or (os.strerror(number) if number else str(error))
+    return f"{path}: {what}"
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(prog="python -m services.base.guard", description="Own a Create's serial port.")
+    parser.add_argument("port")
+    parser.add_argument("--fd", type=int, required=True, help="this process's end of a socket pair")
+    parser.add_argument("--mode", choices=("safe", "full"), default="safe")
+    parser.add_argument("--deadman-ms", type=int, default=200)
+    options = parser.parse_args()
+
+    told: list[int] = []
+    signal.signal(signal.SIGTERM, lambda number, _: told.append(number))
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the service, which closes the socket
+    with suppress(OSError):  # needs the right to: LimitRTPRIO in the unit file
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
+    channel = socket.socket(fileno=options.fd)
+    channel.setblocking(False)
+    fcntl.fcntl(channel, fcntl.F_SETFD, fcntl.FD_CLOEXEC)
+    guard = Guard(options.port, Keeper(options.mode, options.deadman_ms * MS), channel)
+    try:
+        while not told and guard.turn():
+            pass
+    finally:
+        guard.stop()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

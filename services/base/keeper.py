@@ -1,0 +1,217 @@
+"""What the guard of the Create's port decides, as a pure machine: bytes and commands in, bytes to write out.
+
+It lets wheels turn only while all of this holds: the service above asked for it, not longer ago than the deadman
+allows; the Create is heard; it is in the mode in which it was put; no bumper, cliff or wheel drop forbids it.
+"""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+from services.base import oi
+
+Link = Literal["closed", "silent", "waking", "up", "fallen"]
+"""closed: no port. silent: nothing good is heard. waking: being put into its mode. fallen: the Create left the mode by
+itself, and waits for somebody to say that it may go on."""
+
+MS = 1_000_000
+SILENT_NS = 120 * MS
+"""Eight frames missed: the Create is not heard any more."""
+RESEND_NS = 40 * MS
+"""Wheel commands are repeated so often even when nothing has changed: one may have been lost on the wire."""
+COUNTS_NS = 200 * MS
+"""How often way and turn are asked for: at 5 Hz their units, 1 mm and 1 degree, are small beside what they count."""
+COUNTS_LATE_NS = 60 * MS
+WAKE_NS = 500 * MS
+RIGHT_AGAIN_NS = 5000 * MS
+
+SHORT = (
+    oi.BUMPS, *oi.CLIFFS, oi.OVERCURRENTS, oi.BUTTONS, oi.CHARGING, oi.VOLTAGE, oi.CURRENT, oi.TEMPERATURE,
+    oi.CHARGE, oi.CAPACITY, oi.CHARGERS, oi.MODE, oi.RIGHT_SPEED, oi.LEFT_SPEED,
+)  # fmt: skip
+LONG = (*SHORT, oi.DISTANCE, oi.ANGLE)
+"""A frame that holds way and turn starts both counts anew, and what is less than a unit is forgotten. So they are in
+one frame every `COUNTS_NS`, by changing the list for just that long; a checksum protects them there as it does all."""
+
+
+class Wheels(NamedTuple):
+    left_mmps: int
+    right_mmps: int
+    why: str = ""
+    """What keeps them from turning as they were asked to."""
+
+
+STILL = Wheels(0, 0)
+
+
+def reflex(wanted: Wheels, readings: oi.Readings) -> Wheels:
+    """What of the wanted speeds the robot's own sensors let through.
+
+    Against a bumper or at a cliff there is no way forward, but a round base may turn on the spot and back away.
+    """
+    left, right, _ = wanted
+    if readings[oi.BUMPS] & oi.WHEEL_DROPS:
+        return Wheels(0, 0, "wheel drop")
+    if readings[oi.OVERCURRENTS] & oi.WHEEL_OVERCURRENTS:
+        return Wheels(0, 0, "overcurrent")
+    cliff = any(readings[packet] for packet in oi.CLIFFS)
+    bump = readings[oi.BUMPS] & (oi.BUMP_LEFT | oi.BUMP_RIGHT)
+    if (cliff or bump) and left + right > 0:
+        half = (left - right) // 2
+        return Wheels(oi.harmless(half), oi.harmless(-half), "cliff" if cliff else "bump")
+    return wanted
+
+
+class Keeper:
+    """Told the time (monotonic, ns) with every call. `mode` is safe or full."""
+
+    def __init__(self, mode: str, deadman_ns: int) -> None:
+        self.link: Link = "closed"
+        self.readings: oi.Readings = {}
+        """The newest frame."""
+        self.wheels = STILL
+        """What the Create was told last."""
+        self._mode = mode
+        self._deadman_ns = deadman_ns
+        self._parser = oi.StreamParser((SHORT, LONG))
+        self._wanted = STILL
+        self._until_ns = 0
+        self._frame_ns = 0
+        self._sent_ns = 0
+        self._counted_ns = 0
+        self._counting_ns: int | None = None
+        self._counts_lost = False
+        self._righted_ns = -RIGHT_AGAIN_NS
+        self._wake_ns = 0
+        self._wake: list[tuple[int, bytes]] = []
+
+    # --- what happens -------------------------------------------------------------------------------
+
+    def opened(self, now_ns: int) -> None:
+        """There is a port; whatever is at its other end is put into the mode."""
+        self._parser.reset()
+        self._start_waking(now_ns)
+
+    def closed(self) -> None:
+        self.link = "closed"
+        self.readings = {}
+        self._counts_lost = True
+
+    def ask(self, left_mmps: int, right_mmps: int, until_ns: int, now_ns: int) -> None:
+        """Wheel speeds, until then and never for longer than the deadman."""
+        self._wanted = Wheels(oi.harmless(left_mmps), oi.harmless(right_mmps))
+        self._until_ns = min(until_ns, now_ns + self._deadman_ns)
+
+    def recover(self, now_ns: int) -> None:
+        """Somebody says that a Create that left its mode may go on."""
+        if self.link == "fallen":
+            self._start_waking(now_ns)
+
+    def heard(self, data: bytes, now_ns: int) -> list[oi.Readings]:
+        """Bytes from the Create; the good frames in them."""
+        skipped = self._parser.skipped
+        frames = self._parser.feed(data)
+        if self._parser.skipped > skipped and self._counting_ns is not None:
+            self._counts_lost = True
+        for readings in frames:
+            self.readings = readings
+            self._frame_ns = now_ns
+            good = oi.MODES[readings[oi.MODE]] == self._mode
+            if self.link in ("waking", "silent"):
+                if good and not self._wake:
+                    self.link = "up"
+            elif not good and self.link != "fallen":
+                self._fell(now_ns)
+        return frames
+
+    def take_counts_lost(self) -> bool:
+        """Whether, since the last call, a count of way and turn may have been lost on the wire."""
+        lost, self._counts_lost = self._counts_lost, False
+        return lost
+
+    # --- what to write ------------------------------------------------------------------------------
+
+    def poll(self, now_ns: int) -> bytes:
+        """What to write to the port now. To be called after everything above, and every few milliseconds."""
+        if self.link == "closed":
+            return b""
+        if self.link in ("up", "fallen") and now_ns - self._frame_ns > SILENT_NS:
+            self.link = "silent"
+            self._counts_lost = True
+            self._start_waking(now_ns)
+        elif self.link in ("waking", "silent") and now_ns - self._wake_ns > WAKE_NS:
+            if now_ns - self._frame_ns <= SILENT_NS:
+                self.link = "fallen"
+            else:
+                self._start_waking(now_ns)
+                self.link = "silent"
+        return self._waking(now_ns) + self._counts(now_ns) + self._drive(now_ns)
+
+    def allowed(self, now_ns: int) -> Wheels:
+        """What the wheels may do now, and why not more."""
+        if self.link != "up":
+            return Wheels(0, 0, "mode" if self.link == "fallen" else "link")
+        if now_ns > self._until_ns:
+            return Wheels(0, 0, "no command")
+        return reflex(self._wanted, self.readings)
+
+    def _drive(self, now_ns: int) -> bytes:
+        wheels, before = self.allowed(now_ns), self.wheels
+        self.wheels = wheels
+        # The Create repeats in each frame what it was told: a command that was garbled on its way is put right.
+        heeded = (self.readings.get(oi.LEFT_SPEED), self.readings.get(oi.RIGHT_SPEED)) == wheels[:2]
+        stale = self._frame_ns > self._sent_ns and not heeded
+        if wheels[:2] == before[:2] and now_ns - self._sent_ns < RESEND_NS and not stale:
+            return b""
+        self._sent_ns = now_ns
+        return oi.drive_direct(wheels.left_mmps, wheels.right_mmps)
+
+    def _counts(self, now_ns: int) -> bytes:
+        if self.link != "up":
+            self._counting_ns = None
+            return b""
+        if self._counting_ns is None:
+            if now_ns - self._counted_ns < COUNTS_NS:
+                return b""
+            self._counting_ns = now_ns
+            return oi.stream(LONG)
+        if oi.DISTANCE in self.readings:
+            self._counting_ns = None
+            self._counted_ns = now_ns
+            return oi.stream(SHORT)
+        if now_ns - self._counting_ns > COUNTS_LATE_NS:
+            self._counting_ns = now_ns
+            self._counts_lost = True
+            return oi.stream(LONG)
+        return b""
+
+    def _fell(self, now_ns: int) -> None:
+        """It has left its mode. Where its own safety made it, somebody must say when it may go on. Where nothing did,
+        a byte lost on the wire may have become a command, a demo even: that is ended at once, but not for ever."""
+        if not self._has_cause() and now_ns - self._righted_ns > RIGHT_AGAIN_NS:
+            self._righted_ns = now_ns
+            self._start_waking(now_ns)
+        else:
+            self.link = "fallen"
+
+    def _has_cause(self) -> bool:
+        """Whether something is there that makes a Create leave safe mode."""
+        readings = self.readings
+        return bool(readings[oi.BUMPS] & oi.WHEEL_DROPS or readings[oi.CHARGERS] or any(readings[p] for p in oi.CLIFFS))
+
+    def _start_waking(self, now_ns: int) -> None:
+        self.link = "waking"
+        self._wake_ns = now_ns
+        self._counting_ns = None
+        # The first bytes stop the wheels in case that it still drives; a change of mode takes a Create up to 20 ms.
+        self._wake = [
+            (now_ns, oi.drive_direct(0, 0) + oi.abort_demo() + oi.start()),
+            (now_ns + 50 * MS, oi.enter(self._mode)),
+            (now_ns + 100 * MS, oi.drive_direct(0, 0) + oi.stream(SHORT)),
+        ]
+
+    def _waking(self, now_ns: int) -> bytes:
+        data = b""
+        while self._wake and self._wake[0][0] <= now_ns:
+            data += self._wake.pop(0)[1]
+        return data

@@ -1,0 +1,118 @@
+"""The base as a service: the guard keeps the port, the driver makes sense of it, this joins them to the mesh."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import Meta
+
+from cocoro import topics
+from cocoro.latch import LatchKeeper
+from cocoro.messages import BaseCommand, LatchState, RecoverReply, RecoverRequest
+from cocoro.node import Node
+from cocoro.ports import port_path
+from services.base.driver import BaseDriver, Report
+from services.base.guardian import Guardian
+
+__all__ = ["Config", "run"]
+
+BEAT_S = 0.02
+"""How often the guard is asked anew; a tenth of the time after which it stops the wheels."""
+RECOVERY_S = 2.0
+
+
+class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    port: str = "/dev/cocoro-create"
+    """The serial port: a device, or wire:NAME for an emulated one."""
+    mode: Literal["safe", "full"] = "safe"
+    """In safe mode the Create itself stops at cliffs, when a wheel drops and at the charger."""
+    guard_timeout_s: Annotated[float, Meta(gt=0.05, le=1.0)] = 0.2
+    """The guard stops the wheels when it was not asked for so long."""
+
+
+class BaseService:
+    def __init__(self, node: Node, config: Config) -> None:
+        self._node = node
+        self._driver = BaseDriver(node.robot.base)
+        port = port_path(config.port, node.robot_name)
+        self.guardian = Guardian(port, config.mode, config.guard_timeout_s, self._heard)
+        self._epoch = node.clock.epoch
+        self._changed = asyncio.Event()
+        LatchKeeper(node, self._latched)
+        node.on(topics.BASE_COMMAND, self._commanded)
+        node.serve(topics.RECOVER, self._recover)
+
+    async def run(self) -> None:
+        async with self.guardian:
+            self._tell()
+            self._node.spawn(self._beat())
+            async for now_ns in self._node.every(self._node.robot.base.state_rate_hz, "state"):
+                if (state := self._driver.state(now_ns)) is not None:
+                    self._node.publish(topics.BASE_STATE, state)
+                self._tell()
+
+    async def _beat(self) -> None:
+        """The pulse that keeps the wheels turning. It goes by real time, as the guard does."""
+        while True:
+            self.guardian.check()
+            self._ask()
+            await asyncio.sleep(BEAT_S)
+
+    def _ask(self) -> None:
+        if self._node.clock.epoch != self._epoch:
+            self._epoch = self._node.clock.epoch
+            self._driver.new_epoch()
+        self.guardian.ask(*self._driver.wheels(self._node.now_ns()))
+
+    def _commanded(self, command: BaseCommand) -> None:
+        self._driver.command(command, self._node.now_ns())
+        self._ask()
+
+    def _latched(self, state: LatchState, by: str) -> None:
+        self._driver.set_latch(state)
+        self._ask()
+
+    def _heard(self, report: Report) -> None:
+        age_ns = max(time.monotonic_ns() - report.t, 0)
+        before = self._driver.link
+        self._driver.take(report, self._node.now_ns() - age_ns)
+        if self._driver.link != before:
+            self._node.log.info("the Create's link is %s%s", report.link, f": {report.why}" if report.why else "")
+            self._changed.set()
+
+    async def _recover(self, _: RecoverRequest) -> RecoverReply:
+        driver = self._driver
+        if driver.link == "fallen":
+            self.guardian.recover()
+        try:
+            async with asyncio.timeout(RECOVERY_S):
+                while driver.link != "up":
+                    self._changed.clear()
+                    await self._changed.wait()
+                    if driver.link == "fallen":  # once more: what made it fall is still there
+                        break
+        except TimeoutError:
+            pass
+        if driver.link == "up":
+            return RecoverReply(recovered=True)
+        return RecoverReply(recovered=False, text="; ".join(driver.faults()) or driver.why)
+
+    def _tell(self) -> None:
+        """Health, as people read it."""
+        node, faults = self._node, self._driver.faults()
+        if faults != node.faults:
+            for fault in sorted(set(faults) - set(node.faults)):
+                node.log.warning("%s", fault)
+        node.faults = faults
+        if self._driver.link == "up":
+            node.ready()
+        else:
+            node.degraded({"waking": "waking the Create", "fallen": "not obeying"}.get(self._driver.link, "no Create"))
+
+
+async def run(node: Node, config: Config) -> None:
+    """Serve for ever."""
+    await BaseService(node, config).run()

@@ -1,0 +1,161 @@
+"""Runs emulated devices at the ends of their lines, by the machine's own clock, in one thread."""
+
+from __future__ import annotations
+
+import os
+import select
+import threading
+import time
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future
+from contextlib import suppress
+from pathlib import Path
+from queue import SimpleQueue
+from types import TracebackType
+from typing import Protocol, TypeVar
+
+from sim.wire.faults import Disturbance, Fault
+from sim.wire.pty import Port
+
+T = TypeVar("T")
+
+TURN_S = 0.004
+"""It looks at the clock at least so often."""
+
+
+class Device(Protocol):
+    """What is at the end of a line."""
+
+    def receive(self, data: bytes, baud: int, now_ns: int) -> None: ...
+
+    def advance(self, baud: int, now_ns: int) -> bytes:
+        """What it sends by now, to a listener at this baud rate."""
+
+
+class Body(Protocol):
+    """What the devices' motors move and their sensors feel."""
+
+    def advance(self, now_ns: int) -> None: ...
+
+    def fileno(self) -> int:
+        """A descriptor that becomes readable when there is something to do; -1 for none."""
+
+
+class Line:
+    """A port, the device behind it, and what happens to the bytes in between."""
+
+    def __init__(self, path: Path, device: Device, seed: int = 0) -> None:
+        self.port = Port(path)
+        self.device = device
+        self._to_device = Disturbance("to_device", seed)
+        self._to_driver = Disturbance("to_driver", seed)
+
+    def disturb(self, fault: Fault) -> None:
+        self._to_device.add(fault)
+        self._to_driver.add(fault)
+
+    def undisturb(self) -> None:
+        self._to_device.clear()
+        self._to_driver.clear()
+
+    def turn(self, now_ns: int) -> None:
+        data = self._to_device.carry(self.port.read(), now_ns)
+        baud = self.port.baud
+        if data:
+            self.device.receive(data, baud, now_ns)
+        self.port.write(self._to_driver.carry(self.device.advance(baud, now_ns), now_ns))
+
+
+class Emulator:
+    """Devices by name, on ports of these names in a folder. `run` it, or use it as a context manager: a thread."""
+
+    def __init__(self, folder: Path, devices: Mapping[str, Device], body: Body, seed: int = 0) -> None:
+        self.lines = {
+            name: Line(folder / name, device, seed + number) for number, (name, device) in enumerate(devices.items())
+        }
+        self._body = body
+        self._jobs: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
+        self._wake, self._waker = os.pipe()
+        os.set_blocking(self._wake, False)
+        self._thread: threading.Thread | None = None
+        self._watches: list[tuple[Callable[[], object], Future[int]]] = []
+
+    def run(self) -> None:
+        """Until `stop`."""
+        try:
+            while self._take_jobs():
+                now_ns = time.monotonic_ns()
+                self._body.advance(now_ns)
+                for line in self.lines.values():
+                    line.turn(now_ns)
+                self._watch(now_ns)
+                self._rest()
+        finally:
+            for line in self.lines.values():
+                line.port.close()
+
+    def stop(self) -> None:
+        """From any thread."""
+        self._jobs.put(None)
+        os.write(self._waker, b"!")
+
+    def call(self, job: Callable[[], T]) -> T:
+        """Have something done between two turns of the thread, from another thread; what it gives or raises."""
+        future: Future[T] = Future()
+
+        def work() -> None:
+            try:
+                future.set_result(job())
+            except BaseException as error:
+                future.set_exception(error)
+
+        self._jobs.put(work)
+        os.write(self._waker, b"!")
+        return future.result(10.0)
+
+    def until(self, condition: Callable[[], object], timeout_s: float = 30.0) -> int:
+        """Wait until something is so, as it is looked at in each turn of the thread; when that was (monotonic, ns).
+        Raises TimeoutError when it does not come to be."""
+        future: Future[int] = Future()
+        self.call(lambda: self._watches.append((condition, future)))
+        try:
+            return future.result(timeout_s)
+        finally:
+            future.cancel()
+
+    def __enter__(self) -> Emulator:
+        self._thread = threading.Thread(target=self.run, name="emulator", daemon=True)
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stop()
+        if self._thread is not None:
+            self._thread.join()
+        os.close(self._wake)
+        os.close(self._waker)
+
+    def _watch(self, now_ns: int) -> None:
+        for watch in list(self._watches):
+            condition, future = watch
+            if future.cancelled() or condition():
+                self._watches.remove(watch)
+                if future.set_running_or_notify_cancel():
+                    future.set_result(now_ns)
+
+    def _rest(self) -> None:
+        """Until something comes in, but not for long."""
+        waiting = [line.port.fileno() for line in self.lines.values()] + [self._body.fileno(), self._wake]
+        select.select([fd for fd in waiting if fd >= 0], [], [], TURN_S)
+
+    def _take_jobs(self) -> bool:
+        with suppress(BlockingIOError):
+            os.read(self._wake, 4096)
+        while not self._jobs.empty():
+            job = self._jobs.get()
+            if job is None:
+                return False
+            job()
+        return True

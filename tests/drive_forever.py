@@ -1,0 +1,27 @@
+"""A base service in a process of its own that is told to drive straight on: `python drive_forever.py PORT`."""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+
+from cocoro import topics
+from cocoro.bus.local import LocalMesh
+from cocoro.clock import RealClock
+from cocoro.messages import BaseCommand, Latch
+from cocoro.node import Node
+from cocoro.robot import Robot
+from services.base.service import Config, run
+
+
+async def main(port: str) -> None:
+    mesh, clock, robot = LocalMesh(), RealClock(), Robot.load()
+    async with Node("base", mesh.join(), clock, robot) as node, Node("other", mesh.join(), clock, robot) as other:
+        other.spawn(run(node, Config(port=port)))
+        async for _ in other.every(50.0):
+            other.publish(topics.LATCH, Latch(state="released"))
+            other.publish(topics.BASE_COMMAND, BaseCommand(left_mps=0.2, right_mps=0.2))
+
+
+if __name__ == "__main__":
+    asyncio.run(main(sys.argv[1]))

@@ -1,0 +1,129 @@
+"""A Create at the end of a pseudo-terminal and whoever drives it: what the tests of the base have in common."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from services.base import oi
+from services.base.guardian import _PACKAGES
+from sim.wire.body import SimpleBody
+from sim.wire.create import Create
+from sim.wire.emulator import Emulator
+
+MS = 1_000_000
+SAFE = 2
+DEADMAN_NS = 200 * MS
+PATIENCE_NS = 100 * MS
+"""What a busy machine may add to a deadline."""
+
+
+def frame(readings: oi.Readings) -> bytes:
+    """A stream frame as the Create would send it."""
+    payload = b"".join(
+        bytes([packet]) + value.to_bytes(oi.PACKETS[packet].size, "big", signed=oi.PACKETS[packet].signed)
+        for packet, value in readings.items()
+    )
+    body = bytes([19, len(payload)]) + payload
+    return body + bytes([-sum(body) & 0xFF])
+
+
+class Bench:
+    """An emulated Create, its line and its body; `with` it."""
+
+    def __init__(self, folder: Path, seed: int = 0) -> None:
+        self.create = Create()
+        self.body = SimpleBody(self.create)
+        self.emulator = Emulator(folder, {"create": self.create}, self.body, seed)
+        self.line = self.emulator.lines["create"]
+        self.port = str(folder / "create")
+
+    def __enter__(self) -> Bench:
+        self.emulator.__enter__()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.emulator.__exit__(None, None, None)
+
+    def until_awake(self) -> None:
+        """The driver has put it into its mode and asks for its sensors."""
+        self.emulator.until(lambda: self.create.mode == SAFE and self.create._streaming)
+
+    def until_wheels(self, left: int, right: int) -> int:
+        """When the wheels were asked for this; ns, monotonic."""
+        self.emulator.until(lambda: self.create.wheels_mmps == (left, right))
+        return self.emulator.call(lambda: self.create.acted[-1][0])
+
+    def forget(self) -> None:
+        self.emulator.call(self.create.acted.clear)
+
+
+class FakeService:
+    """Stands in for the service: the other end of a guard's socket."""
+
+    def __init__(self, port: str, mode: str = "safe") -> None:
+        self.channel, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self.channel.settimeout(30.0)
+        environment = os.environ | {"PYTHONPATH": os.pathsep.join(_PACKAGES)}
+        command = [sys.executable, "-S", "-P", "-m", "services.base.guard", port, "--fd", str(theirs.fileno())]
+        with theirs:
+            self.guard = subprocess.Popen([*command, "--mode", mode], env=environment, pass_fds=(theirs.fileno(),))
+        self._asking = threading.Event()
+        self._thread: threading.Thread | None = None
+        self.asked_ns = 0
+        """When it asked last."""
+
+    def ask(self, left: int, right: int, for_s: float = 0.2) -> None:
+        self.asked_ns = time.monotonic_ns()
+        self.send({"left": left, "right": right, "until": self.asked_ns + round(for_s * 1e9)})
+
+    def send(self, message: Any) -> None:
+        self.channel.send(message if isinstance(message, bytes) else json.dumps(message).encode())
+
+    def report(self, **wanted: object) -> dict[str, Any]:
+        """The next report that says this."""
+        while True:
+            report: dict[str, Any] = json.loads(self.channel.recv(65536))
+            if all(report[name] == value for name, value in wanted.items()):
+                return report
+
+    def keep_asking(self, left: int, right: int) -> None:
+        """Until `silence`."""
+        self.silence()
+        self._asking.clear()
+
+        def ask() -> None:
+            while not self._asking.wait(0.02):
+                self.ask(left, right)
+
+        self._thread = threading.Thread(target=ask)
+        self._thread.start()
+
+    def silence(self) -> None:
+        self._asking.set()
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+
+    def close(self) -> None:
+        self.silence()
+        self.channel.close()
+        self.guard.wait(10.0)
+
+
+@contextmanager
+def guarded(bench: Bench, mode: str = "safe") -> Iterator[FakeService]:
+    service = FakeService(bench.port, mode)
+    try:
+        yield service
+    finally:
+        service.close()
