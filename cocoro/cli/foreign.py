@@ -66,10 +66,10 @@ def lines(value: Any, everything: bool = False, indent: int = 2) -> Iterator[str
     if isinstance(value, dict):
         for key, item in value.items():
             if _is_block(item):
-                yield f"{shift}{key}:"
+                yield f"{shift}{_text(key)}:"
                 yield from lines(item, everything, indent + 2)
             else:
-                yield f"{shift}{key}: {_inline(item, everything)}"
+                yield f"{shift}{_text(key)}: {_inline(item, everything)}"
     elif isinstance(value, list) and _is_block(value):
         some = value if everything else value[:SHOWN]
         for item in some:

@@ -8,7 +8,7 @@ import re
 from collections import deque
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TextIO
 
 from cocoro.bus.endpoints import default_run_dir
 from cocoro.cli import exits
@@ -90,32 +90,44 @@ def entries(lines: Iterable[str], stamp: str = "") -> Iterator[Entry]:
 
 
 class Tail:
-    """One file, read on as it grows, and from the start again when a new one takes its place."""
+    """One log, read on as it grows, and in the file that takes its place when the process starts again."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._inode: int | None = None
-        self._position = 0
+        self._file: TextIO | None = None
         self._stamp = ""
         self._part = ""
 
     def read(self) -> list[Entry]:
         """What is new. A last line that has no end yet waits for it."""
-        try:
-            with self.path.open(encoding="utf-8", errors="replace") as file:
-                about = os.fstat(file.fileno())
-                if about.st_ino != self._inode or about.st_size < self._position:
-                    self._inode, self._position, self._part = about.st_ino, 0, ""
-                file.seek(self._position)
-                text = self._part + file.read()
-                self._position = file.tell()
-        except FileNotFoundError:  # between two starts
-            return []
-        *whole, self._part = text.split("\n")
+        text = self._rest()
+        if self._replaced():
+            self.close()
+            self._file = None
+            text += self._rest()
+        *whole, self._part = (self._part + text).split("\n")
         found = list(entries(whole, self._stamp))
         if found:
             self._stamp = found[-1].stamp
         return found
+
+    def _rest(self) -> str:
+        if self._file is None:
+            try:
+                self._file = self.path.open(encoding="utf-8", errors="replace")
+            except FileNotFoundError:  # between two starts
+                return ""
+        return self._file.read()
+
+    def _replaced(self) -> bool:
+        try:
+            return self._file is not None and not os.path.samestat(os.fstat(self._file.fileno()), self.path.stat())
+        except FileNotFoundError:
+            return False
+
+    def close(self) -> None:
+        if self._file is not None:
+            self._file.close()
 
 
 async def logs(robot: str | None, name: str | None, follow: bool, count: int, level: str | None) -> int:
@@ -125,15 +137,17 @@ async def logs(robot: str | None, name: str | None, follow: bool, count: int, le
     run_dir = robot_of(robot)
     wanted = {*LEVELS, ""} if level is None else set(LEVELS[LEVELS.index(level) :])
     tails = {path: Tail(path) for path in files_of(run_dir, name)}
-    newest = deque(_chosen(tails.values(), wanted), maxlen=count)
-    _print(newest)
-    if not follow:
-        return exits.DONE
-    with told_to_end() as end:
-        while await passed(end, LOOK_S):
-            if name is None:
-                tails |= {path: Tail(path) for path in files_of(run_dir, None) if path not in tails}
-            _print(_chosen(tails.values(), wanted))
+    try:
+        _print(deque(_chosen(tails.values(), wanted), maxlen=count))
+        if follow:
+            with told_to_end() as end:
+                while await passed(end, LOOK_S):
+                    if name is None:
+                        tails |= {path: Tail(path) for path in files_of(run_dir, None) if path not in tails}
+                    _print(_chosen(tails.values(), wanted))
+    finally:
+        for tail in tails.values():
+            tail.close()
     return exits.DONE
 
 
