@@ -10,11 +10,13 @@ import numpy as np
 from cocoro.messages import TrueObject, Truth, Vec3
 from sim.rigid import rotations
 from sim.scene import Scene, SceneObject
+from sim.stage import FLOOR
 
 HELD_HEIGHT_M = 0.10
 HELD_S = 2.0
 TILTED_DEG = 30.0
 MOVED_M = 0.05
+STANDING_DEG = 5.0
 CLAWS = frozenset({"claw_left", "claw_right"})
 
 
@@ -33,6 +35,10 @@ class Verdict(msgspec.Struct, frozen=True, kw_only=True):
     """Contacts of the robot that are no part of its work ('elbow~green_can'), each once, in order of appearance."""
     target_moved_m: float
     """How far the target was from its first place, level, at most, until both claws first touched it."""
+    target_from_start_m: float | None = None
+    """How far the target is, level, from where the robot stood at first; None without a target."""
+    target_standing: bool | None = None
+    """The target stands on the floor, upright, and touches nothing else."""
 
 
 class Judge:
@@ -54,9 +60,13 @@ class Judge:
         self._moved_m = 0.0
         self._knocked: dict[str, None] = {}
         self._collisions: dict[str, None] = {}
+        self._start_m: Vec3 | None = None
+        self._newest: TrueObject | None = None
 
     def feed(self, truth: Truth) -> None:
         self._now_ns = truth.stamp_ns
+        if self._start_m is None:
+            self._start_m = truth.body_m
         self._collisions.update(dict.fromkeys(truth.collisions))
         for item in truth.objects:
             if item.kind == "object":
@@ -70,7 +80,21 @@ class Judge:
             knocked_over=tuple(self._knocked),
             collisions=tuple(self._collisions),
             target_moved_m=self._moved_m,
+            target_from_start_m=self._from_start_m(),
+            target_standing=self._standing(),
         )
+
+    def _from_start_m(self) -> float | None:
+        if self._newest is None or self._start_m is None:
+            return None
+        x, y, _ = self._newest.position_m
+        return hypot(x - self._start_m[0], y - self._start_m[1])
+
+    def _standing(self) -> bool | None:
+        if self._newest is None:
+            return None
+        upright = self._scene.object(self._target).shape == "sphere" or _tilt_deg(self._newest) < STANDING_DEG
+        return upright and set(self._newest.touching) == {FLOOR}
 
     def _feed_object(self, item: TrueObject) -> None:
         known = self._scene.object(item.label)
@@ -78,6 +102,7 @@ class Judge:
         moved_m = hypot(item.position_m[0] - first[0], item.position_m[1] - first[1])
         is_target = item.label == self._target
         if is_target:
+            self._newest = item
             self._feed_target(item, known, fresh=first is item.position_m)
             if not self._grasped:
                 self._moved_m = max(self._moved_m, moved_m)

@@ -181,7 +181,18 @@ def test_a_verdict_is_json() -> None:
         "knocked_over",
         "collisions",
         "target_moved_m",
+        "target_from_start_m",
+        "target_standing",
     }
+
+
+def test_where_the_target_ends_is_told_from_where_the_robot_began() -> None:
+    judge = Judge(SCENE, "red_can")
+    judge.feed(truth(0.0))
+    first = judge.result()
+    x, y, _ = next(item.position_m for item in truth(0.0).objects if item.label == "red_can")
+    assert first.target_from_start_m == pytest.approx((x**2 + y**2) ** 0.5)
+    assert first.target_standing
 
 
 def test_a_target_that_the_scene_has_not_is_refused() -> None:

@@ -20,6 +20,8 @@ from services.planning.head import PAN, TILT
 from services.planning.reach import ARM
 from services.planning.senses import Senses
 
+_NEED_SIGHT = ("search", "explore", "approach", "carry", "follow")
+"""What drives, or looks for something: none of it without perception."""
 _STALE_NS = NS
 """A running behaviour fails when the robot's state has been missing for so long."""
 
@@ -118,11 +120,24 @@ class PlanningCore:
                 self._ended.reason,
                 self._ended.distance_m,
             )
-        plan = self._behaviour.step(scene)
+        plan = self._blind(scene) or self._behaviour.step(scene)
         if self._senses.intent_age_s(scene.now_ns) > self._config.hesitate_s:
             plan.base, plan.why = self._limbs.driver.halt(), "standing still: the executive is silent"
         if plan.state != "running" and not isinstance(self._behaviour, Idle):
             self._ended = plan
+        return plan
+
+    def _blind(self, scene: Scene) -> Plan | None:
+        """What is done while perception is silent by what needs to see: nothing, and that for so long only. What it
+        had begun goes on when perception speaks again."""
+        if self._intent.behaviour not in _NEED_SIGHT:
+            return None
+        blind_s = self._senses.blind_s(scene.now_ns)
+        if blind_s is None:
+            return None
+        plan = Plan(scene.limbs.driver.halt(), scene.still(), "standing still: perception is silent")
+        if blind_s > self._config.blind_for_good_s:
+            plan.state, plan.reason = "failed", "stale"
         return plan
 
     def _halt(self, why: str, now_ns: int) -> Sequence[Output]:

@@ -144,11 +144,10 @@ class Course:
         if (clearance[~leaving] < share * self._config.clearance_m).any():
             return False
         end = centres[-1]
-        for pose in poses[::3] + poses[-1:]:
-            near_end = hypot(pose.x_m - end[0], pose.y_m - end[1]) <= arm_from_m
-            hand_out = len(self._arm) and (near_end or self._arm_out)
-            half_m = self._config.hand_half_width_m * (0.4 + 0.6 * share)
-            if hand_out and (fields.body.at(placed(self._arm, pose)) < half_m).any():
+        half_m = self._config.hand_half_width_m * (0.4 + 0.6 * share)
+        for pose in [*poses[::3], poses[-1]]:
+            near_end = hypot(pose.x_m - end[0], pose.y_m - end[1]) <= (0.02 if self._arm_out else arm_from_m)
+            if not self._arm_free(pose, fields, half_m, near_end=near_end):
                 return False
         return True
 
@@ -202,10 +201,19 @@ class Course:
         centres = np.array([[pose.x_m, pose.y_m] for pose in stretch])
         if (fields.body.at(centres) < self._body_m + self._config.clearance_m).any():
             return False
-        if not len(self._arm):
+        half_m = self._config.hand_half_width_m + 0.01
+        last = len(stretch) - 1
+        return all(
+            self._arm_free(pose, fields, half_m, near_end=not self._arm_out or number == last)
+            for number, pose in enumerate(stretch)
+        )
+
+    def _arm_free(self, pose: Pose2, fields: Fields, half_m: float, *, near_end: bool) -> bool:
+        """Whether the hand passes a pose. Carried high, it passes over the known objects; near the end it is low."""
+        if not len(self._arm) or not (near_end or self._arm_out):
             return True
-        arm = np.concatenate([placed(self._arm, pose) for pose in stretch])
-        return not (fields.body.at(arm) < self._config.hand_half_width_m + 0.01).any()
+        field = fields.arm if self._arm_out and not near_end else fields.body
+        return not (field.at(placed(self._arm, pose)) < half_m).any()
 
     def _still_good(self, detour: Detour, fields: Fields, target_m: tuple[float, float]) -> bool:
         """Whether the way is still free and still leads to before the target."""
@@ -291,6 +299,7 @@ class Course:
             return True
         if not len(self._arm) or not (move.direct or self._arm_out):
             return False
-        now_m = float(fields.body.at(placed(self._arm, body)).min())
-        then_m = float(fields.body.at(placed(self._arm, poses[-1])).min())
+        field = fields.arm if self._arm_out else fields.body
+        now_m = float(field.at(placed(self._arm, body)).min())
+        then_m = float(field.at(placed(self._arm, poses[-1])).min())
         return then_m < min(self._config.hand_half_width_m * 0.7, now_m)

@@ -21,6 +21,37 @@ from services.planning.surroundings import Surroundings
 _WAIT_FOR_ODOMETRY_NS = NS // 5
 
 
+class Sight:
+    """Whether perception lives, by when it is heard: also when it sees nothing, and however slow it is."""
+
+    def __init__(self, config: Config) -> None:
+        self._least_ns = round(config.blind_s * NS)
+        self._periods = config.blind_periods
+        self._heard_ns: int | None = None
+        self._gaps_ns: deque[int] = deque(maxlen=5)
+        self._blind_since_ns: int | None = None
+
+    def heard(self, now_ns: int) -> None:
+        """Detections have come."""
+        if self._heard_ns is not None and now_ns > self._heard_ns:
+            self._gaps_ns.append(now_ns - self._heard_ns)
+        self._heard_ns = now_ns
+        self._blind_since_ns = None
+
+    def blind_s(self, now_ns: int) -> float | None:
+        """As `Senses.blind_s`; from when this was first asked where nothing was ever heard."""
+        if self._heard_ns is not None and 0 <= now_ns - self._heard_ns <= self._patience_ns():
+            return None
+        if self._blind_since_ns is None or now_ns < self._blind_since_ns:
+            self._blind_since_ns = now_ns
+        return (now_ns - self._blind_since_ns) / NS
+
+    def _patience_ns(self) -> int:
+        # The median: neither one pause nor two messages at once say how fast it is.
+        period_ns = sorted(self._gaps_ns)[len(self._gaps_ns) // 2] if self._gaps_ns else 0
+        return max(self._least_ns, round(self._periods * period_ns))
+
+
 class Senses:
     """Takes every input of the planner; answers by time."""
 
@@ -42,6 +73,7 @@ class Senses:
         self.sight_lag_s = 0.0
         """How old a sighting is when the next one comes, smoothed: a fast perception makes it small."""
         self._looked_ns: int | None = None
+        self._sight = Sight(config)
 
     def take(self, topic: Topic[Message], message: Message, now_ns: int) -> None:
         if isinstance(message, BaseState):
@@ -63,6 +95,7 @@ class Senses:
                 self.hand = message
         elif isinstance(message, Detections):
             self._waiting.append(message)
+            self._sight.heard(now_ns)
             if self._looked_ns is not None and message.stamp_ns > self._looked_ns:
                 lag_s = min(max((now_ns - self._looked_ns) / NS, 0.0), 5.0)
                 self.sight_lag_s += 0.3 * (lag_s - self.sight_lag_s)
@@ -145,6 +178,10 @@ class Senses:
             if state is not None and state.latch != "released":
                 return f"{name}: emergency stop {state.latch}"
         return ""
+
+    def blind_s(self, now_ns: int) -> float | None:
+        """For how long perception has been silent for longer than it may be; None while it is not."""
+        return self._sight.blind_s(now_ns)
 
     def intent_age_s(self, now_ns: int) -> float:
         """Since the executive last said what it wants."""
