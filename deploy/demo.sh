@@ -1,12 +1,14 @@
 #!/usr/bin/env bash
 # The simulated robot, as processes of its own, fetches the red can of the paper's scene. Leaves in out/ what it saw
-# at the grasp, and the logs. Has a mesh of its own, so that it disturbs no robot that is up here.
+# at the grasp, the capture of it all, and the logs. Has a mesh of its own, so that it disturbs no robot that is up here.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 cocoro=$PWD/.venv/bin/cocoro
 mkdir -p out
 COCORO_RUN_DIR=$(mktemp -d)
 export COCORO_RUN_DIR
+rm -rf out/captures
+export COCORO_CAPTURE_DIR=$PWD/out/captures
 
 finish() {
     "$cocoro" down >/dev/null || true

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import pytest
 from hypothesis import HealthCheck, settings
 
@@ -18,3 +20,11 @@ settings.load_profile("repeatable")
 def robot() -> Robot:
     """The Calliope as it is described."""
     return Robot.load()
+
+
+@pytest.fixture(scope="session", autouse=True)
+def captures_of_tests(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """What robots of tests record goes with the tests."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("COCORO_CAPTURE_DIR", str(tmp_path_factory.mktemp("captures")))
+        yield

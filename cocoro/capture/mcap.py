@@ -289,6 +289,13 @@ def records(content: Bytes) -> Iterator[tuple[int, memoryview, int]]:
         at = start + length
 
 
+def channel_of(content: memoryview) -> int:
+    """From a message record's content, before the rest of it is looked at."""
+    if len(content) < 2:
+        raise DamageError("a message is shorter than its head")
+    return content[0] | content[1] << 8
+
+
 def message(content: memoryview) -> Message:
     """From a message record's content."""
     if len(content) < MESSAGE_HEAD.size - PREFIX.size:

@@ -166,9 +166,7 @@ class Capture:
         for number, (place, chunk) in enumerate(self._read_ahead(places)):
             while waiting and waiting[0][0] < place.start_ns:
                 yield heapq.heappop(waiting)[3]
-            for order, message in enumerate(self._chunk_messages(place, chunk)):
-                if message.channel_id not in wanted:
-                    continue
+            for order, message in enumerate(self._chunk_messages(place, chunk, wanted)):
                 if (start_ns is None or message.log_ns >= start_ns) and (end_ns is None or message.log_ns < end_ns):
                     record = self._record(message)
                     heapq.heappush(waiting, (message.log_ns, number, order, record))
@@ -196,16 +194,17 @@ class Capture:
             finally:
                 pool.shutdown(cancel_futures=True)
 
-    def _chunk_messages(self, place: ChunkPlace, chunk: Future[Chunk]) -> Iterator[mcap.Message]:
+    def _chunk_messages(self, place: ChunkPlace, chunk: Future[Chunk], wanted: set[int]) -> Iterator[mcap.Message]:
         try:
             _, raw = chunk.result()
             for op, content, _ in mcap.records(raw):
-                if op == mcap.Op.MESSAGE:
-                    message = mcap.message(content)
-                    if message.channel_id in self.channels:
-                        yield message
-                    else:
-                        self._problem(f"a message is of channel {message.channel_id}, which the file does not tell of")
+                if op != mcap.Op.MESSAGE:
+                    continue
+                channel_id = mcap.channel_of(content)
+                if channel_id in wanted:
+                    yield mcap.message(content)
+                elif channel_id not in self.channels:
+                    self._problem(f"a message is of channel {channel_id}, which the file does not tell of")
         except DamageError as damage:
             self._problem(f"the chunk at byte {place.offset} ({place.length} bytes) is passed by: {damage}")
         except OSError as error:

@@ -1,0 +1,174 @@
+"""What recording costs, what a killed recorder loses, and how fast a capture is executed again.
+
+    python bench/capture.py traffic [--seconds 30] [--sensors ideal|real] [--compression zstd]
+    python bench/capture.py kill [--times 20]
+    python bench/capture.py rerun
+
+`traffic` starts the simulated robot as processes with its recorder, has it fetch the red can, and reads what the
+recorder's process cost (from the operating system, not from the recorder) and what it dropped or never got. `kill`
+sends the recorder SIGKILL at random moments while a stand-in for a robot publishes, and looks how much is missing.
+`rerun` executes perception and planning again over what `traffic` recorded.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import os
+import random
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import psutil
+
+from cocoro import topics
+from cocoro.bus.endpoints import default
+from cocoro.bus.zenoh import ZenohBus
+from cocoro.capture.info import report
+from cocoro.capture.reader import Capture
+from cocoro.capture.rerun import rerun, words
+from cocoro.clock import RealClock
+from cocoro.messages import BaseState, Frame
+from cocoro.node import Node, recorder_key
+from cocoro.robot import Robot
+from cocoro.rundir import RunDir
+
+COCORO = [sys.executable, "-m", "cocoro.cli.main"]
+PROFILE = """
+robot = "calliope"
+clock = "sim"
+processes = ["capture", "sim", "perception", "planning", "executive"]
+[service.sim]
+sensors = "{sensors}"
+[service.capture]
+folder = "{folder}"
+compression = "{compression}"
+min_free_mb = 100.0
+[service.perception]
+record_steps = true
+[service.planning]
+record_steps = true
+"""
+
+
+def traffic(folder: Path, seconds: float, sensors: str, compression: str) -> None:
+    """A live fetch, recorded."""
+    profile = folder / "bench.toml"
+    profile.write_text(PROFILE.format(folder=folder, sensors=sensors, compression=compression))
+    subprocess.run([*COCORO, "up", str(profile), "--detach"], check=True, stdout=subprocess.DEVNULL)
+    try:
+        recorder = psutil.Process(RunDir("calliope").claims()["capture"].pid)
+        before, started = recorder.cpu_times(), time.monotonic()
+        written = recorder.io_counters().write_bytes
+        done = subprocess.run([*COCORO, "fetch", "red_can"], capture_output=True, text=True, check=False)
+        time.sleep(max(seconds - (time.monotonic() - started), 0.0))
+        after, lasted_s = recorder.cpu_times(), time.monotonic() - started
+        written = recorder.io_counters().write_bytes - written
+        cpu_s = after.user + after.system - before.user - before.system
+        rss_mb = recorder.memory_info().rss / 1e6
+    finally:
+        subprocess.run([*COCORO, "down"], check=True, stdout=subprocess.DEVNULL)
+    print(done.stdout.strip().splitlines()[-1] if done.stdout else done.stderr)
+    print(f"recorder: {100 * cpu_s / lasted_s:.1f}% of one core over {lasted_s:.0f} s, {rss_mb:.0f} MB resident")
+    for path in sorted(folder.glob("*.mcap")):
+        with Capture.open(path) as capture:
+            found = report(capture)
+        minutes = found.duration_s / 60
+        print(
+            f"{found.messages} messages in {found.duration_s:.1f} s; a minute is {found.raw_bytes / minutes / 1e6:.0f} "
+            f"MB of payloads, {found.size_bytes / minutes / 1e6:.0f} MB on the disk"
+        )
+        print(f"dropped {sum(k.dropped for k in found.keys)}, lost on the way {sum(k.lost for k in found.keys)}")
+        for key in found.keys:
+            if key.lost or key.dropped or key.key.endswith("kinect/frame"):
+                print(f"  {key.key}: {key.messages}, {key.rate_hz:.1f} Hz, lost {key.lost}, dropped {key.dropped}")
+    print(f"written to the disk: {written / 1e6:.0f} MB")
+
+
+async def kill(folder: Path, times: int) -> None:
+    """The time between the death of the recorder and the last that is in its file."""
+    draw, robot = random.Random(times), Robot.load()
+    async with (
+        await ZenohBus.open(default("bench", "bench", folder / "run")) as bus,
+        Node("base", bus, RealClock(), robot, robot_name="bench") as base,
+    ):
+        base.ready()
+        publishing = asyncio.create_task(_publish(base))
+        all_s = [await _kill_one(bus, folder, 0.5 + draw.random()) for _ in range(times)]
+        publishing.cancel()
+    all_s.sort()
+    print(f"{times} kills: missing {all_s[len(all_s) // 2]:.3f} s in the middle, {all_s[-1]:.3f} s at worst")
+
+
+async def _kill_one(bus: ZenohBus, folder: Path, after_s: float) -> float:
+    """Seconds from the last state in the file to the kill; everything before it must be there."""
+    heard = asyncio.Event()
+    watch = bus.watch_alive(recorder_key("bench", "*"), lambda _, alive: heard.set() if alive else None)
+    out = folder / f"kill-{time.time_ns()}"
+    recorder = await asyncio.create_subprocess_exec(
+        *COCORO, "record", "--out", str(out), "--robot", "bench",
+        env=os.environ | {"COCORO_RUN_DIR": str(folder / "run")}, stdout=subprocess.DEVNULL,
+    )  # fmt: skip
+    await heard.wait()
+    watch.close()
+    await asyncio.sleep(after_s)
+    recorder.kill()
+    killed_ns = time.time_ns()
+    await recorder.wait()
+    (path,) = out.glob("*.mcap")
+    with Capture.open(path) as capture:
+        states = list(capture.messages("base/state"))
+        assert not capture.problems or len(capture.problems) == 1, capture.problems
+    sequences = [each.sequence for each in states]
+    assert sequences == list(range(sequences[0], sequences[-1] + 1)), "a message in the middle is missing"
+    return (killed_ns - states[-1].log_ns) / 1e9
+
+
+async def _publish(base: Node) -> None:
+    """200 states and 30 frames of 1.5 MB a second."""
+    noise = os.urandom(640 * 480 * 5)
+    tick = 0
+    while True:
+        base.publish(
+            topics.BASE_STATE,
+            BaseState(odometry_m=(tick / 200, 0.0), odometry_yaw_rad=0.0, speed_mps=0.0, turn_rate_radps=0.0),
+        )
+        if tick % 7 == 0:
+            view = memoryview(noise)
+            pixels = Frame(width=640, height=480, colour=view[: 640 * 480 * 3], depth=view[640 * 480 * 3 :])
+            base.publish(topics.FRAME, pixels)
+        tick += 1
+        await asyncio.sleep(0.005)
+
+
+def execute(folder: Path) -> None:
+    (path,) = sorted(folder.glob("*.mcap"))[:1]
+    for service in ("perception", "planning"):
+        with Capture.open(path) as capture:
+            print("\n".join(words(rerun([capture], service))))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=("traffic", "kill", "rerun"))
+    parser.add_argument("--seconds", type=float, default=30.0)
+    parser.add_argument("--sensors", default="ideal")
+    parser.add_argument("--compression", default="zstd")
+    parser.add_argument("--times", type=int, default=20)
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory(prefix="cocoro-") as name:
+        folder = Path(name)
+        os.environ["COCORO_RUN_DIR"] = str(folder / "run")
+        if options.what == "kill":
+            asyncio.run(kill(folder, options.times))
+            return
+        traffic(folder, options.seconds, options.sensors, options.compression)
+        if options.what == "rerun":
+            execute(folder)
+
+
+if __name__ == "__main__":
+    main()
