@@ -301,8 +301,9 @@ class TaskRequest(msgspec.Struct, kw_only=True):
 
 
 RefusalCode = Literal[
-    "unknown_label", "not_graspable", "busy", "estop", "not_alive", "holding", "not_holding", "bad_request", "no_task"
-]
+    "unknown_label", "not_graspable", "busy", "estop", "not_alive", "battery", "holding", "not_holding", "bad_request",
+    "no_task",
+]  # fmt: skip
 
 
 class TaskReply(msgspec.Struct, kw_only=True):

@@ -15,7 +15,7 @@ from msgspec import Meta
 from cocoro import topics
 from cocoro.clock import NS, Clock, FollowedClock
 from cocoro.latch import LatchKeeper
-from cocoro.messages import BaseCommand, LatchState, Message, ServoCommand
+from cocoro.messages import BaseCommand, BaseState, LatchState, Message, ServoCommand
 from cocoro.messages import Clock as ClockMessage
 from cocoro.node import Node, Publisher
 from cocoro.robot import Robot
@@ -47,6 +47,10 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     frame_rate_hz: Annotated[float, Meta(gt=0, le=120)] = 30.0
     state_rate_hz: Annotated[float, Meta(gt=0, le=120)] = 50.0
     physics_hz: Annotated[int, Meta(ge=TICK_HZ, multiple_of=TICK_HZ)] = 240
+    pace: Annotated[float, Meta(ge=0.01, le=1)] = 1.0
+    """Simulated seconds a real second, in real time: less gives a busy machine time, or people time to watch."""
+    battery_fraction: Annotated[float, Meta(ge=0, le=1)] = 1.0
+    """How full the base says that its battery is. It stays so."""
     command_timeout_s: Annotated[float, Meta(gt=0)] | None = None
     """Instead of the robot's own deadman; only the lock-step baseline asks for one."""
     renderer: Literal["auto", "moderngl", "tiny"] = "auto"
@@ -111,7 +115,7 @@ class Simulator:
         world = self._world
         self._frames = kinect.publisher(topics.FRAME)
         self._states: tuple[tuple[Publisher[Any], Callable[[], Message]], ...] = (
-            (base.publisher(topics.BASE_STATE), world.base_state),
+            (base.publisher(topics.BASE_STATE), self._base_state),
             (arm.publisher(topics.ARM_STATE), lambda: world.servo_state("arm")),
             (hand.publisher(topics.HAND_STATE), lambda: world.servo_state("hand")),
         )
@@ -126,6 +130,11 @@ class Simulator:
             self._world.set_latch(state, node.name)
 
         LatchKeeper(node, changed)
+
+    def _base_state(self) -> BaseState:
+        state = self._world.base_state()
+        state.battery_fraction = self._config.battery_fraction
+        return state
 
     def _command_base(self, command: BaseCommand) -> None:
         self._world.command_base(command)
@@ -179,7 +188,7 @@ async def run(node: Node, config: Config) -> None:
             for part in (node, *hardware):
                 part.ready(f"simulated, scene {scene.name}, {config.sensors} sensors")
             if isinstance(node.clock, FollowedClock):
-                await _in_real_time(simulator)
+                await _in_real_time(simulator, config.pace)
             else:
                 await _in_virtual_time(simulator, node.clock)
 
@@ -192,12 +201,14 @@ async def _in_virtual_time(simulator: Simulator, clock: Clock) -> None:
         simulator.tick()
 
 
-async def _in_real_time(simulator: Simulator) -> None:
+async def _in_real_time(simulator: Simulator, pace: float) -> None:
     """Keep up with the monotonic clock; where that cannot be done, let simulated time slip and say so in the rate."""
     due_s = measured_s = time.monotonic()
+    simulator.rate = pace
+    tick_s = 1 / TICK_HZ / pace
     ticks = 0
     while True:
-        due_s += 1 / TICK_HZ
+        due_s += tick_s
         behind_s = time.monotonic() - due_s
         if behind_s > LATE_S:
             due_s += behind_s
@@ -206,7 +217,7 @@ async def _in_real_time(simulator: Simulator) -> None:
         ticks += 1
         if ticks == TICK_HZ:
             now_s = time.monotonic()
-            simulator.rate = min(ticks / TICK_HZ / (now_s - measured_s), 1.0)
+            simulator.rate = min(ticks / TICK_HZ / (now_s - measured_s), pace)
             measured_s, ticks = now_s, 0
 
 

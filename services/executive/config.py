@@ -15,6 +15,8 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A catalogue of known objects; empty is the project's own."""
     needed: tuple[str, ...] = ("kinect", "base", "arm", "hand", "perception", "planning")
     """Services without which no task starts, and at whose death a running one fails."""
+    battery_low: Annotated[float, Meta(ge=0, le=1)] = 0.15
+    """With less in the base's battery no task starts; putting down what is in the hand is allowed."""
     intent_hz: Positive = 50.0
     progress_hz: Positive = 5.0
     latch_hz: Positive = 5.0

@@ -92,6 +92,9 @@ class Executive:
         missing = [service for service in self._config.needed if service not in self._alive]
         if missing:
             return "not_alive", f"not alive: {', '.join(missing)}; see cocoro status"
+        battery = self._base.value.battery_fraction if self._base.value is not None else 1.0
+        if battery < self._config.battery_low and request.task != "put-down":
+            return "battery", f"the battery is low ({battery:.0%}); charge the robot first"
         status = self._skills.status
         if status is None:
             return "not_alive", "the planner says nothing; see cocoro status"
