@@ -33,8 +33,8 @@ class Head(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     sweep_pan_rad: Positive = 2.6
     sweep_ahead_rad: Positive = 1.05
     """How far to the first side it looks before it looks everywhere."""
-    sweep_tilts_rad: tuple[float, float] = (-0.30, -0.75)
-    """For the floor from 0.9 m on, and for the floor up to 1.8 m (the camera stands 0.73 m high)."""
+    sweep_tilts_rad: tuple[float, float] = (-0.30, -0.92)
+    """For the floor from 0.9 m on, and for that from 0.2 to 1.2 m (the camera stands 0.73 m high)."""
     tilt_range_rad: tuple[float, float] = (-1.2, 0.5)
     """Further down it would look at itself, and the camera's housing comes near its mount."""
     fixate_speed_radps: Positive = 4.0
