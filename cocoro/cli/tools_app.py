@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import sys
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -26,6 +27,7 @@ Key = Annotated[
 def add_to(app: typer.Typer) -> None:
     for command in (top, echo, hz, logs):
         app.command(rich_help_panel=PANEL)(command)
+    app.add_typer(new, name="new", rich_help_panel=PANEL)
 
 
 def top(
@@ -89,3 +91,19 @@ def logs(
     from cocoro.cli import logs as reading
 
     sys.exit(asyncio.run(reading.logs(robot, service, follow, lines, level)))
+
+
+@new.callback()
+def _new() -> None:
+    """Has a command of its own even while there is but one."""
+
+
+@new.command()
+def service(
+    name: Annotated[str, typer.Argument(help="Of the service, which is the first part of its keys: nearest.")],
+    into: Annotated[Path, typer.Option(metavar="DIR", help="Where its folder goes.")] = Path(),
+) -> None:
+    """A working component with its test, as a package of your own: see docs/components.md."""
+    from cocoro.cli import new as writing
+
+    sys.exit(writing.service(name, into))
