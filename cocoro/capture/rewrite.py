@@ -36,7 +36,7 @@ def rewrite(
     if out.exists():
         raise CaptureError(f"{out} is there already; remove it, or choose another name")
     missing = Missing(*missing_of(capture))
-    writer = Writer(lambda _: out, packer, Limits(), lambda key, _: _info(capture, key), lambda: missing)
+    writer = Writer(lambda _: out, packer, Limits(), lambda key, _: info_in(capture, key), lambda: missing)
     try:
         for name, entries in capture.metadata.items():
             if name != TALLY:
@@ -52,7 +52,8 @@ def rewrite(
     return Rewritten(out, writer.messages, out.stat().st_size, tuple(capture.problems))
 
 
-def _info(capture: Capture, key: str) -> KeyInfo:
+def info_in(capture: Capture, key: str) -> KeyInfo:
+    """What a capture says of a key."""
     channel, schema = capture.keys[key], capture.schema(key)
     kind = None if schema is None else TypeSchema(schema.name, schema.encoding, schema.data)
     return KeyInfo(channel.encoding, kind, dict(channel.metadata))

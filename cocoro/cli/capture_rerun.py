@@ -27,4 +27,5 @@ def rerun(files: list[Path], service: str, against: str, tolerance: float, as_js
         print(msgspec.json.encode(result).decode())
     else:
         print("\n".join(rerunning.words(result)))
-    return exits.FAILED if result.differing or result.problems else exits.DONE
+    bad = result.differing or result.problems or (against == "recorded" and not result.equal)
+    return exits.FAILED if bad else exits.DONE

@@ -1,0 +1,52 @@
+"""Makes the golden capture anew: `python tests/golden/make.py`.
+
+To be done when perception or planning is meant to give other outputs than before, and only then: the test that
+executes it again is there to say when they do so without being meant to.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+from cocoro.capture.compression import Packer
+from cocoro.capture.keys import Choice
+from cocoro.capture.reader import Capture
+from cocoro.capture.rerun import rerun, words
+from cocoro.capture.rewrite import rewrite
+from cocoro.clock import NS
+from cocoro.rehearsal import RehearsalRequest
+from sim.rehearse import rehearse
+
+GOLDEN = Path(__file__).with_name("fetch.mcap")
+LENGTH_S = 6.0
+LARGEST_BYTES = 1_000_000
+
+
+def main() -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        whole = Path(folder) / "fetch.mcap"
+        rehearse(
+            RehearsalRequest(
+                task="fetch", label="red_can", width=160, height=120, frame_rate_hz=10.0, record=str(whole)
+            )
+        )
+        GOLDEN.unlink(missing_ok=True)
+        with Capture.open(whole) as capture:
+            choice = Choice(capture.robot, without=["sim/truth"])
+            done = rewrite(
+                capture,
+                GOLDEN,
+                Packer("zstd", 19),
+                keep=lambda record: record.key in choice,
+                end_ns=capture.start_ns + round(LENGTH_S * NS),
+            )
+    print(f"{GOLDEN}: {done.messages} messages, {done.size_bytes} bytes")
+    assert done.size_bytes < LARGEST_BYTES
+    for service in ("perception", "planning"):
+        with Capture.open(GOLDEN) as capture:
+            print("\n".join(words(rerun([capture], service))))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,263 @@
+"""Exact re-execution: equal where nothing has changed, and told where, what and by how much where something has."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+from capture_rig import Room, drive, record
+
+from cocoro import topics
+from cocoro.capture.compare import difference
+from cocoro.capture.compression import Packer
+from cocoro.capture.errors import CaptureError
+from cocoro.capture.pictures import lossy
+from cocoro.capture.reader import Capture, Record
+from cocoro.capture.rerun import Result, rerun
+from cocoro.capture.rewrite import info_in, rewrite
+from cocoro.capture.writer import Entry, Limits, Writer
+from cocoro.cli.main import main
+from cocoro.clock import NS
+from cocoro.core import Core, Output, Sample, Schedule, Take
+from cocoro.messages import Detections, PlannerStatus
+from services.perception import service as perception
+from services.planning import service as planning
+
+GOLDEN = Path(__file__).parent / "golden" / "fetch.mcap"
+TOLERANCE = 1e-3
+"""Across machines: a thousandth of a number, or of one metre, radian or pixel where the number is smaller. Another
+processor may add up in another order."""
+
+
+def again(path: Path, service: str, tolerance: float = 0.0) -> Result:
+    with Capture.open(path) as capture:
+        return rerun([capture], service, tolerance)
+
+
+def without(path: Path, out: Path, keep: Callable[[Record], bool], start_ns: int | None = None) -> Path:
+    with Capture.open(path) as capture:
+        return rewrite(capture, out, Packer("lz4"), keep=keep, start_ns=start_ns).path
+
+
+@pytest.mark.parametrize("service", ["perception", "planning"])
+def test_the_golden_capture_is_executed_again_with_equal_outputs(service: str) -> None:
+    """When this fails because outputs are meant to be others now, make the capture anew: tests/golden/make.py."""
+    result = again(GOLDEN, service, TOLERANCE)
+    assert result.first is None, result.first
+    assert result.not_executable == 0
+    assert result.equal == result.steps > 250
+    assert result.outputs > 100
+
+
+def test_the_golden_capture_is_small() -> None:
+    assert GOLDEN.stat().st_size < 1_000_000
+
+
+# --- what is different is found -------------------------------------------------------------------
+
+
+class Changed:
+    """A core whose nth output of a type is another; detections of nothing do not count."""
+
+    def __init__(self, core: Core, change: Callable[[Any], None], kind: type, number: int) -> None:
+        self.reads, self.schedule = core.reads, core.schedule
+        self._core, self._change, self._kind, self._left = core, change, kind, number
+
+    def step(self, inputs: Sequence[Sample], now_ns: int) -> Sequence[Output]:
+        outputs = self._core.step(inputs, now_ns)
+        for output in outputs:
+            if isinstance(output.message, self._kind) and getattr(output.message, "detections", True):
+                self._left -= 1
+                if self._left == 0:
+                    self._change(output.message)
+        return outputs
+
+
+def test_the_first_difference_is_told_with_its_place_and_size(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def nudge(seen: Detections) -> None:
+        seen.detections[0].u_px += 0.25
+
+    make = perception.core
+    monkeypatch.setattr(perception, "core", lambda *args: Changed(make(*args), nudge, Detections, 20))
+    result = again(GOLDEN, "perception")
+    assert (result.differing, result.not_executable) == (1, 0)
+    assert result.equal == result.steps - 1
+    assert result.first is not None
+    assert result.first.text.startswith("perception/detections: detections[0].u_px was ")
+    assert result.first.text.endswith("by 0.25")
+    assert not result.first.after_missing
+    assert again(GOLDEN, "perception", 0.1).differing == 0
+    assert main(["capture", "rerun", str(GOLDEN), "--service", "perception"]) == 1
+    assert "1 steps differ" in capsys.readouterr().out
+
+
+def test_outputs_that_are_missing_or_too_many_differ(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Mute(Changed):
+        def step(self, inputs: Sequence[Sample], now_ns: int) -> Sequence[Output]:
+            return [output for output in super().step(inputs, now_ns) if not isinstance(output.message, PlannerStatus)]
+
+    make = planning.core
+    monkeypatch.setattr(planning, "core", lambda *args: Mute(make(*args), lambda _: None, PlannerStatus, 0))
+    result = again(GOLDEN, "planning")
+    assert result.equal == 0
+    assert result.first is not None
+    assert "planning/status" in result.first.text
+
+
+def test_a_core_that_fails_now_differs(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(_: object) -> None:
+        raise ZeroDivisionError("oh")
+
+    make = planning.core
+    monkeypatch.setattr(planning, "core", lambda *args: Changed(make(*args), fail, PlannerStatus, 5))
+    result = again(GOLDEN, "planning")
+    assert result.differing >= 1
+    assert result.first is not None
+    assert "ZeroDivisionError: oh" in result.first.text
+
+
+def test_equal_outputs_exit_with_0_and_json_says_the_same(capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["capture", "rerun", str(GOLDEN), "--service", "planning", "--tolerance", str(TOLERANCE)]
+    assert main(arguments) == 0
+    assert "every one equal" in capsys.readouterr().out
+    assert main([*arguments, "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["steps"] == told["equal"]
+    assert main([*arguments, "--against", "nothing"]) == 0
+
+
+# --- what cannot be executed is never equal -------------------------------------------------------
+
+
+def test_a_step_whose_input_is_missing_is_counted_and_not_equal(tmp_path: Path) -> None:
+    path = without(
+        GOLDEN, tmp_path / "few.mcap", lambda each: not (each.key.endswith("/frame") and each.sequence == 12)
+    )
+    result = again(path, "perception", TOLERANCE)
+    assert result.reasons["the capture lacks an input of kinect/frame"] == 1
+    assert result.equal + result.differing + result.not_executable == result.steps
+    assert result.not_executable >= 1
+
+
+def test_a_step_whose_output_is_missing_is_not_equal_either(tmp_path: Path) -> None:
+    lost = lambda each: each.key.endswith("planning/status") and each.sequence == 30  # noqa: E731
+    path = without(GOLDEN, tmp_path / "few.mcap", lambda each: not lost(each))
+    result = again(path, "planning", TOLERANCE)
+    assert (result.not_executable, result.equal) == (1, result.steps - 1)
+    assert result.reasons == {"the capture lacks an output on planning/status": 1}
+
+
+def test_steps_before_the_capture_began_are_counted_as_not_executable(tmp_path: Path) -> None:
+    with Capture.open(GOLDEN) as capture:
+        start_ns = capture.start_ns + 2 * NS
+    path = without(GOLDEN, tmp_path / "late.mcap", lambda _: True, start_ns)
+    result = again(path, "perception", TOLERANCE)
+    assert result.reasons["its record is missing"] > 50
+    assert result.first is None or result.first.after_missing
+
+
+def test_lossy_frames_are_no_inputs(tmp_path: Path) -> None:
+    path = tmp_path / "lossy.mcap"
+    with Capture.open(GOLDEN) as capture:
+        infos = {key: info_in(capture, key) for key in capture.keys}
+        out = Writer(lambda _: path, Packer("lz4"), Limits(), lambda key, _: infos[key], prepare=lossy(80))
+        for name, entries in capture.metadata.items():
+            out.remember(name, entries)
+        for each in capture.messages():
+            out.put(Entry(each.key, each.sequence, each.log_ns, each.publish_ns, bytes(each.payload)))
+        out.close()
+    result = again(path, "perception", TOLERANCE)
+    assert result.reasons == {"the capture lacks an input of kinect/frame": result.not_executable}
+    assert result.not_executable > 50
+
+
+@pytest.mark.parametrize(
+    ("path", "service", "words"),
+    [(GOLDEN, "executive", "no steps of executive"), (GOLDEN, "nobody", "no steps of nobody")],
+)
+def test_a_capture_without_the_steps_says_how_to_have_them(path: Path, service: str, words: str) -> None:
+    with Capture.open(path) as capture, pytest.raises(CaptureError, match=words):
+        rerun([capture], service)
+
+
+# --- a core of a third party, over restarts -------------------------------------------------------
+
+
+class Adder:
+    """Counts the states that it got since it was started."""
+
+    reads: Mapping[Any, Take] = {topics.BASE_STATE: "all"}
+    schedule = Schedule(None, (topics.BASE_STATE,))
+
+    def __init__(self) -> None:
+        self._count = 0
+
+    def step(self, inputs: Sequence[Sample], now_ns: int) -> Sequence[Output]:
+        self._count += len(inputs)
+        return [Output(topics.PLAN, PlannerStatus(why=f"{self._count} states"))]
+
+
+def test_each_start_of_a_service_is_a_new_core(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    async def twice(room: Room) -> None:
+        for _ in range(2):
+            node = room.node("planning", record_steps=True, module=planning.__name__, config=planning.Config())
+            async with node:
+                driving = asyncio.ensure_future(node.drive(Adder()))
+                await drive(room, 1.0, frames=False)
+                driving.cancel()
+
+    path = record(tmp_path / "twice.mcap", twice)
+    monkeypatch.setattr(planning, "core", lambda *_: Adder())
+    result = again(path, "planning")
+    assert result.steps == result.equal > 80
+    only = Adder()
+    monkeypatch.setattr(planning, "core", lambda *_: only)
+    assert again(path, "planning").differing > 40
+
+
+def test_the_latency_of_a_service_is_in_the_stamps_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    async def slow(room: Room) -> None:
+        node = room.node(
+            "planning", record_steps=True, module=planning.__name__, config=planning.Config(), latency_s=0.05
+        )
+        async with node:
+            driving = asyncio.ensure_future(node.drive(Adder()))
+            await drive(room, 1.0, frames=False)
+            driving.cancel()
+
+    path = record(tmp_path / "slow.mcap", slow)
+    monkeypatch.setattr(planning, "core", lambda *_: Adder())
+    assert again(path, "planning").differing == 0
+
+
+# --- equal by meaning -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("recorded", "now", "tolerance", "words"),
+    [
+        ({"a": 1.0}, {"a": 1}, 0.0, ""),
+        ({"a": [1, {"b": 2.0}]}, {"a": [1, {"b": 2.5}]}, 0.0, "a[1].b was 2.0 and is 2.5, by 0.5"),
+        ({"a": 1000.0}, {"a": 1000.9}, 1e-3, ""),
+        ({"a": 1000.0}, {"a": 1001.1}, 1e-3, "a was 1000.0 and is 1001.1, by 1.1"),
+        ({"stamp_ns": 10**9}, {"stamp_ns": 10**9 + 1}, 1e-3, "stamp_ns was"),
+        ({"a": [1, 2]}, {"a": [1]}, 0.0, "a (its length) was 2 and is 1"),
+        ({"a": 1}, {}, 0.0, "a was 1 and is absent"),
+        ({"a": float("nan")}, {"a": float("nan")}, 0.0, ""),
+        ({"a": None}, {"a": 0.0}, 1.0, "a was None and is 0.0"),
+        ({"a": True}, {"a": 1}, 0.0, "a was True and is 1"),
+        ({"why": "0.500 m to go"}, {"why": "0.5001 m to go"}, 1e-3, ""),
+        ({"why": "0.5 m to go"}, {"why": "0.5 m to come"}, 1e-3, "why was '0.5 m to go'"),
+        ({"why": "0.5 m"}, {"why": "0.50 m"}, 0.0, "why was '0.5 m'"),
+    ],
+)
+def test_messages_are_compared_by_meaning(recorded: Any, now: Any, tolerance: float, words: str) -> None:
+    found = difference(recorded, now, tolerance)
+    assert (found.text if found else "").startswith(words)
+    assert bool(found) is bool(words)
