@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import msgspec
 
@@ -15,30 +15,33 @@ M = TypeVar("M", bound=Message)
 
 
 class Tap:
-    """Everything that is published under one robot's name, in order, as it travelled."""
+    """Everything that is published under one robot's name, in order for each topic, as it travelled."""
 
     def __init__(self, bus: LocalBus, robot_name: str) -> None:
         self._prefix = f"{robot_name}/"
-        self._payloads: list[tuple[str, bytes]] = []
+        self._payloads: dict[str, list[bytes]] = {}
+        self._decoded: dict[str, list[Message]] = {}
         bus.subscribe(f"{robot_name}/**", Qos.EVENT, self._take, depth=1)
 
     def _take(self, key: str, payload: Payload) -> None:
-        self._payloads.append((key.removeprefix(self._prefix), bytes(payload)))
+        self._payloads.setdefault(key.removeprefix(self._prefix), []).append(bytes(payload))
 
     def messages(self, topic: Topic[M]) -> list[M]:
         """All of one topic so far. Raises msgspec.ValidationError for what should never have been published."""
+        payloads, decoded = self._payloads.get(topic.name, []), self._decoded.setdefault(topic.name, [])
         decoder = msgspec.msgpack.Decoder(topic.type)
-        return [decoder.decode(payload) for name, payload in self._payloads if name == topic.name]
+        decoded.extend(decoder.decode(payload) for payload in payloads[len(decoded) :])
+        return cast("list[M]", list(decoded))
 
     def samples(self) -> dict[tuple[str, int, int], Message]:
         """All messages by (topic, incarnation, sequence), as a StepRecord names them."""
-        found: dict[tuple[str, int, int], Message] = {}
-        for name, payload in self._payloads:
-            topic: Topic[Any] | None = topic_named(name)
-            if topic is not None:
-                message = msgspec.msgpack.decode(payload, type=topic.type)
-                found[name, message.incarnation, message.seq] = message
-        return found
+        topics: list[Topic[Any]] = [topic for topic in map(topic_named, self._payloads) if topic is not None]
+        return {
+            (topic.name, message.incarnation, message.seq): message
+            for topic in topics
+            for message in self.messages(topic)
+        }
 
     def forget(self) -> None:
         self._payloads.clear()
+        self._decoded.clear()
