@@ -15,8 +15,10 @@ from __future__ import annotations
 import fcntl
 import json
 import os
+import random
 import select
 import signal
+import time
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import replace
@@ -33,6 +35,8 @@ from cocoro.errors import ConfigError, RefusedError
 
 LOG_DIR = "COCORO_LOG_DIR"
 """Environment variable with a place for the logs that outlives the run directory."""
+LOOK_S = 1.0
+"""Longer than anyone takes to look who holds a file."""
 KEPT_LOGS = 5
 """Of earlier starts, for each process."""
 
@@ -72,11 +76,14 @@ def hold(path: Path, name: str) -> Held | None:
     """Hold a file in the name of this process; None when another one holds it."""
     path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     fd = os.open(path, os.O_CREAT | os.O_RDWR, 0o600)
-    try:
-        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        os.close(fd)
-        return None
+    deadline_s = time.monotonic() + LOOK_S
+    while not _locked(fd, fcntl.LOCK_EX):
+        if not _locked(fd, fcntl.LOCK_SH) or time.monotonic() > deadline_s:
+            os.close(fd)
+            return None
+        # Nobody holds it: somebody only looks, as `holder` does, and has done so in a moment.
+        fcntl.flock(fd, fcntl.LOCK_UN)
+        time.sleep(random.uniform(0.0, 0.002))  # of two that try, one is first
     os.ftruncate(fd, 0)
     os.write(fd, json.dumps({"name": name, "pid": os.getpid()}).encode())
     return Held(fd)
@@ -89,8 +96,8 @@ def holder(path: Path) -> Holder | None:
     except FileNotFoundError:
         return None
     try:
-        fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except BlockingIOError:
+        if _locked(fd, fcntl.LOCK_SH):
+            return None
         try:
             about = json.loads(os.read(fd, 4096))
         except ValueError:  # it was taken this very moment
@@ -98,7 +105,15 @@ def holder(path: Path) -> Holder | None:
         return Holder(about["name"], about["pid"])
     finally:
         os.close(fd)
-    return None
+
+
+def _locked(fd: int, kind: int) -> bool:
+    """Lock a file, if that can be had at once."""
+    try:
+        fcntl.flock(fd, kind | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
 
 
 class RunDir:

@@ -105,21 +105,14 @@ class PlannerSkills:
 
     async def _watch(self, until_s: float) -> PlannerStatus | None:
         """Wait for the planner's word that what is wanted is done; None when it is not by then."""
-        heard_s = self.now_s()
         while True:
             status = await self._next_status()
-            now_s = self.now_s()
-            if status is None:
-                if now_s - heard_s > self._silence_s:
-                    raise TaskFailedError("not_alive", "the planner is silent")
-            else:
-                heard_s = now_s
-                if self._answers(status):
-                    if status.state == "done":
-                        return status
-                    if status.state == "failed":
-                        raise TaskFailedError(status.reason, status.why)
-            if now_s > until_s:
+            if self._answers(status):
+                if status.state == "done":
+                    return status
+                if status.state == "failed":
+                    raise TaskFailedError(status.reason, status.why)
+            if self.now_s() > until_s:
                 return None
 
     def _answers(self, status: PlannerStatus) -> bool:
@@ -132,18 +125,22 @@ class PlannerSkills:
         end_ns = self._node.now_ns() + round(seconds * NS)
         while self._node.now_ns() < end_ns:
             status = await self._next_status()
-            if status is None:
-                raise TaskFailedError("not_alive", "the planner is silent")
             if not status.holding:
                 raise TaskFailedError("slipped", "the hand has lost what it held")
 
-    async def _next_status(self) -> PlannerStatus | None:
-        """The next status, or None when none comes for a while."""
-        waiting = asyncio.ensure_future(self._plan.next())
-        timer = asyncio.ensure_future(self._node.sleep(self._silence_s))
-        try:
-            await asyncio.wait((waiting, timer), return_when=asyncio.FIRST_COMPLETED)
-            return waiting.result() if waiting.done() else None
-        finally:
-            waiting.cancel()
-            timer.cancel()
+    async def _next_status(self) -> PlannerStatus:
+        """The next status. Raises TaskFailedError when none comes for too long."""
+        while True:
+            began_s = self.now_s()
+            waiting = asyncio.ensure_future(self._plan.next())
+            timer = asyncio.ensure_future(self._node.sleep(self._silence_s))
+            try:
+                await asyncio.wait((waiting, timer), return_when=asyncio.FIRST_COMPLETED)
+                if waiting.done():
+                    return waiting.result()
+            finally:
+                waiting.cancel()
+                timer.cancel()
+            if self.now_s() - began_s < 2 * self._silence_s:
+                raise TaskFailedError("not_alive", "the planner is silent")
+            # This process was itself stopped for a while; what the planner said meanwhile is only now being read.

@@ -1,0 +1,255 @@
+"""A simulated robot as it runs on a machine, process by process, and what an onlooker on its mesh hears; for tests
+that kill and stop its processes. What happened when is told by the simulator's stamps alone."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+from collections import defaultdict
+from collections.abc import AsyncIterator, Callable, Mapping
+from contextlib import asynccontextmanager
+from itertools import pairwise
+from math import hypot
+from pathlib import Path
+from typing import Any, TypeVar
+
+import msgspec
+from operator_shell import PATIENCE_S, Running
+
+from cocoro import topics
+from cocoro.bus.base import Payload
+from cocoro.bus.zenoh import ZenohBus
+from cocoro.clock import NS
+from cocoro.messages import AboutRequest, Exchange, Message, TaskReply, TaskRequest, TaskState, Truth
+from cocoro.rundir import RunDir, Target
+from cocoro.topics import Qos, Topic
+
+M = TypeVar("M", bound=Message)
+
+WATCHED: tuple[Topic[Any], ...] = (
+    topics.TRUTH, topics.BASE_STATE, topics.BASE_COMMAND, topics.INTENT, topics.DETECTIONS, topics.PLAN, topics.TASK,
+    topics.EXCHANGES.of("base"),
+)  # fmt: skip
+KEEP = 1_000_000
+"""Of everything that is watched all is kept, however late this process gets to it."""
+SLOW = {"width": 320, "height": 240, "frame_rate_hz": 30.0, "pace": 0.5}
+"""A small picture, and half as fast as it could be: a busy machine must not make the robot late."""
+PROCESSES = ("sim", "perception", "planning", "executive")
+STANDING_MPS = 0.01
+
+
+class LiveRobot:
+    """A robot that is up. Make it with `live`."""
+
+    def __init__(self, name: str, root: Path, folder: Path) -> None:
+        self.name = name
+        self.run_dir = RunDir(name, root)
+        self.profile = folder / f"{name}.toml"
+        self.up: Running
+        self._root = root
+        self._bus: ZenohBus
+        self._heard: dict[str, list[Message]] = defaultdict(list)
+        self._alive: dict[str, bool] = {}
+        self._news = asyncio.Event()
+
+    # --- up and down ----------------------------------------------------------------------------------
+
+    async def start(self) -> None:
+        self.up = Running([sys.executable, "-m", "cocoro.cli.main", "up", str(self.profile)], self.env)
+        await self.told("is up")
+        self._bus = await ZenohBus.open(self.run_dir.join_as("onlooker"))
+        for topic in WATCHED:
+            self._bus.subscribe(topic.key(self.name), Qos.STATE, self._keeper(topic), depth=KEEP)
+        self._bus.watch_alive(f"{self.name}/*/alive", self._on_alive)
+        await self.until(lambda: self.heard(topics.TRUTH))
+
+    async def stop(self) -> None:
+        if hasattr(self, "_bus"):
+            await self._bus.close()
+        for service in list(self.run_dir.claims()):
+            self.signal(service, signal.SIGCONT)
+        if self.up.process.poll() is None:
+            await asyncio.to_thread(self.up.end, signal.SIGINT)
+
+    @property
+    def env(self) -> dict[str, str]:
+        return os.environ | {"COCORO_RUN_DIR": str(self._root)}
+
+    async def told(self, text: str) -> str:
+        """Wait for a line of the supervisor's."""
+        return await asyncio.to_thread(self.up.until, text)
+
+    async def command(self, *arguments: str) -> tuple[int, str]:
+        """Run a `cocoro` command; its exit code and what it printed."""
+        process = await asyncio.create_subprocess_exec(
+            sys.executable, "-m", "cocoro.cli.main", *arguments, "--robot", self.name,
+            env=self.env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+        )  # fmt: skip
+        out, _ = await asyncio.wait_for(process.communicate(), 4 * PATIENCE_S)
+        assert process.returncode is not None
+        return process.returncode, out.decode()
+
+    def pid(self, service: str) -> int:
+        return self.run_dir.claims()[service].pid
+
+    def signal(self, service: str, number: signal.Signals) -> None:
+        """To the process that is a service now."""
+        target = Target(self.run_dir.path / "claims" / service)
+        target.signal(number)
+        target.close()
+
+    # --- what is heard --------------------------------------------------------------------------------
+
+    def _keeper(self, topic: Topic[Any]) -> Callable[[str, Payload], None]:
+        decoder = msgspec.msgpack.Decoder(topic.type)
+
+        def keep(_key: str, payload: Payload) -> None:
+            self._heard[topic.name].append(decoder.decode(payload))
+            self._news.set()
+
+        return keep
+
+    def _on_alive(self, key: str, alive: bool) -> None:
+        self._alive[key.split("/")[1]] = alive
+        self._news.set()
+
+    def alive(self, *services: str) -> bool:
+        return all(self._alive.get(service, False) for service in services)
+
+    def heard(self, topic: Topic[M]) -> list[M]:
+        """All of a topic, in order of arrival."""
+        return self._heard[topic.name]  # type: ignore[return-value]
+
+    def forget(self) -> None:
+        self._heard.clear()
+
+    async def until(self, content: Callable[[], object], timeout_s: float = 2 * PATIENCE_S) -> None:
+        """Wait until something holds; looks whenever anything is heard."""
+        async with asyncio.timeout(timeout_s):
+            while not content():
+                self._news.clear()
+                await self._news.wait()
+
+    @property
+    def now_s(self) -> float:
+        """Simulated time, as far as it was heard of."""
+        truths = self.heard(topics.TRUTH)
+        return truths[-1].stamp_ns / NS if truths else 0.0
+
+    async def passes(self, seconds: float) -> None:
+        """Wait for simulated time."""
+        end_s = self.now_s + seconds
+        await self.until(lambda: self.now_s >= end_s)
+
+    async def surely_now_s(self) -> float:
+        """A time of the simulator's that is not earlier than the moment of asking."""
+        exchanges = topics.EXCHANGES.of("base")
+        before = len(self.heard(exchanges))
+        key = topics.ABOUT.of("base").key(self.name)
+        await self._bus.call(key, msgspec.msgpack.encode(AboutRequest()), PATIENCE_S)
+        await self.until(lambda: len(self.heard(exchanges)) > before)
+        newest: Exchange = self.heard(exchanges)[-1]
+        return newest.stamp_ns / NS
+
+    # --- tasks ----------------------------------------------------------------------------------------
+
+    async def ask(self, request: TaskRequest) -> TaskReply:
+        key = topics.RUN.key(self.name)
+        replies = await self._bus.call(key, msgspec.msgpack.encode(request), PATIENCE_S)
+        if not replies:
+            return TaskReply(accepted=False, refusal="not_alive", text="nobody answers")
+        assert replies[0].ok, replies[0].payload
+        return msgspec.msgpack.decode(replies[0].payload, type=TaskReply)
+
+    async def begin(self, request: TaskRequest) -> str:
+        """Have a task accepted, as soon as the robot is able; its id."""
+        async with asyncio.timeout(2 * PATIENCE_S):
+            while not (reply := await self.ask(request)).accepted:
+                assert reply.refusal in ("not_alive", "estop"), reply.text
+                await self.passes(0.1)
+        return reply.task_id
+
+    def state(self, task_id: str) -> TaskState | None:
+        return next((state for state in reversed(self.heard(topics.TASK)) if state.task_id == task_id), None)
+
+    async def outcome(self, task_id: str) -> TaskState:
+        def ended() -> bool:
+            state = self.state(task_id)
+            return state is not None and state.outcome is not None
+
+        await self.until(ended, 4 * PATIENCE_S)
+        state = self.state(task_id)
+        assert state is not None
+        return state
+
+    async def driving(self, label: str = "red_can", speed_mps: float = 0.12) -> str:
+        """Fetch something, and be on the way to it; the task's id."""
+        task_id = await self.begin(TaskRequest(task="fetch", label=label))
+        await self.drives(speed_mps, task_id)
+        return task_id
+
+    async def drives(self, speed_mps: float = 0.12, task_id: str = "") -> None:
+        """Wait until the body truly moves."""
+        since_s = self.now_s
+
+        def fast() -> bool:
+            if task_id and (state := self.state(task_id)) is not None:
+                assert state.outcome is None, state.reason
+            speeds = self.speeds(since_s)
+            return bool(speeds) and speeds[-1] > speed_mps
+
+        await self.until(fast)
+
+    # --- the truth ------------------------------------------------------------------------------------
+
+    def speeds(self, since_s: float) -> list[float]:
+        """True speeds of the body over each step of the truth that lies after then."""
+        after = [truth for truth in self.heard(topics.TRUTH) if truth.stamp_ns >= since_s * NS]
+        return [_speed_mps(a, b) for a, b in pairwise(after)]
+
+    def stood_since(self, when_s: float) -> bool:
+        return max(self.speeds(when_s)) < STANDING_MPS
+
+    def obeyed_since(self, when_s: float) -> list[tuple[float, float]]:
+        """Wheel commands other than zero that were given after then."""
+        return [
+            (command.left_mps, command.right_mps)
+            for command in self.heard(topics.BASE_COMMAND)
+            if command.stamp_ns > when_s * NS and (command.left_mps or command.right_mps)
+        ]
+
+    def held(self, label: str) -> bool:
+        """Truly between both claws, touching nothing else."""
+        objects = self.heard(topics.TRUTH)[-1].objects
+        return set(next(item for item in objects if item.label == label).touching) == {"claw_left", "claw_right"}
+
+
+def _speed_mps(a: Truth, b: Truth) -> float:
+    return hypot(b.body_m[0] - a.body_m[0], b.body_m[1] - a.body_m[1]) / ((b.stamp_ns - a.stamp_ns) / NS)
+
+
+@asynccontextmanager
+async def live(
+    folder: Path, *, name: str = "calliope", scene: Path | str = "paper", mesh: str = "", **sim: Any
+) -> AsyncIterator[LiveRobot]:
+    """A robot that is up, and goes down at the end. `sim`: settings of the simulator beside `SLOW`."""
+    root = Path(tempfile.mkdtemp(prefix="cocoro"))  # short: sockets live there
+    robot = LiveRobot(name, root, folder)
+    robot.profile.write_text(profile_text(name, {**SLOW, "scene": str(scene), **sim}, mesh))
+    try:
+        await robot.start()
+        yield robot
+    finally:
+        await robot.stop()
+        shutil.rmtree(root)
+
+
+def profile_text(name: str, sim: Mapping[str, Any], mesh: str = "") -> str:
+    settings = "".join(f"{key} = {json.dumps(value)}\n" for key, value in sim.items())
+    return f'robot = "{name}"\nclock = "sim"\nprocesses = {json.dumps(PROCESSES)}\n{mesh}\n[service.sim]\n{settings}'

@@ -1,0 +1,149 @@
+"""Processes of a robot that runs are killed and stopped while it drives; the simulator's truth says what became of it.
+
+Policies: docs/faults.md.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+from pathlib import Path
+
+import pytest
+from faults_live import LiveRobot, live
+
+from cocoro import topics
+from cocoro.messages import TaskRequest
+
+pytestmark = [pytest.mark.zenoh, pytest.mark.sim]
+
+ZERO_S = 0.22
+"""From the moment of the fault until nothing but zero is commanded."""
+STAND_S = 0.3
+"""The same until the body truly stands."""
+FAR = """
+[[object]]
+label = "red_can"
+shape = "cylinder"
+radius_m = 0.033
+height_m = 0.12
+position_m = [2.2, -0.1]
+"""
+
+
+@pytest.fixture
+def far(tmp_path: Path) -> Path:
+    """A can so far off that one can stop on the way to it more than once."""
+    scene = tmp_path / "far.toml"
+    scene.write_text(FAR)
+    return scene
+
+
+async def fault(robot: LiveRobot, service: str, number: signal.Signals) -> float:
+    """Send a signal and give the time, of the simulator, by which the process had it."""
+    robot.signal(service, number)
+    return await robot.surely_now_s()
+
+
+async def stands_in_time(robot: LiveRobot, fault_s: float, for_s: float = 0.9) -> None:
+    await robot.until(lambda: robot.now_s > fault_s + for_s)
+    assert robot.stood_since(fault_s + STAND_S), robot.speeds(fault_s)
+    assert not robot.obeyed_since(fault_s + ZERO_S)
+
+
+@pytest.mark.parametrize("service", ["planning", "perception", "executive"])
+def test_who_is_stopped_or_killed_while_driving_leaves_a_robot_that_stands(
+    service: str, tmp_path: Path, far: Path
+) -> None:
+    async def scenario() -> None:
+        async with live(tmp_path, scene=far) as robot:
+            task_id = await robot.driving()
+            stopped_s = await fault(robot, service, signal.SIGSTOP)
+            await stands_in_time(robot, stopped_s)
+            robot.signal(service, signal.SIGCONT)
+            await robot.drives(task_id=task_id)
+
+            first = robot.pid(service)
+            killed_s = await fault(robot, service, signal.SIGKILL)
+            await stands_in_time(robot, killed_s)
+            if service != "executive":
+                state = await robot.outcome(task_id)
+                assert (state.outcome, state.reason) == ("failed", f"not_alive: {service} died")
+            await robot.told(f"{service} was killed by SIGKILL; restart in")
+            await robot.told(f"{service} ready in")
+            assert robot.pid(service) != first
+            assert robot.stood_since(killed_s + STAND_S), "who comes back waits to be asked"
+            await robot.driving()
+
+    asyncio.run(scenario())
+
+
+def test_a_simulator_that_is_killed_comes_back_and_all_others_work_with_it_as_before(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with live(tmp_path) as robot:
+            task_id = await robot.driving()
+            others = {service: robot.pid(service) for service in ("perception", "planning", "executive")}
+            robot.signal("base", signal.SIGKILL)
+            await robot.told("sim was killed by SIGKILL; restart in")
+            state = await robot.outcome(task_id)
+            assert state.outcome == "failed"
+            assert state.reason in {f"not_alive: {part} died" for part in topics.HARDWARE}
+            await robot.told("sim (kinect, base, arm, hand) ready in")
+            robot.forget()
+            code, said = await robot.command("fetch", "red_can")
+            assert code == 0, said
+            assert robot.held("red_can")
+            assert {service: robot.pid(service) for service in others} == others
+
+    asyncio.run(scenario())
+
+
+def test_a_simulator_that_is_stopped_stops_time_and_when_it_goes_on_so_does_the_task(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with live(tmp_path) as robot:
+            task_id = await robot.driving()
+            robot.signal("base", signal.SIGSTOP)
+            # Nothing tells that time stands; longer than anything of a running robot is silent is long enough.
+            await asyncio.sleep(1.0)
+            robot.signal("base", signal.SIGCONT)
+            await robot.drives(task_id=task_id)
+
+    asyncio.run(scenario())
+
+
+def test_the_grip_holds_through_an_emergency_stop_and_the_can_is_put_down_after_the_reset(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with live(tmp_path, pace=1.0) as robot:
+            code, said = await robot.command("fetch", "red_can")
+            assert code == 0, said
+            code, said = await robot.command("estop")
+            assert code == 0, said
+            code, said = await robot.command("put-down")
+            assert code == 3, said
+            assert "emergency stop is latched" in said
+            await robot.passes(2.0)
+            assert robot.held("red_can")
+            code, said = await robot.command("reset")
+            assert code == 0, said
+            await robot.passes(0.5)
+            assert robot.held("red_can")
+            code, said = await robot.command("put-down")
+            assert code == 0, said
+            await robot.passes(0.5)
+            can = next(item for item in robot.heard(topics.TRUTH)[-1].objects if item.label == "red_can")
+            assert can.touching == ("floor",)
+            assert can.position_m[2] == pytest.approx(0.06, abs=0.003), "it stands"
+
+    asyncio.run(scenario())
+
+
+def test_a_robot_whose_battery_is_low_says_so_and_takes_no_task(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        async with live(tmp_path, battery_fraction=0.1) as robot:
+            for task in (("fetch", "red_can"), ("follow", "red_can"), ("park",)):
+                code, said = await robot.command(*task)
+                assert (code, said) == (3, "cocoro: refused: the battery is low (10%); charge the robot first\n")
+            reply = await robot.ask(TaskRequest(task="fetch", label="red_can"))
+            assert (reply.accepted, reply.refusal) == (False, "battery")
+
+    asyncio.run(scenario())
