@@ -9,19 +9,22 @@ import msgspec
 from cocoro.bus.base import Payload
 from cocoro.bus.local import LocalBus
 from cocoro.messages import Message
+from cocoro.node import recorder_key
 from cocoro.topics import Qos, Topic, topic_named
 
 M = TypeVar("M", bound=Message)
 
 
 class Tap:
-    """Everything that is published under one robot's name, in order for each topic, as it travelled."""
+    """Everything that is published under one robot's name, in order for each topic, as it travelled. A recorder, to
+    those who wait for one before their first step."""
 
     def __init__(self, bus: LocalBus, robot_name: str) -> None:
         self._prefix = f"{robot_name}/"
         self._payloads: dict[str, list[bytes]] = {}
         self._decoded: dict[str, list[Message]] = {}
         bus.subscribe(f"{robot_name}/**", Qos.EVENT, self._take, depth=1)
+        bus.declare_alive(recorder_key(robot_name, "tap"))
 
     def _take(self, key: str, payload: Payload) -> None:
         self._payloads.setdefault(key.removeprefix(self._prefix), []).append(bytes(payload))
