@@ -17,6 +17,8 @@ from cocoro.kinematics import Array
 from cocoro.messages import TargetEstimate
 from services.planning.config import Memory
 
+_SURE = 3
+"""Sightings after which something is taken to be there."""
 _AGREE = 3
 """So many outliers in a row that agree with one another move the memory to their place."""
 
@@ -123,8 +125,12 @@ class TargetMemory:
         track = self._tracks.get(label)
         return track.sightings if track else 0
 
-    def all(self, body: Pose2, now_ns: int) -> tuple[TargetEstimate, ...]:
-        found = (self.estimate(label, body, now_ns) for label in sorted(self._tracks))
+    def all(self, body: Pose2, now_ns: int, *, sure: bool = False) -> tuple[TargetEstimate, ...]:
+        """Everything in memory; `sure`: only what was seen often enough to be there, for a single sighting may be a
+        mistake."""
+        least = _SURE if sure else 1
+        labels = [label for label, track in sorted(self._tracks.items()) if track.sightings >= least]
+        found = (self.estimate(label, body, now_ns) for label in labels)
         return tuple(estimate for estimate in found if estimate is not None)
 
 

@@ -86,7 +86,7 @@ class Scene:
 
     def fields(self, label: str, ignore: tuple[tuple[float, float, float], ...] = ()) -> Fields:
         """What body and arm must keep clear of on the way to a label."""
-        known = self.senses.memory.all(self.body, self.now_ns)
+        known = self.senses.memory.all(self.body, self.now_ns, sure=True)
         return self.senses.around.fields(label, known, self.now_ns, ignore)
 
     def unseen_under_swing(self) -> tuple[float, float] | None:
