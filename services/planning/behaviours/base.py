@@ -86,7 +86,10 @@ class Scene:
 
     def fields(self, label: str, ignore: tuple[tuple[float, float, float], ...] = ()) -> Fields:
         """What body and arm must keep clear of on the way to a label."""
-        known = self.senses.memory.all(self.body, self.now_ns, sure=True)
+        known = [item for item in self.senses.memory.all(self.body, self.now_ns, sure=True) if item.label != label]
+        target = self.target(label)
+        if target is not None:
+            known.append(target)
         return self.senses.around.fields(label, known, self.now_ns, ignore)
 
     def unseen_under_swing(self) -> tuple[float, float] | None:
