@@ -1,0 +1,211 @@
+"""What babbling saw, on disk: JSON lines that any tool reads, appended sample by sample, whole after any kind of end.
+
+The first line is the header: format, version, robot, the fingerprint of the drawing that the positions were computed
+with, joints, units. Each further line is one row. A row is written at once and whole lines only count, so a process
+that is killed loses nothing but a line that it had not finished; that is cut off when the file is next appended to.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import os
+from collections.abc import Iterable
+from pathlib import Path
+from types import TracebackType
+from typing import Generic, TypeVar
+
+import msgspec
+
+from cocoro.errors import ConfigError, RefusedError
+from cocoro.messages import Vec2, Vec3
+from cocoro.robot import Robot
+
+VERSION = 1
+HAND, WHEELS = "cocoro.hand-samples", "cocoro.wheel-trials"
+
+
+class HandRow(msgspec.Struct, frozen=True, kw_only=True):
+    """One sighting of the hand's marker."""
+
+    stamp_ns: int
+    """Of the frame."""
+    draw: int
+    """The number of the Sobol draw that the arm was on its way to: rows of one draw lie near one another."""
+    angles_rad: tuple[float, ...]
+    """Of the header's joints, at the frame's stamp."""
+    head_rad: Vec2
+    """Pan and tilt at the frame's stamp."""
+    seen_m: Vec3
+    """The marker's centre, body frame, as the drawing of the neck places what the camera saw."""
+    area_px: int
+
+
+class WheelRow(msgspec.Struct, frozen=True, kw_only=True):
+    """One trial of wheel babbling: the target seen, both wheels turned for a while, the target seen again."""
+
+    stamp_ns: int
+    """When the trial ended."""
+    trial: int
+    left_mps: float
+    right_mps: float
+    """The commanded speeds."""
+    left_m: float
+    right_m: float
+    """What each wheel was told to roll in all, ramps included."""
+    before_m: Vec2
+    after_m: Vec2
+    """The target over the floor, body frame, each the mean of several frames while the robot stood."""
+    turned_rad: float
+    """What the base's own odometry said of the turn."""
+
+
+class Header(msgspec.Struct, frozen=True, kw_only=True):
+    format: str
+    version: int
+    robot: str
+    drawing: str
+    """Fingerprint of the robot description."""
+    joints: tuple[str, ...] = ()
+    roll_rad: float = 0.0
+    """The wrist roll throughout (hand samples)."""
+    units: str = "rad, m, m/s, ns; body frame: x forward, y left, z up, origin on the floor between the wheels"
+
+
+Row = TypeVar("Row", bound=HandRow | WheelRow)
+
+
+class Recorded(Generic[Row]):
+    """A file that was read."""
+
+    def __init__(self, path: Path, header: Header, rows: list[Row]) -> None:
+        self.path = path
+        self.header = header
+        self.rows = rows
+
+    @property
+    def fingerprint(self) -> str:
+        """Of the rows, whatever their order of keys on disk."""
+        digest = hashlib.sha256()
+        for row in self.rows:
+            digest.update(msgspec.json.encode(row))
+        return digest.hexdigest()[:16]
+
+
+def fingerprint_of(robot: Robot) -> str:
+    """Of a robot description: equal descriptions, equal fingerprints."""
+    data = msgspec.json.encode(robot.to_data(), order="deterministic")
+    return hashlib.sha256(data).hexdigest()[:16]
+
+
+def read(path: Path, kind: type[Row], robot: Robot | None = None) -> Recorded[Row]:
+    """Read a file of one kind of rows. Raises ConfigError, naming file and line, when it is none, is damaged, or (with
+    `robot`) is another robot's."""
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise ConfigError(f"samples {path}: {error.strerror}") from error
+    return _parse(path, data, kind, robot)
+
+
+def _parse(path: Path, data: bytes, kind: type[Row], robot: Robot | None) -> Recorded[Row]:
+    lines = data[: data.rfind(b"\n") + 1].splitlines()  # a line without an end was being written
+    if not lines:
+        raise ConfigError(f"samples {path}: there is nothing in it; babble into a new file")
+    header = _header(path, lines[0], kind)
+    if robot is not None and header.robot != robot.name:
+        raise ConfigError(f"samples {path}: they are of robot {header.robot!r}, this one is {robot.name!r}")
+    if robot is not None and header.drawing != fingerprint_of(robot):
+        raise ConfigError(f"samples {path}: they were seen with another description of {robot.name}: babble anew")
+    decoder = msgspec.json.Decoder(kind)
+    rows: list[Row] = []
+    for number, line in enumerate(lines[1:], start=2):
+        try:
+            row = decoder.decode(line)
+        except msgspec.MsgspecError as error:
+            raise ConfigError(f"samples {path}, line {number}: {error}") from error
+        if isinstance(row, HandRow) and len(row.angles_rad) != len(header.joints):
+            raise ConfigError(f"samples {path}, line {number}: angles_rad must have {len(header.joints)} values")
+        rows.append(row)
+    return Recorded(path, header, rows)
+
+
+def _header(path: Path, line: bytes, kind: type[Row]) -> Header:
+    wanted = HAND if kind is HandRow else WHEELS
+    try:
+        header = msgspec.json.decode(line, type=Header)
+    except msgspec.MsgspecError as error:
+        raise ConfigError(f"samples {path}: it is no file of samples ({error})") from error
+    if header.format != wanted:
+        raise ConfigError(f"samples {path}: it holds {header.format}, not {wanted}")
+    if header.version != VERSION:
+        raise ConfigError(f"samples {path}: it is of version {header.version}, this program reads version {VERSION}")
+    return header
+
+
+class Writer(Generic[Row]):
+    """Appends to a file, or begins it. Use it with `with`.
+
+    Raises ConfigError when the file cannot be written or holds something else (another robot's samples, say), and
+    RefusedError when another process is writing it.
+    """
+
+    def __init__(self, path: Path, kind: type[Row], robot: Robot, header: Header) -> None:
+        self.path = path
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._file = path.open("a+b", buffering=0)
+        except OSError as error:
+            raise ConfigError(f"samples {path}: {error.strerror}") from error
+        try:
+            self._lock()
+            self.rows: list[Row] = self._resume(kind, robot, header)
+            """All rows of the file, those from before included."""
+        except BaseException:
+            self._file.close()
+            raise
+
+    def __enter__(self) -> Writer[Row]:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        os.fsync(self._file.fileno())
+        self._file.close()
+
+    def append(self, rows: Iterable[Row]) -> None:
+        """Write rows at once: when this returns they outlive the process."""
+        added = list(rows)
+        self._file.write(b"".join(msgspec.json.encode(row) + b"\n" for row in added))
+        self.rows += added
+
+    def _lock(self) -> None:
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise RefusedError(f"samples {self.path}: another process is writing it") from error
+
+    def _resume(self, kind: type[Row], robot: Robot, header: Header) -> list[Row]:
+        self._file.seek(0)
+        data = self._file.read()
+        whole = data.rfind(b"\n") + 1
+        if whole < len(data):
+            self._file.truncate(whole)  # the line that was being written when the last process ended
+        if not whole:
+            self._file.write(msgspec.json.encode(header) + b"\n")
+            return []
+        found = _parse(self.path, data, kind, robot)
+        if (found.header.joints, found.header.roll_rad) != (header.joints, header.roll_rad):
+            raise ConfigError(f"samples {self.path}: they were taken with other joints; babble into a new file")
+        return found.rows
+
+
+def hand_header(robot: Robot, joints: tuple[str, ...], roll_rad: float) -> Header:
+    return Header(
+        format=HAND, version=VERSION, robot=robot.name, drawing=fingerprint_of(robot), joints=joints, roll_rad=roll_rad
+    )
+
+
+def wheel_header(robot: Robot) -> Header:
+    return Header(format=WHEELS, version=VERSION, robot=robot.name, drawing=fingerprint_of(robot))

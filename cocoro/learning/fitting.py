@@ -1,0 +1,87 @@
+"""Three ways to set a network's weights: the paper's rule, recursive least squares, and the same all at once."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from copy import copy
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+
+from cocoro.learning.network import Array, HyperplaneRbf
+
+Mask = NDArray[np.bool_]
+_BLOCK = 128
+
+
+def learn_in_order(network: HyperplaneRbf, inputs: Array, targets: Array, rate: float) -> None:
+    """The paper's rule: each sample once, in order. Changes the network. inputs (b, n), targets (b, k).
+
+    Block by block, exactly as sample by sample: with G the Gram matrix of a block's features, the errors E that the
+    rule meets one after the other are the solution of the triangular system (I + rate tril(G, -1)) E = T - Phi W, and
+    the weights then gain rate Phi' E (derived).
+    """
+    for start in range(0, len(inputs), _BLOCK):
+        phi = network.features(inputs[start : start + _BLOCK])
+        before = targets[start : start + _BLOCK] - phi @ network.weights
+        system = np.tril(rate * (phi @ phi.T), -1)
+        np.fill_diagonal(system, 1.0)
+        errors = solve_triangular(system, before, lower=True, unit_diagonal=True)
+        network.weights += rate * (phi.T @ errors)
+
+
+class LeastSquares:
+    """Regularised least squares on a network's weights, one sample at a time (recursive least squares) or many at once.
+
+    The network's weights at the start are the prior mean; `doubt` is the variance of each weight about it as a
+    multiple of a sample's own variance, so 1 / doubt is the ridge. One by one or all at once, the weights are the same
+    (up to rounding). Derived: standard recursive least squares, after Kalman's filter with a static state.
+    """
+
+    def __init__(self, network: HyperplaneRbf, doubt: float = 100.0) -> None:
+        self.network = network
+        count = len(network.weights)
+        self._covariance = doubt * np.eye(count)
+        """P: of the weights, in units of a sample's variance."""
+
+    def copy(self, network: HyperplaneRbf) -> LeastSquares:
+        """A learner that knows as much, for a copy of the network."""
+        other = copy(self)
+        other.network = network
+        other._covariance = self._covariance.copy()
+        return other
+
+    def add(self, x: Array, target: Array) -> Array:
+        """One sample: input (n,), target (k,). Returns the error before it was learned, (k,)."""
+        phi = self.network.features(x[None])[0]
+        gain = self._covariance @ phi
+        step = gain / (1.0 + float(phi @ gain))
+        error: Array = target - phi @ self.network.weights
+        self._covariance -= np.multiply.outer(gain, step)
+        self.network.weights += np.multiply.outer(step, error)
+        return error
+
+    def add_all(self, inputs: Array, targets: Array, weight: float | Array = 1.0) -> None:
+        """Samples (b, n) and (b, k) at once; `weight` counts each, or all of them alike, as so many."""
+        phi = self.network.features(inputs)
+        scale = np.broadcast_to(np.asarray(weight, dtype=np.float64), len(phi))
+        information = np.linalg.inv(self._covariance)
+        scaled = phi * scale[:, None]
+        self._covariance = _symmetric(np.linalg.inv(information + scaled.T @ phi))
+        errors = targets - phi @ self.network.weights
+        self.network.weights += self._covariance @ (scaled.T @ errors)
+
+
+def folds(groups: NDArray[np.int64], count: int) -> Iterable[tuple[Mask, Mask]]:
+    """`count` pairs of boolean masks (learn, check), whole groups in each: what is checked was never near to what was
+    learned. `groups` (b,) tells which samples belong together."""
+    names = np.unique(groups)
+    for number in range(count):
+        check = np.isin(groups, names[number::count])
+        yield ~check, check
+
+
+def _symmetric(matrix: NDArray[Any]) -> Array:
+    return np.asarray((matrix + matrix.T) / 2)
