@@ -1,0 +1,175 @@
+"""Parts that live and say nothing: hung, stopped, starved. In virtual time, so that every bound is exact.
+
+Policies: docs/faults.md.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
+from robot_rig import HALTED_MPS, SMALL_FRAMES, RobotRig
+
+from cocoro import topics
+from cocoro.bus.base import Payload
+from cocoro.testing import in_virtual_time
+
+pytestmark = pytest.mark.sim
+
+ZERO_S = 0.22
+"""From the moment of the fault until nothing but zero is commanded."""
+STAND_S = 0.3
+"""The same until the body truly stands."""
+REAL = {"sim": SMALL_FRAMES | {"frame_rate_hz": 30.0, "sensors": "real"}}
+PERIOD_S = 1 / 30
+
+
+class Mute:
+    """In a publisher's place."""
+
+    def put(self, payload: Payload) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
+
+
+@contextmanager
+def silent(rig: RobotRig, service: str) -> Iterator[None]:
+    """Nothing that the service publishes gets out meanwhile, though its process lives."""
+    publishers = list(rig._services[service].node._publishers.values())
+    raws = [publisher._raw for publisher in publishers]
+    for publisher in publishers:
+        publisher._raw = Mute()
+    yield
+    for publisher, raw in zip(publishers, raws, strict=True):
+        publisher._raw = raw
+
+
+def stands_in_time(rig: RobotRig, fault_s: float) -> None:
+    assert not any(any(wheels) for wheels in rig.commanded_since(fault_s + ZERO_S))
+    assert rig.commanded_since(fault_s + ZERO_S) or not rig.base_obeys_since(fault_s + ZERO_S)
+    assert max(rig.speeds_since(fault_s + STAND_S)) < HALTED_MPS
+
+
+def whys_since(rig: RobotRig, when_s: float) -> set[str]:
+    return {status.why for status in rig.tap.messages(topics.PLAN) if status.stamp_ns > when_s * 1e9}
+
+
+@pytest.mark.parametrize("service", ["planning", "perception", "executive"])
+@pytest.mark.parametrize("speed_mps", [0.15, 0.34])
+@pytest.mark.parametrize("later_s", [0.0, PERIOD_S / 3, 2 * PERIOD_S / 3])
+def test_who_falls_silent_while_driving_leaves_a_robot_that_stands(
+    service: str, speed_mps: float, later_s: float
+) -> None:
+    @in_virtual_time
+    async def scenario() -> None:
+        async with RobotRig(settings=REAL) as rig:
+            await rig.driving(speed_mps)
+            await rig.advance(later_s)
+            silent_s = rig.now_s
+            with silent(rig, service):
+                await rig.advance(1.0)
+            stands_in_time(rig, silent_s)
+
+    scenario()
+
+
+@in_virtual_time
+async def test_when_perception_speaks_again_the_drive_goes_on() -> None:
+    async with RobotRig() as rig:
+        task_id = await rig.driving()
+        silent_s = rig.now_s
+        with silent(rig, "perception"):
+            await rig.advance(1.0)
+            assert rig.speed_mps < HALTED_MPS
+            assert rig.tap.messages(topics.PLAN)[-1].why == "standing still: perception is silent"
+        assert (await rig.outcome(task_id)).outcome == "done"
+        assert rig.held("red_can")
+        assert "standing still: perception is silent" not in whys_since(rig, silent_s + 1.2)
+
+
+@in_virtual_time
+async def test_a_lost_frame_stops_nothing() -> None:
+    async with RobotRig(settings=REAL) as rig:
+        await rig.driving()
+        since_s = rig.now_s
+        for _ in range(4):
+            with silent(rig, "perception"):
+                await rig.advance(PERIOD_S)
+            await rig.advance(0.2)
+        assert "standing still: perception is silent" not in whys_since(rig, since_s)
+
+
+@in_virtual_time
+async def test_perception_that_is_slow_is_not_taken_for_silent() -> None:
+    async with RobotRig(latency_s={"perception": 0.5}) as rig:
+        state = await rig.run("fetch", "red_can")
+        assert (state.outcome, state.reason) == ("done", "")
+        approach = next(phase for phase in state.phases if phase.name == "approach")
+        since_s = approach.start_ns / 1e9
+        assert "standing still: perception is silent" not in whys_since(rig, since_s)
+
+
+@in_virtual_time
+async def test_slow_perception_that_falls_silent_is_noticed_after_two_of_its_own_periods() -> None:
+    async with RobotRig(latency_s={"perception": 0.5}) as rig:
+        await rig.driving(0.2)
+        silent_s = rig.now_s
+        with silent(rig, "perception"):
+            await rig.advance(2.0)
+        late_s = 2 * 0.5
+        stands_in_time(rig, silent_s + late_s)
+
+
+@in_virtual_time
+async def test_when_perception_stays_silent_the_task_fails_and_says_so() -> None:
+    async with RobotRig() as rig:
+        task_id = await rig.driving()
+        with silent(rig, "perception"):
+            state = await rig.outcome(task_id, timeout_s=8.0)
+            assert (state.outcome, state.reason) == ("failed", "stale: standing still: perception is silent")
+            # Nothing is searched for with closed eyes either.
+            state = await rig.run("fetch", "green_can")
+            assert (state.outcome, state.reason) == ("failed", "stale: standing still: perception is silent")
+            assert state.elapsed_s < 1.0
+        await rig.advance(0.2)
+        assert (await rig.run("fetch", "red_can")).outcome == "done"
+
+
+@in_virtual_time
+async def test_when_the_planner_stays_silent_the_task_fails_and_says_so() -> None:
+    async with RobotRig() as rig:
+        task_id = await rig.driving()
+        with silent(rig, "planning"):
+            state = await rig.outcome(task_id, timeout_s=4.0)
+            assert (state.outcome, state.reason) == ("failed", "not_alive: the planner is silent")
+            refused = await rig.ask("fetch", "red_can")
+            assert (refused.refusal, refused.text) == ("not_alive", "the planner says nothing; see cocoro status")
+        await rig.advance(0.2)
+        assert (await rig.run("fetch", "red_can")).outcome == "done"
+
+
+@in_virtual_time
+async def test_when_the_executive_speaks_again_the_task_goes_on() -> None:
+    async with RobotRig() as rig:
+        task_id = await rig.driving()
+        with silent(rig, "executive"):
+            await rig.advance(1.0)
+            assert rig.speed_mps < HALTED_MPS
+        assert (await rig.outcome(task_id)).outcome == "done"
+        assert rig.held("red_can")
+
+
+@in_virtual_time
+async def test_silence_with_a_can_in_the_hand_drops_nothing() -> None:
+    async with RobotRig() as rig:
+        await rig.holding()
+        for service in ("planning", "perception", "executive"):
+            with silent(rig, service):
+                await asyncio.sleep(2.0)
+            assert rig.held("red_can")
+        await rig.advance(0.5)
+        assert (await rig.run("put-down")).outcome == "done"
