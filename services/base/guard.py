@@ -26,6 +26,7 @@ import select
 import signal
 import socket
 import sys
+import termios
 import time
 from contextlib import suppress
 
@@ -96,7 +97,7 @@ class Guard:
         self._tried_ns = now_ns
         try:
             port = serial.Serial(self._path, oi.BAUD, timeout=0, write_timeout=0, exclusive=True)
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, termios.error) as error:
             self._why = _plain(error, self._path)
             return
         self._port = port

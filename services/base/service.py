@@ -103,8 +103,9 @@ class BaseService:
     def _tell(self) -> None:
         """Health, as people read it."""
         node, faults = self._node, self._driver.faults()
-        if faults != node.faults:
-            for fault in sorted(set(faults) - set(node.faults)):
+        told = {fault.partition(":")[0] for fault in node.faults}  # what follows may be a measured value
+        for fault in faults:
+            if fault.partition(":")[0] not in told:
                 node.log.warning("%s", fault)
         node.faults = faults
         if self._driver.link == "up":

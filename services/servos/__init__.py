@@ -1,1 +1,1 @@
-"""The servos: both Dynamixel networks, arm and neck, and hand."""
+"""Dynamixel servos: their registers (`table`), packets, port and bus; motion and networks; the service."""

@@ -1,0 +1,215 @@
+"""The thread that talks to one servo line, so that the event loop never waits for a wire.
+
+Each cycle it writes the newest orders by one sync write, reads every servo, and does at most one task. What it finds
+goes to the event loop as an `Event`; nothing else is shared but the newest orders and the tasks' queue.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import threading
+import time
+from collections.abc import Callable, Collection, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from queue import Empty, SimpleQueue
+
+from services.servos import table
+from services.servos.bus import Bus, PortError, RefusedWriteError, SilentError
+from services.servos.motion import HOLD_RADPS
+from services.servos.network import MISSES, Met, Task
+from services.servos.table import Reading
+
+log = logging.getLogger("cocoro.servos")
+
+REOPEN_S = 0.3
+PROBE_S = 0.2
+"""A silent servo is asked so often whether it is back: waiting for its answer costs the others their time."""
+CHECK_CYCLES = 8
+"""In each of so many cycles one servo is looked at closer."""
+ORDERS_S = 0.2
+"""Orders that were not renewed for so long are not written any more: the event loop hangs."""
+_TORQUE, _GOAL, _LIMIT = (table.REGISTERS[name] for name in ("torque_enable", "goal_position", "torque_limit"))
+
+
+@dataclass
+class Event:
+    """What one cycle found."""
+
+    readings: dict[int, Reading] = field(default_factory=dict)
+    missed: list[int] = field(default_factory=list)
+    met: dict[int, Met] = field(default_factory=dict)
+    checked: dict[int, bool] = field(default_factory=dict)
+    """Whether a servo's torque is on and its settings are those that were written into it."""
+    done: list[tuple[Task, int]] = field(default_factory=list)
+    """With the position."""
+    failed: list[Task] = field(default_factory=list)
+    refused: list[tuple[Task, str]] = field(default_factory=list)
+    port_fault: str = ""
+    busy_s: float = 0.0
+    """How long the cycle took."""
+    strays: int = 0
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What is written into a servo before it holds."""
+
+    slope: int
+    torque_limit: int
+
+
+class ServoLine:
+    """`heard(event)` is called in the event loop in which this was made. Start it, and stop it at the end."""
+
+    def __init__(
+        self,
+        path: str,
+        baud: int,
+        settings: Mapping[int, Setting],
+        rate_hz: float,
+        reply_s: float,
+        heard: Callable[[Event], None],
+    ) -> None:
+        self._open: Callable[[], Bus] = lambda: Bus(path, baud, reply_s)
+        self._settings = settings
+        self._period_s = 1.0 / rate_hz
+        self._heard = heard
+        self._loop = asyncio.get_running_loop()
+        self._ended = threading.Event()
+        self._tasks: SimpleQueue[Task] = SimpleQueue()
+        self._orders: tuple[float, Mapping[int, tuple[int, int]]] = (0.0, {})
+        self._misses = dict.fromkeys(settings, 0)
+        self._probed_s = 0.0
+        self._next_probe = 0
+        self._cycles = 0
+        self._thread = threading.Thread(target=self._run, name=f"servos {path}", daemon=True)
+
+    def start(self) -> None:
+        self._thread.start()
+
+    async def stop(self) -> None:
+        self._ended.set()
+        await self._loop.run_in_executor(None, self._thread.join, 5.0)
+
+    def order(self, goals: Mapping[int, tuple[int, int]]) -> None:
+        """Goal and speed in counts by servo, from now on; to be renewed in every cycle."""
+        self._orders = (time.monotonic() + ORDERS_S, goals)  # one assignment: the thread sees the old or the new
+
+    def do(self, task: Task) -> None:
+        self._tasks.put(task)
+
+    # --- in the thread ------------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        while not self._ended.is_set():
+            try:
+                with self._open() as bus:
+                    self._misses = dict.fromkeys(self._misses, 0)
+                    self._talk(bus)
+            except PortError as error:
+                self._start_over(str(error))
+            except Exception:
+                log.exception("the line's thread failed, and starts over")
+                self._start_over("the line failed: see the log")
+
+    def _start_over(self, why: str) -> None:
+        while not self._tasks.empty():
+            self._tasks.get()
+        self._tell(Event(port_fault=why))
+        self._ended.wait(REOPEN_S)
+
+    def _talk(self, bus: Bus) -> None:
+        due_s = time.monotonic()
+        while not self._ended.wait(max(due_s - time.monotonic(), 0.0)):
+            started_s = time.monotonic()
+            event = Event()
+            until_s, goals = self._orders
+            if started_s < until_s:
+                bus.go(goals)
+            for number in self._to_read(started_s):
+                self._read(bus, number, event)
+            self._do_task(bus, event)
+            self._check(bus, event)
+            event.busy_s = time.monotonic() - started_s
+            event.strays = bus.strays
+            self._tell(event)
+            due_s = max(due_s + self._period_s, time.monotonic())
+
+    def _to_read(self, now_s: float) -> Collection[int]:
+        """All that answer; of those that do not, one at a time and not often."""
+        alive = [number for number, misses in self._misses.items() if misses < MISSES]
+        silent = [number for number, misses in self._misses.items() if misses >= MISSES]
+        if silent and (not alive or now_s - self._probed_s > PROBE_S):
+            self._probed_s = now_s
+            self._next_probe += 1
+            return [*alive, silent[self._next_probe % len(silent)]]
+        return alive
+
+    def _read(self, bus: Bus, number: int, event: Event) -> None:
+        try:
+            event.readings[number] = bus.reading(number)
+            self._misses[number] = 0
+        except SilentError:
+            event.missed.append(number)
+            self._misses[number] += 1
+
+    def _do_task(self, bus: Bus, event: Event) -> None:
+        try:
+            task = self._tasks.get_nowait()
+        except Empty:
+            return
+        try:
+            if task.what == "meet":
+                event.met[task.number] = self._meet(bus, task.number)
+            else:
+                position = self._enable(bus, task.number) if task.what == "enable" else self._relax(bus, task.number)
+                event.done.append((task, position))
+        except SilentError:
+            event.failed.append(task)
+        except RefusedWriteError as error:
+            event.refused.append((task, str(error)))
+
+    def _meet(self, bus: Bus, number: int) -> Met:
+        data, _ = bus.read_block(number, _TORQUE.address, _GOAL.address + _GOAL.size - _TORQUE.address)
+        if len(data) < _GOAL.address + _GOAL.size - _TORQUE.address:
+            raise SilentError(number)
+        reading = bus.reading(number)
+        goal = int.from_bytes(data[_GOAL.address - _TORQUE.address :], "little")
+        return Met(bool(data[0]), goal, reading.position, reading.error)
+
+    def _enable(self, bus: Bus, number: int) -> int:
+        """Have a servo hold where it is. The order matters: what decides how it would move comes before what might
+        make it move, and its goal is where it is before its torque is on."""
+        setting = self._settings[number]
+        bus.write(number, "cw_slope", setting.slope)
+        bus.write(number, "ccw_slope", setting.slope)
+        bus.write(number, "moving_speed", round(HOLD_RADPS / table.SPEED_RADPS))
+        bus.write(number, "torque_limit", setting.torque_limit)  # after a shutdown it is 0
+        position = bus.reading(number).position
+        bus.write(number, "goal_position", position)
+        bus.write(number, "torque_enable", 1)
+        return position
+
+    def _relax(self, bus: Bus, number: int) -> int:
+        bus.write(number, "torque_enable", 0)
+        return bus.reading(number).position
+
+    def _check(self, bus: Bus, event: Event) -> None:
+        self._cycles += 1
+        number = list(self._misses)[self._cycles // CHECK_CYCLES % len(self._misses)]
+        if self._cycles % CHECK_CYCLES == 0 and self._misses[number] == 0 and number not in event.missed:
+            with suppress(SilentError, RefusedWriteError):
+                event.checked[number] = self._is_as_set(bus, number)
+
+    def _is_as_set(self, bus: Bus, number: int) -> bool:
+        data, _ = bus.read_block(number, _TORQUE.address, _LIMIT.address + _LIMIT.size - _TORQUE.address)
+        setting = self._settings[number]
+        slope = data[table.REGISTERS["cw_slope"].address - _TORQUE.address]
+        limit = int.from_bytes(data[_LIMIT.address - _TORQUE.address :], "little")
+        return (data[0], slope, limit) == (1, setting.slope, setting.torque_limit)
+
+    def _tell(self, event: Event) -> None:
+        with suppress(RuntimeError):  # the loop has ended
+            self._loop.call_soon_threadsafe(self._heard, event)

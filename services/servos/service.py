@@ -1,0 +1,171 @@
+"""Both servo networks as services: a thread talks to each line, a network makes sense of it, this joins the mesh."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from contextlib import AsyncExitStack
+from math import radians
+from typing import Annotated
+
+import msgspec
+from msgspec import Meta
+
+from cocoro import topics
+from cocoro.errors import CocoroError, ConfigError
+from cocoro.latch import LatchKeeper
+from cocoro.messages import LatchState, ServoCommand, ServoReply, ServoRequest, ServoState
+from cocoro.node import Node
+from cocoro.ports import port_path
+from cocoro.robot import SERVO_COUNT_RAD
+from cocoro.topics import Topic
+from services.servos import table
+from services.servos.line import Event, ServoLine, Setting
+from services.servos.network import Network
+
+__all__ = ["Config", "run"]
+
+NETWORKS: dict[str, tuple[Topic[ServoState], Topic[ServoCommand]]] = {
+    "arm": (topics.ARM_STATE, topics.ARM_COMMAND),
+    "hand": (topics.HAND_STATE, topics.HAND_COMMAND),
+}
+DONE_S = 2.0
+
+Share = Annotated[float, Meta(gt=0, le=1)]
+
+
+class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    arm_port: str = "/dev/cocoro-arm"
+    """The serial port of neck and arm: a device, or wire:NAME for an emulated one."""
+    hand_port: str = "/dev/cocoro-hand"
+    reply_s: Annotated[float, Meta(gt=0, le=0.5)] = 0.015
+    """How long a servo's answer may take."""
+    torque: dict[str, Share] = {}
+    """By joint, the share of its stall torque that it may push with; all of it where nothing is said."""
+
+
+class NetworkService:
+    """One network: one line, one thread, one participant of the mesh."""
+
+    def __init__(self, node: Node, config: Config) -> None:
+        self._node = node
+        robot = node.robot
+        joints = [robot.joints[name] for name in robot.network_joints(node.name)]
+        self._network = Network(joints, keeps_goal=node.name == "hand", timeout_s=robot.base.command_timeout_s)
+        row = robot.networks[node.name]  # type: ignore[index] # one of the two names
+        settings = {
+            joint.id: Setting(
+                slope=table.slope_of(radians(joint.compliance_deg) / SERVO_COUNT_RAD),
+                torque_limit=round(config.torque.get(joint.name, 1.0) * table.FULL_TORQUE),
+            )
+            for joint in joints
+        }
+        port = port_path(config.arm_port if node.name == "arm" else config.hand_port, node.robot_name)
+        self._line = ServoLine(port, row.baud, settings, row.rate_hz, config.reply_s, self._heard)
+        self._state, command = NETWORKS[node.name]
+        self._epoch = node.clock.epoch
+        self._changed = asyncio.Event()
+        LatchKeeper(node, self._latched)
+        node.on(command, self._commanded)
+        node.serve(topics.SERVOS.of(node.name), self._asked)
+
+    async def run(self) -> None:
+        self._tell()
+        self._line.start()
+        try:
+            await asyncio.get_running_loop().create_future()
+        finally:
+            await self._line.stop()
+
+    def _commanded(self, command: ServoCommand) -> None:
+        now_ns = self._node.now_ns()
+        self._network.command(command, now_ns)
+        self._line.order(self._network.orders(now_ns))
+
+    def _latched(self, state: LatchState, by: str) -> None:
+        self._network.set_latch(state)
+        self._line.order(self._network.orders(self._node.now_ns()))
+
+    def _heard(self, event: Event) -> None:
+        """What a cycle found. The line's thread goes by the monotonic clock, the network by the robot's."""
+        network, now_ns = self._network, self._node.now_ns()
+        if self._node.clock.epoch != self._epoch:
+            self._epoch = self._node.clock.epoch
+            network.new_epoch()
+        monotonic_ns = time.monotonic_ns()
+        network.port_fault = event.port_fault
+        if event.port_fault:
+            network.port_lost(event.port_fault)
+        for number, reading in event.readings.items():
+            network.heard(number, reading, now_ns - max(monotonic_ns - reading.at_ns, 0))
+        for number in event.missed:
+            network.missed(number)
+        for number, met in event.met.items():
+            network.met(number, met)
+        for number, as_set in event.checked.items():
+            network.checked(number, as_set, now_ns)
+        for task, position in event.done:
+            network.done(task, position, now_ns)
+        for task, why in event.refused:
+            network.refused(task, why)
+        for task in event.failed:
+            network.again(task)
+        if (next_task := network.next_task()) is not None:
+            self._line.do(next_task)
+        self._line.order(network.orders(now_ns))
+        if now_ns and (state := network.state(now_ns)) is not None:
+            self._node.publish(self._state, state)
+        self._tell()
+        self._changed.set()
+
+    async def _asked(self, request: ServoRequest) -> ServoReply:
+        network = self._network
+        if unknown := network.unknown(request.joints):
+            known = ", ".join(one.joint.name for one in network.joints.values())
+            raise CocoroError(f"{self._node.name} has no joint {unknown[0]!r}; it has {known}")
+        act = {"clear": network.clear, "relax": network.relax, "hold": network.hold}[request.action]
+        names = act(request.joints)
+        left = [name for name in names if not self._is_done(name, request.action)]
+        try:
+            async with asyncio.timeout(DONE_S):
+                while left:
+                    self._changed.clear()
+                    await self._changed.wait()
+                    left = [name for name in left if not self._is_done(name, request.action)]
+        except TimeoutError:
+            pass
+        why = "; ".join(network.faults(self._node.now_ns())) or self._network.stopped_by
+        text = f"{', '.join(left)}: not done{f', {why}' if why else ''}" if left else ""
+        return ServoReply(joints=tuple(name for name in names if name not in left), text=text)
+
+    def _is_done(self, name: str, action: str) -> bool:
+        one = next(one for one in self._network.joints.values() if one.joint.name == name)
+        return not one.enabled if action == "relax" else one.enabled
+
+    def _tell(self) -> None:
+        """Health, as people read it."""
+        node, faults = self._node, self._network.faults(self._node.now_ns())
+        told = {fault.partition(":")[0] for fault in node.faults}  # what follows may be a measured value
+        for fault in faults:
+            if fault.partition(":")[0] not in told:
+                node.log.warning("%s", fault)
+        node.faults = faults
+        if self._network.port_fault:
+            node.degraded("no line")
+        elif self._network.silent_joints():
+            node.degraded("servos do not answer")
+        else:
+            node.ready()
+
+
+async def run(node: Node, config: Config) -> None:
+    """Serve both networks for ever."""
+    unknown = sorted(set(config.torque) - set(node.robot.joints))
+    if unknown:
+        raise ConfigError(f"[service.servos] torque: the robot has no joint {unknown[0]!r}")
+    async with AsyncExitStack() as stack:
+        nodes = [await stack.enter_async_context(node.sibling(name)) for name in NETWORKS]
+        node.ready()
+        async with asyncio.TaskGroup() as group:
+            for one in nodes:
+                group.create_task(NetworkService(one, config).run())

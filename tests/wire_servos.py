@@ -1,0 +1,128 @@
+"""Servo lines at the end of pseudo-terminals and whoever moves them: what the tests of the servos have in common."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import TypeVar
+
+from cocoro import topics
+from cocoro.clock import RealClock
+from cocoro.messages import Latch, ServoCommand, ServoState
+from cocoro.testing import ServiceUnderTest
+from cocoro.topics import Topic
+from sim.wire.body import SimpleBody
+from sim.wire.dynamixel import Bus, Servo
+from sim.wire.emulator import Emulator
+
+T = TypeVar("T")
+
+MS = 1_000_000
+LONG_S = 30.0
+REPLY_S = 0.2
+"""A busy machine answers late."""
+ARM, HAND = (1, 2, 3, 4, 5, 6), (7, 8, 9)
+STATE: dict[str, Topic[ServoState]] = {"arm": topics.ARM_STATE, "hand": topics.HAND_STATE}
+COMMAND: dict[str, Topic[ServoCommand]] = {"arm": topics.ARM_COMMAND, "hand": topics.HAND_COMMAND}
+
+
+class ServoBench:
+    """Two emulated lines with the Calliope's servos and a body without physics; `with` it."""
+
+    def __init__(self, folder: Path, seed: int = 0, overload_s: float = 5.0) -> None:
+        self.arm = Bus([Servo(number, 28, overload_s) for number in ARM])
+        self.hand = Bus([Servo(number, 12, overload_s) for number in HAND])
+        self.body = SimpleBody(None, self.arm, self.hand)
+        self.emulator = Emulator(folder, {"arm": self.arm, "hand": self.hand}, self.body, seed)
+        self.folder = folder
+
+    def __enter__(self) -> ServoBench:
+        self.emulator.__enter__()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.emulator.__exit__(None, None, None)
+
+    def port(self, name: str) -> str:
+        return str(self.folder / name)
+
+    def servo(self, number: int) -> Servo:
+        return next(servo for bus in (self.arm, self.hand) for servo in bus.servos if servo.number == number)
+
+    def call(self, job: Callable[[], T]) -> T:
+        return self.emulator.call(job)
+
+    async def until(self, condition: Callable[[], object]) -> int:
+        """When it is so; ns, monotonic."""
+        return await asyncio.to_thread(self.emulator.until, condition)
+
+
+class Moved:
+    """The service under test, with what one does to an arm."""
+
+    def __init__(self, bench: ServoBench, service: ServiceUnderTest) -> None:
+        self.bench = bench
+        self.service = service
+        self.commanded_ns = 0
+        self._moving: dict[str, asyncio.Task[None]] = {}
+
+    def release(self) -> None:
+        self.service.feed(topics.LATCH, Latch(state="released"))
+
+    def move(self, network: str, **goals: float) -> None:
+        """Towards these goals at 1 rad/s, commanded at 50 Hz from now on."""
+        self.silence(network)
+        self._moving[network] = asyncio.ensure_future(self._move(network, goals))
+
+    def silence(self, network: str = "") -> None:
+        for name in [network] if network else list(self._moving):
+            if name in self._moving:
+                self._moving.pop(name).cancel()
+
+    async def _move(self, network: str, goals: dict[str, float]) -> None:
+        async for _ in self.service.tester.every(50.0):
+            self.commanded_ns = time.monotonic_ns()
+            command = ServoCommand(joints=tuple(goals), goal_rad=tuple(goals.values()), speed_radps=(1.0,) * len(goals))
+            self.service.feed(COMMAND[network], command)
+
+    async def state(self, network: str, good: Callable[[ServoState], object]) -> ServoState:
+        """The next state that is so."""
+        async with asyncio.timeout(LONG_S):
+            async for state in self.service.tester.stream(STATE[network]):
+                if good(state):
+                    return state
+        raise AssertionError("the stream ended")
+
+    async def fault(self, network: str, text: str) -> None:
+        async with asyncio.timeout(LONG_S):
+            async for health in self.service.tester.stream(topics.HEALTH.of(network)):
+                if any(text in fault for fault in health.faults):
+                    return
+
+    async def healthy(self, network: str) -> None:
+        async with asyncio.timeout(LONG_S):
+            async for health in self.service.tester.stream(topics.HEALTH.of(network)):
+                if not health.faults and health.state == "ready":
+                    return
+
+
+def angle(state: ServoState, joint: str) -> float:
+    return state.position_rad[state.joints.index(joint)]
+
+
+@asynccontextmanager
+async def moved(bench: ServoBench, **config: object) -> AsyncIterator[Moved]:
+    """The servo service on both lines, all servos met, the emergency stop released."""
+    settings = {"arm_port": bench.port("arm"), "hand_port": bench.port("hand"), "reply_s": REPLY_S} | config
+    async with ServiceUnderTest("services.servos.service", settings, clock=RealClock()) as service:
+        servos = Moved(bench, service)
+        await servos.state("arm", lambda state: len(state.joints) == len(ARM))
+        await servos.state("hand", lambda state: len(state.joints) == len(HAND))
+        servos.release()
+        for network in ("arm", "hand"):
+            await servos.state(network, lambda state: state.torque_enabled and all(state.torque_enabled))
+        yield servos
+        servos.silence()
