@@ -2,20 +2,35 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
-from collections.abc import Iterator
+import os
+import signal
+from collections.abc import AsyncIterator, Iterator
+from math import hypot
 from pathlib import Path
+from typing import Any
 
 import operator_shell
 import psutil
 import pytest
 from operator_shell import Shell
 
+from cocoro import topics
+from cocoro.bus.zenoh import ZenohBus
 from cocoro.cli import exits
+from cocoro.clock import NS, FollowedClock
+from cocoro.inbox import Stream
+from cocoro.messages import Truth
+from cocoro.node import Node
+from cocoro.robot import Robot
 from cocoro.rundir import RunDir
-from cocoro.topics import HARDWARE, STOPPABLE
+from cocoro.topics import HARDWARE, STOPPABLE, Topic
 
 pytestmark = [pytest.mark.zenoh, pytest.mark.sim]
+
+UNDER_WAY_S = 0.1
+"""What messages may take on a busy machine, and one period of the truth."""
 
 
 @pytest.fixture
@@ -70,3 +85,71 @@ def test_a_robot_is_started_fetches_is_stopped_and_leaves_nothing_behind(shell: 
     gone = shell("fetch", "red_can")
     assert gone.returncode == exits.NO_MESH
     assert "cocoro up" in gone.stderr
+
+
+def test_a_simulator_that_dies_fails_the_task_comes_back_and_the_robot_is_used_as_before(shell: Shell) -> None:
+    assert shell("up", "sim", "--detach", "--frames", "320x240@15").returncode == exits.DONE
+    fetch = shell.start("fetch", "red_can")
+    fetch.until("approach")
+    killed = shell.pid("base")
+    os.kill(killed, signal.SIGKILL)
+    assert fetch.end() == exits.FAILED
+    assert "not_alive" in fetch.lines[-1]
+    again = shell("fetch", "red_can")
+    for _ in range(20):  # until the supervisor has it up again
+        if again.returncode not in (exits.REFUSED, exits.NO_MESH):
+            break
+        again = shell("fetch", "red_can")
+    assert again.returncode == exits.DONE, again.stdout + again.stderr
+    assert shell.pid("base") != killed
+
+
+@pytest.mark.parametrize(
+    ("service", "said", "reason"),
+    [("planning", topics.BASE_COMMAND, "the planner is silent"), ("executive", topics.INTENT, None)],
+)
+def test_who_is_frozen_while_driving_leaves_a_robot_that_stands(
+    shell: Shell, service: str, said: Topic[Any], reason: str | None
+) -> None:
+    """All times are the simulator's own: how busy the machine is plays no part but for messages under way."""
+    assert shell("up", "sim", "--detach", "--frames", "320x240@15").returncode == exits.DONE
+    fetch = shell.start("fetch", "red_can")
+
+    async def scenario() -> None:
+        async with (
+            await ZenohBus.open(shell.run_dir.join_as("watcher")) as bus,
+            Node("watcher", bus, FollowedClock(), Robot.load()) as watcher,
+        ):
+            last_said: list[int] = []
+            watcher.on(said, lambda message: last_said.append(message.stamp_ns))
+            truths = watcher.stream(topics.TRUTH)
+            async for speed_mps, _ in speeds(truths):
+                if speed_mps > 0.25:
+                    break
+            os.kill(shell.pid(service), signal.SIGSTOP)
+            rolling_ns = 0
+            async for speed_mps, start_ns in speeds(truths):
+                if speed_mps >= 0.01:
+                    rolling_ns = start_ns
+                if last_said and start_ns - last_said[-1] > 2 * NS:
+                    break
+            assert rolling_ns - last_said[-1] < (0.30 + UNDER_WAY_S) * NS
+            os.kill(shell.pid(service), signal.SIGCONT)
+
+    asyncio.run(scenario())
+    code = fetch.end()
+    if reason is not None:
+        assert code == exits.FAILED
+        assert reason in fetch.lines[-1]
+    else:
+        assert code == exits.DONE, "it goes on where it was"
+
+
+async def speeds(truths: Stream[Truth]) -> AsyncIterator[tuple[float, int]]:
+    """The body's true speed between each two truths, and when it began, simulated time."""
+    before = await truths.next()
+    async for truth in truths:
+        passed_ns = truth.stamp_ns - before.stamp_ns
+        way_m = hypot(truth.body_m[0] - before.body_m[0], truth.body_m[1] - before.body_m[1])
+        yield way_m / passed_ns * NS, before.stamp_ns
+        before = truth
