@@ -39,6 +39,8 @@ R = TypeVar("R", bound=msgspec.Struct)
 
 RECORDER_S = 5.0
 """How long a service whose steps are to be recorded waits for a recorder before its first."""
+QUESTION_BYTES = 1024 * 1024
+"""A larger question is refused unread."""
 ALIVE = "{service}/alive"
 """The liveliness token's place under the robot's name."""
 
@@ -444,6 +446,8 @@ _ENCODER = msgspec.msgpack.Encoder(enc_hook=_plain)
 
 
 def _understood(decoder: msgspec.msgpack.Decoder[Q], payload: Payload, request: Request[Q, Any]) -> Q:
+    if len(payload) > QUESTION_BYTES:
+        raise CocoroError(f"{request.name}: a question of {len(payload)} bytes, at most {QUESTION_BYTES} are taken")
     try:
         return decoder.decode(payload)
     except (msgspec.MsgspecError, ValueError) as error:

@@ -4,7 +4,7 @@ the emergency stop is pressed, and the simulator's truth says what became of it.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from itertools import pairwise
 from math import atan2, hypot
 from typing import Any, NamedTuple
@@ -49,6 +49,7 @@ class RobotRig:
     def __init__(
         self,
         *,
+        services: Iterable[str] = SERVICES,
         settings: Mapping[str, Mapping[str, Any]] | None = None,
         latency_s: Mapping[str, float] | None = None,
         record_steps: bool = False,
@@ -65,6 +66,7 @@ class RobotRig:
         self.tap = Tap(self.mesh.join(), self._robot.name)
         self.truths: list[Truth] = []
         self._base: list[BaseState] = []
+        self._first = tuple(services)
         self._tasks: dict[str, TaskState] = {}
 
     async def __aenter__(self) -> RobotRig:
@@ -72,7 +74,7 @@ class RobotRig:
         self.operator.on(topics.TRUTH, self.truths.append)
         self.operator.on(topics.BASE_STATE, self._base.append)
         self.operator.on(topics.TASK, lambda state: self._tasks.update({state.task_id: state}))
-        for name in SERVICES:
+        for name in self._first:
             await self.start(name)
         return self
 

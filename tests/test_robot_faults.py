@@ -9,7 +9,7 @@ import pytest
 from robot_rig import HALTED_MPS, RobotRig
 
 from cocoro import topics
-from cocoro.messages import PlannerStatus
+from cocoro.messages import BaseCommand, PlannerStatus, ServoCommand
 from cocoro.testing import in_virtual_time
 
 pytestmark = pytest.mark.sim
@@ -96,6 +96,26 @@ async def test_a_stop_is_remembered_by_whoever_is_left() -> None:
         await rig.estop(latched=False)
         await rig.advance(1.0)
         assert (await rig.ask("fetch", "red_can")).accepted
+
+
+@in_virtual_time
+async def test_hardware_that_knows_of_no_latch_stands_still_until_the_executive_has_spoken() -> None:
+    async with RobotRig(services=("sim",)) as rig:
+
+        async def command(seconds: float) -> None:
+            for _ in range(round(seconds / 0.02)):
+                nod = ServoCommand(joints=("neck_tilt",), goal_rad=(-0.5,), speed_radps=(2.0,))
+                rig.operator.publish(topics.ARM_COMMAND, nod)
+                rig.operator.publish(topics.BASE_COMMAND, BaseCommand(left_mps=0.3, right_mps=0.3))
+                await rig.advance(0.02)
+
+        await command(1.0)
+        assert stands_since(rig, 0.0)
+        assert abs(rig.truths[-1].joints_rad["neck_tilt"]) < 0.01
+        await rig.start("executive")
+        await command(2.0)
+        assert rig.speed_mps > 0.25
+        assert rig.truths[-1].joints_rad["neck_tilt"] == pytest.approx(-0.5, abs=0.05)
 
 
 # --- cancelling -----------------------------------------------------------------------------------
