@@ -53,14 +53,18 @@ class RobotRig:
         settings: Mapping[str, Mapping[str, Any]] | None = None,
         latency_s: Mapping[str, float] | None = None,
         record_steps: bool = False,
+        name: str = "",
+        mesh: LocalMesh | None = None,
     ) -> None:
-        """`settings` by service; frames are small unless those of 'sim' say otherwise."""
+        """`settings` by service; frames are small unless those of 'sim' say otherwise. `name` and `mesh`: for more
+        than one robot on a mesh."""
         self._settings = {"sim": SMALL_FRAMES} | dict(settings or {})
         self._latency_s = latency_s or {}
         self._record_steps = record_steps
         self._clock = VirtualClock()
         self._robot = Robot.load()
-        self.mesh = LocalMesh()
+        self._robot.name = name or self._robot.name
+        self.mesh = mesh or LocalMesh()
         self._services: dict[str, _Running] = {}
         self.operator = Node("operator", self.mesh.join(), self._clock, self._robot)
         self.tap = Tap(self.mesh.join(), self._robot.name)
