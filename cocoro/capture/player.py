@@ -10,6 +10,8 @@ from cocoro.clock import NS
 from cocoro.topics import FRAME
 
 SLOWEST, FASTEST = 0.01, 100.0
+SHORTEST_PASS_NS = NS // 100
+"""Of a loop: what has no length is not played without a breath."""
 AT_ONCE = 256
 """Messages that one `due` gives at most, so that nobody else has to wait for long."""
 
@@ -38,6 +40,7 @@ class Player:
         self._capture = capture
         self._start_ns = capture.start_ns + round(start_s * NS)
         self._end_ns = capture.end_ns if end_s is None else capture.start_ns + round(end_s * NS) - 1
+        self._turn_ns = max(self._end_ns, self._start_ns + SHORTEST_PASS_NS)
         self._next: deque[Record] = deque(maxlen=1)
         self._records: Iterator[Record] = iter(())
         self._position_ns = self._start_ns
@@ -74,7 +77,7 @@ class Player:
         found: list[Record] = []
         while not self.paused and self._next and self._next[0].log_ns <= position_ns and len(found) < AT_ONCE:
             found.append(self._take())
-        if not self._next and self.loop and not self.paused and self._now_ns(now_s) >= self._end_ns:
+        if not found and not self._next and self.loop and not self.paused and self._now_ns(now_s) >= self._turn_ns:
             self._anchor(now_s, self._start_ns)
             self.passes += 1
             self._go_to(self._start_ns)
@@ -86,9 +89,7 @@ class Player:
             return 0.0
         if self.paused or self.ended:
             return None
-        if not self._next:  # the loop's end; a capture of no length is not played without a breath
-            return max((self._end_ns - self._now_ns(now_s)) / NS / self.rate, 0.01)
-        next_ns = self._next[0].log_ns
+        next_ns = self._next[0].log_ns if self._next else self._turn_ns
         return max((next_ns - self._now_ns(now_s)) / NS / self.rate, 0.0)
 
     def _one_step(self) -> list[Record]:

@@ -85,6 +85,7 @@ class Replay:
         self._changed = asyncio.Event()
         self._clock_key = CLOCK.key(capture.robot)
         self._ticks = 0
+        self._incarnation = bus.new_incarnation()
 
     def changed(self) -> None:
         """The player was worked by hand."""
@@ -99,11 +100,17 @@ class Replay:
             self._handles += [self._bus.declare_alive(alive_key(self._capture.robot, name)) for name in HARDWARE]
         ticking = None
         if self._hardware and self._clock_key not in self._player.keys:
-            ticking = asyncio.create_task(self._tick())
+            ticking = asyncio.create_task(self._tick_for_ever())
         try:
-            while not self._player.ended:
-                for record in self._player.due(loop.time()):
+            while True:
+                passes = self._player.passes
+                records = self._player.due(loop.time())
+                if ticking is not None and self._player.passes != passes:
+                    self._tick()  # the new epoch begins before what is of it
+                for record in records:
                     self._send(record)
+                if self._player.ended:
+                    return
                 await self._wait(self._player.wait_s(loop.time()))
         finally:
             if ticking is not None:
@@ -136,17 +143,19 @@ class Replay:
             publisher = self._publishers[key] = self._bus.publisher(key, known.get(told or "", fallback))
         return publisher
 
-    async def _tick(self) -> None:
-        """A real robot's capture has no clock: its stamps are of the system's, as the log times are."""
-        loop, incarnation = asyncio.get_running_loop(), self._bus.new_incarnation()
+    async def _tick_for_ever(self) -> None:
         while True:
-            clock = Clock(
-                stamp_ns=self._player.position_ns(loop.time()),
-                seq=self._ticks,
-                incarnation=incarnation + (self._player.passes << 48),
-                rate=self._player.rate,
-                paused=self._player.paused,
-            )
-            self._publisher(self._clock_key).put(msgspec.msgpack.encode(clock))
-            self._ticks += 1
+            self._tick()
             await asyncio.sleep(TICK_S)
+
+    def _tick(self) -> None:
+        """A real robot's capture has no clock: its stamps are of the system's, as the log times are."""
+        clock = Clock(
+            stamp_ns=self._player.position_ns(asyncio.get_running_loop().time()),
+            seq=self._ticks,
+            incarnation=self._incarnation + (self._player.passes << 48),
+            rate=self._player.rate,
+            paused=self._player.paused,
+        )
+        self._ticks += 1
+        self._publisher(self._clock_key).put(msgspec.msgpack.encode(clock))
