@@ -519,6 +519,8 @@ class Recording(Message):
     """That the disk took to make sure of what it was given."""
     fault: str = ""
     """Why nothing is recorded any more."""
+    ended: bool = False
+    """The recorder has been told to end, and what it wrote is whole."""
 
 
 # --- truth: the simulator's own, for tests, the judge and viewers alone ---------------------------
