@@ -73,14 +73,14 @@ class Player:
             self._anchor_s = now_s
         if self._stepping:
             return self._one_step()
+        if not self._next and self.loop and not self.paused and self._now_ns(now_s) >= self._turn_ns:
+            self._anchor(now_s, self._start_ns)
+            self.passes += 1
+            self._go_to(self._start_ns)
         position_ns = self._now_ns(now_s)
         found: list[Record] = []
         while not self.paused and self._next and self._next[0].log_ns <= position_ns and len(found) < AT_ONCE:
             found.append(self._take())
-        if not found and not self._next and self.loop and not self.paused and self._now_ns(now_s) >= self._turn_ns:
-            self._anchor(now_s, self._start_ns)
-            self.passes += 1
-            self._go_to(self._start_ns)
         return found
 
     def wait_s(self, now_s: float) -> float | None:

@@ -25,6 +25,8 @@ from cocoro.topics import RECORDING
 
 RECORDER = "capture"
 """The process whose component does it: loaded by name, since the API knows no services."""
+LAST_WORDS_S = 1.0
+"""How long the recorder's last word takes at most, after it has ended."""
 CLEAR = "\r\x1b[K"
 
 
@@ -47,6 +49,8 @@ async def record(where: Where, settings: dict[str, Any], seconds: float | None) 
             node.on(RECORDING.of(name), view.show)
             with _ends() as end:
                 await _work(component.run(node, config), end, view.failed, seconds)
+                with suppress(TimeoutError):
+                    await asyncio.wait_for(view.ended.wait(), LAST_WORDS_S)
     return view.last_words()
 
 
@@ -69,11 +73,14 @@ class _View:
 
     def __init__(self) -> None:
         self.failed = asyncio.Event()
+        self.ended = asyncio.Event()
         self._newest: Recording | None = None
 
     def show(self, recording: Recording) -> None:
         before, self._newest = self._newest, recording
-        if recording.fault:
+        if recording.ended:
+            self.ended.set()
+        elif recording.fault:
             self.failed.set()
         elif sys.stdout.isatty():
             print(f"{CLEAR}{_line(recording)}", end="", flush=True)

@@ -115,12 +115,16 @@ class Recorder:
                 self._node.degraded("not recording")
             if loop.time() - told_s >= TELL_S:
                 told_s = loop.time()
-                missing = self._ledger.missing()
-                self._node.publish(
-                    RECORDING.of(self._node.name),
-                    Recording(**progress._asdict(), dropped=dict(missing.dropped), lost=dict(missing.lost)),
-                )
+                self.say(ended=False)
             await asyncio.sleep(LOOK_S)
+
+    def say(self, ended: bool) -> None:
+        """Say once how it goes, or how it went."""
+        missing, progress = self._ledger.missing(), self._sink.progress()
+        self._node.publish(
+            RECORDING.of(self._node.name),
+            Recording(**progress._asdict(), dropped=dict(missing.dropped), lost=dict(missing.lost), ended=ended),
+        )
 
     # --- what is heard ----------------------------------------------------------------------------
 

@@ -43,6 +43,7 @@ async def run(node: Node, config: Config) -> None:
             await asyncio.to_thread(sink.close)
         else:
             sink.close()
+        recorder.say(ended=True)
 
 
 def _writer(robot: str, config: Config, ledger: Ledger, release: Callable[[int], None] | None) -> Writer:

@@ -1,0 +1,174 @@
+"""Recording and replaying over zenoh, with processes: what is left after a kill, and that nobody is impersonated."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import random
+import sys
+import tempfile
+import time
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+
+import pytest
+from capture_rig import STILL, all_of, drive, record
+
+from cocoro import topics
+from cocoro.bus.endpoints import default
+from cocoro.bus.zenoh import ZenohBus
+from cocoro.capture.compression import Packer
+from cocoro.capture.reader import Capture
+from cocoro.capture.rewrite import rewrite
+from cocoro.clock import RealClock
+from cocoro.messages import BaseState
+from cocoro.node import Node, recorder_key
+from cocoro.robot import Robot
+
+pytestmark = pytest.mark.zenoh
+
+ROBOT = "calliope"
+KILLS = 5
+"""bench/capture.py does 20 and tells the figures."""
+MISSING_S = 0.3
+PATIENCE_S = 60.0
+
+
+@pytest.fixture
+def short_path() -> Iterator[Path]:
+    """Sockets live there."""
+    with tempfile.TemporaryDirectory(prefix="cocoro") as folder:
+        yield Path(folder)
+
+
+class Pulse:
+    """A robot's base that says its state all the time; and how late this machine let it."""
+
+    def __init__(self, node: Node) -> None:
+        self.stall_s = 0.0
+        self._node = node
+
+    async def beat(self) -> None:
+        tick = 0
+        while True:
+            self._node.publish(topics.BASE_STATE, BaseState(odometry_m=(float(tick), 0.0), **STILL))
+            tick += 1
+            began_s = time.monotonic()
+            await asyncio.sleep(0.005)
+            self.stall_s = max(self.stall_s, time.monotonic() - began_s)
+
+
+@asynccontextmanager
+async def robot(run_dir: Path) -> AsyncIterator[tuple[ZenohBus, Pulse]]:
+    async with (
+        await ZenohBus.open(default(ROBOT, "test", run_dir)) as bus,
+        Node("base", bus, RealClock(), Robot.load()) as node,
+    ):
+        node.ready()
+        pulse = Pulse(node)
+        beating = asyncio.create_task(pulse.beat())
+        yield bus, pulse
+        beating.cancel()
+
+
+async def cocoro(run_dir: Path, *arguments: str) -> asyncio.subprocess.Process:
+    return await asyncio.create_subprocess_exec(
+        sys.executable, "-m", "cocoro.cli.main", *arguments,
+        env=os.environ | {"COCORO_RUN_DIR": str(run_dir)},
+        stdin=asyncio.subprocess.DEVNULL, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE,
+    )  # fmt: skip
+
+
+async def heard_by_a_recorder(bus: ZenohBus) -> None:
+    heard = asyncio.Event()
+    watch = bus.watch_alive(recorder_key(ROBOT, "*"), lambda _, alive: heard.set() if alive else None)
+    await asyncio.wait_for(heard.wait(), PATIENCE_S)
+    watch.close()
+
+
+def test_a_killed_recorder_leaves_all_but_the_last_moment(short_path: Path) -> None:
+    draw = random.Random(5)
+
+    async def scenario() -> None:
+        async with robot(short_path) as (bus, pulse):
+            for kill in range(KILLS):
+                out = short_path / str(kill)
+                recorder = await cocoro(short_path, "record", "--out", str(out))
+                await heard_by_a_recorder(bus)
+                pulse.stall_s = 0.0
+                await asyncio.sleep(0.3 + 0.5 * draw.random())
+                recorder.kill()
+                killed_ns = time.time_ns()
+                await recorder.wait()
+                (path,) = out.glob("*.mcap")
+                with Capture.open(path) as capture:
+                    assert not capture.closed
+                    states = list(capture.messages("base/state"))
+                    whole = rewrite(capture, out / "whole.mcap", Packer("zstd"))
+                sequences = [each.sequence for each in states]
+                assert sequences == list(range(sequences[0], sequences[-1] + 1))
+                # What this machine's other work took from it is not the recorder's.
+                assert (killed_ns - states[-1].log_ns) / 1e9 < MISSING_S + 2 * pulse.stall_s
+                assert [each.sequence for each in all_of(whole.path, "base/state")] == sequences
+
+    asyncio.run(scenario())
+
+
+def test_a_recording_ends_well_when_it_is_told_to(short_path: Path) -> None:
+    async def scenario() -> None:
+        async with robot(short_path) as (bus, _):
+            recorder = await cocoro(short_path, "record", "--out", str(short_path / "out"))
+            await heard_by_a_recorder(bus)
+            await asyncio.sleep(0.2)
+            recorder.terminate()
+            out, err = await asyncio.wait_for(recorder.communicate(), PATIENCE_S)
+            assert (recorder.returncode, err) == (0, b"")
+            (path,) = (short_path / "out").glob("*.mcap")
+            assert str(path) in out.decode()
+            with Capture.open(path) as capture:
+                assert capture.whole
+                assert "calliope/base/state" in capture.keys
+                assert capture.metadata["service/base"]["service"] == "base"
+
+    asyncio.run(scenario())
+
+
+def test_a_recorder_without_a_place_to_write_says_so_and_exits_with_1(short_path: Path) -> None:
+    (short_path / "file").write_text("no folder")
+
+    async def scenario() -> None:
+        async with robot(short_path):
+            recorder = await cocoro(short_path, "record", "--out", str(short_path / "file" / "captures"))
+            _, err = await asyncio.wait_for(recorder.communicate(), PATIENCE_S)
+            assert recorder.returncode == 1
+            assert "recording has stopped" in err.decode()
+            assert "Traceback" not in err.decode()
+
+    asyncio.run(scenario())
+
+
+def test_replay_refuses_a_mesh_with_a_robot_and_plays_where_there_is_none(short_path: Path) -> None:
+    path = record(short_path / "drive.mcap", drive)
+
+    async def refused() -> None:
+        async with robot(short_path):
+            replay = await cocoro(short_path, "replay", str(path), "--hardware")
+            _, err = await asyncio.wait_for(replay.communicate(), PATIENCE_S)
+            assert replay.returncode == 3
+            assert "a robot named calliope is alive (base)" in err.decode()
+
+    async def played() -> None:
+        async with await ZenohBus.open(default(ROBOT, "test", short_path)) as bus:
+            found: list[bytes] = []
+            bus.subscribe(
+                "calliope/base/state", topics.Qos.EVENT, lambda _, payload: found.append(bytes(payload)), depth=0
+            )
+            replay = await cocoro(short_path, "replay", str(path), "--rate", "4")
+            out, err = await asyncio.wait_for(replay.communicate(), PATIENCE_S)
+            assert (replay.returncode, err) == (0, b"")
+            assert "2.0 of 2.0 s" in out.decode()
+            assert found == [bytes(each.payload) for each in all_of(path, "base/state")]
+
+    asyncio.run(refused())
+    asyncio.run(played())
