@@ -108,9 +108,17 @@ class Catalogue:
         """Read the project's own catalogue, or another file. Raises ConfigError naming file, table and field."""
         where = str(path) if path else DEFAULT_FILE
         try:
-            text = path.read_text() if path else resources.files("cocoro").joinpath(DEFAULT_FILE).read_text()
+            text = path.read_text() if path else own_text()
+        except (OSError, UnicodeDecodeError) as error:
+            raise ConfigError(f"known objects {where}: {error}") from error
+        return cls.from_text(text, where)
+
+    @classmethod
+    def from_text(cls, text: str, where: str) -> Catalogue:
+        """Read what stands in a catalogue's file; `where` it is from, for messages. Raises ConfigError as `load`."""
+        try:
             rows = msgspec.convert(tomllib.loads(text), _File).object
-        except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        except tomllib.TOMLDecodeError as error:
             raise ConfigError(f"known objects {where}: {error}") from error
         except msgspec.ValidationError as error:
             raise ConfigError(f"known objects {where}: {error}; it must be a list of [[object]] tables") from error
@@ -158,6 +166,11 @@ class Catalogue:
 
     def __len__(self) -> int:
         return len(self.objects)
+
+
+def own_text() -> str:
+    """The project's own catalogue, as it is written."""
+    return resources.files("cocoro").joinpath(DEFAULT_FILE).read_text()
 
 
 def _field(error: msgspec.ValidationError) -> str:

@@ -3,6 +3,7 @@
 robot = "calliope"
 clock = "sim"                     # or "real"
 processes = ["sim", "perception", "planning", "executive"]
+objects = "objects.toml"          # known objects instead of the project's own; beside this file
 
 [mesh]                            # see cocoro.rundir.Mesh; on one machine nothing need be said
 [service.sim]                     # that process's own Config; and for each of them
@@ -54,6 +55,8 @@ class Profile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     """A robot description file instead of the Calliope's."""
     measured: str | None = None
     """A robot's own file with the values that were measured on that robot; it overrides the description."""
+    objects: str | None = None
+    """A file of known objects instead of the project's own, for every process whose Config has a field of that name."""
     mesh: Mesh = Mesh()
     service: dict[Name, dict[str, Any]] = {}
 
@@ -65,12 +68,17 @@ class Profile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
         return tuple(service for row in self.rows() for service in row.services)
 
     def launch(self, process: str) -> Launch:
-        return self._convert(process, self.service.get(process, {}), Launch)
+        return self._convert(process, self._table(process), Launch)
 
     def config(self, process: str, kind: type[C]) -> C:
         """A process's table as its Config. Raises ConfigError that names profile, table and field."""
-        table = {k: v for k, v in self.service.get(process, {}).items() if k not in Launch.__struct_fields__}
+        table = {k: v for k, v in self._table(process).items() if k not in Launch.__struct_fields__}
+        if self.objects is not None and "objects" in getattr(kind, "__struct_fields__", ()):
+            table = {"objects": self.objects} | table
         return self._convert(process, table, kind)
+
+    def _table(self, process: str) -> dict[str, Any]:
+        return self.service.get(named(process).settings or process, {})
 
     def _convert(self, process: str, table: dict[str, Any], kind: type[C]) -> C:
         try:
@@ -102,7 +110,10 @@ def read(which: str, overrides: Iterable[str] = ()) -> Profile:
     profile = from_data(data, which)
     home = source.parent if isinstance(source, Path) else None
     return msgspec.structs.replace(
-        profile, description=_absolute(profile.description, home), measured=_absolute(profile.measured, home)
+        profile,
+        description=_absolute(profile.description, home),
+        measured=_absolute(profile.measured, home),
+        objects=_absolute(profile.objects, home),
     )
 
 

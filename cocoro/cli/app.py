@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from cocoro.cli import capture_app, tools_app
+from cocoro.cli import capture_app, objects_app, tools_app
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -153,13 +153,7 @@ def status(robot: Robot = None, profile: Reach = None, json: Json = False) -> No
     sys.exit(asyncio.run(telling.status(Where(robot, profile), json)))
 
 
-@app.command(rich_help_panel=WATCH)
-def objects(robot: Robot = None, profile: Reach = None, json: Json = False) -> None:
-    """The objects that the robot knows, and where it saw each last."""
-    from cocoro.cli import objects as listing
-    from cocoro.cli.link import Where
-
-    sys.exit(asyncio.run(listing.objects(Where(robot, profile), json)))
+objects_app.add_to(app, WATCH)
 
 
 @app.command(rich_help_panel=WATCH)

@@ -8,26 +8,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cocoro.objects import Catalogue, KnownObject
+from cocoro.colour import Pixels, lab_of, matches
+from cocoro.objects import Catalogue
 
-Pixels = NDArray[np.uint8]
+__all__ = ["Classes", "ColourTable", "Pixels", "lab_of", "matches"]
+
 Classes = NDArray[Any]
 """An unsigned integer a pixel; bit i stands for the catalogue's i-th object."""
-
-
-def lab_of(colour: Pixels) -> NDArray[np.float32]:
-    """8-bit sRGB (..., 3) to true CIELAB, D65: L 0 to 100, a and b about -128 to 127."""
-    flat = np.ascontiguousarray(colour).reshape(1, -1, 3).astype(np.float32) / np.float32(255)
-    return np.asarray(cv2.cvtColor(flat, cv2.COLOR_RGB2Lab), dtype=np.float32).reshape(colour.shape)
-
-
-def matches(known: KnownObject, lab: NDArray[np.float32], *, by_shape: bool = False) -> NDArray[np.bool_]:
-    """Whether each colour (..., 3) lies in one of the object's boxes; with `by_shape` in one that it shares, too."""
-    found = np.zeros(lab.shape[:-1], dtype=np.bool_)
-    for box in known.lab + known.lab_by_shape if by_shape else known.lab:
-        low, high = np.array(box.low, dtype=np.float32), np.array(box.high, dtype=np.float32)
-        found |= np.all((lab >= low) & (lab <= high), axis=-1)
-    return found
 
 
 class ColourTable:

@@ -1,0 +1,267 @@
+"""Which pixels of a picture are the new object: grown from a pixel that is pointed at, or the one blob that stands out.
+
+Colours are compared by their chromaticity 100 (a, b) / (L + 16): with less light on a surface its L + 16, a and b all
+shrink alike, so this stays what it is from the lit side into the shade (CIE 1976; derived).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cocoro.colour import Bools, Lab, Pixels, lab_of
+from cocoro.errors import ConfigError
+
+Chroma = NDArray[np.float32]
+Mask = NDArray[np.uint8]
+Box = tuple[int, int, int, int]
+"""left, top, right, bottom in pixels; right and bottom exclusive."""
+
+MIN_AREA_PX = 150.0
+"""Of 640 x 480. A can at 3.5 m has 220; with less neither colour nor size can be told."""
+MAX_SHARE = 0.4
+"""Of the picture: more is no object but a background."""
+DARKEST_L = 8.0
+"""Below it a colour is nearly all noise."""
+GREY = 6.0
+"""A chromaticity below this is nearly grey: then lightness counts too."""
+GREY_LIGHTNESS = 9.0
+TOLERANCE = (5.0, 14.0)
+"""Least and greatest difference in chromaticity within one object, for a well-lit pixel."""
+TOLERANCE_SHARE = 0.33
+"""Of the difference between the object and what is around it."""
+SEED_PX = 3
+"""Around a pixel that is pointed at, of 640 x 480."""
+MIDDLE = 0.7
+"""Without anybody pointing, the object is looked for in this share of the picture's width and height, but for what
+stands out much more beyond it."""
+CUT_PENALTY = 0.7
+STANDS_OUT = 10.0
+"""Least difference in chromaticity (or a third of it in lightness) from what is frequent along the picture's rim."""
+KNOWN_PENALTY = 0.9
+"""What is known already is hardly meant, but may be all that there is."""
+CELL = 4.0
+"""Width of a cell of chromaticities when colours are counted."""
+
+
+@dataclass(frozen=True)
+class Region:
+    """The object's pixels in one picture."""
+
+    mask: Mask
+    """(height, width), 1 inside; holes are filled, since a label on a can is a part of the can."""
+    coloured: Bools
+    """(height, width): those that have the object's colour, well inside of it."""
+    box: Box
+    area_px: int
+    cut: bool
+    """It touches the picture's edge, so there may be more of it."""
+
+
+class Picture:
+    """A picture, made ready for looking for a thing in it."""
+
+    def __init__(self, colour: Pixels) -> None:
+        """`colour`: RGB, (height, width, 3)."""
+        self.height, self.width = colour.shape[:2]
+        self.scale = float(np.sqrt(self.width * self.height / (640 * 480)))
+        kernel = 5 if self.scale > 0.75 else 3
+        self.lab: Lab = lab_of(np.asarray(cv2.medianBlur(np.ascontiguousarray(colour), kernel), dtype=np.uint8))
+        light = self.lab[..., :1] + np.float32(16)
+        self.chroma: Chroma = np.float32(100) * self.lab[..., 1:] / light
+        self.doubt = np.maximum(np.float32(66) / light[..., 0], np.float32(1))
+        """How much more noise there is in a pixel's chromaticity than in one of a middling lightness."""
+        self.lit: Bools = self.lab[..., 0] >= DARKEST_L
+
+
+def at_pixel(picture: Picture, u_px: int, v_px: int) -> Region:
+    """The object that the pixel (u right, v down) is of. Raises ConfigError when there is none to be told there."""
+    if not (0 <= u_px < picture.width and 0 <= v_px < picture.height):
+        raise ConfigError(f"--at {u_px},{v_px} is outside of the picture, which has {picture.width} x {picture.height}")
+    reach = max(round(SEED_PX * picture.scale), 1)
+    rows = slice(max(v_px - reach, 0), v_px + reach + 1)
+    columns = slice(max(u_px - reach, 0), u_px + reach + 1)
+    seed = np.zeros((picture.height, picture.width), dtype=np.bool_)
+    seed[rows, columns] = picture.lit[rows, columns]
+    if not seed.any():
+        raise ConfigError(f"--at {u_px},{v_px}: it is too dark there to tell a colour")
+    return _checked(picture, _grown(picture, seed), f"around {u_px},{v_px}")
+
+
+def in_box(picture: Picture, box: Box) -> Region:
+    """The object that fills most of a box: of what is in it and is not around it, the most frequent colour.
+
+    Raises ConfigError when nothing in it stands out.
+    """
+    left, top, right, bottom = box
+    if not (0 <= left < right <= picture.width and 0 <= top < bottom <= picture.height):
+        raise ConfigError(
+            f"--box {left},{top},{right},{bottom} is no box within {picture.width} x {picture.height} pixels"
+        )
+    inside = np.zeros((picture.height, picture.width), dtype=np.bool_)
+    inside[top:bottom, left:right] = True
+    across, down = max((right - left) // 3, 4), max((bottom - top) // 3, 4)
+    around = np.zeros_like(inside)
+    around[max(top - down, 0) : bottom + down, max(left - across, 0) : right + across] = True
+    around &= ~inside
+    own, others = _counted(picture, inside & picture.lit), _counted(picture, around & picture.lit)
+    excess = own - others
+    if not own.any() or excess.max() <= 0:
+        raise ConfigError("--box: nothing in it has a colour of its own; point at the object with --at U,V")
+    seed = inside & _of_cell(picture, int(np.argmax(excess)))
+    return _checked(picture, _grown(picture, seed & picture.lit, inside), "in the box")
+
+
+def most_salient(picture: Picture, known: Bools | None = None) -> Region:
+    """The uniform blob that stands out most, near the picture's middle and, if possible, no known object (`known`,
+    (height, width), is where their colours are). Raises ConfigError when nothing stands out."""
+    rim = np.ones((picture.height, picture.width), dtype=np.bool_)
+    edge = max(picture.width // 16, 2), max(picture.height // 16, 2)
+    rim[edge[1] : -edge[1], edge[0] : -edge[0]] = False
+    difference = _difference_from(picture, rim & picture.lit)
+    candidates = np.asarray((difference > STANDS_OUT * picture.doubt) & picture.lit)
+    best: tuple[float, Bools] | None = None
+    for blob, middle in _blobs(candidates, picture):
+        region = _grown(picture, blob)
+        if region is None or region.area_px > MAX_SHARE * rim.size:
+            continue
+        off = np.hypot((middle[0] / picture.width - 0.5) / MIDDLE, (middle[1] / picture.height - 0.5) / MIDDLE) * 2
+        spread = float(picture.chroma[region.coloured].std(axis=0).max())
+        strength = float(np.median(difference[region.coloured]))
+        score = np.sqrt(region.area_px) * strength * np.exp(-(off**2)) / (3.0 + spread)
+        if region.cut:
+            score *= 1.0 - CUT_PENALTY
+        if known is not None:
+            score *= 1.0 - KNOWN_PENALTY * float(known[region.coloured].mean())
+        if best is None or score > best[0]:
+            best = float(score), blob
+    if best is None:
+        raise ConfigError("nothing in the picture stands out; point at the object with --at U,V or --box L,T,R,B")
+    return _checked(picture, _grown(picture, best[1]), "in the middle")
+
+
+# --- growing --------------------------------------------------------------------------------------
+
+
+def _grown(picture: Picture, seed: Bools, within: Bools | None = None) -> Region | None:
+    """All connected pixels that have the seed's colour; None when hardly any are left."""
+    centre = np.median(picture.chroma[seed], axis=0)
+    lightness = float(np.median(picture.lab[..., 0][seed]))
+    distance = np.linalg.norm(picture.chroma - centre, axis=-1) / picture.doubt
+    grey = float(np.linalg.norm(centre)) < GREY
+    lightness_like = np.abs(picture.lab[..., 0] - lightness) < GREY_LIGHTNESS
+
+    def part(tolerance: float) -> tuple[Bools, Mask | None]:
+        like = (distance < tolerance) & picture.lit
+        if grey:
+            like &= lightness_like
+        if within is not None:
+            like &= within
+        return like, _connected(like, seed)
+
+    like, mask = part(TOLERANCE[0])
+    if mask is None:
+        return None
+    around = _ring(mask, picture) & picture.lit
+    if around.any():  # with what is around known, what is between can be told
+        between = float(np.median(distance[around]))
+        like, mask = part(float(np.clip(TOLERANCE_SHARE * between, *TOLERANCE)))
+        if mask is None:
+            return None
+    left, top, width, height = cv2.boundingRect(mask)
+    inner = np.asarray(cv2.erode(mask, np.ones((5, 5), dtype=np.uint8)), dtype=np.bool_) & like
+    coloured = inner if np.count_nonzero(inner) >= 30 else np.asarray((mask > 0) & like)
+    return Region(
+        mask=mask,
+        coloured=coloured,
+        box=(left, top, left + width, top + height),
+        area_px=int(np.count_nonzero(mask)),
+        cut=left <= 1 or top <= 1 or left + width >= picture.width - 1 or top + height >= picture.height - 1,
+    )
+
+
+def _connected(like: Bools, seed: Bools) -> Mask | None:
+    """The connected part that has most of the seed, its holes filled."""
+    opened = cv2.morphologyEx(like.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), dtype=np.uint8))
+    count, labels = cv2.connectedComponents(np.asarray(opened, dtype=np.uint8), connectivity=4, ltype=cv2.CV_32S)
+    own = np.bincount(np.asarray(labels)[seed], minlength=count)
+    own[0] = 0
+    if own.max() == 0:
+        return None
+    part = (np.asarray(labels) == int(np.argmax(own))).astype(np.uint8)
+    outlines, _ = cv2.findContours(part, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    return np.asarray(cv2.drawContours(np.zeros_like(part), outlines, -1, 1, cv2.FILLED), dtype=np.uint8)
+
+
+def _ring(mask: Mask, picture: Picture) -> Bools:
+    """Just outside of a region, beyond the pixels that are blended with it."""
+    near, far = (2 * round(reach * picture.scale) + 1 for reach in (3, 9))
+    outer = cv2.dilate(mask, np.ones((far, far), dtype=np.uint8))
+    inner = cv2.dilate(mask, np.ones((near, near), dtype=np.uint8))
+    return np.asarray((outer > 0) & (inner == 0), dtype=np.bool_)
+
+
+def _checked(picture: Picture, region: Region | None, where: str) -> Region:
+    least = MIN_AREA_PX * picture.scale**2
+    if region is None or region.area_px < least:
+        size = 0 if region is None else region.area_px
+        raise ConfigError(
+            f"the thing {where} has {size} pixels of one colour, at least {least:.0f} are needed: bring it nearer, "
+            "into better light, or point at another place of it"
+        )
+    if region.area_px > MAX_SHARE * picture.width * picture.height:
+        raise ConfigError(f"the thing {where} fills {region.area_px} pixels: that is a background, point at the object")
+    return region
+
+
+# --- colours that are frequent, and colours that stand out ----------------------------------------
+
+_CELLS = 64
+
+
+def _cells(picture: Picture) -> NDArray[np.int64]:
+    """Each pixel's cell of chromaticities."""
+    cell = np.clip(np.rint(picture.chroma / CELL).astype(np.int64) + _CELLS // 2, 0, _CELLS - 1)
+    return np.asarray(cell[..., 0] * _CELLS + cell[..., 1])
+
+
+def _counted(picture: Picture, where: Bools) -> NDArray[np.float64]:
+    """The share that each cell has of these pixels, its neighbours counted in."""
+    counts = np.bincount(_cells(picture)[where], minlength=_CELLS**2).reshape(_CELLS, _CELLS).astype(np.float32)
+    smooth = np.asarray(cv2.blur(counts, (3, 3)), dtype=np.float64)
+    return np.asarray(smooth.reshape(-1) / max(int(np.count_nonzero(where)), 1))
+
+
+def _of_cell(picture: Picture, cell: int) -> Bools:
+    """Pixels of a cell or next to it."""
+    cells = _cells(picture)
+    row, column = divmod(cell, _CELLS)
+    return (np.abs(cells // _CELLS - row) <= 1) & (np.abs(cells % _CELLS - column) <= 1)
+
+
+def _difference_from(picture: Picture, rim: Bools) -> NDArray[np.float32]:
+    """How far each pixel's colour is from the nearest of those that are frequent along the picture's rim."""
+    colours = np.concatenate([picture.chroma, picture.lab[..., :1] / 3], axis=-1)
+    samples = np.ascontiguousarray(colours[rim][:: max(np.count_nonzero(rim) // 4000, 1)])
+    if len(samples) < 8:
+        return np.full(rim.shape, np.float32(99))
+    cv2.setRNGSeed(1)  # the clusters' first guesses: the same picture gives the same object
+    criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 20, 0.5)
+    _, _, centres = cv2.kmeans(samples, 6, np.empty(0, dtype=np.int32), criteria, 2, cv2.KMEANS_PP_CENTERS)
+    distances = [np.linalg.norm(colours - centre, axis=-1) for centre in np.asarray(centres)]
+    return np.asarray(np.min(distances, axis=0), dtype=np.float32)
+
+
+def _blobs(candidates: Bools, picture: Picture) -> list[tuple[Bools, tuple[float, float]]]:
+    """The largest connected blobs, and their middles: seeds for growing."""
+    opened = cv2.morphologyEx(candidates.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), dtype=np.uint8))
+    _, labels, stats, middles = cv2.connectedComponentsWithStats(np.asarray(opened, dtype=np.uint8), connectivity=4)
+    found = []
+    for i in 1 + np.argsort(-stats[1:, cv2.CC_STAT_AREA], kind="stable")[:12]:
+        u, v = (float(value) for value in middles[i])
+        if stats[i, cv2.CC_STAT_AREA] >= MIN_AREA_PX * picture.scale**2 / 2:
+            found.append((np.asarray(labels == i), (u, v)))
+    return found

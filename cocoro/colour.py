@@ -1,0 +1,35 @@
+"""Colours as the catalogue of known objects counts them: true CIELAB, and boxes in it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cocoro.objects import KnownObject, LabBox
+
+Pixels = NDArray[np.uint8]
+Lab = NDArray[np.float32]
+Bools = NDArray[np.bool_]
+
+
+def lab_of(colour: Pixels) -> Lab:
+    """8-bit sRGB (..., 3) to true CIELAB, D65: L 0 to 100, a and b about -128 to 127."""
+    flat = np.ascontiguousarray(colour).reshape(1, -1, 3).astype(np.float32) / np.float32(255)
+    return np.asarray(cv2.cvtColor(flat, cv2.COLOR_RGB2Lab), dtype=np.float32).reshape(colour.shape)
+
+
+def in_boxes(boxes: Iterable[LabBox], lab: Lab) -> Bools:
+    """Whether each colour (..., 3) lies in any of the boxes."""
+    found = np.zeros(lab.shape[:-1], dtype=np.bool_)
+    for box in boxes:
+        low, high = np.array(box.low, dtype=np.float32), np.array(box.high, dtype=np.float32)
+        found |= np.all((lab >= low) & (lab <= high), axis=-1)
+    return found
+
+
+def matches(known: KnownObject, lab: Lab, *, by_shape: bool = False) -> Bools:
+    """Whether each colour (..., 3) is the object's; with `by_shape` also when it is one that it shares."""
+    return in_boxes(known.lab + known.lab_by_shape if by_shape else known.lab, lab)
