@@ -42,6 +42,8 @@ class Process:
     services: tuple[str, ...]
     """It is ready when all of these have declared their liveliness."""
     doc: str
+    settings: str = ""
+    """Whose `[service.NAME]` table it reads; its own where nothing is said."""
     restart: Restart = "on-failure"
     backoff_s: float = 0.5
     """Before the first restart; doubled for each further one, up to `BACKOFF_LIMIT_S`."""
