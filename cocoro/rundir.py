@@ -96,13 +96,16 @@ def holder(path: Path) -> Holder | None:
     except FileNotFoundError:
         return None
     try:
-        if _locked(fd, fcntl.LOCK_SH):
-            return None
-        try:
-            about = json.loads(os.read(fd, 4096))
-        except ValueError:  # it was taken this very moment
-            return Holder("", 0)
-        return Holder(about["name"], about["pid"])
+        deadline_s = time.monotonic() + LOOK_S
+        while not _locked(fd, fcntl.LOCK_SH):
+            try:
+                about = json.loads(os.pread(fd, 4096, 0))
+                return Holder(about["name"], about["pid"])
+            except ValueError:  # it was taken this very moment
+                if time.monotonic() > deadline_s:
+                    return Holder("", 0)
+                time.sleep(0.001)
+        return None
     finally:
         os.close(fd)
 
@@ -162,8 +165,9 @@ class RunDir:
                 by = holder(self.path / "claims" / service)
                 for other in held:
                     other.release()
+                article = "an" if service[0] in "aeiou" else "a"
                 raise RefusedError(
-                    f"{self.robot} has a {service} already{f' ({by.name}, pid {by.pid})' if by else ''}: "
+                    f"{self.robot} has {article} {service} already{f' ({by.name}, pid {by.pid})' if by else ''}: "
                     f"stop that one first"
                 )
             held.append(claim)
