@@ -39,5 +39,7 @@ class RehearsalRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
     """Of the task, simulated seconds; None is the executive's own limit."""
     picture: str | None = None
     """Where to write what the robot saw at the grasp (PNG)."""
+    objects: str | None = None
+    """A file of known objects instead of the project's own."""
     record: str | None = None
     """Where to record everything (MCAP), the steps of perception and planning too."""

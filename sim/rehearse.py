@@ -123,7 +123,10 @@ class _Rehearsal:
             for name in (*((RECORDER,) if request.record else ()), *PROCESSES):
                 row = named(name)
                 component = load(row)
-                config = msgspec.convert(self._settings(name), component.config)
+                settings = self._settings(name)
+                if request.objects is not None and "objects" in component.config.__struct_fields__:
+                    settings["objects"] = request.objects
+                config = msgspec.convert(settings, component.config)
                 lockstep = request.lockstep and name in LockstepCycle.ORDER
                 kind = LockstepNode if lockstep else Node
                 node = kind(
@@ -224,7 +227,8 @@ class _Rehearsal:
 
     def _take_picture(self) -> None:
         if self._frame is not None and self._request.picture is not None:
-            save_png(draw(self._frame, self._seen, Catalogue.load()), Path(self._request.picture))
+            catalogue = Catalogue.load(Path(self._request.objects) if self._request.objects else None)
+            save_png(draw(self._frame, self._seen, catalogue), Path(self._request.picture))
 
     def _result(self, state: TaskState) -> dict[str, Any]:
         request = self._request

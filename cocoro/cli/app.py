@@ -42,6 +42,10 @@ Timeout = Annotated[float | None, typer.Option(min=0.1, max=3600.0, metavar="SEC
 
 Body = Annotated[str, typer.Option(metavar="nominal|worn", help="A body as drawn, or one that differs from it.")]
 
+Objects = Annotated[
+    Path | None,
+    typer.Option(metavar="FILE", help="Known objects instead of the project's own: see `cocoro objects learn`."),
+]
 For = Annotated[
     float | None, typer.Option("--for", min=0.1, max=3600.0, metavar="SECONDS", help="Follow for so long, then stop.")
 ]
@@ -123,6 +127,7 @@ def rehearse(
     latency: Latency = None,
     lockstep: Annotated[bool, typer.Option("--lockstep", help="One serial cycle over all, as in the paper.")] = False,
     frames: Frames = None,
+    objects: Objects = None,
     timeout: Timeout = None,
     picture: Annotated[
         Path | None, typer.Option(metavar="OUT.png", help="Write what the robot saw when it grasped.")
@@ -136,7 +141,7 @@ def rehearse(
     options = {
         "task": task, "label": label, "bring": bring, "for_s": for_, "scene": scene, "seed": seed, "sensors": sensors,
         "body": body, "lockstep": lockstep, "timeout_s": timeout, "picture": None if picture is None else str(picture),
-        "record": None if record is None else str(record),
+        "record": None if record is None else str(record), "objects": None if objects is None else str(objects),
     }  # fmt: skip
     sys.exit(rehearsing.rehearse(options, latency or [], frames, json))
 
@@ -203,6 +208,7 @@ def up(
     ] = None,
     frames: Frames = None,
     latency: Latency = None,
+    objects: Objects = None,
     set_: Set = None,
 ) -> None:
     """Start a robot's processes and stay until Ctrl-C (or, with --detach, until they are ready)."""

@@ -140,7 +140,30 @@ def preview(sight: Sight, learnt: Learnt, catalogue: Path) -> tuple[Pixels, list
     cv2.drawContours(image, outline_of(learnt.region), -1, OUTLINE, 1)
     seen = _perceived(sight, catalogue)
     tinted = msgspec.structs.replace(sight.frame, colour=np.ascontiguousarray(image).reshape(-1).data)
-    return draw(tinted, seen, Catalogue.load(catalogue)), [describe(one) for one in seen.detections]
+    drawn = draw(tinted, seen, Catalogue.load(catalogue))
+    _put_close_up(drawn, sight.look.colour, learnt)
+    return drawn, [describe(one) for one in seen.detections]
+
+
+def _put_close_up(image: Pixels, colour: Pixels, learnt: Learnt) -> None:
+    """The object as it is, with its outline, large, in the corner of the picture that is furthest from it."""
+    left, top, right, bottom = learnt.region.box
+    height, width = image.shape[:2]
+    spare = max(right - left, bottom - top) // 3 + 3
+    crop = slice(max(top - spare, 0), bottom + spare), slice(max(left - spare, 0), right + spare)
+    rows, columns = colour[crop].shape[:2]
+    factor = min(0.4 * height / rows, 0.4 * width / columns, 12.0)
+    if factor < 1.5:  # it is large as it stands
+        return
+    size = round(columns * factor), round(rows * factor)
+    large = np.asarray(cv2.resize(colour[crop], size, interpolation=cv2.INTER_NEAREST), dtype=np.uint8)
+    mask = cv2.resize(learnt.region.mask[crop], size, interpolation=cv2.INTER_NEAREST)
+    outlines, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    cv2.drawContours(large, outlines, -1, OUTLINE, 1)
+    x = 0 if (left + right) > width else width - size[0]
+    y = 0 if (top + bottom) > height else height - size[1]
+    image[y : y + size[1], x : x + size[0]] = large
+    cv2.rectangle(image, (x, y), (x + size[0] - 1, y + size[1] - 1), OUTLINE, 1)
 
 
 def _perceived(sight: Sight, catalogue: Path) -> Detections:

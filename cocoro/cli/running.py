@@ -53,6 +53,14 @@ def overrides(
     return found + settings
 
 
+def objects_of(file: Path) -> str:
+    """A file of known objects as a setting of the profile; read once here, so that a mistake in it is said at once."""
+    from cocoro.objects import Catalogue
+
+    Catalogue.load(file)
+    return f"objects={json.dumps(str(file.resolve()))}"
+
+
 def scene_of(scene: str) -> str:
     """A scene's name as it is; a file's name so that it means the same file from anywhere."""
     if not scene.endswith(".toml") and os.sep not in scene:
