@@ -202,8 +202,9 @@ class Obstacles(Message):
 # --- planning -------------------------------------------------------------------------------------
 
 Behaviour = Literal[
-    "idle", "park", "search", "explore", "approach", "reach", "grasp", "lift", "carry", "place", "follow"
-]
+    "idle", "park", "search", "explore", "approach", "reach", "grasp", "lift", "carry", "place", "follow",
+    "babble-arm", "babble-wheels",
+]  # fmt: skip
 
 
 class Intent(Message):
@@ -217,6 +218,10 @@ class Intent(Message):
     label: str = ""
     place_m: Vec2 | None = None
     """For 'carry': where to put down, in the odometry frame."""
+    first: Count = 0
+    """For babbling: the number of its first draw."""
+    count: Count = 0
+    """For babbling: how many samples or trials make an end of it."""
 
 
 class TargetEstimate(msgspec.Struct, kw_only=True):
@@ -258,11 +263,60 @@ class PlannerStatus(Message):
     """Where the body stands in the odometry frame."""
     known: tuple[TargetEstimate, ...] = ()
     """Every object in memory."""
+    model: str = ""
+    """With what it reaches: the rigid body and why, or what was learned and how good that is."""
+
+
+class LearnedModel(Message):
+    """What the robot has learned of its body, as `cocoro.learning.model` writes it: the planner's own, from now on."""
+
+    content: bytes
+
+
+class ModelRequest(msgspec.Struct, kw_only=True):
+    """Take a model over, in place of the one that is used."""
+
+    content: bytes
+    """As `cocoro.learning.model` writes it."""
+
+
+class ModelReply(msgspec.Struct, kw_only=True):
+    accepted: bool
+    text: str = ""
+    """What is used from now on; or why not, and what goes on being used."""
+
+
+class HandSample(Message):
+    """What the arm's babbling saw: joint angles and the hand's marker, both at the frame's stamp, which is this
+    message's."""
+
+    draw: Count
+    """The number of the draw that the arm was on its way to."""
+    angles_rad: dict[str, Finite]
+    """Of every joint, neck and hand included."""
+    seen_m: Vec3
+    """The marker's centre, body frame."""
+    area_px: Count
+
+
+class WheelTrial(Message):
+    """What one trial of the wheels' babbling saw: a standing target before and after the wheels turned."""
+
+    trial: Count
+    left_mps: Finite
+    right_mps: Finite
+    """As commanded."""
+    way_m: Finite
+    turned_rad: Finite
+    """What the base's odometry says of the way of the body's origin along its arc, and of the turn."""
+    before_m: Vec2
+    after_m: Vec2
+    """The target over the floor, body frame, each the mean of several frames while the robot stood."""
 
 
 # --- executive ------------------------------------------------------------------------------------
 
-TaskName = Literal["fetch", "follow", "park", "put-down"]
+TaskName = Literal["fetch", "follow", "park", "put-down", "babble-arm", "babble-wheels"]
 Outcome = Literal["done", "failed", "cancelled"]
 
 
@@ -298,6 +352,10 @@ class TaskRequest(msgspec.Struct, kw_only=True):
     """Fetch: carry it to where the task began and put it down there."""
     for_s: Annotated[float, Meta(gt=0, le=3600)] | None = None
     """Follow: for so long; None is until cancelled."""
+    first: Count = 0
+    """Babbling: the number of its first draw, to go on where an earlier one ended."""
+    count: Annotated[int, Meta(ge=1, le=1_000_000)] = 1000
+    """Babbling: how many samples or trials make an end of it."""
 
 
 RefusalCode = Literal[

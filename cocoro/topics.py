@@ -119,6 +119,18 @@ PLAN = Topic(
     "planning/status", m.PlannerStatus, Qos.STATE, "planning", 50.0, 0.5,
     "What the planner does and why. Beyond its age the running task fails: planner silent.",
 )  # fmt: skip
+HAND_SAMPLES = Topic(
+    "planning/hand-samples", m.HandSample, Qos.EVENT, "planning", None, 1.0,
+    "What the arm's babbling saw: joint angles and the hand's marker at one time.",
+)  # fmt: skip
+WHEEL_TRIALS = Topic(
+    "planning/wheel-trials", m.WheelTrial, Qos.EVENT, "planning", None, 1.0,
+    "What each trial of the wheels' babbling saw.",
+)  # fmt: skip
+MODEL = Topic(
+    "planning/model", m.LearnedModel, Qos.EVENT, "planning", None, 1.0,
+    "The learned model that the planner has taken over.", max_bytes=8 * 1024 * 1024,
+)  # fmt: skip
 INTENT = Topic(
     "executive/intent", m.Intent, Qos.COMMAND, "executive", 50.0, 0.3,
     "The behaviour that is wanted. The wheels stand when it is 0.12 s old; beyond its age the planner goes idle.",
@@ -159,8 +171,8 @@ RECORDING = Topic(
 
 TOPICS: tuple[Topic[Any], ...] = (
     FRAME, BASE_STATE, BASE_COMMAND, ARM_STATE, ARM_COMMAND, HAND_STATE, HAND_COMMAND,
-    DETECTIONS, OBSTACLES, PLAN, INTENT, TASK, LATCH, CLOCK, TRUTH, HEALTH, STEPS,
-    EXCHANGES, RECORDING,
+    DETECTIONS, OBSTACLES, PLAN, HAND_SAMPLES, WHEEL_TRIALS, MODEL, INTENT, TASK, LATCH, CLOCK, TRUTH,
+    HEALTH, STEPS, EXCHANGES, RECORDING,
 )  # fmt: skip
 
 RUN = Request(
@@ -181,6 +193,10 @@ ESTOP = Request(
     timeout_s=1.0,
 )  # fmt: skip
 
+LEARNED = Request(
+    "planning/learned", m.ModelRequest, m.ModelReply, "planning",
+    "Take over a learned model; refused, with the reason, when it is damaged, foreign or of another version.",
+)  # fmt: skip
 RECOVER = Request(
     "base/recover", m.RecoverRequest, m.RecoverReply, "base",
     "Put a Create that left its mode back into it; answered by the real base.",
@@ -196,7 +212,7 @@ ABOUT = Request(
     "What a service is and what it was started with: answered by every service.",
 )  # fmt: skip
 
-REQUESTS: tuple[Request[Any, Any], ...] = (RUN, CANCEL, OBJECTS, ESTOP, RECOVER, SERVOS, ABOUT)
+REQUESTS: tuple[Request[Any, Any], ...] = (RUN, CANCEL, OBJECTS, ESTOP, LEARNED, RECOVER, SERVOS, ABOUT)
 
 HARDWARE = ("kinect", "base", "arm", "hand")
 """The services whose keys the simulator impersonates."""
