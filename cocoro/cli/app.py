@@ -216,6 +216,8 @@ def up(
     from cocoro.cli import running
 
     overrides = running.overrides(scene, seed, sensors, body, frames, latency or [], set_ or [])
+    if objects is not None:
+        overrides.insert(0, running.objects_of(objects))
     read = profiles.read(profile, overrides)
     sys.exit(running.up_detached(read) if detach else running.up(read))
 
