@@ -92,7 +92,8 @@ async def _main(process: str, run_dir: RunDir, data: dict[str, Any], profile_nam
     row = processes.named(process)
     claims = run_dir.claim(process, row.services)
     try:
-        os.nice(row.nice)
+        with suppress(PermissionError):  # to be preferred is a privilege
+            os.nice(row.nice)
         component = processes.load(row)
         config = profile.config(process, component.config)
         launch = profile.launch(process)

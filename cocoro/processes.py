@@ -52,7 +52,8 @@ class Process:
     stop_s: float = 5.0
     """From SIGTERM to SIGKILL."""
     nice: int = 0
-    """Steps by which it yields the processor to others: what may be late must not make commands late."""
+    """Steps by which it yields the processor to others: what may be late must not make commands late. Below 0 the
+    others yield to it, where that is allowed (LimitNICE in the unit file)."""
     cpu_share: float = 0.25
     """Budget, of one core, on the machine that the project is measured on."""
     rss_mb: float = 150.0
@@ -77,12 +78,12 @@ PROCESSES: tuple[Process, ...] = (
     Process(
         name="base", module="services.base.service", services=("base",),
         doc="The Create: wheels, bumpers, cliffs, battery. Small, because a Create keeps driving when its driver dies.",
-        restart="always", backoff_s=0.1, cpu_share=0.15,
+        restart="always", backoff_s=0.1, nice=-10, cpu_share=0.15,
     ),
     Process(
         name="servos", module="services.servos.service", services=("arm", "hand"),
         doc="Both Dynamixel networks: neck and arm, hand.",
-        restart="always", backoff_s=0.1, cpu_share=0.25,
+        restart="always", backoff_s=0.1, nice=-10, cpu_share=0.25,
     ),
     Process(
         name="perception", module="services.perception.service", services=("perception",),
@@ -103,6 +104,11 @@ PROCESSES: tuple[Process, ...] = (
         name="capture", module="services.capture.service", services=("capture",),
         doc="Records the mesh into MCAP files.",
         nice=10, cpu_share=0.3, rss_mb=300.0,
+    ),
+    Process(
+        name="wire", module="sim.wire.service", services=("kinect",), settings="sim",
+        doc="The simulated robot behind wires: the camera, and ports with base and servos at their other ends.",
+        start_s=60.0, cpu_share=1.0, rss_mb=600.0,
     ),
 )  # fmt: skip
 

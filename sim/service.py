@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import AsyncExitStack
 from heapq import heappop, heappush
 from typing import Annotated, Any, Literal
@@ -21,9 +21,10 @@ from cocoro.node import Node, Publisher
 from cocoro.robot import Robot
 from sim.camera import Kinect
 from sim.random_scene import find_scene
+from sim.realism import BodyRealism
 from sim.render import make_renderer
 from sim.wear import BodyKind, body_of
-from sim.world import World
+from sim.world import Motors, World, services_motors
 
 __all__ = ["Config", "run"]
 
@@ -109,12 +110,20 @@ class Simulator:
         self._frame_latency_ns = round(FRAME_LATENCY_S * NS) if real else 0
         self._ticks = node.publisher(topics.CLOCK)
         self._truth = node.publisher(topics.TRUTH)
+        self._states: tuple[tuple[Publisher[Any], Callable[[], Message]], ...] = ()
         self.rate = 1.0
+        if isinstance(self._clock, FollowedClock):
+            self._clock.driven = True
+
+    def connect_camera(self, kinect: Node) -> None:
+        """Stand in for the camera alone."""
+        self._frames = kinect.publisher(topics.FRAME)
 
     def connect(self, kinect: Node, base: Node, arm: Node, hand: Node) -> None:
+        """Stand in for all of the robot's hardware."""
         world = self._world
-        self._frames = kinect.publisher(topics.FRAME)
-        self._states: tuple[tuple[Publisher[Any], Callable[[], Message]], ...] = (
+        self.connect_camera(kinect)
+        self._states = (
             (base.publisher(topics.BASE_STATE), self._base_state),
             (arm.publisher(topics.ARM_STATE), lambda: world.servo_state("arm")),
             (hand.publisher(topics.HAND_STATE), lambda: world.servo_state("hand")),
@@ -164,33 +173,45 @@ class Simulator:
 
 async def run(node: Node, config: Config) -> None:
     """Simulate for ever: in real time, or as the loop's virtual time goes."""
-    scene = find_scene(config.scene, config.seed, config.target)
-    robot = node.robot
-    with World(
-        _with_timeout(robot, config.command_timeout_s),
-        scene,
-        seed=config.seed,
-        sensors=config.sensors,
-        physics_hz=config.physics_hz,
-        wear=body_of(robot, config.body, config.seed, config.bend_at_s),
-    ) as world:
-        camera = robot.camera.scaled(config.width, config.height)
-        renderer = make_renderer(world.visuals, camera, config.renderer)
-        kinect = Kinect(
-            robot, renderer, sensors=config.sensors, seed=config.seed, width=config.width, height=config.height
-        )
-        if isinstance(node.clock, FollowedClock):
-            node.clock.driven = True
-        simulator = Simulator(node, config, world, kinect)
+    with make_world(node.robot, config) as world:
+        simulator = Simulator(node, config, world, make_kinect(node.robot, config, world))
         async with AsyncExitStack() as stack:
             hardware = [await stack.enter_async_context(node.sibling(name)) for name in topics.HARDWARE]
             simulator.connect(*hardware)
             for part in (node, *hardware):
-                part.ready(f"simulated, scene {scene.name}, {config.sensors} sensors")
-            if isinstance(node.clock, FollowedClock):
-                await _in_real_time(simulator, config.pace)
-            else:
-                await _in_virtual_time(simulator, node.clock)
+                part.ready(f"simulated, scene {world.scene.name}, {config.sensors} sensors")
+            await keep_going(node, config, simulator)
+
+
+def make_world(
+    robot: Robot,
+    config: Config,
+    motors: Callable[[Robot, Mapping[str, float], BodyRealism], Motors] = services_motors,
+) -> World:
+    """The scene with the robot in it."""
+    return World(
+        _with_timeout(robot, config.command_timeout_s),
+        find_scene(config.scene, config.seed, config.target),
+        seed=config.seed,
+        sensors=config.sensors,
+        physics_hz=config.physics_hz,
+        wear=body_of(robot, config.body, config.seed, config.bend_at_s),
+        motors=motors,
+    )
+
+
+def make_kinect(robot: Robot, config: Config, world: World) -> Kinect:
+    camera = robot.camera.scaled(config.width, config.height)
+    renderer = make_renderer(world.visuals, camera, config.renderer)
+    return Kinect(robot, renderer, sensors=config.sensors, seed=config.seed, width=config.width, height=config.height)
+
+
+async def keep_going(node: Node, config: Config, simulator: Simulator) -> None:
+    """Tick for ever, and with it the clock."""
+    if isinstance(node.clock, FollowedClock):
+        await _in_real_time(simulator, config.pace)
+    else:
+        await _in_virtual_time(simulator, node.clock)
 
 
 async def _in_virtual_time(simulator: Simulator, clock: Clock) -> None:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from types import TracebackType
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from sim.bullet import Bullet
 from sim.contacts import Pair, bumper, collisions, touching_pairs
 from sim.mechanism import Mechanism
 from sim.model import build_model
-from sim.realism import REALISM, Sensors, Wander
+from sim.realism import REALISM, BodyRealism, Sensors, Wander
 from sim.scene import Light, Scene
 from sim.seeds import stream
 from sim.servos import Drive, ServoNetwork
@@ -31,6 +32,28 @@ SENSE_HZ = 60.0
 CONTACT_MEMORY = 2
 """What touched at one of the last so many looks touches: the solver lets go of a contact for a step at times."""
 NETWORKS = ("arm", "hand")
+
+
+class Motors(NamedTuple):
+    """What the wheels and joints are driven by, and what measures them."""
+
+    base: MobileBase
+    networks: dict[str, ServoNetwork]
+
+
+def services_motors(robot: Robot, angles_rad: Mapping[str, float], realism: BodyRealism) -> Motors:
+    """Motors that understand messages, as the hardware services do."""
+    networks = {
+        name: ServoNetwork(
+            {joint: robot.joints[joint] for joint in robot.network_joints(name)},
+            angles_rad,
+            keeps_goal=name == "hand",
+            timeout_s=robot.base.command_timeout_s,
+            backlash_deg=realism.backlash_deg,
+        )
+        for name in NETWORKS
+    }
+    return Motors(MobileBase(robot.base, exact=realism.exact_odometry), networks)
 
 
 class World:
@@ -49,8 +72,10 @@ class World:
         sensors: Sensors = "ideal",
         physics_hz: int = 240,
         wear: Wear | None = None,
+        motors: Callable[[Robot, Mapping[str, float], BodyRealism], Motors] = services_motors,
     ) -> None:
-        """`robot` is the drawing, which base and servos go by; `wear` the body as it really is (None: as drawn)."""
+        """`robot` is the drawing, which base and servos go by; `wear` the body as it really is (None: as drawn);
+        `motors` makes what drives it."""
         self.robot = robot
         self.scene = scene
         self._hz = physics_hz
@@ -73,17 +98,7 @@ class World:
         self._mechanism = Mechanism(self._bullet, self._wear.robot, self._model, scene.robot, angles)
         self._names = {body: name for name, body in self._stage.bodies.items()}
 
-        self._base = MobileBase(robot.base, exact=realism.exact_odometry)
-        self._networks = {
-            name: ServoNetwork(
-                {joint: robot.joints[joint] for joint in robot.network_joints(name)},
-                angles,
-                keeps_goal=name == "hand",
-                timeout_s=robot.base.command_timeout_s,
-                backlash_deg=realism.backlash_deg,
-            )
-            for name in NETWORKS
-        }
+        self._base, self._networks = motors(robot, angles, realism)
         servos = {joint: servo for network in self._networks.values() for joint, servo in network.servos.items()}
         self._servos = [servos[joint] for joint in self._mechanism.joints]
         self._driven: list[Drive | None] = [None] * len(self._servos)

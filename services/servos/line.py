@@ -176,17 +176,22 @@ class ServoLine:
         if len(data) < _GOAL.address + _GOAL.size - _TORQUE.address:
             raise SilentError(number)
         reading = bus.reading(number)
+        if data[0] and not reading.error & table.SHUTDOWNS:  # it holds already, but perhaps by another's settings
+            self._set(bus, number)
         goal = int.from_bytes(data[_GOAL.address - _TORQUE.address :], "little")
         return Met(bool(data[0]), goal, reading.position, reading.error)
+
+    def _set(self, bus: Bus, number: int) -> None:
+        setting = self._settings[number]
+        bus.write(number, "cw_slope", setting.slope)
+        bus.write(number, "ccw_slope", setting.slope)
+        bus.write(number, "torque_limit", setting.torque_limit)  # after a shutdown it is 0
 
     def _enable(self, bus: Bus, number: int) -> int:
         """Have a servo hold where it is. The order matters: what decides how it would move comes before what might
         make it move, and its goal is where it is before its torque is on."""
-        setting = self._settings[number]
-        bus.write(number, "cw_slope", setting.slope)
-        bus.write(number, "ccw_slope", setting.slope)
         bus.write(number, "moving_speed", round(HOLD_RADPS / table.SPEED_RADPS))
-        bus.write(number, "torque_limit", setting.torque_limit)  # after a shutdown it is 0
+        self._set(bus, number)
         position = bus.reading(number).position
         bus.write(number, "goal_position", position)
         bus.write(number, "torque_enable", 1)
