@@ -43,6 +43,10 @@ STANDS_OUT = 10.0
 """Least difference in chromaticity (or a third of it in lightness) from what is frequent along the picture's rim."""
 KNOWN_PENALTY = 0.9
 """What is known already is hardly meant, but may be all that there is."""
+LEAST_EXCESS = 0.15
+"""Of a box's pixels, that must have a colour which is not that frequent around the box."""
+LEAST_BACKGROUND = 0.03
+"""Of the rim's pixels: a colour that fewer have is that of something which stands there."""
 CELL = 4.0
 """Width of a cell of chromaticities when colours are counted."""
 
@@ -109,7 +113,7 @@ def in_box(picture: Picture, box: Box) -> Region:
     around &= ~inside
     own, others = _counted(picture, inside & picture.lit), _counted(picture, around & picture.lit)
     excess = own - others
-    if not own.any() or excess.max() <= 0:
+    if excess.max() < LEAST_EXCESS:
         raise ConfigError("--box: nothing in it has a colour of its own; point at the object with --at U,V")
     seed = inside & _of_cell(picture, int(np.argmax(excess)))
     return _checked(picture, _grown(picture, seed & picture.lit, inside), "in the box")
@@ -231,8 +235,8 @@ def _cells(picture: Picture) -> NDArray[np.int64]:
 def _counted(picture: Picture, where: Bools) -> NDArray[np.float64]:
     """The share that each cell has of these pixels, its neighbours counted in."""
     counts = np.bincount(_cells(picture)[where], minlength=_CELLS**2).reshape(_CELLS, _CELLS).astype(np.float32)
-    smooth = np.asarray(cv2.blur(counts, (3, 3)), dtype=np.float64)
-    return np.asarray(smooth.reshape(-1) / max(int(np.count_nonzero(where)), 1))
+    summed = np.asarray(cv2.boxFilter(counts, -1, (3, 3), normalize=False), dtype=np.float64)
+    return np.asarray(summed.reshape(-1) / max(int(np.count_nonzero(where)), 1))
 
 
 def _of_cell(picture: Picture, cell: int) -> Bools:
@@ -250,8 +254,10 @@ def _difference_from(picture: Picture, rim: Bools) -> NDArray[np.float32]:
         return np.full(rim.shape, np.float32(99))
     cv2.setRNGSeed(1)  # the clusters' first guesses: the same picture gives the same object
     criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 20, 0.5)
-    _, _, centres = cv2.kmeans(samples, 6, np.empty(0, dtype=np.int32), criteria, 2, cv2.KMEANS_PP_CENTERS)
-    distances = [np.linalg.norm(colours - centre, axis=-1) for centre in np.asarray(centres)]
+    _, nearest, centres = cv2.kmeans(samples, 6, np.empty(0, dtype=np.int32), criteria, 2, cv2.KMEANS_PP_CENTERS)
+    shares = np.bincount(np.asarray(nearest).reshape(-1), minlength=6) / len(samples)
+    frequent = [centre for centre, share in zip(np.asarray(centres), shares, strict=True) if share >= LEAST_BACKGROUND]
+    distances = [np.linalg.norm(colours - centre, axis=-1) for centre in frequent]
     return np.asarray(np.min(distances, axis=0), dtype=np.float32)
 
 

@@ -1,0 +1,264 @@
+"""`cocoro objects learn` as a person uses it, and the catalogue's file that it writes."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import shutil
+import sys
+import tempfile
+from pathlib import Path
+
+import cv2
+import msgspec
+import numpy as np
+import pytest
+from perception_scenes import Canvas
+
+from cocoro import profiles
+from cocoro.bus.endpoints import default
+from cocoro.bus.zenoh import ZenohBus
+from cocoro.cli.learn_object import size_of
+from cocoro.cli.main import main
+from cocoro.clock import RealClock
+from cocoro.errors import ConfigError
+from cocoro.messages import ServoState
+from cocoro.node import Node
+from cocoro.objects import Catalogue, KnownObject, LabBox, own_text
+from cocoro.objects_file import as_toml, save, with_object
+from cocoro.processes import load, named
+from cocoro.robot import Robot
+from cocoro.topics import ARM_STATE, FRAME
+
+TEAL = (20, 150, 140)
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder of one's own, no robot, nobody at the keyboard."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COCORO_RUN_DIR", str(tmp_path / "run"))
+    monkeypatch.setattr(sys.stdin, "isatty", lambda: False, raising=False)
+    return tmp_path
+
+
+def canvas() -> Canvas:
+    """A teal thing of 6 x 10 cm, 1 m away."""
+    painted = Canvas(320, 240)
+    painted.rectangle("red_can", (160.0, 120.0), 1.0, (0.06, 0.10))
+    painted.colour[(painted.colour != 128).any(axis=-1)] = TEAL
+    return painted
+
+
+@pytest.fixture
+def photo(here: Path) -> str:
+    cv2.imwrite("photo.png", cv2.cvtColor(canvas().colour, cv2.COLOR_RGB2BGR))
+    return "photo.png"
+
+
+# --- the command ----------------------------------------------------------------------------------
+
+
+def test_what_it_would_match_is_shown_and_nothing_is_saved_without_yes(
+    photo: str, here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["objects", "learn", "cup", "--from", photo, "--size", "0.06x0.1"]) == 0
+    out = capsys.readouterr().out
+    assert "cup: cylinder, 6.0 x 6.0 x 10.0 cm (as you say)" in out
+    assert "the robot   cup (no depth)" in out  # what perception itself makes of the picture
+    assert "nothing is saved" in out
+    assert not (here / "objects.toml").exists()
+    drawn = cv2.imread("cup.png")
+    assert drawn is not None
+    assert drawn.shape == (240, 320, 3)
+    inside = drawn[126:138, 148:152].reshape(-1, 3).mean(axis=0)  # blue, green, red: tinted green
+    assert inside[1] > 180
+
+
+def test_with_yes_it_is_saved_beside_all_that_was_known_and_the_robots_processes_take_it(
+    photo: str, here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["objects", "learn", "cup", "--from", photo, "--distance", "1", "--yes"]) == 0
+    assert "saved in objects.toml, which has 7 objects now" in (out := capsys.readouterr().out)
+    assert "--objects objects.toml" in out
+    written = Catalogue.load(here / "objects.toml")
+    assert written.labels == (*Catalogue.load().labels, "cup")
+    assert written["cup"].size_m == pytest.approx((0.06, 0.06, 0.10), abs=0.004)
+
+    profile = profiles.read("sim", [f'objects="{here}/objects.toml"'])
+    for process in ("perception", "executive"):
+        config = profile.config(process, load(named(process)).config)
+        assert config.objects == f"{here}/objects.toml"
+    assert profile.config("planning", load(named("planning")).config)  # has no such field, and is not told
+
+
+def test_the_figures_are_data_for_scripts(photo: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["objects", "learn", "cup", "--from", photo, "--size", "0.06x0.1", "--at", "160,120", "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["object"]["label"] == "cup"
+    assert report["saved"] is False
+    assert report["matched_share"] > 0.8
+    assert report["seen"] == ["cup (no depth)"]
+
+
+def test_what_is_known_is_only_replaced_or_added_to_when_that_is_said(
+    photo: str, here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    learn = ["objects", "learn", "cup", "--from", photo, "--size", "0.06x0.1", "--yes"]
+    assert main(learn) == 0
+    assert main(learn) == 2
+    assert "cup is known already in objects.toml: --replace" in capsys.readouterr().err
+    before = Catalogue.load(here / "objects.toml")["cup"]
+
+    other = canvas()
+    other.colour[(other.colour == TEAL).all(axis=-1)] = (140, 30, 150)
+    cv2.imwrite("purple.png", cv2.cvtColor(other.colour, cv2.COLOR_RGB2BGR))
+    assert main([*learn[:3], "--from", "purple.png", "--size", "0.08x0.1", "--yes", "--add"]) == 0
+    both = Catalogue.load(here / "objects.toml")["cup"]
+    assert set(before.lab) < set(both.lab)
+    assert both.radius_m == before.radius_m
+    assert main([*learn[:3], "--from", "purple.png", "--size", "0.08x0.1", "--yes", "--replace"]) == 0
+    only = Catalogue.load(here / "objects.toml")["cup"]
+    assert not set(before.lab) & set(only.lab)
+    assert only.radius_m == 0.04
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (["Cup", "--from", "photo.png"], "is no label"),
+        (["cup", "--from", "nowhere.png"], "there is no picture nowhere.png"),
+        (["cup", "--from", "words.png"], "is no picture that can be read"),
+        (["cup", "--from", "photo.png"], "say --size"),
+        (["cup", "--from", "photo.png", "--size", "6cm"], "write it in metres"),
+        (["cup", "--from", "photo.png", "--size", "60"], "it is in metres"),
+        (["cup", "--from", "photo.png", "--size", "0x1"], "write it in metres"),
+        (["cup", "--from", "photo.png", "--at", "middle"], "write it as U,V"),
+        (["cup", "--from", "photo.png", "--box", "1,2,3"], "LEFT,TOP,RIGHT,BOTTOM"),
+        (["cup", "--from", "photo.png", "--at", "1,2", "--box", "1,2,3,4"], "say one of them"),
+        (["cup", "--from", "photo.png", "--shape", "cone"], "cylinder, sphere or box"),
+        (["cup", "--from", "photo.png", "--picture", "cup.jpg"], "let its name end with .png"),
+        (["cup", "--from", "photo.png", "--size", "0.1", "--catalogue", "words.png"], "words.png"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_a_mistake_gets_one_line_and_exit_code_2(
+    photo: str, capsys: pytest.CaptureFixture[str], arguments: list[str], complaint: str
+) -> None:
+    Path("words.png").write_text("no picture, no catalogue")
+    assert main(["objects", "learn", *arguments]) == 2
+    err = capsys.readouterr().err
+    assert complaint in err
+    assert len(err.splitlines()) == 1
+    assert not Path("objects.toml").exists()
+
+
+def test_without_a_robot_a_live_view_is_not_to_be_had(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["objects", "learn", "cup"]) == 4
+    assert "cocoro up sim" in capsys.readouterr().err
+
+
+def test_up_refuses_a_bad_file_of_objects_at_once(capsys: pytest.CaptureFixture[str]) -> None:
+    Path("bad.toml").write_text("[[object]]\nlabel = 'x'\n")
+    assert main(["up", "sim", "--objects", "bad.toml"]) == 2
+    assert "bad.toml" in capsys.readouterr().err
+
+
+def test_sizes_are_one_to_three_lengths() -> None:
+    assert [size_of(text) for text in ("0.08", ".066x.12", "0.1x0.06x0.2")] == [
+        (0.08,), (0.066, 0.12), (0.1, 0.06, 0.2)
+    ]  # fmt: skip
+
+
+@pytest.mark.zenoh
+def test_the_live_view_brings_depth_and_the_heads_angles(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run_dir = tempfile.mkdtemp(prefix="cocoro")  # short: sockets live there
+    monkeypatch.setenv("COCORO_RUN_DIR", run_dir)
+    none = (0.0, 0.0)
+
+    async def see(camera: Node, arm: Node) -> None:
+        async for now_ns in camera.every(30.0):
+            head = ServoState(joints=("neck_pan", "neck_tilt"), position_rad=none, speed_radps=none, load=none)
+            arm.publish(ARM_STATE, head)
+            camera.publish(FRAME, canvas().frame(now_ns - 20_000_000))
+
+    async def scenario() -> int:
+        async with (
+            await ZenohBus.open(default("calliope", "robot")) as bus,
+            Node("kinect", bus, RealClock(), Robot.load()) as camera,
+            Node("arm", bus, RealClock(), Robot.load()) as arm,
+        ):
+            camera.spawn(see(camera, arm))
+            command = await asyncio.create_subprocess_exec(
+                sys.executable, "-m", "cocoro.cli.main", "objects", "learn", "cup", "--yes",
+                stdin=asyncio.subprocess.DEVNULL, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.STDOUT,
+            )  # fmt: skip
+            out, _ = await command.communicate()
+            print(out.decode())
+            return command.returncode or 0
+
+    assert asyncio.run(scenario()) == 0
+    out = capsys.readouterr().out
+    shutil.rmtree(run_dir)
+    assert "cup: cylinder, 6." in out
+    assert "the robot   cup 1." in out  # found by perception, and localised
+    cup = Catalogue.load(Path("objects.toml"))["cup"]
+    assert cup.size_m == pytest.approx((0.06, 0.06, 0.10), abs=0.006)
+
+
+# --- the file -------------------------------------------------------------------------------------
+
+CUP = KnownObject(
+    label="cup", shape="cylinder", radius_m=0.031, height_m=0.1, mass_kg=0.15, graspable=True, rgb=(0.1, 0.6, 0.5),
+    lab=(LabBox((10, -30, -5), (60, -10, 5)),), lab_by_shape=(LabBox((5, -12, -5.5), (10, -4, 5)),),
+)  # fmt: skip
+BOX = msgspec.structs.replace(CUP, shape="box", radius_m=None, height_m=None, box_m=(0.1, 0.2, 0.3))
+
+
+@pytest.mark.parametrize("known", [CUP, BOX, *Catalogue.load()], ids=lambda known: f"{known.label} {known.shape}")
+def test_an_objects_table_says_what_the_object_is(known: KnownObject) -> None:
+    assert tuple(Catalogue.from_text(as_toml(known), "test")) == (known,)
+
+
+def test_an_object_is_put_behind_all_others_and_nothing_else_changes() -> None:
+    text = with_object(own_text(), CUP)
+    assert text.startswith(own_text().rstrip())
+    assert Catalogue.from_text(text, "test")["cup"] == CUP
+
+
+def test_an_object_takes_the_place_of_its_own_older_table_and_peoples_comments_stay() -> None:
+    before = own_text()
+    red = msgspec.structs.replace(CUP, label="blue_can")
+    text = with_object(before, red)
+    catalogue = Catalogue.from_text(text, "test")
+    assert catalogue.labels == Catalogue.load().labels
+    assert catalogue["blue_can"] == red
+    for line in before.splitlines():
+        if line.startswith("#"):
+            assert line in text
+    assert [known for known in catalogue if known.label != "blue_can"] == [
+        known for known in Catalogue.load() if known.label != "blue_can"
+    ]
+
+
+def test_a_file_that_would_be_no_catalogue_is_left_as_it_was(here: Path) -> None:
+    path = here / "mine.toml"
+    path.write_text("[[object]]\nlabel = 'half'\n")
+    with pytest.raises(ConfigError, match=r"mine\.toml"):
+        save(path, CUP)
+    assert path.read_text() == "[[object]]\nlabel = 'half'\n"
+    assert [file.name for file in here.iterdir()] == ["mine.toml"]
+
+
+def test_a_place_that_cannot_be_written_to_is_named(here: Path) -> None:
+    (here / "file").touch()
+    with pytest.raises(ConfigError, match=r"file/objects\.toml.*Not a directory"):
+        save(here / "file" / "objects.toml", CUP)
+
+
+def test_a_new_file_begins_with_what_the_project_knows(here: Path) -> None:
+    catalogue = save(here / "new" / "objects.toml", CUP)
+    assert catalogue.labels == (*Catalogue.load().labels, "cup")
+    assert np.array([known.graspable for known in catalogue]).sum() == 5
