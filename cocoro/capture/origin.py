@@ -6,12 +6,12 @@ import base64
 import hashlib
 import json
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 
@@ -22,6 +22,8 @@ from cocoro.core import Core
 from cocoro.errors import ConfigError
 from cocoro.processes import Component
 from cocoro.robot import Robot
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -56,6 +58,18 @@ def origins(captures: Sequence[Capture], service: str) -> Iterator[list[Origin]]
             yield [_origin(service, entries, Path(folder) / str(n)) for n, entries in enumerate(starts)]
         except (KeyError, TypeError, ValueError, ConfigError) as error:
             raise CaptureError(f"{path}: what {service} was started with cannot be had again: {error}") from error
+
+
+def recorded_file(capture: Capture, service: str, field: str, load: Callable[[Path | None], T]) -> T:
+    """What a loader makes of a file that a service was configured with, as it was then (None: not told)."""
+    told = json.loads(capture.metadata.get(f"service/{service}", {}).get("files", "[]"))
+    content = next((base64.b64decode(file["content"]) for file in told if file["field"] == field), b"")
+    if not content:
+        return load(None)
+    with tempfile.NamedTemporaryFile(suffix=".toml") as copy:
+        copy.write(content)
+        copy.flush()
+        return load(Path(copy.name))
 
 
 def _origin(service: str, entries: Mapping[str, str], folder: Path) -> Origin:

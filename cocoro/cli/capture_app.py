@@ -35,6 +35,8 @@ def add_to(app: typer.Typer) -> None:
     app.add_typer(capture, name="capture", rich_help_panel=PANEL)
     app.command(rich_help_panel=PANEL)(record)
     app.command(rich_help_panel=PANEL)(replay)
+    app.command(rich_help_panel=PANEL)(export)
+    app.command(rich_help_panel=PANEL)(view)
 
 
 def record(
@@ -80,6 +82,40 @@ def replay(
 
     options = {"start_s": start or 0.0, "end_s": end, "rate": rate, "loop": loop, "paused": paused}
     sys.exit(asyncio.run(capture_replay.replay(file, only or [], hardware, options)))
+
+
+def export(
+    file: File,
+    video: Annotated[
+        Path | None, typer.Option("--video", metavar="OUT.mp4", help="What the robot saw, detections drawn in.")
+    ] = None,
+    foxglove: Annotated[Path | None, typer.Option("--foxglove", metavar="OUT.mcap", help="For Foxglove.")] = None,
+    csv: Annotated[Path | None, typer.Option("--csv", metavar="DIR", help="Tables, truth beside belief.")] = None,
+    parquet: Annotated[
+        Path | None, typer.Option("--parquet", metavar="DIR", help="The same; needs cocoro-mesh[tables].")
+    ] = None,
+    rrd: Annotated[
+        Path | None, typer.Option("--rrd", metavar="OUT.rrd", help="For Rerun; needs cocoro-mesh[view].")
+    ] = None,
+) -> None:
+    """Turn a capture into a film, tables, or a file for Foxglove or Rerun. Several at once, if wanted."""
+    from cocoro.cli import capture_export
+
+    sys.exit(capture_export.export(file, video, rrd, foxglove, csv, parquet))
+
+
+def view(
+    file: Annotated[Path | None, typer.Argument(metavar="[FILE]", help="A capture; without one, the mesh.")] = None,
+    robot: Robot = None,
+    profile: Reach = None,
+) -> None:
+    """Open Rerun on a capture, or live on the mesh. Needs cocoro-mesh[view]."""
+    from cocoro.cli import capture_view
+    from cocoro.cli.link import Where
+
+    if file is not None:
+        sys.exit(capture_view.view_file(file))
+    sys.exit(asyncio.run(capture_view.view_mesh(Where(robot, profile))))
 
 
 @capture.command()

@@ -1,0 +1,1 @@
+"""Captures in the forms that people look at: films, tables, Rerun and Foxglove."""

@@ -1,0 +1,82 @@
+"""`--video`: what the robot saw, with what it made of it drawn in, as the paper's films have it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+
+from cocoro.capture.errors import CaptureError
+from cocoro.capture.export.story import Story, catalogue_of, read
+from cocoro.capture.reader import Capture
+from cocoro.clock import NS
+from cocoro.messages import Frame
+from cocoro.picture import Pixels, draw
+from cocoro.topics import FRAME
+
+RATE_HZ = 30.0
+CODEC = "mp4v"
+
+
+def export(capture: Capture, out: Path, progress: Callable[[float], None] = lambda _: None) -> int:
+    """Write the film; the number of its pictures. In real time: a frame stays until the next, and what came faster
+    than the film is left out. Raises CaptureError when there is nothing to show, or it cannot be written."""
+    story, catalogue = Story(capture), catalogue_of(capture)
+    film: _Film | None = None
+    for record, frame in read(capture, FRAME):
+        at_s = (record.log_ns - capture.start_ns) / NS
+        if film is None:
+            film = _Film(out, frame, at_s)
+        seen = story.seen_in(frame.incarnation, frame.seq)
+        film.show(at_s, draw(frame, seen, catalogue, _caption(story, record.log_ns, at_s)))
+        progress(at_s)
+    if film is None:
+        raise CaptureError(f"{capture.path}: it has no pictures")
+    return film.close()
+
+
+class _Film:
+    def __init__(self, out: Path, first: Frame, start_s: float) -> None:
+        self._size = first.width, first.height
+        self._start_s = start_s
+        self._count = 0
+        self._picture: Pixels | None = None
+        out.parent.mkdir(parents=True, exist_ok=True)
+        self._writer = cv2.VideoWriter(str(out), cv2.VideoWriter.fourcc(*CODEC), RATE_HZ, self._size)
+        if not self._writer.isOpened():
+            raise CaptureError(f"{out}: OpenCV cannot write a film there; let the name end with .mp4")
+
+    def show(self, at_s: float, picture: Pixels) -> None:
+        self._hold_until(at_s)
+        if (picture.shape[1], picture.shape[0]) != self._size:
+            picture = cv2.resize(picture, self._size).astype(picture.dtype)
+        self._picture = picture
+
+    def close(self) -> int:
+        if self._picture is not None:
+            self._write(self._picture)
+        self._writer.release()
+        return self._count
+
+    def _hold_until(self, at_s: float) -> None:
+        while self._picture is not None and self._start_s + (self._count + 0.5) / RATE_HZ < at_s:
+            self._write(self._picture)
+
+    def _write(self, picture: Pixels) -> None:
+        self._writer.write(cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
+        self._count += 1
+
+
+def _caption(story: Story, log_ns: int, at_s: float) -> str:
+    """Time, phase, what is left to go, and why it does what it does."""
+    words = [f"{at_s:5.1f} s"]
+    task, plan = story.tasks.at(log_ns), story.plans.at(log_ns)
+    if task is not None and task.task_id:
+        words.append(f"{task.task} {task.label}: {task.outcome or task.phase}".strip())
+    if plan is not None:
+        if plan.distance_m is not None:
+            words.append(f"{plan.distance_m:.2f} m")
+        if plan.why:
+            words.append(plan.why)
+    return "  ".join(words)
