@@ -91,7 +91,7 @@ class LiveRobot:
             sys.executable, "-m", "cocoro.cli.main", *arguments, "--robot", self.name,
             env=self.env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
         )  # fmt: skip
-        out, _ = await asyncio.wait_for(process.communicate(), 4 * PATIENCE_S)
+        out, _ = await asyncio.wait_for(process.communicate(), PATIENCE_S)
         assert process.returncode is not None
         return process.returncode, out.decode()
 
@@ -129,7 +129,7 @@ class LiveRobot:
     def forget(self) -> None:
         self._heard.clear()
 
-    async def until(self, content: Callable[[], object], timeout_s: float = 2 * PATIENCE_S) -> None:
+    async def until(self, content: Callable[[], object], timeout_s: float = PATIENCE_S) -> None:
         """Wait until something holds; looks whenever anything is heard."""
         async with asyncio.timeout(timeout_s):
             while not content():
@@ -169,7 +169,7 @@ class LiveRobot:
 
     async def begin(self, request: TaskRequest) -> str:
         """Have a task accepted, as soon as the robot is able; its id."""
-        async with asyncio.timeout(2 * PATIENCE_S):
+        async with asyncio.timeout(PATIENCE_S):
             while not (reply := await self.ask(request)).accepted:
                 assert reply.refusal in ("not_alive", "estop"), reply.text
                 await self.passes(0.1)
@@ -183,7 +183,7 @@ class LiveRobot:
             state = self.state(task_id)
             return state is not None and state.outcome is not None
 
-        await self.until(ended, 4 * PATIENCE_S)
+        await self.until(ended, PATIENCE_S)
         state = self.state(task_id)
         assert state is not None
         return state

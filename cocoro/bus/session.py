@@ -7,6 +7,7 @@ import atexit
 import contextlib
 import json
 import os
+import re
 import threading
 from collections.abc import Callable
 from typing import Any, TypeVar, cast
@@ -29,7 +30,13 @@ and a service publishes several at once: of zenoh's usual 2, a busy processor wo
 SMALL_PRIORITIES = ("control", "real_time", "interactive_high", "interactive_low", "data_high", "data")
 
 
+_SOURCE = re.compile(r" at /\S+\.rs:\d+\.?")
+"""Where in zenoh an error arose; of no use to who reads it."""
+
+
 def no_mesh(config: ZenohConfig) -> MeshError:
+    if config.mode == "client":
+        return MeshError(f"no mesh at {config.where}: no router answers there; start it, or put the [mesh] right")
     return MeshError(f"no mesh at {config.where}: start one with `cocoro up`")
 
 
@@ -75,7 +82,10 @@ def open_session(config: ZenohConfig, chosen: dict[str, Any]) -> zenoh.Session:
     except zenoh.ZError as error:
         if config.mode == "client":
             raise no_mesh(config) from error
-        raise MeshError(f"mesh of {config.name} at {config.where}: {error}") from error
+        what = _SOURCE.sub("", str(error))
+        if "Address already in use" in what:
+            what = "another process listens there already; end that one, or let the [mesh] say another place"
+        raise MeshError(f"mesh of {config.name} at {', '.join(config.listen) or config.where}: {what}") from error
 
 
 def close_session(session: zenoh.Session) -> None:
