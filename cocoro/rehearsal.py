@@ -22,6 +22,12 @@ class RehearsalRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
     """Fetch: bring it back to where the task began."""
     for_s: Annotated[float, Meta(gt=0, le=3600)] | None = None
     """Follow: for so long."""
+    first: Annotated[int, Meta(ge=0)] = 0
+    """Babbling: the number of its first draw."""
+    count: Annotated[int, Meta(ge=1, le=1_000_000)] = 1000
+    """Babbling: how many samples or trials."""
+    samples: str | None = None
+    """Babbling: the file that they are appended to; with samples in it, babbling goes on where they end."""
     scene: str = "paper"
     """A scene's name, or the path of a scene file."""
     seed: Annotated[int, Meta(ge=0)] = 0

@@ -19,6 +19,7 @@ from cocoro.bus.local import LocalMesh
 from cocoro.clock import NS, VirtualClock
 from cocoro.core import Core
 from cocoro.errors import CocoroError, ConfigError
+from cocoro.learning.collector import TOPICS, HandCollector, WheelCollector, collector
 from cocoro.messages import Detections, Frame, Recording, TaskReply, TaskRequest, TaskState
 from cocoro.node import Node, Stepper
 from cocoro.objects import Catalogue
@@ -113,6 +114,7 @@ class _Rehearsal:
         self._frame: Frame | None = None
         self._seen: Detections | None = None
         self._recording: Recording | None = None
+        self._collector: HandCollector | WheelCollector | None = None
 
     async def run(self) -> dict[str, Any]:
         request = self._request
@@ -140,6 +142,9 @@ class _Rehearsal:
             operator = await stack.enter_async_context(Node("operator", mesh.join(), clock, robot))
             operator.on(topics.TRUTH, self._judge.feed)
             operator.on(topics.RECORDING.of(RECORDER), self._keep_recording)
+            if request.samples is not None and request.task in TOPICS:
+                self._collector = collector(request.task, Path(request.samples), robot)
+                stack.enter_context(self._collector)
             task = asyncio.ensure_future(self._operate(operator))
             try:
                 await asyncio.wait((task, *services), return_when=asyncio.FIRST_COMPLETED)
@@ -189,7 +194,12 @@ class _Rehearsal:
             timeout_s=request.timeout_s,
             bring=request.bring,
             for_s=request.for_s,
+            first=request.first,
+            count=request.count,
         )
+        if self._collector is not None:
+            operator.on(TOPICS[request.task], self._collector.take)
+            question.first, question.count = self._collector.next, max(request.count - len(self._collector), 1)
         reply = await self._ask(operator, question)
         while reply.refusal in ("not_alive", "estop") and operator.now_ns() < START_S * NS:
             await operator.sleep(0.1)
@@ -239,6 +249,7 @@ class _Rehearsal:
             "seed": request.seed,
             "sensors": request.sensors,
             "lockstep": request.lockstep,
+            **({} if self._collector is None else {"samples": len(self._collector), "said": self._collector.said}),
             "outcome": state.outcome,
             "reason": state.reason,
             "sim_s": round(state.elapsed_s, 3),

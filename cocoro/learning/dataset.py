@@ -52,7 +52,7 @@ class WheelRow(msgspec.Struct, frozen=True, kw_only=True):
     """The commanded speeds."""
     left_m: float
     right_m: float
-    """What each wheel was told to roll in all, ramps included."""
+    """How far each wheel rolled, by the base's odometry."""
     before_m: Vec2
     after_m: Vec2
     """The target over the floor, body frame, each the mean of several frames while the robot stood."""

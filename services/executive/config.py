@@ -31,6 +31,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     grasp_timeout_s: Positive = 6.0
     lift_timeout_s: Positive = 15.0
     place_timeout_s: Positive = 25.0
+    babble_timeout_s: Positive = 86_400.0
     park_timeout_s: Positive = 20.0
     hold_s: Positive = 2.3
     """A lifted thing must stay held for so long before a fetch is done."""

@@ -26,13 +26,20 @@ from cocoro.objects import Catalogue
 from services.executive.config import Config
 from services.executive.estop import Estop
 from services.executive.skills import PlannerSkills, Skills, TaskFailedError
-from services.executive.tasks import fetch, follow, park, put_down
+from services.executive.tasks import babble_arm, babble_wheels, fetch, follow, park, put_down
 
 Task = Callable[[Skills, TaskRequest, Config], Awaitable[None]]
 _CLOCK_STANDS_S = 1.0
 """When 20 ms of the clock take longer than this, it stands still."""
 _VERY_LONG_S = 86_400.0
-TASKS: dict[str, Task] = {"fetch": fetch, "follow": follow, "park": park, "put-down": put_down}
+TASKS: dict[str, Task] = {
+    "fetch": fetch,
+    "follow": follow,
+    "park": park,
+    "put-down": put_down,
+    "babble-arm": babble_arm,
+    "babble-wheels": babble_wheels,
+}
 
 
 class Executive:
@@ -77,7 +84,7 @@ class Executive:
         return TaskReply(accepted=True, task_id=task_id)
 
     def _refusal(self, request: TaskRequest) -> tuple[RefusalCode, str] | None:
-        if request.task in ("fetch", "follow"):
+        if request.task in ("fetch", "follow", "babble-wheels"):
             known = self._catalogue.get(request.label)
             fetching = request.task == "fetch"
             targets = [target.label for target in self._catalogue.targets if target.graspable or not fetching]
@@ -98,7 +105,7 @@ class Executive:
         status = self._skills.status
         if status is None:
             return "not_alive", "the planner says nothing; see cocoro status"
-        if request.task in ("fetch", "follow", "park") and status.holding:
+        if request.task != "put-down" and status.holding:
             return "holding", "the hand holds something; put it down first (cocoro put-down)"
         if request.task == "put-down" and not status.holding:
             return "not_holding", "the hand holds nothing"
@@ -135,6 +142,8 @@ class Executive:
         if request.task == "follow" and request.timeout_s is None:
             # It has no end of its own.
             timeout_s = (request.for_s or _VERY_LONG_S) + self._config.search_timeout_s
+        elif request.task.startswith("babble") and request.timeout_s is None:
+            timeout_s = _VERY_LONG_S
         self._skills.want("idle", "", self.state.task_id)
         work = asyncio.ensure_future(TASKS[request.task](self._skills, request, self._config))
         timer = asyncio.ensure_future(self._node.sleep(timeout_s))

@@ -26,7 +26,14 @@ class Skills(Protocol):
     """The steps that tasks are made of."""
 
     async def do(
-        self, behaviour: Behaviour, label: str = "", *, timeout_s: float, place_m: Vec2 | None = None
+        self,
+        behaviour: Behaviour,
+        label: str = "",
+        *,
+        timeout_s: float,
+        place_m: Vec2 | None = None,
+        first: int = 0,
+        count: int = 0,
     ) -> PlannerStatus:
         """Have the planner do something until it is done. Raises TaskFailedError with the planner's reason, or
         `timed_out`, or `not_alive` when the planner falls silent."""
@@ -73,10 +80,26 @@ class PlannerSkills:
     def now_s(self) -> float:
         return self._node.now_ns() / NS
 
-    def want(self, behaviour: Behaviour, label: str, task_id: str, place_m: Vec2 | None = None) -> None:
+    def want(
+        self,
+        behaviour: Behaviour,
+        label: str,
+        task_id: str,
+        place_m: Vec2 | None = None,
+        first: int = 0,
+        count: int = 0,
+    ) -> None:
         """Publish a new intent now; it is repeated until the next."""
         self._step += 1
-        self.intent = Intent(task_id=task_id, step=self._step, behaviour=behaviour, label=label, place_m=place_m)
+        self.intent = Intent(
+            task_id=task_id,
+            step=self._step,
+            behaviour=behaviour,
+            label=label,
+            place_m=place_m,
+            first=first,
+            count=count,
+        )
         self._publish()
 
     def _publish(self) -> None:
@@ -87,10 +110,17 @@ class PlannerSkills:
             self._publish()
 
     async def do(
-        self, behaviour: Behaviour, label: str = "", *, timeout_s: float, place_m: Vec2 | None = None
+        self,
+        behaviour: Behaviour,
+        label: str = "",
+        *,
+        timeout_s: float,
+        place_m: Vec2 | None = None,
+        first: int = 0,
+        count: int = 0,
     ) -> PlannerStatus:
         self._phase(behaviour)
-        self.want(behaviour, label, self.intent.task_id, place_m)
+        self.want(behaviour, label, self.intent.task_id, place_m, first, count)
         ended = await self._watch(self.now_s() + timeout_s)
         if ended is None:
             status = self.status

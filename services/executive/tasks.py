@@ -44,6 +44,21 @@ async def put_down(robot: Skills, request: TaskRequest, config: Config) -> None:
     await robot.do("place", timeout_s=config.place_timeout_s)
 
 
+async def babble_arm(robot: Skills, request: TaskRequest, config: Config) -> None:
+    """Move the arm about and look at the hand, until there are samples enough; fold the arm up again."""
+    await robot.do("babble-arm", timeout_s=config.babble_timeout_s, first=request.first, count=request.count)
+    await robot.do("park", timeout_s=config.park_timeout_s)
+
+
+async def babble_wheels(robot: Skills, request: TaskRequest, config: Config) -> None:
+    """Find a target that stands before the robot, and turn the wheels to and fro before it."""
+    await robot.do("park", timeout_s=config.park_timeout_s)
+    await robot.do("search", request.label, timeout_s=config.search_timeout_s)
+    await robot.do(
+        "babble-wheels", request.label, timeout_s=config.babble_timeout_s, first=request.first, count=request.count
+    )
+
+
 async def _pick_up(robot: Skills, label: str, config: Config) -> None:
     tries: Counter[str] = Counter()
     while True:

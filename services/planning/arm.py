@@ -111,6 +111,13 @@ class ArmController:
         left_m = float(np.linalg.norm(self._reacher.point(goal) - self._reacher.position(reference)))
         return self._joints(stage, dt_s)._replace(arrived=False, left=left_m)
 
+    def towards(
+        self, goals: Mapping[str, float], speed_radps: float, measured: Mapping[str, float], dt_s: float
+    ) -> Step:
+        """Move the named joints together to their goals along the straight way in joint space."""
+        self._sync(measured, dt_s)
+        return self._joints(goals, dt_s, speed_radps)
+
     @property
     def stalled(self) -> bool:
         """Something has held a joint up for a while: it does not follow."""
@@ -130,12 +137,13 @@ class ArmController:
         self._stalled_s = self._stalled_s + dt_s if behind else 0.0
         return self._reference
 
-    def _joints(self, goals: Mapping[str, float], dt_s: float) -> Step:
+    def _joints(self, goals: Mapping[str, float], dt_s: float, speed_radps: float | None = None) -> Step:
         """Move the named joints together to their goals, the others stay."""
         assert self._reference is not None
         gaps = {name: goal - self._reference[name] for name, goal in goals.items()}
         widest = max(abs(gap) for gap in gaps.values())
-        scale = min(1.0, self._config.joint_speed_radps * dt_s / widest) if widest > 0 else 1.0
+        step_rad = (speed_radps or self._config.joint_speed_radps) * dt_s
+        scale = min(1.0, step_rad / widest) if widest > 0 else 1.0
         trial = dict(self._reference)
         for name, gap in gaps.items():
             trial[name] += scale * gap

@@ -13,7 +13,7 @@ import numpy as np
 from cocoro.kinematics import Array
 from cocoro.robot import Robot
 
-_TUBES = (
+TUBES = (
     # from, to, radius of the hull, balls
     ("shoulder", "elbow", 0.025, 5),
     ("elbow", "wrist_pitch", 0.025, 4),
@@ -28,7 +28,7 @@ _FINGER_RADIUS_M = 0.02
 
 class Clearance:
     def __init__(self, robot: Robot) -> None:
-        self._tree = robot.tree(*(name for tube in _TUBES for name in tube[:2]), *_FINGER_TURN_RAD)
+        self._tree = robot.tree(*(name for tube in TUBES for name in tube[:2]), *_FINGER_TURN_RAD)
         # A finger lies across its claw's own x axis, towards the hand's tip.
         self._fingers = {name: np.array([cos(turn), sin(turn), 0.0]) for name, turn in _FINGER_TURN_RAD.items()}
         self._mount_min = np.array(robot.kinect.mount_min_m)
@@ -42,7 +42,7 @@ class Clearance:
         poses = self._tree.poses(angles)
         centres: list[Array] = []
         radii: list[float] = []
-        for start, end, radius_m, count in _TUBES:
+        for start, end, radius_m, count in TUBES:
             for share in np.linspace(0.0, 1.0, count):
                 centres.append((1 - share) * poses[start][:3, 3] + share * poses[end][:3, 3])
                 radii.append(radius_m)
@@ -63,5 +63,5 @@ class Clearance:
         over = np.maximum(np.hypot(centres[:, 0], centres[:, 1]) - self._chassis_radius_m, 0.0)
         above = np.maximum(centres[:, 2] - self._chassis_top_m, 0.0)
         # The upper arm turns on the chassis, which nothing can bring it nearer to.
-        chassis = (np.hypot(over, above) - radii)[_TUBES[0][3] :]
+        chassis = (np.hypot(over, above) - radii)[TUBES[0][3] :]
         return float(min(mount.min(), floor.min(), chassis.min()))

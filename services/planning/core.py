@@ -20,7 +20,7 @@ from services.planning.head import PAN, TILT
 from services.planning.reach import ARM
 from services.planning.senses import Senses
 
-_NEED_SIGHT = ("search", "explore", "approach", "carry", "follow")
+_NEED_SIGHT = ("search", "explore", "approach", "carry", "follow", "babble-arm", "babble-wheels")
 """What drives, or looks for something: none of it without perception."""
 _STALE_NS = NS
 """A running behaviour fails when the robot's state has been missing for so long."""
@@ -73,7 +73,7 @@ class PlanningCore:
         scene = Scene(now_ns, dt_s, self._senses, body, self._senses.angles(), self._limbs)
         plan = self._plan(scene)
         status = self._status(plan, scene)
-        return [*self._commands(plan, scene), Output(topics.PLAN, status)]
+        return [*self._commands(plan, scene), *plan.reports, Output(topics.PLAN, status)]
 
     def _own_hull(self, angles: Mapping[str, float]) -> tuple[Array, Array]:
         """Where the robot itself, and what it holds, is in its own view in a posture."""

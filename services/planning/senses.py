@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from cocoro.clock import NS, is_fresh
 from cocoro.frames import Pose2
 from cocoro.history import History
 from cocoro.kinematics import Array
-from cocoro.messages import BaseState, Detections, Intent, Message, Obstacles, ServoState
+from cocoro.messages import BaseState, Detection, Detections, Intent, Message, Obstacles, ServoState, Vec3
 from cocoro.topics import Topic
 from services.planning.config import Config
 from services.planning.memory import TargetMemory
@@ -52,6 +53,17 @@ class Sight:
         return max(self._least_ns, round(self._periods * period_ns))
 
 
+class Sighting(NamedTuple):
+    """One detection that nothing makes doubtful, with the posture at its frame's stamp."""
+
+    label: str
+    stamp_ns: int
+    position_m: Vec3
+    area_px: int
+    angles_rad: dict[str, float]
+    """Of every joint."""
+
+
 class Senses:
     """Takes every input of the planner; answers by time."""
 
@@ -74,6 +86,8 @@ class Senses:
         """How old a sighting is when the next one comes, smoothed: a fast perception makes it small."""
         self._looked_ns: int | None = None
         self._sight = Sight(config)
+        self._watched = {config.marker}
+        self._sightings: list[Sighting] = []
 
     def take(self, topic: Topic[Message], message: Message, now_ns: int) -> None:
         if isinstance(message, BaseState):
@@ -123,6 +137,7 @@ class Senses:
 
     def localise(self, now_ns: int) -> None:
         """Enter the detections whose odometry is known; the others wait, briefly."""
+        self._sightings.clear()
         for _ in range(len(self._waiting)):
             detections = self._waiting.popleft()
             pose = self._odometry.at(detections.stamp_ns, self._gap_ns)
@@ -150,7 +165,32 @@ class Senses:
             distance_m = float(np.linalg.norm(detection.position_m))
             place = np.array(body.apply(detection.position_m))
             doubtful = detection.note != ""
+            if detection.label in self._watched and not doubtful:
+                self._keep_sighting(detection, detections.stamp_ns)
             self.memory.see(detection.label, place, distance_m, detections.stamp_ns, doubtful=doubtful)
+
+    def _keep_sighting(self, detection: Detection, stamp_ns: int) -> None:
+        angles = self._posture_at(stamp_ns)
+        if angles is not None and detection.position_m is not None:
+            self._sightings.append(Sighting(detection.label, stamp_ns, detection.position_m, detection.area_px, angles))
+
+    def watch(self, label: str) -> None:
+        """Keep the sightings of a label as they are, beside what memory makes of them."""
+        self._watched.add(label)
+
+    def sightings_of(self, label: str) -> list[Sighting]:
+        """The watched label's sightings of the step that runs, in order."""
+        return [sighting for sighting in self._sightings if sighting.label == label]
+
+    def _posture_at(self, stamp_ns: int) -> dict[str, float] | None:
+        """Every joint's angle at a time; None where that time is not held."""
+        angles: dict[str, float] = {}
+        for joints, history in self._postures.values():
+            then = history.at(stamp_ns, self._gap_ns)
+            if then is None:
+                return None
+            angles.update(zip(joints, then.tolist(), strict=True))
+        return angles
 
     def body(self) -> Pose2 | None:
         """The body's newest pose in the odometry frame."""

@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 from cocoro.messages import Intent
+from services.planning.behaviours.babbling import BabbleArm, BabbleWheels
 from services.planning.behaviours.base import Behaviour, Limbs, Plan, Scene
 from services.planning.behaviours.driving import Approach, Carry, Follow
 from services.planning.behaviours.handling import Close, Lift, Place, Reach
@@ -25,4 +26,6 @@ BEHAVIOURS: Mapping[str, Callable[[Intent], Behaviour]] = {
     "carry": lambda intent: Carry(intent.label, intent.place_m or (0.0, 0.0)),
     "place": lambda _intent: Place(),
     "follow": lambda intent: Follow(intent.label),
+    "babble-arm": lambda intent: BabbleArm(intent.first, intent.count),
+    "babble-wheels": lambda intent: BabbleWheels(intent.label, intent.first, intent.count),
 }

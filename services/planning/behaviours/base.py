@@ -9,6 +9,7 @@ from typing import Literal, Protocol
 
 import numpy as np
 
+from cocoro.core import Output
 from cocoro.frames import Pose2
 from cocoro.kinematics import Array
 from cocoro.messages import BaseCommand, TargetEstimate
@@ -135,6 +136,8 @@ class Plan:
     state: State = "running"
     reason: str = ""
     distance_m: float | None = None
+    reports: list[Output] = field(default_factory=list)
+    """What it has to say beside the planner's status: what babbling saw."""
 
 
 class Behaviour(Protocol):

@@ -1,0 +1,136 @@
+"""Takes what babbling reports into its file, and knows how far that has got; for the command and the rehearsal."""
+
+from __future__ import annotations
+
+from collections import Counter
+from math import pi
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from cocoro.learning.dataset import HandRow, WheelRow, Writer, hand_header, wheel_header
+from cocoro.learning.drawing import LEVEL_ROLL_RAD, arm_joints
+from cocoro.messages import HandSample, Message, Vec3, WheelTrial
+from cocoro.robot import Robot
+from cocoro.topics import HAND_SAMPLES, WHEEL_TRIALS, Topic
+
+CELL_M = 0.05
+TOPICS: dict[str, Topic[Any]] = {"babble-arm": HAND_SAMPLES, "babble-wheels": WHEEL_TRIALS}
+"""What each task reports on."""
+
+
+class Coverage:
+    """What share of the places that the hand comes to has been seen already (Good and Turing): one less the share of
+    sightings that lie alone in their cell. It needs no knowledge of the arm, and no more sightings than there are."""
+
+    def __init__(self) -> None:
+        self._cells: Counter[tuple[int, int, int]] = Counter()
+        self._alone = 0
+        self._count = 0
+
+    def add(self, place_m: Vec3) -> None:
+        x, y, z = (int(value // CELL_M) for value in place_m)
+        self._cells[x, y, z] += 1
+        self._count += 1
+        self._alone += {1: 1, 2: -1}.get(self._cells[x, y, z], 0)
+
+    @property
+    def share(self) -> float:
+        return 1.0 - self._alone / self._count if self._count else 0.0
+
+
+class HandCollector:
+    """Rows of the arm's babbling. Use it with `with`; raises as `Writer` does."""
+
+    def __init__(self, path: Path, robot: Robot) -> None:
+        self._joints = arm_joints(robot)
+        self._writer = Writer(path, HandRow, robot, hand_header(robot, self._joints, LEVEL_ROLL_RAD))
+        self._coverage = Coverage()
+        for row in self._writer.rows:
+            self._coverage.add(row.seen_m)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._writer.__exit__(kind, error, trace)
+
+    def __len__(self) -> int:
+        return len(self._writer.rows)
+
+    @property
+    def next(self) -> int:
+        """The draw to go on with; number 0 is a corner of the range, which says little."""
+        return max((row.draw + 1 for row in self._writer.rows), default=1)
+
+    @property
+    def said(self) -> str:
+        """How far it has got, in words."""
+        return f"{len(self)} samples, coverage {self._coverage.share:.0%}"
+
+    def take(self, message: Message) -> None:
+        if isinstance(message, HandSample):
+            angles = message.angles_rad
+            row = HandRow(
+                stamp_ns=message.stamp_ns,
+                draw=message.draw,
+                angles_rad=tuple(angles[name] for name in self._joints),
+                head_rad=(angles["neck_pan"], angles["neck_tilt"]),
+                seen_m=message.seen_m,
+                area_px=message.area_px,
+            )
+            self._writer.append([row])
+            self._coverage.add(row.seen_m)
+
+
+class WheelCollector:
+    """Rows of the wheels' babbling. Use it with `with`; raises as `Writer` does."""
+
+    def __init__(self, path: Path, robot: Robot) -> None:
+        self._separation_m = robot.base.wheel_separation_m
+        self._writer = Writer(path, WheelRow, robot, wheel_header(robot))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._writer.__exit__(kind, error, trace)
+
+    def __len__(self) -> int:
+        return len(self._writer.rows)
+
+    @property
+    def next(self) -> int:
+        """The trial to go on with: the first of a pair. Pair 0 stands in the range's corner: both wheels back."""
+        return max((row.trial // 2 * 2 + 2 for row in self._writer.rows), default=2)
+
+    @property
+    def said(self) -> str:
+        turned = sum(abs(row.turned_rad) for row in self._writer.rows)
+        return f"{len(self)} trials, {turned / (2 * pi):.1f} turns in all"
+
+    def take(self, message: Message) -> None:
+        if isinstance(message, WheelTrial):
+            # The base's odometry makes its turn of the two wheels' roads with the distance that it was told.
+            half_m = message.turned_rad * self._separation_m / 2
+            row = WheelRow(
+                stamp_ns=message.stamp_ns,
+                trial=message.trial,
+                left_mps=message.left_mps,
+                right_mps=message.right_mps,
+                left_m=message.way_m - half_m,
+                right_m=message.way_m + half_m,
+                before_m=message.before_m,
+                after_m=message.after_m,
+                turned_rad=message.turned_rad,
+            )
+            self._writer.append([row])
+
+
+def collector(task: str, path: Path, robot: Robot) -> HandCollector | WheelCollector:
+    """For the task 'babble-arm' or 'babble-wheels'."""
+    return HandCollector(path, robot) if task == "babble-arm" else WheelCollector(path, robot)

@@ -1,0 +1,25 @@
+"""What babbling tries: Sobol draws, each known by its number, so that a babbling goes on where an earlier one ended."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from scipy.stats import qmc
+
+from cocoro.learning.network import Array
+
+
+def sobol(first: int, ranges: Array) -> Iterator[tuple[int, Array]]:
+    """(number, point) from the draw `first` on, for ever; points (n,) within `ranges` (n, 2). Equal numbers, equal
+    points. Number 0, the sequence's own first, is a corner of the box like any other."""
+    engine = qmc.Sobol(len(ranges), scramble=False)
+    if first:
+        engine.fast_forward(first)
+    low, high = ranges.T
+    number = first
+    while True:
+        # Two at a time: the engine warns of a first draw alone, which would not be balanced.
+        for share in engine.random(2):
+            yield number, np.asarray(low + share * (high - low))
+            number += 1

@@ -1,0 +1,278 @@
+"""Babbling: moving to learn. The arm from draw to draw, the eyes on the hand; the wheels in pairs of trials."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from math import hypot, sin
+
+import numpy as np
+
+from cocoro.clock import NS
+from cocoro.core import Output
+from cocoro.frames import Pose2
+from cocoro.kinematics import Array
+from cocoro.learning.draws import sobol
+from cocoro.messages import BaseCommand, HandSample, Vec2, WheelTrial
+from cocoro.topics import HAND_SAMPLES, WHEEL_TRIALS
+from services.planning.behaviours.base import Plan, Scene
+from services.planning.postures import Postures
+from services.planning.reach import ARM, LEVEL_ROLL_RAD, HandPose
+
+
+class BabbleArm:
+    """Goes from draw to draw and reports the hand wherever its marker is really seen.
+
+    From each posture the next draw is one that the drawing calls safe and seeable, and that a straight, safe way leads
+    to. Where none of many is, it goes back the way it came. At last it goes home, from where the arm can be folded.
+    """
+
+    SPEED_RADPS = 0.7
+    EVERY_NS = NS // 10
+    """Sightings nearer in time than this are nearly the same."""
+    LOOKS_A_STEP = 2
+    """Draws that are looked at in one step: each takes up to some milliseconds."""
+    GIVE_UP = 60
+    """After so many draws that no way leads to, it goes back."""
+
+    def __init__(self, first: int, count: int) -> None:
+        self._first = first
+        self._count = count
+        self._samples = 0
+        self._draws: Iterator[tuple[int, Array]] | None = None
+        self._draw = first
+        self._looked = 0
+        self._postures: Postures | None = None
+        self._goal: Array | None = None
+        self._trail: list[Array] = []
+        """Postures from home to here, each with a clear way to the next."""
+        self._returning = False
+        self._last_ns: int | None = None
+        self._hitches = 0
+
+    def step(self, scene: Scene) -> Plan:
+        if self._postures is None:
+            self._postures = Postures(scene.limbs.robot)
+            self._draws = sobol(self._first, self._postures.ranges)
+        if not self._trail:
+            return self._unfold(scene)
+        reports = self._report(scene)
+        arm = scene.limbs.arm
+        if self._goal is None:
+            self._choose(scene)
+        if self._goal is None:
+            step = scene.still()
+        else:
+            step = arm.towards(dict(zip(ARM, self._goal.tolist(), strict=True)), self.SPEED_RADPS, scene.angles,
+                               scene.dt_s)  # fmt: skip
+        head = scene.look_at(self._postures.marker_m(scene.angles))
+        why = f"{self._samples} of {self._count} samples, draw {self._draw}"
+        plan = Plan(scene.stand(), step, why, head, reports=reports)
+        if step.blocked or arm.stalled:
+            self._hitch(plan, scene)
+        elif self._goal is not None and step.arrived:
+            self._arrive(plan)
+        if self._samples >= self._count:
+            self._returning = True
+        return plan
+
+    def _unfold(self, scene: Scene) -> Plan:
+        """To the posture that everything starts from; from a posture of an earlier babbling straight there."""
+        limbs, travel = scene.limbs, scene.limbs.config.arm
+        home = HandPose(travel.travel_radius_m, 0.0, travel.travel_height_m, travel.pitch_rad)
+        step = limbs.arm.reach(home, travel.hand_speed_mps, scene.angles, scene.dt_s)
+        plan = Plan(scene.stand(), step, "unfolding the arm")
+        if step.blocked or limbs.arm.stalled:
+            plan.state, plan.reason, plan.why = "failed", "blocked", "something is in the arm's way"
+        elif step.arrived:
+            self._trail = [step.goal_rad]
+        return plan
+
+    def _choose(self, scene: Scene) -> None:
+        """Where to next; nowhere yet when none of the draws of this step would do."""
+        assert self._draws is not None
+        assert self._postures is not None
+        here = self._trail[-1]
+        if self._returning:
+            self._go_home(here)
+            return
+        for _ in range(self.LOOKS_A_STEP):
+            self._draw, posture = next(self._draws)
+            self._looked += 1
+            postures = self._postures
+            if postures.safe(posture) and postures.seeable(posture) and postures.clear_way(here, posture):
+                self._goal, self._looked = posture, 0
+                return
+        if self._looked > self.GIVE_UP and len(self._trail) > 1:
+            self._trail.pop()
+            self._goal, self._looked = self._trail.pop(), 0
+
+    def _go_home(self, here: Array) -> None:
+        """Straight where there is a clear way, else back along the trail."""
+        assert self._postures is not None
+        home = self._trail[0]
+        if len(self._trail) <= 2 or self._postures.clear_way(here, home):
+            self._trail, self._goal = [home], home
+        else:
+            self._trail.pop()
+            self._goal = self._trail.pop()
+
+    def _arrive(self, plan: Plan) -> None:
+        assert self._goal is not None
+        if self._returning and len(self._trail) == 1 and np.array_equal(self._goal, self._trail[0]):
+            plan.state, plan.why = "done", f"{self._samples} samples"
+            return
+        self._trail.append(self._goal)
+        self._goal = None
+
+    def _hitch(self, plan: Plan, scene: Scene) -> None:
+        """The way is not as clear as the drawing has it: back to where it came from."""
+        self._hitches += 1
+        scene.limbs.arm.resync()
+        self._goal = self._trail[-1]
+        if self._hitches > 20:
+            plan.state, plan.reason, plan.why = "failed", "blocked", "the arm is held up again and again"
+
+    def _report(self, scene: Scene) -> list[Output]:
+        """The hand's sightings since the last step, as far as they tell something new."""
+        found: list[Output] = []
+        for sight in scene.senses.sightings_of(scene.limbs.config.marker):
+            new = self._last_ns is None or sight.stamp_ns - self._last_ns >= self.EVERY_NS
+            level = abs(sight.angles_rad["wrist_roll"] - LEVEL_ROLL_RAD) < 0.03
+            if new and level and self._samples < self._count:
+                self._last_ns = sight.stamp_ns
+                self._samples += 1
+                sample = HandSample(
+                    stamp_ns=sight.stamp_ns,
+                    draw=self._draw,
+                    angles_rad=sight.angles_rad,
+                    seen_m=sight.position_m,
+                    area_px=sight.area_px,
+                )
+                found.append(Output(HAND_SAMPLES, sample))
+        return found
+
+
+class BabbleWheels:
+    """Pairs of trials (the paper's): both wheels turn for a while at drawn speeds, then as long at the opposite ones;
+    before and after each the standing robot looks at a standing target.
+
+    The head comes to every look from the same side, so that its backlash is the same each time and falls out.
+    """
+
+    SPEED_MPS = 0.15
+    TURN_S = 1.0
+    LOOKS = 8
+    """Frames of one look."""
+    AWAY_RAD = (0.12, 0.08)
+    """From where the head comes to a look, in pan and tilt."""
+    AWAY_S, SETTLE_S = 0.35, 0.45
+    LOST_S = 4.0
+    MOVED_M = 0.5
+    """Further than this from where it began it does not go."""
+
+    def __init__(self, label: str, first: int, count: int) -> None:
+        self._label = label
+        self._count = count
+        self._done = 0
+        speeds = np.array([[-self.SPEED_MPS, self.SPEED_MPS]] * 2)
+        self._draws = sobol(first // 2, speeds)
+        self._trial = first - first % 2
+        self._speeds = (0.0, 0.0)
+        self._phase_ns: int | None = None
+        self._driving = False
+        self._gaze: tuple[float, float] | None = None
+        self._seen: deque[Vec2] = deque(maxlen=self.LOOKS)
+        self._before: tuple[Vec2, Pose2] | None = None
+        self._begun: Pose2 | None = None
+
+    def step(self, scene: Scene) -> Plan:
+        self._begun = self._begun or scene.body
+        scene.senses.watch(self._label)
+        sightings = scene.senses.sightings_of(self._label)
+        if self._phase_ns is None:
+            self._phase_ns = scene.now_ns
+        spent_s = (scene.now_ns - self._phase_ns) / NS
+        why = f"{self._done} of {self._count} trials"
+        if self._driving:
+            plan = Plan(self._drive(scene, spent_s), scene.still(), why, self._look_there(scene))
+        else:
+            plan = self._look(scene, spent_s, why, [s.position_m for s in sightings])
+        base = scene.senses.base
+        if base is not None and (base.bump_left or base.bump_right):
+            plan.base = scene.stand()
+            plan.state, plan.reason, plan.why = "failed", "blocked", "the bumper touches something"
+        elif self._begun.inverse().compose(scene.body).x_m ** 2 > self.MOVED_M**2:
+            plan.base = scene.stand()
+            plan.state, plan.reason, plan.why = "failed", "blocked", "it has gone too far from where it began"
+        return plan
+
+    def _drive(self, scene: Scene, spent_s: float) -> BaseCommand:
+        if spent_s < self.TURN_S:
+            left, right = self._speeds
+            return BaseCommand(left_mps=left, right_mps=right)
+        scene.limbs.driver.reset()
+        if scene.standing:
+            self._driving, self._phase_ns = False, None
+        return BaseCommand(left_mps=0.0, right_mps=0.0)
+
+    def _look_there(self, scene: Scene) -> tuple[float, float, float] | None:
+        target = scene.target(self._label)
+        return None if target is None else scene.look_at(target.position_m)
+
+    def _look(self, scene: Scene, spent_s: float, why: str, places: list[tuple[float, float, float]]) -> Plan:
+        """Away, back to the target, wait, take the frames."""
+        plan = Plan(scene.stand(), scene.still(), why)
+        if spent_s < self.AWAY_S or self._gaze is None:
+            gaze = self._look_there(scene)
+            if gaze is None:
+                plan.state, plan.reason, plan.why = "failed", "lost", f"{self._label} is out of sight"
+                return plan
+            self._gaze = gaze[:2]
+            self._seen.clear()
+            plan.head = (gaze[0] + self.AWAY_RAD[0], gaze[1] + self.AWAY_RAD[1], 2.0)
+            return plan
+        plan.head = (*self._gaze, 2.0)
+        if spent_s < self.AWAY_S + self.SETTLE_S:
+            return plan
+        self._seen.extend((x, y) for x, y, _ in places)
+        if len(self._seen) == self.LOOKS:
+            self._looked(scene, plan)
+        elif spent_s > self.LOST_S + self.LOOKS * scene.senses.sight_lag_s:
+            plan.state, plan.reason, plan.why = "failed", "lost", f"{self._label} is out of sight"
+        return plan
+
+    def _looked(self, scene: Scene, plan: Plan) -> None:
+        """A look is complete: it ends one trial and begins the next."""
+        x, y = np.median(np.array(self._seen), axis=0).tolist()
+        after = (x, y)
+        if self._before is not None:
+            before, start = self._before
+            moved = start.inverse().compose(scene.body)
+            half = moved.yaw_rad / 2
+            # The way along the arc, from its chord; backwards where the chord points backwards.
+            arc_per_chord = half / sin(half) if abs(half) > 1e-6 else 1.0
+            way_m = hypot(moved.x_m, moved.y_m) * arc_per_chord * (1.0 if moved.x_m >= 0 else -1.0)
+            trial = WheelTrial(
+                trial=self._trial,
+                left_mps=self._speeds[0],
+                right_mps=self._speeds[1],
+                way_m=way_m,
+                turned_rad=moved.yaw_rad,
+                before_m=before,
+                after_m=after,
+            )
+            plan.reports.append(Output(WHEEL_TRIALS, trial))
+            self._done += 1
+            self._trial += 1
+            if self._done >= self._count:
+                plan.state, plan.why = "done", f"{self._done} trials"
+                return
+        if self._trial % 2 == 0:
+            _, speeds = next(self._draws)
+            left, right = speeds.tolist()
+        else:
+            left, right = -self._speeds[0], -self._speeds[1]
+        self._speeds = (left, right)
+        self._before = (after, scene.body)
+        self._gaze, self._phase_ns, self._driving = None, scene.now_ns, True

@@ -1,0 +1,77 @@
+"""Which postures the arm may babble into, and along which ways: clear of the robot itself and of the floor."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from cocoro.kinematics import Array
+from cocoro.robot import Robot
+from services.planning.clearance import TUBES, Clearance
+from services.planning.reach import ARM, LEVEL_ROLL_RAD
+
+RANGE_RAD = 2.62
+"""The paper's, a joint."""
+MARGIN_M = 0.03
+"""The body may differ from its drawing by a centimetre or two."""
+WAY_RAD = 0.12
+"""A way is checked this often, by its widest joint."""
+_HAND_FROM = sum(count for _, end, _, count in TUBES if end in ("elbow", "wrist_pitch", "wrist_roll"))
+"""The hull's balls from here on are the hand's; before, those of upper arm, forearm and wrist."""
+_UPPER_ARM_M = 0.03
+_HEAD_MIN_M, _HEAD_MAX_M = np.array([-0.06, -0.16, 0.64]), np.array([0.13, 0.16, 0.79])
+"""Where the Kinect's housing is, however the head looks."""
+
+
+class Postures:
+    """Angles are in the order of ARM; the wrist roll is level, the claws as they are."""
+
+    def __init__(self, robot: Robot) -> None:
+        limits = np.array([robot.joints[name].limits_rad for name in ARM])
+        self.ranges = np.clip(limits, -RANGE_RAD, RANGE_RAD)
+        self._clearance = Clearance(robot)
+        self._upper = robot.chain("shoulder"), robot.chain("elbow")
+        self._head = robot.chain("camera").position({"neck_pan": 0.0, "neck_tilt": 0.0})
+        self._marker = robot.chain(robot.marker.link), np.array([*robot.marker.position_m, 1.0])
+        self._nearest_m = robot.kinect.min_range_m
+
+    def marker_m(self, angles: Mapping[str, float]) -> tuple[float, float, float]:
+        """Where the drawing has the marker, body frame, for the angles of all joints."""
+        chain, marker = self._marker
+        x, y, z = (chain.pose(angles) @ marker)[:3].tolist()
+        return x, y, z
+
+    def safe(self, posture: Array) -> bool:
+        """Nothing is nearer than the margin: mount, chassis, floor, Kinect, and the hand to the arm it hangs on."""
+        angles = self._angles(posture)
+        if self._clearance.of(angles) < MARGIN_M:
+            return False
+        centres, radii = self._clearance.hull(angles)
+        apart = np.linalg.norm(centres - np.clip(centres, _HEAD_MIN_M, _HEAD_MAX_M), axis=1) - radii
+        if float(apart.min()) < MARGIN_M:
+            return False
+        shoulder, elbow = (chain.position(angles) for chain in self._upper)
+        along = elbow - shoulder
+        hand = centres[_HAND_FROM:] - shoulder
+        share = np.clip(hand @ along / (along @ along), -0.3, 1.0)  # the shoulder's bracket stands behind it
+        away = np.linalg.norm(hand - share[:, None] * along, axis=1) - radii[_HAND_FROM:]
+        return float(away.min()) > _UPPER_ARM_M + MARGIN_M / 2
+
+    def seeable(self, posture: Array) -> bool:
+        """The drawing has the marker where the camera might see it: not too near, and not behind the hand."""
+        chain, marker = self._marker
+        pose = chain.pose(self._angles(posture))
+        to_camera = self._head - (pose @ marker)[:3]
+        distance_m = float(np.linalg.norm(to_camera))
+        # The link's y points from the roll axis to the marker.
+        return distance_m > self._nearest_m and float(pose[:3, 1] @ to_camera) > -0.1 * distance_m
+
+    def clear_way(self, start: Array, end: Array) -> bool:
+        """Every posture on the straight way in joint space is safe; the start itself need not be."""
+        count = int(np.ceil(float(np.abs(end - start).max()) / WAY_RAD))
+        return all(self.safe(start + (end - start) * step / count) for step in range(1, count + 1))
+
+    @staticmethod
+    def _angles(posture: Array) -> dict[str, float]:
+        return dict(zip(ARM, posture.tolist(), strict=True), wrist_roll=LEVEL_ROLL_RAD)
