@@ -108,7 +108,8 @@ class Shell:
 
     @property
     def env(self) -> dict[str, str]:
-        return os.environ | {"COCORO_RUN_DIR": str(self.root), "PYTHONPATH": str(self.folder)}
+        path = os.pathsep.join(filter(None, (str(self.folder), os.environ.get("PYTHONPATH"))))
+        return os.environ | {"COCORO_RUN_DIR": str(self.root), "PYTHONPATH": path}
 
     def profile(self, *processes: str, extra: str = "") -> str:
         path = self.folder / "robbie.toml"
