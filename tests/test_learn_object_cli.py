@@ -13,7 +13,7 @@ import cv2
 import msgspec
 import numpy as np
 import pytest
-from perception_scenes import Canvas
+from perception_scenes import Canvas, Scene, Thing, facing
 
 from cocoro import profiles
 from cocoro.bus.endpoints import default
@@ -26,9 +26,13 @@ from cocoro.messages import ServoState
 from cocoro.node import Node
 from cocoro.objects import Catalogue, KnownObject, LabBox, own_text
 from cocoro.objects_file import as_toml, save, with_object
+from cocoro.picture import colour_of
 from cocoro.processes import load, named
+from cocoro.rehearsal import RehearsalRequest
 from cocoro.robot import Robot
 from cocoro.topics import ARM_STATE, FRAME
+from sim.rehearse import rehearse
+from sim.scene import Light
 
 TEAL = (20, 150, 140)
 
@@ -206,6 +210,39 @@ def test_the_live_view_brings_depth_and_the_heads_angles(
     assert "the robot   cup 1." in out  # found by perception, and localised
     cup = Catalogue.load(Path("objects.toml"))["cup"]
     assert cup.size_m == pytest.approx((0.06, 0.06, 0.10), abs=0.006)
+
+
+@pytest.mark.sim
+def test_what_was_learnt_from_one_look_is_fetched(here: Path) -> None:
+    rgb = (0.95, 0.45, 0.05)
+    thing = Thing("orange_can", "cylinder", (0.03, 0.11), rgb, (1.1, 0.1, 0.055))
+    pan, tilt = facing(thing)
+    with Scene([thing], sensors="real", light=Light(temperature_k=6200)) as scene:
+        cv2.imwrite("photo.png", cv2.cvtColor(colour_of(scene.frame(pan, tilt)), cv2.COLOR_RGB2BGR))
+    arguments = ["orange_can", "--from", "photo.png", "--size", "0.06x0.11", "--mass", "0.2", "--yes"]
+    assert main(["objects", "learn", *arguments]) == 0
+
+    Path("scene.toml").write_text(
+        f"""
+        name = "one can"
+        [[object]]
+        label = "orange_can"
+        shape = "cylinder"
+        radius_m = 0.03
+        height_m = 0.11
+        rgb = {list(rgb)}
+        position_m = [1.0, -0.2]
+        [light]
+        temperature_k = 4900
+        """
+    )
+    rehearsal = RehearsalRequest(
+        task="fetch", label="orange_can", scene="scene.toml", sensors="real", objects="objects.toml",
+        width=320, height=240, frame_rate_hz=15.0,
+    )  # fmt: skip
+    result = rehearse(rehearsal)
+    assert result["outcome"] == "done"
+    assert result["truth"]["held"]
 
 
 # --- the file -------------------------------------------------------------------------------------
