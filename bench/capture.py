@@ -3,11 +3,13 @@
     python bench/capture.py traffic [--seconds 30] [--sensors ideal|real] [--compression zstd]
     python bench/capture.py kill [--times 20]
     python bench/capture.py rerun
+    python bench/capture.py frames
 
 `traffic` starts the simulated robot as processes with its recorder, has it fetch the red can, and reads what the
 recorder's process cost (from the operating system, not from the recorder) and what it dropped or never got. `kill`
 sends the recorder SIGKILL at random moments while a stand-in for a robot publishes, and looks how much is missing.
-`rerun` executes perception and planning again over what `traffic` recorded.
+`rerun` executes perception and planning again over what `traffic` recorded. `frames` packs rendered frames of both
+kinds of sensors by each compression, in one thread.
 """
 
 from __future__ import annotations
@@ -27,14 +29,17 @@ import psutil
 from cocoro import topics
 from cocoro.bus.endpoints import default
 from cocoro.bus.zenoh import ZenohBus
+from cocoro.capture.compression import Packer
 from cocoro.capture.info import report
 from cocoro.capture.reader import Capture
 from cocoro.capture.rerun import rerun, words
 from cocoro.clock import RealClock
 from cocoro.messages import BaseState, Frame
 from cocoro.node import Node, recorder_key
+from cocoro.rehearsal import RehearsalRequest
 from cocoro.robot import Robot
 from cocoro.rundir import RunDir
+from sim.rehearse import rehearse
 
 COCORO = [sys.executable, "-m", "cocoro.cli.main"]
 PROFILE = """
@@ -151,9 +156,25 @@ def execute(folder: Path) -> None:
             print("\n".join(words(rerun([capture], service))))
 
 
+def frames(folder: Path) -> None:
+    """Time of the processor, since the machine may have other work."""
+    for sensors in ("ideal", "real"):
+        path = folder / f"{sensors}.mcap"
+        rehearse(RehearsalRequest(task="fetch", label="red_can", sensors=sensors, record=str(path)))
+        with Capture.open(path) as capture:
+            payloads = [bytes(each.payload) for each in list(capture.messages("kinect/frame"))[10:250:8]]
+        for compression in ("zstd", "lz4"):
+            packer = Packer(compression)
+            started = time.process_time()
+            packed = sum(len(packer.pack(payload)[1]) for payload in payloads)
+            each_ms = (time.process_time() - started) / len(payloads) * 1e3
+            times = sum(map(len, payloads)) / packed
+            print(f"{sensors} sensors, {compression}: {times:.1f} times smaller, {each_ms:.2f} ms a frame")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("traffic", "kill", "rerun"))
+    parser.add_argument("what", choices=("traffic", "kill", "rerun", "frames"))
     parser.add_argument("--seconds", type=float, default=30.0)
     parser.add_argument("--sensors", default="ideal")
     parser.add_argument("--compression", default="zstd")
@@ -162,6 +183,9 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix="cocoro-") as name:
         folder = Path(name)
         os.environ["COCORO_RUN_DIR"] = str(folder / "run")
+        if options.what == "frames":
+            frames(folder)
+            return
         if options.what == "kill":
             asyncio.run(kill(folder, options.times))
             return

@@ -1,0 +1,307 @@
+"""Captures in the forms that people look at."""
+
+from __future__ import annotations
+
+import csv
+import json
+import sys
+import types
+from math import pi
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from capture_rig import ROBOT, Room, drive, record
+from mcap.reader import make_reader
+
+from cocoro import topics
+from cocoro.capture.errors import CaptureError
+from cocoro.capture.export import foxglove, rerun_scene, tables, video
+from cocoro.capture.export.foxglove_types import SceneUpdate, schema_of
+from cocoro.capture.export.geometry import Posture, about_z, conjugate, points, quaternion, rotated
+from cocoro.capture.export.story import catalogue_of, robot_of
+from cocoro.capture.reader import Capture
+from cocoro.cli.main import main
+from cocoro.kinematics import turn_z
+from cocoro.messages import Frame, PlannerStatus, ServoState, TargetEstimate, TrueObject, Truth
+
+GOLDEN = Path(__file__).parent / "golden" / "fetch.mcap"
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The golden capture, in all forms that need nothing more."""
+    folder = tmp_path_factory.mktemp("exported")
+    forms = {"--video": "film.mp4", "--foxglove": "fox.mcap", "--csv": "csv"}
+    assert (
+        main(["export", str(GOLDEN), *(word for form, name in forms.items() for word in (form, str(folder / name)))])
+        == 0
+    )
+    return folder
+
+
+# --- the film -------------------------------------------------------------------------------------
+
+
+def test_the_film_lasts_as_long_as_the_capture_and_shows_what_the_robot_saw(exported: Path) -> None:
+    film = cv2.VideoCapture(str(exported / "film.mp4"))
+    assert film.get(cv2.CAP_PROP_FPS) == video.RATE_HZ
+    assert (film.get(cv2.CAP_PROP_FRAME_WIDTH), film.get(cv2.CAP_PROP_FRAME_HEIGHT)) == (160, 120)
+    pictures = []
+    while (read := film.read())[0]:
+        pictures.append(read[1])
+    with Capture.open(GOLDEN) as capture:
+        frames = [capture.read(each) for each in capture.messages("kinect/frame")]
+        lasts_s = (capture.end_ns - capture.start_ns) / 1e9
+    assert len(pictures) / video.RATE_HZ == pytest.approx(lasts_s, abs=0.2)
+    last = frames[-1]
+    assert isinstance(last, Frame)
+    seen = np.frombuffer(last.colour, np.uint8).reshape(120, 160, 3)[:90, :, ::-1]
+    difference = np.abs(pictures[-1][:90].astype(int) - seen.astype(int))
+    assert np.median(difference) < 12  # but for what is drawn in and the film's loss, the same
+
+
+def test_a_capture_without_pictures_makes_no_film(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    async def blind(room: Room) -> None:
+        await drive(room, 0.5, frames=False)
+
+    path = record(tmp_path / "blind.mcap", blind)
+    assert main(["export", str(path), "--video", str(tmp_path / "film.mp4")]) == 1
+    assert "it has no pictures" in capsys.readouterr().err
+    assert main(["export", str(path)]) == 2
+
+
+# --- tables ---------------------------------------------------------------------------------------
+
+
+def _rows(path: Path) -> list[dict[str, str]]:
+    with path.open(encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def test_each_key_is_a_table_with_a_column_for_each_number(exported: Path) -> None:
+    states = _rows(exported / "csv" / "base_state.csv")
+    with Capture.open(GOLDEN) as capture:
+        records = list(capture.messages("base/state"))
+        recorded = [capture.decode(each) for each in records]
+        joints = capture.decode(next(capture.messages("arm/state")))["joints"]
+    assert [float(row["odometry_m.0"]) for row in states] == [state["odometry_m"][0] for state in recorded]
+    assert [int(row["stamp_ns"]) for row in states] == [each.publish_ns for each in records]
+    assert _rows(exported / "csv" / "kinect_frame.csv")[0]["colour.bytes"] == str(160 * 120 * 3)
+    assert _rows(exported / "csv" / "arm_state.csv")[0]["joints.0"] == joints[0]
+
+
+def test_a_list_of_maps_is_a_table_of_its_own(exported: Path) -> None:
+    seen = _rows(exported / "csv" / "perception_detections.detections.csv")
+    assert {"label", "u_px", "position_m.2", "index", "seq"} <= set(seen[0])
+    with Capture.open(GOLDEN) as capture:
+        count = sum(len(capture.decode(each)["detections"]) for each in capture.messages("perception/detections"))
+    assert len(seen) == count
+
+
+def test_belief_stands_beside_truth_in_the_body_frame(tmp_path: Path) -> None:
+    async def drive_past(room: Room) -> None:
+        """The body looks left, along y, and goes 0.1 m on between two truths; the can is 1 m to its right."""
+        async with room.node("sim") as sim, room.node("planning") as planning:
+            can = TrueObject(label="red_can", kind="object", position_m=(2.0, 1.0, 0.06), orientation=(0, 0, 0, 1))
+            for tick in range(11):
+                body = {"body_m": (1.0, tick / 10, 0.0), "body_orientation": about_z(pi / 2)}
+                sim.publish(topics.TRUTH, Truth(**body, joints_rad={}, objects=(can,)))
+                if tick == 5:
+                    await room.clock.sleep_until(room.clock.now_ns() + 10_000_000)
+                    believed = TargetEstimate(label="red_can", position_m=(0.5, -1.0, 0.06))
+                    planning.publish(topics.PLAN, PlannerStatus(known=(believed,)))
+                await room.clock.sleep_until(room.clock.now_ns() + 20_000_000)
+
+    path = record(tmp_path / "truth.mcap", drive_past)
+    with Capture.open(path) as capture:
+        assert "belief" in tables.export(capture, tables.CsvFolder(tmp_path / "csv"))
+    (row,) = _rows(tmp_path / "csv" / "belief.csv")
+    gone_m = 0.5 + 0.1 / 3  # of 30 ms between the truths 10 have passed
+    assert (float(row["true_x_m"]), float(row["true_y_m"])) == pytest.approx((1.0 - gone_m, -1.0), abs=1e-6)
+    assert float(row["error_m"]) == pytest.approx(0.1 / 3, abs=1e-6)
+
+
+def test_parquet_needs_pyarrow_or_says_how_to_get_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code = main(["export", str(GOLDEN), "--parquet", str(tmp_path / "tables")])
+    try:
+        import pyarrow.parquet
+    except ModuleNotFoundError:
+        assert code == 1
+        assert "pip install 'cocoro-mesh[tables]'" in capsys.readouterr().err
+        return
+    assert code == 0
+    assert pyarrow.parquet.read_table(tmp_path / "tables" / "base_state.parquet").num_rows == 300
+
+
+# --- Foxglove -------------------------------------------------------------------------------------
+
+
+def test_the_file_for_foxglove_has_its_schemas_in_the_robots_time(exported: Path) -> None:
+    found: dict[str, list[Any]] = {}
+    last = 0
+    with (exported / "fox.mcap").open("rb") as stream:
+        for schema, channel, message in make_reader(stream, validate_crcs=True).iter_messages():
+            assert channel.message_encoding == "json"
+            assert last <= message.log_time < 10**10
+            last = message.log_time
+            value = json.loads(message.data)
+            if schema.name.startswith("foxglove."):
+                assert set(value) == set(json.loads(schema.data)["properties"])
+                found.setdefault(schema.name, []).append(value)
+            else:
+                found.setdefault(channel.topic, []).append(value)
+    assert {
+        "foxglove.CompressedImage", "foxglove.CameraCalibration", "foxglove.PointCloud", "foxglove.FrameTransforms",
+        "foxglove.SceneUpdate", "foxglove.ImageAnnotations", "foxglove.Log",
+    } <= set(found)  # fmt: skip
+    assert len(found["foxglove.CompressedImage"]) == len(found["foxglove.PointCloud"]) == 60
+    assert len(found["calliope/base/state"]) == 300
+    frames = {each["child_frame_id"] for update in found["foxglove.FrameTransforms"] for each in update["transforms"]}
+    assert {"body", "camera", "gripper"} <= frames
+    assert any("approach" in log["message"] for log in found["foxglove.Log"])
+
+
+def test_foxglove_schemas_have_foxgloves_names_and_no_references() -> None:
+    schema = schema_of(SceneUpdate)
+    assert schema.name == "foxglove.SceneUpdate"
+    assert b"$ref" not in schema.data
+    entity = json.loads(schema.data)["properties"]["entities"]["items"]
+    assert entity["title"] == "foxglove.SceneEntity"
+    assert entity["properties"]["timestamp"]["title"] == "time"
+
+
+def test_an_export_does_not_write_over_a_file(exported: Path) -> None:
+    with Capture.open(GOLDEN) as capture, pytest.raises(CaptureError, match="is there already"):
+        foxglove.export(capture, exported / "fox.mcap")
+
+
+# --- Rerun ----------------------------------------------------------------------------------------
+
+
+class Made:
+    """Whatever of Rerun's: it remembers what it was made with."""
+
+    def __init__(self, *args: Any, **options: Any) -> None:
+        self.args, self.options = args, options
+
+    def __call__(self, *args: Any, **options: Any) -> Made:
+        return Made(*args, **options)
+
+    def __getattr__(self, name: str) -> Made:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return Made()
+
+
+class Stream:
+    """A recording that keeps what it is told, by path."""
+
+    newest: Stream
+
+    def __init__(self, application: str) -> None:
+        self.told: dict[str, list[tuple[float, Any]]] = {}
+        self.time_s = -1.0
+        self.saved = ""
+        Stream.newest = self
+
+    def set_time(self, timeline: str, *, duration: float) -> None:
+        assert timeline == rerun_scene.TIMELINE
+        self.time_s = duration
+
+    def log(self, path: str, what: Any, static: bool = False) -> None:
+        assert " " not in path
+        self.told.setdefault(path, []).append((self.time_s, what))
+
+    def save(self, path: str) -> None:
+        self.saved = path
+
+    def flush(self) -> None:
+        pass
+
+
+class FakeRerun(types.ModuleType):
+    RecordingStream = Stream
+
+    def __getattr__(self, name: str) -> Made:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return Made()
+
+
+def test_rerun_is_told_of_pictures_points_poses_curves_and_phases(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setitem(sys.modules, "rerun", FakeRerun("rerun"))
+    assert main(["export", str(GOLDEN), "--rrd", str(tmp_path / "out.rrd")]) == 0
+    stream = Stream.newest
+    told = stream.told
+    assert stream.saved == str(tmp_path / "out.rrd")
+    assert len(told["world/body/camera/colour"]) == 60
+    assert len(told["world/body"]) == len(told["curves/base/speed"]) == len(told["curves/joints/elbow"]) == 300
+    assert {"world/body/points", "world/body/links", "world/body/believed"} <= set(told)
+    assert len(told["world/body/camera/colour/detections"]) == 60
+    phases = [what.args[0] for _, what in told["log"] if what.options["level"] == "INFO"]
+    assert phases[0].startswith("fetch red_can: ")
+    assert all(0.0 <= time_s < 10.0 for path, each in told.items() if path != "world" for time_s, _ in each)
+
+
+def test_without_rerun_one_line_says_how_to_install_it(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    for command in (["export", str(GOLDEN), "--rrd", str(tmp_path / "out.rrd")], ["view", str(GOLDEN)], ["view"]):
+        assert main(command) == 1
+        err = capsys.readouterr().err
+        assert "pip install 'cocoro-mesh[view]'" in err
+        assert len(err.splitlines()) == 1
+
+
+def test_rerun_itself_takes_it(tmp_path: Path) -> None:
+    pytest.importorskip("rerun", reason="Rerun is an extra, and not installed here")
+    assert main(["export", str(GOLDEN), "--rrd", str(tmp_path / "out.rrd")]) == 0
+    assert (tmp_path / "out.rrd").stat().st_size > 1_000_000
+
+
+# --- geometry -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("yaw_rad", [0.0, 0.3, pi / 2, 3.0, -2.0])
+def test_quaternions_turn_as_their_matrices_do(yaw_rad: float) -> None:
+    yaw = turn_z(yaw_rad)[:3, :3]
+    tilt = np.array([[1.0, 0, 0], [0, 0.6, -0.8], [0, 0.8, 0.6]])
+    for turn in (yaw, yaw @ tilt, tilt @ yaw):
+        q = quaternion(turn)
+        assert rotated(q, (1.0, 2.0, 3.0)) == pytest.approx(tuple(turn @ (1.0, 2.0, 3.0)))
+        assert rotated(conjugate(q), rotated(q, (1.0, 2.0, 3.0))) == pytest.approx((1.0, 2.0, 3.0))
+    assert rotated(about_z(yaw_rad), (1.0, 0.0, 0.0)) == pytest.approx((np.cos(yaw_rad), np.sin(yaw_rad), 0.0))
+
+
+def test_points_stand_where_the_depth_says() -> None:
+    depth = np.full((12, 16), 2047, dtype="<u2")
+    depth[6, 8] = ROBOT.depth_code(np.array([1.5]))[0]
+    colour = np.full((12, 16, 3), 7, dtype=np.uint8)
+    frame = Frame(width=16, height=12, colour=memoryview(colour.tobytes()), depth=memoryview(depth.tobytes()))
+    places, colours = points(frame, ROBOT, 1)
+    ray = ROBOT.camera.scaled(16, 12).ray(8, 6) * 1.5 + np.array(ROBOT.kinect.depth_offset_m)
+    assert places == pytest.approx(ray.reshape(1, 3), abs=0.01)
+    assert colours.tolist() == [[7, 7, 7]]
+
+
+def test_the_links_are_known_once_every_joint_is() -> None:
+    posture = Posture(ROBOT)
+    assert posture.links() == {}
+    joints = tuple(ROBOT.joints)
+    zero = (0.0,) * len(joints)
+    posture.bend(ServoState(joints=joints, position_rad=zero, speed_radps=zero, load=zero))
+    links = posture.links()
+    assert links["camera"][:3, 3] == pytest.approx((0.0603, 0.0, 0.7331), abs=1e-3)
+    assert len(posture.bones(links)) == len(links) == len(ROBOT.links)
+
+
+def test_robot_and_objects_are_those_that_the_capture_tells_of() -> None:
+    with Capture.open(GOLDEN) as capture:
+        assert "red_can" in catalogue_of(capture)
+        assert robot_of(capture).kinect == ROBOT.kinect
