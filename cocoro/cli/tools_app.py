@@ -11,7 +11,7 @@ import typer
 
 PANEL = "Tools"
 
-new = typer.Typer(no_args_is_help=True, help="Write something new from a template.")
+new = typer.Typer(no_args_is_help=True, help="Write a component from a template: `cocoro new service NAME`.")
 
 Robot = Annotated[str | None, typer.Option(help="Which robot; needed only when several are up here.")]
 Reach = Annotated[
