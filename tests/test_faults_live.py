@@ -78,6 +78,27 @@ def test_who_is_stopped_or_killed_while_driving_leaves_a_robot_that_stands(
     asyncio.run(scenario())
 
 
+def test_who_is_stopped_for_longer_than_the_lease_counts_as_dead_and_is_back_when_it_goes_on(
+    tmp_path: Path, far: Path
+) -> None:
+    async def scenario() -> None:
+        async with live(tmp_path, scene=far) as robot:
+            task_id = await robot.driving()
+            pid = robot.pid("perception")
+            stopped_s = await fault(robot, "perception", signal.SIGSTOP)
+            state = await robot.outcome(task_id)
+            assert (state.outcome, state.reason) == ("failed", "not_alive: perception died")
+            await stands_in_time(robot, stopped_s)
+            await robot.told("perception is silent: no sign of perception")
+            assert (await robot.ask(TaskRequest(task="park"))).refusal == "not_alive"
+            robot.signal("perception", signal.SIGCONT)
+            await robot.told("perception is back")
+            assert robot.pid("perception") == pid, "who is stopped is not killed"
+            await robot.driving()
+
+    asyncio.run(scenario())
+
+
 def test_a_simulator_that_is_killed_comes_back_and_all_others_work_with_it_as_before(tmp_path: Path) -> None:
     async def scenario() -> None:
         async with live(tmp_path) as robot:

@@ -105,6 +105,8 @@ class Executive:
         status = self._skills.status
         if status is None:
             return "not_alive", "the planner says nothing; see cocoro status"
+        if status.body_m is None:
+            return "not_alive", f"the planner does not know yet where the robot stands ({status.why})"
         if request.task != "put-down" and status.holding:
             return "holding", "the hand holds something; put it down first (cocoro put-down)"
         if request.task == "put-down" and not status.holding:

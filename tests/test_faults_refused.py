@@ -1,4 +1,4 @@
-"""A battery that is low: nothing new is begun, and what was begun comes to its end."""
+"""A robot that is not fit for a task begins none: a low battery, a planner that knows nothing yet."""
 
 from __future__ import annotations
 
@@ -6,13 +6,15 @@ import pytest
 from robot_rig import SMALL_FRAMES, RobotRig
 
 from cocoro import topics
-from cocoro.messages import BaseState, PlannerStatus, ServoState, TaskName, TaskReply, TaskRequest
+from cocoro.messages import BaseState, PlannerStatus, ServoState, TaskName, TaskReply, TaskRequest, Vec2
 from cocoro.testing import ServiceUnderTest, in_virtual_time
 
 LOW = 0.15
 
 
-async def executive(service: ServiceUnderTest, battery_fraction: float, *, holding: bool = False) -> None:
+async def executive(
+    service: ServiceUnderTest, battery_fraction: float, *, holding: bool = False, body_m: Vec2 | None = (0.0, 0.0)
+) -> None:
     """Have it know of a robot that is released and able, with so much in its battery."""
     service.others_live(*topics.HARDWARE, "perception", "planning")
     here = BaseState(
@@ -22,7 +24,7 @@ async def executive(service: ServiceUnderTest, battery_fraction: float, *, holdi
     service.feed(topics.BASE_STATE, here)
     for network in (topics.ARM_STATE, topics.HAND_STATE):
         service.feed(network, ServoState(joints=(), position_rad=(), speed_radps=(), load=(), latch="released"))
-    service.feed(topics.PLAN, PlannerStatus(why="nothing is asked", holding=holding))
+    service.feed(topics.PLAN, PlannerStatus(why="nothing is asked", holding=holding, body_m=body_m))
     await service.settle()
 
 
@@ -75,3 +77,15 @@ async def test_the_simulated_base_says_how_full_its_battery_is() -> None:
         await rig.advance(1.5)
         assert rig.tap.messages(topics.BASE_STATE)[-1].battery_fraction == 0.1
         assert (await rig.ask("fetch", "red_can")).refusal == "battery"
+
+
+@in_virtual_time
+async def test_a_planner_that_does_not_know_where_the_robot_stands_is_not_ready_for_a_task() -> None:
+    async with ServiceUnderTest("services.executive.service") as service:
+        await executive(service, 1.0, body_m=None)
+        refused = await ask(service, "fetch", "red_can")
+        assert (refused.refusal, refused.text) == (
+            "not_alive", "the planner does not know yet where the robot stands (nothing is asked)",
+        )  # fmt: skip
+        await executive(service, 1.0)
+        assert (await ask(service, "fetch", "red_can")).accepted
