@@ -23,9 +23,13 @@ from cocoro.capture.export.foxglove_types import SceneUpdate, schema_of
 from cocoro.capture.export.geometry import Posture, about_z, conjugate, points, quaternion, rotated
 from cocoro.capture.export.story import catalogue_of, robot_of
 from cocoro.capture.reader import Capture
+from cocoro.cli.capture_view import watch
 from cocoro.cli.main import main
 from cocoro.kinematics import turn_z
-from cocoro.messages import Frame, PlannerStatus, ServoState, TargetEstimate, TrueObject, Truth
+from cocoro.messages import BaseCommand, Frame, PlannerStatus, ServoState, TargetEstimate, TrueObject, Truth
+from cocoro.objects import Catalogue
+from cocoro.topics import Qos
+from cocoro.vloop import run_virtual
 
 GOLDEN = Path(__file__).parent / "golden" / "fetch.mcap"
 
@@ -246,6 +250,27 @@ def test_rerun_is_told_of_pictures_points_poses_curves_and_phases(
     phases = [what.args[0] for _, what in told["log"] if what.options["level"] == "INFO"]
     assert phases[0].startswith("fetch red_can: ")
     assert all(0.0 <= time_s < 10.0 for path, each in told.items() if path != "world" for time_s, _ in each)
+
+
+def test_rerun_is_told_of_the_mesh_as_it_goes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "rerun", FakeRerun("rerun"))
+
+    async def look() -> None:
+        room = Room()
+        bus = room.mesh.join()
+        watch(bus, "calliope", rerun_scene.Teller(Stream("cocoro"), ROBOT, Catalogue.load()))
+        bus.publisher("calliope/base/state", Qos.STATE).put(b"no message")
+        async with room.node("planning") as planning:
+            await room.clock.sleep_until(10**9)
+            planning.publish(topics.BASE_COMMAND, BaseCommand(left_mps=0.1, right_mps=0.2), stamp_ns=5)
+            await drive(room, 1.0)
+
+    run_virtual(look())
+    told = Stream.newest.told
+    assert len(told["world/body"]) == 50
+    assert len(told["world/body/camera/colour"]) == 10
+    (command,) = told["curves/wheels/commanded_left"]  # as old as it is
+    assert command[1].args == (0.1,)
 
 
 def test_without_rerun_one_line_says_how_to_install_it(

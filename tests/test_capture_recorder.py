@@ -14,12 +14,13 @@ import pytest
 from capture_rig import STILL, Room, all_of, drive, entry, record, writer
 
 from cocoro import topics
+from cocoro.bus.base import Payload
 from cocoro.capture.reader import Capture
 from cocoro.capture.writer import Writer
 from cocoro.clock import NS
 from cocoro.core import Sample, Schedule, Take
 from cocoro.errors import CocoroError, RemoteError
-from cocoro.messages import BaseState, CancelRequest, Recording, TaskReply
+from cocoro.messages import AboutReply, BaseState, CancelRequest, Recording, TaskReply
 from cocoro.node import RECORDER_S
 from cocoro.topics import Qos
 from cocoro.vloop import run_virtual
@@ -100,6 +101,26 @@ def test_liveliness_is_recorded_as_it_changes_and_each_service_says_what_it_was_
     assert float(told["latency_s"]) == 0.25
     assert "numpy" in json.loads(told["versions"])
     assert json.loads(description)["name"] == "calliope"
+
+
+def test_a_service_that_is_too_busy_at_its_start_is_asked_again(tmp_path: Path) -> None:
+    async def busy(room: Room) -> None:
+        async def answer(_: str, __: Payload) -> bytes:
+            asked.append(room.clock.now_ns())
+            if len(asked) == 1:
+                await asyncio.sleep(60.0)
+            return msgspec.msgpack.encode(AboutReply(service="base", robot="calliope", module="parts.slow"))
+
+        bus = room.mesh.join()
+        bus.serve("calliope/base/about", answer)
+        bus.declare_alive("calliope/base/alive")
+        await asyncio.sleep(10.0)
+
+    asked: list[int] = []
+    path = record(tmp_path / "busy.mcap", busy)
+    assert len(asked) == 2
+    with Capture.open(path) as capture:
+        assert capture.metadata["service/base"]["module"] == "parts.slow"
 
 
 def test_what_is_not_wanted_is_not_recorded(tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ from cocoro.capture.rebirth import reborn, with_rate
 from cocoro.capture.replay import Replay, played_keys, refuse_if_alive, services_of
 from cocoro.clock import FollowedClock
 from cocoro.errors import ConfigError, RefusedError
-from cocoro.messages import BaseState, Clock, Detections, PlannerStatus, StepRecord
+from cocoro.messages import BaseState, Clock, Detections, Frame, PlannerStatus, StepRecord
 from cocoro.node import Node
 from cocoro.vloop import run_virtual
 
@@ -278,3 +278,19 @@ def test_a_reader_takes_every_pass_of_a_loop(tmp_path: Path) -> None:
     run_virtual(listen(Room()))
     assert len(got) >= 300
     assert len({state.incarnation for state in got}) >= 3
+
+
+def test_lossy_frames_are_played_as_frames(tmp_path: Path) -> None:
+    path = record(tmp_path / "lossy.mcap", drive, jpeg_quality=90)
+    got: list[Frame] = []
+
+    async def listen(room: Room) -> None:
+        async with room.node("perception") as node:
+            node.on(topics.FRAME, got.append)
+            with Capture.open(path) as capture:
+                keys = played_keys(capture, ["frames"], hardware=False)
+                await Replay(room.mesh.join(), capture, Player(capture, keys.__contains__)).run()
+            await asyncio.sleep(0.1)
+
+    run_virtual(listen(Room()))
+    assert [frame.seq for frame in got] == list(range(20))

@@ -11,9 +11,11 @@ import msgspec
 from cocoro.bus.base import Bus, Handle, RawPublisher
 from cocoro.capture.file import LARGE_BYTES
 from cocoro.capture.keys import MADE_HERE, Choice
+from cocoro.capture.pictures import LossyFrame
 from cocoro.capture.player import Player
 from cocoro.capture.reader import Capture, Record
 from cocoro.capture.rebirth import reborn, with_rate
+from cocoro.capture.types import NotReadableError
 from cocoro.errors import ConfigError, RefusedError
 from cocoro.messages import Clock
 from cocoro.node import alive_key
@@ -128,11 +130,21 @@ class Replay:
                 await self._changed.wait()
 
     def _send(self, record: Record) -> None:
-        payload = reborn(record.payload, self._player.passes)
+        payload = reborn(self._payload(record), self._player.passes)
         if record.key == self._clock_key:
             payload = with_rate(payload, self._player.rate)
         self._publisher(record.key, len(payload)).put(payload)
         self.sent += 1
+
+    def _payload(self, record: Record) -> bytes | memoryview:
+        """As it was published; a frame that was kept with loss, as near to that as can be."""
+        schema = self._capture.schema(record.key)
+        if schema is None or schema.name != LossyFrame.__name__:
+            return record.payload
+        try:
+            return msgspec.msgpack.encode(self._capture.read(record))
+        except NotReadableError:
+            return record.payload
 
     def _publisher(self, key: str, size: int = 0) -> RawPublisher:
         publisher = self._publishers.get(key)

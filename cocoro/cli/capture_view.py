@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import signal
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
+from cocoro.bus.base import Bus, Payload
 from cocoro.capture.export.rerun_scene import APPLICATION, Teller, library, tell
 from cocoro.capture.reader import Capture
 from cocoro.cli import exits
@@ -15,9 +19,11 @@ from cocoro.cli.link import Where, joined
 from cocoro.messages import Message
 from cocoro.objects import Catalogue
 from cocoro.robot import Robot
-from cocoro.topics import TOPICS
+from cocoro.topics import TOPICS, Topic
 
 PER_SERVICE = "{service}"
+WAITING = 4
+"""Messages of a key; a viewer that is behind shows the newest."""
 
 
 def view_file(file: Path) -> int:
@@ -39,10 +45,7 @@ async def view_mesh(where: Where) -> int:
         description, measured = (_path(resolved.get(name)) for name in ("description", "measured"))
         recording = rr.RecordingStream(APPLICATION)
         recording.spawn()
-        teller = Teller(recording, Robot.load(description, measured), Catalogue.load())
-        for topic in TOPICS:
-            if PER_SERVICE not in topic.name:
-                link.inbox(topic).add(partial(_heard, teller, topic.name))
+        watch(link.bus, link.robot, Teller(recording, Robot.load(description, measured), Catalogue.load()))
         print("Ctrl-C ends it")
         end, loop = asyncio.Event(), asyncio.get_running_loop()
         for number in (signal.SIGINT, signal.SIGTERM):
@@ -51,8 +54,17 @@ async def view_mesh(where: Where) -> int:
     return exits.DONE
 
 
-def _heard(teller: Teller, topic: str, _key: str, message: Message) -> None:
-    teller.tell(topic, message)
+def watch(bus: Bus, robot: str, teller: Teller) -> None:
+    """Tell of everything that travels from now on, however old it is: a viewer acts on nothing."""
+
+    def heard(topic: Topic[Any], decoder: msgspec.msgpack.Decoder[Message], _key: str, payload: Payload) -> None:
+        with suppress(msgspec.MsgspecError, ValueError, RecursionError):
+            teller.tell(topic.name, decoder.decode(payload))
+
+    for topic in TOPICS:
+        if PER_SERVICE not in topic.name:
+            handler = partial(heard, topic, msgspec.msgpack.Decoder(topic.type))
+            bus.subscribe(topic.key(robot), topic.qos, handler, depth=WAITING)
 
 
 def _path(file: Any) -> Path | None:

@@ -17,15 +17,17 @@ from cocoro.bus.base import Handle, Payload
 from cocoro.capture.keys import ALIVE_INFO, Alive, Choice, KeyInfo
 from cocoro.capture.writer import Entry, Missing
 from cocoro.clock import VirtualClock
-from cocoro.errors import CocoroError
+from cocoro.errors import MeshError, RemoteError
 from cocoro.messages import AboutReply, AboutRequest, Recording
-from cocoro.node import Node, recorder_key
+from cocoro.node import Node, alive_key, recorder_key
 from cocoro.rundir import RunDir
 from cocoro.topics import ABOUT, RECORDING, Qos
 from services.capture.sink import Sink
 
 TELL_S = 1.0
 """How often the recorder tells how it is getting on."""
+TRIES, ASK_AGAIN_S = 10, 1.0
+"""How often a service is asked what it was started with, and how long after it did not answer."""
 LOOK_S = 0.1
 """How often it looks whether a fault has come up."""
 
@@ -141,8 +143,8 @@ class Recorder:
 
     def _on_alive(self, key: str, alive: bool) -> None:
         source = self._ledger.source(key)
-        if source is not None and self._alive.get(key) != alive:
-            self._alive[key] = alive
+        changed, self._alive[key] = self._alive.get(key) != alive, alive
+        if source is not None and changed:
             message = Alive(alive=alive, seq=source.heard, stamp_ns=self._node.now_ns())
             source.heard += 1
             self._put(source, key, message.seq, message.stamp_ns, msgspec.msgpack.encode(message), ALIVE_INFO)
@@ -168,13 +170,22 @@ class Recorder:
     # --- what is known besides --------------------------------------------------------------------
 
     async def _ask(self, service: str) -> None:
-        """What a service that has come up was started with."""
-        try:
-            reply = await self._node.call(ABOUT.of(service), AboutRequest())
-        except CocoroError as error:
-            self._node.log.info("%s does not say what it was started with: %s", service, error)
-            return
-        self._sink.remember(f"service/{service}", _entries(reply))
+        """What a service that has come up was started with; again, when it is too busy to say so at once."""
+        alive_at = alive_key(self._node.robot_name, service)
+        for _ in range(TRIES):
+            try:
+                reply = await self._node.call(ABOUT.of(service), AboutRequest())
+            except RemoteError as error:
+                self._node.log.info("%s cannot say what it was started with: %s", service, error)
+                return
+            except MeshError:
+                await asyncio.sleep(ASK_AGAIN_S)
+                if not self._alive.get(alive_at):
+                    return
+            else:
+                self._sink.remember(f"service/{service}", _entries(reply))
+                return
+        self._node.log.warning("%s does not say what it was started with", service)
 
     def _remember_run(self) -> None:
         node = self._node
