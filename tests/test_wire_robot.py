@@ -49,5 +49,17 @@ def test_the_robot_behind_wires_comes_up_parks_and_tells_of_a_fault(shell: Shell
             break
     assert "elbow: overload" in told
     assert "fell back to passive" in told
+    base = shell("base")
+    assert base.returncode == 1
+    assert "stopped    by mode" in base.stdout
+    refused = shell("base", "recover")
+    assert refused.returncode == 3
+    assert "a wheel hangs in the air" in refused.stdout
+    ask(shell, do="feel", field="drop_left", value=False)
+    assert shell("base", "recover").returncode == 0
+    cleared = shell("servos", "clear", "elbow")
+    assert (cleared.returncode, cleared.stdout) == (0, "arm: cleared: elbow\n"), cleared.stderr
+    assert "sensors    nothing" in shell("base").stdout
+    assert "another program" in shell("servos", "calibrate", "elbow", "--profile", "sim-wire").stderr
     assert shell("down").returncode == 0
     assert not (shell.run_dir.path / "wire" / "control").exists()

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from cocoro.cli import capture_app, objects_app, tools_app
+from cocoro.cli import capture_app, hardware_app, objects_app, tools_app
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -192,6 +192,8 @@ capture_app.add_to(app)
 # --- tools ----------------------------------------------------------------------------------------
 
 tools_app.add_to(app)
+
+hardware_app.add_to(app)
 
 # --- starting and stopping ------------------------------------------------------------------------
 

@@ -12,7 +12,7 @@ from cocoro.topics import BASE_COMMAND
 from services.base import oi
 from services.base.keeper import Link
 
-FRESH_NS = 150_000_000
+FRESH_NS = 180_000_000
 """The state is told as long as the Create was heard within this time."""
 LONGEST_S = 0.25
 """For longer than this nobody knows what the wheels did: then it is the Create's own count that tells."""

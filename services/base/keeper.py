@@ -15,8 +15,8 @@ Link = Literal["closed", "silent", "waking", "up", "fallen"]
 itself, and waits for somebody to say that it may go on."""
 
 MS = 1_000_000
-SILENT_NS = 120 * MS
-"""Eight frames missed: the Create is not heard any more."""
+SILENT_NS = 180 * MS
+"""Twelve frames missed: the Create is not heard any more."""
 RESEND_NS = 40 * MS
 """Wheel commands are repeated so often even when nothing has changed: one may have been lost on the wire."""
 COUNTS_NS = 200 * MS

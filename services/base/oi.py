@@ -16,7 +16,7 @@ STREAM_S = 0.015
 MAX_FRAME = 86
 """Bytes of a stream frame that fit into that time at 57600 baud."""
 
-START, SAFE, FULL, DEMO, DRIVE, DRIVE_DIRECT, STREAM = 128, 131, 132, 136, 137, 145, 148
+START, SAFE, FULL, DEMO, DRIVE, DRIVE_DIRECT, STREAM, QUERY = 128, 131, 132, 136, 137, 145, 148, 149
 OPCODES = range(128, 159)
 Mode = Literal["off", "passive", "safe", "full"]
 MODES: tuple[Mode, ...] = ("off", "passive", "safe", "full")
@@ -110,9 +110,14 @@ def drive(speed_mmps: int, radius_mm: int) -> bytes:
 
 def stream(packets: Sequence[int]) -> bytes:
     """Send these packets every 15 ms from now on, in place of any that were asked for before."""
-    if 3 + sum(1 + PACKETS[packet].size for packet in packets) > MAX_FRAME:
+    if 3 + length(packets) > MAX_FRAME:
         raise ValueError("so many packets do not fit into 15 ms")
     return bytes([STREAM, len(packets), *packets])
+
+
+def query(packets: Sequence[int]) -> bytes:
+    """Send these packets once, bare: without numbers, frame or checksum."""
+    return bytes([QUERY, len(packets), *packets])
 
 
 def abort_demo() -> bytes:
@@ -157,7 +162,7 @@ class StreamParser:
         self.skipped = 0
         """Bytes given up so far."""
         self._lists = {tuple(packets) for packets in lists}
-        self._lengths = {_length(packets) for packets in self._lists}
+        self._lengths = {length(packets) for packets in self._lists}
         self._bytes = bytearray()
 
     def feed(self, data: bytes) -> list[Readings]:
@@ -172,15 +177,15 @@ class StreamParser:
             left = len(self._bytes) - at
             if left < 2:
                 break
-            length = self._bytes[at + 1]
-            if length in self._lengths:
-                if left < length + 3:
+            size = self._bytes[at + 1]
+            if size in self._lengths:
+                if left < size + 3:
                     break
-                frame = self._bytes[at : at + length + 3]
+                frame = self._bytes[at : at + size + 3]
                 readings = _decode(frame[2:-1]) if sum(frame) % 256 == 0 else None
                 if readings is not None and tuple(readings) in self._lists:
                     frames.append(readings)
-                    at += length + 3
+                    at += size + 3
                     continue
             at += 1
             self.skipped += 1
@@ -193,7 +198,19 @@ class StreamParser:
         self._bytes.clear()
 
 
-def _length(packets: Sequence[int]) -> int:
+def answer(data: bytes, packets: Sequence[int]) -> Readings | None:
+    """What answers a `query`; None when it is too short, or says what cannot be. It has no checksum: not to act on."""
+    spelled = bytearray()
+    at = 0
+    for packet in packets:
+        size = PACKETS[packet].size
+        spelled += bytes([packet]) + data[at : at + size]
+        at += size
+    return _decode(spelled) if at == len(data) else None
+
+
+def length(packets: Sequence[int]) -> int:
+    """Bytes of a stream frame's payload with these packets."""
     return sum(1 + PACKETS[packet].size for packet in packets)
 
 

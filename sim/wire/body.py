@@ -27,6 +27,12 @@ class SimpleBody:
         self._shafts = [(servo, _Shaft(servo)) for bus in buses for servo in bus.servos]
         self._then_ns: int | None = None
 
+    def turn_by_hand(self, number: int, count: int) -> None:
+        """Somebody turns a limp servo."""
+        for servo, shaft in self._shafts:
+            if servo.number == number and not servo.motor.on:
+                shaft.count = float(count)
+
     def fileno(self) -> int:
         return -1
 
@@ -50,12 +56,12 @@ class SimpleBody:
 class _Shaft:
     def __init__(self, servo: Servo) -> None:
         self._servo = servo
-        self._count = float(servo.get(36))
+        self.count = float(servo.get(36))
 
     def turn(self, dt_s: float, blocked: bool, now_ns: int) -> None:
         motor = self._servo.motor
         speed = load = 0.0
-        error = motor.goal - self._count
+        error = motor.goal - self.count
         if motor.on and motor.limit > 0.0 and abs(error) >= 0.5:
             share = min(max(abs(error) / motor.slope, motor.punch), 1.0)
             load = copysign(motor.limit * share if blocked else 0.05 * motor.limit, error)
@@ -63,5 +69,5 @@ class _Shaft:
                 fastest = motor.speed or FULL_SPEED
                 step = min(abs(error), min(fastest, FULL_SPEED) * COUNTS_A_SPEED_COUNT * dt_s)
                 speed = copysign(step / COUNTS_A_SPEED_COUNT / dt_s, error)
-                self._count += copysign(step, error)
-        self._servo.sense(round(self._count), round(speed), load, now_ns)
+                self.count += copysign(step, error)
+        self._servo.sense(round(self.count), round(speed), load, now_ns)

@@ -1,0 +1,53 @@
+"""What `cocoro doctor` looks at for the servos, while the service is down."""
+
+from __future__ import annotations
+
+from cocoro.checks import Check, bad, note, ok
+from cocoro.ports import check_port, port_path
+from cocoro.robot import Joint, Robot
+from services.servos import tools
+from services.servos.bus import Bus, PortError, SilentError
+from services.servos.network import HIGH_V, HOT_C, LOW_V
+from services.servos.service import NETWORKS, Config
+
+__all__ = ["check"]
+
+
+def check(config: Config, robot: Robot, robot_name: str) -> list[Check]:
+    checks: list[Check] = []
+    for name in NETWORKS:
+        port = config.arm_port if name == "arm" else config.hand_port
+        checked = check_port(name, port, robot_name, quick=True)
+        checks += checked
+        if checked[0].state == "ok":
+            joints = [robot.joints[joint] for joint in robot.network_joints(name)]
+            baud = robot.networks[name].baud  # type: ignore[index] # one of the two names
+            checks += _servos(name, port_path(port, robot_name), baud, joints, config.reply_s)
+    return checks
+
+
+def _servos(name: str, path: str, baud: int, joints: list[Joint], reply_s: float) -> list[Check]:
+    try:
+        with Bus(path, baud, max(reply_s, tools.SCAN_S)) as bus:
+            return [_servo(bus, baud, joint) for joint in joints]
+    except PortError as error:
+        return [note(f"{name} servos", f"{error}: does their service run? `cocoro status` tells more")]
+
+
+def _servo(bus: Bus, baud: int, joint: Joint) -> Check:
+    what = f"servo {joint.id}, {joint.name}"
+    try:
+        found = tools.look_at(bus, baud, joint.id)
+    except SilentError:
+        return bad(what, f"does not answer at {baud} baud: power, plugs, ID; `cocoro servos scan` finds it")
+    text = f"{found.model}, {found.voltage_v:.1f} V, {found.temperature_c} C"
+    wrong = []
+    if found.errors:
+        wrong.append(f"says {', '.join(found.errors)}: start the robot and `cocoro servos clear`")
+    if found.return_delay_us:
+        wrong.append(f"waits {found.return_delay_us} us to answer: `cocoro servos set-id {joint.id} {joint.id}`")
+    if not LOW_V <= found.voltage_v <= HIGH_V:
+        wrong.append("bad voltage: check the supply")
+    if found.temperature_c >= HOT_C:
+        wrong.append("hot: let it cool")
+    return bad(what, f"{text}; {'; '.join(wrong)}") if wrong else ok(what, text)

@@ -1,0 +1,42 @@
+"""A Create and a Calliope's servos without a robot and without physics: `python -m sim.wire DIR` until Ctrl-C.
+
+For first steps with the tools: DIR gets the ports `create`, `arm` and `hand`, and the socket `control` (see
+`sim.wire.control`).
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from contextlib import suppress
+from pathlib import Path
+
+from cocoro.robot import Robot
+from sim.wire.body import SimpleBody
+from sim.wire.control import Control, ControlServer
+from sim.wire.create import Create
+from sim.wire.dynamixel import Bus, Servo
+from sim.wire.emulator import Emulator
+
+MODELS = {"arm": 28, "hand": 12}
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(prog="python -m sim.wire", description="Emulated hardware on pseudo-terminals.")
+    parser.add_argument("folder", type=Path, help="where the ports are to be")
+    folder: Path = parser.parse_args().folder
+    robot = Robot.load()
+    create = Create()
+    buses = {
+        name: Bus([Servo(robot.joints[joint].id, model) for joint in robot.network_joints(name)])
+        for name, model in MODELS.items()
+    }
+    emulator = Emulator(folder, {"create": create, **buses}, SimpleBody(create, *buses.values()))
+    with ControlServer(folder, Control(emulator)), suppress(KeyboardInterrupt):
+        print("\n".join(str(folder / name) for name in emulator.lines), flush=True)
+        emulator.run()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
