@@ -34,6 +34,10 @@ class RehearsalRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
     sensors: Sensors = "ideal"
     body: Body = "nominal"
     """Worn: lengths, joint zeros, camera, marker and wheels are off what the drawing says, as the seed says."""
+    model: str | None = None
+    """The file of what was learned of the body."""
+    reach: Literal["learned", "rigid"] = "learned"
+    """Rigid: whatever was learned of the arm."""
     latency: dict[str, Annotated[float, Meta(ge=0, le=60)]] = {}
     """Seconds that are added to every step of a service, by the service's name."""
     lockstep: bool = False

@@ -166,20 +166,21 @@ class _Rehearsal:
         if name == RECORDER:
             return {"file": request.record}
         if name == "sim":
-            settings: dict[str, Any] = {
+            world: dict[str, Any] = {
                 field: getattr(request, field)
                 for field in ("scene", "seed", "sensors", "body", "width", "height", "frame_rate_hz")
             }
-            settings["target"] = request.label
-            return settings | ({"command_timeout_s": _LONG_S} if request.lockstep else {})
+            world["target"] = request.label
+            return world | ({"command_timeout_s": _LONG_S} if request.lockstep else {})
+        settings: dict[str, Any] = {"model": request.model or "", "reach": request.reach} if name == "planning" else {}
         if request.lockstep:
             # The baseline's planner speaks once a cycle, however long that is: no penalty for it.
             baseline: dict[str, dict[str, Any]] = {
                 "planning": {"coordination": "lockstep"},
                 "executive": {"planner_silence_s": _LONG_S},
             }
-            return baseline.get(name, {})
-        return {}
+            settings |= baseline.get(name, {})
+        return settings
 
     async def _operate(self, operator: Node) -> TaskState:
         """What the operator does: give the task, watch it to its end."""

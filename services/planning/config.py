@@ -126,12 +126,36 @@ class Follow(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     give_up_s: Positive = 25.0
 
 
+class HandSight(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Of seeing the own hand while reaching."""
+
+    follow_s: Positive = 0.4
+    """What is felt follows what is seen with this time constant."""
+    speed_mps: Positive = 0.03
+    """And no faster than this."""
+    lately_s: Positive = 0.4
+    """A hand that was not seen for longer is felt."""
+    fade_s: Positive = 6.0
+    """A correction that is not renewed fades with this time constant."""
+    wild_m: Positive = 0.12
+    """A marker further than this from where the hand is felt is something else."""
+    roll_rad: Positive = 0.1
+    """The marker's place is known while the claws lie level, within so much."""
+
+
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     rate_hz: Positive = 50.0
     coordination: Literal["concurrent", "lockstep"] = "concurrent"
     """Lockstep: the arm waits until the base stands, as the paper has it."""
     marker: str = "hand_marker"
     """The label of the ball on the hand, which is no object of the room."""
+    model: str = ""
+    """The file of what was learned of the body; empty: nothing. One that is refused leaves the rigid body."""
+    reach: Literal["learned", "rigid"] = "learned"
+    """Rigid: the drawing's own kinematics, whatever was learned of the arm."""
+    see_hand: bool = False
+    """Bring the rigid body's hand to where its marker is seen, too; with a learned map that is always done."""
+    sight: HandSight = HandSight()
     memory: Memory = Memory()
     head: Head = Head()
     navigation: Navigation = Navigation()

@@ -10,13 +10,14 @@ from cocoro import topics
 from cocoro.clock import NS
 from cocoro.core import Output, Sample, Schedule, Take
 from cocoro.kinematics import Array
-from cocoro.messages import BaseCommand, Intent, PlannerStatus, ServoCommand
+from cocoro.messages import BaseCommand, Intent, LearnedModel, PlannerStatus, ServoCommand
 from cocoro.robot import Robot
 from cocoro.topics import Topic
 from services.planning.arm import Step
 from services.planning.behaviours import BEHAVIOURS, Behaviour, Idle, Limbs, Plan, Scene
 from services.planning.config import Config
 from services.planning.head import PAN, TILT
+from services.planning.learned import Learned
 from services.planning.reach import ARM
 from services.planning.senses import Senses
 
@@ -40,6 +41,18 @@ class PlanningCore:
         self._missing_since_ns: int | None = None
         self._head_goal: tuple[float, float] | None = None
 
+        self.learned = Learned(robot, config)
+        if config.model:
+            self.learned.load(config.model)
+        self._use_learned()
+
+    def _use_learned(self) -> None:
+        learned = self.learned
+        self._limbs.reacher.use(learned.hand)
+        self._limbs.driver.turn_with(learned.separation_m)
+        drawn_m = self._limbs.robot.base.wheel_separation_m
+        self._senses.turning.ratio = drawn_m / learned.separation_m if learned.separation_m is not None else 1.0
+
     reads: Mapping[Topic, Take] = {  # type: ignore[type-arg]
         topics.BASE_STATE: "all",
         topics.ARM_STATE: "all",
@@ -47,6 +60,7 @@ class PlanningCore:
         topics.DETECTIONS: "all",
         topics.OBSTACLES: "all",
         topics.INTENT: "latest",
+        topics.MODEL: "all",
     }
 
     @property
@@ -57,8 +71,13 @@ class PlanningCore:
 
     def step(self, inputs: Sequence[Sample], now_ns: int) -> Sequence[Output]:
         for sample in inputs:
+            if isinstance(sample.message, LearnedModel):
+                self.learned.take(bytes(sample.message.content))
+                self._use_learned()
             self._senses.take(sample.topic, sample.message, now_ns)
         self._senses.localise(now_ns)
+        if self.learned.hand is not None:
+            self.learned.hand.step(self._senses.sightings_of(self._config.marker), now_ns)
         dt_s = self._elapsed(now_ns)
         self._follow_intent(now_ns)
         missing, hand, body = self._senses.missing(now_ns), self._senses.hand, self._senses.body()
@@ -179,6 +198,7 @@ class PlanningCore:
             body_m=(scene.body.x_m, scene.body.y_m),
             body_yaw_rad=scene.body.yaw_rad,
             known=self._senses.memory.all(scene.body, scene.now_ns),
+            model=self.learned.text,
         )
 
     def _commands(self, plan: Plan, scene: Scene) -> list[Output]:

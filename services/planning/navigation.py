@@ -42,8 +42,13 @@ class Driver:
     def __init__(self, config: Navigation, base: Base) -> None:
         self._config = config
         self._base = base
+        self._separation_m = base.wheel_separation_m
         self._speed_mps = 0.0
         self._turn_radps = 0.0
+
+    def turn_with(self, separation_m: float | None) -> None:
+        """The wheels' distance as it was learned; None is the drawing's."""
+        self._separation_m = separation_m if separation_m is not None else self._base.wheel_separation_m
 
     def reset(self) -> None:
         self._speed_mps = self._turn_radps = 0.0
@@ -107,7 +112,7 @@ class Driver:
         limit = more * config.max_turn_radps
         turn_radps = min(max(turn_radps, -limit), limit)
         self._turn_radps = _approach(self._turn_radps, turn_radps, config.turn_acceleration_radps2 * dt_s)
-        half = self._turn_radps * self._base.wheel_separation_m / 2
+        half = self._turn_radps * self._separation_m / 2
         left, right = self._speed_mps - half, self._speed_mps + half
         excess = max(abs(left), abs(right)) / self._base.max_wheel_speed_mps
         if excess > 1.0:

@@ -3,9 +3,9 @@ of the Jacobian, within the joint limits (the paper's 'Motor planning for reachi
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from math import asin, atan2, cos, hypot, pi, sin
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -42,14 +42,32 @@ class HandPose(NamedTuple):
         return HandPose(*(v + gap / scale for v, gap in zip(self, gaps, strict=True)))
 
 
+class HandModel(Protocol):
+    """Where the pads' centre is: the drawing's chain, or what was learned of it."""
+
+    def pose(self, angles: Mapping[str, float]) -> Array:
+        """4 x 4, hand to body frame."""
+
+    def position(self, angles: Mapping[str, float]) -> Array:
+        """Body frame, shape (3,)."""
+
+    def jacobian(self, angles: Mapping[str, float], joints: Iterable[str]) -> Array:
+        """Shape (6, n), as `Chain.jacobian`."""
+
+
 class Reacher:
     """Forward and inverse kinematics of the hand, from the robot description."""
 
     def __init__(self, robot: Robot, damping: float) -> None:
-        self._pad = robot.chain("pad_centre")
+        self._rigid = robot.chain("pad_centre")
+        self._pad: HandModel = self._rigid
         self._axis = robot.chain("arm_base").position({"arm_base": 0.0})
         self._limits = np.array([robot.joints[name].limits_rad for name in ARM])
         self._damping2 = damping * damping
+
+    def use(self, hand: HandModel | None) -> None:
+        """Reach with this from now on; None is the rigid body."""
+        self._pad = hand if hand is not None else self._rigid
 
     def position(self, angles: Mapping[str, float]) -> Array:
         """The pads' centre, body frame, shape (3,)."""

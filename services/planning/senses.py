@@ -18,6 +18,7 @@ from cocoro.topics import Topic
 from services.planning.config import Config
 from services.planning.memory import TargetMemory
 from services.planning.surroundings import Surroundings
+from services.planning.turning import Turning
 
 _WAIT_FOR_ODOMETRY_NS = NS // 5
 
@@ -86,6 +87,7 @@ class Senses:
         """How old a sighting is when the next one comes, smoothed: a fast perception makes it small."""
         self._looked_ns: int | None = None
         self._sight = Sight(config)
+        self.turning = Turning()
         self._watched = {config.marker}
         self._sightings: list[Sighting] = []
 
@@ -93,8 +95,7 @@ class Senses:
         if isinstance(message, BaseState):
             self.base = message
             resets = self._odometry.resets
-            pose = (*message.odometry_m, message.odometry_yaw_rad)
-            self._odometry.add(message.stamp_ns, pose, message.incarnation)
+            self._odometry.add(message.stamp_ns, self.turning.pose(message), message.incarnation)
             if self._odometry.resets != resets:
                 # The base restarted: its odometry frame is a new one, places in the old one mean nothing now.
                 self.memory.clear()

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from cocoro.errors import ConfigError
+from cocoro.learning.model import decode
+from cocoro.messages import LearnedModel, ModelReply, ModelRequest
 from cocoro.node import Node
 from cocoro.robot import Robot
+from cocoro.topics import LEARNED, MODEL
 from services.planning.config import Config
 from services.planning.core import PlanningCore
 
@@ -17,4 +21,18 @@ def core(robot: Robot, config: Config) -> PlanningCore:
 
 async def run(node: Node, config: Config) -> None:
     """Plan for ever: at a fixed rate, and at once when a new detection arrives."""
-    await node.drive(core(node.robot, config))
+    planner = core(node.robot, config)
+    if config.model:
+        node.log.info("reaching: %s", planner.learned.text)
+
+    async def take(request: ModelRequest) -> ModelReply:
+        """Checked here, so that who sends it hears why not; the core takes what is published, for the record."""
+        try:
+            decode(request.content, node.robot, "from the mesh")
+        except ConfigError as error:
+            return ModelReply(accepted=False, text=f"{error}; it goes on with: {planner.learned.text}")
+        node.publish(MODEL, LearnedModel(content=request.content))
+        return ModelReply(accepted=True, text="taken over")
+
+    node.serve(LEARNED, take)
+    await node.drive(planner)

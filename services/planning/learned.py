@@ -1,0 +1,170 @@
+"""What the planner reaches and drives with: the rigid body, or what the robot has learned of itself."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from math import exp
+from pathlib import Path
+
+import numpy as np
+
+from cocoro.clock import NS
+from cocoro.errors import ConfigError
+from cocoro.kinematics import Array
+from cocoro.learning import model as models
+from cocoro.learning.drawing import Drawing
+from cocoro.learning.handmap import HandMap
+from cocoro.learning.model import Model
+from cocoro.robot import Robot
+from services.planning.config import Config, HandSight
+from services.planning.reach import ARM, LEVEL_ROLL_RAD, HandModel
+from services.planning.senses import Sighting
+
+NOTHING_LEARNED = "rigid body: nothing learned"
+
+
+class LearnedHand:
+    """The pads' centre by the learned map: where the drawing has it, moved as the map moves the marker.
+
+    The map knows where the marker is seen, and nothing of the hand's direction, which stays the drawing's.
+    """
+
+    def __init__(self, robot: Robot, learned: HandMap) -> None:
+        self._drawn = robot.chain("pad_centre")
+        self._map = learned
+
+    def pose(self, angles: Mapping[str, float]) -> Array:
+        pose = self._drawn.pose(angles)
+        pose[:3, 3] += self._offset(angles)
+        return pose
+
+    def position(self, angles: Mapping[str, float]) -> Array:
+        return np.asarray(self._drawn.position(angles) + self._offset(angles))
+
+    def jacobian(self, angles: Mapping[str, float], joints: Iterable[str]) -> Array:
+        """As `Chain.jacobian`, for the joints of ARM in their order."""
+        jac = self._drawn.jacobian(angles, joints)
+        at = _arm(angles)
+        if self._map.over_drawing and self._map.coordinates == "cartesian":
+            jac[:3] += self._map.network.jacobian(at)
+        else:
+            jac[:3] += self._map.jacobian(at) - self._map.drawing.jacobian(at)
+        return jac
+
+    def _offset(self, angles: Mapping[str, float]) -> Array:
+        at = _arm(angles)
+        if self._map.over_drawing and self._map.coordinates == "cartesian":
+            return self._map.network.at(at)
+        return np.asarray(self._map.at(at) - self._map.drawing.at(at))
+
+
+class SeenHand:
+    """The hand as it is felt, brought to where it is seen (the paper's DIRECT: seen while in view, else felt).
+
+    What is seen never replaces what is felt: it is what moves a slow correction of it. So nothing jumps when the marker
+    comes into view or is hidden, however far the two are apart; a correction that is not renewed fades.
+    """
+
+    def __init__(self, felt: HandModel, marker: HandMap | Drawing, config: HandSight) -> None:
+        self._felt = felt
+        self._marker = marker
+        self._config = config
+        self._correction = np.zeros(3)
+        self._wanted = np.zeros(3)
+        self._now_ns: int | None = None
+        self._seen_ns: int | None = None
+
+    @property
+    def correction_m(self) -> Array:
+        """Added to where the hand is felt, shape (3,)."""
+        return self._correction
+
+    def pose(self, angles: Mapping[str, float]) -> Array:
+        pose = self._felt.pose(angles)
+        pose[:3, 3] += self._correction
+        return pose
+
+    def position(self, angles: Mapping[str, float]) -> Array:
+        return np.asarray(self._felt.position(angles) + self._correction)
+
+    def jacobian(self, angles: Mapping[str, float], joints: Iterable[str]) -> Array:
+        return self._felt.jacobian(angles, joints)
+
+    def seen(self, now_ns: int) -> bool:
+        """Whether the hand was seen lately."""
+        return self._seen_ns is not None and now_ns - self._seen_ns < self._config.lately_s * NS
+
+    def step(self, sightings: Iterable[Sighting], now_ns: int) -> None:
+        """Take the marker's sightings of this step of the planner, and let the correction follow."""
+        config = self._config
+        dt_s = 0.0 if self._now_ns is None else min(max((now_ns - self._now_ns) / NS, 0.0), 0.1)
+        self._now_ns = now_ns
+        for sighting in sightings:
+            if abs(sighting.angles_rad["wrist_roll"] - LEVEL_ROLL_RAD) > config.roll_rad:
+                continue
+            gap = np.array(sighting.position_m) - self._marker.at(_arm(sighting.angles_rad))
+            if float(np.linalg.norm(gap)) <= config.wild_m:
+                self._wanted = gap
+                self._seen_ns = sighting.stamp_ns
+        if not self.seen(now_ns):
+            self._wanted = self._wanted * exp(-dt_s / config.fade_s)
+        move = (self._wanted - self._correction) * (1.0 - exp(-dt_s / config.follow_s))
+        size_m, most_m = float(np.linalg.norm(move)), config.speed_mps * dt_s
+        self._correction = self._correction + (move if size_m <= most_m else move * (most_m / size_m))
+
+
+class Learned:
+    """What is known beyond the drawing, and the sentence that says so."""
+
+    def __init__(self, robot: Robot, config: Config) -> None:
+        self._robot = robot
+        self._config = config
+        self._text = NOTHING_LEARNED
+        self._refusal = ""
+        self.separation_m: float | None = None
+        self.hand: SeenHand | None = None
+        """None: the rigid body, unseen."""
+        self._use(None)
+
+    @property
+    def text(self) -> str:
+        """For the status: with what the robot reaches, and what was refused last."""
+        return f"{self._text} ({self._refusal})" if self._refusal else self._text
+
+    def load(self, path: str) -> None:
+        """The model in a file; one that is refused changes nothing but the text."""
+        try:
+            self._take(models.load(Path(path), self._robot))
+        except ConfigError as error:
+            self._refusal = str(error)
+
+    def take(self, content: bytes) -> None:
+        """A model that came over the mesh; likewise."""
+        try:
+            self._take(models.decode(content, self._robot, "from the mesh"))
+        except ConfigError as error:
+            self._refusal = str(error)
+
+    def _take(self, model: Model) -> None:
+        self._refusal = ""
+        self.separation_m = model.wheels.separation_m if model.wheels is not None else None
+        arm = model.arm if self._config.reach == "learned" else None
+        self._use(models.hand_map(arm, self._robot) if arm is not None else None)
+        said = "rigid body: asked for" if self._config.reach == "rigid" else "rigid body: no arm in the model"
+        if arm is not None:
+            error_m = arm.training.scores.get("held_out_rms_m", float("nan"))
+            said = f"learned from {arm.training.samples} samples, {1000 * error_m:.1f} mm off where they are held out"
+        wheels = f"; wheels {1000 * self.separation_m:.1f} mm apart" if self.separation_m is not None else ""
+        self._text = said + wheels
+
+    def _use(self, learned: HandMap | None) -> None:
+        if learned is not None:
+            self.hand = SeenHand(LearnedHand(self._robot, learned), learned, self._config.sight)
+        elif self._config.see_hand:
+            self.hand = SeenHand(self._robot.chain("pad_centre"), Drawing(self._robot), self._config.sight)
+        else:
+            self.hand = None
+
+
+def _arm(angles: Mapping[str, float]) -> Array:
+    return np.array([angles[name] for name in ARM])
