@@ -48,11 +48,13 @@ def inbox_of(topic: Topic[Any], clock: StillClock | None = None) -> tuple[Inbox[
 
 
 def payload(topic: Topic[Any], seq: int = 0, incarnation: int = 1, stamp_ns: int = 100 * NS, **fields: Any) -> bytes:
-    good: dict[str, Any] = {
+    goods: dict[str, dict[str, Any]] = {
         topics.BASE_COMMAND.name: {"left_mps": 0.1, "right_mps": 0.1},
         topics.BASE_STATE.name: {"odometry_m": (0, 0), "odometry_yaw_rad": 0, "speed_mps": 0, "turn_rate_radps": 0},
-    }.get(topic.name, {})
-    return msgpack.packb(good | {"seq": seq, "incarnation": incarnation, "stamp_ns": stamp_ns} | fields)
+    }
+    return msgpack.packb(
+        goods.get(topic.name, {}) | {"seq": seq, "incarnation": incarnation, "stamp_ns": stamp_ns} | fields
+    )
 
 
 # --- at the border --------------------------------------------------------------------------------

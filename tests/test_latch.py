@@ -26,6 +26,7 @@ class Base:
         self.executive, self.operator = (
             Node(name, self.mesh.join(), self.clock, ROBOT) for name in ("executive", "op")
         )
+        self.node: Node | None = None
         self.changes: list[tuple[LatchState, str]] = []
 
     async def __aenter__(self) -> Base:
@@ -33,11 +34,12 @@ class Base:
         return self
 
     async def __aexit__(self, *_: object) -> None:
+        assert self.node is not None
         await self.node.__aexit__()
 
     async def restart(self) -> None:
         """The hardware service ends, if it ran, and starts afresh."""
-        if hasattr(self, "node"):
+        if self.node is not None:
             await self.node.__aexit__()
         self.node = Node("base", self.mesh.join(), self.clock, ROBOT)
         await self.node.__aenter__()

@@ -34,7 +34,7 @@ from cocoro.topics import Topic
 
 MS = NS // 1000
 ROBOT = Robot.load()
-HERE = {"odometry_m": (0.0, 0.0), "odometry_yaw_rad": 0.0, "speed_mps": 0.0, "turn_rate_radps": 0.0}
+HERE: dict[str, Any] = {"odometry_m": (0.0, 0.0), "odometry_yaw_rad": 0.0, "speed_mps": 0.0, "turn_rate_radps": 0.0}
 
 
 class Mesh:
@@ -88,7 +88,7 @@ async def test_a_restarted_publisher_is_another_incarnation() -> None:
 async def test_a_topic_carries_its_own_type_alone() -> None:
     async with Mesh().node("base") as node:
         with pytest.raises(TypeError, match="base/state carries BaseState, not BaseCommand"):
-            node.publish(topics.BASE_STATE, BaseCommand(left_mps=0.0, right_mps=0.0))  # type: ignore[arg-type]
+            node.publish(topics.BASE_STATE, BaseCommand(left_mps=0.0, right_mps=0.0))  # type: ignore[misc]
 
 
 # --- reading --------------------------------------------------------------------------------------
@@ -304,7 +304,8 @@ async def test_a_record_says_what_a_step_consumed_and_gave_in_order() -> None:
             driven.feeder.publish(topics.DETECTIONS, seen())
         await settle()
         (record,) = driven.tap.messages(topics.STEPS.of("planning"))
-        states, detections = (driven.feeder.publisher(t).incarnation for t in (topics.BASE_STATE, topics.DETECTIONS))
+        states = driven.feeder.publisher(topics.BASE_STATE).incarnation
+        detections = driven.feeder.publisher(topics.DETECTIONS).incarnation
         commands = driven.node.publisher(topics.BASE_COMMAND).incarnation
         assert record == StepRecord(
             stamp_ns=now_ns,

@@ -392,7 +392,14 @@ def test_in_lock_step_it_plans_once_a_cycle_and_keeps_the_arm_back(planner: Plan
 
 # --- abuse ----------------------------------------------------------------------------------------
 
-READ = (topics.BASE_STATE, topics.ARM_STATE, topics.HAND_STATE, topics.DETECTIONS, topics.OBSTACLES, topics.INTENT)
+READ: tuple[Topic[Any], ...] = (
+    topics.BASE_STATE,
+    topics.ARM_STATE,
+    topics.HAND_STATE,
+    topics.DETECTIONS,
+    topics.OBSTACLES,
+    topics.INTENT,
+)
 
 PER_JOINT = ("position_rad", "speed_radps", "load")
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from itertools import pairwise
 from math import cos, pi
+from typing import Any
 
 import pytest
 from robot_rig import HALTED_MPS, RobotRig
@@ -11,6 +12,7 @@ from robot_rig import HALTED_MPS, RobotRig
 from cocoro import topics
 from cocoro.messages import BaseCommand, PlannerStatus, ServoCommand
 from cocoro.testing import in_virtual_time
+from cocoro.topics import Topic
 
 pytestmark = pytest.mark.sim
 
@@ -199,7 +201,8 @@ async def test_slow_perception_slows_no_command() -> None:
         await rig.driving(0.1)
         start_s = rig.now_s
         await rig.advance(2.0)
-        for topic in (topics.BASE_COMMAND, topics.ARM_COMMAND, topics.HAND_COMMAND):
+        moving: tuple[Topic[Any], ...] = (topics.BASE_COMMAND, topics.ARM_COMMAND, topics.HAND_COMMAND)
+        for topic in moving:
             at_ms = [message.stamp_ns / 1e6 for message in rig.tap.messages(topic) if message.stamp_ns > start_s * 1e9]
             assert len(at_ms) >= 99
             assert max(after - before for before, after in pairwise(at_ms)) == pytest.approx(20.0)

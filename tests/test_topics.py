@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import msgspec
 import pytest
 
@@ -12,7 +14,7 @@ from cocoro.topics import HARDWARE, REQUESTS, STOPPABLE, TOPICS, Qos, topic_name
 
 
 def test_no_name_is_taken_twice() -> None:
-    names = [row.name for row in (*TOPICS, *REQUESTS)]
+    names = [topic.name for topic in TOPICS] + [request.name for request in REQUESTS]
     assert len(names) == len(set(names))
 
 
@@ -68,7 +70,7 @@ def test_what_moves_something_is_hardware() -> None:
 
 
 @pytest.mark.parametrize("request_row", REQUESTS, ids=lambda row: row.name)
-def test_a_requests_row_is_complete(request_row: topics.Request) -> None:  # type: ignore[type-arg]
+def test_a_requests_row_is_complete(request_row: topics.Request[Any, Any]) -> None:
     assert request_row.timeout_s > 0
     assert issubclass(request_row.request, msgspec.Struct)
     assert issubclass(request_row.reply, msgspec.Struct)
