@@ -13,7 +13,7 @@ import sys
 import tempfile
 from collections import defaultdict
 from collections.abc import AsyncIterator, Callable, Mapping
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from itertools import pairwise
 from math import hypot
 from pathlib import Path
@@ -32,9 +32,10 @@ from cocoro.topics import Qos, Topic
 
 M = TypeVar("M", bound=Message)
 
+SERVICES = (*topics.HARDWARE, "perception", "planning", "executive")
 WATCHED: tuple[Topic[Any], ...] = (
     topics.TRUTH, topics.BASE_STATE, topics.BASE_COMMAND, topics.INTENT, topics.DETECTIONS, topics.PLAN, topics.TASK,
-    topics.EXCHANGES.of("base"),
+    topics.EXCHANGES.of("base"), *(topics.HEALTH.of(service) for service in SERVICES),
 )  # fmt: skip
 KEEP = 1_000_000
 """Of everything that is watched all is kept, however late this process gets to it."""
@@ -110,8 +111,9 @@ class LiveRobot:
         decoder = msgspec.msgpack.Decoder(topic.type)
 
         def keep(_key: str, payload: Payload) -> None:
-            self._heard[topic.name].append(decoder.decode(payload))
-            self._news.set()
+            with suppress(msgspec.MsgspecError):  # of a test that publishes what is bad
+                self._heard[topic.name].append(decoder.decode(payload))
+                self._news.set()
 
         return keep
 
@@ -156,6 +158,12 @@ class LiveRobot:
         await self.until(lambda: len(self.heard(exchanges)) > before)
         newest: Exchange = self.heard(exchanges)[-1]
         return newest.stamp_ns / NS
+
+    def publish(self, key: str, payload: bytes) -> None:
+        """Put something on the mesh under this robot's name."""
+        publisher = self._bus.publisher(f"{self.name}/{key}", Qos.STATE)
+        publisher.put(payload)
+        publisher.close()
 
     # --- tasks ----------------------------------------------------------------------------------------
 

@@ -10,7 +10,7 @@ import signal
 from pathlib import Path
 
 import pytest
-from faults_live import LiveRobot, live
+from faults_live import SERVICES, LiveRobot, live
 
 from cocoro import topics
 from cocoro.messages import TaskRequest
@@ -95,6 +95,39 @@ def test_who_is_stopped_for_longer_than_the_lease_counts_as_dead_and_is_back_whe
             await robot.told("perception is back")
             assert robot.pid("perception") == pid, "who is stopped is not killed"
             await robot.driving()
+
+    asyncio.run(scenario())
+
+
+def test_bad_messages_on_every_key_of_a_robot_that_drives_are_counted_and_stop_nothing(
+    tmp_path: Path, far: Path
+) -> None:
+    rubbish = (b"", b"\xc1", b"what is this", b"\x81\xa3seq\xa3one", bytes(300_000))
+
+    async def scenario() -> None:
+        async with live(tmp_path, scene=far) as robot:
+            task_id = await robot.driving()
+            pids = {service: robot.pid(service) for service in SERVICES}
+            for topic in topics.TOPICS:
+                for service in SERVICES if "{" in topic.name else ("",):
+                    for payload in rubbish:
+                        robot.publish(topic.name.format(service=service), payload)
+            began_s = await robot.surely_now_s()
+            await robot.drives(task_id=task_id)
+
+            def counted() -> bool:
+                """By everyone, in a health that was told later."""
+                return all(
+                    any(
+                        health.stamp_ns > began_s * 1e9 and sum(port.rejected for port in health.topics) >= len(rubbish)
+                        for health in robot.heard(topics.HEALTH.of(service))
+                    )
+                    for service in SERVICES
+                    if service != "kinect"  # which reads nothing
+                )
+
+            await robot.until(counted)
+            assert {service: robot.pid(service) for service in SERVICES} == pids
 
     asyncio.run(scenario())
 
