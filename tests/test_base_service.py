@@ -20,6 +20,7 @@ from cocoro.clock import RealClock
 from cocoro.messages import BaseCommand, BaseState, EstopRequest, Latch, RecoverRequest
 from cocoro.testing import ServiceUnderTest
 from services.base.service import BaseService, Config
+from sim.wire.faults import Fault
 
 LONG_S = 30.0
 
@@ -189,6 +190,25 @@ async def test_a_fallen_create_is_recovered_on_request(bench: Bench) -> None:
         bench.create.around.drop_left = bench.create.around.cliffs[2] = False
         assert (await base.service.ask(topics.RECOVER, RecoverRequest())).recovered
         await base.wheels(100, 100)
+
+
+@pytest.mark.parametrize("way", ["to_device", "to_driver"])
+def test_a_disturbed_line_is_told_and_stops_nothing_for_long(bench: Bench, way: str) -> None:
+    @in_real_time
+    async def scenario(bench: Bench) -> None:
+        async with driven(bench) as base:
+            base.release()
+            base.drive(0.2, 0.2)
+            await base.wheels(200, 200)
+            fault = Fault("corrupted", 0.01, way, 10**19)  # type: ignore[arg-type]
+            bench.emulator.call(lambda: bench.line.disturb(fault))
+            await base.fault("its line is disturbed, look after the cable")
+            bench.emulator.call(bench.line.undisturb)
+            bench.emulator.call(lambda: setattr(bench.create, "baud", 57600))  # a flipped bit may have changed it
+            await base.service.ask(topics.RECOVER, RecoverRequest())
+            await base.wheels(200, 200)
+
+    scenario(bench)
 
 
 @in_real_time

@@ -187,6 +187,21 @@ async def test_a_servo_that_falls_silent_is_named_and_the_others_keep_their_rate
 
 
 @in_real_time
+async def test_a_disturbed_line_is_told_and_obeyed_no_wrong_way(bench: ServoBench) -> None:
+    line = bench.emulator.lines["arm"]
+    async with moved(bench, reply_s=0.03) as servos:
+        servos.move("arm", elbow=0.4)
+        bench.call(bench.servo(ELBOW).acted.clear)
+        bench.call(lambda: line.disturb(Fault("corrupted", 0.02, "both", FOREVER_NS)))
+        await servos.fault("arm", "the line is disturbed, look after its cables")
+        bench.call(line.undisturb)
+        await servos.state("arm", lambda state: "elbow" in state.joints and angle(state, "elbow") > 0.35)
+        goals = [value for _, address, value in bench.call(bench.servo(ELBOW).acted.copy) if address == 30]
+        assert goals
+        assert all(500 <= goal <= 600 for goal in goals)
+
+
+@in_real_time
 async def test_a_servo_whose_power_comes_back_holds_again_where_it_is(bench: ServoBench) -> None:
     async with moved(bench) as servos:
         servos.move("arm", elbow=0.5)

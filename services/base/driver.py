@@ -7,6 +7,7 @@ import msgspec
 from cocoro.clock import NS, is_fresh
 from cocoro.messages import BaseCommand, BaseState, LatchState
 from cocoro.odometry import Odometry, WheelRamp
+from cocoro.recent import WINDOW_S, Recent
 from cocoro.robot import Base
 from cocoro.topics import BASE_COMMAND
 from services.base import oi
@@ -30,6 +31,8 @@ class Report(msgspec.Struct):
     left: int
     """mm/s, as the Create was told last."""
     right: int
+    damage: int = 0
+    """Bytes and commands so far that were damaged on the line."""
     readings: dict[int, int] | None = None
     counts_lost: bool = False
 
@@ -49,6 +52,9 @@ class BaseDriver:
         self._until_ns = -1
         self._readings: oi.Readings = {}
         self._frame_ns: int | None = None
+        self._damage = 0
+        self._damaged = Recent()
+        self._reported_ns = 0
 
     # --- commands -----------------------------------------------------------------------------------
 
@@ -87,6 +93,8 @@ class BaseDriver:
     def take(self, report: Report, now_ns: int) -> None:
         """A report that was made at `now_ns`."""
         self.link, self.why = report.link, report.why
+        self._damaged.add(report.damage - self._damage, report.t)
+        self._damage, self._reported_ns = report.damage, report.t
         readings = report.readings
         if readings is None:
             return
@@ -175,6 +183,8 @@ class BaseDriver:
             found.append("a cliff is below a sensor")
         if self._readings[oi.OVERCURRENTS] & oi.WHEEL_OVERCURRENTS:
             found.append("a wheel draws too much current: is it blocked?")
+        if damage := self._damaged.total(self._reported_ns):
+            found.append(f"its line is disturbed, look after the cable: {damage} damaged bytes in {WINDOW_S:g} s")
         if self.battery_fraction < BATTERY_LOW:
             found.append(f"the battery is low: {100 * self.battery_fraction:.0f}%")
         return tuple(found)

@@ -159,6 +159,7 @@ class Guard:
             "why": self._why or self._keeper.allowed(now_ns).why,
             "left": wheels.left_mmps,
             "right": wheels.right_mmps,
+            "damage": self._keeper.damage,
             "readings": readings,
             "counts_lost": self._keeper.take_counts_lost() if readings is not None else False,
         }

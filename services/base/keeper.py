@@ -19,6 +19,8 @@ SILENT_NS = 180 * MS
 """Twelve frames missed: the Create is not heard any more."""
 RESEND_NS = 40 * MS
 """Wheel commands are repeated so often even when nothing has changed: one may have been lost on the wire."""
+HEEDED_NS = 60 * MS
+"""By then a frame says that a command was heeded, or it was lost or garbled."""
 COUNTS_NS = 200 * MS
 """How often way and turn are asked for: at 5 Hz their units, 1 mm and 1 degree, are small beside what they count."""
 COUNTS_LATE_NS = 60 * MS
@@ -71,6 +73,8 @@ class Keeper:
         """The newest frame."""
         self.wheels = STILL
         """What the Create was told last."""
+        self.damage = 0
+        """Bytes so far that were no part of a good frame, and commands that did not arrive as they were sent."""
         self._mode = mode
         self._deadman_ns = deadman_ns
         self._parser = oi.StreamParser((SHORT, LONG))
@@ -78,6 +82,7 @@ class Keeper:
         self._until_ns = 0
         self._frame_ns = 0
         self._sent_ns = 0
+        self._changed_ns = 0
         self._counted_ns = 0
         self._counting_ns: int | None = None
         self._counts_lost = False
@@ -111,8 +116,9 @@ class Keeper:
         """Bytes from the Create; the good frames in them."""
         skipped = self._parser.skipped
         frames = self._parser.feed(data)
-        if self._parser.skipped > skipped and self._counting_ns is not None:
-            self._counts_lost = True
+        if self._parser.skipped > skipped and self.link == "up":
+            self.damage += self._parser.skipped - skipped
+            self._counts_lost = self._counts_lost or self._counting_ns is not None
         for readings in frames:
             self.readings = readings
             self._frame_ns = now_ns
@@ -161,6 +167,10 @@ class Keeper:
         # The Create repeats in each frame what it was told: a command that was garbled on its way is put right.
         heeded = (self.readings.get(oi.LEFT_SPEED), self.readings.get(oi.RIGHT_SPEED)) == wheels[:2]
         stale = self._frame_ns > self._sent_ns and not heeded
+        if wheels[:2] != before[:2]:
+            self._changed_ns = now_ns
+        elif stale and self.link == "up" and now_ns - self._changed_ns > HEEDED_NS:
+            self.damage += 1
         if wheels[:2] == before[:2] and now_ns - self._sent_ns < RESEND_NS and not stale:
             return b""
         self._sent_ns = now_ns

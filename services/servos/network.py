@@ -12,6 +12,7 @@ from typing import Literal
 
 from cocoro.clock import NS, is_fresh
 from cocoro.messages import LatchState, ServoCommand, ServoState
+from cocoro.recent import WINDOW_S, Recent
 from cocoro.robot import Joint
 from cocoro.topics import ARM_COMMAND
 from services.servos import table
@@ -93,6 +94,8 @@ class Network:
         self._keeps_goal = keeps_goal
         self._timeout_ns = round(timeout_s * NS)
         self._tasks: dict[int, Task] = {}
+        self._strays = 0
+        self._disturbed = Recent()
 
     # --- commands -----------------------------------------------------------------------------------
 
@@ -191,6 +194,12 @@ class Network:
             one.met = one.enabled = False  # who knows what it is like when it comes back
             one.motion.goal_rad = None
             self._tasks.pop(number, None)
+
+    def disturbed(self, strays: int, missed: int, now_ns: int) -> None:
+        """So many bytes so far that were no part of an answer, and so many servos now that did not answer, though they
+        are not silent."""
+        self._disturbed.add(max(strays - self._strays, 0) + missed, now_ns)
+        self._strays = strays
 
     def met(self, number: int, met: Met) -> None:
         """What a servo was found to be like. One that holds already goes on holding: the hand what it holds, the arm
@@ -297,6 +306,8 @@ class Network:
             return (self.port_fault,)
         found = [f"{fault}; `cocoro servos clear`" for fault in self.latched_faults()]
         found += [f"{name} does not answer" for name in self.silent_joints()]
+        if damage := self._disturbed.total(now_ns):
+            found.append(f"the line is disturbed, look after its cables: {damage} damaged bytes in {WINDOW_S:g} s")
         for one in self.joints.values():
             name = one.joint.name
             if one.relaxed:

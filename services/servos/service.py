@@ -98,6 +98,8 @@ class NetworkService:
             network.port_lost(event.port_fault)
         for number, reading in event.readings.items():
             network.heard(number, reading, now_ns - max(monotonic_ns - reading.at_ns, 0))
+        missed = [number for number in event.missed if not network.joints[number].silent]
+        network.disturbed(event.strays, len(missed), now_ns)
         for number in event.missed:
             network.missed(number)
         for number, met in event.met.items():
