@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from cocoro.cli import capture_app, hardware_app, objects_app, tools_app
+from cocoro.cli import capture_app, hardware_app, learning_app, objects_app, tools_app
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -40,6 +40,8 @@ Latency = Annotated[
 Frames = Annotated[str | None, typer.Option(metavar="WxH@HZ", help="The camera's frames: 320x240@15.")]
 Timeout = Annotated[float | None, typer.Option(min=0.1, max=3600.0, metavar="SECONDS", help="Give up after this.")]
 
+Model = Annotated[Path | None, typer.Option(metavar="FILE", help="What was learned of the body (`cocoro learn`).")]
+Reaching = Annotated[str | None, typer.Option(metavar="learned|rigid", help="Rigid: whatever was learned of the arm.")]
 Body = Annotated[str, typer.Option(metavar="nominal|worn", help="A body as drawn, or one that differs from it.")]
 
 Objects = Annotated[
@@ -114,7 +116,7 @@ def cancel(robot: Robot = None, profile: Reach = None) -> None:
 
 @app.command(rich_help_panel=TASKS)
 def rehearse(
-    task: Annotated[str, typer.Argument(help="fetch, follow, park or put-down.")],
+    task: Annotated[str, typer.Argument(help="fetch, follow, park, put-down, babble-arm or babble-wheels.")],
     label: Annotated[str, typer.Argument(help="What to fetch or to follow.")] = "",
     bring: Annotated[bool, typer.Option("--bring", help="Fetch: bring it to where the task began.")] = False,
     for_: For = None,
@@ -124,6 +126,10 @@ def rehearse(
         str, typer.Option(metavar="ideal|real", help="Perfect camera and body, or real ones.")
     ] = "ideal",
     body: Body = "nominal",
+    model: Model = None,
+    reach: Reaching = None,
+    count: Annotated[int, typer.Option(min=1, metavar="N", help="Babbling: how many samples or trials.")] = 1000,
+    samples: Annotated[Path | None, typer.Option(metavar="FILE", help="Babbling: where they are kept.")] = None,
     latency: Latency = None,
     lockstep: Annotated[bool, typer.Option("--lockstep", help="One serial cycle over all, as in the paper.")] = False,
     frames: Frames = None,
@@ -141,7 +147,9 @@ def rehearse(
     options = {
         "task": task, "label": label, "bring": bring, "for_s": for_, "scene": scene, "seed": seed, "sensors": sensors,
         "body": body, "lockstep": lockstep, "timeout_s": timeout, "picture": None if picture is None else str(picture),
-        "record": None if record is None else str(record), "objects": None if objects is None else str(objects),
+        "record": None if record is None else str(record), "count": count, "reach": reach or "learned",
+        "model": None if model is None else str(model), "samples": None if samples is None else str(samples),
+        "objects": None if objects is None else str(objects),
     }  # fmt: skip
     sys.exit(rehearsing.rehearse(options, latency or [], frames, json))
 
@@ -195,6 +203,10 @@ tools_app.add_to(app)
 
 hardware_app.add_to(app)
 
+# --- learning -------------------------------------------------------------------------------------
+
+learning_app.add_to(app)
+
 # --- starting and stopping ------------------------------------------------------------------------
 
 
@@ -208,6 +220,8 @@ def up(
     body: Annotated[
         str | None, typer.Option(metavar="nominal|worn", help="Simulator: a body as drawn, or not.")
     ] = None,
+    model: Model = None,
+    reach: Reaching = None,
     frames: Frames = None,
     latency: Latency = None,
     objects: Objects = None,
@@ -220,6 +234,7 @@ def up(
     overrides = running.overrides(scene, seed, sensors, body, frames, latency or [], set_ or [])
     if objects is not None:
         overrides.insert(0, running.objects_of(objects))
+    overrides[:0] = running.model_of(model, reach)
     read = profiles.read(profile, overrides)
     sys.exit(running.up_detached(read) if detach else running.up(read))
 

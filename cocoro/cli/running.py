@@ -61,6 +61,14 @@ def objects_of(file: Path) -> str:
     return f"objects={json.dumps(str(file.resolve()))}"
 
 
+def model_of(file: Path | None, reach: str | None) -> list[str]:
+    """A learned model, and whether to reach with it, as settings of the profile. Raises ConfigError."""
+    if file is not None and not file.is_file():
+        raise ConfigError(f"there is no model {file}")
+    found = [] if file is None else [f"service.planning.model={json.dumps(str(file.resolve()))}"]
+    return found + ([] if reach is None else [f"service.planning.reach={json.dumps(reach)}"])
+
+
 def scene_of(scene: str) -> str:
     """A scene's name as it is; a file's name so that it means the same file from anywhere."""
     if not scene.endswith(".toml") and os.sep not in scene:

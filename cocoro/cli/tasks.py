@@ -38,7 +38,7 @@ async def run(where: Where, request: TaskRequest, as_json: bool, picture: Path |
         check(picture)
     async with joined(where) as link:
         follower = Follower(link, request, view(as_json), picture)
-        with _interrupts(follower.interrupt):
+        with interrupts(follower.interrupt):
             code, result = await follower.run()
     if as_json:
         print(json.dumps(result))
@@ -164,7 +164,7 @@ class Follower:
 
 
 @contextmanager
-def _interrupts(handler: Callable[[], None]) -> Iterator[None]:
+def interrupts(handler: Callable[[], None]) -> Iterator[None]:
     """Ctrl-C, being told to end and a closed terminal all go to `handler`: a task is not left running by itself."""
     loop = asyncio.get_running_loop()
     ends = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)

@@ -27,6 +27,8 @@ PRIMING_SHARE = 0.1
 HELD_OUT = 5
 """Every fifth draw is held out."""
 FOLDS = 4
+CHANCE = 0.05
+"""Errors that differ by less, as a share, do not say which method is better."""
 
 
 @dataclass(frozen=True)
@@ -199,9 +201,14 @@ def grid(rule: Literal["in order", "least squares"]) -> Sequence[Method]:
 
 
 def best(scores: Sequence[Score], methods: Sequence[Method]) -> Method:
-    """The method of the smallest cross-validated error; the project's own where none could be validated."""
-    checked = [(s.cross_validated_m, i) for i, s in enumerate(scores) if not np.isnan(s.cross_validated_m)]
-    return methods[min(checked)[1]] if checked else BEST
+    """The method of the smallest cross-validated error. The project's own stays where it is among them and no other is
+    better by more than chance, or where none could be validated."""
+    checked = {method: s.cross_validated_m for s, method in zip(scores, methods, strict=True)}
+    checked = {method: error for method, error in checked.items() if not np.isnan(error)}
+    if not checked:
+        return BEST if BEST in methods else methods[0]
+    least = min(checked, key=lambda method: checked[method])
+    return BEST if BEST in checked and checked[BEST] * (1 - CHANCE) <= checked[least] else least
 
 
 def curve(method: Method, drawing: Drawing, learn: Sightings, held: Sightings, sizes: Sequence[int]) -> list[float]:

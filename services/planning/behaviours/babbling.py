@@ -168,6 +168,8 @@ class BabbleWheels:
     """From where the head comes to a look, in pan and tilt."""
     AWAY_S, SETTLE_S = 0.35, 0.45
     LOST_S = 4.0
+    LEAST_TURN_RAD = 0.2
+    """A draw that turns it less is passed over."""
     MOVED_M = 0.5
     """Further than this from where it began it does not go."""
 
@@ -268,11 +270,18 @@ class BabbleWheels:
             if self._done >= self._count:
                 plan.state, plan.why = "done", f"{self._done} trials"
                 return
+        left, right = -self._speeds[0], -self._speeds[1]
         if self._trial % 2 == 0:
-            _, speeds = next(self._draws)
-            left, right = speeds.tolist()
-        else:
-            left, right = -self._speeds[0], -self._speeds[1]
+            left, right = self._draw(scene)
         self._speeds = (left, right)
         self._before = (after, scene.body)
         self._gaze, self._phase_ns, self._driving = None, scene.now_ns, True
+
+    def _draw(self, scene: Scene) -> tuple[float, float]:
+        """The next pair's speeds: of the draws the next that turns the robot far enough to say something."""
+        for number, speeds in self._draws:
+            left, right = speeds.tolist()
+            if abs(right - left) * self.TURN_S > self.LEAST_TURN_RAD * scene.limbs.robot.base.wheel_separation_m:
+                self._trial = 2 * number
+                return left, right
+        raise AssertionError("draws have no end")

@@ -1,0 +1,83 @@
+"""`cocoro babble`: have the robot babble, and keep what it reports in a file that the next time goes on from."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from cocoro.cli.link import Link, Where, joined
+from cocoro.cli.progress import View, view
+from cocoro.cli.tasks import Follower, interrupts
+from cocoro.errors import MeshError
+from cocoro.learning.collector import TOPICS, HandCollector, WheelCollector, collector
+from cocoro.messages import AboutRequest, TaskName, TaskRequest, TaskState
+from cocoro.robot import Robot
+from cocoro.topics import ABOUT
+
+BAR = 20
+"""Characters of the progress bar."""
+
+
+class BabbleView:
+    """Shows the samples beside what the task says: a bar, the coverage, and the time that is left at this rate."""
+
+    def __init__(self, view: View, kept: HandCollector | WheelCollector, wanted: int) -> None:
+        self._view = view
+        self._kept = kept
+        self._wanted = wanted
+        self._had = len(kept)
+
+    def show(self, state: TaskState) -> None:
+        if state.phase.startswith("babble"):
+            state.text = self.text(state.elapsed_s)
+        self._view.show(state)
+
+    def say(self, text: str) -> None:
+        self._view.say(text)
+
+    def result(self, text: str) -> None:
+        self._view.result(f"{text}; {self._kept.said}")
+
+    def text(self, elapsed_s: float) -> str:
+        count = len(self._kept)
+        full = round(BAR * min(count / self._wanted, 1.0))
+        new = count - self._had
+        left = f", {_time((self._wanted - count) * elapsed_s / new)} left" if new else ""
+        return f"[{'#' * full}{'.' * (BAR - full)}] {count} of {self._wanted}: {self._kept.said}{left}"
+
+
+async def babble(where: Where, task: TaskName, wanted: int, file: Path, label: str, as_json: bool) -> int:
+    """Babble until the file holds `wanted` samples or trials. Ctrl-C stops the robot and keeps them. Returns the exit
+    code; raises ConfigError or RefusedError for a file that cannot be gone on with."""
+    async with joined(where) as link:
+        robot = await description(link)
+        with collector(task, file, robot) as kept:
+            shown = BabbleView(view(as_json), kept, wanted)
+            if len(kept) >= wanted:
+                shown.result(f"{file} holds enough already")
+                return 0
+            if len(kept):
+                shown.say(f"going on from {file}: {kept.said}")
+            samples = link.inbox(TOPICS[task])  # before the task is asked for, so that nothing is missed
+            samples.add(lambda _key, message: kept.take(message))
+            request = TaskRequest(task=task, label=label, first=kept.next, count=wanted - len(kept))
+            follower = Follower(link, request, shown, None)
+            with interrupts(follower.interrupt):
+                code, result = await follower.run()
+            result |= {"file": str(file), "samples": len(kept)}
+    if as_json:
+        print(json.dumps(result))
+    return code
+
+
+async def description(link: Link) -> Robot:
+    """The description that the planner of a running robot computes with."""
+    reply = await link.call(ABOUT.of("planning"), AboutRequest())
+    if reply.description is None:
+        raise MeshError(f"{link.robot}: the planner does not say what robot it is")
+    return Robot.from_data(reply.description, f"description of {link.robot}")
+
+
+def _time(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes} min {rest:02d} s" if minutes else f"{rest} s"

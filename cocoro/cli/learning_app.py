@@ -1,0 +1,135 @@
+"""`cocoro babble` and `cocoro learn`, and their options; `app` takes them in."""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from cocoro import robot as robots
+    from cocoro.learning.model import Model
+
+PANEL = "Learning"
+
+babble = typer.Typer(no_args_is_help=True, help="Move to learn: the arm before the eyes, the wheels before a target.")
+learn = typer.Typer(no_args_is_help=True, help="Learn from what babbling saw: a model that the planner loads.")
+
+Robot = Annotated[str | None, typer.Option(help="Which robot; needed only when several are up here.")]
+Reach = Annotated[
+    str | None,
+    typer.Option("--profile", metavar="PROFILE", help="Reach the robot as this profile says, on another machine."),
+]
+Json = Annotated[bool, typer.Option("--json", help="Print JSON, for scripts.")]
+Into = Annotated[Path, typer.Option("--model", metavar="FILE", help="Where the model goes; what else is in it stays.")]
+Description = Annotated[
+    Path | None, typer.Option(metavar="FILE", help="The robot's description, where it is not the Calliope's own.")
+]
+Measured = Annotated[
+    Path | None, typer.Option(metavar="FILE", help="What was measured on this robot, over the description.")
+]
+Send = Annotated[bool, typer.Option("--send", help="Have the robot that is up take it over, without a restart.")]
+
+
+def add_to(app: typer.Typer) -> None:
+    app.add_typer(babble, name="babble", rich_help_panel=PANEL)
+    app.add_typer(learn, name="learn", rich_help_panel=PANEL)
+
+
+@babble.command("arm")
+def babble_arm(
+    samples: Annotated[int, typer.Option(min=1, max=1_000_000, metavar="N", help="How many, all in all.")] = 1000,
+    out: Annotated[
+        Path, typer.Option(metavar="FILE", help="Where they are kept; one that is there is gone on with.")
+    ] = Path("arm.jsonl"),
+    robot: Robot = None,
+    profile: Reach = None,
+    json: Json = False,
+) -> None:
+    """Move the arm about and look at the hand. Ctrl-C stops it; the same command goes on, and nothing is lost."""
+    from cocoro.cli import babble as babbling
+    from cocoro.cli.link import Where
+
+    sys.exit(asyncio.run(babbling.babble(Where(robot, profile), "babble-arm", samples, out, "", json)))
+
+
+@babble.command("wheels")
+def babble_wheels(
+    trials: Annotated[int, typer.Option(min=1, max=100_000, metavar="N", help="How many, all in all.")] = 40,
+    target: Annotated[
+        str, typer.Option(metavar="LABEL", help="A known object that stands 1.5 m before the robot.")
+    ] = "red_can",
+    out: Annotated[
+        Path, typer.Option(metavar="FILE", help="Where they are kept; one that is there is gone on with.")
+    ] = Path("wheels.jsonl"),
+    robot: Robot = None,
+    profile: Reach = None,
+    json: Json = False,
+) -> None:
+    """Turn the wheels to and fro before a target. The robot needs half a metre around it. Ctrl-C stops it."""
+    from cocoro.cli import babble as babbling
+    from cocoro.cli.link import Where
+
+    sys.exit(asyncio.run(babbling.babble(Where(robot, profile), "babble-wheels", trials, out, target, json)))
+
+
+@learn.command("arm")
+def learn_arm(
+    samples: Annotated[Path, typer.Argument(metavar="FILE", help="What `babble arm` kept.")] = Path("arm.jsonl"),
+    into: Into = Path("model.json"),
+    search: Annotated[bool, typer.Option("--search", help="A grid of bases, widths and rates too.")] = False,
+    method: Annotated[
+        str | None, typer.Option(metavar="NAME", help="This one, in place of the one that measures best.")
+    ] = None,
+    description: Description = None,
+    measured: Measured = None,
+    send: Send = False,
+    robot: Robot = None,
+    profile: Reach = None,
+    json: Json = False,
+) -> None:
+    """The hand-eye map: every way of learning it, measured on samples that it did not learn from; the best is kept."""
+    from cocoro.cli import learn as learning
+
+    made, text = learning.learn_arm(
+        samples, into, _robot(description, measured), search=search, method=method, as_json=json
+    )
+    print(text)
+    _send(send, made, robot, profile, json)
+
+
+@learn.command("wheels")
+def learn_wheels(
+    samples: Annotated[Path, typer.Argument(metavar="FILE", help="What `babble wheels` kept.")] = Path("wheels.jsonl"),
+    into: Into = Path("model.json"),
+    description: Description = None,
+    measured: Measured = None,
+    send: Send = False,
+    robot: Robot = None,
+    profile: Reach = None,
+    json: Json = False,
+) -> None:
+    """The distance between the wheels."""
+    from cocoro.cli import learn as learning
+
+    made, text = learning.learn_wheels(samples, into, _robot(description, measured), as_json=json)
+    print(text)
+    _send(send, made, robot, profile, json)
+
+
+def _robot(description: Path | None, measured: Path | None) -> robots.Robot:
+    from cocoro.robot import Robot
+
+    return Robot.load(description, measured)
+
+
+def _send(wanted: bool, made: Model, robot: str | None, profile: str | None, as_json: bool) -> None:
+    if wanted:
+        from cocoro.cli import learn as learning
+        from cocoro.cli.link import Where
+
+        text = asyncio.run(learning.send(Where(robot, profile), made))
+        print(text, file=sys.stderr if as_json else sys.stdout)
