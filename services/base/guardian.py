@@ -23,7 +23,7 @@ from services.base.driver import Report
 
 log = logging.getLogger("cocoro.base")
 
-HANGS_S = 0.3
+HANGS_S = 0.25
 """A guard reports at least ten times a second; one that does not is killed."""
 AGAIN_S = 1.0
 """So long a guard may take to report first; and one that dies sooner is not started again at once."""

@@ -1,0 +1,476 @@
+"""Faults at random moments of a moving robot, at the ends of emulated wires.
+
+    python -m bench.hardware_faults --count 1000
+
+The services run in a process of their own (`bench.hardware_driver`), which keeps wheels and joints moving; here is the
+emulated hardware. Each fault is asked for, looked at from the hardware's side, taken away again, and the robot must
+move again without a restart (unless its process was killed). Counted and told for each kind:
+
+- crashes: the services' process ended though nobody killed it;
+- wrong: wheels or goals that nobody asked for. Where bytes to the Create are damaged it cannot know: its commands have
+  no checksum. What it made of them is counted apart, with how long it lasted;
+- stops: how long the wheels went on where link or service were lost (limit 0.3 s);
+- unseen: not told in the health of the services, which is what `cocoro status` shows;
+- stuck: not moving again in time.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import queue
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import psutil
+
+from bench.hardware_driver import REACH_RAD, SPEED_RADPS, WHEELS
+from cocoro.robot import Robot
+from sim.wire.body import SimpleBody
+from sim.wire.create import Create
+from sim.wire.dynamixel import Bus, Servo
+from sim.wire.emulator import Emulator
+from sim.wire.faults import KINDS, Fault
+
+NS, MS = 1_000_000_000, 1_000_000
+STOP_NS = 300 * MS
+SEEN_S, AGAIN_S = 8.0, 15.0
+FAR_NS = 10**19
+LINES = ("create", "arm", "hand")
+ROBOT = Robot.load()
+SPEEDS = {(round(1000 * left), round(1000 * right)) for left, right in WHEELS}
+TURNS = {((left - right) // 2, -((left - right) // 2)) for left, right in SPEEDS}
+"""What the reflexes make of them."""
+GOOD_WHEELS = SPEEDS | TURNS | {(0, 0)}
+SLACK_COUNTS = 25
+
+
+@dataclass
+class Tally:
+    tried: int = 0
+    crashes: int = 0
+    wrong: int = 0
+    garbled: int = 0
+    garbled_longest_ms: float = 0.0
+    late_stops: int = 0
+    slowest_stop_ms: float = 0.0
+    unseen: int = 0
+    stuck: int = 0
+    notes: list[str] = field(default_factory=list)
+
+    @property
+    def good(self) -> bool:
+        return not (self.crashes or self.wrong or self.late_stops or self.unseen or self.stuck)
+
+
+class Hardware:
+    """The emulated robot, and what is asked of it."""
+
+    def __init__(self, folder: Path, seed: int) -> None:
+        self.create = Create()
+        self.buses = {
+            "arm": Bus([Servo(number, 28) for number in range(1, 7)]),
+            "hand": Bus([Servo(number) for number in (7, 8, 9)]),
+        }
+        self.servos = {servo.number: servo for bus in self.buses.values() for servo in bus.servos}
+        self.body = SimpleBody(self.create, *self.buses.values())
+        self.emulator = Emulator(folder, {"create": self.create, **self.buses}, self.body, seed)
+        self.limits = {}
+        for name, joint in ROBOT.joints.items():
+            reach = REACH_RAD.get(name, 0.0)
+            ends = sorted((joint.to_count(-reach), joint.to_count(reach)))
+            self.limits[joint.id] = ends[0] - SLACK_COUNTS, ends[1] + SLACK_COUNTS
+
+    def wheel_log(self) -> list[tuple[int, tuple[int, int]]]:
+        """Since the last call."""
+
+        def take() -> list[tuple[int, tuple[int, int]]]:
+            log = list(self.create.acted)
+            self.create.acted[:] = []
+            return log
+
+        return self.emulator.call(take)
+
+    def wrong_goals(self) -> list[str]:
+        """Since the last call: goals out of where anybody sent that joint, speeds beyond what was commanded."""
+        limit = round(max(SPEED_RADPS, 1.0) / 0.011623892) + 1  # a held joint goes at 1 rad/s
+
+        def take() -> list[str]:
+            wrong = []
+            for number, servo in self.servos.items():
+                low, high = self.limits[number]
+                for _, address, value in servo.acted:
+                    if (address == 30 and not low <= value <= high) or (address == 32 and not 0 < value <= limit):
+                        wrong.append(f"servo {number}: {value} into {address}")
+                servo.acted.clear()
+            return wrong
+
+        return self.emulator.call(take)
+
+
+class Services:
+    """The services' process."""
+
+    def __init__(self, folder: Path) -> None:
+        self._command = [sys.executable, "-m", "bench.hardware_driver", *(str(folder / line) for line in LINES)]
+        self.starts = 0
+        self.start()
+
+    def start(self) -> None:
+        self.process = subprocess.Popen(
+            self._command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+        )
+        self.told: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
+        threading.Thread(target=self._read, args=(self.process, self.told), daemon=True).start()
+        self.starts += 1
+
+    def _read(self, process: subprocess.Popen[str], told: queue.SimpleQueue[dict[str, Any]]) -> None:
+        assert process.stdout is not None
+        for line in process.stdout:
+            told.put(json.loads(line))
+
+    @property
+    def alive(self) -> bool:
+        return self.process.poll() is None
+
+    def say(self, what: str) -> None:
+        assert self.process.stdin is not None
+        self.process.stdin.write(json.dumps({"do": what}) + "\n")
+        self.process.stdin.flush()
+
+    def guard_pid(self) -> int | None:
+        for child in psutil.Process(self.process.pid).children():
+            if any("services.base.guard" in part for part in child.cmdline()):
+                return child.pid
+        return None
+
+    def shows(self, texts: tuple[str, ...]) -> bool:
+        """Whether one of these is told within its time; forgets what was told before."""
+        while not self.told.empty():
+            self.told.get()
+        end_s = time.monotonic() + SEEN_S
+        while (left_s := end_s - time.monotonic()) > 0:
+            try:
+                report = self.told.get(timeout=left_s)
+            except queue.Empty:
+                return False
+            if any(
+                text in fault for fault in [*report["faults"], f"stopped by {report['stopped_by']}"] for text in texts
+            ):
+                return True
+        return False
+
+    def kill(self) -> None:
+        self.process.kill()
+        self.process.wait()
+
+
+@dataclass
+class Trial:
+    """One fault: how it comes, how long it stays, how it goes, what is expected of it."""
+
+    name: str
+    begin: Callable[[], None]
+    end: Callable[[], None]
+    for_s: float
+    shown: tuple[str, ...]
+    """One of these must be told; none is asked for when it is empty."""
+    stops: bool = False
+    """The wheels must stop within the limit."""
+    garbles: bool = False
+    """Bytes to the Create are damaged."""
+    kills: bool = False
+
+
+class Campaign:
+    def __init__(self, hardware: Hardware, services: Services, seed: int) -> None:
+        self._hardware = hardware
+        self._services = services
+        self._draws = random.Random(seed)
+        self.tallies: dict[str, Tally] = {}
+        kinds: list[Callable[[], Trial]] = [self._line] * 18
+        kinds += [self._unplug] * 3
+        kinds += [self._overload, self._mute, self._brown_out, self._heat, self._undervoltage]
+        kinds += [self._drop, self._charger, self._cliff, self._bump, self._demo, self._power_cycle, self._battery_low]
+        kinds += [self._kill_service, self._stop_service, self._kill_guard, self._stop_guard]
+        self._kinds = kinds
+
+    def run(self, count: int, tell: Callable[[str], None]) -> None:
+        self._until_moving()
+        for number in range(count):
+            trial = self._draws.choice(self._kinds)()
+            tally = self.tallies.setdefault(trial.name, Tally())
+            bad = tally.good
+            self._try(trial, tally)
+            if bad and not tally.good:
+                tell(f"{number}: {trial.name}: {tally}")
+            if (number + 1) % 50 == 0:
+                tell(f"{number + 1} faults")
+
+    def _try(self, trial: Trial, tally: Tally) -> None:
+        tally.tried += 1
+        _pause(self._draws.uniform(0.0, 0.8))
+        self._hardware.wheel_log()
+        self._hardware.wrong_goals()
+        began_ns = time.monotonic_ns()
+        trial.begin()
+        if trial.stops:
+            self._await_stop(began_ns, tally)
+        seen = not trial.shown or self._services.shows(trial.shown)
+        _pause(max(trial.for_s - (time.monotonic_ns() - began_ns) / NS, 0.0))
+        trial.end()
+        if trial.kills:
+            self._services.start()
+        if not seen:
+            tally.unseen += 1
+        if not self._services.alive:
+            tally.crashes += 1
+            self._services.start()
+        moving = self._until_moving()
+        self._judge(trial, tally)
+        if not moving:
+            tally.stuck += 1
+            self._services.kill()
+            self._hardware.emulator.call(self._hardware.create.power_cycle)
+            self._services.start()
+            self._until_moving()
+
+    def _await_stop(self, began_ns: int, tally: Tally) -> None:
+        create = self._hardware.create
+        try:
+            stopped_ns = self._hardware.emulator.until(lambda: create.wheels_mmps == (0, 0), 5.0)
+        except TimeoutError:
+            stopped_ns = began_ns + 5 * NS
+        took_ms = (stopped_ns - began_ns) / MS
+        tally.slowest_stop_ms = max(tally.slowest_stop_ms, took_ms)
+        tally.late_stops += took_ms > STOP_NS / MS
+
+    def _judge(self, trial: Trial, tally: Tally) -> None:
+        """What wheels and joints were told meanwhile, against what anybody wanted."""
+        wrong = self._hardware.wrong_goals()
+        tally.notes += wrong[:3]
+        tally.wrong += len(wrong)
+        log = self._hardware.wheel_log()
+        ends = [*(at_ns for at_ns, _ in log[1:]), time.monotonic_ns()]
+        for (at_ns, wheels), end_ns in zip(log, ends, strict=False):
+            if wheels in GOOD_WHEELS:
+                continue
+            if trial.garbles:
+                tally.garbled += 1
+                tally.garbled_longest_ms = max(tally.garbled_longest_ms, (end_ns - at_ns) / MS)
+            else:
+                tally.wrong += 1
+                tally.notes.append(f"wheels {wheels}")
+
+    def _until_moving(self) -> bool:
+        """Wheels and every moved joint go again; a person's part is done: recovering, clearing."""
+        create, servos = self._hardware.create, self._hardware.servos
+        moved = [ROBOT.joints[joint].id for joint in REACH_RAD]
+        end_s = time.monotonic() + AGAIN_S
+        while time.monotonic() < end_s:
+            goals = self._hardware.emulator.call(lambda: {number: servos[number].get(30) for number in moved})
+            if not self._services.alive:
+                return False
+            self._services.say("recover")
+            self._services.say("clear")
+            try:
+                self._hardware.emulator.until(
+                    lambda goals=goals: (
+                        create.wheels_mmps in SPEEDS  # type: ignore[misc]
+                        and all(servos[number].motor.on and servos[number].get(30) != goals[number] for number in moved)
+                    ),
+                    2.5,
+                )
+                return True
+            except TimeoutError:
+                continue
+        return False
+
+    # --- the faults -----------------------------------------------------------------------------------
+
+    def _call(self, job: Callable[[], object]) -> None:
+        self._hardware.emulator.call(job)
+
+    def _line(self) -> Trial:
+        draws, name, kind = self._draws, self._draws.choice(LINES), self._draws.choice(KINDS)
+        way = draws.choice(("to_device", "to_driver"))
+        share = draws.uniform(0.003, 0.05) if kind in ("lost", "corrupted") else draws.uniform(0.05, 0.4)
+        line = self._hardware.emulator.lines[name]
+        fault = Fault(kind, share, way, FAR_NS, round(draws.uniform(5, 80) * MS))
+        cut = kind == "silent"
+        shown: tuple[str, ...] = ("disturbed",)
+        if cut:
+            shown = ("does not answer",) if way == "to_driver" or name != "create" else ("disturbed",)
+        elif kind in ("late", "repeated"):
+            shown = ()  # late or twice is no damage as long as it is whole
+        elif name != "create" and way == "to_device":
+            shown = ("disturbed", "does not answer")
+
+        def end() -> None:
+            self._call(line.undisturb)
+            if name == "create":  # a flipped bit may be the command that changes the baud rate
+                self._call(lambda: setattr(self._hardware.create, "baud", 57600))
+
+        return Trial(
+            f"{name}: {kind} {way.replace('_', ' ')}",
+            lambda: self._call(lambda: line.disturb(fault)),
+            end,
+            draws.uniform(0.5, 1.5),
+            shown,
+            stops=cut and name == "create" and way == "to_driver",
+            garbles=name == "create" and way == "to_device",
+        )
+
+    def _unplug(self) -> Trial:
+        name = self._draws.choice(LINES)
+        port = self._hardware.emulator.lines[name].port
+        return Trial(
+            f"{name}: unplugged", lambda: self._call(port.unplug), lambda: self._call(port.plug),
+            self._draws.uniform(0.2, 1.0), ("plugged in",),
+        )  # fmt: skip
+
+    def _servo(self) -> Servo:
+        return self._hardware.servos[ROBOT.joints[self._draws.choice(list(REACH_RAD))].id]
+
+    def _overload(self) -> Trial:
+        servo = self._servo()
+        return Trial("servo: overload", lambda: self._call(lambda: servo.trip(32)), _nothing, 0.3, ("overload",))
+
+    def _heat(self) -> Trial:
+        servo = self._servo()
+
+        def begin() -> None:
+            self._call(lambda: servo.put(43, 90))
+
+        return Trial("servo: overheating", begin, lambda: self._call(lambda: servo.put(43, 40)), 0.5, ("overheating",))
+
+    def _mute(self) -> Trial:
+        servo = self._servo()
+        return Trial(
+            "servo: plug out", lambda: self._call(lambda: setattr(servo, "mute", True)),
+            lambda: self._call(lambda: setattr(servo, "mute", False)), 0.5, ("does not answer",),
+        )  # fmt: skip
+
+    def _brown_out(self) -> Trial:
+        servo = self._servo()
+        return Trial("servo: brown-out", lambda: self._call(servo.power_up), _nothing, 0.3, ("lost its settings",))
+
+    def _undervoltage(self) -> Trial:
+        servo = self._servo()
+
+        def end() -> None:
+            self._call(lambda: (servo.put(42, 120), servo.power_up()))
+
+        return Trial("servo: power lost", lambda: self._call(lambda: servo.put(42, 30)), end, 0.5, ("does not answer",))
+
+    def _feel(self, name: str, field_name: str, value: object, shown: str, *, stops: bool) -> Trial:
+        around = self._hardware.create.around
+        before = getattr(around, field_name)
+        return Trial(
+            f"create: {name}", lambda: self._call(lambda: setattr(around, field_name, value)),
+            lambda: self._call(lambda: setattr(around, field_name, before)),
+            self._draws.uniform(0.2, 1.0), (shown,), stops=stops,
+        )  # fmt: skip
+
+    def _drop(self) -> Trial:
+        return self._feel("wheel drop", "drop_left", True, "fell back", stops=True)
+
+    def _charger(self) -> Trial:
+        return self._feel("charger", "charger", True, "fell back", stops=True)
+
+    def _cliff(self) -> Trial:
+        return self._feel("cliff", "cliffs", [False, True, False, False], "cliff", stops=False)
+
+    def _bump(self) -> Trial:
+        return self._feel("bump", "bump_left", True, "stopped by bump", stops=False)
+
+    def _battery_low(self) -> Trial:
+        return self._feel("battery low", "charge_mah", 150, "battery is low", stops=False)
+
+    def _demo(self) -> Trial:
+        create = self._hardware.create
+        return Trial(
+            "create: leaves its mode", lambda: self._call(lambda: create.receive(bytes([131, 128]), create.baud, 0)),
+            _nothing, 0.3, (), stops=True,
+        )  # fmt: skip
+
+    def _power_cycle(self) -> Trial:
+        create = self._hardware.create
+        return Trial("create: brown-out", lambda: self._call(create.power_cycle), _nothing, 0.3, (), stops=True)
+
+    def _kill_service(self) -> Trial:
+        return Trial("service: SIGKILL", self._services.kill, _nothing, 0.5, (), stops=True, kills=True)
+
+    def _stop_service(self) -> Trial:
+        process = self._services.process
+        return Trial(
+            "service: SIGSTOP", lambda: process.send_signal(signal.SIGSTOP),
+            lambda: process.send_signal(signal.SIGCONT), self._draws.uniform(0.5, 1.5), (), stops=True,
+        )  # fmt: skip
+
+    def _signal_guard(self, number: signal.Signals) -> None:
+        pid = self._services.guard_pid()
+        if pid is not None:
+            os.kill(pid, number)
+
+    def _kill_guard(self) -> Trial:
+        return Trial("guard: SIGKILL", lambda: self._signal_guard(signal.SIGKILL), _nothing, 0.5, (), stops=True)
+
+    def _stop_guard(self) -> Trial:
+        return Trial("guard: SIGSTOP", lambda: self._signal_guard(signal.SIGSTOP), _nothing, 0.8, (), stops=True)
+
+
+def _nothing() -> None:
+    pass
+
+
+def _pause(seconds: float) -> None:
+    threading.Event().wait(seconds)
+
+
+def run(count: int, seed: int, tell: Callable[[str], None]) -> dict[str, Tally]:
+    """What each kind of fault came to."""
+    with tempfile.TemporaryDirectory(prefix="cocoro") as name:
+        folder = Path(name)
+        hardware = Hardware(folder, seed)
+        with hardware.emulator:
+            services = Services(folder)
+            campaign = Campaign(hardware, services, seed)
+            try:
+                campaign.run(count, tell)
+            finally:
+                services.kill()
+            return campaign.tallies
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(prog="python -m bench.hardware_faults", description="Faults at random moments.")
+    parser.add_argument("--count", type=int, default=100)
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    tallies = run(options.count, options.seed, lambda text: print(text, file=sys.stderr, flush=True))
+    print(f"{'fault':34} tried crash wrong garbled longest  late slowest unseen stuck")
+    for name, tally in sorted(tallies.items()):
+        print(
+            f"{name:34} {tally.tried:5} {tally.crashes:5} {tally.wrong:5} {tally.garbled:7}"
+            f" {tally.garbled_longest_ms:4.0f} ms {tally.late_stops:5} {tally.slowest_stop_ms:4.0f} ms"
+            f" {tally.unseen:6} {tally.stuck:5}  {'; '.join(tally.notes[:2])}"
+        )
+    total = sum(tally.tried for tally in tallies.values())
+    bad = [name for name, tally in tallies.items() if not tally.good]
+    print(f"{total} faults, {len(bad)} kinds with something wrong{': ' + ', '.join(bad) if bad else ''}")
+    return 1 if bad else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
