@@ -3,12 +3,14 @@
     python bench/capture.py traffic [--seconds 30] [--sensors ideal|real] [--compression zstd]
     python bench/capture.py kill [--times 20]
     python bench/capture.py rerun
+    python bench/capture.py again
     python bench/capture.py frames
 
 `traffic` starts the simulated robot as processes with its recorder, has it fetch the red can, and reads what the
 recorder's process cost (from the operating system, not from the recorder) and what it dropped or never got. `kill`
 sends the recorder SIGKILL at random moments while a stand-in for a robot publishes, and looks how much is missing.
-`rerun` executes perception and planning again over what `traffic` recorded. `frames` packs rendered frames of both
+`rerun` executes perception and planning again over what `traffic` recorded. `again` plays that into a mesh where
+another recorder listens, and compares the two captures. `frames` packs rendered frames of both
 kinds of sensors by each compression, in one thread.
 """
 
@@ -22,6 +24,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections import defaultdict
 from pathlib import Path
 
 import psutil
@@ -156,6 +159,39 @@ def execute(folder: Path) -> None:
             print("\n".join(words(rerun([capture], service))))
 
 
+def again(folder: Path) -> None:
+    """Record, replay, record again: are the payloads the same, in the same order of each key?"""
+    (first,) = folder.glob("*.mcap")
+    listener = folder / "listener.toml"
+    listener.write_text(
+        f'robot = "calliope"\nclock = "sim"\nprocesses = ["capture"]\n[service.capture]\nfolder = "{folder}/again"\n'
+    )
+    subprocess.run([*COCORO, "up", str(listener), "--detach"], check=True, stdout=subprocess.DEVNULL)
+    try:
+        subprocess.run([*COCORO, "replay", str(first)], check=True)
+        time.sleep(0.5)
+    finally:
+        subprocess.run([*COCORO, "down"], check=True, stdout=subprocess.DEVNULL)
+    (second,) = (folder / "again").glob("*.mcap")
+    payloads = [_published(path) for path in (first, second)]
+    different = sorted(key for key in payloads[0].keys() | payloads[1].keys() if payloads[0][key] != payloads[1][key])
+    count = sum(map(len, payloads[0].values()))
+    print(
+        f"{count} messages of {len(payloads[0])} keys: {f'not the same: {different}' if different else 'all the same'}"
+    )
+
+
+def _published(path: Path) -> dict[str, list[int]]:
+    """By key, what components published, but for what recorders say of themselves."""
+    found: dict[str, list[int]] = defaultdict(list)
+    with Capture.open(path) as capture:
+        for each in capture.messages():
+            service, _, topic = each.key.removeprefix("calliope/").partition("/")
+            if service != "capture" and topic not in ("alive", "requests", "recorder"):
+                found[each.key].append(hash(bytes(each.payload)))
+    return found
+
+
 def frames(folder: Path) -> None:
     """Time of the processor, since the machine may have other work."""
     for sensors in ("ideal", "real"):
@@ -174,7 +210,7 @@ def frames(folder: Path) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("traffic", "kill", "rerun", "frames"))
+    parser.add_argument("what", choices=("traffic", "kill", "rerun", "again", "frames"))
     parser.add_argument("--seconds", type=float, default=30.0)
     parser.add_argument("--sensors", default="ideal")
     parser.add_argument("--compression", default="zstd")
@@ -192,6 +228,8 @@ def main() -> None:
         traffic(folder, options.seconds, options.sensors, options.compression)
         if options.what == "rerun":
             execute(folder)
+        if options.what == "again":
+            again(folder)
 
 
 if __name__ == "__main__":

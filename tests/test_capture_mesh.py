@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 import os
 import random
+import select
+import subprocess
 import sys
 import tempfile
 import time
@@ -172,3 +174,46 @@ def test_replay_refuses_a_mesh_with_a_robot_and_plays_where_there_is_none(short_
 
     asyncio.run(refused())
     asyncio.run(played())
+
+
+def test_replay_is_worked_by_the_keyboard(short_path: Path) -> None:
+    path = record(short_path / "drive.mcap", drive)
+    ours, theirs = os.openpty()
+    replay = subprocess.Popen(
+        [sys.executable, "-m", "cocoro.cli.main", "replay", str(path), "--paused"],
+        env=os.environ | {"COCORO_RUN_DIR": str(short_path)}, stdin=theirs, stdout=theirs, stderr=theirs,
+    )  # fmt: skip
+    os.close(theirs)
+    screen = Screen(ours)
+    screen.wait_for("paused 0.0 of 2.0 s")
+    os.write(ours, b".")
+    screen.wait_for("2 messages")
+    os.write(ours, b"\x1b[C")
+    screen.wait_for("paused 2.0 of 2.0 s")
+    os.write(ours, b"\x1b[D")
+    screen.wait_for("paused 0.0 of 2.0 s")
+    screen.wait_for("pass 2")
+    os.write(ours, b"-")
+    screen.wait_for("x0.80")
+    os.write(ours, b" ")
+    screen.wait_for("0.3 of 2.0 s")
+    os.write(ours, b"q")
+    assert replay.wait(PATIENCE_S) == 0
+    os.close(ours)
+
+
+class Screen:
+    """What a program writes on its terminal."""
+
+    def __init__(self, fd: int) -> None:
+        self._fd = fd
+        self._text = ""
+
+    def wait_for(self, words: str) -> None:
+        """Until it has been written; what came before it is forgotten."""
+        until_s = time.monotonic() + PATIENCE_S
+        while words not in self._text:
+            assert time.monotonic() < until_s, f"{words!r} does not come; there is {self._text[-300:]!r}"
+            if select.select([self._fd], [], [], 0.1)[0]:
+                self._text += os.read(self._fd, 4096).decode(errors="replace")
+        self._text = self._text.partition(words)[2]

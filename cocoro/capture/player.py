@@ -51,7 +51,8 @@ class Player:
 
     @property
     def ended(self) -> bool:
-        return not self._next and not self.loop
+        """Nothing is left, and nobody waits there to go back."""
+        return not self._next and not self.loop and not self.paused
 
     @property
     def length_s(self) -> float:

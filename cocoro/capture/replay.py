@@ -9,7 +9,6 @@ from contextlib import suppress
 import msgspec
 
 from cocoro.bus.base import Bus, Handle, RawPublisher
-from cocoro.capture.file import LARGE_BYTES
 from cocoro.capture.keys import MADE_HERE, Choice
 from cocoro.capture.pictures import LossyFrame
 from cocoro.capture.player import Player
@@ -24,6 +23,8 @@ from cocoro.topics import ARM_STATE, BASE_STATE, CLOCK, FRAME, HAND_STATE, HARDW
 SIMULATOR = "sim"
 HARDWARE_TOPICS = (FRAME, BASE_STATE, ARM_STATE, HAND_STATE)
 """What a robot's hardware says."""
+LINGER_S = 0.5
+"""After the last message: leaving the mesh would cut off what is still on its way out."""
 TICK_S = 1 / 120
 """Of a clock that is made here, for a capture that has none."""
 
@@ -96,8 +97,7 @@ class Replay:
     async def run(self) -> None:
         loop = asyncio.get_running_loop()
         for key in self._player.keys:
-            if "qos" in self._capture.keys[key].metadata:
-                self._publisher(key)  # what takes its time is done before it is needed
+            self._publisher(key)
         if self._hardware:
             self._handles += [self._bus.declare_alive(alive_key(self._capture.robot, name)) for name in HARDWARE]
         ticking = None
@@ -112,6 +112,7 @@ class Replay:
                 for record in records:
                     self._send(record)
                 if self._player.ended:
+                    await asyncio.sleep(LINGER_S)
                     return
                 await self._wait(self._player.wait_s(loop.time()))
         finally:
@@ -133,7 +134,7 @@ class Replay:
         payload = reborn(self._payload(record), self._player.passes)
         if record.key == self._clock_key:
             payload = with_rate(payload, self._player.rate)
-        self._publisher(record.key, len(payload)).put(payload)
+        self._publisher(record.key).put(payload)
         self.sent += 1
 
     def _payload(self, record: Record) -> bytes | memoryview:
@@ -146,13 +147,11 @@ class Replay:
         except NotReadableError:
             return record.payload
 
-    def _publisher(self, key: str, size: int = 0) -> RawPublisher:
+    def _publisher(self, key: str) -> RawPublisher:
+        """Everything is played as events are: what a live mesh may leave out under load, a replay may not."""
         publisher = self._publishers.get(key)
         if publisher is None:
-            told = self._capture.keys[key].metadata.get("qos") if key in self._capture.keys else Qos.COMMAND.value
-            known = {qos.value: qos for qos in Qos}
-            fallback = Qos.FRAME if size >= LARGE_BYTES else Qos.STATE
-            publisher = self._publishers[key] = self._bus.publisher(key, known.get(told or "", fallback))
+            publisher = self._publishers[key] = self._bus.publisher(key, Qos.EVENT)
         return publisher
 
     async def _tick_for_ever(self) -> None:
