@@ -28,7 +28,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -457,8 +457,12 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m bench.hardware_faults", description="Faults at random moments.")
     parser.add_argument("--count", type=int, default=100)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     tallies = run(options.count, options.seed, lambda text: print(text, file=sys.stderr, flush=True))
+    if options.json:
+        print(json.dumps({name: asdict(tally) for name, tally in tallies.items()}))
+        return 0
     print(f"{'fault':34} tried crash wrong garbled longest  late slowest unseen stuck")
     for name, tally in sorted(tallies.items()):
         print(
