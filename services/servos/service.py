@@ -38,7 +38,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     arm_port: str = "/dev/cocoro-arm"
     """The serial port of neck and arm: a device, or wire:NAME for an emulated one."""
     hand_port: str = "/dev/cocoro-hand"
-    reply_s: Annotated[float, Meta(gt=0, le=0.5)] = 0.015
+    reply_s: Annotated[float, Meta(gt=0, le=0.5)] = 0.03
     """How long a servo's answer may take."""
     torque: dict[str, Share] = {}
     """By joint, the share of its stall torque that it may push with; all of it where nothing is said."""
