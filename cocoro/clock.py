@@ -26,6 +26,10 @@ class Clock(Protocol):
     def epoch(self) -> int:
         """Counts the times that the clock jumped back."""
 
+    @property
+    def stands(self) -> bool:
+        """Time does not go on: whatever keeps it has stopped, or died."""
+
     def now_ns(self) -> int: ...
 
     async def sleep_until(self, when_ns: int) -> bool:
@@ -47,6 +51,8 @@ class RealClock:
     def __init__(self) -> None:
         self._newest_ns = 0
         self._epoch = 0
+
+    stands = False
 
     @property
     def epoch(self) -> int:
@@ -76,6 +82,7 @@ class VirtualClock:
     """The running event loop's own time, for `vloop.VirtualTimeLoop`."""
 
     epoch = 0
+    stands = False
 
     def now_ns(self) -> int:
         return round(asyncio.get_running_loop().time() * NS)
@@ -103,6 +110,9 @@ class FollowedClock:
     """Follows ticks of simulated time. Between ticks it runs on at the simulator's rate, for at most
     `run_on_s`: when the simulator stands still, time stands still."""
 
+    STANDS_NS = NS
+    """Without a tick for so long of real time, the clock stands: the slowest simulator ticks oftener."""
+
     def __init__(self, run_on_s: float = 0.03) -> None:
         self.driven = False
         """True in the simulator's own process, which ticks it directly."""
@@ -122,6 +132,10 @@ class FollowedClock:
     @property
     def started(self) -> bool:
         return self._incarnation is not None
+
+    @property
+    def stands(self) -> bool:
+        return time.monotonic_ns() - self._tick_real_ns > self.STANDS_NS
 
     def tick(self, stamp_ns: int, incarnation: int, rate: float = 1.0) -> None:
         """A sample of the clock key. Ticks that arrive late within an incarnation are ignored."""

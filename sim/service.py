@@ -165,10 +165,13 @@ class Simulator:
             if self._frame_due.due(now_ns):
                 frame = self._kinect.capture(world.visual_poses(), world.camera_pose(), now_ns, world.light)
                 self._outbox.put(self._frames, frame, now_ns + self._frame_latency_ns)
-        sent = self._ticks.put(ClockMessage(rate=self.rate), world.time_ns)
+        self.tell_time()
+        self._outbox.flush(world.time_ns)
+
+    def tell_time(self) -> None:
+        sent = self._ticks.put(ClockMessage(rate=self.rate), self._world.time_ns)
         if isinstance(self._clock, FollowedClock):
             self._clock.tick(sent.stamp_ns, sent.incarnation, self.rate)
-        self._outbox.flush(world.time_ns)
 
 
 async def run(node: Node, config: Config) -> None:
@@ -178,6 +181,7 @@ async def run(node: Node, config: Config) -> None:
         async with AsyncExitStack() as stack:
             hardware = [await stack.enter_async_context(node.sibling(name)) for name in topics.HARDWARE]
             simulator.connect(*hardware)
+            simulator.tell_time()  # before anybody is ready, so that nobody begins anything in a time that is over
             for part in (node, *hardware):
                 part.ready(f"simulated, scene {world.scene.name}, {config.sensors} sensors")
             await keep_going(node, config, simulator)

@@ -315,3 +315,18 @@ def test_a_new_epoch_ends_a_sleep_and_says_so(deadline_ns: int) -> None:
         assert not await waiting
 
     run_virtual(main())
+
+
+@pytest.mark.usefixtures("real_time")
+def test_it_stands_when_its_ticks_have_ended_and_goes_on_with_the_next() -> None:
+    async def main() -> None:
+        clock = FollowedClock()
+        clock.tick(5 * NS, incarnation=1)
+        await asyncio.sleep(0.9)
+        assert not clock.stands
+        await asyncio.sleep(0.2)
+        assert clock.stands
+        clock.tick(1, incarnation=2)
+        assert not clock.stands
+
+    run_virtual(main())

@@ -399,6 +399,17 @@ async def test_when_the_clock_begins_anew_the_task_ends_and_the_next_one_can_beg
 
 
 @in_virtual_time
+async def test_nothing_begins_while_the_clock_stands_however_fresh_all_seems() -> None:
+    clock = JumpingClock()
+    async with robot(clock) as it:
+        clock.stands = True
+        refused = await it.ask()
+        assert (refused.refusal, refused.text) == ("not_alive", "the clock stands still; see cocoro status")
+        clock.stands = False
+        assert (await it.ask()).accepted
+
+
+@in_virtual_time
 async def test_a_task_that_cannot_be_is_refused_with_what_to_do() -> None:
     async with robot() as it:
         unknown = await it.ask(label="teapot")

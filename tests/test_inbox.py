@@ -29,6 +29,7 @@ class StillClock:
     """Stands where it is put."""
 
     epoch = 0
+    stands = True
 
     def __init__(self, now_ns: int = 100 * NS) -> None:
         self.at_ns = now_ns

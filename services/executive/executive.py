@@ -99,6 +99,8 @@ class Executive:
         missing = [service for service in self._config.needed if service not in self._alive]
         if missing:
             return "not_alive", f"not alive: {', '.join(missing)}; see cocoro status"
+        if self._node.clock.stands:  # and what was heard last would seem fresh for as long as it does
+            return "not_alive", "the clock stands still; see cocoro status"
         battery = self._base.value.battery_fraction if self._base.value is not None else 1.0
         if battery < self._config.battery_low and request.task != "put-down":
             return "battery", f"the battery is low ({battery:.0%}); charge the robot first"

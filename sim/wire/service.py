@@ -116,6 +116,7 @@ async def run(node: Node, config: Config) -> None:
             async with node.sibling("kinect") as camera:
                 simulator.connect_camera(camera)
                 await asyncio.to_thread(select.select, [channel], [], [], START_S)  # its first orders: it is there
+                simulator.tell_time()
                 for part in (node, camera):
                     part.ready(f"simulated behind wires, scene {world.scene.name}, {config.sensors} sensors")
                 await keep_going(node, config, simulator)
