@@ -25,6 +25,8 @@ _SIDE_RAD = 0.6
 """With the arm base turned further than this the arm is in the plane that it parks in."""
 _NEAR_RAD = 0.06
 _FRONT_RAD = -0.087
+_ASTRAY_RAD = 0.6
+"""At work the hand is never pitched so far off what it is to be, nor the elbow below it."""
 
 
 class Step(NamedTuple):
@@ -47,6 +49,8 @@ class ArmController:
         self._park = {name: robot.poses["park"][name] for name in ARM}
         self._reference: dict[str, float] | None = None
         self._stalled_s = 0.0
+        self._astray = False
+        """Where babbling left the arm no way of the hand leads back, but one of the joints does."""
         self._clearance_m: float | None = None
         """Of the reference, where it is known."""
 
@@ -78,8 +82,9 @@ class ArmController:
         reference = self._sync(measured, dt_s)
         if not self.folded(reference):
             pose = self._reacher.pose(reference)
+            astray = self._is_astray(reference, pose)
             out = all(abs(reference[name] - angle) < _NEAR_RAD for name, angle in _OUT.items())
-            if not out and pose.height_m < 0.15:
+            if not out and pose.height_m < 0.15 and not astray:
                 rise = HandPose(
                     max(pose.radius_m, self._config.travel_radius_m),
                     pose.azimuth_rad,
@@ -92,6 +97,7 @@ class ArmController:
             if abs(reference[ROLL]) > _NEAR_RAD:
                 return self._joints(_OUT | {ROLL: 0.0}, dt_s)._replace(arrived=False)
             return self._joints(_OUT | {ROLL: 0.0, "arm_base": self._park["arm_base"]}, dt_s)._replace(arrived=False)
+        self._astray = False
         if abs(reference["arm_base"] - self._park["arm_base"]) > _NEAR_RAD:
             return self._joints(_OUT | {ROLL: 0.0, "arm_base": self._park["arm_base"]}, dt_s)._replace(arrived=False)
         return self._joints(self._park | {ROLL: 0.0}, dt_s)
@@ -106,6 +112,9 @@ class ArmController:
             stage = _OUT | ({ROLL: 0.0} if not out and in_park_plane else {"arm_base": _FRONT_RAD})
         elif reference["arm_base"] > 0.35 and goal.azimuth_rad < 0.3:
             stage = _OUT | {"arm_base": _FRONT_RAD, ROLL: LEVEL_ROLL_RAD}
+        elif self._is_astray(reference, self._reacher.pose(reference)):
+            stage = _OUT | {"arm_base": _FRONT_RAD, ROLL: LEVEL_ROLL_RAD}
+            self._astray = any(abs(reference[name] - angle) > _NEAR_RAD for name, angle in stage.items())
         if stage is None:
             return self._cartesian(goal, speed_mps, dt_s)
         left_m = float(np.linalg.norm(self._reacher.point(goal) - self._reacher.position(reference)))
@@ -115,8 +124,13 @@ class ArmController:
         self, goals: Mapping[str, float], speed_radps: float, measured: Mapping[str, float], dt_s: float
     ) -> Step:
         """Move the named joints together to their goals along the straight way in joint space."""
+        self._astray = True
         self._sync(measured, dt_s)
         return self._joints(goals, dt_s, speed_radps)
+
+    def _is_astray(self, reference: Mapping[str, float], pose: HandPose) -> bool:
+        self._astray |= abs(pose.pitch_rad - self._config.pitch_rad) > _ASTRAY_RAD or reference["elbow"] > _NEAR_RAD
+        return self._astray
 
     @property
     def stalled(self) -> bool:
