@@ -6,6 +6,7 @@ an operator's request. What is latched is released only by an operator's reset, 
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 
 from cocoro import topics
@@ -53,6 +54,7 @@ class LatchKeeper:
 
     def _set(self, state: LatchState, by: str) -> None:
         if state != self.state:
-            self._node.log.warning("emergency stop %s by %s", state, by or "?")
+            level = logging.WARNING if state == "latched" else logging.INFO
+            self._node.log.log(level, "emergency stop %s by %s", state, by or "?")
         self.state = state
         self._changed(state, by)

@@ -144,7 +144,7 @@ def test_the_emergency_stop_imports_next_to_nothing() -> None:
     modules = set(done.stdout.split())
     assert "zenoh" in modules
     assert modules.isdisjoint(
-        {"numpy", "scipy", "cv2", "typer", "click", "rich", "uvloop", "cocoro.node", "cocoro.cli.app"}
+        {"numpy", "scipy", "cv2", "typer", "click", "rich", "cocoro.node", "cocoro.cli.app"}
     )
 
 

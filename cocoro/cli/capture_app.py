@@ -109,7 +109,7 @@ def view(
     robot: Robot = None,
     profile: Reach = None,
 ) -> None:
-    """Open Rerun on a capture, or live on the mesh. Needs cocoro-mesh[view]."""
+    """Open Rerun on a capture, or live on the mesh. Needs the extra `view`."""
     from cocoro.cli import capture_view
     from cocoro.cli.link import Where
 

@@ -12,7 +12,9 @@ import typer
 PANEL = "Hardware"
 
 base = typer.Typer(invoke_without_command=True)
-servos = typer.Typer(no_args_is_help=True)
+servos = typer.Typer(
+    no_args_is_help=True, help="Find, set up, calibrate, hold and relax the servos; clear their faults."
+)
 
 Robot = Annotated[str | None, typer.Option(help="Which robot; needed only when several are up here.")]
 Reach = Annotated[

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 
 from cocoro import topics
@@ -54,7 +55,8 @@ class Estop:
 
     def _set(self, state: LatchState, by: str) -> None:
         if state != self.state:
-            self._node.log.warning("emergency stop %s by %s", state, by or "?")
+            level = logging.WARNING if state == "latched" else logging.INFO
+            self._node.log.log(level, "emergency stop %s by %s", state, by or "?")
             self.state, self._by = state, by
             self._changed(state == "latched", by)
             self._say()
