@@ -6,8 +6,10 @@ from collections.abc import Iterator
 
 import pytest
 from hypothesis import HealthCheck, settings
+from pictures import renderer_of
 
 from cocoro.robot import Robot
+from sim.render import Renderer
 
 # The same examples at every run, and none that fails because the machine was busy.
 settings.register_profile(
@@ -28,3 +30,13 @@ def captures_of_tests(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("COCORO_CAPTURE_DIR", str(tmp_path_factory.mktemp("captures")))
         yield
+
+
+@pytest.fixture(params=["moderngl", "tiny"])
+def renderer(request: pytest.FixtureRequest) -> Renderer:
+    return renderer_of(request.param)
+
+
+@pytest.fixture
+def gl() -> Renderer:
+    return renderer_of("moderngl")

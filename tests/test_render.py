@@ -20,7 +20,6 @@ from pictures import (
     look,
     pixel_of,
     reddish,
-    renderer_of,
 )
 
 from cocoro.kinematics import Array
@@ -30,17 +29,6 @@ from sim.render import Images, Renderer, make_renderer
 from sim.render.room import FLOOR_RGB, OTHER_TILE_RGB, walls
 from sim.render.views import lamp_tint
 from sim.visual import Visual
-
-
-@pytest.fixture(params=["moderngl", "tiny"])
-def renderer(request: pytest.FixtureRequest) -> Renderer:
-    return renderer_of(request.param)
-
-
-@pytest.fixture
-def gl() -> Renderer:
-    return renderer_of("moderngl")
-
 
 # --- geometry -------------------------------------------------------------------------------------
 

@@ -30,17 +30,6 @@ from sim.camera import moved
 from sim.render import Images, Renderer, make_renderer
 from sim.render import gl as gl_module
 
-
-@pytest.fixture(params=["moderngl", "tiny"])
-def renderer(request: pytest.FixtureRequest) -> Renderer:
-    return renderer_of(request.param)
-
-
-@pytest.fixture
-def gl() -> Renderer:
-    return renderer_of("moderngl")
-
-
 # --- the infrared projector -----------------------------------------------------------------------
 
 

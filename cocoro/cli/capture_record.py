@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import os
-import signal
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +13,7 @@ import msgspec
 
 from cocoro import processes
 from cocoro.cli import exits
+from cocoro.cli.ending import told_to_end
 from cocoro.cli.link import Where, joined
 from cocoro.clock import FollowedClock, RealClock
 from cocoro.errors import ConfigError
@@ -47,7 +46,7 @@ async def record(where: Where, settings: dict[str, Any], seconds: float | None) 
         async with Node(name, link.bus, clock, robot, robot_name=link.robot, module=row.module, config=config) as node:
             view = _View()
             node.on(RECORDING.of(name), view.show)
-            with _ends() as end:
+            with told_to_end() as end:
                 await _work(component.run(node, config), end, view.failed, seconds)
                 with suppress(TimeoutError):
                     await asyncio.wait_for(view.ended.wait(), LAST_WORDS_S)
@@ -101,16 +100,3 @@ def _line(recording: Recording) -> str:
     missing = sum(recording.dropped.values()), sum(recording.lost.values())
     told = "".join(f", {count} {word}" for count, word in zip(missing, ("dropped", "lost"), strict=True) if count)
     return f"{recording.file}: {recording.messages} messages, {recording.size_bytes / 1e6:.1f} MB{told}"
-
-
-@contextmanager
-def _ends() -> Iterator[asyncio.Event]:
-    """Set by Ctrl-C and by being told to end."""
-    loop, end = asyncio.get_running_loop(), asyncio.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, end.set)
-    try:
-        yield end
-    finally:
-        for number in (signal.SIGINT, signal.SIGTERM):
-            loop.remove_signal_handler(number)
