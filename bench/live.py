@@ -1,0 +1,204 @@
+"""The robot as its operator has it, processes on zenoh in real time: `python -m bench.live fetches|periods|stop`.
+
+`fetches`: start it, fetch the red can, shut it down, again and again; nothing may fail, nothing may be left over.
+`periods`: how evenly wheels and servos are commanded during a fetch, with perception slowed to 2 Hz.
+`stop`: from the call of `cocoro stop` on a robot that drives until its wheels stand, as its base says.
+
+Times are this machine's at this moment: see how busy it is. Exit code 1 when something failed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import os
+import shutil
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+from cocoro import topics
+from cocoro.bus.zenoh import ZenohBus
+from cocoro.clock import NS, FollowedClock
+from cocoro.node import Node
+from cocoro.robot import Robot
+from cocoro.rundir import RunDir
+
+NAME = "calliope"
+STANDING_MPS = 0.01
+
+
+class Operator:
+    """`cocoro` with a run directory of its own."""
+
+    def __init__(self, root: Path) -> None:
+        self.run_dir = RunDir(NAME, root)
+        self._env = os.environ | {"COCORO_RUN_DIR": str(root), "COCORO_CAPTURE_DIR": str(root / "captures")}
+
+    def start(self, *arguments: str) -> subprocess.Popen[str]:
+        command = [sys.executable, "-m", "cocoro.cli.main", *arguments]
+        return subprocess.Popen(command, env=self._env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+
+    def __call__(self, *arguments: str) -> tuple[int, str, float]:
+        """Exit code, what was printed, and seconds."""
+        begun_s = time.monotonic()
+        with self.start(*arguments) as process:
+            said = process.communicate(timeout=300.0)[0]
+        return process.returncode, said, time.monotonic() - begun_s
+
+
+@contextmanager
+def operator() -> Iterator[Operator]:
+    root = Path(tempfile.mkdtemp(prefix="cocoro"))  # short: sockets live there
+    work = Operator(root)
+    try:
+        yield work
+    finally:
+        work("down")
+        shutil.rmtree(root, ignore_errors=True)
+
+
+def _spread(values: list[float], unit: str) -> str:
+    ordered = sorted(values)
+    p99 = ordered[min(len(ordered) - 1, int(0.99 * len(ordered)))]
+    return f"median {statistics.median(ordered):.2f} {unit}, p99 {p99:.2f}, longest {ordered[-1]:.2f}"
+
+
+# --- fetches --------------------------------------------------------------------------------------
+
+
+def fetches(count: int, *options: str) -> bool:
+    took: dict[str, list[float]] = {"up": [], "fetch": [], "down": []}
+    good = 0
+    for number in range(count):
+        with operator() as cocoro:
+            up, said_up, took_up = cocoro("up", "sim", "--detach", *options)
+            fetch, said_fetch, took_fetch = cocoro("fetch", "red_can") if up == 0 else (1, "", 0.0)
+            down, said_down, took_down = cocoro("down")
+            left = sorted(cocoro.run_dir.claims())
+        well = (up, fetch, down) == (0, 0, 0) and not left
+        good += well
+        for name, seconds in zip(took, (took_up, took_fetch, took_down), strict=True):
+            took[name].append(seconds)
+        last = said_fetch.strip().splitlines()[-1] if said_fetch.strip() else "no fetch"
+        print(f"{'ok  ' if well else 'FAIL'} {number + 1:3d}  up {took_up:.1f} s  {last}  down {took_down:.1f} s")
+        if not well:
+            print(said_up, said_fetch, said_down, f"left: {left}", sep="\n")
+        sys.stdout.flush()
+    print(f"{good} of {count}; " + "; ".join(f"{name}: {_spread(values, 's')}" for name, values in took.items()))
+    return good == count
+
+
+# --- periods --------------------------------------------------------------------------------------
+
+
+async def _commands(cocoro: Operator) -> dict[str, list[int]]:
+    """The stamps of what is commanded, and of what is detected, while a fetch goes on."""
+    stamps: dict[str, list[int]] = {}
+    async with (
+        await ZenohBus.open(cocoro.run_dir.join_as("bench")) as bus,
+        Node("bench", bus, FollowedClock(), Robot.load()) as node,
+    ):
+        for topic in (topics.BASE_COMMAND, topics.ARM_COMMAND, topics.DETECTIONS):
+            heard = stamps.setdefault(topic.name, [])
+            node.on(topic, lambda message, heard=heard: heard.append(message.stamp_ns))  # type: ignore[misc]
+        process = cocoro.start("fetch", "red_can")
+        said, _ = await asyncio.to_thread(process.communicate)
+        print(said.strip().splitlines()[-1])
+    return stamps
+
+
+def periods(latency_s: float) -> bool:
+    with operator() as cocoro:
+        code, said, _ = cocoro("up", "sim", "--detach", "--latency", f"perception={latency_s:g}")
+        if code:
+            print(said)
+            return False
+        stamps = asyncio.run(_commands(cocoro))
+        _, status, _ = cocoro("status", "--json")
+    for name, heard in stamps.items():
+        apart_ms = [(b - a) / 1e6 for a, b in pairwise(heard)]
+        rate_hz = (len(heard) - 1) / ((heard[-1] - heard[0]) / NS)
+        print(f"{name:22s} {rate_hz:5.1f} Hz; period by stamp {_spread(apart_ms, 'ms')}")
+    print("the planner's own loop:", json.dumps(_loops(json.loads(status), "planning")))
+    return True
+
+
+def _loops(status: Any, service: str) -> Any:
+    """Wherever it stands in the status."""
+    if isinstance(status, dict):
+        if status.get("service") == service and status.get("loops"):
+            return status["loops"]
+        status = list(status.values())
+    if isinstance(status, list):
+        return next(filter(None, (_loops(value, service) for value in status)), None)
+    return None
+
+
+# --- stop -----------------------------------------------------------------------------------------
+
+
+async def _stop(cocoro: Operator) -> tuple[float, float]:
+    """Seconds until the wheels stand, as the base says, and until the command has ended."""
+    async with (
+        await ZenohBus.open(cocoro.run_dir.join_as("bench")) as bus,
+        Node("bench", bus, FollowedClock(), Robot.load()) as node,
+    ):
+        states = node.stream(topics.BASE_STATE)
+        fetch = cocoro.start("fetch", "red_can")
+        async for state in states:
+            if state.speed_mps > 0.25:
+                break
+        begun_s = time.monotonic()
+        stop = cocoro.start("stop")
+        async for state in states:
+            if abs(state.speed_mps) < STANDING_MPS:
+                break
+        stood_s = time.monotonic() - begun_s
+        await asyncio.to_thread(stop.communicate)
+        ended_s = time.monotonic() - begun_s
+        await asyncio.to_thread(fetch.communicate)
+    return stood_s, ended_s
+
+
+def stop(count: int) -> bool:
+    stood, ended = [], []
+    for _ in range(count):
+        with operator() as cocoro:
+            code, said, _ = cocoro("up", "sim", "--detach")
+            if code:
+                print(said)
+                return False
+            stood_s, ended_s = asyncio.run(_stop(cocoro))
+            stood.append(stood_s)
+            ended.append(ended_s)
+    print(f"wheels stand after {_spread(stood, 's')}; the command has ended after {_spread(ended, 's')}")
+    return True
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=["fetches", "periods", "stop"])
+    parser.add_argument("--count", type=int, default=20)
+    parser.add_argument("--latency", type=float, default=0.5, metavar="S", help="of perception, for periods")
+    parser.add_argument("--sensors", choices=["ideal", "real"], default="ideal")
+    arguments = parser.parse_args()
+    if arguments.what == "fetches":
+        well = fetches(arguments.count, "--sensors", arguments.sensors)
+    elif arguments.what == "periods":
+        well = periods(arguments.latency)
+    else:
+        well = stop(arguments.count)
+    return 0 if well else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
