@@ -21,6 +21,8 @@ from cocoro.kinematics import Array, Chain, Link, Tree
 
 Positive = Annotated[float, Meta(gt=0)]
 Vec3 = tuple[float, float, float]
+LensValues = tuple[float, float, float, float, float, float, float, float, float]
+"""fx, fy, cx, cy in pixels, then k1, k2, p1, p2, k3 as OpenCV has them."""
 
 SERVO_COUNTS = 1024
 SERVO_RANGE_RAD = radians(300.0)
@@ -53,6 +55,12 @@ class Kinect(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     depth_curve: Vec3
     mount_min_m: Vec3
     mount_max_m: Vec3
+    colour_lens: LensValues | None = None
+    depth_lens: LensValues | None = None
+    """What was measured of the two lenses; the driver straightens its pictures by it, so that readers of frames may
+    reckon with the fields of view above."""
+    depth_rotation_rad: Vec3 = (0.0, 0.0, 0.0)
+    """How the depth camera is turned against the colour camera (rotation vector): from its frame into the latter's."""
 
 
 class Marker(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

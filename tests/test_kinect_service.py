@@ -16,7 +16,8 @@ from cocoro.node import Node
 from cocoro.robot import Robot
 from cocoro.vloop import run_virtual
 from services.kinect import device
-from services.kinect.device import Shot
+from services.kinect.device import Shot, Tell
+from services.kinect.freenect import LED
 from services.kinect.service import Config, run
 
 
@@ -37,6 +38,8 @@ class _Two:
 
     def tilt(self, angle_rad: float) -> None: ...
 
+    def led(self, led: LED) -> None: ...
+
     def close(self) -> None:
         self.closed = True
 
@@ -44,7 +47,7 @@ class _Two:
 def test_every_pair_is_published_with_its_own_stamp_and_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
     cameras: list[_Two] = []
 
-    def open_two(clock: Clock) -> _Two:
+    def open_two(config: Config, clock: Clock, tell: Tell) -> _Two:
         cameras.append(_Two(clock))
         return cameras[-1]
 
@@ -70,5 +73,5 @@ def test_every_pair_is_published_with_its_own_stamp_and_pixels(monkeypatch: pyte
 
 
 def test_a_driver_that_is_not_there_is_said_with_what_to_do() -> None:
-    with pytest.raises(ConfigError, match=r"no driver 'nonesuch'.*cocoro up sim"):
-        device.open_device("nonesuch", VirtualClock())
+    with pytest.raises(ConfigError, match=r"no driver 'nonesuch' \(known: .*freenect"):
+        device.open_device(Config(device="nonesuch"), VirtualClock(), print)

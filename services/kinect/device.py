@@ -10,6 +10,11 @@ from numpy.typing import NDArray
 
 from cocoro.clock import Clock
 from cocoro.errors import ConfigError
+from services.kinect.config import Config
+from services.kinect.freenect import LED
+
+Tell = Callable[[str], None]
+"""Called with what keeps pictures from coming, in a sentence; with '' when they come again."""
 
 
 class Shot(NamedTuple):
@@ -32,19 +37,22 @@ class DepthCamera(Protocol):
     def tilt(self, angle_rad: float) -> None:
         """Move the device's own tilt motor (the Calliope's stays at 0: its neck tilts)."""
 
+    def led(self, led: LED) -> None: ...
+
     def close(self) -> None: ...
 
 
-DEVICES: dict[str, Callable[[Clock], DepthCamera]] = {}
+Open = Callable[[Config, Clock, Tell], DepthCamera]
+
+DEVICES: dict[str, Open] = {}
 """Drivers by name. Raise ConfigError, naming the package to install, when their library is missing."""
 
 
-def open_device(name: str, clock: Clock) -> DepthCamera:
+def open_device(config: Config, clock: Clock, tell: Tell) -> DepthCamera:
     """Raises ConfigError for a driver that is not there."""
-    if name not in DEVICES:
-        known = ", ".join(DEVICES) or "none"
-        raise ConfigError(
-            f"kinect: there is no driver {name!r} (known: {known}); on the simulated robot the simulator takes"
-            " the Kinect's place: cocoro up sim"
-        )
-    return DEVICES[name](clock)
+    from services.kinect import camera  # enters the real one
+
+    DEVICES.setdefault("freenect", camera.FreenectCamera)
+    if config.device not in DEVICES:
+        raise ConfigError(f"kinect: there is no driver {config.device!r} (known: {', '.join(DEVICES)})")
+    return DEVICES[config.device](config, clock, tell)

@@ -1,0 +1,100 @@
+"""A lens as OpenCV models it, and straightened pictures: as if both cameras were the pinholes of the description.
+
+Everybody who reads frames reckons with one pinhole for both pictures, and with a depth camera that looks where the
+colour camera looks from a place beside it. A real Kinect's lenses bend, their middles and focal lengths differ, and
+one is turned against the other by a fraction of a degree. Once that has been measured (`services.kinect.calibration`)
+it is taken out here, where the pictures come in, and nowhere else. (Rectification; derived.)
+"""
+
+from __future__ import annotations
+
+from math import pi
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cocoro.robot import Camera, Robot
+from services.kinect.device import Shot
+
+Array = NDArray[np.float64]
+Maps = tuple[cv2.typing.MatLike, cv2.typing.MatLike]
+NO_DATA = 2047
+MATTERS_CODES = 0.5
+"""Less is lost in the rounding."""
+
+
+class Lens:
+    """Made of the nine numbers of a robot's own file: fx, fy, cx, cy in pixels, then k1, k2, p1, p2, k3."""
+
+    def __init__(self, values: tuple[float, ...]) -> None:
+        fx, fy, cx, cy = values[:4]
+        self.matrix: Array = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        self.distortion: Array = np.array(values[4:])
+
+    @classmethod
+    def of(cls, camera: Camera) -> Lens:
+        return cls((camera.fx, camera.fy, camera.cx, camera.cy, 0.0, 0.0, 0.0, 0.0, 0.0))
+
+    def pixels(self, rays: Array) -> Array:
+        """Where directions (n, 3), camera frame, appear: (n, 2)."""
+        points, _ = cv2.projectPoints(rays.reshape(-1, 1, 3), np.zeros(3), np.zeros(3), self.matrix, self.distortion)
+        return np.asarray(points, float).reshape(-1, 2)
+
+    def rays(self, pixels: Array) -> Array:
+        """The directions of pixels (n, 2), with z = 1: (n, 3)."""
+        points = cv2.undistortPoints(pixels.reshape(-1, 1, 2), self.matrix, self.distortion).reshape(-1, 2)
+        return np.column_stack([points, np.ones(len(points))])
+
+
+class Straightener:
+    """Of one robot's Kinect. Where nothing was measured pictures are passed on as they are."""
+
+    def __init__(self, robot: Robot) -> None:
+        kinect = robot.kinect
+        target = robot.camera
+        shape = target.height, target.width
+        v, u = np.mgrid[0 : target.height, 0 : target.width].astype(float)
+        rays = Lens.of(target).rays(np.column_stack([u.ravel(), v.ravel()]))
+        self._colour: Maps | None = None
+        if kinect.colour_lens is not None:
+            self._colour = _maps(Lens(kinect.colour_lens).pixels(rays), shape)
+        self._depth: Maps | None = None
+        self._move: tuple[NDArray[np.float32], NDArray[np.float32]] | None = None
+        if kinect.depth_lens is not None:
+            turn, _ = cv2.Rodrigues(np.array(kinect.depth_rotation_rad))
+            turned = rays @ turn  # by its inverse: into the depth camera's own frame
+            self._depth = _maps(Lens(kinect.depth_lens).pixels(turned), shape, nearest=True)
+            # Along another axis the same point has another depth: z / turned z. Codes are all but linear in 1 / z.
+            _, b, c = kinect.depth_curve
+            endless = b * (pi / 2 - c)
+            gain = turned[:, 2].reshape(shape).astype(np.float32)
+            if float(np.abs(gain - 1.0).max()) * endless > MATTERS_CODES:
+                self._move = gain, np.float32(endless) * (np.float32(1.0) - gain) + np.float32(0.5)
+
+    @property
+    def idle(self) -> bool:
+        """Nothing was measured."""
+        return self._colour is None and self._depth is None
+
+    def __call__(self, shot: Shot) -> Shot:
+        """Colour smoothly, depth from the nearest pixel: two depths have no mean."""
+        colour, depth = shot.colour, shot.depth
+        if self._colour is not None:
+            colour = np.asarray(cv2.remap(colour, self._colour[0], self._colour[1], cv2.INTER_LINEAR), np.uint8)
+        if self._depth is not None:
+            u, v = self._depth
+            carried = cv2.remap(depth, u, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=NO_DATA)
+            depth = np.asarray(carried, np.uint16)
+            if self._move is not None:
+                gain, shift = self._move
+                moved = (depth * gain + shift).astype(np.uint16)
+                depth = np.where(depth >= NO_DATA, np.uint16(NO_DATA), moved)
+        return Shot(shot.stamp_ns, colour, depth)
+
+
+def _maps(
+    pixels: Array, shape: tuple[int, int], *, nearest: bool = False
+) -> tuple[cv2.typing.MatLike, cv2.typing.MatLike]:
+    u, v = (pixels[:, axis].reshape(shape).astype(np.float32) for axis in (0, 1))
+    return cv2.convertMaps(u, v, cv2.CV_16SC2, nninterpolation=nearest)
