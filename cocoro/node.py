@@ -302,10 +302,10 @@ class Node:
             await self._until_recorded()
         step = self.stepper(core, name)
         meter = self._meter(name or self.name)
+        self.ready()  # whoever keeps the clock may come later: a replay, a simulator that starts anew
         if isinstance(self.clock, FollowedClock):
             await self.clock.wait_started()
         schedule = Schedule(self.clock, core.schedule.rate_hz, meter) if core.schedule.rate_hz else None
-        self.ready()
         epoch = self.clock.epoch
         while True:
             if schedule is None:

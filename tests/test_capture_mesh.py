@@ -195,6 +195,8 @@ def test_replay_is_worked_by_the_keyboard(short_path: Path) -> None:
     screen.wait_for("pass 2")
     os.write(ours, b"-")
     screen.wait_for("x0.80")
+    os.write(ours, b"++x-\x1bOC\x1b[D")  # at once, as of keys that are held down
+    screen.wait_for("paused 0.0 of 2.0 s, x1.00")
     os.write(ours, b" ")
     screen.wait_for("0.3 of 2.0 s")
     os.write(ours, b"q")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from cocoro.capture.reader import Capture
 from cocoro.capture.rebirth import reborn, with_rate
 from cocoro.capture.replay import Replay, played_keys, refuse_if_alive, services_of
 from cocoro.clock import FollowedClock
+from cocoro.core import Output, Sample, Schedule, Take
 from cocoro.errors import ConfigError, RefusedError
 from cocoro.messages import BaseState, Clock, Detections, Frame, PlannerStatus, StepRecord
 from cocoro.node import Node
@@ -232,6 +233,40 @@ def test_hardware_alone_impersonates_the_robot_with_a_clock(tmp_path: Path) -> N
     assert alive == {"kinect", "base", "arm", "hand"}
     assert len(followed) > 120
     assert all(abs(now_ns - stamp_ns) < 10**8 for stamp_ns, now_ns in followed[2:])
+
+
+class Counting:
+    """A core that counts the states that it is given."""
+
+    reads: Mapping[Any, Take] = {topics.BASE_STATE: "all"}
+    schedule = Schedule(None, (topics.BASE_STATE,))
+
+    def __init__(self) -> None:
+        self.heard = 0
+
+    def step(self, inputs: Sequence[Sample], now_ns: int) -> Sequence[Output]:
+        self.heard += len(inputs)
+        return ()
+
+
+def test_what_thinks_is_up_before_the_capture_begins_and_misses_nothing_of_it(tmp_path: Path) -> None:
+    """`cocoro up replay` in one terminal, then `cocoro replay --hardware` in another: until then there is no clock."""
+    path = record(tmp_path / "first.mcap", drive)
+    core = Counting()
+
+    async def think_along(room: Room) -> None:
+        async with Node("planning", room.mesh.join(), FollowedClock(), ROBOT) as node:
+            thinking = asyncio.ensure_future(node.drive(core))
+            await asyncio.sleep(1.0)
+            assert node.state == "ready"
+            with Capture.open(path) as capture:
+                player = Player(capture, played_keys(capture, (), hardware=True).__contains__)
+                await Replay(room.mesh.join(), capture, player, hardware=True).run()
+            thinking.cancel()
+            await asyncio.gather(thinking, return_exceptions=True)
+
+    run_virtual(think_along(Room()))
+    assert core.heard == len(all_of(path, "base/state")) == 100
 
 
 def test_a_mesh_with_a_robot_of_that_name_is_left_alone(tmp_path: Path) -> None:

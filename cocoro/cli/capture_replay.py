@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import re
 import sys
 import termios
 import tty
@@ -25,7 +26,9 @@ from cocoro.topics import HARDWARE
 SHOW_S = 0.1
 JUMP_S = 5.0
 FASTER = 1.25
-LEFT, RIGHT = "\x1b[D", "\x1b[C"
+LEFT, RIGHT = ("\x1b[D", "\x1bOD"), ("\x1b[C", "\x1bOC")
+KEY = re.compile(r"\x1b[\[O][A-Z]|.", re.DOTALL)
+"""A terminal hands over several at once when they come quickly, as of a key that is held down."""
 HELP = "space pauses, . steps, left and right 5 s, + and - rate, q ends"
 
 
@@ -106,7 +109,12 @@ def _keyboard(pressed: Callable[[str], None]) -> Iterator[bool]:
     fd, loop = sys.stdin.fileno(), asyncio.get_running_loop()
     before = termios.tcgetattr(fd)
     tty.setcbreak(fd)
-    loop.add_reader(fd, lambda: pressed(os.read(fd, 32).decode(errors="replace")))
+
+    def read() -> None:
+        for key in KEY.findall(os.read(fd, 32).decode(errors="replace")) or [""]:
+            pressed(key)
+
+    loop.add_reader(fd, read)
     try:
         yield True
     finally:
@@ -120,8 +128,8 @@ def _work(text: str, player: Player, replaying: Replay, end: asyncio.Event) -> N
         player.toggle(now_s)
     elif text == ".":
         player.step(now_s)
-    elif text in (LEFT, RIGHT):
-        player.seek(now_s, player.position_s(now_s) + (JUMP_S if text == RIGHT else -JUMP_S))
+    elif text in (*LEFT, *RIGHT):
+        player.seek(now_s, player.position_s(now_s) + (JUMP_S if text in RIGHT else -JUMP_S))
     elif text in ("+", "="):
         player.change_rate(now_s, player.rate * FASTER)
     elif text == "-":
