@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -70,6 +71,20 @@ def test_the_wheels_stop_at_once_when_the_service_is_gone(bench: Bench, service:
     asked_ns = service.asked_ns
     service.close()
     assert bench.until_wheels(0, 0) - asked_ns < DEADMAN_NS
+    assert service.guard.returncode == 0
+
+
+@pytest.mark.parametrize("eaten", [bytes([152, 255]), bytes([140, 3, 255])], ids=["script", "song"])
+def test_the_wheels_stop_though_the_create_takes_what_comes_for_the_rest_of_another_command(
+    bench: Bench, service: FakeService, eaten: bytes
+) -> None:
+    service.keep_asking(200, 200)
+    bench.until_wheels(200, 200)
+    bench.emulator.call(lambda: bench.create.receive(eaten, 57600, bench.create._now_ns))
+    service.silence()
+    gone_ns = time.monotonic_ns()
+    service.close()
+    assert bench.until_wheels(0, 0) - gone_ns < DEADMAN_NS + PATIENCE_NS
     assert service.guard.returncode == 0
 
 

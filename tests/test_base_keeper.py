@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from wire_base import frame
 
 from services.base import oi
-from services.base.keeper import LONG, MS, SHORT, Keeper, Wheels, reflex
+from services.base.keeper import LONG, MS, OVERRUN, SHORT, Keeper, Wheels, reflex
 
 QUIET = dict.fromkeys(SHORT, 0) | {oi.MODE: 2}
 
@@ -60,7 +60,7 @@ def rig() -> Rig:
 def test_waking_stops_the_wheels_first_and_then_enters_the_mode() -> None:
     rig = Rig()
     rig.frames(12)
-    assert rig.written.startswith(oi.drive_direct(0, 0) + oi.abort_demo() + oi.start())
+    assert rig.written.startswith(oi.drive_direct(0, 0) * OVERRUN + oi.abort_demo() + oi.start())
     assert rig.written.index(oi.enter("safe")) < rig.written.index(oi.stream(SHORT))
 
 
@@ -100,6 +100,20 @@ def test_a_command_that_the_create_took_for_another_is_repeated_at_once(rig: Rig
     rig.now_ns += 15 * MS
     rig.keeper.heard(frame({packet: rig.readings[packet] for packet in SHORT}), rig.now_ns)
     assert rig.keeper.poll(rig.now_ns).endswith(oi.drive_direct(100, 100))
+
+
+def test_a_create_that_takes_commands_for_the_rest_of_another_gets_more_than_it_can_take(rig: Rig) -> None:
+    """A garbled byte may have become the head of a script, which takes up to 255 bytes that follow."""
+    rig.keeper.ask(100, 100, rig.now_ns + 200 * MS, rig.now_ns)
+    rig.frames(2)
+    rig.keeper.ask(0, 0, rig.now_ns + 200 * MS, rig.now_ns)
+    written, taken = [], dict(rig.readings)
+    for _ in range(8):
+        rig.now_ns += 15 * MS
+        rig.keeper.heard(frame({packet: taken[packet] for packet in SHORT}), rig.now_ns)
+        written.append(rig.keeper.poll(rig.now_ns))
+    assert max(len(data) for data in written) > 255
+    assert set(b"".join(written)) == set(oi.drive_direct(0, 0))
 
 
 def test_a_silent_create_gets_no_wheel_speeds_and_is_woken_again_and_again(rig: Rig) -> None:

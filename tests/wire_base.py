@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -102,8 +102,9 @@ class FakeService:
         self._asking.clear()
 
         def ask() -> None:
-            while not self._asking.wait(0.02):
-                self.ask(left, right)
+            with suppress(BrokenPipeError):  # the guard has ended
+                while not self._asking.wait(0.02):
+                    self.ask(left, right)
 
         self._thread = threading.Thread(target=ask)
         self._thread.start()

@@ -15,12 +15,18 @@ Link = Literal["closed", "silent", "waking", "up", "fallen"]
 itself, and waits for somebody to say that it may go on."""
 
 MS = 1_000_000
+SAFE = oi.MODES.index("safe")
 SILENT_NS = 180 * MS
 """Twelve frames missed: the Create is not heard any more."""
 RESEND_NS = 40 * MS
 """Wheel commands are repeated so often even when nothing has changed: one may have been lost on the wire."""
 HEEDED_NS = 60 * MS
 """By then a frame says that a command was heeded, or it was lost or garbled."""
+OVERRUN = 52
+"""A garbled byte may have become a command that waits for up to 255 bytes (a script, a list of packets), and takes what
+comes for them. So many drive commands are more than that."""
+OVERRUN_NS = 60 * MS
+"""On the wire they take 45 ms."""
 COUNTS_NS = 200 * MS
 """How often way and turn are asked for: at 5 Hz their units, 1 mm and 1 degree, are small beside what they count."""
 COUNTS_LATE_NS = 60 * MS
@@ -83,6 +89,7 @@ class Keeper:
         self._frame_ns = 0
         self._sent_ns = 0
         self._changed_ns = 0
+        self._overran_ns = 0
         self._counted_ns = 0
         self._counting_ns: int | None = None
         self._counts_lost = False
@@ -135,6 +142,14 @@ class Keeper:
         lost, self._counts_lost = self._counts_lost, False
         return lost
 
+    def stands(self, since_ns: int) -> bool:
+        """Whether the Create has said, in a frame that came after `since_ns`, that it was told to stand still, or that
+        it is in a mode in which it obeys nobody."""
+        if self._frame_ns <= since_ns:
+            return False
+        readings = self.readings
+        return (readings[oi.LEFT_SPEED], readings[oi.RIGHT_SPEED]) == (0, 0) or readings[oi.MODE] < SAFE
+
     # --- what to write ------------------------------------------------------------------------------
 
     def poll(self, now_ns: int) -> bytes:
@@ -171,6 +186,9 @@ class Keeper:
             self._changed_ns = now_ns
         elif stale and self.link == "up" and now_ns - self._changed_ns > HEEDED_NS:
             self.damage += 1
+            if now_ns - self._overran_ns > OVERRUN_NS:
+                self._sent_ns = self._overran_ns = now_ns
+                return oi.drive_direct(wheels.left_mmps, wheels.right_mmps) * OVERRUN
         if wheels[:2] == before[:2] and now_ns - self._sent_ns < RESEND_NS and not stale:
             return b""
         self._sent_ns = now_ns
@@ -213,11 +231,12 @@ class Keeper:
         self.link = "waking"
         self._wake_ns = now_ns
         self._counting_ns = None
-        # The first bytes stop the wheels in case that it still drives; a change of mode takes a Create up to 20 ms.
+        # The first bytes stop the wheels in case that it still drives, whatever it takes some of them for; a change of
+        # mode takes a Create up to 20 ms.
         self._wake = [
-            (now_ns, oi.drive_direct(0, 0) + oi.abort_demo() + oi.start()),
-            (now_ns + 50 * MS, oi.enter(self._mode)),
-            (now_ns + 100 * MS, oi.drive_direct(0, 0) + oi.stream(SHORT)),
+            (now_ns, oi.drive_direct(0, 0) * OVERRUN + oi.abort_demo() + oi.start()),
+            (now_ns + 100 * MS, oi.enter(self._mode)),
+            (now_ns + 150 * MS, oi.drive_direct(0, 0) + oi.stream(SHORT)),
         ]
 
     def _waking(self, now_ns: int) -> bytes:
