@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import csv
 import json
+import resource
+import subprocess
 import sys
 import types
 from math import pi
@@ -77,6 +79,36 @@ def test_a_capture_without_pictures_makes_no_film(tmp_path: Path, capsys: pytest
     assert main(["export", str(path)]) == 2
 
 
+def test_a_film_that_the_disk_did_not_take_whole_is_no_film(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, hard))
+    try:
+        assert main(["export", str(GOLDEN), "--video", str(tmp_path / "film.mp4")]) == 1
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert "could not be written to its end" in capsys.readouterr().err
+    assert not (tmp_path / "film.mp4").exists()
+
+
+@pytest.mark.parametrize(
+    ("form", "name", "words"),
+    [
+        ("--video", "film.avi", "name ends with .mp4"),
+        ("--video", "file/in/film.mp4", "film.mp4: Not a directory"),
+        ("--foxglove", "file/in/fox.mcap", "fox.mcap: Not a directory"),
+        ("--csv", "file", "arm_alive.csv: "),
+    ],
+)
+def test_a_place_where_nothing_can_be_written_is_told_in_one_line(
+    form: str, name: str, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").write_text("no folder")
+    assert main(["export", str(GOLDEN), form, str(tmp_path / name)]) == 1
+    err = capsys.readouterr().err
+    assert words in err
+    assert len(err.splitlines()) == 1
+
+
 # --- tables ---------------------------------------------------------------------------------------
 
 
@@ -95,6 +127,13 @@ def test_each_key_is_a_table_with_a_column_for_each_number(exported: Path) -> No
     assert [int(row["stamp_ns"]) for row in states] == [each.publish_ns for each in records]
     assert _rows(exported / "csv" / "kinect_frame.csv")[0]["colour.bytes"] == str(160 * 120 * 3)
     assert _rows(exported / "csv" / "arm_state.csv")[0]["joints.0"] == joints[0]
+
+
+def test_what_is_nothing_now_and_then_has_the_columns_of_its_parts_alone(exported: Path) -> None:
+    plans = _rows(exported / "csv" / "planning_status.csv")
+    assert {"target.label", "target.position_m.0", "hand_m.2", "distance_m"} <= set(plans[0])
+    assert not {"target", "hand_m"} & set(plans[0])
+    assert {row["target.label"] for row in plans} == {"", "red_can"}
 
 
 def test_a_list_of_maps_is_a_table_of_its_own(exported: Path) -> None:
@@ -177,9 +216,17 @@ def test_foxglove_schemas_have_foxgloves_names_and_no_references() -> None:
     assert entity["properties"]["timestamp"]["title"] == "time"
 
 
-def test_an_export_does_not_write_over_a_file(exported: Path) -> None:
-    with Capture.open(GOLDEN) as capture, pytest.raises(CaptureError, match="is there already"):
-        foxglove.export(capture, exported / "fox.mcap")
+def test_an_export_does_not_write_over_a_file(exported: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """It might be the capture."""
+    with Capture.open(GOLDEN) as capture:
+        for export, name in ((foxglove.export, "fox.mcap"), (video.export, "film.mp4")):
+            with pytest.raises(CaptureError, match="is there already"):
+                export(capture, exported / name)
+    before = GOLDEN.read_bytes()
+    assert main(["export", str(GOLDEN), "--csv", str(exported / "more"), "--rrd", str(GOLDEN)]) == 1
+    assert "is there already" in capsys.readouterr().err
+    assert GOLDEN.read_bytes() == before
+    assert not (exported / "more").exists()  # all are looked at before the first is made
 
 
 # --- Rerun ----------------------------------------------------------------------------------------
@@ -284,10 +331,26 @@ def test_without_rerun_one_line_says_how_to_install_it(
         assert len(err.splitlines()) == 1
 
 
+def test_without_a_screen_one_line_says_what_to_do(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def spawn(_: Stream) -> None:
+        raise RuntimeError("Failed to find Rerun Viewer executable in PATH")
+
+    monkeypatch.setitem(sys.modules, "rerun", FakeRerun("rerun"))
+    monkeypatch.setattr(Stream, "spawn", spawn, raising=False)
+    monkeypatch.setenv("PATH", "")
+    assert main(["view", str(GOLDEN)]) == 1
+    err = capsys.readouterr().err
+    assert "--rrd OUT.rrd" in err
+    assert len(err.splitlines()) == 1
+
+
 def test_rerun_itself_takes_it(tmp_path: Path) -> None:
     pytest.importorskip("rerun", reason="Rerun is an extra, and not installed here")
     assert main(["export", str(GOLDEN), "--rrd", str(tmp_path / "out.rrd")]) == 0
-    assert (tmp_path / "out.rrd").stat().st_size > 1_000_000
+    assert (tmp_path / "out.rrd").stat().st_size > 500_000
+    subprocess.run([sys.executable, "-m", "rerun", "rrd", "verify", str(tmp_path / "out.rrd")], check=True)
 
 
 # --- geometry -------------------------------------------------------------------------------------

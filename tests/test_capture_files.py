@@ -174,7 +174,7 @@ def test_a_full_disk_ends_the_recording_with_a_readable_file(tmp_path: Path, mon
                 written.flush()
                 flushed = n
 
-    with pytest.raises(CaptureError, match=r"one-1\.mcap: No space left on device; recording has stopped"):
+    with pytest.raises(CaptureError, match=r"one-1\.mcap: No space left on device$"):
         fill()
     found = all_of(written.file.path)
     assert [record.sequence for record in found] == list(range(flushed + 1))
@@ -186,7 +186,7 @@ def test_recording_stops_before_the_disk_is_full(tmp_path: Path) -> None:
     total = shutil.disk_usage(tmp_path).total
     written = writer(tmp_path, Limits(min_free_bytes=2 * total))
     written.put(entry("base/state", 0))
-    with pytest.raises(CaptureError, match="MB are free, so recording has stopped"):
+    with pytest.raises(CaptureError, match="MB are free; make room"):
         written.flush()
     with Capture.open(written.file.path) as capture:
         assert capture.whole
@@ -195,7 +195,7 @@ def test_recording_stops_before_the_disk_is_full(tmp_path: Path) -> None:
 
 def test_a_folder_that_cannot_be_written_to_is_told_of(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("no folder")
-    with pytest.raises(CaptureError, match="recording has stopped"):
+    with pytest.raises(CaptureError, match=r"one-1\.mcap: Not a directory"):
         writer(tmp_path / "file" / "folder")
 
 

@@ -142,8 +142,8 @@ class Writer:
         if room.f_bavail * room.f_frsize < self._limits.min_free_bytes:
             self.close()
             raise CaptureError(
-                f"{self.file.path.parent}: less than {self._limits.min_free_bytes / MB:.0f} MB are free, "
-                f"so recording has stopped; make room or record elsewhere"
+                f"{self.file.path.parent}: less than {self._limits.min_free_bytes / MB:.0f} MB are free; "
+                f"make room, or write elsewhere"
             )
 
     def remember(self, name: str, entries: Mapping[str, str]) -> None:
@@ -221,7 +221,7 @@ class Writer:
 
 
 def _told(error: OSError, path: Path) -> CaptureError:
-    return CaptureError(f"{path}: {error.strerror or error}; recording has stopped")
+    return CaptureError(f"{path}: {error.strerror or error}")
 
 
 def _sync_folder(folder: Path) -> None:

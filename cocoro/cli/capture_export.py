@@ -6,6 +6,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+from cocoro.capture.export.outfile import refuse_existing
 from cocoro.capture.reader import Capture
 from cocoro.cli import exits
 from cocoro.clock import NS
@@ -26,6 +27,9 @@ def export(
     """Raises CaptureError for what cannot be read or written, ConfigError when nothing is asked for."""
     if not any((video, rrd, foxglove, csv, parquet)):
         raise ConfigError("say what to make of it: --video, --foxglove, --csv, --parquet or --rrd")
+    for out in (video, rrd, foxglove):
+        if out is not None:
+            refuse_existing(out)  # now, not after the first of them has been made
     with Capture.open(file) as capture:
         if video is not None:
             from cocoro.capture.export import video as films

@@ -12,7 +12,7 @@ from typing import Any
 import msgspec
 
 from cocoro.bus.base import Bus, Payload
-from cocoro.capture.export.rerun_scene import APPLICATION, Teller, library, tell
+from cocoro.capture.export.rerun_scene import Teller, library, no_viewer, opened, tell
 from cocoro.capture.reader import Capture
 from cocoro.cli import exits
 from cocoro.cli.link import Where, joined
@@ -27,13 +27,14 @@ WAITING = 4
 
 
 def view_file(file: Path) -> int:
-    """Open Rerun on a capture. Raises CaptureError when Rerun is not installed."""
+    """Open Rerun on a capture. Raises CaptureError when Rerun is not installed, or cannot be opened."""
     rr = library()
     with Capture.open(file) as capture:
-        recording = rr.RecordingStream(APPLICATION)
-        recording.spawn()
-        print(f"{tell(capture, recording)} messages are in Rerun")
-        recording.flush()
+        recording = opened(rr)
+        with no_viewer():
+            count = tell(capture, recording)
+            recording.flush()
+        print(f"{count} messages are in Rerun")
         return exits.FAILED if capture.problems else exits.DONE
 
 
@@ -43,8 +44,7 @@ async def view_mesh(where: Where) -> int:
     async with joined(where) as link:
         resolved = link.run_dir.resolved()
         description, measured = (_path(resolved.get(name)) for name in ("description", "measured"))
-        recording = rr.RecordingStream(APPLICATION)
-        recording.spawn()
+        recording = opened(rr)
         watch(link.bus, link.robot, Teller(recording, Robot.load(description, measured), Catalogue.load()))
         print("Ctrl-C ends it")
         end, loop = asyncio.Event(), asyncio.get_running_loop()

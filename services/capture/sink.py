@@ -250,7 +250,7 @@ class _Guard:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> bool:
         if isinstance(error, CaptureError):
-            self._tell(str(error))
+            self._tell(f"recording has stopped: {error}")
             return True
         if isinstance(error, Exception):
             log.exception("the recorder has failed", exc_info=error)

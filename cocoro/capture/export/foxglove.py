@@ -16,9 +16,10 @@ import msgspec
 import numpy as np
 
 from cocoro.capture.compression import Packer
-from cocoro.capture.errors import CaptureError, DamageError
+from cocoro.capture.errors import DamageError
 from cocoro.capture.export import foxglove_types as fg
 from cocoro.capture.export.geometry import CAMERA, Posture, about_z, conjugate, points, quaternion, rotated
+from cocoro.capture.export.outfile import making
 from cocoro.capture.export.story import catalogue_of, robot_of
 from cocoro.capture.keys import JSON, KeyInfo
 from cocoro.capture.reader import Capture, Record
@@ -61,8 +62,11 @@ class Said(NamedTuple):
 
 def export(capture: Capture, out: Path, progress: Callable[[float], None] = lambda _: None) -> int:
     """Returns how many messages were written. Raises CaptureError when that cannot be done."""
-    if out.exists():
-        raise CaptureError(f"{out} is there already; remove it, or choose another name")
+    with making(out):
+        return _export(capture, out, progress)
+
+
+def _export(capture: Capture, out: Path, progress: Callable[[float], None]) -> int:
     translator = Translator(capture)
     writer = Writer(lambda _: out, Packer("zstd"), Limits(), lambda key, _: translator.info(key))
     newest_ns = 0

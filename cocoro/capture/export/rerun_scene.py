@@ -6,7 +6,10 @@ goes (`cocoro view`). Needs the package rerun-sdk, which is an extra.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import os
+import sysconfig
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +17,7 @@ import numpy as np
 
 from cocoro.capture.errors import CaptureError
 from cocoro.capture.export.geometry import CAMERA, Posture, about_z, conjugate, points, quaternion, rotated
+from cocoro.capture.export.outfile import making
 from cocoro.capture.export.story import catalogue_of, robot_of
 from cocoro.capture.reader import Capture
 from cocoro.capture.types import NotReadableError
@@ -51,13 +55,36 @@ def library() -> Any:
 
 
 def export(capture: Capture, out: Path, progress: Callable[[float], None] = lambda _: None) -> int:
-    """Write a recording that Rerun opens; the number of messages in it."""
+    """Write a recording that Rerun opens; the number of messages in it. Raises CaptureError when that cannot be."""
     rr = library()
+    with making(out):
+        recording = rr.RecordingStream(APPLICATION)
+        recording.save(str(out))
+        count = tell(capture, recording, progress)
+        recording.flush()
+        return count
+
+
+def opened(rr: Any) -> Any:
+    """A recording that a viewer shows, which is opened here. Raises CaptureError when it cannot be."""
+    beside_us = sysconfig.get_path("scripts")  # where the package has put it, whether or not that is in the PATH
+    os.environ["PATH"] = os.pathsep.join(filter(None, (beside_us, os.environ.get("PATH"))))
     recording = rr.RecordingStream(APPLICATION)
-    recording.save(str(out))
-    count = tell(capture, recording, progress)
-    recording.flush()
-    return count
+    with no_viewer():
+        recording.spawn()
+    return recording
+
+
+@contextmanager
+def no_viewer() -> Iterator[None]:
+    """Around what fails when the viewer does, as it does without a screen."""
+    try:
+        yield
+    except RuntimeError as error:
+        raise CaptureError(
+            "Rerun's viewer could not be opened, or has gone; it needs a screen. "
+            "`cocoro export FILE --rrd OUT.rrd` makes a file that it opens elsewhere"
+        ) from error
 
 
 def tell(capture: Capture, recording: Any, progress: Callable[[float], None] = lambda _: None) -> int:

@@ -92,8 +92,11 @@ def _joined(parts: Iterator[tuple[str, Any]], name: str) -> Row:
 
 
 def columns(rows: list[Row]) -> list[str]:
-    """All that any row has, in the order in which they come up."""
-    return list(dict.fromkeys(name for row in rows for name in row))
+    """All that any row has, in the order in which they come up. What is nothing or a map or list ('target' or
+    'target.label') has the columns of its parts alone."""
+    names = dict.fromkeys(name for row in rows for name in row)
+    wholes = {name[:at] for name in names for at, letter in enumerate(name) if letter == "."}
+    return [name for name in names if name not in wholes or any(row.get(name) is not None for row in rows)]
 
 
 class CsvFolder:
@@ -107,7 +110,7 @@ class CsvFolder:
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
             with path.open("w", newline="", encoding="utf-8") as file:
-                writer = csv.DictWriter(file, columns(rows), restval="")
+                writer = csv.DictWriter(file, columns(rows), restval="", extrasaction="ignore")
                 writer.writeheader()
                 writer.writerows(rows)
         except OSError as error:

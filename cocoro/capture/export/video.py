@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 
 from cocoro.capture.errors import CaptureError
+from cocoro.capture.export.outfile import making
 from cocoro.capture.export.story import Story, catalogue_of, read
 from cocoro.capture.reader import Capture
 from cocoro.clock import NS
@@ -16,12 +17,20 @@ from cocoro.picture import Pixels, draw
 from cocoro.topics import FRAME
 
 RATE_HZ = 30.0
-CODEC = "mp4v"
+CODEC, SUFFIX = "mp4v", ".mp4"
+"""MPEG-4 part 2: what OpenCV can write wherever it is installed."""
 
 
 def export(capture: Capture, out: Path, progress: Callable[[float], None] = lambda _: None) -> int:
     """Write the film; the number of its pictures. In real time: a frame stays until the next, and what came faster
     than the film is left out. Raises CaptureError when there is nothing to show, or it cannot be written."""
+    if out.suffix.lower() != SUFFIX:
+        raise CaptureError(f"{out}: a film's name ends with {SUFFIX}")
+    with making(out):
+        return _export(capture, out, progress)
+
+
+def _export(capture: Capture, out: Path, progress: Callable[[float], None]) -> int:
     story, catalogue = Story(capture), catalogue_of(capture)
     film: _Film | None = None
     for record, frame in read(capture, FRAME):
@@ -38,14 +47,14 @@ def export(capture: Capture, out: Path, progress: Callable[[float], None] = lamb
 
 class _Film:
     def __init__(self, out: Path, first: Frame, start_s: float) -> None:
+        self._out = out
         self._size = first.width, first.height
         self._start_s = start_s
         self._count = 0
         self._picture: Pixels | None = None
-        out.parent.mkdir(parents=True, exist_ok=True)
         self._writer = cv2.VideoWriter(str(out), cv2.VideoWriter.fourcc(*CODEC), RATE_HZ, self._size)
         if not self._writer.isOpened():
-            raise CaptureError(f"{out}: OpenCV cannot write a film there; let the name end with .mp4")
+            raise CaptureError(f"{out}: OpenCV cannot write a film there")
 
     def show(self, at_s: float, picture: Pixels) -> None:
         self._hold_until(at_s)
@@ -57,7 +66,17 @@ class _Film:
         if self._picture is not None:
             self._write(self._picture)
         self._writer.release()
+        if not self._is_whole():
+            raise CaptureError(f"{self._out}: the film could not be written to its end; the disk may be full")
         return self._count
+
+    def _is_whole(self) -> bool:
+        """OpenCV does not say when the disk takes no more; a film whose end is missing cannot be opened."""
+        film = cv2.VideoCapture(str(self._out))
+        try:
+            return film.isOpened() and round(film.get(cv2.CAP_PROP_FRAME_COUNT)) == self._count
+        finally:
+            film.release()
 
     def _hold_until(self, at_s: float) -> None:
         while self._picture is not None and self._start_s + (self._count + 0.5) / RATE_HZ < at_s:
