@@ -203,7 +203,7 @@ class Obstacles(Message):
 
 Behaviour = Literal[
     "idle", "park", "search", "explore", "approach", "reach", "grasp", "lift", "carry", "place", "follow",
-    "babble-arm", "babble-wheels",
+    "touch", "go-to", "babble-arm", "babble-wheels",
 ]  # fmt: skip
 
 
@@ -218,6 +218,8 @@ class Intent(Message):
     label: str = ""
     place_m: Vec2 | None = None
     """For 'carry': where to put down, in the odometry frame."""
+    distance_m: NonNegative = 0.0
+    """For 'go-to': from the body's centre to the target's, over the floor, when it stands there."""
     first: Count = 0
     """For babbling: the number of its first draw."""
     count: Count = 0
@@ -316,7 +318,7 @@ class WheelTrial(Message):
 
 # --- executive ------------------------------------------------------------------------------------
 
-TaskName = Literal["fetch", "follow", "park", "put-down", "babble-arm", "babble-wheels"]
+TaskName = Literal["fetch", "follow", "touch", "go-to", "park", "put-down", "babble-arm", "babble-wheels"]
 Outcome = Literal["done", "failed", "cancelled"]
 
 
@@ -352,6 +354,8 @@ class TaskRequest(msgspec.Struct, kw_only=True):
     """Fetch: carry it to where the task began and put it down there."""
     for_s: Annotated[float, Meta(gt=0, le=3600)] | None = None
     """Follow: for so long; None is until cancelled."""
+    distance_m: Annotated[float, Meta(ge=0, le=5)] = 0.2
+    """Go-to: from the robot's centre to the target's nearest edge, over the floor."""
     first: Count = 0
     """Babbling: the number of its first draw, to go on where an earlier one ended."""
     count: Annotated[int, Meta(ge=1, le=1_000_000)] = 1000

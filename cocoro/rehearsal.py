@@ -22,6 +22,10 @@ class RehearsalRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
     """Fetch: bring it back to where the task began."""
     for_s: Annotated[float, Meta(gt=0, le=3600)] | None = None
     """Follow: for so long."""
+    distance_m: Annotated[float, Meta(ge=0, le=5)] = 0.2
+    """Go-to: from the robot's centre to the target's nearest edge, over the floor."""
+    then: tuple[str, ...] = ()
+    """The same task again, one after the other, with each of these labels; the first that fails is the last."""
     first: Annotated[int, Meta(ge=0)] = 0
     """Babbling: the number of its first draw."""
     count: Annotated[int, Meta(ge=1, le=1_000_000)] = 1000
@@ -38,6 +42,12 @@ class RehearsalRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
     """The file of what was learned of the body."""
     reach: Literal["learned", "rigid"] = "learned"
     """Rigid: whatever was learned of the arm."""
+    see_hand: bool = False
+    """Reaching with the rigid body, bring it to where the hand is seen."""
+    adapt: bool = False
+    """What was learned of the arm goes on being taught at work."""
+    bend_s: Annotated[float, Meta(ge=0)] | None = None
+    """When somebody bends the forearm, by 3 cm at the hand."""
     latency: dict[str, Annotated[float, Meta(ge=0, le=60)]] = {}
     """Seconds that are added to every step of a service, by the service's name."""
     lockstep: bool = False
@@ -51,5 +61,7 @@ class RehearsalRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
     """Where to write what the robot saw at the grasp (PNG)."""
     objects: str | None = None
     """A file of known objects instead of the project's own."""
+    trace: bool = False
+    """Have in the result how everything moved, by the truth and by the robot's own belief."""
     record: str | None = None
     """Where to record everything (MCAP), the steps of perception and planning too."""

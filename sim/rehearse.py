@@ -21,7 +21,7 @@ from cocoro.core import Core
 from cocoro.errors import CocoroError, ConfigError
 from cocoro.learning.collector import TOPICS, HandCollector, WheelCollector, collector
 from cocoro.messages import Detections, Frame, Recording, TaskReply, TaskRequest, TaskState
-from cocoro.node import Node, Stepper
+from cocoro.node import Node, Stepper, Stream
 from cocoro.objects import Catalogue
 from cocoro.picture import draw, save_png
 from cocoro.processes import load, named
@@ -31,6 +31,8 @@ from cocoro.vloop import run_virtual
 from sim.judge import Judge
 from sim.pursuit import PursuitJudge
 from sim.random_scene import find_scene
+from sim.trace import Trace
+from sim.wear import body_of
 
 RECORDER = "capture"
 PROCESSES = ("sim", "perception", "planning", "executive")
@@ -111,6 +113,11 @@ class _Rehearsal:
             if request.task == "follow" and present
             else Judge(scene, present)
         )
+        self._scene = scene
+        self._body = body_of(Robot.load(), request.body, request.seed).robot
+        self._trace = Trace(self._body, present)
+        self._steps: list[dict[str, Any]] = []
+        """One by one, the tasks that came to an end."""
         self._frame: Frame | None = None
         self._seen: Detections | None = None
         self._recording: Recording | None = None
@@ -141,6 +148,9 @@ class _Rehearsal:
                 services.append(asyncio.ensure_future(component.run(node, config)))
             operator = await stack.enter_async_context(Node("operator", mesh.join(), clock, robot))
             operator.on(topics.TRUTH, self._judge.feed)
+            operator.on(topics.TRUTH, self._trace.feed)
+            operator.on(topics.PLAN, self._trace.said)
+            operator.on(topics.TASK, self._trace.state)
             operator.on(topics.RECORDING.of(RECORDER), self._keep_recording)
             if request.samples is not None and request.task in TOPICS:
                 self._collector = collector(request.task, Path(request.samples), robot)
@@ -170,9 +180,14 @@ class _Rehearsal:
                 field: getattr(request, field)
                 for field in ("scene", "seed", "sensors", "body", "width", "height", "frame_rate_hz")
             }
-            world["target"] = request.label
+            world |= {"target": request.label, "bend_at_s": request.bend_s}
             return world | ({"command_timeout_s": _LONG_S} if request.lockstep else {})
-        settings: dict[str, Any] = {"model": request.model or "", "reach": request.reach} if name == "planning" else {}
+        settings: dict[str, Any] = {}
+        if name == "planning":
+            settings = {
+                "model": request.model or "", "reach": request.reach, "see_hand": request.see_hand,
+                "adapt": request.adapt,
+            }  # fmt: skip
         if request.lockstep:
             # The baseline's planner speaks once a cycle, however long that is: no penalty for it.
             baseline: dict[str, dict[str, Any]] = {
@@ -183,33 +198,44 @@ class _Rehearsal:
         return settings
 
     async def _operate(self, operator: Node) -> TaskState:
-        """What the operator does: give the task, watch it to its end."""
+        """What the operator does: give the task, watch it to its end, and again with each other label."""
         request = self._request
         states = operator.stream(topics.TASK)
         if request.picture is not None:
             operator.on(topics.FRAME, self._keep_frame)
             operator.on(topics.DETECTIONS, self._keep_seen)
-        question = TaskRequest(
-            task=request.task,
-            label=request.label,
-            timeout_s=request.timeout_s,
-            bring=request.bring,
-            for_s=request.for_s,
-            first=request.first,
-            count=request.count,
-        )
-        if self._collector is not None:
-            operator.on(TOPICS[request.task], self._collector.take)
-            question.first, question.count = self._collector.next, max(request.count - len(self._collector), 1)
-        reply = await self._ask(operator, question)
-        while reply.refusal in ("not_alive", "estop") and operator.now_ns() < START_S * NS:
-            await operator.sleep(0.1)
+        for number, label in enumerate((request.label, *request.then)):
+            question = TaskRequest(
+                task=request.task,
+                label=label,
+                timeout_s=request.timeout_s,
+                bring=request.bring,
+                for_s=request.for_s,
+                distance_m=request.distance_m,
+                first=request.first,
+                count=request.count,
+            )
+            if self._collector is not None and number == 0:
+                operator.on(TOPICS[request.task], self._collector.take)
+            if self._collector is not None:
+                question.first, question.count = self._collector.next, max(request.count - len(self._collector), 1)
+            self._trace.begin(label)
             reply = await self._ask(operator, question)
-        if not reply.accepted:
-            raise TaskRefusedError(reply)
-        pictured = request.picture is None
+            while reply.refusal in ("not_alive", "estop") and operator.now_ns() < START_S * NS:
+                await operator.sleep(0.1)
+                reply = await self._ask(operator, question)
+            if not reply.accepted:
+                raise TaskRefusedError(reply)
+            state = await self._watch(states, reply.task_id)
+            self._keep_step(state)
+            if state.outcome != "done":
+                break
+        return state
+
+    async def _watch(self, states: Stream[TaskState], task_id: str) -> TaskState:
+        pictured = self._request.picture is None
         async for state in states:
-            if state.task_id != reply.task_id:
+            if state.task_id != task_id:
                 continue
             if isinstance(self._judge, PursuitJudge) and state.phase == "follow":
                 self._judge.begin()
@@ -219,6 +245,23 @@ class _Rehearsal:
             if state.outcome is not None:
                 return state
         raise AssertionError("a stream has no end")
+
+    def _keep_step(self, state: TaskState) -> None:
+        """What came of one task, by the truth at its end."""
+        labels = {item.label: item for item in self._scene.objects}
+        known = labels.get(state.label)
+        edge_m = self._trace.edge_m(known.half_width_m) if known is not None else None
+        self._steps.append(
+            {
+                "label": state.label,
+                "outcome": state.outcome,
+                "reason": state.reason,
+                "sim_s": round(state.elapsed_s, 3),
+                "hand_to_target": self._trace.hand_gap(),
+                "target_edge_m": edge_m,
+                "longest_stall_s": round(self._trace.longest_stall_s(), 3),
+            }
+        )
 
     @staticmethod
     async def _ask(operator: Node, question: TaskRequest) -> TaskReply:
@@ -260,4 +303,7 @@ class _Rehearsal:
                 for phase in state.phases
             ],
             "truth": msgspec.to_builtins(self._judge.result()),
+            "tasks": self._steps,
+            "body": {"kind": request.body, "wheel_separation_m": self._body.base.wheel_separation_m},
+            **({"trace": self._trace.data()} if request.trace else {}),
         }

@@ -81,6 +81,11 @@ class _Body(_Table, frozen=True, kw_only=True):
         return tuple(number for field in _SIZES[self.shape] for number in _numbers(getattr(self, field)))
 
     @property
+    def half_width_m(self) -> float:
+        """From the centre to the edge, over the floor."""
+        return max(self.dimensions_m[:2]) / 2 if self.shape == "box" else self.dimensions_m[0]
+
+    @property
     def standing_height_m(self) -> float:
         """From the floor to the centre when it stands."""
         if self.shape == "sphere":

@@ -42,6 +42,13 @@ Timeout = Annotated[float | None, typer.Option(min=0.1, max=3600.0, metavar="SEC
 
 Model = Annotated[Path | None, typer.Option(metavar="FILE", help="What was learned of the body (`cocoro learn`).")]
 Reaching = Annotated[str | None, typer.Option(metavar="learned|rigid", help="Rigid: whatever was learned of the arm.")]
+Adapt = Annotated[
+    bool, typer.Option("--adapt", help="What was learned of the arm goes on being taught by what is seen at work.")
+]
+Distance = Annotated[
+    float,
+    typer.Option(min=0.0, max=5.0, metavar="METRES", help="Go-to: from the robot's centre to the target's edge."),
+]
 Body = Annotated[str, typer.Option(metavar="nominal|worn", help="A body as drawn, or one that differs from it.")]
 
 Objects = Annotated[
@@ -94,6 +101,31 @@ def follow(
 
 
 @app.command(rich_help_panel=TASKS)
+def touch(
+    label: Annotated[str, typer.Argument(help="What to touch: something within the arm's reach.")],
+    timeout: Timeout = None,
+    robot: Robot = None,
+    profile: Reach = None,
+    json: Json = False,
+) -> None:
+    """Bring the open hand around something within reach, on the floor or in the air; the wheels stand."""
+    _task((robot, profile), json, task="touch", label=label, timeout_s=timeout)
+
+
+@app.command("go-to", rich_help_panel=TASKS)
+def go_to(
+    label: Annotated[str, typer.Argument(help="Where to go; `cocoro objects` lists what the robot knows.")],
+    distance: Distance = 0.2,
+    timeout: Timeout = None,
+    robot: Robot = None,
+    profile: Reach = None,
+    json: Json = False,
+) -> None:
+    """Drive to an object and stop at a distance from it. Ctrl-C cancels it on the robot."""
+    _task((robot, profile), json, task="go-to", label=label, distance_m=distance, timeout_s=timeout)
+
+
+@app.command(rich_help_panel=TASKS)
 def park(timeout: Timeout = None, robot: Robot = None, profile: Reach = None, json: Json = False) -> None:
     """Fold the arm. Ctrl-C cancels it on the robot."""
     _task((robot, profile), json, task="park", timeout_s=timeout)
@@ -116,10 +148,13 @@ def cancel(robot: Robot = None, profile: Reach = None) -> None:
 
 @app.command(rich_help_panel=TASKS)
 def rehearse(
-    task: Annotated[str, typer.Argument(help="fetch, follow, park, put-down, babble-arm or babble-wheels.")],
-    label: Annotated[str, typer.Argument(help="What to fetch or to follow.")] = "",
+    task: Annotated[
+        str, typer.Argument(help="fetch, follow, touch, go-to, park, put-down, babble-arm or babble-wheels.")
+    ],
+    label: Annotated[str, typer.Argument(help="What to fetch, to follow, to touch or to go to.")] = "",
     bring: Annotated[bool, typer.Option("--bring", help="Fetch: bring it to where the task began.")] = False,
     for_: For = None,
+    distance: Distance = 0.2,
     scene: Annotated[str, typer.Option(help="A scene's name, or its file.")] = "paper",
     seed: Annotated[int, typer.Option(min=0, help="Everything that is drawn comes from it.")] = 0,
     sensors: Annotated[
@@ -128,6 +163,10 @@ def rehearse(
     body: Body = "nominal",
     model: Model = None,
     reach: Reaching = None,
+    adapt: Adapt = False,
+    bend: Annotated[
+        float | None, typer.Option(min=0.0, metavar="SECONDS", help="Then somebody bends the forearm: 3 cm.")
+    ] = None,
     count: Annotated[int, typer.Option(min=1, metavar="N", help="Babbling: how many samples or trials.")] = 1000,
     samples: Annotated[Path | None, typer.Option(metavar="FILE", help="Babbling: where they are kept.")] = None,
     latency: Latency = None,
@@ -146,6 +185,7 @@ def rehearse(
 
     options = {
         "task": task, "label": label, "bring": bring, "for_s": for_, "scene": scene, "seed": seed, "sensors": sensors,
+        "distance_m": distance, "adapt": adapt, "bend_s": bend,
         "body": body, "lockstep": lockstep, "timeout_s": timeout, "picture": None if picture is None else str(picture),
         "record": None if record is None else str(record), "count": count, "reach": reach or "learned",
         "model": None if model is None else str(model), "samples": None if samples is None else str(samples),
@@ -222,6 +262,7 @@ def up(
     ] = None,
     model: Model = None,
     reach: Reaching = None,
+    adapt: Adapt = False,
     frames: Frames = None,
     latency: Latency = None,
     objects: Objects = None,
@@ -234,7 +275,7 @@ def up(
     overrides = running.overrides(scene, seed, sensors, body, frames, latency or [], set_ or [])
     if objects is not None:
         overrides.insert(0, running.objects_of(objects))
-    overrides[:0] = running.model_of(model, reach)
+    overrides[:0] = running.model_of(model, reach, adapt)
     read = profiles.read(profile, overrides)
     sys.exit(running.up_detached(read) if detach else running.up(read))
 

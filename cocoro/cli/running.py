@@ -61,12 +61,14 @@ def objects_of(file: Path) -> str:
     return f"objects={json.dumps(str(file.resolve()))}"
 
 
-def model_of(file: Path | None, reach: str | None) -> list[str]:
-    """A learned model, and whether to reach with it, as settings of the profile. Raises ConfigError."""
+def model_of(file: Path | None, reach: str | None, adapt: bool = False) -> list[str]:
+    """A learned model, whether to reach with it, and whether to go on teaching it, as settings of the profile. Raises
+    ConfigError."""
     if file is not None and not file.is_file():
         raise ConfigError(f"there is no model {file}")
     found = [] if file is None else [f"service.planning.model={json.dumps(str(file.resolve()))}"]
-    return found + ([] if reach is None else [f"service.planning.reach={json.dumps(reach)}"])
+    found += [] if reach is None else [f"service.planning.reach={json.dumps(reach)}"]
+    return found + (["service.planning.adapt=true"] if adapt else [])
 
 
 def scene_of(scene: str) -> str:

@@ -93,9 +93,22 @@ class Recorded(Generic[Row]):
 
 
 def fingerprint_of(robot: Robot) -> str:
-    """Of a robot description: equal descriptions, equal fingerprints."""
-    data = msgspec.json.encode(robot.to_data(), order="deterministic")
-    return hashlib.sha256(data).hexdigest()[:16]
+    """Of what places and turns are reckoned with: links, zeros of the joints, marker, wheels, camera. Robots that agree
+    in these have equal fingerprints, whatever else their descriptions say; what is as it is by default is left out, so
+    that a description that learns to say more stays the same."""
+    data = robot.to_data()
+    drawing = {
+        "link": data["link"],
+        "joint": [(row["name"], row["direction"], row["centre_count"]) for row in data["joint"]],
+        "marker": data["marker"],
+        "base": [data["base"][name] for name in ("wheel_separation_m", "wheel_radius_m")],
+        "kinect": {
+            field.name: data["kinect"][field.name]
+            for field in msgspec.structs.fields(robot.kinect)
+            if field.required or getattr(robot.kinect, field.name) != field.default
+        },
+    }
+    return hashlib.sha256(msgspec.json.encode(drawing, order="deterministic")).hexdigest()[:16]
 
 
 def read(path: Path, kind: type[Row], robot: Robot | None = None) -> Recorded[Row]:

@@ -76,6 +76,11 @@ class ReachMesh:
         inside = np.where(self._small[simplex], Reach.INSIDE, Reach.UNPROVEN)
         return np.where(simplex < 0, Reach.OUTSIDE, inside)
 
+    def nearest_m(self, place_m: Sequence[float] | Array) -> float:
+        """From one place to the nearest at which the hand was seen; infinite where it was nowhere."""
+        places = self.places_m
+        return float(np.linalg.norm(places - np.asarray(place_m), axis=1).min()) if len(places) else float("inf")
+
     def volume_m3(self) -> float:
         """Of all that is INSIDE."""
         self._enter()

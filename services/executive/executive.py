@@ -26,7 +26,7 @@ from cocoro.objects import Catalogue
 from services.executive.config import Config
 from services.executive.estop import Estop
 from services.executive.skills import PlannerSkills, Skills, TaskFailedError
-from services.executive.tasks import babble_arm, babble_wheels, fetch, follow, park, put_down
+from services.executive.tasks import babble_arm, babble_wheels, fetch, follow, go_to, park, put_down, touch
 
 Task = Callable[[Skills, TaskRequest, Config], Awaitable[None]]
 _CLOCK_STANDS_S = 1.0
@@ -35,6 +35,8 @@ _VERY_LONG_S = 86_400.0
 TASKS: dict[str, Task] = {
     "fetch": fetch,
     "follow": follow,
+    "touch": touch,
+    "go-to": go_to,
     "park": park,
     "put-down": put_down,
     "babble-arm": babble_arm,
@@ -74,6 +76,8 @@ class Executive:
         if refusal is not None:
             code, text = refusal
             return TaskReply(accepted=False, refusal=code, text=text)
+        if request.task == "go-to":  # people say it to the edge, which the planner does not know
+            request.distance_m += self._radius_m(request.label)
         self._count += 1
         task_id = f"{request.task}-{self._node.now_ns()}-{self._count}"
         self.state = TaskState(
@@ -84,9 +88,9 @@ class Executive:
         return TaskReply(accepted=True, task_id=task_id)
 
     def _refusal(self, request: TaskRequest) -> tuple[RefusalCode, str] | None:
-        if request.task in ("fetch", "follow", "babble-wheels"):
+        if request.task in ("fetch", "follow", "touch", "go-to", "babble-wheels"):
             known = self._catalogue.get(request.label)
-            fetching = request.task == "fetch"
+            fetching = request.task in ("fetch", "touch")
             targets = [target.label for target in self._catalogue.targets if target.graspable or not fetching]
             if known is None or known.marker:
                 return "unknown_label", f"unknown object {request.label!r}; known are {', '.join(targets)}"
@@ -114,6 +118,11 @@ class Executive:
         if request.task == "put-down" and not status.holding:
             return "not_holding", "the hand holds nothing"
         return None
+
+    def _radius_m(self, label: str) -> float:
+        """From a known object's centre to its edge, over the floor."""
+        known = self._catalogue.get(label)
+        return max(known.size_m[:2]) / 2 if known is not None else 0.0
 
     async def _cancel(self, request: CancelRequest) -> TaskReply:
         if self._running is None or request.task_id not in ("", self.state.task_id):

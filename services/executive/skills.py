@@ -32,6 +32,7 @@ class Skills(Protocol):
         *,
         timeout_s: float,
         place_m: Vec2 | None = None,
+        distance_m: float = 0.0,
         first: int = 0,
         count: int = 0,
     ) -> PlannerStatus:
@@ -86,6 +87,7 @@ class PlannerSkills:
         label: str,
         task_id: str,
         place_m: Vec2 | None = None,
+        distance_m: float = 0.0,
         first: int = 0,
         count: int = 0,
     ) -> None:
@@ -97,6 +99,7 @@ class PlannerSkills:
             behaviour=behaviour,
             label=label,
             place_m=place_m,
+            distance_m=distance_m,
             first=first,
             count=count,
         )
@@ -116,11 +119,12 @@ class PlannerSkills:
         *,
         timeout_s: float,
         place_m: Vec2 | None = None,
+        distance_m: float = 0.0,
         first: int = 0,
         count: int = 0,
     ) -> PlannerStatus:
         self._phase(behaviour)
-        self.want(behaviour, label, self.intent.task_id, place_m, first, count)
+        self.want(behaviour, label, self.intent.task_id, place_m, distance_m, first, count)
         ended = await self._watch(self.now_s() + timeout_s)
         if ended is None:
             status = self.status

@@ -34,6 +34,19 @@ async def follow(robot: Skills, request: TaskRequest, config: Config) -> None:
             await _find(robot, request.label, config)
 
 
+async def touch(robot: Skills, request: TaskRequest, config: Config) -> None:
+    """Bring the open hand around what is within the arm's reach, on the floor or in the air; the base stands."""
+    if not _known(robot, request.label):  # the hand may hide what it is about to leave
+        await robot.do("search", request.label, timeout_s=config.search_timeout_s)
+    await robot.do("touch", request.label, timeout_s=config.reach_timeout_s)
+
+
+async def go_to(robot: Skills, request: TaskRequest, config: Config) -> None:
+    """Find it, drive there, and stop at the distance that was asked, which here is between the centres."""
+    await _find(robot, request.label, config)
+    await robot.do("go-to", request.label, distance_m=request.distance_m, timeout_s=config.approach_timeout_s)
+
+
 async def park(robot: Skills, request: TaskRequest, config: Config) -> None:
     """Fold the arm up."""
     await robot.do("park", timeout_s=config.park_timeout_s)
@@ -57,6 +70,11 @@ async def babble_wheels(robot: Skills, request: TaskRequest, config: Config) -> 
     await robot.do(
         "babble-wheels", request.label, timeout_s=config.babble_timeout_s, first=request.first, count=request.count
     )
+
+
+def _known(robot: Skills, label: str) -> bool:
+    status = robot.status
+    return status is not None and any(item.label == label for item in status.known)
 
 
 async def _pick_up(robot: Skills, label: str, config: Config) -> None:

@@ -83,6 +83,8 @@ class Arm(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Where a target should stand for grasping: from the arm base's axis."""
     grasp_radius_range_m: tuple[float, float] = (0.468, 0.535)
     """Nearer, the open claws would come down on the target; further, the arm does not reach."""
+    touch_radius_range_m: tuple[float, float] = (0.44, 0.56)
+    """What hangs is touched from behind alone, so nothing comes down on it."""
     grasp_azimuth_range_rad: tuple[float, float] = (-0.45, 0.45)
     grasp_height_range_m: tuple[float, float] = (0.045, 0.30)
     retreat_radius_m: Positive = 0.37
@@ -153,6 +155,8 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The file of what was learned of the body; empty: nothing. One that is refused leaves the rigid body."""
     reach: Literal["learned", "rigid"] = "learned"
     """Rigid: the drawing's own kinematics, whatever was learned of the arm."""
+    adapt: bool = False
+    """Sightings of the hand at work go on teaching a learned map."""
     see_hand: bool = False
     """Bring the rigid body's hand to where its marker is seen, too; with a learned map that is always done."""
     sight: HandSight = HandSight()

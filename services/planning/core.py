@@ -21,7 +21,7 @@ from services.planning.learned import Learned
 from services.planning.reach import ARM
 from services.planning.senses import Senses
 
-_NEED_SIGHT = ("search", "explore", "approach", "carry", "follow", "babble-arm", "babble-wheels")
+_NEED_SIGHT = ("search", "explore", "approach", "carry", "follow", "go-to", "babble-arm", "babble-wheels")
 """What drives, or looks for something: none of it without perception."""
 _STALE_NS = NS
 """A running behaviour fails when the robot's state has been missing for so long."""
@@ -49,6 +49,7 @@ class PlanningCore:
     def _use_learned(self) -> None:
         learned = self.learned
         self._limbs.reacher.use(learned.hand)
+        self._limbs.reachability.use(learned.map, learned.mesh)
         self._limbs.driver.turn_with(learned.separation_m)
         drawn_m = self._limbs.robot.base.wheel_separation_m
         self._senses.turning.ratio = drawn_m / learned.separation_m if learned.separation_m is not None else 1.0
@@ -76,8 +77,7 @@ class PlanningCore:
                 self._use_learned()
             self._senses.take(sample.topic, sample.message, now_ns)
         self._senses.localise(now_ns)
-        if self.learned.hand is not None:
-            self.learned.hand.step(self._senses.sightings_of(self._config.marker), now_ns)
+        self.learned.step(self._senses.sightings_of(self._config.marker), now_ns)
         dt_s = self._elapsed(now_ns)
         self._follow_intent(now_ns)
         missing, hand, body = self._senses.missing(now_ns), self._senses.hand, self._senses.body()

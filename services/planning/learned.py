@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from math import exp
 from pathlib import Path
 
@@ -15,11 +15,16 @@ from cocoro.learning import model as models
 from cocoro.learning.drawing import Drawing
 from cocoro.learning.handmap import HandMap
 from cocoro.learning.model import Model
+from cocoro.learning.reachability import ReachMesh
 from cocoro.robot import Robot
 from services.planning.config import Config, HandSight
-from services.planning.reach import ARM, LEVEL_ROLL_RAD, HandModel
+from services.planning.reach import LEVEL_ROLL_RAD, HandModel
 from services.planning.senses import Sighting
+from services.planning.teaching import Teacher
+from services.planning.teaching import arm_angles as _arm
 
+USUAL_M = 0.005
+"""A map's error where its model does not tell it."""
 NOTHING_LEARNED = "rigid body: nothing learned"
 
 
@@ -124,12 +129,24 @@ class Learned:
         self.separation_m: float | None = None
         self.hand: SeenHand | None = None
         """None: the rigid body, unseen."""
+        self.map: HandMap | None = None
+        self.mesh: ReachMesh | None = None
+        """Where the hand was seen; None where nothing was learned of the arm."""
+        self._teacher: Teacher | None = None
         self._use(None)
 
     @property
     def text(self) -> str:
         """For the status: with what the robot reaches, and what was refused last."""
-        return f"{self._text} ({self._refusal})" if self._refusal else self._text
+        text = f"{self._text}; {self._teacher.text}" if self._teacher is not None else self._text
+        return f"{text} ({self._refusal})" if self._refusal else text
+
+    def step(self, sightings: Sequence[Sighting], now_ns: int) -> None:
+        """Take the marker's sightings of this step of the planner."""
+        if self._teacher is not None:
+            self._teacher.step(sightings)
+        if self.hand is not None:
+            self.hand.step(sightings, now_ns)
 
     def load(self, path: str) -> None:
         """The model in a file; one that is refused changes nothing but the text."""
@@ -149,7 +166,15 @@ class Learned:
         self._refusal = ""
         self.separation_m = model.wheels.separation_m if model.wheels is not None else None
         arm = model.arm if self._config.reach == "learned" else None
-        self._use(models.hand_map(arm, self._robot) if arm is not None else None)
+        self._teacher, self.mesh = None, None
+        learned = models.hand_map(arm, self._robot) if arm is not None else None
+        if arm is not None and learned is not None:
+            self.mesh = ReachMesh(np.array(arm.seen_m))
+            if self._config.adapt:
+                usual_m = arm.training.scores.get("held_out_rms_m", USUAL_M)
+                self._teacher = Teacher(learned, usual_m, self.mesh)
+                learned = self._teacher.map
+        self._use(learned)
         said = "rigid body: asked for" if self._config.reach == "rigid" else "rigid body: no arm in the model"
         if arm is not None:
             error_m = arm.training.scores.get("held_out_rms_m", float("nan"))
@@ -158,13 +183,10 @@ class Learned:
         self._text = said + wheels
 
     def _use(self, learned: HandMap | None) -> None:
+        self.map = learned
         if learned is not None:
             self.hand = SeenHand(LearnedHand(self._robot, learned), learned, self._config.sight)
         elif self._config.see_hand:
             self.hand = SeenHand(self._robot.chain("pad_centre"), Drawing(self._robot), self._config.sight)
         else:
             self.hand = None
-
-
-def _arm(angles: Mapping[str, float]) -> Array:
-    return np.array([angles[name] for name in ARM])

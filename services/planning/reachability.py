@@ -1,13 +1,20 @@
-"""Whether a target can be grasped from where the robot stands, by the rigid-body model."""
+"""Whether a target can be grasped from where the robot stands: by the kinematics it reaches with, and, where it has
+learned them, by where the hand was ever seen."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
+
+from cocoro.learning.handmap import HandMap
+from cocoro.learning.reachability import Reach, ReachMesh
 from cocoro.messages import Vec3
 from services.planning.config import Arm
-from services.planning.reach import LEVEL_ROLL_RAD, HandPose, Reacher
+from services.planning.reach import ARM, LEVEL_ROLL_RAD, HandPose, Reacher
 
+BEYOND_M = 0.15
+"""Further than this beyond all places where the hand was seen, what was learned of it says nothing."""
 _UPRIGHT = {"arm_base": -0.087, "shoulder": 0.66, "elbow": -1.6, "wrist_pitch": 0.77, "wrist_roll": LEVEL_ROLL_RAD}
 """Elbow up, hand before the robot: where the search for joint angles starts, so that it stays in that family."""
 
@@ -23,6 +30,11 @@ class Reachability:
     def __init__(self, config: Arm, reacher: Reacher) -> None:
         self._config = config
         self._reacher = reacher
+        self._seen: tuple[HandMap, ReachMesh] | None = None
+
+    def use(self, learned: HandMap | None, mesh: ReachMesh | None) -> None:
+        """Judge by where the hand was seen, too, from now on; None: by the kinematics alone."""
+        self._seen = (learned, mesh) if learned is not None and mesh is not None else None
 
     def grasp(self, target_m: Vec3) -> Grasp:
         """The hand poses for a target's centre (body frame), reachable or not."""
@@ -33,12 +45,13 @@ class Reachability:
         behind = HandPose(config.retreat_radius_m, azimuth, height, config.pitch_rad)
         return Grasp(behind, behind._replace(radius_m=radius))
 
-    def why_not(self, target_m: Vec3) -> str:
-        """Why a target cannot be grasped from here; '' when it can."""
+    def why_not(self, target_m: Vec3, *, touching: bool = False) -> str:
+        """Why a target cannot be grasped from here, or just touched; '' when it can."""
         config = self._config
+        radius_range_m = config.touch_radius_range_m if touching else config.grasp_radius_range_m
         radius, azimuth, height = self._reacher.seen_from_arm(target_m)
         for name, value, (low, high), unit in (
-            ("radius", radius, config.grasp_radius_range_m, "m from the arm base"),
+            ("radius", radius, radius_range_m, "m from the arm base"),
             ("azimuth", azimuth, config.grasp_azimuth_range_rad, "rad from the arm base"),
         ):
             if not low <= value <= high:
@@ -47,6 +60,13 @@ class Reachability:
             return f"it is {height:.2f} m high, reachable is up to {config.grasp_height_range_m[1]:.2f}"
         grasp = self.grasp(target_m)
         start = _UPRIGHT | {"arm_base": _UPRIGHT["arm_base"] + azimuth}
-        if self._reacher.solve(start, grasp.around) is None or self._reacher.solve(start, grasp.behind) is None:
+        around = self._reacher.solve(start, grasp.around)
+        if around is None or self._reacher.solve(start, grasp.behind) is None:
             return "the joint limits do not let the hand there"
+        if self._seen is not None:
+            learned, mesh = self._seen
+            # In a gap between sightings, and a little beyond them, it may try: there the drawing still serves.
+            place = learned.at(np.array([around[name] for name in ARM]))
+            if mesh.verdict(place) is Reach.OUTSIDE and mesh.nearest_m(place) > BEYOND_M:
+                return "the hand was never seen anywhere near"
         return ""

@@ -9,8 +9,10 @@ from cocoro.messages import Intent
 from services.planning.behaviours.babbling import BabbleArm, BabbleWheels
 from services.planning.behaviours.base import Behaviour, Limbs, Plan, Scene
 from services.planning.behaviours.driving import Approach, Carry, Follow
+from services.planning.behaviours.going import GoTo
 from services.planning.behaviours.handling import Close, Lift, Place, Reach
 from services.planning.behaviours.looking import Explore, Idle, Park, Search
+from services.planning.behaviours.touching import Touch
 
 __all__ = ["BEHAVIOURS", "Behaviour", "Idle", "Limbs", "Plan", "Scene"]
 
@@ -26,6 +28,8 @@ BEHAVIOURS: Mapping[str, Callable[[Intent], Behaviour]] = {
     "carry": lambda intent: Carry(intent.label, intent.place_m or (0.0, 0.0)),
     "place": lambda _intent: Place(),
     "follow": lambda intent: Follow(intent.label),
+    "touch": lambda intent: Touch(intent.label),
+    "go-to": lambda intent: GoTo(intent.label, intent.distance_m),
     "babble-arm": lambda intent: BabbleArm(intent.first, intent.count),
     "babble-wheels": lambda intent: BabbleWheels(intent.label, intent.first, intent.count),
 }

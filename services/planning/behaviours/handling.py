@@ -14,10 +14,17 @@ class Reach:
     """From here on the hand covers the target: its place is held."""
     CLOSE_IN_M = 0.015
 
-    def __init__(self, label: str) -> None:
+    def __init__(self, label: str, *, touching: bool = False) -> None:
+        """`touching`: it will not be grasped, so it may be nearer or further than what is."""
         self._label = label
+        self._touching = touching
         self._frozen: Grasp | None = None
         self._inserting = False
+
+    @property
+    def goal(self) -> HandPose | None:
+        """Where the hand comes to at last, once that is settled."""
+        return self._frozen.around if self._frozen is not None else None
 
     def step(self, scene: Scene) -> Plan:
         limbs, config = scene.limbs, scene.limbs.config
@@ -25,7 +32,7 @@ class Reach:
         if self._frozen is None and (target is None or target.age_s > config.stale_target_s + scene.senses.sight_lag_s):
             return Plan(scene.stand(), scene.still(), f"{self._label} is out of sight", None, "failed", "lost")
         if target is not None and not self._inserting:
-            why_not = limbs.reachability.why_not(target.position_m)
+            why_not = limbs.reachability.why_not(target.position_m, touching=self._touching)
             if why_not:
                 return Plan(scene.stand(), scene.still(), why_not, None, "failed", "unreachable")
         limbs.grip.open()

@@ -1,0 +1,70 @@
+"""Going somewhere for its own sake: to a set distance from a target, the arm folded."""
+
+from __future__ import annotations
+
+from math import hypot
+
+from services.planning.behaviours.base import Plan, Scene
+from services.planning.behaviours.driving import BackOff
+from services.planning.course import Course
+from services.planning.navigation import offset_to
+
+
+class GoTo:
+    """Drive, around what is in the way, until the target is straight ahead at a distance between the centres."""
+
+    CREEP_MPS = 0.04
+    NEAR_ENOUGH_M = 0.003
+    """At last it creeps, for the driver's own tolerance is made for the arm, which makes up for it."""
+
+    def __init__(self, label: str, distance_m: float) -> None:
+        self._label = label
+        self._distance_m = distance_m
+        self._course: Course | None = None
+        self._back_off = BackOff()
+        self._creeping = False
+
+    def step(self, scene: Scene) -> Plan:
+        limbs, config = scene.limbs, scene.limbs.config
+        target = scene.target(self._label)
+        if target is None:
+            return Plan(scene.stand(), scene.still(), f"{self._label} is unknown", None, "failed", "lost")
+        if self._course is None:
+            self._course = Course(limbs.robot, config, (self._distance_m, 0.0), arm="folded")
+        head = scene.look_at(target.position_m)
+        backing = self._back_off.step(scene, head)
+        if backing is not None:
+            return backing
+        arm = limbs.arm.park(scene.angles, scene.dt_s)
+        place = target.odometry_position_m[:2]
+        move = self._course.step(
+            place, scene.body, scene.senses.around, scene.fields(self._label), limbs.driver, scene.now_ns
+        )
+        # The camera is blind near by, so on the last stretch the target may be remembered for a while.
+        patience_s = config.stale_target_s if move.direct else config.stale_on_way_s
+        if target.age_s > patience_s + scene.senses.sight_lag_s:
+            why = f"{self._label} has not been seen for {target.age_s:.1f} s"
+            return Plan(scene.stand(), scene.still(), why, None, "failed", "lost")
+        self._creeping |= move.arrived
+        if self._creeping:
+            return self._creep(scene, Plan(scene.stand(), arm, "", head))
+        if move.look_at is not None:
+            head = scene.look_at(scene.body.inverse().apply((*move.look_at, 0.0)))
+        base = limbs.driver.command(move.speed_mps, move.turn_radps, scene.dt_s)
+        plan = Plan(base, arm, move.why, head, distance_m=move.left_m)
+        if move.blocked:
+            plan.base, plan.state, plan.reason = scene.stand(), "failed", "blocked"
+        return plan
+
+    def _creep(self, scene: Scene, plan: Plan) -> Plan:
+        target = scene.target(self._label)
+        assert target is not None
+        x, y, _ = target.position_m
+        left_m = offset_to((x, y), (self._distance_m, 0.0)).ahead_m
+        plan.distance_m, plan.why = abs(left_m), f"{left_m:+.3f} m to creep"
+        if abs(left_m) > self.NEAR_ENOUGH_M:
+            speed = min(max(2.0 * left_m, -self.CREEP_MPS), self.CREEP_MPS)
+            plan.base = scene.limbs.driver.command(speed, 0.0, scene.dt_s)
+        elif scene.standing:
+            plan.state, plan.why = "done", f"{self._label} is {hypot(x, y):.3f} m away"
+        return plan

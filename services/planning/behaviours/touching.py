@@ -1,0 +1,83 @@
+"""Touching: the open hand brought around what is within the arm's reach, one thing after the other."""
+
+from __future__ import annotations
+
+from cocoro.clock import NS
+from cocoro.frames import Spherical, to_spherical, wrap_rad
+from services.planning.behaviours.base import Plan, Scene, hand_place
+from services.planning.behaviours.handling import Reach
+from services.planning.reach import HandPose
+
+REACHED = Spherical(0.02, 0.034, 0.034)
+"""The paper's: how far hand and target may be apart, egocentric: metres, azimuth and elevation in radians."""
+
+
+class Touch:
+    """Back from where the hand is, behind the target, around it; the base stands. It is reached when hand and target
+    are one place, as the robot sees and feels them, by the paper's measure."""
+
+    IN_VIEW_S = 0.2
+    LOOK_S = 1.5
+
+    def __init__(self, label: str) -> None:
+        self._label = label
+        self._reach = Reach(label, touching=True)
+        self._back: HandPose | None = None
+        self._begun = False
+        self._seen = False
+        self._looking_since_ns: int | None = None
+
+    def step(self, scene: Scene) -> Plan:
+        limbs, config = scene.limbs, scene.limbs.config.arm
+        reference = limbs.arm.reference or scene.angles
+        if not self._begun:
+            self._begun = True
+            have = limbs.reacher.pose({**scene.angles, **reference})
+            if not limbs.arm.folded(reference) and have.radius_m > config.retreat_radius_m + 0.02:
+                self._back = have._replace(radius_m=config.retreat_radius_m, pitch_rad=config.pitch_rad)
+        if self._back is not None:
+            return self._back_out(scene, self._back)
+        plan = self._look(scene) or self._reach.step(scene)
+        if plan.state == "done":
+            self._judge(scene, plan)
+        return plan
+
+    def _back_out(self, scene: Scene, goal: HandPose) -> Plan:
+        """Out of what it was around before, along the hand's own axis."""
+        limbs, config = scene.limbs, scene.limbs.config.arm
+        limbs.grip.open()
+        step = limbs.arm.reach(goal, config.hand_speed_mps, scene.angles, scene.dt_s)
+        target = scene.target(self._label)
+        head = scene.look_at(target.position_m) if target is not None else None
+        plan = Plan(scene.stand(), step, "backing the hand out first", head, distance_m=step.left)
+        if step.left < Reach.CLOSE_IN_M:
+            self._back = None
+        elif step.blocked:
+            plan.state, plan.reason, plan.why = "failed", "blocked", "the hand's way out is blocked"
+        return plan
+
+    def _look(self, scene: Scene) -> Plan | None:
+        """Wait, for so long, for a target that the hand has hidden; None once it is in view."""
+        target, lag_s = scene.target(self._label), scene.senses.sight_lag_s
+        if target is None or self._seen or target.age_s < self.IN_VIEW_S + lag_s:
+            self._seen = True
+            return None
+        if self._looking_since_ns is None:
+            self._looking_since_ns = scene.now_ns
+        if scene.now_ns - self._looking_since_ns > (self.LOOK_S + lag_s) * NS:
+            return None
+        return Plan(scene.stand(), scene.still(), f"looking at {self._label}", scene.look_at(target.position_m))
+
+    def _judge(self, scene: Scene, plan: Plan) -> None:
+        """The goal's posture is commanded; done is it when the hand has come there."""
+        goal = self._reach.goal
+        assert goal is not None
+        x, y, z = scene.limbs.reacher.point(goal).tolist()
+        want, have = to_spherical((x, y, z)), to_spherical(hand_place(scene))
+        turn_rad, rise_rad = wrap_rad(have.azimuth_rad - want.azimuth_rad), have.elevation_rad - want.elevation_rad
+        gap = Spherical(have.rho_m - want.rho_m, turn_rad, rise_rad)
+        if all(abs(value) <= limit for value, limit in zip(gap, REACHED, strict=True)):
+            plan.why = f"{self._label} is reached"
+        else:
+            plan.state = "running"
+            plan.why = f"the hand is {gap.rho_m:+.3f} m, {turn_rad:+.3f} and {rise_rad:+.3f} rad off"
