@@ -246,11 +246,15 @@ class Campaign:
             self._until_moving()
 
     def _await_stop(self, began_ns: int, tally: Tally) -> None:
+        """When they stopped is taken from the hardware's own log: who waits for it here may be late."""
         create = self._hardware.create
         try:
-            stopped_ns = self._hardware.emulator.until(lambda: create.wheels_mmps == (0, 0), 5.0)
+            self._hardware.emulator.until(lambda: create.wheels_mmps == (0, 0), 5.0)
+            log = self._hardware.emulator.call(create.acted.copy)
+            stopped_ns = max(log[-1][0], began_ns) if log else began_ns
         except TimeoutError:
             stopped_ns = began_ns + 5 * NS
+            tally.notes.append(f"not stopped: {create.pending.hex() or 'nothing'} pending, mode {create.mode}")
         took_ms = (stopped_ns - began_ns) / MS
         tally.slowest_stop_ms = max(tally.slowest_stop_ms, took_ms)
         tally.late_stops += took_ms > STOP_NS / MS

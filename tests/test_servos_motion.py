@@ -263,6 +263,17 @@ def test_a_servo_that_lost_its_settings_gets_them_again_and_it_is_told(arm: Net)
     assert arm.net.latched_faults() == ()
 
 
+def test_a_servo_that_shuts_down_just_after_it_was_enabled_is_not_taken_for_one_that_lost_its_settings(
+    arm: Net,
+) -> None:
+    arm.net.done(Task("enable", 5), 512, arm.now_ns)
+    arm.cycle(elbow=0x20)  # not believed so soon: it may be the word of the last shutdown
+    assert arm.net.latched_faults() == ()
+    arm.net.checked(5, as_set=False, now_ns=arm.now_ns)  # but that its torque is gone is
+    assert arm.net.latched_faults() == ("elbow: overload",)
+    assert arm.net.next_task() is None
+
+
 def test_a_silent_servo_is_left_out_and_named_and_the_others_go_on(arm: Net) -> None:
     for _ in range(MISSES):
         arm.net.missed(5)

@@ -11,7 +11,7 @@ the base service: it passes on what the service asks of the wheels while the ser
     python -m services.base.guard PORT --fd N --mode safe --deadman-ms 200
 
 `--fd` is its end of a SOCK_SEQPACKET pair. Down come {"left": mm/s, "right": mm/s, "until": ns} and {"recover": true},
-up goes a report for each frame, and ten a second when there are none (`Report` in `services.base.driver`). Times are
+up goes a report for each frame, and twenty a second when there are none (`Report` in `services.base.driver`). Times are
 CLOCK_MONOTONIC, which all processes of a machine share. It needs pyserial and nothing else beyond Python.
 """
 
@@ -37,7 +37,7 @@ from services.base.keeper import MS, OVERRUN, OVERRUN_NS, Keeper
 
 TURN_S = 0.005
 """How long it sleeps at most between two looks at the clock."""
-QUIET_NS = 100 * MS
+QUIET_NS = 50 * MS
 REOPEN_NS = 200 * MS
 STOPPING_NS = 1000 * MS
 """How long it sees to it that the wheels have stopped, before it ends."""

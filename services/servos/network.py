@@ -217,9 +217,13 @@ class Network:
         """Whether a servo still has what was written into it, looked at now and then: one whose power failed for a
         moment has not, and would go on limp or with the settings of the factory."""
         one = self.joints[number]
-        if one.obeys and not as_set and number not in self._tasks:
-            one.interrupted_ns = now_ns
-            self._tasks[number] = Task("enable", number)
+        if not one.obeys or as_set or number in self._tasks:
+            return
+        if one.reading is not None and one.reading.error & table.SHUTDOWNS:  # it let go by itself, just after it held
+            self._shut_down(one, one.reading.error)
+            return
+        one.interrupted_ns = now_ns
+        self._tasks[number] = Task("enable", number)
 
     def done(self, task: Task, position: int, now_ns: int) -> None:
         """A task was done, with the servo there."""

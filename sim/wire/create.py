@@ -130,6 +130,11 @@ class Create:
         self._out.clear()
         return out if baud == self.baud else b""
 
+    @property
+    def pending(self) -> bytes:
+        """What came of a command that is not whole yet."""
+        return bytes(self._pending)
+
     # --- commands -----------------------------------------------------------------------------------
 
     def _work(self) -> None:
