@@ -6,7 +6,10 @@ import numpy as np
 import pytest
 from perception_scenes import CATALOGUE, MS, ROBOT, STAMP_NS, Scene, Thing, block, error_mm, facing, known, seen, the
 
+from services.perception.config import Config
+from services.perception.localise import Localiser
 from services.perception.shapes import distance_from, signed_distance
+from services.perception.sighting import Sighting
 from sim.scene import Light
 
 pytestmark = pytest.mark.sim
@@ -93,6 +96,19 @@ def test_a_turning_heads_motion_blur_leaves_a_near_can_in_place(speed_radps):
         scene.frame(pan - speed_radps / 30, tilt, STAMP_NS)
         frame = scene.frame(pan, tilt, STAMP_NS + 1_000_000_000 // 30)
     assert error_mm(the(CAN, seen(frame, pan, tilt)), can)[0] < 5.0
+
+
+@pytest.mark.parametrize(("area_px", "is_told"), [(300, False), (2500, True)], ids=["a part", "whole"])
+def test_what_seems_to_be_a_part_of_something_that_reaches_into_the_floor_is_no_such_thing(area_px, is_told):
+    """Of a can that the arm hides in part, what is left may be as round as a ball."""
+    localiser = Localiser(ROBOT, CATALOGUE, Config().occluded_share)
+    camera = ROBOT.camera
+    head_rad = np.array([0.3, -0.6])
+    into_floor = np.linalg.inv(localiser.camera_pose(head_rad)) @ [1.05, 0.35, -0.07, 1.0]
+    x, y, z, _ = into_floor.tolist()
+    u, v = x / z * camera.fx + camera.cx, y / z * camera.fy + camera.cy
+    sighting = Sighting("blue_ball", u, v, area_px, (0, 0, 30, 30), z, hidden=True)
+    assert bool(localiser.locate([sighting], camera, head_rad)) == is_told
 
 
 # --- hidden in part -------------------------------------------------------------------------------

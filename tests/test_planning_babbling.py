@@ -207,10 +207,10 @@ def intent(behaviour: Behaviour, count: int, first: int = 1, label: str = "") ->
 
 def test_the_arm_babbles_until_there_are_samples_enough_and_comes_home(robot: Robot, postures: Postures) -> None:
     body = Body(robot, robot.base.wheel_separation_m)
-    status = body.run(intent("babble-arm", 40), ticks=3000)
-    assert (status.state, status.why) == ("done", "40 samples")
+    status = body.run(intent("babble-arm", 90), ticks=4000)
+    assert (status.state, status.why) == ("done", "90 samples")
     samples = [output.message for output in body.reports]
-    assert len(samples) == 40
+    assert len(samples) == 90
     drawing = Drawing(robot)
     for sample in samples:
         assert isinstance(sample, HandSample)

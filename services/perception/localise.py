@@ -8,7 +8,7 @@ visible, and to the rays beside it that are known to pass freely. Hidden parts s
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import log
+from math import hypot, log
 from typing import NamedTuple
 
 import numpy as np
@@ -35,6 +35,9 @@ RAY_DOUBT_M, RAY_DOUBT_RAD = 0.001, 0.002
 HUBER = 1.5
 SAME_PLACE = 0.5
 """Overlap of two boxes, common area over area together."""
+UNDER_FLOOR_M, UNDER_FLOOR_PER_M = 0.03, 0.03
+"""How far under the floor something may seem to reach: where it is, and more at a distance, since the camera's
+mounting is not known exactly."""
 SIZE_DOUBT = 0.2
 """How far the number of pixels may be off, as a share (its logarithm), where nothing hides any."""
 
@@ -59,7 +62,19 @@ class Localiser:
         """
         pose = None if angles_rad is None else self.camera_pose(angles_rad)
         placed = [self._place(sighting, camera, pose) for sighting in sightings]
-        return [one.detection for one in placed if not any(other.displaces(one) for other in placed)]
+        return [
+            one.detection
+            for one in placed
+            if not self._underground(one.detection) and not any(other.displaces(one) for other in placed)
+        ]
+
+    def _underground(self, detection: Detection) -> bool:
+        """It is a part of something that is taken for the part of another thing, which would reach into the floor."""
+        if detection.position_m is None or not detection.note:
+            return False
+        x, y, z = detection.position_m
+        bottom_m = z - self._catalogue[detection.label].size_m[2] / 2
+        return bottom_m < -UNDER_FLOOR_M - UNDER_FLOOR_PER_M * hypot(x, y)
 
     def _place(self, sighting: Sighting, camera: Camera, pose: Array | None) -> _Placed:
         position: Vec3 | None = None

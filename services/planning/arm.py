@@ -1,8 +1,9 @@
 """The arm's trajectories: unfolding, folding, and moving the hand to a pose, one step at a time.
 
 Between the folded (parked) pose and the space before the robot the arm goes by way of two poses: folded out in the
-plane that it parks in (the hand's thin side to the camera mount), then swung to the front. All references are kept
-as commanded angles: feeding back the servos' coarse positions would only add their steps to the motion.
+plane that it parks in (the hand's thin side to the camera mount, until it is out), then swung to the front with the
+hand level, so that it passes over what stands there. All references are kept as commanded angles: feeding back the
+servos' coarse positions would only add their steps to the motion.
 """
 
 from __future__ import annotations
@@ -92,14 +93,14 @@ class ArmController:
                     pose.pitch_rad,
                 )
                 return self._cartesian(rise, self._config.hand_speed_mps, dt_s)._replace(arrived=False)
-            if not out:
-                return self._joints(_OUT | {ROLL: 0.0}, dt_s)._replace(arrived=False)
-            if abs(reference[ROLL]) > _NEAR_RAD:
-                return self._joints(_OUT | {ROLL: 0.0}, dt_s)._replace(arrived=False)
-            return self._joints(_OUT | {ROLL: 0.0, "arm_base": self._park["arm_base"]}, dt_s)._replace(arrived=False)
+            if not out or abs(reference[ROLL] - LEVEL_ROLL_RAD) > _NEAR_RAD:
+                return self._joints(_OUT | {ROLL: LEVEL_ROLL_RAD}, dt_s)._replace(arrived=False)
+            return self._joints(_OUT | {"arm_base": self._park["arm_base"]}, dt_s)._replace(arrived=False)
         self._astray = False
         if abs(reference["arm_base"] - self._park["arm_base"]) > _NEAR_RAD:
-            return self._joints(_OUT | {ROLL: 0.0, "arm_base": self._park["arm_base"]}, dt_s)._replace(arrived=False)
+            return self._joints(_OUT | {"arm_base": self._park["arm_base"]}, dt_s)._replace(arrived=False)
+        if abs(reference[ROLL]) > _NEAR_RAD:
+            return self._joints(_OUT | {ROLL: 0.0}, dt_s)._replace(arrived=False)
         return self._joints(self._park | {ROLL: 0.0}, dt_s)
 
     def reach(self, goal: HandPose, speed_mps: float, measured: Mapping[str, float], dt_s: float) -> Step:
@@ -109,7 +110,12 @@ class ArmController:
         if self.folded(reference):
             out = all(abs(reference[name] - angle) < _NEAR_RAD for name, angle in _OUT.items())
             in_park_plane = reference["arm_base"] > self._park["arm_base"] - 0.2
-            stage = _OUT | ({ROLL: 0.0} if not out and in_park_plane else {"arm_base": _FRONT_RAD})
+            if not out and in_park_plane:
+                stage = _OUT | {ROLL: 0.0}
+            elif abs(reference[ROLL] - LEVEL_ROLL_RAD) > _NEAR_RAD:
+                stage = _OUT | {ROLL: LEVEL_ROLL_RAD}
+            else:
+                stage = _OUT | {"arm_base": _FRONT_RAD}
         elif reference["arm_base"] > 0.35 and goal.azimuth_rad < 0.3:
             stage = _OUT | {"arm_base": _FRONT_RAD, ROLL: LEVEL_ROLL_RAD}
         elif self._is_astray(reference, self._reacher.pose(reference)):

@@ -172,6 +172,10 @@ class Approach:
             goal = limbs.reachability.grasp(target.position_m).behind
             low, high = config.grasp_azimuth_range_rad
             goal = goal._replace(azimuth_rad=min(max(goal.azimuth_rad, low), high))
+            have = limbs.reacher.pose({**angles, **reference})
+            if abs(have.azimuth_rad - goal.azimuth_rad) > 0.12 and have.height_m > config.travel_height_m - 0.03:
+                # What stands beside the target is passed over first: the hand comes down where it is to be.
+                goal = goal._replace(radius_m=config.travel_radius_m, height_m=config.travel_height_m)
             step = arm.reach(goal, config.hand_speed_mps, angles, dt_s)
             late = move.left_m < 0.10 and not step.arrived and step.left > 0.03
             # The hand must be behind the target before the target is between the fingers.
