@@ -82,6 +82,8 @@ def test_a_damaged_capture_gives_nothing_but_what_was_recorded_and_says_what_is_
 ) -> None:
     data: bytes = request.getfixturevalue(state)
     path = folder / f"{state}-{damage.__name__}.mcap"
+    with Capture.open(folder / "whole.mcap") as capture:
+        metadata = capture.metadata
     draw = random.Random(f"{state} {damage.__name__}")
     for _ in range(DAMAGES // 12 + 1):
         damaged = bytearray(data)
@@ -91,7 +93,10 @@ def test_a_damaged_capture_gives_nothing_but_what_was_recorded_and_says_what_is_
         if isinstance(reading, str):
             assert str(path) in reading
             continue
-        found, closed, problems, counted = reading
+        found, told, closed, problems, counted = reading
+        assert all(entries in metadata.values() for entries in told.values())
+        assert not closed or told.items() <= metadata.items()
+        assert told.keys() >= metadata.keys() or problems or not closed
         assert set(found) <= original
         assert len(found) == len(set(found))
         if state == "whole" and len(found) < len(original):
@@ -99,13 +104,14 @@ def test_a_damaged_capture_gives_nothing_but_what_was_recorded_and_says_what_is_
         assert counted == len(found) or problems
 
 
-def _read(path: Path) -> str | tuple[list[Told], bool, list[str], int]:
-    """What a reader makes of it: the error's text, or what it has, whether it was closed, what is wrong, a count."""
+def _read(path: Path) -> str | tuple[list[Told], dict[str, dict[str, str]], bool, list[str], int]:
+    """What a reader makes of it: the error's text; or its messages, its metadata, whether it was closed, what is wrong
+    with it, and how many messages the report counts."""
     try:
         with Capture.open(path) as capture:
             found = [_told(each) for each in capture.messages()]
             counted = report(capture).messages
-            return found, capture.closed, capture.problems, counted
+            return found, capture.metadata, capture.closed, capture.problems, counted
     except CaptureError as error:
         return str(error)
 
@@ -149,6 +155,27 @@ def test_a_capture_that_is_missing_or_a_folder_is_told_in_one_line(
         assert str(path) in capsys.readouterr().err
 
 
+def test_a_record_that_its_recorder_did_not_finish_is_no_damage_but_told_of(
+    whole: bytes, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "killed.mcap"
+    path.write_bytes(whole)
+    with Capture.open(path) as capture:
+        last = capture.chunks[-1]
+    path.write_bytes(whole[: last.offset + last.length - 10])
+    with Capture.open(path) as capture:
+        assert capture.problems == []
+        assert capture.cut_bytes == last.length - 10
+    assert main(["capture", "info", str(path)]) == 0
+    assert f"of its last record there are {last.length - 10} bytes" in capsys.readouterr().out
+    for command in (["export", str(path), "--csv", str(tmp_path / "csv")], ["capture", "repair", str(path)]):
+        assert main(command) == 0
+        out, err = capsys.readouterr()
+        assert "killed.mcap was not closed" in out + err
+    assert main(["capture", "info", str(tmp_path / "killed.repaired.mcap")]) == 0
+    assert "made of   killed.mcap, which was not closed" in capsys.readouterr().out
+
+
 def test_a_damaged_capture_is_mended_as_far_as_it_goes(
     whole: bytes, tmp_path: Path, original: set[Told], capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -163,6 +190,7 @@ def test_a_damaged_capture_is_mended_as_far_as_it_goes(
     assert "missing:" in capsys.readouterr().out
     mended = tmp_path / "damaged.repaired.mcap"
     assert main(["capture", "info", "--check", str(mended)]) == 0
+    assert "made of   damaged.mcap, which was damaged; " in capsys.readouterr().out
     found = {_told(each) for each in all_of(mended)}
     assert found < original
     assert len(found) > len(original) / 2

@@ -8,11 +8,15 @@ import os
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import pytest
 from capture_rig import all_of, entry, frame, state, writer
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from mcap.reader import make_reader
+from message_samples import data_of
 
 from cocoro.capture.compression import COMPRESSIONS, Compression, Packer, unpack
 from cocoro.capture.errors import CaptureError
@@ -22,11 +26,11 @@ from cocoro.capture.pictures import LossyFrame, lossy
 from cocoro.capture.reader import Capture
 from cocoro.capture.retention import captures, make_room
 from cocoro.capture.rewrite import rewrite
-from cocoro.capture.schema import changes, schema_of
+from cocoro.capture.schema import changes, known_to, schema_of
 from cocoro.capture.types import NotReadableError
 from cocoro.capture.writer import Limits, Missing
 from cocoro.errors import ConfigError
-from cocoro.messages import BaseState, Detections, Frame
+from cocoro.messages import BaseState, Detections, Frame, Message, PlannerStatus
 from cocoro.topics import TOPICS
 
 BIG = msgspec.msgpack.encode(frame(7, 320, 240))
@@ -90,6 +94,26 @@ def test_each_type_of_the_mesh_has_a_schema_that_is_an_object_with_binary_pixels
         assert "stamp_ns" in schema["properties"]
     pixels = json.loads(schema_of(Frame).data)["properties"]["colour"]
     assert pixels == {"type": "string", "contentEncoding": "binary"}
+
+
+@settings(max_examples=20)
+@given(st.sampled_from(TOPICS).flatmap(lambda topic: st.tuples(st.just(topic.type), data_of(topic.type))))
+def test_a_types_schema_knows_all_that_its_messages_have(made: tuple[type[Message], Any]) -> None:
+    kind, data = made
+    plain = json.loads(msgspec.json.encode(msgspec.convert(data, kind, builtin_types=(bytes, memoryview))))
+    assert known_to(schema_of(kind).data, plain) == plain
+
+
+def test_fields_that_a_schema_does_not_have_are_left_out_wherever_they_are() -> None:
+    schema = json.loads(schema_of(PlannerStatus).data)
+    del schema["properties"]["model"]
+    del schema["$defs"]["TargetEstimate"]["properties"]["age_s"]
+    target = {"label": "red_can", "age_s": 1.0, "position_m": [1.0, 2.0, 3.0]}
+    status = {"model": "learned", "target": target, "known": [target, target], "why": "so"}
+    less = {"label": "red_can", "position_m": [1.0, 2.0, 3.0]}
+    expected = {"target": less, "known": [less, less], "why": "so"}
+    assert known_to(json.dumps(schema).encode(), status) == expected
+    assert known_to(b"no schema", status) == status
 
 
 def test_keys_never_heard_of_are_kept_as_what_they_seem_to_be(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 from capture_rig import Room, drive, record
 
@@ -177,11 +178,78 @@ def test_lossy_frames_are_no_inputs(tmp_path: Path) -> None:
     assert result.not_executable > 50
 
 
+def of_an_older_version(out: Path, change: Callable[[dict[str, Any]], None] = lambda _: None) -> Path:
+    """The golden capture as it were if the planner's status had had no `model`, an object no `sigma_m`, and the status
+    something else, that is no more."""
+
+    def older(name: str, payload: bytes) -> bytes:
+        if name != "PlannerStatus":
+            return payload
+        status = msgspec.msgpack.decode(payload)
+        del status["model"]
+        for known in (*status["known"], *filter(None, [status["target"]])):
+            del known["sigma_m"]
+        change(status)
+        return msgspec.msgpack.encode({**status, "mood": "good"})
+
+    with Capture.open(GOLDEN) as capture:
+        infos = {key: info_in(capture, key) for key in capture.keys}
+        schema = infos["calliope/planning/status"].schema
+        assert schema is not None
+        then = json.loads(schema.data)
+        del then["properties"]["model"]
+        del then["$defs"]["TargetEstimate"]["properties"]["sigma_m"]
+        then["properties"]["mood"] = {"type": "string"}
+        infos["calliope/planning/status"] = infos["calliope/planning/status"]._replace(
+            schema=schema._replace(data=json.dumps(then).encode())
+        )
+        written = Writer(lambda _: out, Packer("lz4"), Limits(), lambda key, _: infos[key])
+        for name, entries in capture.metadata.items():
+            written.remember(name, entries)
+        for each in capture.messages():
+            kind = infos[each.key].schema
+            payload = older("" if kind is None else kind.name, bytes(each.payload))
+            written.put(Entry(each.key, each.sequence, each.log_ns, each.publish_ns, payload))
+        written.close()
+    return out
+
+
+def test_outputs_of_an_older_version_are_compared_by_the_fields_that_both_have(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = of_an_older_version(tmp_path / "older.mcap")
+    result = again(path, "planning", TOLERANCE)
+    assert result.first is None, result.first
+    assert result.equal == result.steps > 250
+    assert result.changed == (
+        "calliope/planning/status: mood is no more: passed by",
+        "calliope/planning/status: model is new: takes its default",
+        "calliope/planning/status: TargetEstimate.sigma_m is new: takes its default",
+    )
+    assert main(["capture", "rerun", str(path), "--service", "planning", "--tolerance", "0.001"]) == 0
+    assert "changed since, calliope/planning/status: model is new" in capsys.readouterr().out
+
+
+def test_what_differs_is_found_in_a_capture_of_an_older_version_too(tmp_path: Path) -> None:
+    def move(status: dict[str, Any]) -> None:
+        for known in status["known"]:
+            known["position_m"][0] += 0.25
+
+    result = again(of_an_older_version(tmp_path / "older.mcap", move), "planning", TOLERANCE)
+    assert result.first is not None
+    assert result.first.text.startswith("planning/status: known[0].position_m[0] was ")
+
+
 @pytest.mark.parametrize(
-    ("path", "service", "words"),
-    [(GOLDEN, "executive", "no steps of executive"), (GOLDEN, "nobody", "no steps of nobody")],
+    ("service", "words"),
+    [
+        ("executive", "has no pure core"),
+        ("nobody", "does not say what nobody was started with; it does of arm, base, capture, executive"),
+        ("planning", r"no steps of planning; have them recorded by record_steps = true"),
+    ],
 )
-def test_a_capture_without_the_steps_says_how_to_have_them(path: Path, service: str, words: str) -> None:
+def test_a_capture_that_does_not_have_what_it_takes_is_told_of(service: str, words: str, tmp_path: Path) -> None:
+    path = without(GOLDEN, tmp_path / "less.mcap", lambda each: not each.key.endswith("/steps"))
     with Capture.open(path) as capture, pytest.raises(CaptureError, match=words):
         rerun([capture], service)
 

@@ -11,3 +11,7 @@ class CaptureError(CocoroError):
 
 class DamageError(Exception):
     """Bytes that cannot be what they should be. Readers catch it and go on with what is whole."""
+
+
+class CutOffError(DamageError):
+    """There are fewer bytes than there should be, as where a recorder was killed in the middle of a record."""

@@ -11,6 +11,7 @@ import msgspec
 from cocoro.capture.errors import DamageError
 from cocoro.capture.file import KeyTally
 from cocoro.capture.keys import MADE_HERE
+from cocoro.capture.pictures import LossyFrame
 from cocoro.capture.reader import Capture
 from cocoro.capture.schema import changes, schema_of
 from cocoro.capture.writer import TALLY
@@ -43,6 +44,8 @@ class Report(msgspec.Struct, kw_only=True):
     raw_bytes: int
     """Before compression; 0 when that is not known."""
     closed: bool
+    ending: str
+    """Why it may be shorter than the run was; '' when it was closed."""
     checked: bool
     """Every byte was read for this report, and not only what the file says of itself."""
     problems: tuple[str, ...]
@@ -69,6 +72,7 @@ def report(capture: Capture, check: bool = False) -> Report:
         size_bytes=capture.size_bytes,
         raw_bytes=sum(tally.size_bytes for tally in tallies.values()),
         closed=capture.closed,
+        ending=capture.ending,
         checked=checked,
         problems=tuple(capture.problems),
         robot=capture.robot,
@@ -133,14 +137,17 @@ def _key_report(
         longest_gap_from_s=max(tally.longest_gap_from_ns - capture.start_ns, 0) / NS,
         lost=lost.get(key, 0),
         dropped=dropped.get(key, 0),
-        changed=tuple(_changed(capture, key)),
+        changed=tuple(changed_since(capture, key)),
     )
 
 
-def _changed(capture: Capture, key: str) -> list[str]:
+def changed_since(capture: Capture, key: str) -> list[str]:
+    """What is different in today's type of a key, in words."""
     schema = capture.schema(key)
     topic = topic_named(key.removeprefix(f"{capture.robot}/"))
     if schema is None or topic is None or capture.keys[key].metadata.get("publisher") == MADE_HERE:
+        return []
+    if schema.name == LossyFrame.__name__:
         return []
     if schema.name != topic.type.__name__:
         return [f"it carries {topic.type.__name__} today"]

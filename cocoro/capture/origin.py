@@ -52,12 +52,16 @@ def origins(captures: Sequence[Capture], service: str) -> Iterator[list[Origin]]
     starts = [entries for n, entries in enumerate(told) if entries not in told[:n]]
     path = captures[0].path
     if not starts:
-        raise CaptureError(f"{path}: it does not say what {service} was started with")
+        there = sorted({name[8:] for capture in captures for name in capture.metadata if name.startswith("service/")})
+        raise CaptureError(
+            f"{path}: it does not say what {service} was started with; it does of {', '.join(there) or 'none'}"
+        )
     with tempfile.TemporaryDirectory(prefix="cocoro-") as folder:
         try:
-            yield [_origin(service, entries, Path(folder) / str(n)) for n, entries in enumerate(starts)]
+            made = [_origin(service, entries, Path(folder) / str(n)) for n, entries in enumerate(starts)]
         except (KeyError, TypeError, ValueError, ConfigError) as error:
             raise CaptureError(f"{path}: what {service} was started with cannot be had again: {error}") from error
+        yield made
 
 
 def recorded_file(capture: Capture, service: str, field: str, load: Callable[[Path | None], T]) -> T:
@@ -79,7 +83,7 @@ def _origin(service: str, entries: Mapping[str, str], folder: Path) -> Origin:
         raise ConfigError(f"there is no process of module {module!r} here")
     component = processes.load(rows[0])
     if component.core is None:
-        raise ConfigError(f"{module} has no pure core to execute again")
+        raise CaptureError(f"{service} cannot be executed again: {module} has no pure core")
     settings = json.loads(entries["config"])
     for file in json.loads(entries["files"]):
         settings[file["field"]] = _same_file(file, folder, settings.get(file["field"]))

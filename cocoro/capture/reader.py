@@ -88,6 +88,19 @@ class Capture:
         return self._contents.whole
 
     @property
+    def ending(self) -> str:
+        """In words, why it may be shorter than the run was; '' when it was closed."""
+        if self.closed:
+            return ""
+        cut = f" (of its last record there are {self.cut_bytes} bytes and not the rest)" if self.cut_bytes else ""
+        return f"not closed: it is still being written, or its recorder was killed or had no room left{cut}"
+
+    @property
+    def cut_bytes(self) -> int:
+        """At its end, of a record that was never finished."""
+        return self._contents.cut_bytes
+
+    @property
     def problems(self) -> list[str]:
         """What could not be read, as far as it was tried."""
         more = [f"and {self._untold} more of the kind"] if self._untold else []

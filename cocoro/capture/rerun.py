@@ -9,15 +9,18 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
 
 from cocoro.capture.compare import difference
+from cocoro.capture.info import changed_since
 from cocoro.capture.inputs import Found, Id, Step, steps_of, with_messages
 from cocoro.capture.origin import Origin, origins
 from cocoro.capture.reader import Capture
+from cocoro.capture.schema import known_to
 from cocoro.capture.types import NotReadableError
 from cocoro.clock import NS
 from cocoro.core import Core, Output, Sample
@@ -53,6 +56,8 @@ class Result(msgspec.Struct, kw_only=True):
     wall_s: float = 0.0
     cpu_s: float = 0.0
     """Of this process's processors; less than `wall_s` where others wanted them too."""
+    changed: tuple[str, ...] = ()
+    """What is different in the types of its messages since; outputs are compared by the fields that both have."""
     problems: tuple[str, ...] = ()
     """What of the captures could not be read."""
 
@@ -68,13 +73,14 @@ def rerun(captures: Sequence[Capture], service: str, tolerance: float = 0.0, com
     Raises CaptureError when they do not have what that takes: its steps, its configuration, a component with a core.
     """
     started, cpu_started = time.perf_counter(), time.process_time()
-    steps = steps_of(captures, service)
     with origins(captures, service) as made:
+        steps = steps_of(captures, service)
         run = _Rerun(service, made, captures[0], tolerance if compare else None)
         for step in with_messages(captures, steps):
             run.execute(step)
     result = run.result
     result.recorded_s = (steps[-1][0] - steps[0][0]) / NS
+    result.changed = tuple(run.changed)
     result.problems = tuple(problem for capture in captures for problem in capture.problems)
     result.wall_s, result.cpu_s = time.perf_counter() - started, time.process_time() - cpu_started
     return result
@@ -92,6 +98,8 @@ class _Rerun:
         self._core: Core | None = None
         self._latency_ns = 0
         self._inputs_missed = False
+        self._looked_at: set[tuple[Path, str]] = set()
+        self.changed: dict[str, None] = {}
         self._encoder = msgspec.msgpack.Encoder(enc_hook=_plain)
 
     def execute(self, step: Step) -> None:
@@ -144,6 +152,7 @@ class _Rerun:
             elif found is None:
                 missing = f"the capture lacks an input of {name[0]}"
             else:
+                self._look_at(found)
                 try:
                     message = found.capture.read(found.record)
                     assert isinstance(message, Message)
@@ -162,6 +171,7 @@ class _Rerun:
             found = step.messages.get(name)
             if found is None:
                 return f"the capture lacks an output on {name[0]}", ""
+            self._look_at(found)
             self.result.outputs += 1
             payload = self._encoded(name, output, step.record.now_ns)
             if payload == found.record.payload:
@@ -183,12 +193,22 @@ class _Rerun:
         return self._encoder.encode(message)
 
     def _difference(self, found: Found, payload: bytes) -> str:
-        """By meaning: a field that has come since has its default in the recorded one, and may have it in ours."""
+        """By meaning, and by the fields that the type had then and has today."""
         recorded = found.capture.read(found.record)
         now = found.capture.read(found.record._replace(payload=memoryview(payload)))
         plain = [msgspec.to_builtins(message, builtin_types=(bytes, memoryview)) for message in (recorded, now)]
+        schema = found.capture.schema(found.record.key)
+        if schema is not None:
+            plain = [known_to(schema.data, message) for message in plain]
         unlike = difference(plain[0], plain[1], self._tolerance or 0.0)
         return "" if unlike is None else unlike.text
+
+    def _look_at(self, found: Found) -> None:
+        """Whether the type of its key has changed since."""
+        key = found.record.key
+        if (found.capture.path, key) not in self._looked_at:
+            self._looked_at.add((found.capture.path, key))
+            self.changed.update(dict.fromkeys(f"{key}: {text}" for text in changed_since(found.capture, key)))
 
     def _cannot(self, reason: str, count: int = 1, inputs: bool = True) -> None:
         self._inputs_missed |= inputs
@@ -231,6 +251,7 @@ def words(result: Result) -> list[str]:
     if result.not_executable:
         lines.append(f"  {result.not_executable} steps not re-executable")
         lines += [f"    {count}: {reason}" for reason, count in _by_count(result.reasons)]
+    lines += [f"  changed since, {change}" for change in result.changed]
     lines += [f"  not read: {problem}" for problem in result.problems]
     times = f"{result.wall_s:.1f} s ({result.cpu_s:.1f} s of processor)"
     lines.append(f"  {result.recorded_s:.1f} s in {times}: {result.speed:.1f} times real time")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -13,6 +14,9 @@ from cocoro.capture.keys import KeyInfo
 from cocoro.capture.reader import Capture, Record
 from cocoro.capture.schema import TypeSchema
 from cocoro.capture.writer import TALLY, Entry, Limits, Missing, Writer
+
+REPAIRED = "repaired"
+"""The metadata record of what was written anew, and had not been whole: what was wrong with it."""
 
 
 class Rewritten(NamedTuple):
@@ -45,6 +49,9 @@ def rewrite(
             if keep(record):
                 key, log_ns, publish_ns, sequence, payload = record
                 writer.put(Entry(key, sequence, log_ns, publish_ns, bytes(payload)))
+        if capture.problems or capture.ending:
+            problems = json.dumps(capture.problems)
+            writer.remember(REPAIRED, {"file": capture.path.name, "ending": capture.ending, "problems": problems})
         writer.close()
     except BaseException:
         out.unlink(missing_ok=True)

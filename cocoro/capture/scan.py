@@ -15,8 +15,8 @@ from typing import NamedTuple
 
 from cocoro.capture import mcap
 from cocoro.capture.compression import LARGEST_CHUNK, unpack
-from cocoro.capture.errors import DamageError
-from cocoro.capture.file import CHECKSUM, checksum
+from cocoro.capture.errors import CutOffError, DamageError
+from cocoro.capture.file import CHECKSUM, PROFILE, checksum
 from cocoro.capture.mcap import MAGIC, PREFIX, Op
 
 LARGEST_SUMMARY = 1 << 30
@@ -51,9 +51,13 @@ class Contents:
     statistics: mcap.Statistics | None = None
     whole: bool = False
     """The file was closed, and its summary is as it was written."""
+    cut_bytes: int = 0
+    """At the end, of a record that was never finished: what the death of a recorder leaves, so no damage."""
     problems: list[str] = field(default_factory=list)
     foreign: bool = False
     """It has messages outside of chunks, which captures never do."""
+    ours: bool = False
+    """It was written by a recorder, so each metadata record has its checksum."""
 
 
 class Disk:
@@ -65,12 +69,12 @@ class Disk:
 
     def read(self, offset: int, length: int) -> bytes:
         if offset < 0 or offset + length > self.size:
-            raise DamageError(f"{length} bytes at byte {offset} are beyond the file's end")
+            raise CutOffError(f"{length} bytes at byte {offset} are beyond the file's end")
         data = os.pread(self._fd, length, offset)
         while len(data) < length:
             more = os.pread(self._fd, length - len(data), offset + len(data))
             if not more:
-                raise DamageError(f"the file has become shorter than {offset + length} bytes")
+                raise CutOffError(f"the file has become shorter than {offset + length} bytes")
             data += more
         return data
 
@@ -109,7 +113,7 @@ def _by_summary(disk: Disk) -> Contents:
     summary = disk.read(footer.summary_start, footer_at - footer.summary_start)
     if not footer.vouches_for(summary):
         raise DamageError("the file's summary is damaged")
-    found = Contents(whole=True)
+    found = Contents(whole=True, ours=_profile(disk) == PROFILE)
     indices = []
     for op, content, _ in mcap.records(summary):
         if op == Op.SCHEMA:
@@ -141,6 +145,18 @@ def _read_metadata(disk: Disk, index: mcap.MetadataIndex, found: Contents) -> No
     if [op for op, _, _ in there] != [Op.METADATA]:
         raise DamageError("it is not there")
     _add_metadata(found, there[0][1])
+    if found.metadata[-1].name != index.name:
+        del found.metadata[-1]
+        raise DamageError("it is not there")
+
+
+def _profile(disk: Disk) -> str:
+    """Whose conventions hold, by the file's header."""
+    try:
+        op, length = PREFIX.unpack(disk.read(len(MAGIC), PREFIX.size))
+        return mcap.Take(disk.read(len(MAGIC) + PREFIX.size, length)).string() if op == Op.HEADER else ""
+    except DamageError:
+        return ""
 
 
 # --- from front to back ---------------------------------------------------------------------------
@@ -148,13 +164,16 @@ def _read_metadata(disk: Disk, index: mcap.MetadataIndex, found: Contents) -> No
 
 def scan(disk: Disk) -> Contents:
     """Read everything, and keep what is whole."""
-    found = Contents()
+    found = Contents(ours=_profile(disk) == PROFILE)
     at = len(MAGIC)
     while at < disk.size:
         try:
             at = _step(disk, at, found)
         except DamageError as damage:
             after = _search(disk, at + 1)
+            if after == disk.size and isinstance(damage, CutOffError):
+                found.cut_bytes = disk.size - at
+                break
             found.problems.append(f"bytes {at} to {after} are not readable: {damage}")
             at = after
     return found
@@ -165,7 +184,7 @@ def _step(disk: Disk, at: int, found: Contents) -> int:
     op, length = PREFIX.unpack(disk.read(at, PREFIX.size))
     end: int = at + PREFIX.size + length
     if end > disk.size:
-        raise DamageError("a record is cut off")
+        raise CutOffError("a record is cut off")
     if op == Op.CHUNK:
         _add_chunk(disk, at, found)
         return end
@@ -268,6 +287,7 @@ def _add_channel(found: Contents, content: bytes | memoryview) -> None:
 def _add_metadata(found: Contents, content: bytes | memoryview) -> None:
     name, entries = mcap.Metadata.unpack(content)
     told = dict(entries)
-    if told.pop(CHECKSUM, None) not in (None, checksum(entries)):
+    known = told.pop(CHECKSUM, None)
+    if known != checksum(entries) and (found.ours or known is not None):
         raise DamageError(f"the metadata {name!r} is not what was written")
     found.metadata.append(mcap.Metadata(name, told))

@@ -6,6 +6,9 @@ The rules of reading, as of every reader on the mesh (msgspec applies them to ea
 - a field that the recorded message does not have takes today's default; where there is none, the message cannot be read
   as that type, only as the map that it is;
 - a field whose type or limits have changed is read where the recorded value fits today's, else as above.
+
+An output that is compared with a recorded one (`cocoro.capture.rerun`) is compared by the fields that both types have:
+of a field that has come since nothing was recorded, and one that is no more is not made. What has changed is told.
 """
 
 from __future__ import annotations
@@ -84,6 +87,43 @@ def _object_changes(old: Mapping[str, Any], new: Mapping[str, Any], where: str) 
     for name in sorted(set(before) & set(after)):
         if _plain(before[name]) != _plain(after[name]):
             yield Change(f"{where}{name} has changed", readable=False)
+
+
+def known_to(recorded: bytes, value: Any) -> Any:
+    """A message, made of maps and lists, without the fields that a recorded schema does not have; all of it, where
+    that is no schema."""
+    try:
+        root = json.loads(recorded)
+    except ValueError:
+        return value
+    return _known(root, root, value) if isinstance(root, dict) else value
+
+
+def _known(root: Mapping[str, Any], node: Any, value: Any) -> Any:
+    node = _resolved(root, node, value)
+    if isinstance(value, Mapping):
+        fields, others = node.get("properties"), node.get("additionalProperties")
+        if fields is not None:
+            return {name: _known(root, fields[name], item) for name, item in value.items() if name in fields}
+        return {name: _known(root, others, item) for name, item in value.items()}
+    if isinstance(value, list | tuple):
+        first, rest = node.get("prefixItems", ()), node.get("items")
+        return [_known(root, first[n] if n < len(first) else rest, item) for n, item in enumerate(value)]
+    return value
+
+
+def _resolved(root: Mapping[str, Any], node: Any, value: Any) -> Mapping[str, Any]:
+    """Behind its references; of several, the one that may be meant."""
+    if not isinstance(node, dict):
+        return {}
+    if "$ref" in node:
+        return _resolved(root, root.get("$defs", {}).get(str(node["$ref"]).rpartition("/")[2]), value)
+    kind = "object" if isinstance(value, Mapping) else "array" if isinstance(value, list | tuple) else ""
+    for part in node.get("anyOf", ()):
+        found = _resolved(root, part, value)
+        if found.get("type") == kind:
+            return found
+    return node
 
 
 def _plain(node: Any) -> Any:

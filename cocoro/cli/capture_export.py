@@ -55,6 +55,8 @@ def export(
             _done(f"{rrd}: {messages} messages; open it with `rerun {rrd}`")
         for problem in capture.problems:
             print(f"missing: {problem}", file=sys.stderr)
+        if capture.ending:
+            print(f"note: {file} was {capture.ending}", file=sys.stderr)
         return exits.FAILED if capture.problems else exits.DONE
 
 

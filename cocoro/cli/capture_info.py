@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
 from cocoro.capture.info import Report, report
 from cocoro.capture.reader import Capture
+from cocoro.capture.rewrite import REPAIRED
 from cocoro.cli import exits
 from cocoro.cli.table import table
 from cocoro.clock import NS
@@ -51,6 +54,7 @@ def _head(found: Report) -> list[str]:
     start = datetime.fromtimestamp(found.start_ns / NS, UTC).isoformat(timespec="milliseconds") if unix else "0"
     services = sorted(name.partition("/")[2] for name in found.metadata if name.startswith("service/"))
     versions = run.get("versions", {})
+    repaired = found.metadata.get(REPAIRED, {})
     lines = [
         ("file", found.path),
         ("robot", found.robot or "unknown"),
@@ -59,6 +63,7 @@ def _head(found: Report) -> list[str]:
         ("messages", f"{found.messages}"),
         ("size", f"{found.size_bytes / MB:.1f} MB, of {found.raw_bytes / MB:.1f} MB of payloads"),
         ("state", _state(found)),
+        ("made of", "; ".join(_repaired(repaired))),
         ("recorder", " on ".join(filter(None, (run.get("recorder", ""), run.get("host", ""))))),
         ("services", ", ".join(services)),
         ("files", "; ".join(_files(found))),
@@ -72,8 +77,16 @@ def _state(found: Report) -> str:
     if found.problems:
         return "damaged: what can be read is below"
     if not found.closed:
-        return "not closed: it is still being written, or its recorder was killed; all that is there is readable"
+        return f"{found.ending}; all else that is there is readable"
     return "whole, every byte read" if found.checked else "whole"
+
+
+def _repaired(repaired: Mapping[str, Any]) -> list[str]:
+    """What is missing in a capture that was made of one that was not whole."""
+    if not repaired:
+        return []
+    ending = f"{repaired.get('file', '')}, which was {repaired.get('ending') or 'damaged'}"
+    return [ending, *map(str, repaired.get("problems") or ())]
 
 
 def _files(found: Report) -> list[str]:

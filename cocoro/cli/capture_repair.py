@@ -38,6 +38,8 @@ def repair(
     print(f"{done.path}: {done.messages} messages, {done.size_bytes / 1e6:.1f} MB")
     for problem in done.problems:
         print(f"missing: {problem}")
+    if capture.ending:
+        print(f"note: {file} was {capture.ending}")
     return exits.DONE
 
 

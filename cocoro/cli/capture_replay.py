@@ -56,6 +56,8 @@ async def replay(file: Path, only: list[str], hardware: bool, options: dict[str,
                 claim.release()
         for problem in capture.problems:
             print(f"not played: {problem}", file=sys.stderr)
+        if capture.ending:
+            print(f"note: {file} was {capture.ending}", file=sys.stderr)
         return exits.FAILED if capture.problems else exits.DONE
 
 

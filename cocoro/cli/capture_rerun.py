@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -23,6 +24,9 @@ def rerun(files: list[Path], service: str, against: str, tolerance: float, as_js
         if len({capture.robot for capture in captures}) > 1:
             raise CaptureError("these captures are of several robots")
         result = rerunning.rerun(captures, service, tolerance, compare=against == "recorded")
+    for capture in captures:
+        if capture.ending:
+            print(f"note: {capture.path} was {capture.ending}", file=sys.stderr)
     if as_json:
         print(msgspec.json.encode(result).decode())
     else:
