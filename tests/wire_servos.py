@@ -102,6 +102,13 @@ class Moved:
                 if any(text in fault for fault in health.faults):
                     return
 
+    async def without(self, network: str, text: str) -> None:
+        """Until none of its faults says this. On a busy machine others may come and go."""
+        async with asyncio.timeout(LONG_S):
+            async for health in self.service.tester.stream(topics.HEALTH.of(network)):
+                if not any(text in fault for fault in health.faults):
+                    return
+
     async def healthy(self, network: str) -> None:
         async with asyncio.timeout(LONG_S):
             async for health in self.service.tester.stream(topics.HEALTH.of(network)):
