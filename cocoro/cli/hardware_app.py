@@ -1,4 +1,4 @@
-"""`cocoro base`, `cocoro servos` and `cocoro doctor`; `app` takes them in."""
+"""`cocoro base`, `cocoro servos`, `cocoro kinect` and `cocoro doctor`; `app` takes them in."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ base = typer.Typer(invoke_without_command=True)
 servos = typer.Typer(
     no_args_is_help=True, help="Find, set up, calibrate, hold and relax the servos; clear their faults."
 )
+kinect = typer.Typer(no_args_is_help=True, help="Calibrate the Kinect; tilt it.")
 
 Robot = Annotated[str | None, typer.Option(help="Which robot; needed only when several are up here.")]
 Reach = Annotated[
@@ -35,6 +36,7 @@ Write = Annotated[
 def add_to(app: typer.Typer) -> None:
     app.add_typer(base, name="base", rich_help_panel=PANEL)
     app.add_typer(servos, name="servos", rich_help_panel=PANEL)
+    app.add_typer(kinect, name="kinect", rich_help_panel=PANEL)
     app.command(rich_help_panel=PANEL)(doctor)
 
 
@@ -148,6 +150,40 @@ def limits(
     from cocoro.cli import servos_by_hand as tools
 
     sys.exit(tools.limits(profile, joints, port, baud, write))
+
+
+# --- kinect, while it is down -----------------------------------------------------------------------
+
+
+@kinect.command("calibrate")
+def calibrate_kinect(
+    board: Annotated[
+        str, typer.Option(metavar="CxR", help="Inner corners of the chessboard, across and down.")
+    ] = "9x6",
+    square: Annotated[float, typer.Option(metavar="MM", help="The side of one square.")] = 25.0,
+    views: Annotated[int, typer.Option(min=6, max=200, help="So many views are taken.")] = 30,
+    source: Annotated[
+        Path | None, typer.Option("--from", metavar="FOLDER", help="Views that were kept, instead of the device.")
+    ] = None,
+    keep: Annotated[Path | None, typer.Option(metavar="FOLDER", help="Keep the views, to calibrate from anew.")] = None,
+    profile: Profile = "robot",
+    write: Write = None,
+) -> None:
+    """Measure lenses, registration and depth curve from views of a chessboard. The robot must be down."""
+    from cocoro.cli import kinect as tools
+
+    sys.exit(tools.calibrate(profile, board, square, views, source, keep, write))
+
+
+@kinect.command()
+def tilt(
+    angle: Annotated[float, typer.Argument(metavar="DEG", min=-30.0, max=30.0, help="Upward is positive.")],
+    profile: Profile = "robot",
+) -> None:
+    """Move the Kinect's own tilt motor. The robot's description wants it at 0: its neck tilts."""
+    from cocoro.cli import kinect as tools
+
+    sys.exit(tools.tilt(profile, angle))
 
 
 # --- doctor ---------------------------------------------------------------------------------------
