@@ -44,7 +44,7 @@ from sim.wire.faults import KINDS, Fault
 
 NS, MS = 1_000_000_000, 1_000_000
 STOP_NS = 300 * MS
-SEEN_S, AGAIN_S = 8.0, 15.0
+SEEN_S, AGAIN_S = 8.0, 40.0
 FAR_NS = 10**19
 LINES = ("create", "arm", "hand")
 ROBOT = Robot.load()

@@ -10,7 +10,7 @@ from functools import wraps
 from pathlib import Path
 
 import pytest
-from wire_servos import LONG_S, REPLY_S, ServoBench, angle, moved
+from wire_servos import LONG_S, MS, REPLY_S, ServoBench, angle, moved
 
 from cocoro import topics
 from cocoro.errors import ConfigError, RemoteError
@@ -18,6 +18,7 @@ from cocoro.messages import EstopRequest, ServoRequest
 from cocoro.robot import SERVO_COUNT_RAD, Robot
 from cocoro.testing import ServiceUnderTest
 from services.servos.bus import Bus, PortError, RefusedWriteError, SilentError
+from services.servos.line import STATE
 from sim.wire.faults import Fault
 
 ELBOW = 5
@@ -87,6 +88,19 @@ def test_a_port_that_is_not_there_or_goes_away_is_said(bench: ServoBench, tmp_pa
         bench.call(bench.emulator.lines["arm"].port.unplug)
         with pytest.raises(PortError):
             bus.reading(ELBOW)
+
+
+def test_an_answer_that_comes_late_is_not_taken_for_that_to_another_question(bench: ServoBench) -> None:
+    line, servo = bench.emulator.lines["arm"], bench.servo(ELBOW)
+    bench.call(lambda: (servo.put(28, 2), servo.put(29, 2)))  # in a reading's place these would be a load
+    with Bus(bench.port("arm"), 1_000_000, 0.3) as bus:
+        for _ in range(3):
+            bench.call(lambda: line.disturb(Fault("late", 1.0, "to_driver", FOREVER_NS, 450 * MS)))
+            with pytest.raises(SilentError):
+                bus.read_block(ELBOW, *STATE)
+            bench.call(line.undisturb)
+            assert bus.reading(ELBOW).position == 512
+            assert bus.strays > 0
 
 
 # --- the service ------------------------------------------------------------------------------------

@@ -23,7 +23,7 @@ from services.base.driver import Report
 
 log = logging.getLogger("cocoro.base")
 
-HANGS_S = 0.18
+HANGS_S = 0.2
 """A guard reports at least twenty times a second; one that does not is killed."""
 AGAIN_S = 1.0
 """So long a guard may take to report first; and one that dies sooner is not started again at once."""

@@ -14,12 +14,13 @@ from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from queue import Empty, SimpleQueue
+from typing import NamedTuple
 
 from services.servos import table
 from services.servos.bus import Bus, PortError, RefusedWriteError, SilentError
 from services.servos.motion import HOLD_RADPS
 from services.servos.network import MISSES, Met, Task
-from services.servos.table import Reading
+from services.servos.table import Reading, Register
 
 log = logging.getLogger("cocoro.servos")
 
@@ -30,7 +31,20 @@ CHECK_CYCLES = 8
 """In each of so many cycles one servo is looked at closer."""
 ORDERS_S = 0.2
 """Orders that were not renewed for so long are not written any more: the event loop hangs."""
-_TORQUE, _GOAL, _LIMIT = (table.REGISTERS[name] for name in ("torque_enable", "goal_position", "torque_limit"))
+_TORQUE, _SLOPE, _GOAL, _LIMIT = (
+    table.REGISTERS[name] for name in ("torque_enable", "cw_slope", "goal_position", "torque_limit")
+)
+STATE = _TORQUE.address, _LIMIT.address + _LIMIT.size - _TORQUE.address
+"""First register and length of what is read of a servo's state: longer than a reading."""
+
+
+class _State(NamedTuple):
+    """What was written into a servo."""
+
+    torque: bool
+    slope: int
+    goal: int
+    limit: int
 
 
 @dataclass
@@ -172,14 +186,11 @@ class ServoLine:
             event.refused.append((task, str(error)))
 
     def _meet(self, bus: Bus, number: int) -> Met:
-        data, _ = bus.read_block(number, _TORQUE.address, _GOAL.address + _GOAL.size - _TORQUE.address)
-        if len(data) < _GOAL.address + _GOAL.size - _TORQUE.address:
-            raise SilentError(number)
+        state = self._state(bus, number)
         reading = bus.reading(number)
-        if data[0] and not reading.error & table.SHUTDOWNS:  # it holds already, but perhaps by another's settings
+        if state.torque and not reading.error & table.SHUTDOWNS:  # it holds already, but perhaps by another's settings
             self._set(bus, number)
-        goal = int.from_bytes(data[_GOAL.address - _TORQUE.address :], "little")
-        return Met(bool(data[0]), goal, reading.position, reading.error)
+        return Met(state.torque, state.goal, reading.position, reading.error)
 
     def _set(self, bus: Bus, number: int) -> None:
         setting = self._settings[number]
@@ -189,11 +200,14 @@ class ServoLine:
 
     def _enable(self, bus: Bus, number: int) -> int:
         """Have a servo hold where it is. The order matters: what decides how it would move comes before what might
-        make it move, and its goal is where it is before its torque is on."""
+        make it move, and its goal is where it is before its torque is on. That this was written is read, too: a
+        confirmation that came late may be another's."""
         bus.write(number, "moving_speed", round(HOLD_RADPS / table.SPEED_RADPS))
         self._set(bus, number)
         position = bus.reading(number).position
         bus.write(number, "goal_position", position)
+        if self._state(bus, number).goal != position:
+            raise SilentError(number)
         bus.write(number, "torque_enable", 1)
         return position
 
@@ -209,11 +223,21 @@ class ServoLine:
                 event.checked[number] = self._is_as_set(bus, number)
 
     def _is_as_set(self, bus: Bus, number: int) -> bool:
-        data, _ = bus.read_block(number, _TORQUE.address, _LIMIT.address + _LIMIT.size - _TORQUE.address)
-        setting = self._settings[number]
-        slope = data[table.REGISTERS["cw_slope"].address - _TORQUE.address]
-        limit = int.from_bytes(data[_LIMIT.address - _TORQUE.address :], "little")
-        return (data[0], slope, limit) == (1, setting.slope, setting.torque_limit)
+        state, setting = self._state(bus, number), self._settings[number]
+        return (state.torque, state.slope, state.limit) == (True, setting.slope, setting.torque_limit)
+
+    def _state(self, bus: Bus, number: int) -> _State:
+        """What was written into a servo. Always this whole block: an answer says nothing of what it answers, and one
+        that comes late must not be taken for that to another question, such as `Bus.reading`."""
+        data, _ = bus.read_block(number, *STATE)
+        if len(data) < STATE[1]:
+            raise SilentError(number)
+
+        def value(register: Register) -> int:
+            at = register.address - STATE[0]
+            return int.from_bytes(data[at : at + register.size], "little")
+
+        return _State(bool(value(_TORQUE)), value(_SLOPE), value(_GOAL), value(_LIMIT))
 
     def _tell(self, event: Event) -> None:
         with suppress(RuntimeError):  # the loop has ended
