@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from chessboard import Eyes, Painter, lying
 
+from cocoro.cli import kinect as command
 from cocoro.errors import CocoroError, ConfigError
 from cocoro.robot import Robot
 from cocoro.robot_file import write_values
@@ -160,6 +161,30 @@ def test_a_view_is_taken_when_the_board_is_held_still_somewhere_new(painter: Pai
     assert np.allclose(read[0].corners_px, collector.views[0].corners_px)
     whole = corners_of(*places[0])
     assert min(np.abs(read[0].corners_px - order).max() for order in (whole, whole[::-1])) < 0.5
+
+
+def test_the_command_calibrates_from_kept_views_and_writes_the_robots_file(
+    painter: Painter, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    rng = np.random.default_rng(4)
+    for number in range(1, 8):
+        board = held(rng)
+        tools.save(tmp_path, number, painter.colour(*board), painter.depth(*board))
+    assert command.calibrate("robot", "8x6", 40.0, 30, tmp_path, None, None) == 0
+    out = capsys.readouterr().out
+    assert "7 views" in out
+    assert 'measured = "calliope-measured.toml"' in out
+    kinect = Robot.load(None, tmp_path / "calliope-measured.toml").kinect
+    assert kinect.colour_lens is not None
+    assert kinect.colour_lens[0] == pytest.approx(EYES.colour[0], rel=0.02)
+    assert kinect.depth_lens is not None
+    with pytest.raises(ConfigError, match="write the inner corners as 9x6"):
+        command.calibrate("robot", "8 by 6", 40.0, 30, tmp_path, None, None)
+    with pytest.raises(ConfigError, match="side of a square in mm"):
+        command.calibrate("robot", "8x6", 0.04, 30, tmp_path, None, None)
+    with pytest.raises(ConfigError, match="holds views already"):
+        command.calibrate("robot", "8x6", 40.0, 30, None, tmp_path, None)
 
 
 def test_depths_of_a_still_view_are_their_middle_and_none_where_one_is_missing() -> None:

@@ -31,8 +31,9 @@ log = logging.getLogger("cocoro.kinect")
 
 AGAIN_S = 1.0
 """Between two attempts to open the device."""
-HANGS_S = 6.0
-"""A process that neither sends pictures nor ends within this time is killed: longer than it waits itself."""
+FIRST_S, HANGS_S = 6.0, 2.0
+"""A process that neither sends pictures (the first takes a while) nor ends within this time is killed: longer than it
+waits itself."""
 END_S = 1.0
 SAID_BYTES = 4096
 _PACKAGE = str(Path(__file__).parents[2])
@@ -70,11 +71,12 @@ class FreenectCamera:
 
     async def shots(self) -> AsyncIterator[Shot]:
         while True:
+            limit_s = FIRST_S if self._fault else HANGS_S
             try:
-                async with asyncio.timeout(HANGS_S):
+                async with asyncio.timeout(limit_s):
                     await self._came.wait()
             except TimeoutError:
-                if self._process is not None and time.monotonic() - self._heard_s > HANGS_S:
+                if self._process is not None and time.monotonic() - self._heard_s > limit_s:
                     self._lost("the Kinect's library hangs")
                 continue
             self._came.clear()
