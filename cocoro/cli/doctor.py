@@ -25,7 +25,7 @@ from cocoro.rundir import RunDir
 LIBRARIES = {
     "base": ("pyserial",),
     "servos": ("pyserial", "dynamixel-sdk"),
-    "kinect": ("numpy", "opencv-python-headless", "scipy"),
+    "kinect": ("numpy", "opencv-python-headless"),
     "perception": ("numpy", "opencv-python-headless"),
     "sim": ("pybullet", "moderngl"),
     "wire": ("pybullet", "moderngl"),

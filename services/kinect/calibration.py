@@ -18,7 +18,6 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 
 from cocoro.errors import CocoroError
 from cocoro.robot import LensValues, Robot, Vec3
@@ -37,6 +36,11 @@ MOST_COLOUR_PX, MOST_DEPTH_CODES = 1.0, 3.0
 """With a larger misfit it is no good calibration: a bent board, a wrong number of squares, a board that moved."""
 NOISE_CODES = 2.0
 """More than a pixel's own noise: neighbours err together."""
+
+HUBER = 2.0
+MEDIAN_TO_SIGMA = 1.4826
+ITERATIONS, SETTLED, SLOPE_STEP = 15, 1e-3, 1e-4
+"""Steps are in sigmas of the priors."""
 
 # Of Kinects in general: where the search begins, and how far it goes where no view says anything (one sigma).
 FOCAL_PX, FOCAL_SIGMA_PX = 585.0, 15.0
@@ -238,23 +242,41 @@ class _DepthFit:
 
     def fit(self) -> tuple[_Guess, Array, float]:
         """The depth camera, the doubt of its place (m, one sigma), and the misfit in codes."""
-        guess = _Guess(self._start, self._a)
+        steps = np.zeros(len(self._start))
         for count in PIXELS_A_VIEW:  # which pixels show the board depends on the guess
-            pixels, codes, planes = self._on_boards(guess, count)
-            steps = (guess.values - self._start) / self._sigma
-            found = least_squares(self._misfits, steps, loss="soft_l1", f_scale=2.0, args=(pixels, codes, planes))
-            guess = _Guess(self._start + found.x * self._sigma, self._a)
-        slopes = np.asarray(found.jac)
-        spread = np.linalg.inv(slopes.T @ slopes)
-        doubt = np.sqrt(np.diag(spread)) * self._sigma
-        _, depth_m = guess.along(pixels, planes)
-        return guess, doubt[9:12], float(np.median(np.abs(guess.codes(depth_m) - codes))) * 1.4826
+            seen = self._on_boards(self._guess(steps), count)
+            steps, information = self._descend(steps, *seen)
+        guess = self._guess(steps)
+        doubt = np.sqrt(np.diag(np.linalg.inv(information))) * self._sigma
+        misfit = float(np.median(np.abs(self._misfits(steps, *seen)))) * NOISE_CODES
+        return guess, doubt[9:12], MEDIAN_TO_SIGMA * misfit
+
+    def _guess(self, steps: Array) -> _Guess:
+        """So many sigmas from the start, for each of its numbers."""
+        return _Guess(self._start + steps * self._sigma, self._a)
+
+    def _descend(self, steps: Array, pixels: Array, codes: Array, planes: Array) -> tuple[Array, Array]:
+        """Gauss-Newton with Huber weights and the priors; where it settles, and the information there."""
+        for _ in range(ITERATIONS):
+            misfits = self._misfits(steps, pixels, codes, planes)
+            slopes = np.empty((len(misfits), len(steps)))
+            for number in range(len(steps)):
+                beside = steps.copy()
+                beside[number] += SLOPE_STEP
+                slopes[:, number] = (self._misfits(beside, pixels, codes, planes) - misfits) / SLOPE_STEP
+            weighted = slopes * (HUBER / np.maximum(np.abs(misfits), HUBER))[:, None]
+            information = weighted.T @ slopes + np.eye(len(steps))
+            move = np.linalg.solve(information, -weighted.T @ misfits - steps)
+            steps = steps + move
+            if float(np.abs(move).max()) < SETTLED:
+                break
+        return steps, information
 
     def _misfits(self, steps: Array, pixels: Array, codes: Array, planes: Array) -> Array:
-        """In units of their sigma: of each pixel, then of the priors."""
-        guess = _Guess(self._start + steps * self._sigma, self._a)
+        """Of each pixel, in sigmas."""
+        guess = self._guess(steps)
         _, depth_m = guess.along(pixels, planes)
-        return np.concatenate([(guess.codes(depth_m) - codes) / NOISE_CODES, steps])
+        return (guess.codes(depth_m) - codes) / NOISE_CODES
 
     def _on_boards(self, guess: _Guess, count: int) -> tuple[Array, Array, Array]:
         """Pixels (n, 2), codes (n,) and planes (n, 4) of the depth that shows the boards."""
