@@ -314,6 +314,8 @@ class WheelTrial(Message):
     before_m: Vec2
     after_m: Vec2
     """The target over the floor, body frame, each the mean of several frames while the robot stood."""
+    height_m: Finite | None = None
+    """How high above the floor its centre was seen, at the end."""
 
 
 # --- executive ------------------------------------------------------------------------------------

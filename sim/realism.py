@@ -12,6 +12,7 @@ from typing import Literal
 import numpy as np
 
 from cocoro.kinematics import Array
+from sim.seeds import stream
 
 Sensors = Literal["ideal", "real"]
 
@@ -41,6 +42,11 @@ REALISM: dict[Sensors, BodyRealism] = {
         exact_odometry=False,
     ),
 }
+
+
+def wheel_scales(seed: int, realism: BodyRealism) -> Array:
+    """How far the left and the right wheel of a run roll for a metre that they are told to; shape (2,)."""
+    return np.asarray(1.0 + stream(seed, "wheel scale").uniform(-1.0, 1.0, 2) * realism.wheel_scale_error)
 
 
 class Wander:

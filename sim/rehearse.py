@@ -19,9 +19,10 @@ from cocoro.bus.local import LocalMesh
 from cocoro.clock import NS, VirtualClock
 from cocoro.core import Core
 from cocoro.errors import CocoroError, ConfigError
+from cocoro.inbox import Stream
 from cocoro.learning.collector import TOPICS, HandCollector, WheelCollector, collector
 from cocoro.messages import Detections, Frame, Recording, TaskReply, TaskRequest, TaskState
-from cocoro.node import Node, Stepper, Stream
+from cocoro.node import Node, Stepper
 from cocoro.objects import Catalogue
 from cocoro.picture import draw, save_png
 from cocoro.processes import load, named
@@ -31,6 +32,7 @@ from cocoro.vloop import run_virtual
 from sim.judge import Judge
 from sim.pursuit import PursuitJudge
 from sim.random_scene import find_scene
+from sim.realism import REALISM, wheel_scales
 from sim.trace import Trace
 from sim.wear import body_of
 
@@ -153,7 +155,7 @@ class _Rehearsal:
             operator.on(topics.TASK, self._trace.state)
             operator.on(topics.RECORDING.of(RECORDER), self._keep_recording)
             if request.samples is not None and request.task in TOPICS:
-                self._collector = collector(request.task, Path(request.samples), robot)
+                self._collector = collector(request.task, Path(request.samples), robot, self._standing_height_m())
                 stack.enter_context(self._collector)
             task = asyncio.ensure_future(self._operate(operator))
             try:
@@ -270,6 +272,12 @@ class _Rehearsal:
         except CocoroError as error:
             return TaskReply(accepted=False, refusal="not_alive", text=str(error))
 
+    def _standing_height_m(self) -> float | None:
+        """Of the target's centre, as the robot knows the object."""
+        catalogue = Catalogue.load(Path(self._request.objects) if self._request.objects else None)
+        known = catalogue.get(self._request.label)
+        return known.size_m[2] / 2 if known is not None else None
+
     def _keep_recording(self, recording: Recording) -> None:
         self._recording = recording
 
@@ -283,6 +291,16 @@ class _Rehearsal:
         if self._frame is not None and self._request.picture is not None:
             catalogue = Catalogue.load(Path(self._request.objects) if self._request.objects else None)
             save_png(draw(self._frame, self._seen, catalogue), Path(self._request.picture))
+
+    def _true_body(self) -> dict[str, Any]:
+        request, separation_m = self._request, self._body.base.wheel_separation_m
+        scales = wheel_scales(request.seed, REALISM[request.sensors])
+        return {
+            "kind": request.body,
+            "wheel_separation_m": separation_m,
+            # Wheels that roll further than they are told to turn it as if they stood nearer together.
+            "turning_separation_m": separation_m / float(scales.mean()),
+        }
 
     def _result(self, state: TaskState) -> dict[str, Any]:
         request = self._request
@@ -304,6 +322,6 @@ class _Rehearsal:
             ],
             "truth": msgspec.to_builtins(self._judge.result()),
             "tasks": self._steps,
-            "body": {"kind": request.body, "wheel_separation_m": self._body.base.wheel_separation_m},
+            "body": self._true_body(),
             **({"trace": self._trace.data()} if request.trace else {}),
         }

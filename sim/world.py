@@ -17,7 +17,7 @@ from sim.bullet import Bullet
 from sim.contacts import Pair, bumper, collisions, touching_pairs
 from sim.mechanism import Mechanism
 from sim.model import build_model
-from sim.realism import REALISM, BodyRealism, Sensors, Wander
+from sim.realism import REALISM, BodyRealism, Sensors, Wander, wheel_scales
 from sim.scene import Light, Scene
 from sim.seeds import stream
 from sim.servos import Drive, ServoNetwork
@@ -104,8 +104,7 @@ class World:
         self._driven: list[Drive | None] = [None] * len(self._servos)
 
         sense_s = self._sense_every * self._dt_s
-        scale = stream(seed, "wheel scale").uniform(-1.0, 1.0, 2) * realism.wheel_scale_error
-        self._wheel_scale = 1.0 + scale
+        self._wheel_scale = wheel_scales(seed, realism)
         self._slip = Wander(stream(seed, "wheel slip"), 2, realism.wheel_slip, realism.slip_time_s, sense_s)
         self._scatter = Wander(
             stream(seed, "servo speed"),

@@ -10,9 +10,9 @@ from cocoro.cli.progress import View, view
 from cocoro.cli.tasks import Follower, interrupts
 from cocoro.errors import MeshError
 from cocoro.learning.collector import TOPICS, HandCollector, WheelCollector, collector
-from cocoro.messages import AboutRequest, TaskName, TaskRequest, TaskState
+from cocoro.messages import AboutRequest, ObjectsRequest, TaskName, TaskRequest, TaskState
 from cocoro.robot import Robot
-from cocoro.topics import ABOUT
+from cocoro.topics import ABOUT, OBJECTS
 
 BAR = 20
 """Characters of the progress bar."""
@@ -51,7 +51,7 @@ async def babble(where: Where, task: TaskName, wanted: int, file: Path, label: s
     code; raises ConfigError or RefusedError for a file that cannot be gone on with."""
     async with joined(where) as link:
         robot = await description(link)
-        with collector(task, file, robot) as kept:
+        with collector(task, file, robot, await _standing_height(link, label) if label else None) as kept:
             shown = BabbleView(view(as_json), kept, wanted)
             if len(kept) >= wanted:
                 shown.result(f"{file} holds enough already")
@@ -68,6 +68,12 @@ async def babble(where: Where, task: TaskName, wanted: int, file: Path, label: s
     if as_json:
         print(json.dumps(result))
     return code
+
+
+async def _standing_height(link: Link, label: str) -> float | None:
+    """Of the centre of a known object that stands on the floor, as the robot knows it."""
+    reply = await link.call(OBJECTS, ObjectsRequest())
+    return next((known.size_m[2] / 2 for known in reply.objects if known.label == label), None)
 
 
 async def description(link: Link) -> Robot:

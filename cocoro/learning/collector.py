@@ -88,9 +88,10 @@ class HandCollector:
 class WheelCollector:
     """Rows of the wheels' babbling. Use it with `with`; raises as `Writer` does."""
 
-    def __init__(self, path: Path, robot: Robot) -> None:
+    def __init__(self, path: Path, robot: Robot, target_height_m: float | None = None) -> None:
+        """`target_height_m`: of the target's centre above the floor, where that is known."""
         self._separation_m = robot.base.wheel_separation_m
-        self._writer = Writer(path, WheelRow, robot, wheel_header(robot))
+        self._writer = Writer(path, WheelRow, robot, wheel_header(robot, target_height_m))
 
     def __enter__(self) -> Self:
         return self
@@ -127,10 +128,13 @@ class WheelCollector:
                 before_m=message.before_m,
                 after_m=message.after_m,
                 turned_rad=message.turned_rad,
+                height_m=message.height_m,
             )
             self._writer.append([row])
 
 
-def collector(task: str, path: Path, robot: Robot) -> HandCollector | WheelCollector:
-    """For the task 'babble-arm' or 'babble-wheels'."""
-    return HandCollector(path, robot) if task == "babble-arm" else WheelCollector(path, robot)
+def collector(
+    task: str, path: Path, robot: Robot, target_height_m: float | None = None
+) -> HandCollector | WheelCollector:
+    """For the task 'babble-arm' or 'babble-wheels'; for the latter how high its target's centre stands."""
+    return HandCollector(path, robot) if task == "babble-arm" else WheelCollector(path, robot, target_height_m)

@@ -58,6 +58,8 @@ class WheelRow(msgspec.Struct, frozen=True, kw_only=True):
     """The target over the floor, body frame, each the mean of several frames while the robot stood."""
     turned_rad: float
     """What the base's own odometry said of the turn."""
+    height_m: float | None = None
+    """How high above the floor the target's centre was seen, at the end."""
 
 
 class Header(msgspec.Struct, frozen=True, kw_only=True):
@@ -69,6 +71,8 @@ class Header(msgspec.Struct, frozen=True, kw_only=True):
     joints: tuple[str, ...] = ()
     roll_rad: float = 0.0
     """The wrist roll throughout (hand samples)."""
+    target_height_m: float | None = None
+    """How high above the floor the target's centre is known to be (wheel trials)."""
     units: str = "rad, m, m/s, ns; body frame: x forward, y left, z up, origin on the floor between the wheels"
 
 
@@ -220,5 +224,7 @@ def hand_header(robot: Robot, joints: tuple[str, ...], roll_rad: float) -> Heade
     )
 
 
-def wheel_header(robot: Robot) -> Header:
-    return Header(format=WHEELS, version=VERSION, robot=robot.name, drawing=fingerprint_of(robot))
+def wheel_header(robot: Robot, target_height_m: float | None = None) -> Header:
+    return Header(
+        format=WHEELS, version=VERSION, robot=robot.name, drawing=fingerprint_of(robot), target_height_m=target_height_m
+    )

@@ -59,6 +59,8 @@ class ArmModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
 class WheelModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     separation_m: Annotated[float, Meta(gt=0.01, lt=10)]
+    eye_tilt_rad: Annotated[float, Meta(ge=-0.5, le=0.5)] = 0.0
+    """By how much the eye sees things higher than they are, as an angle at the neck."""
     training: Training
 
 

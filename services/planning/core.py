@@ -50,6 +50,7 @@ class PlanningCore:
         learned = self.learned
         self._limbs.reacher.use(learned.hand)
         self._limbs.reachability.use(learned.map, learned.mesh)
+        self._limbs.eye = learned.eye
         self._limbs.driver.turn_with(learned.separation_m)
         drawn_m = self._limbs.robot.base.wheel_separation_m
         self._senses.turning.ratio = drawn_m / learned.separation_m if learned.separation_m is not None else 1.0

@@ -13,6 +13,7 @@ from cocoro.errors import ConfigError
 from cocoro.kinematics import Array
 from cocoro.learning import model as models
 from cocoro.learning.drawing import Drawing
+from cocoro.learning.eye import Eye
 from cocoro.learning.handmap import HandMap
 from cocoro.learning.model import Model
 from cocoro.learning.reachability import ReachMesh
@@ -127,6 +128,7 @@ class Learned:
         self._text = NOTHING_LEARNED
         self._refusal = ""
         self.separation_m: float | None = None
+        self.eye = Eye(robot)
         self.hand: SeenHand | None = None
         """None: the rigid body, unseen."""
         self.map: HandMap | None = None
@@ -165,6 +167,7 @@ class Learned:
     def _take(self, model: Model) -> None:
         self._refusal = ""
         self.separation_m = model.wheels.separation_m if model.wheels is not None else None
+        self.eye = Eye(self._robot, model.wheels.eye_tilt_rad if model.wheels is not None else 0.0)
         arm = model.arm if self._config.reach == "learned" else None
         self._teacher, self.mesh = None, None
         learned = models.hand_map(arm, self._robot) if arm is not None else None

@@ -13,7 +13,7 @@ from cocoro.core import Output
 from cocoro.frames import Pose2
 from cocoro.kinematics import Array
 from cocoro.learning.draws import sobol
-from cocoro.messages import BaseCommand, HandSample, Vec2, WheelTrial
+from cocoro.messages import BaseCommand, HandSample, Vec2, Vec3, WheelTrial
 from cocoro.topics import HAND_SAMPLES, WHEEL_TRIALS
 from services.planning.behaviours.base import Plan, Scene
 from services.planning.postures import Postures
@@ -184,7 +184,7 @@ class BabbleWheels:
         self._phase_ns: int | None = None
         self._driving = False
         self._gaze: tuple[float, float] | None = None
-        self._seen: deque[Vec2] = deque(maxlen=self.LOOKS)
+        self._seen: deque[Vec3] = deque(maxlen=self.LOOKS)
         self._before: tuple[Vec2, Pose2] | None = None
         self._begun: Pose2 | None = None
 
@@ -237,7 +237,7 @@ class BabbleWheels:
         plan.head = (*self._gaze, 2.0)
         if spent_s < self.AWAY_S + self.SETTLE_S:
             return plan
-        self._seen.extend((x, y) for x, y, _ in places)
+        self._seen.extend(places)
         if len(self._seen) == self.LOOKS:
             self._looked(scene, plan)
         elif spent_s > self.LOST_S + self.LOOKS * scene.senses.sight_lag_s:
@@ -246,7 +246,7 @@ class BabbleWheels:
 
     def _looked(self, scene: Scene, plan: Plan) -> None:
         """A look is complete: it ends one trial and begins the next."""
-        x, y = np.median(np.array(self._seen), axis=0).tolist()
+        x, y, height_m = np.median(np.array(self._seen), axis=0).tolist()
         after = (x, y)
         if self._before is not None:
             before, start = self._before
@@ -263,6 +263,7 @@ class BabbleWheels:
                 turned_rad=moved.yaw_rad,
                 before_m=before,
                 after_m=after,
+                height_m=height_m,
             )
             plan.reports.append(Output(WHEEL_TRIALS, trial))
             self._done += 1

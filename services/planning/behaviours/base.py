@@ -12,6 +12,7 @@ import numpy as np
 from cocoro.core import Output
 from cocoro.frames import Pose2
 from cocoro.kinematics import Array
+from cocoro.learning.eye import Eye
 from cocoro.messages import BaseCommand, TargetEstimate
 from cocoro.robot import Robot
 from services.planning.arm import ArmController, Step
@@ -42,6 +43,7 @@ class Limbs:
     reachability: Reachability = field(init=False)
     unfolding: Array = field(init=False)
     """The floor places (n, 2), body frame, over which the arm swings when it unfolds."""
+    eye: Eye = field(init=False)
     grasp_height_m: float = 0.065
     """At which height what is in the hand was grasped: there it is put down."""
 
@@ -54,6 +56,7 @@ class Limbs:
         self.gaze = Gaze(robot, config.head)
         self.reachability = Reachability(config.arm, self.reacher)
         self.unfolding = self._unfolding()
+        self.eye = Eye(robot)
 
     def _unfolding(self) -> Array:
         arm = ArmController(self.robot, self.config.arm, self.reacher)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from math import hypot
 
+from cocoro.messages import Vec2
 from services.planning.behaviours.base import Plan, Scene
 from services.planning.behaviours.driving import BackOff
 from services.planning.course import Course
@@ -36,7 +37,9 @@ class GoTo:
         if backing is not None:
             return backing
         arm = limbs.arm.park(scene.angles, scene.dt_s)
-        place = target.odometry_position_m[:2]
+        # The arm works where things are seen; the wheels have to go to where they are.
+        x, y, _ = straight = limbs.eye.straight(target.position_m)
+        place = scene.body.apply(straight)[:2]
         move = self._course.step(
             place, scene.body, scene.senses.around, scene.fields(self._label), limbs.driver, scene.now_ns
         )
@@ -47,7 +50,7 @@ class GoTo:
             return Plan(scene.stand(), scene.still(), why, None, "failed", "lost")
         self._creeping |= move.arrived
         if self._creeping:
-            return self._creep(scene, Plan(scene.stand(), arm, "", head))
+            return self._creep(scene, Plan(scene.stand(), arm, "", head), (x, y))
         if move.look_at is not None:
             head = scene.look_at(scene.body.inverse().apply((*move.look_at, 0.0)))
         base = limbs.driver.command(move.speed_mps, move.turn_radps, scene.dt_s)
@@ -56,15 +59,12 @@ class GoTo:
             plan.base, plan.state, plan.reason = scene.stand(), "failed", "blocked"
         return plan
 
-    def _creep(self, scene: Scene, plan: Plan) -> Plan:
-        target = scene.target(self._label)
-        assert target is not None
-        x, y, _ = target.position_m
-        left_m = offset_to((x, y), (self._distance_m, 0.0)).ahead_m
+    def _creep(self, scene: Scene, plan: Plan, place_m: Vec2) -> Plan:
+        left_m = offset_to(place_m, (self._distance_m, 0.0)).ahead_m
         plan.distance_m, plan.why = abs(left_m), f"{left_m:+.3f} m to creep"
         if abs(left_m) > self.NEAR_ENOUGH_M:
             speed = min(max(2.0 * left_m, -self.CREEP_MPS), self.CREEP_MPS)
             plan.base = scene.limbs.driver.command(speed, 0.0, scene.dt_s)
         elif scene.standing:
-            plan.state, plan.why = "done", f"{self._label} is {hypot(x, y):.3f} m away"
+            plan.state, plan.why = "done", f"{self._label} is {hypot(*place_m):.3f} m away"
         return plan

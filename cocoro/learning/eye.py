@@ -1,0 +1,58 @@
+"""How the eye is tilted beyond what the drawing of the neck says: from a target of known height on the floor.
+
+An eye that is tilted too far up sees everything as if the room were turned about the neck's tilt axis: what is far away
+too high, and what is below the eye too far away. The first tells the angle, the second is what driving by sight suffers
+from (derived).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import atan2, cos, hypot, sin
+
+import numpy as np
+
+from cocoro.learning.dataset import WheelRow
+from cocoro.messages import Vec3
+from cocoro.robot import Robot
+
+LEAST_TRIALS = 4
+
+
+class Eye:
+    """Sees with the drawing of the neck, and knows by how much that is wrong."""
+
+    def __init__(self, robot: Robot, tilt_rad: float = 0.0) -> None:
+        """`tilt_rad`: by how much things are seen higher than they are, as an angle at the neck."""
+        self._axis_x_m, _, self._axis_z_m = (
+            robot.chain("neck_tilt").position({"neck_pan": 0.0, "neck_tilt": 0.0}).tolist()
+        )
+        self.tilt_rad = tilt_rad
+
+    def straight(self, seen_m: Vec3) -> Vec3:
+        """Where something is that is seen at a place; body frame."""
+        if self.tilt_rad == 0.0:
+            return seen_m
+        x, y, up = seen_m[0] - self._axis_x_m, seen_m[1], seen_m[2] - self._axis_z_m
+        level = hypot(x, y)
+        c, s = cos(self.tilt_rad), sin(self.tilt_rad)
+        share = (c * level + s * up) / max(level, 1e-6)
+        return self._axis_x_m + share * x, share * y, self._axis_z_m + c * up - s * level
+
+    def tilt_of(self, seen_m: Vec3, height_m: float) -> float:
+        """What one sighting of something of a known height says of the tilt, radians."""
+        level, up = hypot(seen_m[0] - self._axis_x_m, seen_m[1]), seen_m[2] - self._axis_z_m
+        # It is turned up to where it is seen from where it is: as far from the axis, at the known height.
+        away = hypot(level, up)
+        true_up = height_m - self._axis_z_m
+        return atan2(up, level) - atan2(true_up, max(away**2 - true_up**2, 1e-9) ** 0.5)
+
+
+def eye_tilt(trials: Sequence[WheelRow], height_m: float | None, robot: Robot) -> float | None:
+    """The median over wheel trials before a target whose centre is known to be so high; None where that is not known,
+    or too few trials tell how high it was seen."""
+    if height_m is None:
+        return None
+    eye = Eye(robot)
+    found = [eye.tilt_of((*row.after_m, row.height_m), height_m) for row in trials if row.height_m is not None]
+    return float(np.median(found)) if len(found) >= LEAST_TRIALS else None

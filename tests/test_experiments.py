@@ -1,0 +1,230 @@
+"""The paper's experiments: what is run, what is kept, and what the report says of given results."""
+
+from __future__ import annotations
+
+import json
+from math import cos, isnan, sin
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from learning_arm import sightings
+
+from cocoro.cli.experiment import Progress
+from cocoro.cli.main import main
+from cocoro.experiments import bodies, lessons, report
+from cocoro.experiments.every import EXPERIMENTS
+from cocoro.experiments.runs import Result, Run, perform
+from cocoro.experiments.settings import Settings
+from cocoro.experiments.stats import summarise
+from cocoro.learning.dataset import HandRow, WheelRow, Writer, hand_header, wheel_header
+from cocoro.learning.drawing import LEVEL_ROLL_RAD, Drawing
+from cocoro.learning.study import BEST
+from cocoro.rehearsal import RehearsalRequest
+from cocoro.robot import Robot
+
+# --- statistics ---------------------------------------------------------------------------------------
+
+
+def test_a_mean_has_a_confidence_interval_and_a_worst_that_depends_on_what_is_good() -> None:
+    values = [1.0, 2.0, 3.0, float("nan")]
+    low = summarise(values)
+    assert (low.mean, low.worst, low.runs, low.median) == (2.0, 3.0, 3, 2.0)
+    assert low.ci95 == pytest.approx(4.303 / 3**0.5, abs=1e-3)  # Student's t with 2 degrees of freedom
+    assert summarise(values, best="high").worst == 1.0
+    assert summarise([-3.0, 2.0], best="zero").worst == -3.0
+
+
+def test_one_value_has_no_interval_and_none_has_no_mean() -> None:
+    assert isnan(summarise([1.0]).ci95)
+    assert isnan(summarise([]).mean)
+
+
+# --- runs ---------------------------------------------------------------------------------------------
+
+
+class Quiet:
+    def __init__(self) -> None:
+        self.begun: list[str] = []
+
+    def begin(self, total: int, had: int) -> None: ...
+
+    def started(self, name: str) -> None:
+        self.begun.append(name)
+
+    def ended(self, name: str, result: Result) -> None: ...
+
+
+def test_every_experiment_asks_for_rehearsals_that_are_possible_and_names_what_it_needs(tmp_path: Path) -> None:
+    settings = Settings(seeds=(0, 1), out=tmp_path)
+    for experiment in EXPERIMENTS.values():
+        given: set[str] = set()
+        for run in experiment.runs(settings):
+            assert set(run.needs) <= given
+            given.add(run.name)
+            if run.kind == "rehearse":
+                request = msgspec.convert(run.fields, RehearsalRequest)
+                assert (request.sensors, request.body) == ("real", "worn")
+            else:
+                assert hasattr(lessons, run.kind)
+            json.dumps(run.fields)
+
+
+def test_what_cannot_be_run_fails_with_its_reason_and_so_does_what_needs_it(tmp_path: Path) -> None:
+    runs = [
+        Run("one", "learn", {"arm": str(tmp_path / "a"), "wheels": "w", "into": str(tmp_path / "m.json")}),
+        Run("two", "rehearse", {"task": "fetch"}, needs=("one",)),
+    ]
+    display = Quiet()
+    results = perform(runs, tmp_path / "runs", 1, display)
+    assert "No such file" in results["one"]["error"]
+    assert results["two"]["error"].startswith("one failed")
+    assert display.begun == ["one"]
+    assert not (tmp_path / "runs").exists()  # errors are not kept: the next time tries again
+
+
+def arm_and_wheels(settings: Settings, robot: Robot) -> None:
+    seen = sightings(robot, draws=60)
+    header = hand_header(robot, Drawing(robot).joints, LEVEL_ROLL_RAD)
+    with Writer(settings.arm_file(0), HandRow, robot, header) as writer:
+        writer.append(
+            HandRow(
+                stamp_ns=number * 10**8, draw=int(draw), angles_rad=tuple(angles), head_rad=(0.0, 0.0),
+                seen_m=tuple(place), area_px=300,
+            )
+            for number, (angles, place, draw) in enumerate(
+                zip(seen.angles_rad.tolist(), seen.places_m.tolist(), seen.draws, strict=True)
+            )
+        )  # fmt: skip
+    with Writer(settings.wheels_file(0), WheelRow, robot, wheel_header(robot, 0.06)) as writer:
+        writer.append(
+            WheelRow(
+                stamp_ns=number, trial=number, left_mps=-0.1, right_mps=0.1, left_m=-0.03 * way, right_m=0.03 * way,
+                before_m=(1.5, 0.0), after_m=(1.5 * cos(turn), -1.5 * sin(turn)), turned_rad=turn, height_m=0.06,
+            )
+            for number, way in enumerate((1, -1) * 3)
+            if (turn := 0.06 * way / 0.255)
+        )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def learned(tmp_path_factory: pytest.TempPathFactory, robot: Robot) -> tuple[Settings, Result]:
+    """A body that has learned, and what its lesson says."""
+    settings = Settings(seeds=(0,), out=tmp_path_factory.mktemp("experiments"))
+    arm_and_wheels(settings, robot)
+    run = bodies.learned(settings, 0)[-1]
+    return settings, lessons.learn(**run.fields, method=BEST.name)
+
+
+def test_a_lesson_tells_how_good_the_map_is_and_what_the_wheels_are(learned: tuple[Settings, Result]) -> None:
+    settings, result = learned
+    assert settings.model_file(0).is_file()
+    assert {score["name"] for score in result["arm"]["scores"]} >= {"the drawing", result["arm"]["chosen"]}
+    assert result["wheels"]["separation_m"] == pytest.approx(0.255, abs=1e-3)
+    assert set(result["curves"]["default"]) == set(result["curves"]["paper"])
+    json.dumps(result, allow_nan=False)
+
+
+def test_a_kept_result_is_used_until_what_it_stands_on_changes(tmp_path: Path) -> None:
+    kept = {"kind": "rehearse", "fields": {"task": "park"}, "after": {}, "result": {"outcome": "done"}}
+    (tmp_path / "one.json").write_text(json.dumps(kept))
+    (tmp_path / "two.json").write_text(json.dumps({**kept, "after": {"one": "something else"}}))
+    one = Run("one", "rehearse", {"task": "park"})
+    two = Run("two", "learn", {"arm": str(tmp_path / "none"), "wheels": "", "into": ""}, needs=("one",))
+    display = Quiet()
+    results = perform([one, two], tmp_path, 1, display)
+    assert results["one"] == {"outcome": "done"}
+    assert display.begun == ["two"]
+
+
+# --- report -------------------------------------------------------------------------------------------
+
+TRACE = {
+    "time_s": [0.0, 0.1], "phase": ["touch", "follow"], "target": ["red_can"] * 2, "body": [[0.0, 0.0, 0.0]] * 2,
+    "hand_m": [[0.4, 0.0, 0.2], [0.5, 0.0, 0.2]], "felt_m": [None, [0.5, 0.0, 0.2]],
+    "target_m": [[0.6, 0.0, 0.2]] * 2,
+}  # fmt: skip
+TOUCHED = {
+    "label": "red_can", "outcome": "done", "reason": "", "sim_s": 2.0, "longest_stall_s": 0.1, "target_edge_m": 0.205,
+    "hand_to_target": {"gap_m": 0.01, "rho_m": 0.01, "azimuth_rad": 0.0, "elevation_rad": 0.0},
+}  # fmt: skip
+FOLLOWED = {"mean_gap_m": 0.8, "max_gap_m": 1.1, "min_gap_m": 0.7, "lost_s": 0.1, "contacts": 0}
+FETCHED = {"held": True, "knocked_over": []}
+
+
+def made_up(run: Run, lesson: Result) -> dict[str, Any]:
+    """What a run might have come to."""
+    if run.kind == "learn":
+        return lesson
+    if run.kind == "bend":
+        return {"bent_at": 20, "fixed_m": [0.004] * 20 + [0.03] * 180, "adapted_m": [0.004] * 200, "changes": 1}
+    task = run.fields["task"]
+    return {
+        "task": task, "label": run.fields.get("label", ""), "seed": 0, "outcome": "done", "reason": "", "sim_s": 20.0,
+        "phases": [{"name": "search", "sim_s": 1.0}, {"name": "grasp", "sim_s": 2.0}], "trace": TRACE,
+        "tasks": [TOUCHED] * (12 if task == "touch" else 1), "truth": FOLLOWED if task == "follow" else FETCHED,
+        "body": {"wheel_separation_m": 0.256, "turning_separation_m": 0.255},
+    }  # fmt: skip
+
+
+def test_the_report_has_tables_plots_and_verdicts_in_every_format(learned: tuple[Settings, Result]) -> None:
+    settings, lesson = learned
+    sections = []
+    for experiment in EXPERIMENTS.values():
+        results = {run.name: made_up(run, lesson) for run in experiment.runs(settings)}
+        sections.append(experiment.section(settings, results))
+    path = report.write(sections, settings, plots=True)
+    text, page = path.read_text(), path.with_suffix(".html").read_text()
+    for section in sections:
+        assert f"## {section.key}: {section.title}" in text
+        assert section.plots
+        for plot in section.plots:
+            assert 2_000 < (settings.out / f"{plot.name}.png").stat().st_size < 150_000
+            assert f"]({plot.name}.png)" in text
+    assert "<img" in page
+    assert str(settings.out) not in text + page
+    data = json.loads((settings.out / "report.json").read_text())
+    held = {(row["measure"], row["held"]) for section in data["sections"] for row in section["rows"] if row["wanted"]}
+    assert ("reached of 12, in view", True) in held
+    assert ("fetched, of 3", True) in held
+    manifest = json.loads((settings.out / "manifest.json").read_text())
+    assert manifest["settings"]["seeds"] == [0]
+    assert manifest["versions"]["numpy"] == np.__version__
+
+
+def test_runs_that_could_not_be_are_reported_and_hold_nothing(learned: tuple[Settings, Result]) -> None:
+    settings, _ = learned
+    for experiment in EXPERIMENTS.values():
+        results = {run.name: {"error": "it broke"} for run in experiment.runs(settings)}
+        section = experiment.section(settings, results)
+        assert not any(row.held for row in section.rows)
+        assert not section.plots
+        json.dumps(section.data(), allow_nan=False)
+
+
+# --- the command --------------------------------------------------------------------------------------
+
+
+def test_an_unknown_experiment_is_refused_with_those_there_are(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["experiment", "E9"]) == 2
+    assert "known are E1, E2, E3, E4, E5, E6 and all" in capsys.readouterr().err
+
+
+def test_a_wrong_body_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["experiment", "E1", "--body", "bent"]) == 2
+    assert "nominal or worn" in capsys.readouterr().err
+
+
+def test_progress_tells_what_runs_and_what_could_not_be(capsys: pytest.CaptureFixture[str]) -> None:
+    import sys
+
+    progress = Progress(sys.stdout)
+    progress.begin(4, 1)
+    progress.started("learn-0")
+    progress.ended("babble-arm-0", {"error": "it broke"})
+    assert "2 of 4" in progress.text()
+    assert "1 could not be" in progress.text()
+    assert "learn-0" in progress.text()
+    assert "babble-arm-0: it broke" in capsys.readouterr().out

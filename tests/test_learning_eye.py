@@ -1,0 +1,50 @@
+"""The tilt of the eye, from targets of known height."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from cocoro.learning.dataset import WheelRow
+from cocoro.learning.eye import LEAST_TRIALS, Eye, eye_tilt
+from cocoro.messages import Vec3
+from cocoro.robot import Robot
+
+
+def seen(robot: Robot, true_m: Vec3, tilt_rad: float) -> Vec3:
+    """Where a camera that hangs on a neck whose tilt is off by so much has something, by the drawing."""
+    neck = robot.chain("camera")
+    angles = {"neck_pan": float(np.arctan2(true_m[1], true_m[0] - 0.032685)), "neck_tilt": -0.4}
+    really = neck.pose(angles | {"neck_tilt": -0.4 - tilt_rad})
+    x, y, z, _ = (neck.pose(angles) @ np.linalg.inv(really) @ np.array([*true_m, 1.0])).tolist()
+    return x, y, z
+
+
+def row(after_m: Vec3) -> WheelRow:
+    return WheelRow(
+        stamp_ns=1, trial=2, left_mps=0.1, right_mps=-0.1, left_m=0.1, right_m=-0.1, before_m=(1.5, 0.0),
+        after_m=after_m[:2], turned_rad=0.0, height_m=after_m[2],
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("tilt_rad", [-0.04, 0.0, 0.03])
+def test_what_a_tilted_eye_sees_is_put_straight(robot: Robot, tilt_rad: float) -> None:
+    eye = Eye(robot, tilt_rad)
+    for place in ((1.5, 0.0, 0.06), (0.4, -0.2, 0.3), (0.9, 0.8, 0.0)):
+        assert eye.straight(seen(robot, place, tilt_rad)) == pytest.approx(place, abs=1e-6)
+
+
+def test_the_tilt_is_learned_from_a_can_on_the_floor(robot: Robot) -> None:
+    places = [(1.5 + 0.02 * n, 0.1 * n, 0.06) for n in range(LEAST_TRIALS)]
+    trials = [row(seen(robot, place, 0.025)) for place in places]
+    assert eye_tilt(trials, 0.06, robot) == pytest.approx(0.025, abs=1e-6)
+
+
+def test_without_the_targets_height_or_with_few_trials_nothing_is_said_of_the_eye(robot: Robot) -> None:
+    trials = [row((1.5, 0.0, 0.1))] * LEAST_TRIALS
+    assert eye_tilt(trials, None, robot) is None
+    assert eye_tilt(trials[1:], 0.06, robot) is None
+
+
+def test_an_eye_that_is_as_drawn_changes_nothing(robot: Robot) -> None:
+    assert Eye(robot).straight((1.0, 0.3, 0.2)) == (1.0, 0.3, 0.2)
