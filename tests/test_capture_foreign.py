@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
+from cocoro.capture.export import foxglove
 from cocoro.capture.reader import Capture
 
 HERE = Path(__file__).parent
@@ -73,7 +74,7 @@ def reader(tmp_path_factory: pytest.TempPathFactory) -> Path:
     if shutil.which("node") is None or shutil.which("npm") is None:
         pytest.skip("node and npm are not installed: the npm packages cannot read the capture here")
     folder = tmp_path_factory.mktemp("foreign")
-    for name in ("package.json", "package-lock.json", "read.mjs"):
+    for name in ("package.json", "package-lock.json", "read.mjs", "foxglove.mjs"):
         shutil.copy(HERE / "foreign" / name, folder)
     command = ["npm", "ci", "--no-audit", "--no-fund", "--prefer-offline", "--ignore-scripts"]
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False, timeout=300)
@@ -85,9 +86,11 @@ def reader(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def _read(reader: Path, capture: Path, how: str) -> dict[str, Any]:
-    done = subprocess.run(
-        ["node", "read.mjs", str(capture), how], cwd=reader, capture_output=True, text=True, check=False, timeout=120
-    )
+    return _run(reader, "read.mjs", str(capture), how)
+
+
+def _run(reader: Path, *words: str) -> dict[str, Any]:
+    done = subprocess.run(["node", *words], cwd=reader, capture_output=True, text=True, check=False, timeout=120)
     assert done.returncode == 0, done.stderr
     found: dict[str, Any] = json.loads(done.stdout)
     return found
@@ -118,3 +121,14 @@ def test_the_npm_packages_read_what_a_killed_recorder_left(reader: Path, tmp_pat
         counts = Counter(record.key for record in capture.messages())
     assert {key: told["messages"] for key, told in found["keys"].items()} == counts
     assert sum(counts.values()) > 1000
+
+
+def test_what_is_exported_for_foxglove_is_by_foxgloves_own_schemas(reader: Path, tmp_path: Path) -> None:
+    with Capture.open(GOLDEN) as capture:
+        foxglove.export(capture, tmp_path / "fox.mcap")
+        frames = sum(1 for _ in capture.messages("kinect/frame"))
+    found = _run(reader, "foxglove.mjs", str(tmp_path / "fox.mcap"))
+    assert {name: told["problem"] for name, told in found.items() if told["problem"]} == {}
+    assert found["foxglove.PointCloud"]["messages"] == found["foxglove.CompressedImage"]["messages"] == frames
+    assert {"foxglove.CameraCalibration", "foxglove.FrameTransforms", "foxglove.SceneUpdate"} <= found.keys()
+    assert {"foxglove.ImageAnnotations", "foxglove.Log"} <= found.keys()

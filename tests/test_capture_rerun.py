@@ -254,6 +254,36 @@ def test_a_capture_that_does_not_have_what_it_takes_is_told_of(service: str, wor
         rerun([capture], service)
 
 
+def started_otherwise(out: Path, change: Callable[[dict[str, Any]], object]) -> Path:
+    """The golden capture as it were if the planner had had other settings."""
+    with Capture.open(GOLDEN) as capture:
+        infos = {key: info_in(capture, key) for key in capture.keys}
+        written = Writer(lambda _: out, Packer("lz4"), Limits(), lambda key, _: infos[key])
+        for name, entries in capture.metadata.items():
+            if name == "service/planning":
+                config = json.loads(entries["config"])
+                change(config)
+                entries["config"] = json.dumps(config)
+            written.remember(name, entries)
+        for each in capture.messages():
+            written.put(Entry(each.key, each.sequence, each.log_ns, each.publish_ns, bytes(each.payload)))
+        written.close()
+    return out
+
+
+def test_a_setting_that_has_come_since_takes_its_default(tmp_path: Path) -> None:
+    result = again(
+        started_otherwise(tmp_path / "older.mcap", lambda config: config.pop("rate_hz")), "planning", TOLERANCE
+    )
+    assert result.equal == result.steps > 250
+
+
+def test_a_setting_that_is_no_more_ends_it_with_its_name(tmp_path: Path) -> None:
+    path = started_otherwise(tmp_path / "older.mcap", lambda config: config.update(mood=3))
+    with pytest.raises(CaptureError, match=r"older\.mcap: what planning was started with cannot be had again: .*mood"):
+        again(path, "planning")
+
+
 # --- a core of a third party, over restarts -------------------------------------------------------
 
 

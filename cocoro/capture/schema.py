@@ -92,11 +92,17 @@ def _object_changes(old: Mapping[str, Any], new: Mapping[str, Any], where: str) 
 def known_to(recorded: bytes, value: Any) -> Any:
     """A message, made of maps and lists, without the fields that a recorded schema does not have; all of it, where
     that is no schema."""
+    root = _parsed(recorded)
+    return value if root is None else _known(root, root, value)
+
+
+@cache
+def _parsed(schema: bytes) -> dict[str, Any] | None:
     try:
-        root = json.loads(recorded)
+        root = json.loads(schema)
     except ValueError:
-        return value
-    return _known(root, root, value) if isinstance(root, dict) else value
+        return None
+    return root if isinstance(root, dict) else None
 
 
 def _known(root: Mapping[str, Any], node: Any, value: Any) -> Any:

@@ -1,0 +1,105 @@
+"""Damaged captures, and what every command that takes one makes of them.
+
+    python bench/capture_damage.py [--times 1000]
+
+Spoils a second of a rehearsed fetch at random, again and again, and has each command read it. None may hang, fail but
+in words, or find what was not recorded.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import random
+import tempfile
+import time
+from collections import defaultdict
+from contextlib import redirect_stderr, redirect_stdout, suppress
+from pathlib import Path
+
+from cocoro.capture.compression import Packer
+from cocoro.capture.errors import CaptureError
+from cocoro.capture.reader import Capture, Record
+from cocoro.capture.rewrite import rewrite
+from cocoro.cli.main import main as cocoro
+from cocoro.clock import NS
+from cocoro.rehearsal import RehearsalRequest
+from sim.rehearse import rehearse
+
+
+def damage(folder: Path, times: int) -> None:
+    """What each command makes of damaged captures."""
+    second, spoilt = folder / "second.mcap", folder / "spoilt.mcap"
+    request = RehearsalRequest(
+        task="fetch", label="red_can", width=160, height=120, frame_rate_hz=10.0, record=str(folder / "whole.mcap")
+    )
+    rehearse(request)
+    with Capture.open(folder / "whole.mcap") as capture:
+        rewrite(capture, second, Packer("zstd"), start_ns=capture.start_ns, end_ns=capture.start_ns + NS)
+    with Capture.open(second) as capture:
+        recorded = {_fingerprint(each) for each in capture.messages()}
+    data, draw = second.read_bytes(), random.Random(times)
+    counts: dict[tuple[str, int], int] = defaultdict(int)
+    slowest_s = 0.0
+    for number in range(times):
+        spoilt.write_bytes(_spoilt(data, draw))
+        commands = [
+            ["capture", "info", str(spoilt), "--check"],
+            ["capture", "repair", str(spoilt), "--out", str(folder / f"{number}.mcap")],
+            ["capture", "rerun", str(spoilt), "--service", "perception"],
+            ["capture", "rerun", str(spoilt), "--service", "planning"],
+            ["export", str(spoilt), "--csv", str(folder / "csv"), "--foxglove", str(folder / f"{number}-fox.mcap")],
+            ["export", str(spoilt), "--video", str(folder / f"{number}.mp4")],
+        ]
+        for command in commands:
+            said, started = io.StringIO(), time.monotonic()
+            with redirect_stdout(said), redirect_stderr(said):
+                code = cocoro(command)
+            slowest_s = max(slowest_s, time.monotonic() - started)
+            assert code in (0, 1), (number, command, code)
+            assert "Traceback" not in said.getvalue(), (number, command, said.getvalue())
+            counts[" ".join(word for word in command if "/" not in word), code] += 1
+        with suppress(CaptureError), Capture.open(spoilt) as capture:
+            found = [_fingerprint(each) for each in capture.messages()]
+            assert set(found) <= recorded, number
+            assert len(found) == len(set(found)), number
+        for made in folder.glob(f"{number}*"):
+            made.unlink()
+    print(f"{times} damages; nothing but words, nothing that was not recorded; the slowest command {slowest_s:.1f} s")
+    for (command_words, code), count in sorted(counts.items()):
+        print(f"  {command_words}: exit code {code}, {count} times")
+
+
+def _fingerprint(record: Record) -> tuple[str, int, int, int, int]:
+    return record.key, record.sequence, record.log_ns, record.publish_ns, hash(bytes(record.payload))
+
+
+def _spoilt(whole: bytes, draw: random.Random) -> bytes:
+    """Cut, flipped, blanked, with something taken away or put in; of a closed file, or of one without its end."""
+    data = bytearray(whole if draw.random() < 0.5 else whole[: round(len(whole) * draw.uniform(0.2, 0.95))])
+    at, length = draw.randrange(len(data)), draw.choice((1, 8, 600, 5000))
+    kind = draw.choice(("cut", "flip", "flip", "blank", "take", "put"))
+    if kind == "cut":
+        del data[at:]
+    elif kind == "flip":
+        for _ in range(draw.choice((1, 1, 2, 8))):
+            data[draw.randrange(len(data))] ^= 1 << draw.randrange(8)
+    elif kind == "blank":
+        data[at : at + length] = bytes(len(data[at : at + length]))
+    elif kind == "take":
+        del data[at : at + length]
+    else:
+        data[at:at] = draw.randbytes(length)
+    return bytes(data)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--times", type=int, default=1000)
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory(prefix="cocoro-") as folder:
+        damage(Path(folder), options.times)
+
+
+if __name__ == "__main__":
+    main()
