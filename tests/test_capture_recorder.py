@@ -13,7 +13,7 @@ import msgspec
 import pytest
 from capture_rig import STILL, Room, all_of, drive, entry, record, writer
 
-from cocoro import topics
+from cocoro import profiles, topics
 from cocoro.bus.base import Payload
 from cocoro.capture.reader import Capture
 from cocoro.capture.writer import Writer
@@ -296,6 +296,13 @@ def test_steps_that_are_to_be_recorded_begin_when_a_recorder_hears_them() -> Non
     begun.clear()
     run_virtual(scenario(False))
     assert begun[0] == round(RECORDER_S * NS)
+
+
+@pytest.mark.parametrize("name", ["robot", "sim", "sim-wire"])
+def test_the_recorder_is_part_of_every_profile_that_has_a_robot(name: str) -> None:
+    profile = profiles.read(name)
+    assert profile.processes[0] == "capture"  # the first to come up, the last to be stopped
+    assert all(profile.launch(service).record_steps for service in ("perception", "planning"))
 
 
 def test_captures_go_where_operator_or_environment_say(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
