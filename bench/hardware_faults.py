@@ -28,6 +28,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -123,13 +124,15 @@ class Services:
 
     def __init__(self, folder: Path) -> None:
         self._command = [sys.executable, "-m", "bench.hardware_driver", *(str(folder / line) for line in LINES)]
+        self._said = folder / "said"
         self.starts = 0
         self.start()
 
     def start(self) -> None:
-        self.process = subprocess.Popen(
-            self._command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
-        )
+        with self._said.open("w") as said:
+            self.process = subprocess.Popen(
+                self._command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=said, text=True
+            )
         self.told: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
         threading.Thread(target=self._read, args=(self.process, self.told), daemon=True).start()
         self.starts += 1
@@ -143,10 +146,16 @@ class Services:
     def alive(self) -> bool:
         return self.process.poll() is None
 
+    def last_words(self) -> str:
+        """Of a process that ended."""
+        lines = self._said.read_text(errors="replace").strip().splitlines()
+        return f"ended with {self.process.poll()}: {' / '.join(lines[-3:])}"
+
     def say(self, what: str) -> None:
         assert self.process.stdin is not None
-        self.process.stdin.write(json.dumps({"do": what}) + "\n")
-        self.process.stdin.flush()
+        with suppress(BrokenPipeError):  # that it has ended is noticed elsewhere
+            self.process.stdin.write(json.dumps({"do": what}) + "\n")
+            self.process.stdin.flush()
 
     def guard_pid(self) -> int | None:
         for child in psutil.Process(self.process.pid).children():
@@ -233,13 +242,16 @@ class Campaign:
             self._services.start()
         if not seen:
             tally.unseen += 1
-        if not self._services.alive:
-            tally.crashes += 1
-            self._services.start()
         moving = self._until_moving()
         self._judge(trial, tally)
-        if not moving:
+        if not self._services.alive:
+            tally.crashes += 1
+            tally.notes.append(self._services.last_words())
+            self._services.start()
+            self._until_moving()
+        elif not moving:
             tally.stuck += 1
+            tally.notes.append(self._state())
             self._services.kill()
             self._hardware.emulator.call(self._hardware.create.power_cycle)
             self._services.start()
@@ -299,6 +311,15 @@ class Campaign:
             except TimeoutError:
                 continue
         return False
+
+    def _state(self) -> str:
+        """What there is to know of hardware that does not move."""
+        create, servos = self._hardware.create, self._hardware.servos
+        told: list[Any] = []
+        while not self._services.told.empty():
+            told.append(self._services.told.get())
+        limp = [number for number, servo in servos.items() if not servo.motor.on]
+        return f"mode {create.mode}, baud {create.baud}, pending {create.pending.hex()}, limp {limp}, {told[-1:]}"
 
     # --- the faults -----------------------------------------------------------------------------------
 

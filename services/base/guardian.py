@@ -25,8 +25,10 @@ log = logging.getLogger("cocoro.base")
 
 HANGS_S = 0.2
 """A guard reports at least twenty times a second; one that does not is killed."""
+START_S = 5.0
+"""So long a guard may take to report first, on a busy machine. Before that it has turned no wheels."""
 AGAIN_S = 1.0
-"""So long a guard may take to report first; and one that dies sooner is not started again at once."""
+"""A guard that dies sooner is not started again at once."""
 _REPORT = msgspec.json.Decoder(Report)
 _PACKAGES = (str(Path(__file__).parents[2]), str(Path(serial.__file__).parents[1]))
 
@@ -78,7 +80,7 @@ class Guardian:
         if self._channel is None:
             if now_s - self._started_s > AGAIN_S or self.starts < 2:
                 self._start()
-        elif now_s - (self._reported_s or self._started_s + AGAIN_S) > HANGS_S:
+        elif now_s - (self._reported_s or self._started_s + START_S) > HANGS_S:
             self._lost("the guard of the port hangs")
 
     def _start(self) -> None:
