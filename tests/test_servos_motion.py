@@ -154,7 +154,7 @@ class Net:
         while (task := self.net.next_task()) is not None:
             self.tasks.append(task)
             if task.what == "meet":
-                self.net.met(task.number, Met(torque_enabled=False, goal=512, position=512, error=0))
+                self.net.met(task.number, Met(torque_enabled=False, goal=512, position=512, error=0), self.now_ns)
             else:
                 self.net.done(task, 512, self.now_ns)
 
@@ -193,11 +193,11 @@ def test_nothing_is_made_to_hold_before_the_emergency_stops_state_is_known() -> 
 def test_a_servo_that_holds_already_goes_on_holding_what_it_holds() -> None:
     hand = Net("hand")
     hand.net.heard(8, reading(500), hand.now_ns)
-    hand.net.met(8, Met(torque_enabled=True, goal=600, position=500, error=0))
+    hand.net.met(8, Met(torque_enabled=True, goal=600, position=500, error=0), hand.now_ns)
     assert hand.net.orders(hand.now_ns)[8][0] == pytest.approx(600, abs=20)
     arm = Net()
     arm.net.heard(5, reading(500), arm.now_ns)
-    arm.net.met(5, Met(torque_enabled=True, goal=600, position=500, error=0))
+    arm.net.met(5, Met(torque_enabled=True, goal=600, position=500, error=0), arm.now_ns)
     assert arm.net.orders(arm.now_ns)[5][0] == 500
 
 
@@ -248,7 +248,7 @@ def test_a_servo_that_was_shut_down_before_the_service_started_is_a_fault_too() 
     arm = Net()
     arm.net.set_latch("released")
     arm.net.heard(5, reading(error=0x20), arm.now_ns)
-    arm.net.met(5, Met(torque_enabled=False, goal=512, position=512, error=0x20))
+    arm.net.met(5, Met(torque_enabled=False, goal=512, position=512, error=0x20), arm.now_ns)
     assert arm.net.latched_faults() == ("elbow: overload",)
     assert arm.net.next_task() == Task("meet", 5)
     assert arm.net.next_task() is None
@@ -283,8 +283,17 @@ def test_a_silent_servo_is_left_out_and_named_and_the_others_go_on(arm: Net) -> 
     assert len(state.joints) == 5
     assert arm.faults() == "elbow (ID 5) does not answer"
     assert set(arm.net.orders(arm.now_ns)) == {1, 2, 3, 4, 6}
-    arm.cycle()  # back, and met again, since nobody knows what happened to it
+    arm.cycle()  # back, and met again, since nobody knows what happened to it: its torque is off
     arm.cycle()
+    assert arm.faults().startswith("elbow lost its settings a moment ago")
+    assert 5 in arm.net.orders(arm.now_ns)
+
+
+def test_a_servo_that_was_silent_and_has_held_all_the_while_is_nothing_to_tell_of(arm: Net) -> None:
+    for _ in range(MISSES):
+        arm.net.missed(5)
+    arm.net.heard(5, reading(), arm.now_ns)
+    arm.net.met(5, Met(torque_enabled=True, goal=512, position=512, error=0), arm.now_ns)
     assert arm.faults() == ""
     assert 5 in arm.net.orders(arm.now_ns)
 

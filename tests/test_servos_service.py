@@ -19,6 +19,7 @@ from cocoro.robot import SERVO_COUNT_RAD, Robot
 from cocoro.testing import ServiceUnderTest
 from services.servos.bus import Bus, PortError, RefusedWriteError, SilentError
 from services.servos.line import STATE
+from services.servos.motion import LEAD_S, REACH_RAD
 from sim.wire.faults import Fault
 
 ELBOW = 5
@@ -281,6 +282,6 @@ def test_a_killed_service_leaves_an_arm_that_stops_by_itself(bench: ServoBench) 
         service.wait()
     killed_at = bench.call(lambda: servo.get(36))
     bench.emulator.until(lambda: servo.get(36) == servo.get(30))
-    lead = 0.2 * 0.5 / SERVO_COUNT_RAD
-    assert servo.get(36) - killed_at < lead + 10
+    # Where it keeps up, 0.2 s of travel; on a busy machine no more than it may be led ahead at all.
+    assert servo.get(36) - killed_at < (REACH_RAD + LEAD_S * 0.5) / SERVO_COUNT_RAD + 10
     assert servo.get(36) < 1000

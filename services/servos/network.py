@@ -64,6 +64,8 @@ class ServoJoint:
         self.met = False
         self.enabled = False
         self.enabled_ns = 0
+        self.held = False
+        """When it fell silent."""
         self.interrupted_ns: int | None = None
         self.relaxed = False
         """On somebody's word."""
@@ -191,6 +193,7 @@ class Network:
         one = self.joints[number]
         one.misses += 1
         if one.silent:
+            one.held = one.held or one.enabled
             one.met = one.enabled = False  # who knows what it is like when it comes back
             one.motion.goal_rad = None
             self._tasks.pop(number, None)
@@ -201,13 +204,16 @@ class Network:
         self._disturbed.add(max(strays - self._strays, 0) + missed, now_ns)
         self._strays = strays
 
-    def met(self, number: int, met: Met) -> None:
+    def met(self, number: int, met: Met, now_ns: int) -> None:
         """What a servo was found to be like. One that holds already goes on holding: the hand what it holds, the arm
         where it is unless it was there for long."""
         one = self.joints[number]
         one.met = True
         one.enabled = met.torque_enabled
         self._shut_down(one, met.error)
+        if one.held and not one.enabled and not one.fault:  # it lost its power meanwhile, and with it all that was set
+            one.interrupted_ns = now_ns
+        one.held = False
         if one.enabled:
             resting = abs(met.goal - met.position) <= AT_GOAL_COUNTS * 4
             one.motion.hold(one.joint.to_angle(met.goal if self._keeps_goal or resting else met.position))

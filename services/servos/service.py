@@ -103,7 +103,7 @@ class NetworkService:
         for number in event.missed:
             network.missed(number)
         for number, met in event.met.items():
-            network.met(number, met)
+            network.met(number, met, now_ns)
         for number, as_set in event.checked.items():
             network.checked(number, as_set, now_ns)
         for task, position in event.done:
