@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from chessboard import Eyes, Painter, lying
 from fakenect import player
 
 from cocoro.clock import NS, RealClock
@@ -18,6 +19,8 @@ from cocoro.messages import Detections, ServoState
 from cocoro.objects import Catalogue
 from cocoro.robot import Robot
 from cocoro.topics import ARM_STATE, FRAME
+from services.kinect import doctor, tools
+from services.kinect.calibration import Board
 from services.kinect.camera import FreenectCamera
 from services.kinect.config import Config
 from services.kinect.device import Shot
@@ -26,6 +29,7 @@ from services.perception.config import Config as PerceptionConfig
 from services.perception.core import PerceptionCore
 from sim.service import Config as SimConfig
 from sim.wire.record import RATE_HZ, record
+from sim.wire.recording import RecordingWriter
 
 pytestmark = pytest.mark.sim
 
@@ -192,6 +196,35 @@ def test_perception_finds_the_recorded_objects_where_they_stand(
     assert len(places) >= 5
     errors_m = np.linalg.norm(np.array(places, float) - truth["objects"][label], axis=1)
     assert errors_m.max() <= depth_step_m(robot, truth["objects"][label])
+
+
+def test_views_of_a_chessboard_are_taken_from_the_device_and_kept(library: str, tmp_path: Path) -> None:
+    board, robot = Board(8, 6, 0.04), Robot.load()
+    lens = (robot.camera.fx, robot.camera.fy, robot.camera.cx, robot.camera.cy, 0.0, 0.0, 0.0, 0.0, 0.0)
+    painter = Painter(Eyes(lens, lens, (0.0, 0.0, 0.0), robot.kinect.depth_offset_m, robot.kinect.depth_curve), board)
+    poses = [lying((0.2, 0.3 * side, 0.0), (0.1 * side, 0.0, 0.8), board) for side in (-1, 1)]
+    pictures = [(painter.colour(*pose), painter.depth(*pose)) for pose in poses]
+    with RecordingWriter(tmp_path / "recording") as writer:
+        for number in range(40):
+            writer.add(as_frame(Shot(NS + number * NS // 30, *pictures[number // 20])))
+    told: list[str] = []
+    config = Config(library=library, recording=str(tmp_path / "recording"))
+    views = tools.capture(config, board, 2, tmp_path / "views", told.append)
+    assert [text for text in told if text.startswith("view")] == ["view 1 of 2", "view 2 of 2"]
+    assert {view.depth.tobytes() for view in views} == {depth.tobytes() for _, depth in pictures}
+    assert len(tools.read(tmp_path / "views", board, told.append)) == 2
+
+
+def test_the_doctor_says_whether_pictures_come(library: str, recording: Path, tmp_path: Path) -> None:
+    robot = Robot.load()
+    sends, lenses = doctor.check(Config(library=library, recording=str(recording)), robot, "calliope")
+    assert (sends.state, sends.text[:30]) == ("ok", "sends pictures, 640 x 480, dep")
+    assert (lenses.state, lenses.text) == ("note", "not measured: `cocoro kinect calibrate`")
+    nothing, _ = doctor.check(Config(library=library, recording=str(tmp_path)), robot, "calliope")
+    assert nothing.state == "bad"
+    assert "is no recording" in nothing.text
+    missing, _ = doctor.check(Config(library="/nowhere/libfreenect.so"), robot, "calliope")
+    assert missing.text.endswith("sudo apt install libfreenect0.5")
 
 
 def depth_step_m(robot: Robot, place_m: list[float]) -> float:

@@ -23,7 +23,7 @@ from services.base.driver import Report
 
 log = logging.getLogger("cocoro.base")
 
-HANGS_S = 0.2
+HANGS_S = 0.25
 """A guard reports at least twenty times a second; one that does not is killed."""
 START_S = 5.0
 """So long a guard may take to report first, on a busy machine. Before that it has turned no wheels."""
