@@ -263,7 +263,7 @@ class Campaign:
         try:
             self._hardware.emulator.until(lambda: create.wheels_mmps == (0, 0), 5.0)
             log = self._hardware.emulator.call(create.acted.copy)
-            stopped_ns = max(log[-1][0], began_ns) if log else began_ns
+            stopped_ns = next((at_ns for at_ns, wheels in log if wheels == (0, 0) and at_ns > began_ns), began_ns)
         except TimeoutError:
             stopped_ns = began_ns + 5 * NS
             tally.notes.append(f"not stopped: {create.pending.hex() or 'nothing'} pending, mode {create.mode}")
