@@ -311,6 +311,7 @@ class _Rehearsal:
             "seed": request.seed,
             "sensors": request.sensors,
             "lockstep": request.lockstep,
+            "model": self._trace.model,
             **({} if self._collector is None else {"samples": len(self._collector), "said": self._collector.said}),
             "outcome": state.outcome,
             "reason": state.reason,

@@ -42,6 +42,11 @@ class Trace:
     def said(self, status: PlannerStatus) -> None:
         self._status = status
 
+    @property
+    def model(self) -> str:
+        """With what the planner says that it reaches."""
+        return self._status.model
+
     def state(self, state: TaskState) -> None:
         self._phase = state.phase
 

@@ -74,6 +74,8 @@ def summary(result: dict[str, Any]) -> str:
     lines = [f"{result['outcome']}: {name} in {result['sim_s']:.1f} s{reason}"]
     lines += [f"  {phase['name']:<10} {phase['sim_s']:6.1f} s" for phase in result["phases"]]
     lines.append(f"  took {result['wall_s']:.1f} s, {speed:.1f} times real time")
+    if result.get("model"):
+        lines.append(f"  reached with: {result['model']}")
     truth = result["truth"]
     lines.append("in truth")
     lines += [f"  {name.replace('_', ' '):<18} {_said(value)}" for name, value in truth.items()]

@@ -125,6 +125,8 @@ def _print(report: dict[str, Any]) -> None:
             if plan["why"]
             else f"planner         {plan['behaviour']}"
         )
+        if plan["model"]:
+            print(f"reaches with    {plan['model']}")
 
 
 def _task(task: TaskState) -> str:

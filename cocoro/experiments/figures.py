@@ -57,7 +57,7 @@ def hand_places(samples: Path, learned: Path) -> Figure:
     assert arm is not None
     held = held.pick(slice(None, None, max(len(held) // 150, 1)))
     drawn, mapped = drawing.predict(held.angles_rad), model.hand_map(arm, robot).predict(held.angles_rad)
-    figure, axes = sheet(2, width=5.2, height=4.4)
+    figure, axes = sheet(2, width=4.6, height=4.6)
     for axis, (one, other, said) in zip(axes, ((0, 1, "left, m"), (0, 2, "up, m")), strict=True):
         for start, end in zip(held.places_m, drawn, strict=True):
             axis.plot([start[one], end[one]], [start[other], end[other]], color=FAINT, linewidth=0.7, zorder=1)
@@ -66,7 +66,7 @@ def hand_places(samples: Path, learned: Path) -> Figure:
         axis.scatter(held.places_m[:, one], held.places_m[:, other], s=26, facecolors="none", edgecolors=TRUE,
                      linewidths=0.7, label="seen", zorder=4)  # fmt: skip
         axis.set(xlabel="ahead, m", ylabel=said, aspect="equal")
-    axes[0].legend(frameon=False, fontsize=8)
+    figure.legend(*axes[0].get_legend_handles_labels(), frameon=False, fontsize=8, ncols=3, loc="outside lower center")
     return figure
 
 
@@ -101,23 +101,25 @@ def bend(seeds: Sequence[Mapping[str, Any]]) -> Figure:
 
 def reaches(traces: Mapping[tuple[str, str], Mapping[str, list[Any]]], said: Sequence[str]) -> Figure:
     """A column a way of reaching, rows: from above and from the side."""
-    figure, axes = sheet(2, 2, width=5.2, height=3.6)
+    figure, axes = sheet(2, 2, width=4.2, height=3.6)
     ways = list(dict.fromkeys(way for way, _ in traces))
     for column, way in enumerate(ways):
         for (its, scene), trace in traces.items():
             if its != way:
                 continue
             hidden = scene.endswith("hidden")
-            touching = np.array([phase == "touch" for phase in trace["phase"]])
-            hand = np.array(trace["hand_m"])[touching]
+            # Not how the arm unfolds before the first of them.
+            first = trace["target"][0]
+            later = next(number for number, target in enumerate(trace["target"]) if target != first)
+            hand = np.array(trace["hand_m"][later:])
             targets = np.array([t for t in trace["target_m"] if t is not None])
+            label, colour, line = ("marker hidden", OTHER, "--") if hidden else ("marker in view", OURS, "-")
             for axis, other in ((axes[column], 1), (axes[2 + column], 2)):
-                axis.plot(hand[:, 0], hand[:, other], color=OTHER if hidden else OURS, linewidth=0.8, alpha=0.8,
-                          label="marker hidden at the fourth" if hidden else "marker in view")  # fmt: skip
+                axis.plot(hand[:, 0], hand[:, other], color=colour, linestyle=line, linewidth=0.8, label=label)
                 axis.scatter(targets[:, 0], targets[:, other], s=60, facecolors="none", edgecolors=TRUE, zorder=3)
                 axis.set(xlabel="ahead, m", ylabel="left, m" if other == 1 else "up, m", aspect="equal")
         axes[column].set_title(said[column], fontsize=9)
-    axes[0].legend(frameon=False, fontsize=8)
+    figure.legend(*axes[0].get_legend_handles_labels(), frameon=False, fontsize=8, ncols=2, loc="outside lower center")
     return figure
 
 
