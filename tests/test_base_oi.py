@@ -100,3 +100,12 @@ def test_a_value_that_the_manual_does_not_know_makes_the_frame_a_bad_one() -> No
     assert oi.StreamParser((SHORT,)).feed(frame(readings)) == [readings]
     assert oi.StreamParser((SHORT,)).feed(frame(readings | {oi.MODE: 4})) == []
     assert oi.StreamParser((SHORT,)).feed(frame(readings | {oi.LEFT_SPEED: 501})) == []
+
+
+def test_a_frame_that_tells_a_packet_twice_is_a_bad_one() -> None:
+    """As long as the other list, with a sum that is right by chance."""
+    good = frame(dict.fromkeys(SHORT, 0))
+    body = good[:-1] + bytes([oi.VOLTAGE, 0, 1, oi.CURRENT, 0, 2])
+    body = bytes([19, len(body) - 2]) + body[2:]
+    assert len(body) - 2 == oi.length(LONG)
+    assert oi.StreamParser((SHORT, LONG)).feed(body + bytes([-sum(body) & 0xFF])) == []

@@ -215,12 +215,12 @@ def length(packets: Sequence[int]) -> int:
 
 
 def _decode(payload: bytearray) -> Readings | None:
-    """Values by packet, in order; None when a number or value is none that can be."""
+    """Values by packet, in order; None when a number or value is none that can be, or a packet is there twice."""
     readings: Readings = {}
     at = 0
     while at < len(payload):
         packet = PACKETS.get(payload[at])
-        if packet is None or at + 1 + packet.size > len(payload):
+        if packet is None or payload[at] in readings or at + 1 + packet.size > len(payload):
             return None
         value = int.from_bytes(payload[at + 1 : at + 1 + packet.size], "big", signed=packet.signed)
         if not packet.low <= value <= packet.high:
