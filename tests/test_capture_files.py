@@ -154,6 +154,16 @@ def test_rotation_loses_nothing_and_every_file_is_whole_in_itself(tmp_path: Path
     assert written.size_bytes == sum(path.stat().st_size for path in files)
 
 
+def test_two_recorders_that_begin_in_the_same_moment_write_beside_each_other(tmp_path: Path) -> None:
+    both = [writer(tmp_path), writer(tmp_path)]
+    for n, written in enumerate(both):
+        written.put(entry("base/state", n, b"state"))
+        written.close()
+    files = list(tmp_path.glob("*.mcap"))
+    assert len(files) == 2
+    assert sorted(sequence for path in files for sequence in [record.sequence for record in all_of(path)]) == [0, 1]
+
+
 def test_the_oldest_captures_make_room_and_nothing_else_does(tmp_path: Path) -> None:
     names = [f"calliope-2026010{day}T000000Z-001.mcap" for day in range(1, 5)]
     for name in (*names, "calliope-notes.mcap", "other-20260101T000000Z-001.mcap"):

@@ -169,7 +169,12 @@ class Writer:
         path = self._place(self._number)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            file = CaptureFile(path, self._packer, LIBRARY)
+            try:
+                file = CaptureFile(path, self._packer, LIBRARY)
+            except FileExistsError:
+                if self._place(self._number + 1) == path:
+                    raise
+                return self._open()  # another recorder, begun in the same moment, has taken the name
             try:
                 for name, entries in self._metadata.items():
                     file.metadata(name, entries)
