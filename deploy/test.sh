@@ -18,7 +18,7 @@ check lint-imports --no-logo
 [ ${#unclean[@]} = 0 ] || echo "NOT CLEAN: ${unclean[*]}"
 
 echo "== pytest $*"
-pytest "$@"
+pytest -rs "$@"
 tests=$?
 [ ${#unclean[@]} = 0 ] && exit $tests
 exit 1
