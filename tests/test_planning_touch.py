@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
+
 import numpy as np
 import pytest
 from learning_arm import sightings
 
 from cocoro.clock import NS
+from cocoro.kinematics import Array
 from cocoro.learning.drawing import Drawing
 from cocoro.learning.model import Training, arm_model, empty, encode
 from cocoro.learning.reachability import ReachMesh
 from cocoro.learning.study import BEST, fit
 from cocoro.rehearsal import RehearsalRequest
 from cocoro.robot import Robot
+from services.planning.behaviours.base import Limbs
 from services.planning.config import Config
 from services.planning.learned import Learned
 from services.planning.reach import ARM, LEVEL_ROLL_RAD
@@ -96,3 +100,32 @@ def test_only_a_planner_that_is_told_to_goes_on_learning_and_it_says_so(robot: R
         learned.step([sighting(1, seen.angles_rad[0], seen.places_m[0])], NS // 5)
         assert ("taught by 1 sightings at work" in learned.text) is adapt
         assert learned.mesh is not None
+
+
+class LongerHand:
+    """The drawing's hand, but further out along its own axis."""
+
+    def __init__(self, robot: Robot, more_m: float) -> None:
+        self._drawn = robot.chain("pad_centre")
+        self._more_m = more_m
+
+    def pose(self, angles: Mapping[str, float]) -> Array:
+        pose = self._drawn.pose(angles)
+        pose[:3, 3] += self._more_m * pose[:3, 2]
+        return pose
+
+    def position(self, angles: Mapping[str, float]) -> Array:
+        return np.asarray(self.pose(angles)[:3, 3])
+
+    def jacobian(self, angles: Mapping[str, float], joints: Iterable[str]) -> Array:
+        return self._drawn.jacobian(angles, joints)
+
+
+def test_a_hand_that_is_learned_to_be_further_out_waits_where_the_arm_still_folds(robot: Robot) -> None:
+    limbs = Limbs(robot, Config())
+    drawn_m = limbs.reachability.retreat_m
+    assert drawn_m == Config().arm.retreat_radius_m
+    limbs.reacher.use(LongerHand(robot, 0.03))
+    limbs.reachability.use(None, None)
+    assert drawn_m + 0.005 < limbs.reachability.retreat_m < drawn_m + 0.04
+    assert limbs.reachability.grasp((0.58, -0.1, 0.06)).behind.radius_m == limbs.reachability.retreat_m

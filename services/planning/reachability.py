@@ -15,6 +15,10 @@ from services.planning.reach import ARM, LEVEL_ROLL_RAD, HandPose, Reacher
 
 BEYOND_M = 0.15
 """Further than this beyond all places where the hand was seen, what was learned of it says nothing."""
+RETREAT_STEP_M, RETREAT_STEPS = 0.005, 8
+RETREAT_ROOM_M = 0.01
+"""The arm must fold in further than to where it waits, lest it waits at its limits."""
+RETREAT_HEIGHTS_M = (0.045, 0.08)
 _UPRIGHT = {"arm_base": -0.087, "shoulder": 0.66, "elbow": -1.6, "wrist_pitch": 0.77, "wrist_roll": LEVEL_ROLL_RAD}
 """Elbow up, hand before the robot: where the search for joint angles starts, so that it stays in that family."""
 
@@ -31,10 +35,24 @@ class Reachability:
         self._config = config
         self._reacher = reacher
         self._seen: tuple[HandMap, ReachMesh] | None = None
+        self.retreat_m = self._retreat()
+        """Where the hand waits behind a target, from the arm base's axis: no nearer than the arm folds."""
 
     def use(self, learned: HandMap | None, mesh: ReachMesh | None) -> None:
         """Judge by where the hand was seen, too, from now on; None: by the kinematics alone."""
         self._seen = (learned, mesh) if learned is not None and mesh is not None else None
+        self.retreat_m = self._retreat()
+
+    def _retreat(self) -> float:
+        """The configured radius, or as much more as the kinematics that it reaches with want: a hand that is learned to
+        be further out than its drawing has it folds less far in."""
+        config = self._config
+        for more in range(RETREAT_STEPS):
+            radius = config.retreat_radius_m + more * RETREAT_STEP_M
+            poses = [HandPose(radius - RETREAT_ROOM_M, 0.0, height, config.pitch_rad) for height in RETREAT_HEIGHTS_M]
+            if all(self._reacher.solve(_UPRIGHT, pose) is not None for pose in poses):
+                return radius
+        return config.retreat_radius_m
 
     def grasp(self, target_m: Vec3) -> Grasp:
         """The hand poses for a target's centre (body frame), reachable or not."""
@@ -42,7 +60,7 @@ class Reachability:
         radius, azimuth, height = self._reacher.seen_from_arm(target_m)
         low, high = config.grasp_height_range_m
         height = min(max(height, low), high)
-        behind = HandPose(config.retreat_radius_m, azimuth, height, config.pitch_rad)
+        behind = HandPose(self.retreat_m, azimuth, height, config.pitch_rad)
         return Grasp(behind, behind._replace(radius_m=radius))
 
     def why_not(self, target_m: Vec3, *, touching: bool = False) -> str:

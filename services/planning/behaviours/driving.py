@@ -145,10 +145,10 @@ class Approach:
             return arm.park(angles, dt_s), move
         if not arm.folded(reference):
             have = limbs.reacher.pose({**angles, **reference})
-            if have.height_m < config.travel_height_m - 0.05 and have.radius_m > config.retreat_radius_m + 0.02:
+            if have.height_m < config.travel_height_m - 0.05 and have.radius_m > limbs.reachability.retreat_m + 0.02:
                 # Low and stretched out, perhaps around something: back out before anything else.
                 limbs.grip.open()
-                back = have._replace(radius_m=config.retreat_radius_m, pitch_rad=config.pitch_rad)
+                back = have._replace(radius_m=limbs.reachability.retreat_m, pitch_rad=config.pitch_rad)
                 step = arm.reach(back, config.insert_speed_mps, angles, dt_s)
                 return step._replace(arrived=False), _waiting(move, "backing the hand out first")
             if not move.direct:

@@ -137,7 +137,7 @@ class Place:
             ("stretching out", low._replace(height_m=low.height_m + 0.05), config.lift_speed_mps),
             ("setting it down", low, config.lift_speed_mps / 2),
             ("letting go", low, config.lift_speed_mps),
-            ("backing out", low._replace(radius_m=config.retreat_radius_m), config.insert_speed_mps),
+            ("backing out", low._replace(radius_m=limbs.reachability.retreat_m), config.insert_speed_mps),
             (
                 "raising the hand",
                 HandPose(config.travel_radius_m, azimuth, config.travel_height_m, pitch),

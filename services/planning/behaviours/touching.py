@@ -33,8 +33,8 @@ class Touch:
         if not self._begun:
             self._begun = True
             have = limbs.reacher.pose({**scene.angles, **reference})
-            if not limbs.arm.folded(reference) and have.radius_m > config.retreat_radius_m + 0.02:
-                self._back = have._replace(radius_m=config.retreat_radius_m, pitch_rad=config.pitch_rad)
+            if not limbs.arm.folded(reference) and have.radius_m > limbs.reachability.retreat_m + 0.02:
+                self._back = have._replace(radius_m=limbs.reachability.retreat_m, pitch_rad=config.pitch_rad)
         if self._back is not None:
             return self._back_out(scene, self._back)
         plan = self._look(scene) or self._reach.step(scene)
