@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from math import isnan
 from pathlib import Path
 
@@ -22,7 +23,14 @@ def learn_arm(
     samples: Path, into: Path, robot: Robot, *, search: bool, method: str | None, as_json: bool
 ) -> tuple[Model, str]:
     """Learn, write the model; returns it with what is to be printed. Raises ConfigError."""
-    made, report = lesson.learn_arm(samples, into, robot, search=search, method=method)
+    shown = sys.stderr.isatty()
+
+    def tell(text: str) -> None:
+        if shown:
+            print(f"\r\x1b[K{text}", end="", file=sys.stderr, flush=True)
+
+    made, report = lesson.learn_arm(samples, into, robot, search=search, method=method, tell=tell)
+    tell("")
     return made, json.dumps(report.data() | {"model": str(into)}) if as_json else _text(report) + f"\n{into} is written"
 
 

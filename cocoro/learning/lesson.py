@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import isnan
 from pathlib import Path
@@ -55,9 +55,15 @@ def sightings(rows: Sequence[HandRow]) -> Sightings:
 
 
 def learn_arm(
-    samples: Path, into: Path, robot: Robot, *, search: bool = False, method: str | None = None
+    samples: Path,
+    into: Path,
+    robot: Robot,
+    *,
+    search: bool = False,
+    method: str | None = None,
+    tell: Callable[[str], None] = lambda text: None,
 ) -> tuple[Model, Report]:
-    """Fit every method, choose, write the model. Raises ConfigError."""
+    """Fit every method, choose, write the model. `tell` hears what is being done. Raises ConfigError."""
     recorded = dataset.read(samples, HandRow, robot)
     rows = recorded.rows
     if len(rows) < LEAST_SAMPLES:
@@ -69,7 +75,10 @@ def learn_arm(
     if not len(held):
         raise ConfigError(f"samples {samples}: {study.HELD_OUT} draws at least are needed to hold one out")
     methods = _methods(search, method)
-    scores = [study.score(one, drawing, learn, held) for one in methods]
+    scores = []
+    for number, one in enumerate(methods, 1):
+        tell(f"{number} of {len(methods)}: {one.name}")
+        scores.append(study.score(one, drawing, learn, held))
     chosen = study.best(scores, methods)
     sizes = [*[size for size in CURVE if size < len(learn)], len(learn)]
     curve_m = study.curve(chosen, drawing, learn, held, sizes)
