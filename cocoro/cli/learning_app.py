@@ -147,7 +147,7 @@ def experiment(
     frames: Annotated[str | None, typer.Option(metavar="WxH@HZ", help="The camera's frames: 320x240@15.")] = None,
     samples: Annotated[
         int, typer.Option(min=100, max=100_000, metavar="N", help="Of each body's babbling; a fifth is held out.")
-    ] = 2500,
+    ] = 2600,
     jobs: Annotated[int | None, typer.Option(min=1, metavar="N", help="Runs at once; by default one a core.")] = None,
     no_plots: Annotated[bool, typer.Option("--no-plots", help="Tables alone, without matplotlib.")] = False,
 ) -> None:

@@ -133,8 +133,8 @@ def wheel_trials(seeds: Sequence[tuple[Mapping[str, Any], float]]) -> Figure:
     for axis in (left, right):
         axis.axhline(0, color=TRUE, linewidth=0.8)
     left.axhspan(-8, 8, color=FAINT, alpha=0.25, linewidth=0)
-    left.set(xlabel="trials", ylabel="fit to all so far, less the truth, mm", ylim=(-25, 25))
-    right.set(xlabel="trial", ylabel="its own estimate, less the truth, mm", ylim=(-40, 40))
+    left.set(xlabel="trials", ylabel="fit to all so far, less the truth, mm", ylim=(-10, 10))
+    right.set(xlabel="trial", ylabel="its own estimate, less the truth, mm", ylim=(-25, 25))
     return figure
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import partial
-from math import cos, radians, sin
+from math import cos, isnan, radians, sin
 from typing import Any
 
 from cocoro.experiments import bodies, figures
@@ -70,13 +70,14 @@ def section(settings: Settings, results: Mapping[str, Result]) -> Section:
         total = len(settings.seeds) * len(BEARINGS_DEG)
         found = row("stopping distance less the asked one", who, errors_cm, "cm", best="zero", digits=2)
         ours = way == "learned"
+        spread = "" if isnan(found.values.sd) else f"{found.values.sd:.2f}"
         made.rows += [
             found._replace(
                 wanted="mean within 1" if ours else "",
                 held=abs(found.values.mean) <= 100 * MEAN_M and len(done) == total if ours else None,
                 paper="real: 22.7 cm where 20 were asked; virtual: 2.5 cm away from that" if ours else "",
             ),
-            row("spread of the stopping distance (SD over all runs)", who, [], "cm", said=f"{found.values.sd:.2f}",
+            row("spread of the stopping distance (SD over all runs)", who, [], "cm", said=spread,
                 wanted="at most 1" if ours else "", held=found.values.sd <= 100 * SPREAD_M if ours else None,
                 paper="real: 0.748 cm" if ours else ""),
             row(f"arrived, of {total}", who, [], "", said=str(len(done))),

@@ -20,7 +20,7 @@ from cocoro.learning.dataset import fingerprint_of
 from cocoro.robot import Robot
 
 HEADS = ("measure", "who", "mean ± 95% CI", "worst", "unit", "wanted", "", "the paper's text")
-DOTS_PER_INCH = 100
+DOTS_PER_INCH = 90
 _STYLE = """body{font:15px/1.5 system-ui,sans-serif;max-width:70rem;margin:2rem auto;padding:0 1rem;color:#222}
 table{border-collapse:collapse;font-size:13px;width:100%;display:block;overflow-x:auto}
 th,td{text-align:left;padding:.25rem .6rem;border-bottom:1px solid #ddd;vertical-align:top}
@@ -68,7 +68,7 @@ def _about(settings: Settings) -> str:
     seeds = settings.seeds
     which = f"{seeds[0]} to {seeds[-1]}" if len(seeds) > 1 else str(seeds[0])
     return (
-        f"{len(seeds)} seeds ({which}); sensors {settings.sensors}, body {settings.body}, frames"
+        f"{len(seeds)} seed{'' if len(seeds) == 1 else 's'} ({which}); sensors {settings.sensors}, body {settings.body}, frames"
         f" {settings.width}x{settings.height} at {settings.frame_rate_hz:g} Hz; virtual time. A row is over the seeds,"
         " or over all runs where it says so; 'worst' is of all of them. Rows of ours are measured in the same runs as"
         " the baselines' beside them."

@@ -18,8 +18,8 @@ class Settings(msgspec.Struct, frozen=True, kw_only=True):
     width: int = 640
     height: int = 480
     frame_rate_hz: float = 30.0
-    samples: int = 2500
-    """Of the arm's babbling: four fifths of them are learned from, so that there are 2,000."""
+    samples: int = 2600
+    """Of the arm's babbling: four fifths of them are learned from, so that there are 2,000 and a few."""
     trials: int = 40
     """Of the wheels' babbling."""
     jobs: int = 1
