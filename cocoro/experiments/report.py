@@ -67,8 +67,9 @@ def _manifest(settings: Settings) -> dict[str, Any]:
 def _about(settings: Settings) -> str:
     seeds = settings.seeds
     which = f"{seeds[0]} to {seeds[-1]}" if len(seeds) > 1 else str(seeds[0])
+    count = f"{len(seeds)} seed" + ("" if len(seeds) == 1 else "s")
     return (
-        f"{len(seeds)} seed{'' if len(seeds) == 1 else 's'} ({which}); sensors {settings.sensors}, body {settings.body}, frames"
+        f"{count} ({which}); sensors {settings.sensors}, body {settings.body}, frames"
         f" {settings.width}x{settings.height} at {settings.frame_rate_hz:g} Hz; virtual time. A row is over the seeds,"
         " or over all runs where it says so; 'worst' is of all of them. Rows of ours are measured in the same runs as"
         " the baselines' beside them."
