@@ -92,6 +92,8 @@ class PlanningCore:
         self._senses.look_around(now_ns, self._own_hull)
         scene = Scene(now_ns, dt_s, self._senses, body, self._senses.angles(), self._limbs)
         plan = self._plan(scene)
+        if isinstance(self._behaviour, Idle):
+            self.learned.rest()
         status = self._status(plan, scene)
         return [*self._commands(plan, scene), *plan.reports, Output(topics.PLAN, status)]
 

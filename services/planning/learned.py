@@ -150,6 +150,11 @@ class Learned:
         if self.hand is not None:
             self.hand.step(sightings, now_ns)
 
+    def rest(self) -> None:
+        """Called while the robot does nothing, for what takes long."""
+        if self._teacher is not None:
+            self._teacher.rest()
+
     def load(self, path: str) -> None:
         """The model in a file; one that is refused changes nothing but the text."""
         try:

@@ -18,7 +18,7 @@ EVERY_NS = NS // 10
 """Sightings nearer in time than this are nearly the same; babbling takes no more of them either."""
 ROLL_RAD = 0.03
 LUMP = 64
-"""So many places are entered into the mesh together: it costs as much for one as for many."""
+"""So many places are entered into the mesh together: it costs some tenths of a second, for one as for many."""
 
 
 class Teacher:
@@ -51,6 +51,9 @@ class Teacher:
         if self._adapter.add(angles_rad, place_m) > WILD_M:
             return
         self._places.append(place_m)
+
+    def rest(self) -> None:
+        """The robot does nothing: time to enter what was seen into the mesh."""
         if len(self._places) >= LUMP:
             self._mesh.add(np.array(self._places))
             self._places = []
