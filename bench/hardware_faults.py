@@ -266,7 +266,7 @@ class Campaign:
             stopped_ns = next((at_ns for at_ns, wheels in log if wheels == (0, 0) and at_ns > began_ns), began_ns)
         except TimeoutError:
             stopped_ns = began_ns + 5 * NS
-            tally.notes.append(f"not stopped: {create.pending.hex() or 'nothing'} pending, mode {create.mode}")
+            tally.notes.append(f"not stopped: {self._state()}")
         took_ms = (stopped_ns - began_ns) / MS
         tally.slowest_stop_ms = max(tally.slowest_stop_ms, took_ms)
         tally.late_stops += took_ms > STOP_NS / MS
@@ -303,6 +303,7 @@ class Campaign:
                 self._hardware.emulator.until(
                     lambda goals=goals: (
                         create.wheels_mmps in SPEEDS  # type: ignore[misc]
+                        and not create.deaf
                         and all(servos[number].motor.on and servos[number].get(30) != goals[number] for number in moved)
                     ),
                     2.5,
@@ -319,7 +320,8 @@ class Campaign:
         while not self._services.told.empty():
             told.append(self._services.told.get())
         limp = [number for number, servo in servos.items() if not servo.motor.on]
-        return f"mode {create.mode}, baud {create.baud}, pending {create.pending.hex()}, limp {limp}, {told[-1:]}"
+        heard = f"pending {create.pending.hex()}{', deaf' if create.deaf else ''}"
+        return f"mode {create.mode}, baud {create.baud}, {heard}, limp {limp}, {told[-1:]}"
 
     # --- the faults -----------------------------------------------------------------------------------
 

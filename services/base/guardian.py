@@ -117,6 +117,7 @@ class Guardian:
         """What it kept from happening must not happen now: stop the wheels, then start another guard."""
         self._let_go()
         process, self._process = self._process, None
+        _stop_wheels(self._port)  # this process, too, may be killed between any two of these lines
         if process is not None:
             process.kill()
             asyncio.get_running_loop().run_in_executor(None, process.wait)

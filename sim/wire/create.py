@@ -135,6 +135,11 @@ class Create:
         """What came of a command that is not whole yet."""
         return bytes(self._pending)
 
+    @property
+    def deaf(self) -> bool:
+        """It was told to wait for something (opcodes 155 to 158), and hears nothing until then."""
+        return self._deaf is not None
+
     # --- commands -----------------------------------------------------------------------------------
 
     def _work(self) -> None:
