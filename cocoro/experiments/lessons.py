@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -45,13 +46,19 @@ def learn(arm: str, wheels: str, into: str, method: str | None = None) -> dict[s
         },
         "draws_used": len(draws),
         "draws_looked_at": int(draws.max() - draws.min() + 1),
-        "babbled_s": (rows[-1].stamp_ns - rows[0].stamp_ns) / NS,
+        "babbled_s": _babbled_s(rows),
         "wheels": {
             "separation_m": fit.separation_m, "sigma_m": fit.sigma_m, "median_m": fit.median_m,
             "estimates_m": list(fit.estimates_m), "left_scale": fit.left_scale, "right_scale": fit.right_scale,
             "after_m": [one.separation_m if one is not None else None for one in after],
         },
     }  # fmt: skip
+
+
+def _babbled_s(rows: Sequence[HandRow]) -> float:
+    """How long it took to see them; a babbling that was gone on with began its clock anew."""
+    steps = np.diff([row.stamp_ns for row in rows])
+    return float(steps[steps > 0].sum()) / NS
 
 
 def bend(into: str, bent: str, bend_s: float) -> dict[str, Any]:
