@@ -143,9 +143,7 @@ def test_the_emergency_stop_imports_next_to_nothing() -> None:
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     modules = set(done.stdout.split())
     assert "zenoh" in modules
-    assert modules.isdisjoint(
-        {"numpy", "scipy", "cv2", "typer", "click", "rich", "cocoro.node", "cocoro.cli.app"}
-    )
+    assert modules.isdisjoint({"numpy", "scipy", "cv2", "typer", "click", "rich", "cocoro.node", "cocoro.cli.app"})
 
 
 # --- rehearse -------------------------------------------------------------------------------------
