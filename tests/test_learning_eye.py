@@ -7,8 +7,10 @@ import pytest
 
 from cocoro.learning.dataset import WheelRow
 from cocoro.learning.eye import LEAST_TRIALS, Eye, eye_tilt
-from cocoro.messages import Vec3
+from cocoro.messages import Obstacles, Vec3
 from cocoro.robot import Robot
+from services.planning.config import Config
+from services.planning.senses import Senses
 
 
 def seen(robot: Robot, true_m: Vec3, tilt_rad: float) -> Vec3:
@@ -48,3 +50,13 @@ def test_without_the_targets_height_or_with_few_trials_nothing_is_said_of_the_ey
 
 def test_an_eye_that_is_as_drawn_changes_nothing(robot: Robot) -> None:
     assert Eye(robot).straight((1.0, 0.3, 0.2)) == (1.0, 0.3, 0.2)
+
+
+def test_the_floor_that_a_tilted_eye_lifts_is_no_obstacle(robot: Robot) -> None:
+    floor, box = seen(robot, (1.9, 0.2, 0.0), 0.03), seen(robot, (1.9, -0.2, 0.2), 0.03)
+    assert floor[2] > 0.05  # higher than what counts as floor so far off
+    senses = Senses(Config(), robot.joints)
+    obstacles = Obstacles(points_m=(floor, box), origin_m=(0.06, 0.0))
+    assert senses._standing(obstacles).points_m == (floor, box)
+    senses.eye = Eye(robot, 0.03)
+    assert senses._standing(obstacles).points_m == (box,)

@@ -13,6 +13,7 @@ from math import atan2, cos, hypot, sin
 import numpy as np
 
 from cocoro.learning.dataset import WheelRow
+from cocoro.learning.network import Array
 from cocoro.messages import Vec3
 from cocoro.robot import Robot
 
@@ -38,6 +39,12 @@ class Eye:
         c, s = cos(self.tilt_rad), sin(self.tilt_rad)
         share = (c * level + s * up) / max(level, 1e-6)
         return self._axis_x_m + share * x, share * y, self._axis_z_m + c * up - s * level
+
+    def heights(self, seen_m: Array) -> Array:
+        """How high things are above the floor that are seen at places (b, 3); shape (b,)."""
+        level = np.hypot(seen_m[:, 0] - self._axis_x_m, seen_m[:, 1])
+        up = seen_m[:, 2] - self._axis_z_m
+        return np.asarray(self._axis_z_m + np.cos(self.tilt_rad) * up - np.sin(self.tilt_rad) * level)
 
     def tilt_of(self, seen_m: Vec3, height_m: float) -> float:
         """What one sighting of something of a known height says of the tilt, radians."""

@@ -50,7 +50,7 @@ class PlanningCore:
         learned = self.learned
         self._limbs.reacher.use(learned.hand)
         self._limbs.reachability.use(learned.map, learned.mesh)
-        self._limbs.eye = learned.eye
+        self._limbs.eye = self._senses.eye = learned.eye
         self._limbs.driver.turn_with(learned.separation_m)
         drawn_m = self._limbs.robot.base.wheel_separation_m
         self._senses.turning.ratio = drawn_m / learned.separation_m if learned.separation_m is not None else 1.0
@@ -100,6 +100,9 @@ class PlanningCore:
     def _own_hull(self, angles: Mapping[str, float]) -> tuple[Array, Array]:
         """Where the robot itself, and what it holds, is in its own view in a posture."""
         centres, radii = self._limbs.arm.clearance.hull(angles)
+        off = self.learned.offset_m(angles)
+        if off is not None:  # the arm is seen there, and nearer to its shoulder in between
+            centres, radii = np.vstack([centres, centres + off / 2, centres + off]), np.tile(radii, 3)
         held = self._limbs.reacher.position(angles)
         chassis = np.array([0.0, 0.0, 0.0])
         own_m = self._limbs.robot.base.chassis_diameter_m / 2 + 0.03

@@ -150,6 +150,13 @@ class Learned:
         if self.hand is not None:
             self.hand.step(sightings, now_ns)
 
+    def offset_m(self, angles: Mapping[str, float]) -> Array | None:
+        """By how much the hand is seen beside where the drawing has it, shape (3,); None where nothing was learned."""
+        if self.map is None:
+            return None
+        at = _arm(angles)
+        return np.asarray(self.map.at(at) - self.map.drawing.at(at))
+
     def rest(self) -> None:
         """Called while the robot does nothing, for what takes long."""
         if self._teacher is not None:

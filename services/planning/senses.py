@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
+from itertools import compress
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
 
 from cocoro import topics
@@ -13,6 +15,7 @@ from cocoro.clock import NS, is_fresh
 from cocoro.frames import Pose2
 from cocoro.history import History
 from cocoro.kinematics import Array
+from cocoro.learning.eye import Eye
 from cocoro.messages import BaseState, Detection, Detections, Intent, Message, Obstacles, ServoState, Vec3
 from cocoro.topics import Topic
 from services.planning.config import Config
@@ -21,6 +24,8 @@ from services.planning.surroundings import Surroundings
 from services.planning.turning import Turning
 
 _WAIT_FOR_ODOMETRY_NS = NS // 5
+FLOOR_M, FLOOR_PER_M = 0.025, 0.012
+"""Lower than this, growing with the distance, counts as floor, as perception has it."""
 
 
 class Sight:
@@ -88,6 +93,8 @@ class Senses:
         self._looked_ns: int | None = None
         self._sight = Sight(config)
         self.turning = Turning()
+        self.eye: Eye | None = None
+        """Where it is known to be tilted: what it sees standing on the floor may be the floor."""
         self._watched = {config.marker}
         self._sightings: list[Sighting] = []
 
@@ -156,7 +163,17 @@ class Senses:
                 return
             self._floors.popleft()
             if pose is not None and now_ns - seen.stamp_ns <= topics.OBSTACLES.max_age_s * NS:
+                seen = self._standing(seen)
                 self.around.floor.enter(seen, Pose2(*pose.tolist()), own(self.posture(seen.stamp_ns)))
+
+    def _standing(self, seen: Obstacles) -> Obstacles:
+        """Without what only a tilted eye lifts off the floor."""
+        if self.eye is None or self.eye.tilt_rad <= 0.0 or not seen.points_m:
+            return seen
+        points = np.array(seen.points_m)
+        distance = np.hypot(points[:, 0] - seen.origin_m[0], points[:, 1] - seen.origin_m[1])
+        stands = self.eye.heights(points) > FLOOR_M + FLOOR_PER_M * distance
+        return msgspec.structs.replace(seen, points_m=tuple(compress(seen.points_m, stands.tolist())))
 
     def _remember(self, detections: Detections, body: Pose2) -> None:
         for detection in detections.detections:
