@@ -24,8 +24,9 @@ from services.planning.surroundings import Surroundings
 from services.planning.turning import Turning
 
 _WAIT_FOR_ODOMETRY_NS = NS // 5
-FLOOR_M, FLOOR_PER_M = 0.025, 0.012
-"""Lower than this, growing with the distance, counts as floor, as perception has it."""
+FLOOR_M, FLOOR_PER_M = 0.040, 0.012
+"""Lower than this, growing with the distance, counts as floor to an eye that is tilted: more than perception has it,
+for such an eye is likely to be rolled a little, too."""
 
 
 class Sight:
