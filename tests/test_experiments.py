@@ -142,7 +142,8 @@ def test_a_kept_result_is_used_until_what_it_stands_on_changes(tmp_path: Path) -
 # --- report -------------------------------------------------------------------------------------------
 
 TRACE = {
-    "time_s": [0.0, 0.1], "phase": ["touch", "follow"], "target": ["red_can", "green_can"], "body": [[0.0, 0.0, 0.0]] * 2,
+    "time_s": [0.0, 0.1], "phase": ["touch", "follow"], "target": ["red_can", "green_can"],
+    "body": [[0.0, 0.0, 0.0]] * 2,
     "hand_m": [[0.4, 0.0, 0.2], [0.5, 0.0, 0.2]], "felt_m": [None, [0.5, 0.0, 0.2]],
     "target_m": [[0.6, 0.0, 0.2]] * 2,
 }  # fmt: skip
