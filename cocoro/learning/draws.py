@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from scipy.stats import qmc
+import scipy  # which loads its parts when they are needed: half a second for this one
 
 from cocoro.learning.network import Array
 
@@ -13,7 +13,7 @@ from cocoro.learning.network import Array
 def sobol(first: int, ranges: Array) -> Iterator[tuple[int, Array]]:
     """(number, point) from the draw `first` on, for ever; points (n,) within `ranges` (n, 2). Equal numbers, equal
     points. Number 0, the sequence's own first, is a corner of the box like any other."""
-    engine = qmc.Sobol(len(ranges), scramble=False)
+    engine = scipy.stats.qmc.Sobol(len(ranges), scramble=False)
     if first:
         engine.fast_forward(first)
     low, high = ranges.T

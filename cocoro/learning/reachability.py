@@ -13,8 +13,8 @@ from collections.abc import Sequence
 from enum import IntEnum
 
 import numpy as np
+import scipy  # which loads its parts when they are needed: a robot that has learned nothing does without
 from numpy.typing import NDArray
-from scipy.spatial import Delaunay, KDTree, QhullError
 
 from cocoro.learning.network import Array
 
@@ -43,7 +43,7 @@ class ReachMesh:
     def __init__(self, places_m: Array | None = None, *, radius_m: float | None = None) -> None:
         """`radius_m`: of the largest ball that counts as small; None derives it from the sightings' own spacing."""
         self._wanted_m = radius_m
-        self._mesh: Delaunay | None = None
+        self._mesh: scipy.spatial.Delaunay | None = None
         self._waiting: list[Array] = []
         self._held = np.empty((0, 3))
         self._cells: set[tuple[int, ...]] = set()
@@ -103,8 +103,8 @@ class ReachMesh:
             if len(places) < 5:
                 return
             try:
-                self._mesh = Delaunay(places, incremental=True)
-            except QhullError:  # all in one plane so far
+                self._mesh = scipy.spatial.Delaunay(places, incremental=True)
+            except scipy.spatial.QhullError:  # all in one plane so far
                 return
         else:
             self._mesh.add_points(fresh)
@@ -124,7 +124,9 @@ class ReachMesh:
         """Which tetrahedra are small."""
         assert self._mesh is not None
         if self._wanted_m is None:
-            neighbours = np.asarray(KDTree(self._held).query(self._held, k=min(4, len(self._held)))[0])[:, -1]
+            neighbours = np.asarray(scipy.spatial.KDTree(self._held).query(self._held, k=min(4, len(self._held)))[0])[
+                :, -1
+            ]
             self.radius_m = max(LEAST_RADIUS_M, GAP_FACTOR * float(np.quantile(neighbours, 0.75)))
         self._small = _radii_m(self._mesh.points[self._mesh.simplices]) <= self.radius_m
         self._mesh.find_simplex(self._held[:1])  # what it makes for the first question takes long: now, not then
