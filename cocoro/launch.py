@@ -13,7 +13,6 @@ import json
 import logging
 import os
 import signal
-import sys
 import threading
 import time
 from collections.abc import Awaitable
@@ -22,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from cocoro.errors import CocoroError, RefusedError
+from cocoro.quit import quit_process
 from cocoro.rundir import RunDir
 
 OK, CRASHED, MISCONFIGURED, REFUSED = 0, 1, 2, 3
@@ -175,4 +175,4 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    quit_process(main())

@@ -23,6 +23,7 @@ import msgspec
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.errors import CocoroError, RefusedError
 from cocoro.profiles import Profile, from_data
+from cocoro.quit import quit_process
 from cocoro.rundir import RunDir
 from deploy.child import Child, StartError
 
@@ -216,4 +217,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    quit_process(main())

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import signal
+import tempfile
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
@@ -26,6 +28,13 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 def robot() -> Robot:
     """The Calliope as it is described."""
     return Robot.load()
+
+
+@pytest.fixture
+def short_path() -> Iterator[Path]:
+    """Sockets live there."""
+    with tempfile.TemporaryDirectory(prefix="cocoro") as folder:
+        yield Path(folder)
 
 
 @pytest.fixture(scope="session", autouse=True)

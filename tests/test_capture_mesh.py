@@ -8,9 +8,8 @@ import random
 import select
 import subprocess
 import sys
-import tempfile
 import time
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
 
@@ -35,13 +34,6 @@ KILLS = 5
 """bench/capture.py does 20 and tells the figures."""
 MISSING_S = 0.3
 PATIENCE_S = 60.0
-
-
-@pytest.fixture
-def short_path() -> Iterator[Path]:
-    """Sockets live there."""
-    with tempfile.TemporaryDirectory(prefix="cocoro") as folder:
-        yield Path(folder)
 
 
 class Pulse:

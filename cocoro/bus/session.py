@@ -9,6 +9,7 @@ import json
 import os
 import re
 import threading
+import time
 from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
@@ -21,6 +22,8 @@ T = TypeVar("T")
 
 LEAVE_S = 2.0
 """How long leaving the mesh may take before it is given up; the process can end all the same."""
+LAST_TURN_S = 0.02
+"""For threads of zenoh's that wait for the interpreter while the process ends."""
 FRAGMENT_WAIT_US = 25_000
 """How long a large sample without shared memory may wait for a receiver on this machine that does not read."""
 
@@ -122,15 +125,19 @@ async def in_thread(work: Callable[[], T], undo: Callable[[T], None] | None = No
 
 
 class ExitGuard:
-    """Sessions that the program forgot to close: zenoh must not call back into an interpreter that ends."""
+    """Zenoh must not call back into an interpreter that is taken apart (`cocoro.quit` tells why): sessions that the
+    program forgot are closed before, and a thread of zenoh's that is about to call gets its turn. A program that
+    would be sure ends by `quit_process`."""
 
     def __init__(self) -> None:
         self._leaves: set[Callable[[], None]] = set()
+        self._used = False
         self._process = os.getpid()
         atexit.register(self._leave_all)
 
     def add(self, leave: Callable[[], None]) -> None:
         self._leaves.add(leave)
+        self._used = True
 
     def discard(self, leave: Callable[[], None]) -> None:
         self._leaves.discard(leave)
@@ -143,6 +150,8 @@ class ExitGuard:
             thread.start()
         for thread in threads:
             thread.join(LEAVE_S)
+        if self._used:
+            time.sleep(LAST_TURN_S)
 
 
 exit_guard = ExitGuard()

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import sys
+from typing import NoReturn
 
 from cocoro.cli import exits
+from cocoro.quit import quit_process
 
 ESTOP = ("estop", "stop")
 
@@ -53,5 +55,10 @@ def code_of(error: Exception) -> int:
     return exits.FAILED
 
 
+def run() -> NoReturn:
+    """The process `cocoro`, to its end."""
+    quit_process(main())
+
+
 if __name__ == "__main__":
-    sys.exit(main())
+    run()
