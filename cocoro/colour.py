@@ -24,9 +24,12 @@ def lab_of(colour: Pixels) -> Lab:
 def in_boxes(boxes: Iterable[LabBox], lab: Lab) -> Bools:
     """Whether each colour (..., 3) lies in any of the boxes."""
     found = np.zeros(lab.shape[:-1], dtype=np.bool_)
+    channels = [np.ascontiguousarray(lab[..., number]) for number in range(3)]
     for box in boxes:
-        low, high = np.array(box.low, dtype=np.float32), np.array(box.high, dtype=np.float32)
-        found |= np.all((lab >= low) & (lab <= high), axis=-1)
+        inside = np.ones_like(found)
+        for channel, low, high in zip(channels, box.low, box.high, strict=True):
+            inside &= (channel >= np.float32(low)) & (channel <= np.float32(high))
+        found |= inside
     return found
 
 

@@ -11,6 +11,9 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+_HERE = np.eye(4)
+_HERE.setflags(write=False)
+
 
 @dataclass(frozen=True)
 class Link:
@@ -43,7 +46,13 @@ class Link:
 def turn_z(angle_rad: float) -> Array:
     """4 x 4 rotation about z."""
     c, s = cos(angle_rad), sin(angle_rad)
-    return np.array([[c, -s, 0.0, 0.0], [s, c, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+    return np.array((c, -s, 0.0, 0.0, s, c, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0)).reshape(4, 4)
+
+
+def cross(a: Array, b: Array) -> Array:
+    """Vector product of two of shape (3,); `np.cross` takes ten times as long to find out that they are two."""
+    (ax, ay, az), (bx, by, bz) = a.tolist(), b.tolist()
+    return np.array((ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx))
 
 
 class Chain:
@@ -67,12 +76,12 @@ class Chain:
 
     def pose(self, angles_rad: Mapping[str, float]) -> Array:
         """4 x 4 transform from the tip's frame to the root's. `angles_rad` has every joint of the chain."""
-        total = np.eye(4)
+        total = _HERE
         for fixed, joint, offset in self._steps:
             total = total @ fixed
             if joint is not None:
                 total = total @ turn_z(angles_rad[joint] + offset)
-        return total
+        return total if total is not _HERE else total.copy()
 
     def position(self, angles_rad: Mapping[str, float]) -> Array:
         """The tip's origin in the root's frame, shape (3,)."""
@@ -84,7 +93,7 @@ class Chain:
         Columns follow `joints` (those of the chain by default); a joint outside the chain has a zero column.
         """
         columns: dict[str, tuple[Array, Array]] = {}
-        total = np.eye(4)
+        total = _HERE
         for fixed, joint, offset in self._steps:
             total = total @ fixed
             if joint is not None:
@@ -96,7 +105,7 @@ class Chain:
         for i, joint in enumerate(wanted):
             if joint in columns:
                 axis, origin = columns[joint]
-                jac[:3, i] = np.cross(axis, tip - origin)
+                jac[:3, i] = cross(axis, tip - origin)
                 jac[3:, i] = axis
         return jac
 
@@ -123,7 +132,7 @@ class Tree:
 
     def poses(self, angles_rad: Mapping[str, float]) -> dict[str, Array]:
         """4 x 4 transforms from each link's frame on the way to the tips to the root's, by the link's name."""
-        poses: dict[str, Array] = {self._root: np.eye(4)}
+        poses: dict[str, Array] = {self._root: _HERE.copy()}
         for name, parent, fixed, joint, offset in self._steps:
             pose = poses[parent] @ fixed
             poses[name] = pose if joint is None else pose @ turn_z(angles_rad[joint] + offset)

@@ -5,10 +5,8 @@ from __future__ import annotations
 from math import acos, degrees, hypot, sqrt
 
 import msgspec
-import numpy as np
 
 from cocoro.messages import TrueObject, Truth, Vec3
-from sim.rigid import rotations
 from sim.scene import Scene, SceneObject
 from sim.stage import FLOOR
 
@@ -124,8 +122,8 @@ class Judge:
 
 def _upright(item: TrueObject) -> tuple[float, float, float]:
     """The world's z in the object's axes."""
-    x, y, z = rotations(np.array([item.orientation]))[0][2]
-    return float(x), float(y), float(z)
+    x, y, z, w = item.orientation
+    return 2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)
 
 
 def _tilt_deg(item: TrueObject) -> float:

@@ -16,7 +16,7 @@ from cocoro.robot import Robot
 from sim.body import CHASSIS
 from sim.bullet import Bullet
 from sim.model import WHEELS, Model, write_urdf
-from sim.rigid import rotations
+from sim.rigid import rotation, rotations
 from sim.scene import Start
 from sim.servos import Drive
 
@@ -118,7 +118,7 @@ class Mechanism:
         """4 x 4 transform from the body frame to the world."""
         position, orientation = self._bullet.getBasePositionAndOrientation(self.body)
         pose = np.eye(4)
-        pose[:3, :3] = rotations(np.array([orientation]))[0]
+        pose[:3, :3] = rotation(orientation)
         pose[:3, 3] = np.array(position) - pose[:3, :3] @ self._root_offset
         return pose
 

@@ -10,7 +10,7 @@ import numpy as np
 from cocoro.kinematics import Array
 from cocoro.messages import TrueObject, Truth
 from cocoro.robot import Robot
-from sim.rigid import rotations
+from sim.rigid import rotation
 from sim.scene import Scene
 
 
@@ -60,7 +60,7 @@ class PursuitJudge:
 
     def _in_picture(self, truth: Truth, target: TrueObject) -> bool:
         body = np.eye(4)
-        body[:3, :3] = rotations(np.array([truth.body_orientation]))[0]
+        body[:3, :3] = rotation(truth.body_orientation)
         body[:3, 3] = truth.body_m
         pose: Array = body @ self._chain.pose(truth.joints_rad)
         x, y, z = pose[:3, :3].T @ (np.array(target.position_m) - pose[:3, 3])

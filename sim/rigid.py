@@ -2,9 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from cocoro.kinematics import Array
+
+
+def rotation(quaternion: Sequence[float]) -> Array:
+    """Rotation matrix (3, 3) of one unit quaternion (x, y, z, w)."""
+    x, y, z, w = quaternion
+    return np.array(
+        (
+            (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
+            (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
+            (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
+        )
+    )
 
 
 def rotations(quaternions: Array) -> Array:

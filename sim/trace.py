@@ -12,7 +12,7 @@ from cocoro.frames import to_spherical, wrap_rad
 from cocoro.kinematics import Array
 from cocoro.messages import PlannerStatus, TaskState, Truth, Vec3
 from cocoro.robot import Robot
-from sim.rigid import rotations
+from sim.rigid import rotation
 
 STALL_M = 0.005
 """A hand that moves less than this stands still."""
@@ -53,7 +53,7 @@ class Trace:
     def feed(self, truth: Truth) -> None:
         self._began_ns = truth.stamp_ns if self._began_ns is None else self._began_ns
         time_s = (truth.stamp_ns - self._began_ns) / NS
-        turn = rotations(np.array([truth.body_orientation]))[0]
+        turn = rotation(truth.body_orientation)
         place = np.array(truth.body_m)
         self._objects = {
             item.label: _vec3(turn.T @ (np.array(item.position_m) - place)) for item in truth.objects

@@ -7,8 +7,8 @@ from copy import copy
 from typing import Any
 
 import numpy as np
+import scipy  # which loads its parts when they are needed: a robot that has learned nothing does without
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
 
 from cocoro.learning.network import Array, HyperplaneRbf
 
@@ -28,7 +28,7 @@ def learn_in_order(network: HyperplaneRbf, inputs: Array, targets: Array, rate: 
         before = targets[start : start + _BLOCK] - phi @ network.weights
         system = np.tril(rate * (phi @ phi.T), -1)
         np.fill_diagonal(system, 1.0)
-        errors = solve_triangular(system, before, lower=True, unit_diagonal=True)
+        errors = scipy.linalg.solve_triangular(system, before, lower=True, unit_diagonal=True)
         network.weights += rate * (phi.T @ errors)
 
 

@@ -58,8 +58,8 @@ class FloorScanner:
         ray = np.floor(np.degrees(bearing) / _RAY_DEG).astype(np.int64) % _RAYS
         return Obstacles(
             points_m=tuple(
-                (round(float(x), 3), round(float(y), 3), round(float(z), 3))
-                for (x, y), z in zip(cells, heights, strict=True)
+                (round(x, 3), round(y, 3), round(z, 3))
+                for (x, y), z in zip(cells.tolist(), heights.tolist(), strict=True)
             ),
             free=_free(ray, distance, floor, standing),
             origin_m=(float(origin[0]), float(origin[1])),
@@ -102,6 +102,5 @@ def _free(
     farthest = np.minimum(farthest, ends)
     bearings = np.radians((np.arange(_RAYS) + 0.5) * _RAY_DEG)
     rays = np.flatnonzero(farthest > nearest)
-    return tuple(
-        (round(float(bearings[i]), 4), round(float(nearest[i]), 3), round(float(farthest[i]), 3)) for i in rays
-    )
+    found = zip(bearings[rays].tolist(), nearest[rays].tolist(), farthest[rays].tolist(), strict=True)
+    return tuple((round(bearing, 4), round(near, 3), round(far, 3)) for bearing, near, far in found)

@@ -23,11 +23,15 @@ TUBES = (
 _FINGER_TURN_RAD = {"claw_left": radians(80.0), "claw_right": radians(-80.0)}
 """From the claw's x axis to its finger (Tekkotsu Calliope5KP.kin)."""
 _FINGER_M = 0.11
+_FINGER_REACH = np.array([[0.0], [0.5 * _FINGER_M], [_FINGER_M]])
 _FINGER_RADIUS_M = 0.02
 
 
 class Clearance:
     def __init__(self, robot: Robot) -> None:
+        self._shares = [np.linspace(0.0, 1.0, count)[:, None] for *_, count in TUBES]
+        radii = [radius_m for *_, radius_m, count in TUBES for _ in range(count)]
+        self._radii = np.array(radii + [_FINGER_RADIUS_M] * (len(_FINGER_REACH) * len(_FINGER_TURN_RAD)))
         self._tree = robot.tree(*(name for tube in TUBES for name in tube[:2]), *_FINGER_TURN_RAD)
         # A finger lies across its claw's own x axis, towards the hand's tip.
         self._fingers = {name: np.array([cos(turn), sin(turn), 0.0]) for name, turn in _FINGER_TURN_RAD.items()}
@@ -40,19 +44,13 @@ class Clearance:
         """Centres (n, 3) in the body frame and radii (n,) of the arm's balls. The claws' angles may be left out."""
         angles = dict.fromkeys(_FINGER_TURN_RAD, 0.0) | dict(angles)
         poses = self._tree.poses(angles)
-        centres: list[Array] = []
-        radii: list[float] = []
-        for start, end, radius_m, count in TUBES:
-            for share in np.linspace(0.0, 1.0, count):
-                centres.append((1 - share) * poses[start][:3, 3] + share * poses[end][:3, 3])
-                radii.append(radius_m)
+        balls: list[Array] = []
+        for (start, end, *_), share in zip(TUBES, self._shares, strict=True):
+            balls.append((1 - share) * poses[start][:3, 3] + share * poses[end][:3, 3])
         for name, turn in self._fingers.items():
             pose = poses[name]
-            along = pose[:3, :3] @ turn
-            for reach_m in (0.0, 0.5 * _FINGER_M, _FINGER_M):
-                centres.append(pose[:3, 3] + reach_m * along)
-                radii.append(_FINGER_RADIUS_M)
-        return np.array(centres), np.array(radii)
+            balls.append(pose[:3, 3] + _FINGER_REACH * (pose[:3, :3] @ turn))
+        return np.concatenate(balls), self._radii
 
     def of(self, angles: Mapping[str, float]) -> float:
         """The least distance, metres; negative inside of something."""

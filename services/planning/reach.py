@@ -63,7 +63,7 @@ class Reacher:
         self._pad: HandModel = self._rigid
         self._axis = robot.chain("arm_base").position({"arm_base": 0.0})
         self._limits = np.array([robot.joints[name].limits_rad for name in ARM])
-        self._damping2 = damping * damping
+        self._damping = damping * damping * np.eye(4)
 
     def use(self, hand: HandModel | None) -> None:
         """Reach with this from now on; None is the rigid body."""
@@ -102,7 +102,7 @@ class Reacher:
         jac6 = self._pad.jacobian(angles, ARM)
         along = transform[:3, 2]
         level = max(float(np.sqrt(max(1.0 - along[2] ** 2, 0.0))), 0.1)
-        pitch_row = np.cross(jac6[3:].T, along)[:, 2] / level
+        pitch_row = (jac6[3] * along[1] - jac6[4] * along[0]) / level  # how its axis, turned by a joint, rises
         jac = np.vstack([jac6[:3], 0.2 * pitch_row])
         error = np.empty(4)
         error[:3] = self.point(pose) - transform[:3, 3]
@@ -114,7 +114,7 @@ class Reacher:
         for _ in range(4):
             part = jac[:, free]
             rest = error - jac[:, ~free] @ change[~free]
-            change[free] = part.T @ np.linalg.solve(part @ part.T + self._damping2 * np.eye(4), rest)
+            change[free] = part.T @ np.linalg.solve(part @ part.T + self._damping, rest)
             goal = start + change
             over = free & ((goal < self._limits[:, 0]) | (goal > self._limits[:, 1]))
             if not over.any():

@@ -35,13 +35,19 @@ class Reachability:
         self._config = config
         self._reacher = reacher
         self._seen: tuple[HandMap, ReachMesh] | None = None
-        self.retreat_m = self._retreat()
-        """Where the hand waits behind a target, from the arm base's axis: no nearer than the arm folds."""
+        self._retreat_m: float | None = None
 
     def use(self, learned: HandMap | None, mesh: ReachMesh | None) -> None:
         """Judge by where the hand was seen, too, from now on; None: by the kinematics alone."""
         self._seen = (learned, mesh) if learned is not None and mesh is not None else None
-        self.retreat_m = self._retreat()
+        self._retreat_m = None  # the kinematics may have changed, too
+
+    @property
+    def retreat_m(self) -> float:
+        """Where the hand waits behind a target, from the arm base's axis: no nearer than the arm folds."""
+        if self._retreat_m is None:
+            self._retreat_m = self._retreat()
+        return self._retreat_m
 
     def _retreat(self) -> float:
         """The configured radius, or as much more as the kinematics that it reaches with want: a hand that is learned to

@@ -5,9 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import scipy  # which loads its parts when they are needed: a robot that never meets a detour does without
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import dijkstra
 
 from cocoro.kinematics import Array
 from services.planning.floor_map import CELL_M, SIZE, ClearanceField, FloorMap
@@ -36,7 +35,9 @@ class Routes:
         here = (slice(max(row - 4, 0), row + 5), slice(max(column - 4, 0), column + 5))
         cost[here] = np.where(np.isfinite(cost[here]), cost[here], 6.0)
         start_at = np.array([row * SIZE + column])
-        distance, predecessors = dijkstra(_graph(cost), directed=False, indices=start_at, return_predecessors=True)
+        distance, predecessors = scipy.sparse.csgraph.dijkstra(
+            _graph(cost), directed=False, indices=start_at, return_predecessors=True
+        )
         self._distance, self._predecessors = distance[0], predecessors[0]
 
     def cost(self, x_m: float, y_m: float) -> float:
@@ -74,4 +75,4 @@ def _graph(cost: Array) -> Any:
         columns.append(other[open_])
         weights.append(weight[open_])
     entries: Any = (np.concatenate(weights), (np.concatenate(rows), np.concatenate(columns)))
-    return coo_array(entries, shape=(SIZE * SIZE, SIZE * SIZE)).tocsr()
+    return scipy.sparse.coo_array(entries, shape=(SIZE * SIZE, SIZE * SIZE)).tocsr()

@@ -29,7 +29,10 @@ class Batch:
     ) -> None:
         self._ctx = ctx
         self._rows = list(rows)
+        # A corner that several triangles share is transformed once.
+        corners, order = np.unique(corners, axis=0, return_inverse=True)
         self._corners = ctx.buffer(corners.tobytes())
+        self._order = ctx.buffer(order.astype(np.uint32).tobytes())
         self._fixed = ctx.buffer(np.hstack([scales, rgbs]).astype(np.float32).tobytes())
         self._poses = ctx.buffer(reserve=64 * len(self._rows))
         self._arrays: dict[moderngl.Program, moderngl.VertexArray] = {}
@@ -46,13 +49,13 @@ class Batch:
                 _layout(program, self._fixed, "/i", ("3f", "in_scale"), ("3f", "in_rgb")),
                 _layout(program, self._poses, "/i", ("16f", "in_pose")),
             ]
-            self._arrays[program] = self._ctx.vertex_array(program, parts)
+            self._arrays[program] = self._ctx.vertex_array(program, parts, self._order)
         self._arrays[program].render(moderngl.TRIANGLES, instances=len(self._rows))
 
     def release(self) -> None:
         for array in self._arrays.values():
             array.release()
-        for buffer in (self._corners, self._fixed, self._poses):
+        for buffer in (self._corners, self._order, self._fixed, self._poses):
             buffer.release()
 
 

@@ -20,7 +20,7 @@ from cocoro.clock import NS
 from cocoro.errors import CocoroError
 from cocoro.messages import ServoCommand
 from cocoro.robot import Robot
-from sim.rigid import rotations
+from sim.rigid import rotation
 from sim.service import Config, make_kinect, make_world
 from sim.wire.recording import HEIGHT, WIDTH, RecordingWriter
 from sim.world import World
@@ -61,7 +61,7 @@ def _turn_head(world: World, pan_rad: float, tilt_rad: float) -> None:
 
 def _truth(world: World) -> dict[str, Any]:
     truth = world.truth()
-    turn, origin = rotations(np.array([truth.body_orientation]))[0], np.array(truth.body_m)
+    turn, origin = rotation(truth.body_orientation), np.array(truth.body_m)
     return {
         "objects": {
             one.label: ((np.array(one.position_m) - origin) @ turn).round(6).tolist()
