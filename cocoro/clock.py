@@ -115,7 +115,7 @@ class FollowedClock:
 
     def __init__(self, run_on_s: float = 0.03) -> None:
         self.driven = False
-        """True in the simulator's own process, which ticks it directly."""
+        """Somebody in this process ticks it: see `Node.drive_clock`."""
         self._run_on_ns = round(run_on_s * NS)
         self._epoch = 0
         self._incarnation: int | None = None
@@ -123,7 +123,8 @@ class FollowedClock:
         self._tick_real_ns = 0
         self._newest_ns = 0
         self._rate = 1.0
-        self._ticked = asyncio.Event()
+        self._sleeping: dict[asyncio.Future[None], int] = {}
+        """Until when each wants to sleep. A tick wakes only those to whom it matters: there are a hundred a second."""
 
     @property
     def epoch(self) -> int:
@@ -139,7 +140,8 @@ class FollowedClock:
 
     def tick(self, stamp_ns: int, incarnation: int, rate: float = 1.0) -> None:
         """A sample of the clock key. Ticks that arrive late within an incarnation are ignored."""
-        if incarnation != self._incarnation:
+        anew = incarnation != self._incarnation
+        if anew:
             if self._incarnation is not None:
                 self._epoch += 1
             self._incarnation = incarnation
@@ -149,8 +151,10 @@ class FollowedClock:
         self._tick_ns = stamp_ns
         self._tick_real_ns = time.monotonic_ns()
         self._rate = min(max(rate, 0.01), 2.0)
-        ticked, self._ticked = self._ticked, asyncio.Event()
-        ticked.set()
+        reachable_ns = stamp_ns + self._run_on_ns
+        for sleeper, when_ns in self._sleeping.items():
+            if (anew or when_ns <= reachable_ns) and not sleeper.done():
+                sleeper.set_result(None)
 
     def now_ns(self) -> int:
         if self._incarnation is None:
@@ -161,7 +165,7 @@ class FollowedClock:
 
     async def wait_started(self) -> None:
         while self._incarnation is None:
-            await self._ticked.wait()
+            await self._tick_that_reaches(0)
 
     async def sleep_until(self, when_ns: int) -> bool:
         await self.wait_started()
@@ -173,5 +177,14 @@ class FollowedClock:
             wait_s = left_ns / NS / self._rate if left_ns <= reachable_ns else None
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(wait_s):
-                    await self._ticked.wait()
+                    await self._tick_that_reaches(when_ns)
         return self._epoch == epoch
+
+    async def _tick_that_reaches(self, when_ns: int) -> None:
+        """From which on the clock may run to this time by itself; or one of another epoch."""
+        sleeper: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self._sleeping[sleeper] = when_ns
+        try:
+            await sleeper
+        finally:
+            del self._sleeping[sleeper]

@@ -178,6 +178,16 @@ class Node:
         assert isinstance(self.clock, FollowedClock)
         self.clock.tick(clock.stamp_ns, clock.incarnation, getattr(clock, "rate", 1.0))
 
+    def drive_clock(self) -> FollowedClock:
+        """The caller ticks this node's clock from now on, since it makes the time, or hears its key anyway."""
+        assert isinstance(self.clock, FollowedClock)
+        self.clock.driven = True
+        inbox = self._inboxes.pop(topics.CLOCK.name, None)
+        if inbox is not None and inbox.subscription is not None:
+            self._handles.remove(inbox.subscription)
+            inbox.subscription.close()
+        return self.clock
+
     def sibling(self, name: str) -> Node:
         """Another service in this process, on the same bus and clock: the simulator stands in for four."""
         return Node(

@@ -113,7 +113,7 @@ class Simulator:
         self._states: tuple[tuple[Publisher[Any], Callable[[], Message]], ...] = ()
         self.rate = 1.0
         if isinstance(self._clock, FollowedClock):
-            self._clock.driven = True
+            node.drive_clock()
 
     def connect_camera(self, kinect: Node) -> None:
         """Stand in for the camera alone."""

@@ -13,7 +13,7 @@ from typing import Any, Protocol
 
 import pytest
 
-from cocoro.bus.base import Bus, Payload
+from cocoro.bus.base import Bus, Heard, Payload
 from cocoro.bus.endpoints import default
 from cocoro.bus.local import LocalBus, LocalMesh
 from cocoro.bus.zenoh import ZenohBus
@@ -112,6 +112,27 @@ class Inbox:
 
     async def has(self, payload: bytes) -> None:
         await self.until(lambda: payload in self.payloads)
+
+
+class Listener:
+    """Collects lots, and lets a test wait for so many samples."""
+
+    def __init__(self) -> None:
+        self.lots: list[list[Heard]] = []
+        self._came = asyncio.Event()
+
+    def __call__(self, lot: list[Heard]) -> None:
+        self.lots.append(lot)
+        self._came.set()
+
+    @property
+    def heard(self) -> list[Heard]:
+        return [each for lot in self.lots for each in lot]
+
+    async def has(self, count: int) -> None:
+        while len(self.heard) < count:
+            self._came.clear()
+            await self._came.wait()
 
 
 numbers = itertools.count()
@@ -336,6 +357,57 @@ async def test_a_reader_that_fails_gets_the_next_sample_all_the_same(mesh: Mesh)
         publisher.put(b"good")
         await inbox.has(b"good")
         assert reported == ["the reader of robot/x failed"]
+
+
+@scenario
+async def test_who_listens_hears_all_in_order_in_few_lots_and_what_has_come_when_it_ends(mesh: Mesh) -> None:
+    async with joined(mesh, 2) as (a, b):
+        listener, last, every_s = Listener(), Inbox(), 0.2
+        listening = b.listen("robot/**", listener, every_s)
+        b.subscribe("last", Qos.EVENT, last, depth=1)
+        await known(b, a)
+        publishers = [a.publisher(key, Qos.EVENT) for key in ("robot/x", "robot/y/z")]
+        loop = asyncio.get_running_loop()
+        began_s = loop.time()
+        for number in range(200):
+            publishers[number % 2].put(b"%d" % number)
+        await listener.has(200)
+        most = 200 if isinstance(mesh, Local) else (loop.time() - began_s) / every_s + 2
+        assert len(listener.lots) <= most
+
+        for number in range(200, 300):
+            publishers[number % 2].put(b"%d" % number)
+        a.publisher("last", Qos.EVENT).put(b"")
+        await last.has(b"")
+        listening.close()
+        heard = listener.heard
+        assert [bytes(each.payload) for each in heard] == [b"%d" % number for number in range(300)]
+        assert [each.key for each in heard] == ["robot/x", "robot/y/z"] * 150
+        times = [each.heard_ns for each in heard]
+        assert times == sorted(times)
+        publishers[0].put(b"more")
+        a.publisher("last", Qos.EVENT).put(b"again")
+        await last.has(b"again")
+        assert len(listener.heard) == 300
+
+
+@scenario
+async def test_who_fails_at_a_lot_gets_the_next_one(mesh: Mesh, caplog: pytest.LogCaptureFixture) -> None:
+    async with joined(mesh, 1) as (a,):
+        listener = Listener()
+
+        def fail_once(lot: list[Heard]) -> None:
+            listener(lot)
+            if len(listener.heard) == 1:
+                raise RuntimeError("once")
+
+        a.listen("robot/x", fail_once, 0.01)
+        publisher = a.publisher("robot/x", Qos.EVENT)
+        publisher.put(b"bad")
+        await listener.has(1)
+        publisher.put(b"good")
+        await listener.has(2)
+        assert "failed" in caplog.text
 
 
 @scenario

@@ -11,17 +11,20 @@ from typing import Any
 
 import msgspec
 import pytest
-from capture_rig import STILL, Room, all_of, drive, entry, record, writer
+from capture_rig import ROBOT, STILL, Room, all_of, drive, entry, record, writer
 
 from cocoro import profiles, topics
 from cocoro.bus.base import Payload
+from cocoro.bus.local import LocalMesh
 from cocoro.capture.reader import Capture
 from cocoro.capture.writer import Writer
-from cocoro.clock import NS
+from cocoro.clock import NS, FollowedClock
 from cocoro.core import Sample, Schedule, Take
 from cocoro.errors import CocoroError, RemoteError
-from cocoro.messages import AboutReply, BaseState, CancelRequest, Recording, TaskReply
-from cocoro.node import RECORDER_S
+from cocoro.messages import AboutReply, BaseState, CancelRequest, Clock, Recording, TaskReply
+from cocoro.node import RECORDER_S, Node
+from cocoro.processes import load, named
+from cocoro.testing import settle
 from cocoro.topics import Qos
 from cocoro.vloop import run_virtual
 from services.capture.config import Config, folder_of
@@ -121,6 +124,32 @@ def test_a_service_that_is_too_busy_at_its_start_is_asked_again(tmp_path: Path) 
     assert len(asked) == 2
     with Capture.open(path) as capture:
         assert capture.metadata["service/base"]["module"] == "parts.slow"
+
+
+def test_it_tells_simulated_time_by_what_it_hears_and_is_not_woken_for_it_besides(tmp_path: Path) -> None:
+    async def scenario() -> None:
+        mesh, clock = LocalMesh(), FollowedClock()
+        key = topics.CLOCK.key("calliope")
+        component = load(named("capture"))
+        config = component.config(file=str(tmp_path / "time.mcap"))
+        async with Node("capture", mesh.join(), clock, ROBOT, config=config) as node:
+            recording = asyncio.ensure_future(component.run(node, config))
+            ticks = mesh.join().publisher(key, Qos.STATE)
+            await settle()
+            ticks.put(msgspec.msgpack.encode(Clock(stamp_ns=70 * NS, incarnation=1)))
+            ticks.put(b"\xc1 no clock")
+            await settle()
+            assert 70 * NS <= node.now_ns() < 71 * NS
+            mesh.join().declare_alive("calliope/base/alive")
+            await settle()
+            recording.cancel()
+            await asyncio.gather(recording, return_exceptions=True)
+            assert key not in [subscription.keyexpr for subscription in mesh.subscriptions]
+
+    asyncio.run(scenario())
+    (alive,) = all_of(tmp_path / "time.mcap", "base/alive")
+    assert 70 * NS <= alive.publish_ns < 71 * NS
+    assert [bytes(each.payload) for each in all_of(tmp_path / "time.mcap", "sim/clock")][1:] == [b"\xc1 no clock"]
 
 
 def test_what_is_not_wanted_is_not_recorded(tmp_path: Path) -> None:

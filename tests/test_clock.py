@@ -305,6 +305,31 @@ def test_a_tick_that_says_time_is_faster_ends_a_sleep_early() -> None:
 
 
 @pytest.mark.usefixtures("real_time")
+def test_a_long_sleep_is_not_woken_by_every_tick() -> None:
+    async def main() -> None:
+        clock = FollowedClock()
+        clock.tick(0, 1)
+        looked = 0
+        now_ns = clock.now_ns
+
+        def look() -> int:
+            nonlocal looked
+            looked += 1
+            return now_ns()
+
+        clock.now_ns = look  # type: ignore[method-assign]
+        waiting = await started(clock.sleep_until(10 * NS))
+        for tick in range(1, 1201):
+            await asyncio.sleep(1 / 120)
+            clock.tick(tick * NS // 120, 1)
+        assert await waiting
+        assert looked < 30
+        assert loop_s() == pytest.approx(10.0, abs=0.02)
+
+    run_virtual(main())
+
+
+@pytest.mark.usefixtures("real_time")
 @pytest.mark.parametrize("deadline_ns", [10_000_000, 500_000_000])
 def test_a_new_epoch_ends_a_sleep_and_says_so(deadline_ns: int) -> None:
     async def main() -> None:

@@ -21,6 +21,19 @@ Server = Callable[[str, Payload], Awaitable[bytes]]
 """Answers a request. Raising cocoro.errors.CocoroError answers with an error whose text the caller gets."""
 
 
+class Heard(NamedTuple):
+    """A sample, for who listens to everything."""
+
+    key: str
+    payload: Payload
+    heard_ns: int
+    """When it came in: Unix time between processes, the loop's time within one."""
+
+
+OnLot = Callable[[list[Heard]], None]
+"""Gets samples in the loop's thread, in the order in which they came."""
+
+
 class Reply(NamedTuple):
     key: str
     ok: bool
@@ -58,6 +71,11 @@ class Bus(Protocol):
     def subscribe(self, keyexpr: str, qos: Qos, handler: OnSample, *, depth: int) -> Subscription:
         """`depth` bounds what may wait for the loop, per key; beyond it the oldest is dropped and counted.
         Order per key is kept. Qos.EVENT: nothing is dropped."""
+
+    def listen(self, keyexpr: str, handler: OnLot, every_s: float) -> Handle:
+        """All that travels there; nothing is dropped. It comes in lots, one in `every_s` at most, since waking the loop
+        for each of a thousand samples a second would cost more than all that is done with them. Closing it gives
+        the handler what has come until then."""
 
     def serve(self, key: str, server: Server) -> Handle: ...
 

@@ -10,6 +10,7 @@ from typing import Any
 import zenoh
 
 from cocoro.bus.base import Payload
+from cocoro.bus.lots import Lots
 from cocoro.bus.outbox import Outbox
 from cocoro.bus.pool import SharedPool
 from cocoro.bus.ring import Ring
@@ -29,7 +30,7 @@ does so when a receiver does not read, and then waits for 1 ms at most; one that
 class Declared:
     """Something declared on a session, with the ring that its samples come through, if it receives."""
 
-    def __init__(self, declaration: Any, ring: Ring[Any] | None = None) -> None:
+    def __init__(self, declaration: Any, ring: Ring[Any] | Lots[Any] | None = None) -> None:
         self.on_close: Callable[[Declared], None] = lambda _: None
         self._declaration = declaration
         self._ring = ring
@@ -51,6 +52,17 @@ class Declared:
     def _undeclare(self) -> None:
         with contextlib.suppress(zenoh.ZError):  # the session has ended
             self._declaration.undeclare()
+
+
+class ZenohListening(Declared):
+    def __init__(self, subscriber: zenoh.Subscriber[None], lots: Lots[Any]) -> None:
+        super().__init__(subscriber, lots)
+        self._lots = lots
+
+    def close(self) -> None:
+        if not self._closed:
+            self._lots.deliver()
+        super().close()
 
 
 class ZenohSubscription(Declared):

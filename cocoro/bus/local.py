@@ -11,10 +11,12 @@ from collections import defaultdict, deque
 from typing import TypeVar
 
 from cocoro.bus.answer import answer
-from cocoro.bus.base import Handle, OnAlive, OnSample, Payload, Reply, Server
+from cocoro.bus.base import Handle, Heard, OnAlive, OnLot, OnSample, Payload, Reply, Server
 from cocoro.bus.keys import matches
 from cocoro.errors import CallTimeoutError
 from cocoro.topics import Qos
+
+NS = 1_000_000_000
 
 D = TypeVar("D", bound=Handle)
 
@@ -89,7 +91,7 @@ class LocalSubscription:
         ring.append((key, payload))
 
     def _drain(self, place: str) -> None:
-        for key, payload in self._waiting.pop(place):
+        for key, payload in self._waiting.pop(place, ()):
             if self._handler is None:
                 return
             try:
@@ -104,6 +106,23 @@ class LocalSubscription:
         if self in self._mesh.subscriptions:
             self._mesh.subscriptions.remove(self)
             self._mesh.changed()
+
+
+class LocalListening(LocalSubscription):
+    """No time passes between samples that could be saved: each is a lot."""
+
+    def __init__(self, mesh: LocalMesh, keyexpr: str, handler: OnLot) -> None:
+        loop = asyncio.get_running_loop()
+
+        def hear(key: str, payload: Payload) -> None:
+            handler([Heard(key, payload, round(loop.time() * NS))])
+
+        super().__init__(mesh, keyexpr, Qos.EVENT, hear, depth=1)
+
+    def close(self) -> None:
+        for place in list(self._waiting):
+            self._drain(place)
+        super().close()
 
 
 class LocalPublisher:
@@ -181,6 +200,9 @@ class LocalBus:
 
     def subscribe(self, keyexpr: str, qos: Qos, handler: OnSample, *, depth: int) -> LocalSubscription:
         return self._keep(LocalSubscription(self.mesh, keyexpr, qos, handler, depth))
+
+    def listen(self, keyexpr: str, handler: OnLot, every_s: float) -> Handle:
+        return self._keep(LocalListening(self.mesh, keyexpr, handler))
 
     def serve(self, key: str, server: Server) -> Handle:
         serving = _Serving(self, key, server)

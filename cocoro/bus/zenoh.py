@@ -11,6 +11,7 @@ import contextlib
 import logging
 import secrets
 import threading
+import time
 from collections.abc import Callable
 from types import TracebackType
 from typing import TypeVar
@@ -19,9 +20,10 @@ import zenoh
 from zenoh.handlers import Callback
 
 from cocoro.bus.answer import answer
-from cocoro.bus.base import OnAlive, OnSample, Reply, Server
-from cocoro.bus.declared import QOS, Declared, ZenohPublisher, ZenohSubscription
+from cocoro.bus.base import Heard, OnAlive, OnLot, OnSample, Reply, Server
+from cocoro.bus.declared import QOS, Declared, ZenohListening, ZenohPublisher, ZenohSubscription
 from cocoro.bus.endpoints import ZenohConfig
+from cocoro.bus.lots import Lots
 from cocoro.bus.members import Membership, members, new_identity
 from cocoro.bus.outbox import Outbox
 from cocoro.bus.pool import SharedPool, read
@@ -147,6 +149,21 @@ class ZenohBus:
 
         subscriber = self._session.declare_subscriber(keyexpr, Callback(on_sample, indirect=False))
         return self._keep(ZenohSubscription(subscriber, ring))
+
+    def listen(self, keyexpr: str, handler: OnLot, every_s: float) -> ZenohListening:
+        def deliver(samples: list[tuple[zenoh.Sample, int]]) -> None:
+            found = ((str(sample.key_expr), read(sample.payload), heard_ns) for sample, heard_ns in samples)
+            handler([Heard(key, data, heard_ns) for key, data, heard_ns in found if data is not None])
+
+        lots = Lots(self._loop, deliver, every_s)
+        push, time_ns = lots.push, time.time_ns
+
+        def on_sample(sample: zenoh.Sample) -> None:
+            push((sample, time_ns()))
+
+        return self._keep(
+            ZenohListening(self._session.declare_subscriber(keyexpr, Callback(on_sample, indirect=False)), lots)
+        )
 
     def serve(self, key: str, server: Server) -> Declared:
         def start(_: str, query: zenoh.Query) -> None:

@@ -7,27 +7,30 @@ import base64
 import json
 import platform
 import time
+from contextlib import suppress
 from datetime import UTC, datetime
 from typing import Any
 
 import msgspec
 
 from cocoro.about import about, versions
-from cocoro.bus.base import Handle, Payload
+from cocoro.bus.base import Handle, Heard, Payload
 from cocoro.capture.keys import ALIVE_INFO, Alive, Choice, KeyInfo
 from cocoro.capture.writer import Entry, Missing
-from cocoro.clock import VirtualClock
+from cocoro.clock import FollowedClock, VirtualClock
 from cocoro.errors import MeshError, RemoteError
-from cocoro.messages import AboutReply, AboutRequest, Recording
+from cocoro.messages import AboutReply, AboutRequest, Clock, Recording
 from cocoro.node import Node, alive_key, recorder_key
 from cocoro.rundir import RunDir
-from cocoro.topics import ABOUT, RECORDING, Qos
+from cocoro.topics import ABOUT, CLOCK, RECORDING
 from services.capture.sink import Sink
 
 TELL_S = 1.0
 """How often the recorder tells how it is getting on."""
 TRIES, ASK_AGAIN_S = 10, 1.0
 """How often a service is asked what it was started with, and how long after it did not answer."""
+LISTEN_S = 0.02
+"""How often what was heard is fetched; each message is stamped when it comes in."""
 LOOK_S = 0.1
 """How often it looks whether a fault has come up."""
 
@@ -88,15 +91,20 @@ class Recorder:
         self._sink = sink
         self._handles: list[Handle] = []
         self._head = msgspec.msgpack.Decoder(Head)
+        self._clock: FollowedClock | None = None
+        self._clock_key = CLOCK.key(node.robot_name)
+        self._time = msgspec.msgpack.Decoder(Clock)
         self._newest_ns = 0
         self._alive: dict[str, bool] = {}
         self._virtual = isinstance(node.clock, VirtualClock)
 
     def start(self) -> None:
         robot, bus = self._node.robot_name, self._node.bus
+        if isinstance(self._node.clock, FollowedClock):
+            self._clock = self._node.drive_clock()
         self._remember_run()
-        # As events, nothing is dropped before this loop has seen it; the sink bounds what may wait.
-        self._handles.append(bus.subscribe(f"{robot}/**", Qos.EVENT, self._on_sample, depth=0))
+        # Nothing is dropped before this loop has seen it; the sink bounds what may wait.
+        self._handles.append(bus.listen(f"{robot}/**", self._on_lot, LISTEN_S))
         self._handles.append(bus.watch_alive(f"{robot}/**", self._on_alive))
         self._handles.append(bus.declare_alive(recorder_key(robot, self._node.name)))
 
@@ -130,16 +138,27 @@ class Recorder:
 
     # --- what is heard ----------------------------------------------------------------------------
 
-    def _on_sample(self, key: str, payload: Payload) -> None:
-        source = self._ledger.source(key)
-        if source is None:
+    def _on_lot(self, lot: list[Heard]) -> None:
+        for key, payload, heard_ns in lot:
+            if key == self._clock_key:
+                self._tick(payload)
+            source = self._ledger.source(key)
+            if source is None:
+                continue
+            try:
+                head = self._head.decode(payload)
+            except (msgspec.MsgspecError, ValueError, RecursionError):
+                head = Head(seq=source.heard)
+            source.hear(head)
+            self._put(source, key, head.seq, head.stamp_ns, payload, None, heard_ns)
+
+    def _tick(self, payload: Payload) -> None:
+        """Who hears everything need not be woken for the time besides."""
+        if self._clock is None:
             return
-        try:
-            head = self._head.decode(payload)
-        except (msgspec.MsgspecError, ValueError, RecursionError):
-            head = Head(seq=source.heard)
-        source.hear(head)
-        self._put(source, key, head.seq, head.stamp_ns, payload)
+        with suppress(msgspec.MsgspecError, ValueError, RecursionError):
+            time_is = self._time.decode(payload)
+            self._clock.tick(time_is.stamp_ns, time_is.incarnation, time_is.rate)
 
     def _on_alive(self, key: str, alive: bool) -> None:
         source = self._ledger.source(key)
@@ -147,25 +166,28 @@ class Recorder:
         if source is not None and changed:
             message = Alive(alive=alive, seq=source.heard, stamp_ns=self._node.now_ns())
             source.heard += 1
-            self._put(source, key, message.seq, message.stamp_ns, msgspec.msgpack.encode(message), ALIVE_INFO)
+            data = msgspec.msgpack.encode(message)
+            self._put(source, key, message.seq, message.stamp_ns, data, ALIVE_INFO, time.time_ns())
         _, _, rest = key.partition("/")
         service, _, what = rest.partition("/")
         if alive and what == "alive" and service != self._node.name:
             self._node.spawn(self._ask(service))
 
     def _put(
-        self, source: Source, key: str, sequence: int, stamp_ns: int, payload: Payload, info: KeyInfo | None = None
+        self,
+        source: Source,
+        key: str,
+        sequence: int,
+        stamp_ns: int,
+        payload: Payload,
+        info: KeyInfo | None,
+        heard_ns: int,
     ) -> None:
-        log_ns = self._log_ns()
+        # When it was heard; each later than the last, so that the order can be told by it.
+        log_ns = self._newest_ns = max(self._node.now_ns() if self._virtual else heard_ns, self._newest_ns + 1)
         data = payload if isinstance(payload, bytes) else bytes(payload)
         if not self._sink.offer(Entry(key, sequence, log_ns, stamp_ns or log_ns, data, info)):
             source.dropped += 1
-
-    def _log_ns(self) -> int:
-        """When something was heard; each time later than the last, so that the order can be told by it."""
-        now_ns = self._node.now_ns() if self._virtual else time.time_ns()
-        self._newest_ns = max(now_ns, self._newest_ns + 1)
-        return self._newest_ns
 
     # --- what is known besides --------------------------------------------------------------------
 
