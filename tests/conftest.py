@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from bus_rig import Local, Mesh, Zenoh
 from hypothesis import HealthCheck, settings
 from pictures import renderer_of
 
@@ -35,6 +36,18 @@ def short_path() -> Iterator[Path]:
     """Sockets live there."""
     with tempfile.TemporaryDirectory(prefix="cocoro") as folder:
         yield Path(folder)
+
+
+@pytest.fixture
+def directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where the processes of one robot's mesh will meet: sockets will live there."""
+    return tmp_path_factory.mktemp("m") / "robot"
+
+
+@pytest.fixture(params=["local", pytest.param("zenoh", marks=pytest.mark.zenoh)])
+def mesh(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Mesh:
+    """Either bus."""
+    return Local() if request.param == "local" else Zenoh(tmp_path_factory.mktemp("m"))
 
 
 @pytest.fixture(scope="session", autouse=True)

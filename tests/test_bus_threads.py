@@ -1,0 +1,141 @@
+"""What stands between zenoh's threads and the loop: the ring, the outbox and the pool of shared memory."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from typing import Any
+
+from zenoh_rig import FRAME, PATIENCE_S
+
+from cocoro.bus.outbox import CAPACITY_BYTES, Outbox
+from cocoro.bus.pool import POOL_BYTES, SharedPool, read
+from cocoro.bus.ring import Ring
+
+
+def test_a_ring_keeps_the_newest_counts_the_rest_and_wakes_the_loop_once() -> None:
+    wakes = []
+
+    class Loop(asyncio.SelectorEventLoop):
+        def call_soon_threadsafe(self, *args: Any, **kwargs: Any) -> asyncio.Handle:
+            wakes.append(1)
+            return super().call_soon_threadsafe(*args, **kwargs)
+
+    async def test() -> None:
+        got: list[tuple[str, int]] = []
+        ring = Ring[int](asyncio.get_running_loop(), lambda key, item: got.append((key, item)), depth=2)
+        pushing = threading.Thread(target=lambda: [ring.push(key, n) for n in range(100) for key in "ab"])
+        pushing.start()
+        pushing.join()
+        await asyncio.sleep(0)
+        await asyncio.sleep(0)
+        assert got == [("a", 98), ("a", 99), ("b", 98), ("b", 99)]
+        assert ring.skipped == 196
+        assert len(wakes) == 1
+        ring.push("a", 100)
+        await asyncio.sleep(0)
+        await asyncio.sleep(0)
+        assert got[-1] == ("a", 100)
+
+    with asyncio.Runner(loop_factory=Loop) as runner:
+        runner.run(test())
+
+
+def test_a_ring_without_depth_keeps_all_in_order_over_all_keys() -> None:
+    async def test() -> None:
+        got: list[str] = []
+        ring = Ring[None](asyncio.get_running_loop(), lambda key, _: got.append(key), depth=None)
+        keys = [f"{n % 7}" for n in range(1000)]
+        for key in keys:
+            ring.push(key, None)
+        await asyncio.sleep(0)
+        assert got == keys
+        assert ring.skipped == 0
+
+    asyncio.run(test())
+
+
+def test_a_ring_loses_no_count_between_threads() -> None:
+    async def test() -> None:
+        delivered = 0
+        done = asyncio.Event()
+
+        def deliver(key: str, item: int) -> None:
+            nonlocal delivered
+            delivered += 1
+
+        loop = asyncio.get_running_loop()
+        ring = Ring(loop, deliver, depth=1)
+        threads = [
+            threading.Thread(target=lambda: [ring.push("x", n) for n in range(5000)], name=str(t)) for t in range(4)
+        ]
+
+        def join() -> None:
+            for thread in threads:
+                thread.join()
+            loop.call_soon_threadsafe(done.set)
+
+        for thread in threads:
+            thread.start()
+        threading.Thread(target=join).start()
+        await done.wait()
+        await asyncio.sleep(0)
+        assert delivered + ring.skipped == 20_000
+
+    asyncio.run(test())
+
+
+def test_a_ring_whose_loop_is_closed_takes_samples_in_silence() -> None:
+    loop = asyncio.new_event_loop()
+    ring = Ring[int](loop, lambda key, item: None, depth=None)
+    loop.close()
+    ring.push("x", 1)
+    ring.push("x", 2)
+    assert ring._waiting == {}
+
+
+def test_an_outbox_never_keeps_the_sender_waiting_and_counts_what_it_cannot_take() -> None:
+    outbox = Outbox("test")
+    go_on, sent = threading.Event(), []
+    outbox.put(lambda: (go_on.wait(), sent.append("first"))[0], 1)  # type: ignore[func-returns-value]
+    outbox.put(lambda: sent.append("second"), CAPACITY_BYTES - 1)
+    outbox.put(lambda: sent.append("too much"), 1)
+    assert outbox.lost == 1
+    go_on.set()
+    outbox.close(PATIENCE_S)
+    assert sent == ["first", "second"]
+
+
+def test_an_outbox_that_cannot_send_ends_all_the_same() -> None:
+    outbox, never = Outbox("test"), threading.Event()
+    outbox.put(lambda: never.wait() and None, 1)
+    outbox.close(0.01)
+    never.set()
+
+
+def test_a_pool_that_is_full_lets_samples_go_by_copy() -> None:
+    pool = SharedPool()
+    held = [pool.hold(FRAME) for _ in range(POOL_BYTES // len(FRAME) + 2)]
+    by_copy = [sample for sample in held if isinstance(sample, bytes)]
+    assert pool.missed == len(by_copy) > 0
+    shared = [sample for sample in held if not isinstance(sample, bytes)]
+    assert len(shared) >= 10
+    assert all(read(sample) == FRAME for sample in shared)
+    held.clear()
+    shared.clear()
+    assert not isinstance(pool.hold(FRAME), bytes)
+
+
+def test_a_sample_whose_memory_was_taken_back_is_not_read() -> None:
+    class Held:
+        def is_valid(self) -> bool:
+            return False
+
+    class Payload:
+        def to_bytes(self) -> bytes:
+            return b"half of one and half of another"
+
+        def as_shm(self) -> Held:
+            return Held()
+
+    assert read(Payload()) is None  # type: ignore[arg-type]
