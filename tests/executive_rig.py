@@ -1,0 +1,138 @@
+"""The executive for tests, with a planner and hardware that do as a test's script says."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from typing import Any
+
+import msgspec
+
+from cocoro import topics
+from cocoro.clock import NS, Clock
+from cocoro.messages import (
+    BaseState,
+    EstopReply,
+    EstopRequest,
+    Intent,
+    LatchState,
+    PlannerStatus,
+    ServoState,
+    TargetEstimate,
+    TaskReply,
+    TaskRequest,
+    TaskState,
+)
+from cocoro.testing import ServiceUnderTest
+from cocoro.topics import HARDWARE, STOPPABLE
+
+
+class Robot:
+    """An executive under test, and all that it needs around it."""
+
+    def __init__(self, service: ServiceUnderTest) -> None:
+        self.service = service
+        self.script: dict[str, list[str]] = {}
+        """By behaviour, how its next steps end: 'done', a reason to fail, or 'never'; done when nothing is said."""
+        self.takes_s = 0.1
+        self.holding = False
+        self.speed_mps = 0.0
+        self.silent = False
+        self.says: dict[str, LatchState] = dict.fromkeys(STOPPABLE, "released")
+        self.task_id = ""
+        self.asked: list[str] = []
+        """The behaviours that were wanted, each once."""
+        self._intent = Intent()
+        self._since_ns = 0
+        self._end = "done"
+        service.tester.on(topics.INTENT, self._hear)
+        service.tester.spawn(self._work())
+
+    def _hear(self, intent: Intent) -> None:
+        if (intent.task_id, intent.step) == (self._intent.task_id, self._intent.step):
+            return
+        self._intent, self._since_ns = intent, self.service.tester.now_ns()
+        self.asked.append(intent.behaviour)
+        self._end = (self.script.get(intent.behaviour) or ["done"]).pop(0)
+
+    async def _work(self) -> None:
+        async for _ in self.service.tester.every(50.0):
+            self._tell_hardware()
+            if not self.silent:
+                self.service.feed(topics.PLAN, self.status())
+
+    def _tell_hardware(self) -> None:
+        for name in STOPPABLE:
+            if name == "base" and name in self.says:
+                here = {"odometry_m": (0.0, 0.0), "odometry_yaw_rad": 0.0, "turn_rate_radps": 0.0}
+                state = BaseState(**here, speed_mps=self.speed_mps, latch=self.says[name])  # type: ignore[arg-type]
+                self.service.feed(topics.BASE_STATE, state)
+            elif name in self.says:
+                servos = ServoState(joints=(), position_rad=(), speed_radps=(), load=(), latch=self.says[name])
+                self.service.feed(topics.ARM_STATE if name == "arm" else topics.HAND_STATE, servos)
+
+    def status(self, **changes: Any) -> PlannerStatus:
+        over = self.service.tester.now_ns() - self._since_ns >= self.takes_s * NS and self._end != "never"
+        status = PlannerStatus(
+            task_id=self._intent.task_id,
+            step=self._intent.step,
+            behaviour=self._intent.behaviour,
+            state=("done" if self._end == "done" else "failed") if over else "running",
+            reason=self._end if over and self._end != "done" else "",
+            why=f"{self._intent.behaviour} is what I do",
+            distance_m=0.5,
+            holding=self.holding,
+            body_m=(0.0, 0.0),
+            known=(TargetEstimate(label="red_can", position_m=(1.0, 0.0, 0.06), age_s=3.0),),
+        )
+        return msgspec.structs.replace(status, **changes)
+
+    # --- what an operator does ------------------------------------------------------------------------
+
+    async def ask(self, task: str = "fetch", label: str = "red_can", **more: Any) -> TaskReply:
+        return await self.service.ask(topics.RUN, TaskRequest(task=task, label=label, **more))  # type: ignore[arg-type]
+
+    async def begin(self, task: str = "fetch", label: str = "red_can", **more: Any) -> str:
+        reply = await self.ask(task, label, **more)
+        assert reply.accepted, reply.text
+        self.task_id = reply.task_id
+        return reply.task_id
+
+    async def estop(self, latched: bool) -> EstopReply:
+        """Ask the executive alone."""
+        return await self.service.ask(topics.ESTOP.of("executive"), EstopRequest(latched=latched, by="test"))
+
+    def state(self) -> TaskState:
+        """What was said last of a task; nothing of any when nothing was said."""
+        return (self.service.outputs(topics.TASK) or [TaskState()])[-1]
+
+    async def outcome(self) -> TaskState:
+        """Of the task that was begun last."""
+
+        def over() -> bool:
+            state = self.state()
+            return state.outcome is not None and state.task_id == self.task_id
+
+        await self.service.until(over, timeout_s=300.0)
+        return self.state()
+
+    async def phase(self, name: str) -> None:
+        await self.service.until(lambda: self.state().phase == name)
+
+    def latch(self) -> LatchState:
+        return self.service.latest(topics.LATCH).state
+
+
+@asynccontextmanager
+async def robot(clock: Clock | None = None, ready: bool = True, **config: Any) -> AsyncIterator[Robot]:
+    """A robot whose services all live and whose hardware is released, or (`ready=False`) nothing yet."""
+    async with ServiceUnderTest("services.executive.service", config, clock=clock) as service:
+        robot = Robot(service)
+        if ready:
+            service.others_live(*HARDWARE, "perception", "planning")
+            await service.advance(0.5)
+        yield robot
+
+
+def idle_again(robot: Robot) -> bool:
+    return robot.service.latest(topics.INTENT).behaviour == "idle"

@@ -1,0 +1,148 @@
+"""What ends an executive's task from outside: an operator, a death, silence, a mistake, a clock that begins anew."""
+
+from __future__ import annotations
+
+import asyncio
+
+import pytest
+from executive_rig import idle_again, robot
+
+from cocoro import topics
+from cocoro.clock import NS
+from cocoro.messages import CancelRequest
+from cocoro.testing import JumpingClock, in_virtual_time
+from cocoro.topics import HARDWARE
+from services.executive import executive
+
+
+@in_virtual_time
+async def test_a_cancelled_task_says_so_when_the_robot_stands() -> None:
+    async with robot() as it:
+        it.script, it.speed_mps = {"approach": ["never"]}, 0.3
+        task_id = await it.begin()
+        await it.phase("approach")
+        assert (await it.service.ask(topics.CANCEL, CancelRequest(task_id=task_id))).accepted
+        await it.service.advance(1.0)
+        assert idle_again(it)
+        assert it.state().outcome is None, "it still rolls"
+        it.speed_mps = 0.0
+        state = await it.outcome()
+        assert (state.outcome, state.reason) == ("cancelled", "by the operator")
+
+
+@in_virtual_time
+async def test_only_the_task_that_runs_can_be_cancelled() -> None:
+    async with robot() as it:
+        assert (await it.service.ask(topics.CANCEL, CancelRequest())).refusal == "no_task"
+        it.script = {"search": ["never"]}
+        await it.begin()
+        assert (await it.service.ask(topics.CANCEL, CancelRequest(task_id="another"))).refusal == "no_task"
+        assert (await it.service.ask(topics.CANCEL, CancelRequest())).accepted
+
+
+@pytest.mark.parametrize("ended_by", ["cancel", "estop", "death"])
+@pytest.mark.parametrize("when", [*range(1, 9), "in the middle", "coming to rest"])
+def test_whatever_ends_a_task_and_whenever_it_ends_once_and_another_can_follow(ended_by: str, when: int | str) -> None:
+    """A number is how many turns of the loop after the request."""
+
+    @in_virtual_time
+    async def scenario() -> None:
+        async with robot() as it:
+            it.script = {"search": ["lost"] * 9 if when == "coming to rest" else ["never"]}
+            it.speed_mps = 0.3
+            run = asyncio.ensure_future(it.ask())
+            if isinstance(when, str):
+                await it.service.advance(1.0)
+            else:
+                for _ in range(when):
+                    await asyncio.sleep(0)
+            if ended_by == "cancel":
+                await it.service.ask(topics.CANCEL, CancelRequest())
+            elif ended_by == "estop":
+                await it.estop(latched=True)
+            else:
+                it.service.other_dies("base")
+            accepted = (await run).accepted
+            await it.service.advance(10.0)
+            states = [state for state in it.service.outputs(topics.TASK) if state.outcome is not None]
+            assert len({(state.outcome, state.reason) for state in states}) <= 1
+            if isinstance(when, str):
+                assert accepted
+                assert states[-1].outcome == (
+                    "cancelled" if ended_by == "cancel" and when != "coming to rest" else "failed"
+                )
+
+            it.service.forget()
+            it.script, it.speed_mps, it.holding = {}, 0.0, False
+            it.service.others_live("base")
+            await it.estop(latched=False)
+            await it.service.advance(0.5)
+            await it.begin("park", "")
+            await it.service.until(lambda: it.state().task == "park" and it.state().outcome == "done")
+
+    scenario()
+
+
+@pytest.mark.parametrize("service", [*HARDWARE, "perception", "planning"])
+def test_a_task_fails_when_a_service_that_it_needs_dies(service: str) -> None:
+    @in_virtual_time
+    async def scenario() -> None:
+        async with robot() as it:
+            it.script = {"search": ["never"]}
+            await it.begin()
+            await it.phase("search")
+            it.service.other_dies(service)
+            state = await it.outcome()
+            assert (state.outcome, state.reason) == ("failed", f"not_alive: {service} died")
+            refused = await it.ask()
+            assert (refused.refusal, refused.text) == ("not_alive", f"not alive: {service}; see cocoro status")
+
+    scenario()
+
+
+@in_virtual_time
+async def test_a_planner_that_lives_but_says_nothing_fails_the_task() -> None:
+    async with robot() as it:
+        it.script = {"search": ["never"]}
+        await it.begin()
+        await it.phase("search")
+        it.silent = True
+        silent_s = it.service.tester.now_ns() / NS
+        state = await it.outcome()
+        assert (state.outcome, state.reason) == ("failed", "not_alive: the planner is silent")
+        assert state.stamp_ns / NS - silent_s < 4.0
+        assert (await it.ask()).refusal == "not_alive"
+
+
+@in_virtual_time
+async def test_a_mistake_in_a_task_is_told_and_is_not_the_end_of_the_executive(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def broken(*_: object) -> None:
+        raise ZeroDivisionError("a mistake")
+
+    monkeypatch.setitem(executive.TASKS, "park", broken)
+    async with robot() as it:
+        await it.begin("park", "")
+        state = await it.outcome()
+        assert (state.outcome, state.reason) == ("failed", "internal error: a mistake")
+        it.service.forget()
+        await it.begin("fetch", "red_can", timeout_s=1.0)
+        assert (await it.outcome()).reason.startswith("timed_out")
+
+
+@in_virtual_time
+async def test_when_the_clock_begins_anew_the_task_ends_and_the_next_one_can_begin() -> None:
+    clock = JumpingClock()
+    clock.jump_to(1000.0)
+    async with robot(clock) as it:
+        it.script = {"search": ["never"]}
+        await it.begin()
+        await it.phase("search")
+        clock.jump_to(1.0)
+        state = await it.outcome()
+        assert (state.outcome, state.reason) == ("failed", "clock: the clock began anew")
+        assert state.elapsed_s >= 0.0
+        it.service.forget()
+        await it.service.advance(0.5)
+        await it.begin("park", "")
+        state = await it.outcome()
+        assert (state.outcome, state.reason) == ("done", "")
