@@ -1,4 +1,4 @@
-"""The planner's core by hand: what it does with what it is told, and with what it is not told."""
+"""The planner's core: what it does with what it is told, and with what it is not told."""
 
 from __future__ import annotations
 
@@ -12,121 +12,18 @@ import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 from message_samples import data_of
+from planner_rig import CAN_M, ROBOT, Planner, standing, started
 
 from cocoro import topics
-from cocoro.messages import (
-    BaseCommand,
-    BaseState,
-    Behaviour,
-    Detection,
-    Detections,
-    Intent,
-    Message,
-    Obstacles,
-    PlannerStatus,
-    ServoCommand,
-    ServoState,
-)
-from cocoro.robot import Robot
-from cocoro.testing import CoreUnderTest
+from cocoro.messages import Behaviour, Detection, Detections, Message, ServoState
 from cocoro.topics import Topic
-from services.planning.config import Config
-from services.planning.core import PlanningCore
 
-ROBOT = Robot.load()
-TICK_S = 0.02
-CAN_M = (1.5, 0.0, 0.06)
 MOVING = (topics.BASE_COMMAND, topics.ARM_COMMAND, topics.HAND_COMMAND)
-
-
-class Planner:
-    """A planning core on a robot that is perfectly obedient but for its wheels, and sees a can and free floor."""
-
-    def __init__(self, config: Config | None = None) -> None:
-        self.under_test = CoreUnderTest(PlanningCore(ROBOT, config or Config()))
-        self.angles = dict.fromkeys(ROBOT.joints, 0.0) | ROBOT.poses["park"]
-        self.base: dict[str, Any] = {}
-        self.hand_load = 0.0
-        self.latch = "released"
-        self.wants: Intent | None = Intent()
-        self.sees: tuple[float, float, float] | None = CAN_M
-        self.silent: set[str] = set()
-        self.incarnation = 1
-        self._count = 0
-
-    def tick(self) -> PlannerStatus:
-        """One step, 20 ms later, with everything fresh that is not silent."""
-        test = self.under_test
-        test.now_ns += round(TICK_S * 1e9)
-        here = {"odometry_m": (0.0, 0.0), "odometry_yaw_rad": 0.0, "speed_mps": 0.0, "turn_rate_radps": 0.0}
-        self._feed(topics.BASE_STATE, BaseState(**(here | self.base), latch=self.latch))  # type: ignore[arg-type]
-        self._feed(topics.ARM_STATE, self._servos("arm"))
-        self._feed(topics.HAND_STATE, self._servos("hand"))
-        if self.wants is not None:
-            wants = self.wants
-            self._feed(
-                topics.INTENT,
-                Intent(task_id=wants.task_id, step=wants.step, behaviour=wants.behaviour, label=wants.label),
-            )
-        if self._count % 2 == 0:
-            self._feed(topics.DETECTIONS, self._seen())
-            self._feed(topics.OBSTACLES, Obstacles(free=tuple((k * 0.1, 0.2, 3.0) for k in range(-31, 32))))
-        self._count += 1
-        test.step()
-        status = self.status
-        for output in test.steps[-1]:
-            if isinstance(output.message, ServoCommand):
-                self.angles.update(zip(output.message.joints, output.message.goal_rad, strict=True))
-        return status
-
-    def run(self, seconds: float) -> PlannerStatus:
-        for _ in range(round(seconds / TICK_S)):
-            status = self.tick()
-        return status
-
-    def want(self, behaviour: Behaviour, label: str = "") -> None:
-        step = self.wants.step + 1 if self.wants is not None else 1
-        self.wants = Intent(task_id="task", step=step, behaviour=behaviour, label=label)
-
-    @property
-    def status(self) -> PlannerStatus:
-        return self.under_test.latest(topics.PLAN)
-
-    @property
-    def wheels(self) -> BaseCommand:
-        return self.under_test.latest(topics.BASE_COMMAND)
-
-    @property
-    def commanded(self) -> set[str]:
-        """The topics that the last step commanded on."""
-        return {output.topic.name for output in self.under_test.steps[-1]} - {topics.PLAN.name}
-
-    def _feed(self, topic: Topic[Any], message: Message) -> None:
-        if topic.name not in self.silent:
-            self.under_test.feed(topic, message, incarnation=self.incarnation)
-
-    def _servos(self, network: str) -> ServoState:
-        joints = ROBOT.network_joints(network)
-        loads = {claw: -sign * self.hand_load for claw, sign in ROBOT.claw.open_sign.items()}
-        return ServoState(
-            joints=joints,
-            position_rad=tuple(self.angles[name] for name in joints),
-            speed_radps=(0.0,) * len(joints),
-            load=tuple(loads.get(name, 0.0) for name in joints),
-            latch=self.latch,  # type: ignore[arg-type]
-        )
-
-    def _seen(self) -> Detections:
-        can = Detection(label="red_can", u_px=0, v_px=0, area_px=900, box_px=(0, 0, 9, 9), position_m=self.sees)
-        found = (can,) if self.sees is not None else ()
-        return Detections(frame_seq=0, frame_incarnation=1, width=640, height=480, detections=found)
 
 
 @pytest.fixture
 def planner() -> Planner:
-    planner = Planner()
-    planner.run(0.2)
-    return planner
+    return started()
 
 
 def approaching(planner: Planner) -> None:
@@ -134,11 +31,6 @@ def approaching(planner: Planner) -> None:
     planner.want("approach", "red_can")
     planner.run(2.0)
     assert planner.wheels.left_mps > 0.1
-
-
-def standing(planner: Planner) -> bool:
-    """Whether the wheels are told to stand, or told nothing, which stops them."""
-    return planner.wheels == BaseCommand(left_mps=0.0, right_mps=0.0) if "base/command" in planner.commanded else True
 
 
 # --- idle -----------------------------------------------------------------------------------------
@@ -306,88 +198,6 @@ def test_a_detection_is_placed_by_where_the_body_stood_then(planner: Planner) ->
     ball = next(estimate for estimate in planner.tick().known if estimate.label == "ball")
     assert ball.odometry_position_m == pytest.approx((1.0, 0.5, 0.03))
     assert ball.position_m == pytest.approx((0.5, 0.5, 0.03))
-
-
-# --- behaviours -----------------------------------------------------------------------------------
-
-
-def test_search_is_done_when_what_it_seeks_is_in_view(planner: Planner) -> None:
-    planner.want("search", "red_can")
-    status = planner.run(0.2)
-    assert (status.state, status.why) == ("done", "red_can is in view")
-    assert standing(planner)
-
-
-def test_search_that_finds_nothing_looks_everywhere_and_says_so(planner: Planner) -> None:
-    planner.sees = None
-    planner.want("search", "blue_can")
-    pans = []
-    for _ in range(4000):
-        status = planner.tick()
-        pans.append(planner.angles["neck_pan"])
-        if status.state != "running":
-            break
-    assert (status.state, status.reason) == ("failed", "not_found")
-    assert (min(pans), max(pans)) == pytest.approx((-2.6, 2.6), abs=0.1)
-
-
-def test_approach_to_what_was_never_seen_is_lost(planner: Planner) -> None:
-    planner.want("approach", "blue_can")
-    assert planner.tick().reason == "lost"
-    assert standing(planner)
-
-
-def test_reaching_for_what_is_too_far_is_unreachable(planner: Planner) -> None:
-    planner.want("reach", "red_can")
-    status = planner.tick()
-    assert (status.state, status.reason) == ("failed", "unreachable")
-    assert "its radius is" in status.why
-
-
-def test_a_step_that_has_ended_keeps_its_result_until_another_is_asked_for(planner: Planner) -> None:
-    planner.want("reach", "red_can")
-    planner.tick()
-    assert planner.run(1.0).reason == "unreachable"
-    assert standing(planner)
-    planner.want("search", "red_can")
-    assert planner.run(0.2).state == "done"
-
-
-def test_claws_that_close_on_nothing_have_no_grip(planner: Planner) -> None:
-    planner.want("grasp")
-    status = planner.run(2.5)
-    assert (status.state, status.reason, status.holding) == ("failed", "no_grip", False)
-
-
-def test_claws_that_are_stopped_hold_something_and_push_on_a_little(planner: Planner) -> None:
-    planner.want("grasp")
-    planner.run(0.1)
-    stopped = {claw: sign * 0.05 for claw, sign in ROBOT.claw.open_sign.items()}
-    config = Config().hand
-    for _ in range(40):
-        planner.angles |= stopped
-        planner.hand_load = 0.5
-        status = planner.tick()
-    assert (status.state, status.holding) == ("done", True)
-    hand = planner.under_test.latest(topics.HAND_COMMAND)
-    goals = dict(zip(hand.joints, hand.goal_rad, strict=True))
-    for claw, sign in ROBOT.claw.open_sign.items():
-        assert sign * goals[claw] == pytest.approx(0.05 - config.clamp_rad, abs=0.01)
-
-
-def test_in_lock_step_it_plans_once_a_cycle_and_keeps_the_arm_back(planner: Planner) -> None:
-    core = PlanningCore(ROBOT, Config(coordination="lockstep"))
-    assert core.schedule.rate_hz is None
-    assert core.schedule.triggers == (topics.DETECTIONS,)
-    lockstep = Planner(Config(coordination="lockstep"))
-    lockstep.run(0.2)
-    lockstep.want("approach", "red_can")
-    lockstep.run(3.0)
-    planner.want("approach", "red_can")
-    planner.run(3.0)
-    park = ROBOT.poses["park"]
-    assert {name: lockstep.angles[name] for name in park} == pytest.approx(park, abs=0.05)
-    assert planner.angles["arm_base"] < 0.5, "meanwhile the other one has unfolded"
 
 
 # --- abuse ----------------------------------------------------------------------------------------

@@ -1,0 +1,124 @@
+"""The planner's core for tests, by hand: every step with everything fresh that a test does not hold back."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from cocoro import topics
+from cocoro.messages import (
+    BaseCommand,
+    BaseState,
+    Behaviour,
+    Detection,
+    Detections,
+    Intent,
+    Message,
+    Obstacles,
+    PlannerStatus,
+    ServoCommand,
+    ServoState,
+)
+from cocoro.robot import Robot
+from cocoro.testing import CoreUnderTest
+from cocoro.topics import Topic
+from services.planning.config import Config
+from services.planning.core import PlanningCore
+
+ROBOT = Robot.load()
+TICK_S = 0.02
+CAN_M = (1.5, 0.0, 0.06)
+
+
+class Planner:
+    """A planning core on a robot that is perfectly obedient but for its wheels, and sees a can and free floor."""
+
+    def __init__(self, config: Config | None = None) -> None:
+        self.under_test = CoreUnderTest(PlanningCore(ROBOT, config or Config()))
+        self.angles = dict.fromkeys(ROBOT.joints, 0.0) | ROBOT.poses["park"]
+        self.base: dict[str, Any] = {}
+        self.hand_load = 0.0
+        self.latch = "released"
+        self.wants: Intent | None = Intent()
+        self.sees: tuple[float, float, float] | None = CAN_M
+        self.silent: set[str] = set()
+        self.incarnation = 1
+        self._count = 0
+
+    def tick(self) -> PlannerStatus:
+        """One step, 20 ms later, with everything fresh that is not silent."""
+        test = self.under_test
+        test.now_ns += round(TICK_S * 1e9)
+        here = {"odometry_m": (0.0, 0.0), "odometry_yaw_rad": 0.0, "speed_mps": 0.0, "turn_rate_radps": 0.0}
+        self._feed(topics.BASE_STATE, BaseState(**(here | self.base), latch=self.latch))  # type: ignore[arg-type]
+        self._feed(topics.ARM_STATE, self._servos("arm"))
+        self._feed(topics.HAND_STATE, self._servos("hand"))
+        if self.wants is not None:
+            wants = self.wants
+            self._feed(
+                topics.INTENT,
+                Intent(task_id=wants.task_id, step=wants.step, behaviour=wants.behaviour, label=wants.label),
+            )
+        if self._count % 2 == 0:
+            self._feed(topics.DETECTIONS, self._seen())
+            self._feed(topics.OBSTACLES, Obstacles(free=tuple((k * 0.1, 0.2, 3.0) for k in range(-31, 32))))
+        self._count += 1
+        test.step()
+        status = self.status
+        for output in test.steps[-1]:
+            if isinstance(output.message, ServoCommand):
+                self.angles.update(zip(output.message.joints, output.message.goal_rad, strict=True))
+        return status
+
+    def run(self, seconds: float) -> PlannerStatus:
+        for _ in range(round(seconds / TICK_S)):
+            status = self.tick()
+        return status
+
+    def want(self, behaviour: Behaviour, label: str = "") -> None:
+        step = self.wants.step + 1 if self.wants is not None else 1
+        self.wants = Intent(task_id="task", step=step, behaviour=behaviour, label=label)
+
+    @property
+    def status(self) -> PlannerStatus:
+        return self.under_test.latest(topics.PLAN)
+
+    @property
+    def wheels(self) -> BaseCommand:
+        return self.under_test.latest(topics.BASE_COMMAND)
+
+    @property
+    def commanded(self) -> set[str]:
+        """The topics that the last step commanded on."""
+        return {output.topic.name for output in self.under_test.steps[-1]} - {topics.PLAN.name}
+
+    def _feed(self, topic: Topic[Any], message: Message) -> None:
+        if topic.name not in self.silent:
+            self.under_test.feed(topic, message, incarnation=self.incarnation)
+
+    def _servos(self, network: str) -> ServoState:
+        joints = ROBOT.network_joints(network)
+        loads = {claw: -sign * self.hand_load for claw, sign in ROBOT.claw.open_sign.items()}
+        return ServoState(
+            joints=joints,
+            position_rad=tuple(self.angles[name] for name in joints),
+            speed_radps=(0.0,) * len(joints),
+            load=tuple(loads.get(name, 0.0) for name in joints),
+            latch=self.latch,  # type: ignore[arg-type]
+        )
+
+    def _seen(self) -> Detections:
+        can = Detection(label="red_can", u_px=0, v_px=0, area_px=900, box_px=(0, 0, 9, 9), position_m=self.sees)
+        found = (can,) if self.sees is not None else ()
+        return Detections(frame_seq=0, frame_incarnation=1, width=640, height=480, detections=found)
+
+
+def started(config: Config | None = None) -> Planner:
+    """A planner that has seen what there is."""
+    planner = Planner(config)
+    planner.run(0.2)
+    return planner
+
+
+def standing(planner: Planner) -> bool:
+    """Whether the wheels are told to stand, or told nothing, which stops them."""
+    return planner.wheels == BaseCommand(left_mps=0.0, right_mps=0.0) if "base/command" in planner.commanded else True

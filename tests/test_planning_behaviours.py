@@ -1,0 +1,93 @@
+"""The planner's behaviours: how each ends, and what it says of it."""
+
+from __future__ import annotations
+
+import pytest
+from planner_rig import ROBOT, Planner, standing, started
+
+from cocoro import topics
+from services.planning.config import Config
+from services.planning.core import PlanningCore
+
+
+@pytest.fixture
+def planner() -> Planner:
+    return started()
+
+
+def test_search_is_done_when_what_it_seeks_is_in_view(planner: Planner) -> None:
+    planner.want("search", "red_can")
+    status = planner.run(0.2)
+    assert (status.state, status.why) == ("done", "red_can is in view")
+    assert standing(planner)
+
+
+def test_search_that_finds_nothing_looks_everywhere_and_says_so(planner: Planner) -> None:
+    planner.sees = None
+    planner.want("search", "blue_can")
+    pans = []
+    for _ in range(4000):
+        status = planner.tick()
+        pans.append(planner.angles["neck_pan"])
+        if status.state != "running":
+            break
+    assert (status.state, status.reason) == ("failed", "not_found")
+    assert (min(pans), max(pans)) == pytest.approx((-2.6, 2.6), abs=0.1)
+
+
+def test_approach_to_what_was_never_seen_is_lost(planner: Planner) -> None:
+    planner.want("approach", "blue_can")
+    assert planner.tick().reason == "lost"
+    assert standing(planner)
+
+
+def test_reaching_for_what_is_too_far_is_unreachable(planner: Planner) -> None:
+    planner.want("reach", "red_can")
+    status = planner.tick()
+    assert (status.state, status.reason) == ("failed", "unreachable")
+    assert "its radius is" in status.why
+
+
+def test_a_step_that_has_ended_keeps_its_result_until_another_is_asked_for(planner: Planner) -> None:
+    planner.want("reach", "red_can")
+    planner.tick()
+    assert planner.run(1.0).reason == "unreachable"
+    assert standing(planner)
+    planner.want("search", "red_can")
+    assert planner.run(0.2).state == "done"
+
+
+def test_claws_that_close_on_nothing_have_no_grip(planner: Planner) -> None:
+    planner.want("grasp")
+    status = planner.run(2.5)
+    assert (status.state, status.reason, status.holding) == ("failed", "no_grip", False)
+
+
+def test_claws_that_are_stopped_hold_something_and_push_on_a_little(planner: Planner) -> None:
+    planner.want("grasp")
+    planner.run(0.1)
+    stopped = {claw: sign * 0.05 for claw, sign in ROBOT.claw.open_sign.items()}
+    config = Config().hand
+    for _ in range(40):
+        planner.angles |= stopped
+        planner.hand_load = 0.5
+        status = planner.tick()
+    assert (status.state, status.holding) == ("done", True)
+    hand = planner.under_test.latest(topics.HAND_COMMAND)
+    goals = dict(zip(hand.joints, hand.goal_rad, strict=True))
+    for claw, sign in ROBOT.claw.open_sign.items():
+        assert sign * goals[claw] == pytest.approx(0.05 - config.clamp_rad, abs=0.01)
+
+
+def test_in_lock_step_it_plans_once_a_cycle_and_keeps_the_arm_back(planner: Planner) -> None:
+    core = PlanningCore(ROBOT, Config(coordination="lockstep"))
+    assert core.schedule.rate_hz is None
+    assert core.schedule.triggers == (topics.DETECTIONS,)
+    lockstep = started(Config(coordination="lockstep"))
+    lockstep.want("approach", "red_can")
+    lockstep.run(3.0)
+    planner.want("approach", "red_can")
+    planner.run(3.0)
+    park = ROBOT.poses["park"]
+    assert {name: lockstep.angles[name] for name in park} == pytest.approx(park, abs=0.05)
+    assert planner.angles["arm_base"] < 0.5, "meanwhile the other one has unfolded"
