@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable
 
 from services.base import oi
-from services.base.keeper import LONG, MS, OVERRUN, SHORT, Keeper
+from services.base.keeper import LONG, MS, SHORT, Keeper
 from services.servos import table
 from services.servos.packets import find_status
 
@@ -76,7 +76,7 @@ class Fuzzer:
             )
             written = keeper.poll(now_ns)
             assert keeper.wheels[:2] == (0, 0) or keeper.link == "up"
-            assert len(written) < 2 * 5 * OVERRUN + 100
+            assert len(written) < 2 * 5 * oi.OVERRUN + 100
         for readings in frames:
             assert tuple(readings) in (SHORT, LONG)
             size = oi.length(LONG if len(readings) == len(LONG) else SHORT)

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from wire_base import frame
 
 from services.base import oi
-from services.base.keeper import LONG, MS, OVERRUN, SHORT, Keeper, Wheels, reflex
+from services.base.keeper import LONG, MS, SHORT, Keeper, Wheels, reflex
 
 QUIET = dict.fromkeys(SHORT, 0) | {oi.MODE: 2}
 
@@ -60,7 +60,7 @@ def rig() -> Rig:
 def test_waking_stops_the_wheels_first_and_then_enters_the_mode() -> None:
     rig = Rig()
     rig.frames(12)
-    assert rig.written.startswith(oi.drive_direct(0, 0) * OVERRUN + oi.abort_demo() + oi.start())
+    assert rig.written.startswith(oi.halt())
     assert rig.written.index(oi.enter("safe")) < rig.written.index(oi.stream(SHORT))
 
 

@@ -33,7 +33,7 @@ from contextlib import suppress
 import serial
 
 from services.base import oi
-from services.base.keeper import MS, OVERRUN, OVERRUN_NS, Keeper
+from services.base.keeper import MS, Keeper
 
 TURN_S = 0.005
 """How long it sleeps at most between two looks at the clock."""
@@ -84,19 +84,19 @@ class Guard:
         return True
 
     def stop(self) -> None:
-        """Stop the wheels, and let go of the port when the Create says that they stand: the one command that matters
-        may be lost or garbled on the wire, or taken for the rest of another. What says nothing is told a few times."""
+        """Stop the wheels, and let go of the port when the Create says that they stand; what says nothing is told a few
+        times."""
         if self._port is None:
             return
-        began_ns = told_ns = time.monotonic_ns()
+        began_ns = now_ns = time.monotonic_ns()
+        self._keeper.end(began_ns)
         with suppress(OSError):
-            self._port.write(oi.drive_direct(0, 0))
-            while (now_ns := time.monotonic_ns()) < began_ns + STOPPING_NS and not self._keeper.stands(began_ns):
-                if select.select([self._port], [], [], TURN_S)[0]:
+            while now_ns < began_ns + STOPPING_NS and not self._keeper.stands:
+                self._write(self._port, self._keeper.poll(now_ns))
+                readable = select.select([self._port], [], [], TURN_S)[0]
+                now_ns = time.monotonic_ns()
+                if readable:
                     self._keeper.heard(os.read(self._port.fileno(), 4096), now_ns)
-                if now_ns - told_ns > OVERRUN_NS:
-                    told_ns = now_ns
-                    self._write(self._port, oi.drive_direct(0, 0) * OVERRUN)
             self._port.flush()
         with suppress(OSError):
             self._port.close()

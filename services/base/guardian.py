@@ -23,8 +23,9 @@ from services.base.driver import Report
 
 log = logging.getLogger("cocoro.base")
 
-HANGS_S = 0.25
-"""A guard reports at least twenty times a second; one that does not is killed."""
+LATE_S, HANGS_S = 0.12, 0.25
+"""A guard reports at least twenty times a second. One that is late has the wheels stopped past it, which it puts right
+at once when it was only slow; one that hangs is killed."""
 START_S = 5.0
 """So long a guard may take to report first, on a busy machine. Before that it has turned no wheels."""
 AGAIN_S = 1.0
@@ -46,6 +47,7 @@ class Guardian:
         self._ended = False
         self._started_s = 0.0
         self._reported_s = 0.0
+        self._late = False
 
     async def __aenter__(self) -> Guardian:
         self._start()
@@ -80,8 +82,13 @@ class Guardian:
         if self._channel is None:
             if now_s - self._started_s > AGAIN_S or self.starts < 2:
                 self._start()
-        elif now_s - (self._reported_s or self._started_s + START_S) > HANGS_S:
+            return
+        silent_s = now_s - (self._reported_s or self._started_s + START_S)
+        if silent_s > HANGS_S:
             self._lost("the guard of the port hangs")
+        elif silent_s > LATE_S and not self._late:
+            self._late = True
+            _write(self._port, oi.drive_direct(0, 0))
 
     def _start(self) -> None:
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -96,6 +103,7 @@ class Guardian:
         self._channel = ours
         self._started_s = time.monotonic()
         self._reported_s = 0.0
+        self._late = False
         self.starts += 1
         asyncio.get_running_loop().add_reader(ours, self._read, ours)
 
@@ -111,17 +119,18 @@ class Guardian:
                 self._lost("the guard of the port died")
                 return
             self._reported_s = time.monotonic()
+            self._late = False
             self._heard(_REPORT.decode(message))
 
     def _lost(self, why: str) -> None:
         """What it kept from happening must not happen now: stop the wheels, then start another guard."""
         self._let_go()
         process, self._process = self._process, None
-        _stop_wheels(self._port)  # this process, too, may be killed between any two of these lines
+        _write(self._port, oi.halt())  # this process, too, may be killed between any two of these lines
         if process is not None:
             process.kill()
             asyncio.get_running_loop().run_in_executor(None, process.wait)
-        _stop_wheels(self._port)
+        _write(self._port, oi.halt())
         log.error("%s; the wheels were told to stop, and another one is started", why)
         self._heard(Report(t=time.monotonic_ns(), link="closed", why=why, left=0, right=0))
         self.check()
@@ -138,12 +147,12 @@ class Guardian:
                 self._channel.send(json.dumps(message).encode())
 
 
-def _stop_wheels(port: str) -> None:
-    """Write the one command that matters, past whoever had the port; its settings are still as they were."""
+def _write(port: str, command: bytes) -> None:
+    """Write past whoever had the port; its settings are still as they were."""
     with suppress(OSError):
         fd = os.open(port, os.O_WRONLY | os.O_NOCTTY | os.O_NONBLOCK)
         try:
-            os.write(fd, oi.drive_direct(0, 0))
+            os.write(fd, command)
         finally:
             os.close(fd)
 

@@ -20,13 +20,9 @@ SILENT_NS = 180 * MS
 """Twelve frames missed: the Create is not heard any more."""
 RESEND_NS = 40 * MS
 """Wheel commands are repeated so often even when nothing has changed: one may have been lost on the wire."""
-HEEDED_NS = 60 * MS
-"""By then a frame says that a command was heeded, or it was lost or garbled."""
-OVERRUN = 52
-"""A garbled byte may have become a command that waits for up to 255 bytes (a script, a list of packets), and takes what
-comes for them. So many drive commands are more than that."""
-OVERRUN_NS = 60 * MS
-"""On the wire they take 45 ms."""
+HEEDED_NS = 75 * MS
+"""By then a frame says that a command was heeded, or it was lost or garbled: the longest take 46 ms on the wire, and a
+frame comes every 15 ms."""
 COUNTS_NS = 200 * MS
 """How often way and turn are asked for: at 5 Hz their units, 1 mm and 1 degree, are small beside what they count."""
 COUNTS_LATE_NS = 60 * MS
@@ -90,6 +86,9 @@ class Keeper:
         self._sent_ns = 0
         self._changed_ns = 0
         self._overran_ns = 0
+        self._ended_ns: int | None = None
+        self._halted_ns: int | None = None
+        self._told_stop = False
         self._counted_ns = 0
         self._counting_ns: int | None = None
         self._counts_lost = False
@@ -119,6 +118,12 @@ class Keeper:
         if self.link == "fallen":
             self._start_waking(now_ns)
 
+    def end(self, now_ns: int) -> None:
+        """The service is gone: from now on the wheels are stopped, and nothing else."""
+        self._ended_ns = now_ns
+        self._halted_ns = None
+        self._told_stop = False
+
     def heard(self, data: bytes, now_ns: int) -> list[oi.Readings]:
         """Bytes from the Create; the good frames in them."""
         skipped = self._parser.skipped
@@ -142,13 +147,16 @@ class Keeper:
         lost, self._counts_lost = self._counts_lost, False
         return lost
 
-    def stands(self, since_ns: int) -> bool:
-        """Whether the Create has said, in a frame that came after `since_ns`, that it was told to stand still, or that
-        it is in a mode in which it obeys nobody."""
-        if self._frame_ns <= since_ns:
+    @property
+    def stands(self) -> bool:
+        """Whether a frame that came after the end says that the Create was told to stand still; or, where it is in a
+        mode in which it heeds no speeds, came long enough after it was halted."""
+        if self._ended_ns is None or self._frame_ns <= self._ended_ns:
             return False
         readings = self.readings
-        return (readings[oi.LEFT_SPEED], readings[oi.RIGHT_SPEED]) == (0, 0) or readings[oi.MODE] < SAFE
+        if readings[oi.MODE] < SAFE:
+            return self._halted_ns is not None and self._frame_ns > self._halted_ns + HEEDED_NS
+        return (readings[oi.LEFT_SPEED], readings[oi.RIGHT_SPEED]) == (0, 0)
 
     # --- what to write ------------------------------------------------------------------------------
 
@@ -156,6 +164,8 @@ class Keeper:
         """What to write to the port now. To be called after everything above, and every few milliseconds."""
         if self.link == "closed":
             return b""
+        if self._ended_ns is not None:
+            return self._stop(now_ns)
         if self.link in ("up", "fallen") and now_ns - self._frame_ns > SILENT_NS:
             self.link = "silent"
             self._counts_lost = True
@@ -186,13 +196,26 @@ class Keeper:
             self._changed_ns = now_ns
         elif stale and self.link == "up" and now_ns - self._changed_ns > HEEDED_NS:
             self.damage += 1
-            if now_ns - self._overran_ns > OVERRUN_NS:
+            if now_ns - self._overran_ns > HEEDED_NS:
                 self._sent_ns = self._overran_ns = now_ns
-                return oi.drive_direct(wheels.left_mmps, wheels.right_mmps) * OVERRUN
+                return oi.drive_direct(wheels.left_mmps, wheels.right_mmps) * oi.OVERRUN
         if wheels[:2] == before[:2] and now_ns - self._sent_ns < RESEND_NS and not stale:
             return b""
         self._sent_ns = now_ns
         return oi.drive_direct(wheels.left_mmps, wheels.right_mmps)
+
+    def _stop(self, now_ns: int) -> bytes:
+        """The one command that matters may be lost or garbled on the wire, taken for the rest of another, or not be
+        heeded; then it is said so that it must be."""
+        assert self._ended_ns is not None
+        if not self._told_stop:
+            self._told_stop = True
+            if self.readings.get(oi.MODE, SAFE) >= SAFE:
+                return oi.drive_direct(0, 0)
+        elif self.stands or now_ns < (self._ended_ns if self._halted_ns is None else self._halted_ns) + HEEDED_NS:
+            return b""
+        self._halted_ns = now_ns
+        return oi.halt()
 
     def _counts(self, now_ns: int) -> bytes:
         if self.link != "up":
@@ -234,7 +257,7 @@ class Keeper:
         # The first bytes stop the wheels in case that it still drives, whatever it takes some of them for; a change of
         # mode takes a Create up to 20 ms.
         self._wake = [
-            (now_ns, oi.drive_direct(0, 0) * OVERRUN + oi.abort_demo() + oi.start()),
+            (now_ns, oi.halt()),
             (now_ns + 100 * MS, oi.enter(self._mode)),
             (now_ns + 150 * MS, oi.drive_direct(0, 0) + oi.stream(SHORT)),
         ]

@@ -18,6 +18,8 @@ MAX_FRAME = 86
 
 START, SAFE, FULL, DEMO, DRIVE, DRIVE_DIRECT, STREAM, QUERY = 128, 131, 132, 136, 137, 145, 148, 149
 OPCODES = range(128, 159)
+OVERRUN = 52
+"""So many drive commands are more bytes than any other command waits for."""
 Mode = Literal["off", "passive", "safe", "full"]
 MODES: tuple[Mode, ...] = ("off", "passive", "safe", "full")
 HEADER = 19
@@ -123,6 +125,14 @@ def query(packets: Sequence[int]) -> bytes:
 def abort_demo() -> bytes:
     """End a built-in demo, should one have been started."""
     return bytes([DEMO, 255])
+
+
+def halt() -> bytes:
+    """Stop a Create, whatever it does and whatever it takes these bytes for: it ends in passive mode.
+
+    A garbled byte may have become a command that waits for up to 255 bytes (a script, a list of packets) and takes
+    what comes for them, or one that starts a demo, which drives on its own and heeds no speeds."""
+    return drive_direct(0, 0) * OVERRUN + abort_demo() + start()
 
 
 def harmless(speed_mmps: int) -> int:

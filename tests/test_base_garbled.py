@@ -1,0 +1,107 @@
+"""Whatever garbled bytes have made of the Create before: on a line that is good again, its wheels stop when its service
+dies. The keeper and the emulated firmware face each other, in virtual time."""
+
+from __future__ import annotations
+
+from random import Random
+
+import pytest
+
+from services.base.keeper import MS, Keeper
+from sim.wire.body import SimpleBody
+from sim.wire.create import Create
+from sim.wire.faults import Disturbance, Fault, Kind
+
+BAUD = 57600
+TURN_NS = 5 * MS
+BYTES_A_TURN = BAUD // 10 * TURN_NS // (1000 * MS)
+DEADMAN_NS = 200 * MS
+STOP_NS = 300 * MS
+AGAIN_NS = 20_000 * MS
+SPEEDS = ((200, 200), (120, -120), (250, 110), (-80, -80))
+
+
+class Line:
+    """Keeper and Create with a wire between them that takes its time, and that can be disturbed."""
+
+    def __init__(self, seed: int) -> None:
+        self.draws = Random(seed)
+        self.create = Create()
+        self.keeper = Keeper("safe", DEADMAN_NS)
+        self.now_ns = 10**12
+        self.disturbed = Disturbance("to_device", seed)
+        self.wanted: tuple[int, int] | None = SPEEDS[0]
+        self._body = SimpleBody(self.create)
+        self._sent = b""
+        self.keeper.opened(self.now_ns)
+
+    def turn(self) -> None:
+        self.now_ns += TURN_NS
+        if self.wanted is not None:
+            self.keeper.ask(*self.wanted, self.now_ns + DEADMAN_NS, self.now_ns)
+            if self.keeper.link == "fallen":
+                self.keeper.recover(self.now_ns)
+        self._sent += self.disturbed.carry(self.keeper.poll(self.now_ns), self.now_ns)
+        now, self._sent = self._sent[:BYTES_A_TURN], self._sent[BYTES_A_TURN:]
+        self._body.advance(self.now_ns)
+        self.create.receive(now, BAUD, self.now_ns)
+        self.keeper.heard(self.create.advance(BAUD, self.now_ns), self.now_ns)
+
+    def drives(self) -> bool:
+        """It goes as it was asked to, within a time; False when it hears nobody any more."""
+        end_ns = self.now_ns + AGAIN_NS
+        while self.now_ns < end_ns:
+            self.turn()
+            if self.lost_to_the_world:
+                return False
+            if self.keeper.wheels[:2] == self.create.wheels_mmps != (0, 0):
+                return True
+        raise AssertionError(f"stuck: {self.keeper.link}, mode {self.create.mode}, pending {self.create.pending.hex()}")
+
+    @property
+    def lost_to_the_world(self) -> bool:
+        """A garbled byte has told the Create to wait for something, or to use another baud rate."""
+        return self.create.deaf or self.create.baud != BAUD
+
+    def garble(self, kind: Kind, share: float, for_ns: int) -> None:
+        self.disturbed.add(Fault(kind, share, "to_device", self.now_ns + for_ns))
+        end_ns = self.now_ns + for_ns
+        while self.now_ns < end_ns:
+            self.wanted = self.draws.choice(SPEEDS) if self.draws.random() < 0.05 else self.wanted
+            self.turn()
+        self.disturbed.clear()
+
+    def stops_after_ns(self) -> int:
+        """From the death of the service on."""
+        self.wanted = None
+        self.keeper.end(self.now_ns)
+        began_ns = self.now_ns
+        while self.create.wheels_mmps != (0, 0):
+            self.turn()
+            if self.now_ns - began_ns > AGAIN_NS:
+                break
+        return self.now_ns - began_ns
+
+
+def one(seed: int, kind: Kind) -> int | None:
+    """How long the wheels went on; None when nobody could have stopped them."""
+    line = Line(seed)
+    assert line.drives()
+    line.garble(kind, line.draws.uniform(0.003, 0.1), round(line.draws.uniform(100, 1500)) * MS)
+    # The service dies at any moment: when all is well again, or while the Create still puts itself together.
+    if line.draws.random() < 0.5 and not line.drives():
+        return None
+    for _ in range(line.draws.randrange(20)):
+        line.turn()
+    if line.lost_to_the_world:
+        return None
+    took_ns = line.stops_after_ns()
+    return None if line.lost_to_the_world else took_ns
+
+
+@pytest.mark.parametrize("kind", ["corrupted", "lost", "truncated", "repeated"])
+def test_the_wheels_stop_in_time_unless_a_garbled_byte_has_made_the_create_deaf(kind: Kind) -> None:
+    took = [one(seed, kind) for seed in range(60)]
+    heard = [each for each in took if each is not None]
+    assert len(heard) > 40
+    assert max(heard) < STOP_NS
