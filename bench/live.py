@@ -1,6 +1,8 @@
 """The robot as its operator has it, processes on zenoh in real time: `python -m bench.live fetches|periods|stop`.
 
-`fetches`: start it, fetch the red can, shut it down, again and again; nothing may fail, nothing may be left over.
+`fetches`: start it, fetch the red can, shut it down, again and again; nothing may fail, nothing may be left over, and
+the truth must say that the can is held and nothing else was touched. With `--profile sim-wire` the real services of
+base and servos drive it over emulated wires.
 `periods`: how evenly wheels and servos are commanded during a fetch, with perception slowed to 2 Hz.
 `stop`: from the call of `cocoro stop` on a robot that drives until its wheels stand, as its base says.
 
@@ -23,7 +25,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from cocoro import topics
 from cocoro.bus.zenoh import ZenohBus
@@ -31,6 +33,8 @@ from cocoro.clock import NS, FollowedClock
 from cocoro.node import Node
 from cocoro.robot import Robot
 from cocoro.rundir import RunDir
+from sim.judge import HELD_S, Judge, Verdict
+from sim.random_scene import find_scene
 
 NAME = "calliope"
 STANDING_MPS = 0.01
@@ -75,23 +79,48 @@ def _spread(values: list[float], unit: str) -> str:
 # --- fetches --------------------------------------------------------------------------------------
 
 
-def fetches(count: int, *options: str) -> bool:
+class Fetched(NamedTuple):
+    code: int
+    said: str
+    seconds: float
+    truth: Verdict
+
+
+async def _fetch(cocoro: Operator) -> Fetched:
+    """One fetch, judged a while after it says that it is done: what it holds then, it holds."""
+    judge = Judge(find_scene("paper", 0, "red_can"), "red_can")
+    async with (
+        await ZenohBus.open(cocoro.run_dir.join_as("bench")) as bus,
+        Node("bench", bus, FollowedClock(), Robot.load()) as node,
+    ):
+        node.on(topics.TRUTH, judge.feed)
+        begun_s = time.monotonic()
+        process = cocoro.start("fetch", "red_can")
+        said, _ = await asyncio.to_thread(process.communicate)
+        seconds = time.monotonic() - begun_s
+        await asyncio.sleep(HELD_S + 0.5)
+    return Fetched(process.returncode, said, seconds, judge.result())
+
+
+def fetches(count: int, profile: str, sensors: str) -> bool:
     took: dict[str, list[float]] = {"up": [], "fetch": [], "down": []}
     good = 0
     for number in range(count):
         with operator() as cocoro:
-            up, said_up, took_up = cocoro("up", "sim", "--detach", *options)
-            fetch, said_fetch, took_fetch = cocoro("fetch", "red_can") if up == 0 else (1, "", 0.0)
+            up, said_up, took_up = cocoro("up", profile, "--detach", "--sensors", sensors)
+            fetched = asyncio.run(_fetch(cocoro)) if up == 0 else None
             down, said_down, took_down = cocoro("down")
             left = sorted(cocoro.run_dir.claims())
-        well = (up, fetch, down) == (0, 0, 0) and not left
+        code, said_fetch, took_fetch, truth = fetched or (1, "", 0.0, None)
+        well = (up, code, down) == (0, 0, 0) and not left
+        well = well and truth is not None and truth.held and not truth.knocked_over and not truth.collisions
         good += well
         for name, seconds in zip(took, (took_up, took_fetch, took_down), strict=True):
             took[name].append(seconds)
         last = said_fetch.strip().splitlines()[-1] if said_fetch.strip() else "no fetch"
         print(f"{'ok  ' if well else 'FAIL'} {number + 1:3d}  up {took_up:.1f} s  {last}  down {took_down:.1f} s")
         if not well:
-            print(said_up, said_fetch, said_down, f"left: {left}", sep="\n")
+            print(said_up, said_fetch, said_down, f"left: {left}", truth, sep="\n")
         sys.stdout.flush()
     print(f"{good} of {count}; " + "; ".join(f"{name}: {_spread(values, 's')}" for name, values in took.items()))
     return good == count
@@ -189,10 +218,11 @@ def main() -> int:
     parser.add_argument("what", choices=["fetches", "periods", "stop"])
     parser.add_argument("--count", type=int, default=20)
     parser.add_argument("--latency", type=float, default=0.5, metavar="S", help="of perception, for periods")
+    parser.add_argument("--profile", choices=["sim", "sim-wire"], default="sim", help="of the fetches")
     parser.add_argument("--sensors", choices=["ideal", "real"], default="ideal")
     arguments = parser.parse_args()
     if arguments.what == "fetches":
-        well = fetches(arguments.count, "--sensors", arguments.sensors)
+        well = fetches(arguments.count, arguments.profile, arguments.sensors)
     elif arguments.what == "periods":
         well = periods(arguments.latency)
     else:
