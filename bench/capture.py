@@ -38,10 +38,11 @@ from cocoro.capture.reader import Capture
 from cocoro.capture.rerun import rerun, words
 from cocoro.clock import RealClock
 from cocoro.messages import BaseState, Frame
-from cocoro.node import Node, recorder_key
+from cocoro.node import Node
 from cocoro.rehearsal import RehearsalRequest
 from cocoro.robot import Robot
 from cocoro.rundir import RunDir
+from cocoro.tokens import recorder_key
 from sim.rehearse import rehearse
 
 COCORO = [sys.executable, "-m", "cocoro.cli.main"]

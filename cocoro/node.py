@@ -14,79 +14,33 @@ import logging
 import os
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine
-from typing import Any, Generic, TypeVar
+from typing import Any, TypeVar
 
 import msgspec
-import numpy as np
 
 from cocoro import topics
 from cocoro.about import about
 from cocoro.bus.base import Bus, Handle, Payload, Reply
 from cocoro.clock import NS, Clock, FollowedClock, VirtualClock
 from cocoro.clock import sleep as clock_sleep
-from cocoro.core import Core, Sample
+from cocoro.core import Core
 from cocoro.errors import CocoroError, MeshError, RemoteError
-from cocoro.inbox import Inbox, Intake, Latest, Rate, Stream
-from cocoro.loops import LoopMeter, Schedule, every
-from cocoro.messages import AboutReply, AboutRequest, Exchange, Health, Message, StepRecord, TopicHealth
+from cocoro.inbox import Inbox, Latest, Stream
+from cocoro.loops import LoopMeter, every
+from cocoro.messages import AboutReply, AboutRequest, Exchange, Health, Message
 from cocoro.meter import ProcessMeter
+from cocoro.publisher import Publisher
 from cocoro.robot import Robot
-from cocoro.topics import EXCHANGES, HEALTH, STEPS, Qos, Request, Topic
+from cocoro.stepper import Stepper, drive
+from cocoro.tokens import alive_key
+from cocoro.topics import EXCHANGES, HEALTH, Qos, Request, Topic
 
 M = TypeVar("M", bound=Message)
 Q = TypeVar("Q", bound=msgspec.Struct)
 R = TypeVar("R", bound=msgspec.Struct)
 
-RECORDER_S = 5.0
-"""How long a service whose steps are to be recorded waits for a recorder before its first."""
 QUESTION_BYTES = 1024 * 1024
 """A larger question is refused unread."""
-ALIVE = "{service}/alive"
-"""The liveliness token's place under the robot's name."""
-
-
-def alive_key(robot: str, service: str) -> str:
-    return f"{robot}/{ALIVE.format(service=service)}"
-
-
-def recorder_key(robot: str, service: str) -> str:
-    """The token of a service that records the mesh, declared once it hears everything."""
-    return f"{robot}/{service}/recorder"
-
-
-class Publisher(Generic[M]):
-    """Publishes on one topic. Makes stamp, sequence and incarnation, so that no component has to."""
-
-    def __init__(self, topic: Topic[M], key: str, bus: Bus, clock: Clock) -> None:
-        self.topic = topic
-        self.key = key
-        self.rate = Rate()
-        self.newest_stamp_ns: int | None = None
-        self._raw = bus.publisher(key, topic.qos)
-        self.incarnation = bus.new_incarnation()
-        self._clock = clock
-
-    def put(self, message: M, stamp_ns: int | None = None) -> M:
-        """Publish and return the message, completed in place. `stamp_ns` defaults to the message's own when it has one,
-        else to now."""
-        if not isinstance(message, self.topic.type):
-            raise TypeError(f"{self.topic.name} carries {self.topic.type.__name__}, not {type(message).__name__}")
-        if stamp_ns is not None:
-            message.stamp_ns = stamp_ns
-        elif message.stamp_ns == 0:
-            message.stamp_ns = self._clock.now_ns()
-        message.seq = self.rate.count
-        message.incarnation = self.incarnation
-        self.rate.count += 1
-        self.newest_stamp_ns = message.stamp_ns
-        self._raw.put(encode(message))
-        return message
-
-    def health(self, now_ns: int) -> TopicHealth:
-        age_s = None if self.newest_stamp_ns is None else (now_ns - self.newest_stamp_ns) / NS
-        return TopicHealth(
-            key=self.key, direction="out", count=self.rate.count, rate_hz=self.rate.take(now_ns), age_s=age_s
-        )
 
 
 class Node:
@@ -233,7 +187,7 @@ class Node:
         if topic.name not in self._publishers:
             publisher = Publisher(topic, topic.key(self.robot_name), self.bus, self.clock)
             self._publishers[topic.name] = publisher
-            self._handles.append(publisher._raw)
+            self._handles.append(publisher)
         return self._publishers[topic.name]
 
     def publish(self, topic: Topic[M], message: M, stamp_ns: int | None = None) -> M:
@@ -293,9 +247,10 @@ class Node:
 
     def every(self, rate_hz: float, name: str = "loop") -> AsyncIterator[int]:
         """`async for now_ns in node.every(50.0)`: a fixed-rate loop whose jitter and overruns show in the health."""
-        return every(self.clock, rate_hz, self._meter(name))
+        return every(self.clock, rate_hz, self.meter(name))
 
-    def _meter(self, name: str) -> LoopMeter:
+    def meter(self, name: str) -> LoopMeter:
+        """Of a loop of this node's, which shows in its health."""
         meter = LoopMeter(name)
         self._meters.append(meter)
         return meter
@@ -308,69 +263,11 @@ class Node:
         An exception in the core ends the service: its state cannot be trusted any more, and the supervisor starts it
         afresh. The hardware stops by itself meanwhile.
         """
-        if self.record_steps:
-            await self._until_recorded()
-        step = self.stepper(core, name)
-        meter = self._meter(name or self.name)
-        self.ready()  # whoever keeps the clock may come later: a replay, a simulator that starts anew
-        if isinstance(self.clock, FollowedClock):
-            await self.clock.wait_started()
-        schedule = Schedule(self.clock, core.schedule.rate_hz, meter) if core.schedule.rate_hz else None
-        epoch = self.clock.epoch
-        while True:
-            if schedule is None:
-                await step.wake.wait()
-                due = True
-            else:
-                # The clock may have begun anew in the middle of a step: the deadline is of the time before then.
-                due = self.clock.epoch != epoch or await self._wait(step.wake, schedule.deadline_ns)
-            if self.clock.epoch != epoch:
-                epoch = self.clock.epoch
-                due = True
-            step.wake.clear()
-            now_ns = self.clock.now_ns()
-            if due:
-                meter.began(now_ns)
-            started = time.perf_counter()
-            await step(now_ns)
-            meter.steps_ms.append((time.perf_counter() - started) * 1e3)
-            if due and schedule is not None:
-                schedule.advance()
+        await drive(self, core, name or self.name)
 
     def stepper(self, core: Core, name: str | None = None) -> Stepper:
         """What gathers a core's inputs, steps it and publishes, for those who drive it themselves."""
         return Stepper(self, core, name or self.name)
-
-    async def _until_recorded(self) -> None:
-        """A record of steps is whole only when a recorder hears the first; wait for one, but not for ever."""
-        heard = asyncio.Event()
-
-        def on_token(_key: str, alive: bool) -> None:
-            if alive:
-                heard.set()
-
-        watch = self.bus.watch_alive(recorder_key(self.robot_name, "*"), on_token)
-        try:
-            async with asyncio.timeout(RECORDER_S):
-                await heard.wait()
-        except TimeoutError:
-            self.log.warning("steps are to be recorded, but within %g s there was no recorder", RECORDER_S)
-        finally:
-            watch.close()
-
-    async def _wait(self, wake: asyncio.Event, deadline_ns: int) -> bool:
-        """Wait for a deadline (True) or an earlier wake (False)."""
-        if self.clock.now_ns() >= deadline_ns:
-            await asyncio.sleep(0)  # a core that is too slow for its rate must not keep everything else from running
-            return True
-        timer = asyncio.ensure_future(self.clock.sleep_until(deadline_ns))
-        waker = asyncio.ensure_future(wake.wait())
-        try:
-            await asyncio.wait((timer, waker), return_when=asyncio.FIRST_COMPLETED)
-            return timer.done()
-        finally:
-            timer.cancel()
-            waker.cancel()
 
     # --- health -----------------------------------------------------------------------------------
 
@@ -399,60 +296,6 @@ class Node:
             loops=tuple(meter.health() for meter in self._meters),
             faults=self.faults,
         )
-
-
-class Stepper:
-    """Gathers a core's inputs; each call is one step: take, step, wait out the latency, publish, record."""
-
-    def __init__(self, node: Node, core: Core, name: str) -> None:
-        self.wake = asyncio.Event()
-        self._node = node
-        self._core = core
-        self._name = name
-        self._intake = Intake()
-        triggers = {topic.name for topic in core.schedule.triggers}
-        for topic, take in core.reads.items():
-            inbox = node.inbox(topic)
-            wake = self.wake.set if topic.name in triggers else None
-            inbox.add(self._intake.reader(topic, inbox, take == "all", wake))
-
-    async def __call__(self, now_ns: int) -> int:
-        """One step; the number of messages that it gave."""
-        node = self._node
-        samples = [Sample(topic, message) for topic, message in self._intake.take()]
-        outputs = self._core.step(samples, now_ns)
-        stamp_ns = now_ns
-        if outputs and node.latency_s > 0:
-            if not await node.sleep(node.latency_s):
-                outputs = ()  # the clock began anew meanwhile: what was computed is of no time that there is
-            # What takes longer to compute is said later; a command's age counts from when it could be given.
-            stamp_ns += round(node.latency_s * NS)
-        produced = []
-        for topic, message in outputs:
-            if message.stamp_ns == 0:
-                message.stamp_ns = stamp_ns
-            sent = node.publish(topic, message)
-            produced.append((topic.name, sent.incarnation, sent.seq))
-        if node.record_steps:
-            consumed = tuple((s.topic.name, s.message.incarnation, s.message.seq) for s in samples)
-            record = StepRecord(now_ns=now_ns, core=self._name, consumed=consumed, produced=tuple(produced))
-            node.publish(STEPS.of(node.name), record)
-        return len(produced)
-
-
-def encode(message: Message) -> bytes:
-    """A message as it travels."""
-    return _ENCODER.encode(message)
-
-
-def _plain(value: object) -> object:
-    """NumPy's scalars as Python's, so that a component's author need not think of it."""
-    if isinstance(value, np.generic):
-        return value.item()
-    raise TypeError(f"a {type(value).__name__} cannot be sent")
-
-
-_ENCODER = msgspec.msgpack.Encoder(enc_hook=_plain)
 
 
 def _understood(decoder: msgspec.msgpack.Decoder[Q], payload: Payload, request: Request[Q, Any]) -> Q:

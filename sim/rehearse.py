@@ -22,12 +22,13 @@ from cocoro.errors import CocoroError, ConfigError
 from cocoro.inbox import Stream
 from cocoro.learning.collector import TOPICS, HandCollector, WheelCollector, collector
 from cocoro.messages import Detections, Frame, Recording, TaskReply, TaskRequest, TaskState
-from cocoro.node import Node, Stepper
+from cocoro.node import Node
 from cocoro.objects import Catalogue
 from cocoro.picture import draw, save_png
 from cocoro.processes import load, named
 from cocoro.rehearsal import RehearsalRequest
 from cocoro.robot import Robot
+from cocoro.stepper import Stepper
 from cocoro.vloop import run_virtual
 from sim.judge import Judge
 from sim.pursuit import PursuitJudge

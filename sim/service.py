@@ -17,7 +17,8 @@ from cocoro.clock import NS, Clock, FollowedClock
 from cocoro.latch import LatchKeeper
 from cocoro.messages import BaseCommand, BaseState, LatchState, Message, ServoCommand
 from cocoro.messages import Clock as ClockMessage
-from cocoro.node import Node, Publisher
+from cocoro.node import Node
+from cocoro.publisher import Publisher
 from cocoro.robot import Robot
 from sim.camera import Kinect
 from sim.random_scene import find_scene

@@ -24,8 +24,9 @@ from cocoro.capture.reader import Capture
 from cocoro.capture.rewrite import rewrite
 from cocoro.clock import RealClock
 from cocoro.messages import BaseState
-from cocoro.node import Node, recorder_key
+from cocoro.node import Node
 from cocoro.robot import Robot
+from cocoro.tokens import recorder_key
 
 pytestmark = pytest.mark.zenoh
 

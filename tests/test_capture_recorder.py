@@ -22,8 +22,9 @@ from cocoro.clock import NS, FollowedClock
 from cocoro.core import Sample, Schedule, Take
 from cocoro.errors import CocoroError, RemoteError
 from cocoro.messages import AboutReply, BaseState, CancelRequest, Clock, Recording, TaskReply
-from cocoro.node import RECORDER_S, Node
+from cocoro.node import Node
 from cocoro.processes import load, named
+from cocoro.stepper import RECORDER_S
 from cocoro.testing import settle
 from cocoro.topics import Qos
 from cocoro.vloop import run_virtual

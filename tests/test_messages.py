@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from message_samples import MESSAGES, QUESTIONS, data_of, leaves_in, numbers_in, replaced
 
 from cocoro.messages import BaseCommand, Frame, Message, ServoCommand, ServoState
-from cocoro.node import encode
+from cocoro.publisher import encode
 
 every_message = pytest.mark.parametrize("kind", MESSAGES, ids=lambda kind: kind.__name__)
 few = settings(max_examples=25)

@@ -17,7 +17,7 @@ from cocoro.capture.rebirth import reborn, with_rate
 from cocoro.capture.types import NotReadableError
 from cocoro.errors import ConfigError, RefusedError
 from cocoro.messages import Clock
-from cocoro.node import alive_key
+from cocoro.tokens import alive_key
 from cocoro.topics import ARM_STATE, BASE_STATE, CLOCK, FRAME, HAND_STATE, HARDWARE, RECORDING, Qos
 
 SIMULATOR = "sim"

@@ -8,7 +8,7 @@ from typing import NamedTuple
 from cocoro.core import Core, Sample
 from cocoro.errors import CocoroError
 from cocoro.messages import Message, StepRecord
-from cocoro.node import encode
+from cocoro.publisher import encode
 
 
 class Executed(NamedTuple):

@@ -10,7 +10,7 @@ import msgspec
 from cocoro.clock import NS
 from cocoro.core import Core, Output, Sample
 from cocoro.messages import Message
-from cocoro.node import encode
+from cocoro.publisher import encode
 from cocoro.topics import Topic
 
 M = TypeVar("M", bound=Message)

@@ -13,11 +13,12 @@ from cocoro.bus.base import Handle
 from cocoro.bus.local import LocalMesh
 from cocoro.clock import NS, Clock, VirtualClock
 from cocoro.messages import Message, TopicHealth
-from cocoro.node import Node, alive_key
+from cocoro.node import Node
 from cocoro.processes import Component, Process, load
 from cocoro.robot import Robot
 from cocoro.testing.tap import Tap
 from cocoro.testing.virtual import settle
+from cocoro.tokens import alive_key
 from cocoro.topics import Request, Topic
 
 M = TypeVar("M", bound=Message)

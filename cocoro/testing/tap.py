@@ -9,7 +9,7 @@ import msgspec
 from cocoro.bus.base import Payload
 from cocoro.bus.local import LocalBus
 from cocoro.messages import Message
-from cocoro.node import recorder_key
+from cocoro.tokens import recorder_key
 from cocoro.topics import Qos, Topic, topic_named
 
 M = TypeVar("M", bound=Message)

@@ -20,8 +20,9 @@ from cocoro.capture.writer import Entry, Missing
 from cocoro.clock import FollowedClock, VirtualClock
 from cocoro.errors import MeshError, RemoteError
 from cocoro.messages import AboutReply, AboutRequest, Clock, Recording
-from cocoro.node import Node, alive_key, recorder_key
+from cocoro.node import Node
 from cocoro.rundir import RunDir
+from cocoro.tokens import alive_key, recorder_key
 from cocoro.topics import ABOUT, CLOCK, RECORDING
 from services.capture.sink import Sink
 

@@ -1,0 +1,69 @@
+"""What publishes on one topic, and a message as it travels."""
+
+from __future__ import annotations
+
+from typing import Generic, TypeVar
+
+import msgspec
+import numpy as np
+
+from cocoro.bus.base import Bus
+from cocoro.clock import NS, Clock
+from cocoro.inbox import Rate
+from cocoro.messages import Message, TopicHealth
+from cocoro.topics import Topic
+
+M = TypeVar("M", bound=Message)
+
+
+class Publisher(Generic[M]):
+    """Publishes on one topic. Makes stamp, sequence and incarnation, so that no component has to."""
+
+    def __init__(self, topic: Topic[M], key: str, bus: Bus, clock: Clock) -> None:
+        self.topic = topic
+        self.key = key
+        self.rate = Rate()
+        self.newest_stamp_ns: int | None = None
+        self._raw = bus.publisher(key, topic.qos)
+        self.incarnation = bus.new_incarnation()
+        self._clock = clock
+
+    def put(self, message: M, stamp_ns: int | None = None) -> M:
+        """Publish and return the message, completed in place. `stamp_ns` defaults to the message's own when it has one,
+        else to now."""
+        if not isinstance(message, self.topic.type):
+            raise TypeError(f"{self.topic.name} carries {self.topic.type.__name__}, not {type(message).__name__}")
+        if stamp_ns is not None:
+            message.stamp_ns = stamp_ns
+        elif message.stamp_ns == 0:
+            message.stamp_ns = self._clock.now_ns()
+        message.seq = self.rate.count
+        message.incarnation = self.incarnation
+        self.rate.count += 1
+        self.newest_stamp_ns = message.stamp_ns
+        self._raw.put(encode(message))
+        return message
+
+    def close(self) -> None:
+        self._raw.close()
+
+    def health(self, now_ns: int) -> TopicHealth:
+        age_s = None if self.newest_stamp_ns is None else (now_ns - self.newest_stamp_ns) / NS
+        return TopicHealth(
+            key=self.key, direction="out", count=self.rate.count, rate_hz=self.rate.take(now_ns), age_s=age_s
+        )
+
+
+def encode(message: Message) -> bytes:
+    """A message as it travels."""
+    return _ENCODER.encode(message)
+
+
+def _plain(value: object) -> object:
+    """NumPy's scalars as Python's, so that a component's author need not think of it."""
+    if isinstance(value, np.generic):
+        return value.item()
+    raise TypeError(f"a {type(value).__name__} cannot be sent")
+
+
+_ENCODER = msgspec.msgpack.Encoder(enc_hook=_plain)
