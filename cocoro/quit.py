@@ -14,6 +14,9 @@ import threading
 from contextlib import suppress
 from typing import NoReturn
 
+UNSAID = 120
+"""Python's own exit code for it."""
+
 
 def quit_process(code: int) -> NoReturn:
     """End with this exit code: other threads that are no daemons end first, then what was registered with `atexit`
@@ -21,6 +24,9 @@ def quit_process(code: int) -> NoReturn:
     threading._shutdown()  # type: ignore[attr-defined] # with executors' threads, which no public call ends
     atexit._run_exitfuncs()
     for stream in (sys.stdout, sys.stderr):
-        with suppress(OSError, ValueError, AttributeError):  # nobody reads it any more, or it is closed, or missing
-            stream.flush()
+        try:
+            with suppress(ValueError, AttributeError):  # it is closed, or there is none
+                stream.flush()
+        except OSError:  # nobody reads it any more, or the disk is full: what was printed has not arrived
+            code = code or UNSAID
     os._exit(code)

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from cocoro.quit import UNSAID
+
 PATIENCE_S = 60.0
 
 
@@ -40,6 +42,12 @@ quit_process(3)
 def test_nobody_to_read_its_last_words_changes_no_exit_code() -> None:
     script = "import sys; from cocoro.quit import quit_process; print('words'); sys.stdout.close(); quit_process(0)"
     assert ended(script)[0] == 0
+
+
+def test_what_it_could_not_print_is_an_error() -> None:
+    script = "from cocoro.quit import quit_process; print('words'); quit_process(0)"
+    with open("/dev/full", "w") as full:
+        assert subprocess.run([sys.executable, "-c", script], stdout=full, timeout=PATIENCE_S).returncode == UNSAID
 
 
 CAUGHT_IN_A_CALLBACK = """

@@ -1,7 +1,7 @@
 """How chunks are packed: `zstd`, `lz4` or not at all, as MCAP names them.
 
 Measured on frames of the simulated Kinect, 1.5 MB each, one core (bench/capture.py): zstd at level 1 makes ideal frames
-26 times smaller in 1.1 ms and noisy ones 2.1 times in 2.4 ms; lz4 11.9 times in 0.6 ms and 1.4 times in 1.4 ms.
+25 times smaller in 1.0 ms and noisy ones 2.1 times in 2.1 ms; lz4 11 times in 0.6 ms and 1.3 times in 0.9 ms.
 Both cost less than writing the bytes that they save, so frames are packed too.
 """
 
