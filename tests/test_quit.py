@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -46,8 +47,10 @@ def test_nobody_to_read_its_last_words_changes_no_exit_code() -> None:
 
 def test_what_it_could_not_print_is_an_error() -> None:
     script = "from cocoro.quit import quit_process; print('words'); quit_process(0)"
-    with open("/dev/full", "w") as full:
-        assert subprocess.run([sys.executable, "-c", script], stdout=full, timeout=PATIENCE_S).returncode == UNSAID
+    buffered = os.environ | {"PYTHONUNBUFFERED": ""}
+    with Path("/dev/full").open("w") as full:
+        run = subprocess.run([sys.executable, "-c", script], stdout=full, env=buffered, timeout=PATIENCE_S)
+    assert run.returncode == UNSAID
 
 
 CAUGHT_IN_A_CALLBACK = """
