@@ -20,7 +20,7 @@ from cocoro.clock import NS, VirtualClock
 from cocoro.core import Core
 from cocoro.errors import CocoroError, ConfigError
 from cocoro.inbox import Stream
-from cocoro.learning.collector import TOPICS, HandCollector, WheelCollector, collector
+from cocoro.learning.collector import TOPICS, Collector, collector
 from cocoro.messages import Detections, Frame, Recording, TaskReply, TaskRequest, TaskState
 from cocoro.node import Node
 from cocoro.objects import Catalogue
@@ -124,7 +124,7 @@ class _Rehearsal:
         self._frame: Frame | None = None
         self._seen: Detections | None = None
         self._recording: Recording | None = None
-        self._collector: HandCollector | WheelCollector | None = None
+        self._collector: Collector[Any] | None = None
 
     async def run(self) -> dict[str, Any]:
         request = self._request

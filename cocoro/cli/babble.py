@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 from cocoro.cli.link import Link, Where, joined
 from cocoro.cli.progress import View, view
 from cocoro.cli.tasks import Follower, interrupts
 from cocoro.errors import MeshError
-from cocoro.learning.collector import TOPICS, HandCollector, WheelCollector, collector
+from cocoro.learning.collector import TOPICS, Collector, collector
 from cocoro.messages import AboutRequest, ObjectsRequest, TaskName, TaskRequest, TaskState
 from cocoro.robot import Robot
 from cocoro.topics import ABOUT, OBJECTS
@@ -21,7 +22,7 @@ BAR = 20
 class BabbleView:
     """Shows the samples beside what the task says: a bar, the coverage, and the time that is left at this rate."""
 
-    def __init__(self, view: View, kept: HandCollector | WheelCollector, wanted: int) -> None:
+    def __init__(self, view: View, kept: Collector[Any], wanted: int) -> None:
         self._view = view
         self._kept = kept
         self._wanted = wanted

@@ -12,6 +12,7 @@ import typer
 if TYPE_CHECKING:
     from cocoro import robot as robots
     from cocoro.learning.model import Model
+    from cocoro.messages import TaskName
 
 PANEL = "Learning"
 
@@ -31,6 +32,7 @@ Description = Annotated[
 Measured = Annotated[
     Path | None, typer.Option(metavar="FILE", help="What was measured on this robot, over the description.")
 ]
+Kept = Annotated[Path, typer.Option(metavar="FILE", help="Where they are kept; one that is there is gone on with.")]
 Send = Annotated[bool, typer.Option("--send", help="Have the robot that is up take it over, without a restart.")]
 
 
@@ -43,18 +45,13 @@ def add_to(app: typer.Typer) -> None:
 @babble.command("arm")
 def babble_arm(
     samples: Annotated[int, typer.Option(min=1, max=1_000_000, metavar="N", help="How many, all in all.")] = 1000,
-    out: Annotated[
-        Path, typer.Option(metavar="FILE", help="Where they are kept; one that is there is gone on with.")
-    ] = Path("arm.jsonl"),
+    out: Kept = Path("arm.jsonl"),
     robot: Robot = None,
     profile: Reach = None,
     json: Json = False,
 ) -> None:
     """Move the arm about and look at the hand. Ctrl-C stops it; the same command goes on, and nothing is lost."""
-    from cocoro.cli import babble as babbling
-    from cocoro.cli.link import Where
-
-    sys.exit(asyncio.run(babbling.babble(Where(robot, profile), "babble-arm", samples, out, "", json)))
+    _babble("babble-arm", samples, out, "", robot, profile, json)
 
 
 @babble.command("wheels")
@@ -63,18 +60,22 @@ def babble_wheels(
     target: Annotated[
         str, typer.Option(metavar="LABEL", help="A known object that stands 1.5 m before the robot.")
     ] = "red_can",
-    out: Annotated[
-        Path, typer.Option(metavar="FILE", help="Where they are kept; one that is there is gone on with.")
-    ] = Path("wheels.jsonl"),
+    out: Kept = Path("wheels.jsonl"),
     robot: Robot = None,
     profile: Reach = None,
     json: Json = False,
 ) -> None:
     """Turn the wheels to and fro before a target. The robot needs half a metre around it. Ctrl-C stops it."""
+    _babble("babble-wheels", trials, out, target, robot, profile, json)
+
+
+def _babble(
+    task: TaskName, wanted: int, out: Path, target: str, robot: str | None, profile: str | None, as_json: bool
+) -> None:
     from cocoro.cli import babble as babbling
     from cocoro.cli.link import Where
 
-    sys.exit(asyncio.run(babbling.babble(Where(robot, profile), "babble-wheels", trials, out, target, json)))
+    sys.exit(asyncio.run(babbling.babble(Where(robot, profile), task, wanted, out, target, as_json)))
 
 
 @learn.command("arm")

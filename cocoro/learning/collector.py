@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections import Counter
 from math import pi
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Generic, Self
 
-from cocoro.learning.dataset import HandRow, WheelRow, Writer, hand_header, wheel_header
+from cocoro.learning.dataset import HandRow, Row, WheelRow, Writer, hand_header, wheel_header
 from cocoro.learning.drawing import LEVEL_ROLL_RAD, arm_joints
 from cocoro.messages import HandSample, Message, Vec3, WheelTrial
 from cocoro.robot import Robot
@@ -39,15 +40,11 @@ class Coverage:
         return 1.0 - self._alone / self._count if self._count else 0.0
 
 
-class HandCollector:
-    """Rows of the arm's babbling. Use it with `with`; raises as `Writer` does."""
+class Collector(ABC, Generic[Row]):
+    """Rows of one task's babbling. Use it with `with`; raises as `Writer` does."""
 
-    def __init__(self, path: Path, robot: Robot) -> None:
-        self._joints = arm_joints(robot)
-        self._writer = Writer(path, HandRow, robot, hand_header(robot, self._joints, LEVEL_ROLL_RAD))
-        self._coverage = Coverage()
-        for row in self._writer.rows:
-            self._coverage.add(row.seen_m)
+    def __init__(self, writer: Writer[Row]) -> None:
+        self._writer = writer
 
     def __enter__(self) -> Self:
         return self
@@ -61,13 +58,37 @@ class HandCollector:
         return len(self._writer.rows)
 
     @property
+    @abstractmethod
+    def next(self) -> int:
+        """The number to go on with."""
+
+    @property
+    @abstractmethod
+    def said(self) -> str:
+        """How far it has got, in words."""
+
+    @abstractmethod
+    def take(self, message: Message) -> None:
+        """Keep what is reported; a message of another task is passed over."""
+
+
+class HandCollector(Collector[HandRow]):
+    """Of the arm's babbling."""
+
+    def __init__(self, path: Path, robot: Robot) -> None:
+        self._joints = arm_joints(robot)
+        super().__init__(Writer(path, HandRow, robot, hand_header(robot, self._joints, LEVEL_ROLL_RAD)))
+        self._coverage = Coverage()
+        for row in self._writer.rows:
+            self._coverage.add(row.seen_m)
+
+    @property
     def next(self) -> int:
         """The draw to go on with; number 0 is a corner of the range, which says little."""
         return max((row.draw + 1 for row in self._writer.rows), default=1)
 
     @property
     def said(self) -> str:
-        """How far it has got, in words."""
         return f"{len(self)} samples, coverage {self._coverage.share:.0%}"
 
     def take(self, message: Message) -> None:
@@ -85,24 +106,13 @@ class HandCollector:
             self._coverage.add(row.seen_m)
 
 
-class WheelCollector:
-    """Rows of the wheels' babbling. Use it with `with`; raises as `Writer` does."""
+class WheelCollector(Collector[WheelRow]):
+    """Of the wheels' babbling."""
 
     def __init__(self, path: Path, robot: Robot, target_height_m: float | None = None) -> None:
         """`target_height_m`: of the target's centre above the floor, where that is known."""
         self._separation_m = robot.base.wheel_separation_m
-        self._writer = Writer(path, WheelRow, robot, wheel_header(robot, target_height_m))
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._writer.__exit__(kind, error, trace)
-
-    def __len__(self) -> int:
-        return len(self._writer.rows)
+        super().__init__(Writer(path, WheelRow, robot, wheel_header(robot, target_height_m)))
 
     @property
     def next(self) -> int:
@@ -133,8 +143,6 @@ class WheelCollector:
             self._writer.append([row])
 
 
-def collector(
-    task: str, path: Path, robot: Robot, target_height_m: float | None = None
-) -> HandCollector | WheelCollector:
+def collector(task: str, path: Path, robot: Robot, target_height_m: float | None = None) -> Collector[Any]:
     """For the task 'babble-arm' or 'babble-wheels'; for the latter how high its target's centre stands."""
     return HandCollector(path, robot) if task == "babble-arm" else WheelCollector(path, robot, target_height_m)
