@@ -49,6 +49,12 @@ class Driven:
         self.silence()
         self._driving = asyncio.ensure_future(self._drive(left_mps, right_mps))
 
+    async def roll(self) -> None:
+        """Releases it and drives it on at 0.2 m/s; returns when its wheels turn so."""
+        self.release()
+        self.drive(0.2, 0.2)
+        await self.wheels(200, 200)
+
     def silence(self) -> None:
         if self._driving is not None:
             self._driving.cancel()
@@ -107,9 +113,7 @@ async def test_it_stays_still_until_it_knows_the_emergency_stops_state(bench: Be
 @in_real_time
 async def test_wheels_stop_when_no_command_comes_any_more(bench: Bench) -> None:
     async with driven(bench) as base:
-        base.release()
-        base.drive(0.2, 0.2)
-        await base.wheels(200, 200)
+        await base.roll()
         base.silence()
         assert await base.wheels(0, 0) - base.commanded_ns < DEADMAN_NS + PATIENCE_NS
         await base.state(lambda state: state.stopped_by == "no command")
@@ -130,9 +134,7 @@ async def test_an_old_command_is_none(bench: Bench) -> None:
 @in_real_time
 async def test_the_emergency_stop_is_answered_and_stops_at_once(bench: Bench) -> None:
     async with driven(bench) as base:
-        base.release()
-        base.drive(0.2, 0.2)
-        await base.wheels(200, 200)
+        await base.roll()
         asked_ns = time.monotonic_ns()
         reply = await base.service.ask(topics.ESTOP.of("base"), EstopRequest(latched=True, by="test"))
         assert reply.latch == "latched"
@@ -197,9 +199,7 @@ def test_a_disturbed_line_is_told_and_stops_nothing_for_long(bench: Bench, way: 
     @in_real_time
     async def scenario(bench: Bench) -> None:
         async with driven(bench) as base:
-            base.release()
-            base.drive(0.2, 0.2)
-            await base.wheels(200, 200)
+            await base.roll()
             fault = Fault("corrupted", 0.01, way, 10**19)  # type: ignore[arg-type]
             bench.emulator.call(lambda: bench.line.disturb(fault))
             await base.fault("its line is disturbed, look after the cable")
@@ -236,9 +236,7 @@ def test_a_guard_that_dies_or_hangs_is_replaced_and_the_wheels_stopped_meanwhile
     @in_real_time
     async def scenario(bench: Bench) -> None:
         async with driven(bench) as base:
-            base.release()
-            base.drive(0.2, 0.2)
-            await base.wheels(200, 200)
+            await base.roll()
             pid = services[0].guardian.pid
             assert pid is not None
             base.silence()
