@@ -39,6 +39,13 @@ def short_path() -> Iterator[Path]:
 
 
 @pytest.fixture
+def root(short_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The run directories' place, for this process and those that it starts."""
+    monkeypatch.setenv("COCORO_RUN_DIR", str(short_path))
+    return short_path
+
+
+@pytest.fixture
 def directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Where the processes of one robot's mesh will meet: sockets will live there."""
     return tmp_path_factory.mktemp("m") / "robot"

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import json
-import shutil
 import signal
 import sys
-import tempfile
 import time
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager
 from pathlib import Path
 
@@ -48,14 +46,6 @@ from cocoro.topics import BASE_STATE, CANCEL, DETECTIONS, ESTOP, FRAME, LATCH, O
 pytestmark = pytest.mark.zenoh
 
 ANY = Where()
-
-
-@pytest.fixture
-def root(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    folder = Path(tempfile.mkdtemp(prefix="cocoro"))
-    monkeypatch.setenv("COCORO_RUN_DIR", str(folder))
-    yield folder
-    shutil.rmtree(folder)
 
 
 class FakeRobot:

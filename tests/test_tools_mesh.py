@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import json
-import shutil
 import signal
 import sys
-import tempfile
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
@@ -31,14 +29,6 @@ from cocoro.topics import BASE_COMMAND, Qos
 pytestmark = pytest.mark.zenoh
 
 ANY = Where()
-
-
-@pytest.fixture
-def root(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    folder = Path(tempfile.mkdtemp(prefix="cocoro"))
-    monkeypatch.setenv("COCORO_RUN_DIR", str(folder))
-    yield folder
-    shutil.rmtree(folder)
 
 
 @asynccontextmanager
