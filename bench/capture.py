@@ -46,6 +46,8 @@ from cocoro.tokens import recorder_key
 from sim.rehearse import rehearse
 
 COCORO = [sys.executable, "-m", "cocoro.cli.main"]
+HEARD_S, LOOK_S = 10.0, 0.2
+"""How long the second recorder may take for the last of a replay, and how often that is looked for."""
 PROFILE = """
 robot = "calliope"
 clock = "sim"
@@ -170,16 +172,22 @@ def again(folder: Path) -> None:
     subprocess.run([*COCORO, "up", str(listener), "--detach"], check=True, stdout=subprocess.DEVNULL)
     try:
         subprocess.run([*COCORO, "replay", str(first)], check=True)
-        time.sleep(0.5)
+        (second,) = (folder / "again").glob("*.mcap")
+        played, give_up_s = _published(first), time.monotonic() + HEARD_S
+        while _count(_published(second)) < _count(played) and time.monotonic() < give_up_s:
+            time.sleep(LOOK_S)  # the last of it is still on its way, or waits to be written
     finally:
         subprocess.run([*COCORO, "down"], check=True, stdout=subprocess.DEVNULL)
-    (second,) = (folder / "again").glob("*.mcap")
-    payloads = [_published(path) for path in (first, second)]
+    payloads = [played, _published(second)]
     different = sorted(key for key in payloads[0].keys() | payloads[1].keys() if payloads[0][key] != payloads[1][key])
-    count = sum(map(len, payloads[0].values()))
+    count = _count(played)
     print(
         f"{count} messages of {len(payloads[0])} keys: {f'not the same: {different}' if different else 'all the same'}"
     )
+
+
+def _count(published: dict[str, list[int]]) -> int:
+    return sum(map(len, published.values()))
 
 
 def _published(path: Path) -> dict[str, list[int]]:

@@ -104,7 +104,7 @@ def holder(path: Path) -> Holder | None:
             except ValueError:  # it was taken this very moment
                 if time.monotonic() > deadline_s:
                     return Holder("", 0)
-                time.sleep(0.001)
+                time.sleep(0.001)  # its holder is about to write who it is
         return None
     finally:
         os.close(fd)

@@ -127,7 +127,7 @@ def _flock_within(fd: int, patience_s: float) -> bool:
         except BlockingIOError:
             if time.monotonic() > deadline_s:
                 return False
-            time.sleep(0.001)
+            time.sleep(0.001)  # flock itself would wait for ever, and who holds it may have been stopped
 
 
 def _living(directory: Path, tidy: bool) -> list[Member]:

@@ -29,7 +29,7 @@ def _talk(path: str) -> list[Check]:
     try:
         with serial.Serial(path, oi.BAUD, timeout=ANSWER_S, exclusive=True) as port:
             port.write(oi.start())
-            time.sleep(0.05)
+            time.sleep(0.05)  # what it was still sending comes in meanwhile, and is thrown away
             port.reset_input_buffer()
             port.write(oi.query(ASKED))
             data = port.read(oi.length(ASKED) - len(ASKED))

@@ -112,7 +112,7 @@ def position_of(bus: Bus, joint: Joint) -> float:
     positions = []
     for _ in range(READINGS):
         positions.append(bus.reading(joint.id).position)
-        time.sleep(0.01)
+        time.sleep(0.01)  # the readings span a while, in which an unsteady hand shows
     if max(positions) - min(positions) > TURNED_COUNTS:
         raise RefusedError(f"{joint.name} moved while it was measured; hold it still")
     return sum(positions) / len(positions)
