@@ -117,6 +117,22 @@ async def test_what_slips_while_it_is_held_up_is_noticed() -> None:
 
 
 @in_virtual_time
+async def test_claws_that_feel_nothing_for_a_moment_have_lost_nothing() -> None:
+    async with robot() as it:
+        await it.begin()
+        it.holding = True
+        for _ in range(3):
+            await it.phase("hold")
+            it.holding = False
+            await it.service.advance(0.4)
+            it.holding = True
+            await it.service.advance(0.1)
+        state = await it.outcome()
+        assert (state.outcome, state.reason) == ("done", "")
+        assert "search" not in [phase.name for phase in state.phases[1:]]
+
+
+@in_virtual_time
 async def test_a_planner_that_was_idle_because_it_heard_nothing_has_done_no_step() -> None:
     async with robot() as it:
         it.script = {"approach": ["never"]}

@@ -12,6 +12,10 @@ from cocoro.clock import NS
 from cocoro.messages import Behaviour, Intent, PlannerStatus, Vec2
 from cocoro.node import Node
 
+LOOSE_S = 0.5
+"""A hand that feels nothing for so long has lost what it held. When the arm comes to rest the claws may feel nothing
+for a moment, and then want a quarter of a second until they trust their grip again."""
+
 
 class TaskFailedError(Exception):
     """A step, and with it perhaps the task, did not succeed: a reason to decide on, a text for people."""
@@ -157,9 +161,17 @@ class PlannerSkills:
     async def watch_hold(self, seconds: float) -> None:
         self._phase("hold")
         end_ns = self._node.now_ns() + round(seconds * NS)
-        while self._node.now_ns() < end_ns:
+        loose_since_ns: int | None = None
+        while True:
             status = await self._next_status()
-            if not status.holding:
+            now_ns = self._node.now_ns()
+            if status.holding:
+                loose_since_ns = None
+                if now_ns >= end_ns:
+                    return
+            elif loose_since_ns is None:
+                loose_since_ns = now_ns
+            elif now_ns - loose_since_ns > LOOSE_S * NS:
                 raise TaskFailedError("slipped", "the hand has lost what it held")
 
     async def _next_status(self) -> PlannerStatus:
