@@ -75,7 +75,7 @@ def traffic(folder: Path, seconds: float, sensors: str, compression: str) -> Non
         before, started = recorder.cpu_times(), time.monotonic()
         written = recorder.io_counters().write_bytes
         done = subprocess.run([*COCORO, "fetch", "red_can"], capture_output=True, text=True, check=False)
-        time.sleep(max(seconds - (time.monotonic() - started), 0.0))
+        time.sleep(max(seconds - (time.monotonic() - started), 0.0))  # so long it is measured
         after, lasted_s = recorder.cpu_times(), time.monotonic() - started
         written = recorder.io_counters().write_bytes - written
         cpu_s = after.user + after.system - before.user - before.system

@@ -13,10 +13,9 @@ from typing import TypeVar
 from cocoro.bus.answer import answer
 from cocoro.bus.base import Handle, Heard, OnAlive, OnLot, OnSample, Payload, Reply, Server
 from cocoro.bus.keys import matches
+from cocoro.clock import NS
 from cocoro.errors import CallTimeoutError
 from cocoro.topics import Qos
-
-NS = 1_000_000_000
 
 D = TypeVar("D", bound=Handle)
 

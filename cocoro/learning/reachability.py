@@ -124,9 +124,8 @@ class ReachMesh:
         """Which tetrahedra are small."""
         assert self._mesh is not None
         if self._wanted_m is None:
-            neighbours = np.asarray(scipy.spatial.KDTree(self._held).query(self._held, k=min(4, len(self._held)))[0])[
-                :, -1
-            ]
+            distances, _ = scipy.spatial.KDTree(self._held).query(self._held, k=min(4, len(self._held)))
+            neighbours = np.asarray(distances)[:, -1]
             self.radius_m = max(LEAST_RADIUS_M, GAP_FACTOR * float(np.quantile(neighbours, 0.75)))
         self._small = _radii_m(self._mesh.points[self._mesh.simplices]) <= self.radius_m
         self._mesh.find_simplex(self._held[:1])  # what it makes for the first question takes long: now, not then

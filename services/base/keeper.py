@@ -121,8 +121,6 @@ class Keeper:
     def end(self, now_ns: int) -> None:
         """The service is gone: from now on the wheels are stopped, and nothing else."""
         self._ended_ns = now_ns
-        self._halted_ns = None
-        self._told_stop = False
 
     def heard(self, data: bytes, now_ns: int) -> list[oi.Readings]:
         """Bytes from the Create; the good frames in them."""
