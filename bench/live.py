@@ -46,6 +46,7 @@ class Operator:
     def __init__(self, root: Path) -> None:
         self.run_dir = RunDir(NAME, root)
         self._env = os.environ | {"COCORO_RUN_DIR": str(root), "COCORO_CAPTURE_DIR": str(root / "captures")}
+        self._env |= {"COCORO_STATE_DIR": str(root / "state")}
 
     def start(self, *arguments: str) -> subprocess.Popen[str]:
         command = [sys.executable, "-m", "cocoro.cli.main", *arguments]

@@ -61,6 +61,11 @@ class LatchKeeper:
         if follows:
             node.on(topics.LATCH, self._heard)
 
+    def stop(self, by: str) -> None:
+        """Latch, in the event loop: another part of the service was told to stop."""
+        if self.state != "latched":
+            self._set("latched", by)
+
     def word(self, state: LatchState, by: str) -> None:
         """Take another's word for it: it releases only what is unknown, and it may be from before a reset."""
         if state == "released" and self.state == "unknown":

@@ -33,8 +33,10 @@ class Point:
         self.latched_ns: int | None = None
         """When its process stopped what it moves, CLOCK_MONOTONIC."""
         self.kept: bool | None = None
-        """Whether the latch is on its disk; None while it has not said."""
+        """Whether the latch is on the disk; None while that is not known, or another process keeps it."""
         self.why_not_kept = ""
+        self.settled = False
+        """Nothing more is to be heard from it."""
 
 
 class Asking:
@@ -66,7 +68,7 @@ class Asking:
     def hear_of_the_disk(self, until_s: float) -> None:
         """Hear, until then at the latest, from all that are latched whether the latch is kept."""
         while (left_s := until_s - time.monotonic()) > 0 and any(
-            point.kept is None and point.latched_ns is not None for point in self.points.values()
+            point.latched_ns is not None and not point.settled for point in self.points.values()
         ):
             if select.select([self._socket], [], [], left_s)[0]:
                 self._hear()
@@ -104,7 +106,9 @@ class Asking:
         if word == "latched" and about.isdecimal() and point.latched_ns is None:
             point.latched_ns = int(about)
         elif word in ("kept", "unkept"):
-            point.kept, point.why_not_kept = word == "kept", about
+            point.kept, point.why_not_kept, point.settled = word == "kept", about, True
+        elif word == "keepless":
+            point.settled = True
 
 
 def addresses(robot: str | None = None) -> list[str]:

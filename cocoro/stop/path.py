@@ -77,6 +77,10 @@ class StopPoint:
         """Answer that the latch is on the disk, or why it is not."""
         self._answer(asked, f"unkept {self.service} {why_not}" if why_not else f"kept {self.service}")
 
+    def keeps_nothing(self, asked: Asked) -> None:
+        """Answer that another process keeps the latch of what this one moves."""
+        self._answer(asked, f"keepless {self.service}")
+
     def _answer(self, asked: Asked, text: str) -> None:
         if asked.answer_to:
             with suppress(OSError):  # the asker has gone, or does not read: that must hold nothing up
