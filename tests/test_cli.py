@@ -84,7 +84,8 @@ def test_bad_usage_exits_with_2_and_no_traceback(arguments: list[str], capsys: p
     "arguments",
     [
         ["fetch", "red_can"], ["park"], ["put-down"], ["cancel"], ["status"], ["objects"], ["snapshot", "out.png"],
-        ["estop", "--robot", "nobody"], ["stop", "--robot", "nobody"], ["reset"], ["fetch", "red_can", "--robot", "calliope"],
+        ["estop", "--robot", "nobody"], ["stop", "--robot", "nobody"], ["reset"],
+        ["fetch", "red_can", "--robot", "calliope"],
     ],
     ids=" ".join,
 )  # fmt: skip

@@ -95,9 +95,9 @@ def main(command: str, arguments: list[str]) -> int:
 def by_path(robot: str | None) -> tuple[list[Stop], list[str]]:
     """Stop by the stop path; how it went with each robot, and what was in the way."""
     try:
-        asking = Asking(robot)
-        asking.go_on(time.monotonic() + ACKNOWLEDGE_S)
-        asking.hear_of_the_disk(time.monotonic() + KEPT_S)
+        with Asking(robot) as asking:
+            asking.go_on(time.monotonic() + ACKNOWLEDGE_S)
+            asking.hear_of_the_disk(time.monotonic() + KEPT_S)
     except OSError as error:
         return [], [f"the stop path cannot be used ({error}): the mesh alone was asked"]
     started_s = _process_start_s()

@@ -40,7 +40,10 @@ class Point:
 
 
 class Asking:
-    """Stops one robot by name, or all, for as long as `go_on` is called."""
+    """Stops one robot by name, or all, from its making on. A context manager.
+
+    Raises OSError where the kernel does not list its sockets (no /proc), or has no socket left for this process.
+    """
 
     def __init__(self, robot: str | None = None, by: str = "operator") -> None:
         self.points: dict[str, Point] = {}
@@ -49,8 +52,18 @@ class Asking:
         self._by = by.encode()
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC | socket.SOCK_NONBLOCK)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_PASSCRED, 1)
-        self._socket.bind(b"")  # the kernel chooses an address for the answers
-        self._tell()
+        try:
+            self._socket.bind(b"")  # the kernel chooses an address for the answers
+            self._tell()
+        except OSError:
+            self._socket.close()
+            raise
+
+    def __enter__(self) -> Asking:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._socket.close()
 
     def go_on(self, until_s: float) -> None:
         """Hear answers, and tell again who could not be told, until then (monotonic) or until all have answered."""

@@ -65,6 +65,10 @@ class StopPoint:
             )
         except BlockingIOError:
             return None
+        except OSError:
+            if self._closed:
+                return None
+            raise
         if self._closed:
             return None
         return Asked(_who(text, ancillary), sender if isinstance(sender, bytes) else b"")

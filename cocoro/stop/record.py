@@ -142,7 +142,7 @@ def _record(said: Said) -> bytes:
 
 def _understood(path: Path, data: bytes) -> Said:
     body = data[9:-1].rstrip()
-    if len(data) != RECORD_BYTES or data[:9] != f"{zlib.crc32(body):08x} ".encode():
+    if len(data) != RECORD_BYTES or data[-1:] != b"\n" or data[:9] != f"{zlib.crc32(body):08x} ".encode():
         return _unreadable(path, "it is damaged")
     try:
         said = json.loads(body)
