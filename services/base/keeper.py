@@ -122,7 +122,7 @@ class Keeper:
 
     def reset(self, stops: int) -> None:
         """So many of the emergency stops have been reset by the robot's owner."""
-        self._reset_stops = min(stops, self.stops)
+        self._reset_stops = min(max(stops, 0), self.stops)
 
     def recover(self, now_ns: int) -> None:
         """Somebody says that a Create that left its mode may go on."""
