@@ -39,6 +39,8 @@ class Stop(NamedTuple):
     """Why latches will not outlive a restart."""
     owner: int | None = None
     """User id of a robot that is another's."""
+    latched_ns: dict[str, int] = {}  # noqa: RUF012 # read only
+    """When each service stopped what it moves, CLOCK_MONOTONIC; by the stop path alone."""
 
     @property
     def code(self) -> int:
@@ -122,6 +124,7 @@ def _stop_of(uid: int, robot: str, points: list[Point], started_s: float) -> Sto
         max(latched_s, default=time.monotonic()) - started_s,
         tuple(dict.fromkeys(point.why_not_kept for point in points if point.kept is False)),
         None if uid == os.getuid() else uid,
+        {point.service: point.latched_ns for point in points if point.latched_ns is not None},
     )
 
 
