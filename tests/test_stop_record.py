@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from cocoro.stop import record
+from cocoro.cli import doctor_stop
+from cocoro.stop import asking, record
 from cocoro.stop.record import RECORD_BYTES, LatchRecord, latch_dir, prepare, read
 
 PATIENCE_S = 60.0
@@ -161,3 +162,32 @@ def test_the_place_outlives_a_reboot(monkeypatch: pytest.MonkeyPatch) -> None:
     assert latch_dir("calliope") == Path("/var/lib/cocoro/calliope/latch")
     monkeypatch.setenv(record.STATE_DIR, "/somewhere")
     assert latch_dir("calliope") == Path("/somewhere/calliope/latch")
+
+
+# --- what the doctor says of it ---------------------------------------------------------------------
+
+
+def test_the_doctor_says_where_the_latch_is_kept_and_that_it_is_latched() -> None:
+    path, latch = doctor_stop.check("robbie")
+    assert (path.state, latch.state) == ("ok", "ok")
+    assert str(latch_dir("robbie")) in latch.text
+    prepare(latch_dir("robbie"), ["base"], by_hand=False)
+    _, latch = doctor_stop.check("robbie")
+    assert (latch.state, "`cocoro reset`" in latch.text) == ("note", True)
+
+
+def test_the_doctor_warns_of_a_place_that_does_not_outlive_a_reboot_or_cannot_be_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert doctor_stop._filesystem(Path("/proc")) != "tmpfs"
+    monkeypatch.setattr(doctor_stop, "_filesystem", lambda _: "tmpfs")
+    assert [one.state for one in doctor_stop.check("robbie")] == ["ok", "bad"]
+    (tmp_path / "file").touch()
+    monkeypatch.setenv(record.STATE_DIR, str(tmp_path / "file"))
+    assert "comes up stopped" in list(doctor_stop.check("robbie"))[1].text
+
+
+def test_the_doctor_says_when_the_kernels_list_cannot_be_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(asking, "SOCKETS", "/nowhere/unix")
+    path, _ = doctor_stop.check("robbie")
+    assert (path.state, "is /proc mounted?" in path.text) == ("bad", True)

@@ -36,6 +36,11 @@ class Estop:
     def state(self) -> LatchState:
         return self._said
 
+    @property
+    def words(self) -> str:
+        """The state and by whom it is so, for people."""
+        return f"{self._said} by {self._by}" if self._said == "latched" and self._by else self._said
+
     def _hardware(self, service: str, latch: LatchState) -> None:
         self._heard[service] = latch
         if latch == "latched":
