@@ -80,9 +80,18 @@ def main(command: str, arguments: list[str]) -> int:
         except SystemExit as end:
             return end.code if isinstance(end.code, int) else exits.USAGE
         robot, profile, as_json = options.robot, options.profile, options.json
-    stops, troubles = ([], []) if profile is not None else by_path(robot)
+    if profile is not None:
+        from cocoro import profiles
+        from cocoro.errors import ConfigError
+
+        try:
+            robot = robot or profiles.read(profile).robot
+        except ConfigError as error:
+            print(f"cocoro: {error}", file=sys.stderr)
+            return exits.USAGE
+    stops, troubles = by_path(robot)
     started_s = _process_start_s()
-    if not stops or any(stop.missing for stop in stops):
+    if profile is not None or not stops or any(stop.missing for stop in stops):
         stops, troubles, code = _by_mesh_too(robot, profile, started_s, stops, troubles)
     else:
         code = exits.DONE
@@ -140,7 +149,7 @@ def _by_mesh_too(
     from cocoro.cli import estop_mesh
     from cocoro.errors import CocoroError, ConfigError
 
-    done = {stop.robot for stop in stops if not stop.missing}
+    done = {stop.robot for stop in stops if not stop.missing and profile is None}
     try:
         which = [(run_dir, config) for run_dir, config in estop_mesh.found(robot, profile) if run_dir.robot not in done]
         if not which and not stops:

@@ -52,7 +52,7 @@ class StopPoint:
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_PASSCRED, 1)
         self._socket.bind(b"\0" + name)
-        self._closed = False
+        self.closed = False
 
     def fileno(self) -> int:
         return self._socket.fileno()
@@ -66,10 +66,10 @@ class StopPoint:
         except BlockingIOError:
             return None
         except OSError:
-            if self._closed:
+            if self.closed:
                 return None
             raise
-        if self._closed:
+        if self.closed:
             return None
         return Asked(_who(text, ancillary), sender if isinstance(sender, bytes) else b"")
 
@@ -92,7 +92,7 @@ class StopPoint:
 
     def close(self) -> None:
         """From now on nobody listens; a `take` that waits returns."""
-        self._closed = True
+        self.closed = True
         with suppress(OSError):
             self._socket.shutdown(socket.SHUT_RDWR)
         self._socket.close()
@@ -121,7 +121,7 @@ def listen(point: StopPoint, halt: Callable[[str], None], keep: Callable[[str], 
                 point.latched(asked, time.monotonic_ns())
                 point.kept(asked, _kept(keep, asked.by))
         finally:
-            if not point._closed:
+            if not point.closed:
                 halt("the failure of its own path")
 
     threading.Thread(target=hear, name=f"stop {point.service}", daemon=True).start()
