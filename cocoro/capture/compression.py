@@ -17,9 +17,11 @@ from cocoro.capture.errors import DamageError
 
 Compression = Literal["zstd", "lz4", "none"]
 COMPRESSIONS: tuple[Compression, ...] = get_args(Compression)
+KNOWN = ("", "zstd", "lz4")
+"""As they stand in a chunk."""
 
-LARGEST_CHUNK = 256 * 1024 * 1024
-"""Bytes before compression; what claims to be larger is damaged."""
+LARGEST_CHUNK = 4 << 30
+"""Bytes, before compression and after, as the mcap package has it; what claims to be larger is damaged."""
 WORTH = 0.95
 """What does not become smaller than this share of itself is stored as it is: then reading it costs nothing."""
 
