@@ -1,11 +1,13 @@
-"""How fast captures are written and read: by the code here, and by the mcap package alone.
+"""How fast captures are written and read: by the code here, and by the mcap package.
 
-    python bench/capture_format.py [--seconds 5] [--times 5]
+    python bench/capture_format.py files [--seconds 5] [--times 5]
+    python bench/capture_format.py records [--times 5]
 
-Both write by zstd, as each does it by itself, the messages of a rehearsed fetch (30 frames of 1.54 MB and some 800
-small messages a second), and read the same files, in turn in one run. The figures are times of this process, reader
-threads included, the middle one of all turns; a ratio is that of the package over that of the code here. Files are on a disk in memory
-where there is one, so no disk is measured.
+`files`: both write by zstd, as each does it by itself, the messages of a rehearsed fetch (30 frames of 1.54 MB and some
+800 small messages a second), and read the same files. `records`: each kind of record that is made or read by hand, and
+a frame joined with its head before it is packed or packed piece by piece. The two take turns in one run. The
+figures are times of this process, reader threads included, the middle one of all turns; a ratio is the package's time
+over that of the code here. Files are on a disk in memory where there is one, so no disk is measured.
 """
 
 from __future__ import annotations
@@ -15,15 +17,23 @@ import statistics
 import tempfile
 import time
 import tracemalloc
+import zlib
 from collections.abc import Callable
+from io import BytesIO
 from pathlib import Path
 from typing import Literal
 
+import zstandard
+from mcap.data_stream import ReadDataStream
 from mcap.reader import make_reader
+from mcap.records import Chunk, Message, MessageIndex
+from mcap.stream_reader import breakup_chunk
 from mcap.writer import CompressionType
 from mcap.writer import Writer as PackageWriter
 
-from cocoro.capture.compression import Packer
+from cocoro.capture import mcap
+from cocoro.capture.compression import QUICK, Packer
+from cocoro.capture.contents import unpacked
 from cocoro.capture.keys import info_of
 from cocoro.capture.reader import Capture
 from cocoro.capture.writer import Entry, Limits, Writer
@@ -147,13 +157,92 @@ def _ratio(spent: dict[str, float]) -> float:
     return spent["package"] / spent["here"]
 
 
+def records(folder: Path, times: int) -> None:
+    payload, count, places = bytes(220), 1000, list(range(40))
+
+    def write_messages() -> bytes:
+        return b"".join(part for n in range(count) for part in (mcap.message_head(3, n, n, n, len(payload)), payload))
+
+    def write_messages_by_package() -> bytes:
+        return mcap.packed(*(Message(3, n, payload, n, n) for n in range(count)))
+
+    raw = write_messages()
+    assert raw == write_messages_by_package()
+    small = Chunk("", raw, 0, 0, 0, len(raw))
+    some = list(zip(places[::2], places[1::2], strict=True))
+    assert mcap.message_index(3, places) == mcap.packed(MessageIndex(3, some))
+    _tell(f"{count} messages of {len(payload)} bytes, written", times, write_messages, write_messages_by_package)
+    _tell(
+        "the same, read", times,
+        lambda: [mcap.message(content) for _, content, _ in mcap.records(raw)],
+        lambda: breakup_chunk(small),
+    )  # fmt: skip
+    _tell(
+        f"{count} indices of {len(some)} messages, written", times,
+        lambda: [mcap.message_index(3, places) for _ in range(count)],
+        lambda: [mcap.packed(MessageIndex(3, some)) for _ in range(count)],
+    )  # fmt: skip
+    for sensors in ("ideal", "real"):
+        frames = [one.payload for one in recorded(folder, sensors, 3.0) if one.key.endswith("kinect/frame")][::4]
+        _frames(f"{len(frames)} frames, {sensors} sensors", frames, times)
+
+
+def _frames(name: str, frames: list[bytes], times: int) -> None:
+    head = bytes(mcap.MESSAGE_HEAD.size)
+    raws = [head + frame for frame in frames]
+    packer = zstandard.ZstdCompressor(compression_params=QUICK)
+    packed = [(packer.compress(raw), len(raw), zlib.crc32(raw)) for raw in raws]
+    contents = [mcap.packed(Chunk("zstd", data, 0, 0, crc, size))[9:] for data, size, crc in packed]
+
+    def write() -> None:
+        for data, size, crc in packed:  # the head, and the packed records as they are
+            mcap.ChunkHead(0, 0, size, crc, "zstd", len(data)).pack()
+
+    def write_by_package() -> None:
+        for data, size, crc in packed:
+            mcap.packed(Chunk("zstd", data, 0, 0, crc, size))
+
+    _tell(f"{name}, packed: chunk records made", times, write, write_by_package)
+    _tell(
+        f"{name}: chunk records read", times,
+        lambda: [unpacked(content) for content in contents],
+        lambda: [breakup_chunk(Chunk.read(ReadDataStream(BytesIO(content))), True) for content in contents],
+    )  # fmt: skip
+
+    def joined() -> None:
+        for frame in frames:
+            raw = b"".join((head, frame))
+            zlib.crc32(raw)
+            packer.compress(raw)
+
+    def in_pieces() -> None:
+        for frame in frames:
+            zlib.crc32(frame, zlib.crc32(head))
+            stream = packer.compressobj(size=len(head) + len(frame))
+            _ = [stream.compress(head), stream.compress(frame), stream.flush()]
+
+    spent = in_turn(times, here=joined, pieces=in_pieces)
+    print(f"{name}: joined and packed {1e3 * spent['here'] / len(frames):.2f} ms each, ", end="")
+    print(f"packed in pieces {1e3 * spent['pieces'] / len(frames):.2f} ms")
+
+
+def _tell(name: str, times: int, here: Callable[[], object], package: Callable[[], object]) -> None:
+    spent = in_turn(times, here=here, package=package)
+    print(f"{name}: here {1e3 * spent['here']:.2f} ms, by the package {1e3 * spent['package']:.2f} ms: ", end="")
+    print(f"{_ratio(spent):.1f} times")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=("files", "records"))
     parser.add_argument("--seconds", type=float, default=5.0)
     parser.add_argument("--times", type=int, default=5)
     options = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="cocoro-", dir=MEMORY if MEMORY.is_dir() else None) as folder:
-        compare(Path(folder), options.seconds, options.times)
+        if options.what == "records":
+            records(Path(folder), options.times)
+        else:
+            compare(Path(folder), options.seconds, options.times)
 
 
 if __name__ == "__main__":

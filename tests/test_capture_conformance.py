@@ -8,12 +8,16 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from mcap.reader import NonSeekingReader, make_reader
 from mcap.records import Attachment, Channel, Message, Metadata, Schema
 from mcap.stream_reader import StreamReader
+from mcap.writer import CompressionType, IndexType, Writer
 from mcap_conformance import CONTENTS, MAGIC, made, variants
 
 from cocoro.capture.compression import Packer
+from cocoro.capture.file import checksum
 from cocoro.capture.info import report
 from cocoro.capture.reader import Capture
 from cocoro.capture.rewrite import rewrite
@@ -192,3 +196,65 @@ def report_of(path: Path) -> Any:
 def here_attachments(path: Path) -> list[Attachment]:
     with Capture.open(path) as capture:
         return [capture.attachment(index) for index in capture.attachments]
+
+
+# --- whatever a writer does -----------------------------------------------------------------------
+
+OPTIONS = st.fixed_dictionaries(
+    {
+        "chunk_size": st.sampled_from([1, 100, 1 << 20]),
+        "compression": st.sampled_from(list(CompressionType)),
+        "index_types": st.sampled_from([IndexType.ALL, IndexType.NONE, *(IndexType.ALL & ~one for one in IndexType)]),
+        **{
+            name: st.booleans()
+            for name in (
+                "repeat_channels", "repeat_schemas", "use_chunking", "use_statistics", "use_summary_offsets",
+                "enable_crcs", "enable_data_crcs",
+            )
+        },
+    }
+)  # fmt: skip
+MESSAGE = st.tuples(st.just("message"), st.integers(0, 3), st.integers(0, 50), st.binary(max_size=40))
+OTHERS = st.tuples(st.sampled_from(["metadata", "attachment"]), st.text(max_size=3), st.integers(0, 9), st.binary())
+
+
+@settings(max_examples=150, deadline=None)
+@given(options=OPTIONS, acts=st.lists(MESSAGE | OTHERS, max_size=25), profile=st.sampled_from(["", "ros2", "cocoro"]))
+def test_whatever_the_package_writes_is_read_as_the_package_reads_it_before_and_after_repair(
+    tmp_path_factory: pytest.TempPathFactory, options: dict[str, Any], acts: list[Any], profile: str
+) -> None:
+    if not options["use_chunking"]:  # the package's checksum over all the data lacks channels that it has not flushed
+        options["enable_data_crcs"] = False
+    stream, folder = BytesIO(), tmp_path_factory.mktemp("any")
+    written = Writer(stream, **options)
+    written.start(profile)
+    schemas = [0, written.register_schema("S", "jsonschema", b"{}"), written.register_schema("S", "other", b"")]
+    for n, schema in enumerate((*schemas, 1)):  # two topics, two channels of each
+        written.register_channel(f"/topic{n % 2}", "json", schema, {"n": str(n)})
+    written.add_message(1, 20, b"", 20)  # or the package loses the channels
+    for n, (kind, which, number, data) in enumerate(acts):
+        if kind == "message":
+            written.add_message(which + 1, number, data, n, n)
+        elif kind == "metadata":
+            written.add_metadata(which, {"number": str(number), "crc32": data.hex()})
+        else:
+            written.add_attachment(number, n, which, "text/plain", data)
+    written.finish()
+    known = by_package(stream.getvalue())
+    path, repaired = folder / "any.mcap", folder / "repaired.mcap"
+    path.write_bytes(stream.getvalue())
+    assert here(path) == known
+    with Capture.open(path) as capture:
+        for check in (False, True):
+            found = report(capture, check)
+            assert (found.problems, found.notes, found.messages) == ((), (), len(known.messages))
+        rewrite(capture, repaired, Packer("lz4"))
+    again = here(repaired)
+    if profile == "cocoro":  # whose conventions give each metadata record a checksum
+        known = known._replace(metadata=[_sealed(found) for found in known.metadata])
+    assert again == known
+    assert by_package(repaired.read_bytes())._replace(metadata=known.metadata) == known
+
+
+def _sealed(found: Metadata) -> Metadata:
+    return Metadata(found.name, {**found.metadata, "crc32": checksum(found.metadata)})
