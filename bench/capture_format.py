@@ -51,7 +51,10 @@ def recorded(folder: Path, sensors: Literal["ideal", "real"], seconds: float) ->
     rehearse(RehearsalRequest(task="fetch", label="red_can", sensors=sensors, record=str(path)))
     with Capture.open(path) as capture:
         end_ns = capture.start_ns + round(seconds * NS)
-        made = [Entry(*record[:4], bytes(record[4])) for record in capture.messages(end_ns=end_ns)]
+        made = [
+            Entry(one.key, one.sequence, one.log_ns, one.publish_ns, bytes(one.payload))
+            for one in capture.messages(end_ns=end_ns)
+        ]
     path.unlink()
     return made
 
@@ -203,11 +206,16 @@ def _frames(name: str, frames: list[bytes], times: int) -> None:
             mcap.packed(Chunk("zstd", data, 0, 0, crc, size))
 
     _tell(f"{name}, packed: chunk records made", times, write, write_by_package)
-    _tell(
-        f"{name}: chunk records read", times,
-        lambda: [unpacked(content) for content in contents],
-        lambda: [breakup_chunk(Chunk.read(ReadDataStream(BytesIO(content))), True) for content in contents],
-    )  # fmt: skip
+
+    def read() -> None:
+        for content in contents:
+            unpacked(content)
+
+    def read_by_package() -> None:
+        for content in contents:
+            breakup_chunk(Chunk.read(ReadDataStream(BytesIO(content))), validate_crc=True)
+
+    _tell(f"{name}: chunk records read", times, read, read_by_package)
 
     def joined() -> None:
         for frame in frames:

@@ -315,7 +315,8 @@ class Capture:
                 elif channel_id not in self.channels:
                     self.add_problem(f"a message is of channel {channel_id}, which the file does not tell of")
         except DamageError as damage:
-            self.add_problem(f"the chunk at byte {place.offset} ({place.length} bytes) is passed by: {damage}")
+            kind = "run of messages" if place.loose else "chunk"
+            self.add_problem(f"the {kind} at byte {place.offset} ({place.length} bytes) is passed by: {damage}")
         except OSError as error:
             raise CaptureError(f"{self.path} cannot be read: {error.strerror}") from error
 
