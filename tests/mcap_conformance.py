@@ -25,7 +25,7 @@ SUMMARISED = {CHUNK_INDEX, SCHEMAS_AGAIN, CHANNELS_AGAIN, METADATA_INDEX, ATTACH
 
 
 class Content(NamedTuple):
-    """What a file has, as the contents of its records without opcode and length."""
+    """The contents of a file's records, without opcode and length."""
 
     schema: bytes = b""
     channel: bytes = b""
@@ -148,7 +148,8 @@ class _File:
             self.add(0x05, message, padded=False)
 
     def chunk(self, content: Content) -> bytes:
-        """The same in a chunk; neither it nor what is in it has padding. Returns its index, if it is to have one."""
+        """Schema, channel and messages in a chunk; neither the chunk nor its records have padding. Returns its index,
+        if it is to have one."""
         inner = _File(frozenset())
         inner.run(content)
         records = bytes(inner.data[len(MAGIC) :])

@@ -98,7 +98,7 @@ def test_every_file_of_the_conformance_set_is_read_as_the_package_reads_it_befor
 
 
 def _check_indexed(data: bytes, known: Known) -> None:
-    """What is written here has an index, so the package's reader of indexed files finds all by it."""
+    """A repaired file has indices, so the package's reader of indexed files finds everything by them."""
     reader = make_reader(BytesIO(data), validate_crcs=True)
     summary = reader.get_summary()
     assert summary is not None

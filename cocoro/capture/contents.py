@@ -1,4 +1,4 @@
-"""What is in a file of MCAP records, and where."""
+"""The contents of an MCAP file: what it has, and at which byte."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Place(NamedTuple):
 
 @dataclass
 class Contents:
-    """What a file has."""
+    """A file's schemas, channels, metadata and attachments, and the places of its messages."""
 
     profile: str = ""
     library: str = ""
@@ -50,15 +50,15 @@ class Contents:
     attachments: list[AttachmentIndex] = field(default_factory=list)
     statistics: Statistics | None = None
     raw_bytes: int = 0
-    """Of all chunks, before compression."""
+    """Size of all chunks before compression."""
     closed: bool = False
     """It has its end, whatever else is wrong with it."""
     summarised: bool = False
-    """What stands here is by the file's summary, so not all of the file has been read."""
+    """This was taken from the file's summary, so not all of the file has been read."""
     data_end: int = 0
     """Where the record of this name is; 0 where there is none."""
     data_crc: int = 0
-    """Of all before it; 0: its writer gave none."""
+    """Checksum of all bytes before it; 0: its writer gave none."""
     cut_bytes: int = 0
     """At the end, of a record that was never finished: what the death of a recorder leaves, so no damage."""
     problems: list[str] = field(default_factory=list)
@@ -114,7 +114,7 @@ class Disk:
         return data
 
     def near(self, offset: int, length: int) -> bytes:
-        """Likewise, for one who reads little after little, going on; not for use by two threads at once."""
+        """Read from a block that is kept: for many small pieces in order. Not for use by two threads at once."""
         at = offset - self._near_at
         if at < 0 or at + length > len(self._near):
             if length > NEAR_BYTES or offset + length > self.size:
@@ -131,7 +131,7 @@ class Disk:
 
 
 def header_of(disk: Disk) -> Header:
-    """Whose conventions hold; an empty one where it cannot be read."""
+    """Read the file's header; an empty one where it cannot be read."""
     try:
         op, length = PREFIX.unpack(disk.read(len(MAGIC), PREFIX.size))
         if op == Opcode.HEADER and length <= LARGEST_RECORD:

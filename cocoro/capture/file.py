@@ -37,7 +37,7 @@ from cocoro.capture.compression import Packer
 PROFILE = "cocoro"
 """In the MCAP header: the conventions of docs/captures.md hold."""
 MAKER = "cocoro"
-"""What the header's library begins with in files that were written here."""
+"""The header's library begins with this in files that were written here."""
 LIBRARY = f"{MAKER} {versions().get('cocoro-mesh', '')}".strip()
 LARGE_BYTES = 64 * 1024
 """A payload from this size on gets a chunk of its own, so that readers of small things can pass it by."""
@@ -46,11 +46,11 @@ FULL_BYTES = 512 * 1024
 
 
 class KeyTally(msgspec.Struct):
-    """What a file has of one key."""
+    """Counts of one channel of a file."""
 
     messages: int = 0
     size_bytes: int = 0
-    """Of the payloads."""
+    """Size of the payloads."""
     first_ns: int = 0
     last_ns: int = 0
     """Log times."""
@@ -69,7 +69,7 @@ class KeyTally(msgspec.Struct):
 
 
 class _Chunk:
-    """What is being gathered."""
+    """A chunk that is being gathered."""
 
     def __init__(self) -> None:
         self.parts: list[bytes] = []
@@ -89,7 +89,7 @@ class CaptureFile:
         self.path = path
         self.size_bytes = 0
         self.raw_bytes = 0
-        """Of the chunks, before compression."""
+        """Size of the chunks before compression."""
         self.tallies: dict[int, KeyTally] = {}
         """By channel."""
         self._packer = packer
@@ -125,7 +125,7 @@ class CaptureFile:
             self._pending.append(mcap.packed(schema))
 
     def channel(self, channel: Channel) -> None:
-        """Likewise a channel, before its first message."""
+        """Make a channel known, before its first message. One of an id that is known already is passed by."""
         if channel.id not in self._channels:
             self._channels[channel.id] = channel
             self.tallies[channel.id] = KeyTally()
@@ -285,7 +285,7 @@ TALLY = "tally"
 
 
 def tally_names(channels: Mapping[int, Channel]) -> dict[int, str]:
-    """What the tally calls each channel: by its key, and where a key has several by its number, too."""
+    """The name of each channel in the tally, by its number: its key, or KEY#NUMBER where a key has several."""
     counts = Counter(channel.topic for channel in channels.values())
     return {
         id: channel.topic if counts[channel.topic] == 1 else f"{channel.topic}#{id}" for id, channel in channels.items()

@@ -1,4 +1,4 @@
-"""What a capture has: its channels with their counts, rates, gaps and losses, and where it came from."""
+"""The report on a capture: its channels with their counts, rates, gaps and losses, and where it came from."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class KeyReport(msgspec.Struct, kw_only=True):
     channel: int
     """Its number in the file."""
     encoding: str
-    """Of its messages."""
+    """Message encoding, as the file has it."""
     type: str
     """The recorded schema's name; '' where there is none."""
     messages: int
@@ -74,13 +74,13 @@ class Report(msgspec.Struct, kw_only=True):
     keys: tuple[KeyReport, ...]
     attachments: tuple[AttachmentReport, ...]
     notes: tuple[str, ...]
-    """What is odd about it, without being damaged."""
+    """Contradictions and records that are passed by, in words; no damage."""
     metadata: dict[str, dict[str, Any]]
 
 
 def report(capture: Capture, check: bool = False) -> Report:
-    """By what a whole capture says of itself (its checksums vouch for that), where it does not contradict itself; by
-    reading it all for any other, and with `check`."""
+    """Report on a capture. The counts of a whole capture are those of its own tally (checksums vouch for it), where
+    that agrees with its statistics and chunks. Of any other capture, and with `check`, all is read and counted."""
     told = _told_tallies(capture) if capture.whole and capture.summarised else None
     tallies = told if told is not None and not check else _counted(capture)
     checked = check or tallies is not told
@@ -160,7 +160,7 @@ def _counted(capture: Capture) -> dict[int, KeyTally]:
 
 
 def _contradictions(capture: Capture, tallies: Mapping[int, KeyTally]) -> list[str]:
-    """What the file says of itself and is not so, in words. MCAP readers pass by it, so it is no damage."""
+    """False statements of the file about itself, in words. MCAP readers do not look at them, so they are no damage."""
     if capture.problems:
         return []
     found, counted = [], sum(tally.messages for tally in tallies.values())
@@ -213,7 +213,7 @@ def _key_report(
 
 
 def changed_since(capture: Capture, channel: int) -> list[str]:
-    """What is different in today's type of a channel's key, in words."""
+    """Differences between the recorded schema of a channel and today's type of its key, in words."""
     schema, key = capture.schema(channel), capture.channels[channel].topic
     topic = topic_named(key.removeprefix(f"{capture.robot}/"))
     if schema is None or topic is None or capture.channels[channel].metadata.get("publisher") == MADE_HERE:

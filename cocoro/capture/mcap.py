@@ -68,7 +68,7 @@ def packed(*records: McapRecord) -> bytes:
 
 
 def ended(builder: RecordBuilder) -> bytes:
-    """What was built."""
+    """Take the bytes that a builder has gathered."""
     data: bytes = builder.end()  # type: ignore[no-untyped-call]
     return data
 
@@ -87,8 +87,9 @@ def parsed(kind: type[K], content: Bytes) -> tuple[K, int]:
 
 
 def attachment_index(content: Bytes, offset: int, length: int) -> tuple[AttachmentIndex, int]:
-    """What an attachment is, from the beginning of its record, and where in that its data begins; `offset` and `length`
-    are of the record with its prefix. The package reads attachments with all their data, however large."""
+    """Read the head of an attachment from the beginning of its record: its index, and the offset of its data in the
+    record. `offset` and `length` are those of the record with its prefix. Raises DamageError. By hand, because the
+    package reads an attachment only with all its data, however large."""
     stream = _Exact(BytesIO(content))
     try:
         log_time, create_time = stream.read8(), stream.read8()
@@ -173,7 +174,7 @@ def message(content: memoryview) -> Message:
 
 
 def message_head(channel_id: int, sequence: int, log_ns: int, publish_ns: int, payload_bytes: int) -> bytes:
-    """What stands before a payload.
+    """Pack the prefix and the fields of a message; the payload follows.
 
     By hand: WRITE_TIMES
     """
@@ -200,7 +201,7 @@ def check_message_index(content: Bytes) -> int:
 
 @dataclass(frozen=True)
 class ChunkHead:
-    """What stands before a chunk's records.
+    """The fields of a chunk before its records.
 
     By hand, since the package has a chunk only as a whole: it copies the packed records into the record, and again out
     of it. CHUNK_TIMES
@@ -210,7 +211,7 @@ class ChunkHead:
     end_ns: int
     raw_bytes: int
     crc: int
-    """Of the records before compression; 0: there is none."""
+    """Checksum of the records before compression; 0: there is none."""
     compression: str
     packed_bytes: int
 

@@ -102,7 +102,7 @@ class Capture:
 
     @property
     def summarised(self) -> bool:
-        """What is known of it so far is by its summary, so not all of it has been read."""
+        """Its contents were taken from its summary, so not all of it has been read."""
         return self._contents.summarised
 
     @property
@@ -129,7 +129,7 @@ class Capture:
 
     @property
     def problems(self) -> list[str]:
-        """What could not be read, as far as it was tried."""
+        """Parts that could not be read, as far as it was tried, in words."""
         more = [f"and {self._untold} more of the kind"] if self._untold else []
         return [*self._problems, *more]
 
@@ -139,7 +139,7 @@ class Capture:
 
     @property
     def notes(self) -> list[str]:
-        """What is there and is not read, without being damaged."""
+        """Records that are passed by without being damaged, in words."""
         kinds = self._contents.unknown
         if not kinds:
             return []
@@ -153,12 +153,12 @@ class Capture:
 
     @property
     def statistics(self) -> Statistics | None:
-        """What the file says of itself."""
+        """Counts that the file states in its summary; None where it has none."""
         return self._contents.statistics
 
     @property
     def chunk_bytes(self) -> int:
-        """Of all chunks, before compression."""
+        """Size of all chunks before compression."""
         return self._contents.raw_bytes
 
     @cached_property
@@ -202,11 +202,11 @@ class Capture:
 
     @property
     def attachments(self) -> tuple[AttachmentIndex, ...]:
-        """What they are, and where."""
+        """The index of each attachment: its names, times and size, and its place in the file."""
         return tuple(self._contents.attachments)
 
     def attachment(self, index: AttachmentIndex) -> Attachment:
-        """One with its data. Raises DamageError where that is not what was written."""
+        """Read one attachment with its data. Raises DamageError where its checksum is wrong."""
         content = self._disk.read(index.offset, index.length)
         return mcap.attachment(content[mcap.PREFIX.size :])
 
@@ -376,7 +376,7 @@ def _unsealed(entries: dict[str, str]) -> dict[str, str]:
 
 
 def _kind(mode: int) -> str:
-    """What is no file, in words."""
+    """Name the kind of something that is no file."""
     if stat.S_ISFIFO(mode):
         return "a pipe"
     return "a socket" if stat.S_ISSOCK(mode) else "a device"

@@ -28,9 +28,9 @@ class Rewritten(NamedTuple):
     attachments: int
     size_bytes: int
     problems: tuple[str, ...]
-    """What of the original could not be read, and so is missing."""
+    """Parts of the original that could not be read, and so are missing."""
     notes: tuple[str, ...]
-    """What of it is not MCAP's own, and so is missing, too."""
+    """Records of the original that are not of MCAP's own kinds, and so were left out."""
 
 
 def rewrite(
@@ -105,7 +105,7 @@ def _copied(
 
 
 def info_in(capture: Capture, channel: int) -> KeyInfo:
-    """What a capture says of a channel."""
+    """Encoding, schema and metadata of a channel, as a capture has them."""
     found, schema = capture.channels[channel], capture.schema(channel)
     kind = None if schema is None else TypeSchema(schema.name, schema.encoding, schema.data)
     return KeyInfo(found.message_encoding, kind, dict(found.metadata))

@@ -91,7 +91,7 @@ def _by_summary(disk: Disk) -> Contents:
 
 
 def _footer(disk: Disk) -> tuple[Footer, int]:
-    """And where it is."""
+    """Read the footer; also the offset of its record. Raises _UnsureError where there is none with a summary."""
     if not _ends(disk):
         raise _UnsureError  # it was never closed, which is no damage; or its footer is longer than what is known of it
     at = disk.size - mcap.FOOTER_LENGTH - len(MAGIC)
@@ -102,7 +102,7 @@ def _footer(disk: Disk) -> tuple[Footer, int]:
 
 
 def _summary(disk: Disk) -> tuple[bytes, int]:
-    """As its checksum vouches for it, and where it begins."""
+    """Read the summary section, which its checksum vouches for, and the offset at which it begins."""
     footer, footer_at = _footer(disk)
     if not len(MAGIC) <= footer.summary_start <= footer_at or footer_at - footer.summary_start > LARGEST_SUMMARY:
         raise _UnsureError("the file's footer is damaged")

@@ -21,7 +21,7 @@ MB = 1_000_000
 
 
 Name = str | tuple[str, int]
-"""What a channel is told apart by."""
+"""A channel of a writer: the key, or the key and a number where the key may have several."""
 
 
 class Entry(NamedTuple):
@@ -35,7 +35,7 @@ class Entry(NamedTuple):
     info: KeyInfo | None = None
     """What to write of the key, where that is not to be seen from the payload."""
     channel: int | None = None
-    """Which one, where the key may have several."""
+    """A number, where the key may have several channels; it is not the number in the file."""
 
 
 class Prepared(NamedTuple):

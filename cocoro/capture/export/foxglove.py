@@ -54,7 +54,7 @@ TRUE = fg.Color(0.2, 0.9, 0.3, 0.45)
 
 
 class Said(NamedTuple):
-    """What is written of a message."""
+    """One message of the new file."""
 
     topic: str
     message: msgspec.Struct | dict[str, Any]
@@ -136,7 +136,7 @@ class Translator:
             yield Said(record.key, _for_json(plain), record.channel)
 
     def info_of(self, said: Said) -> KeyInfo:
-        """Of a recorded channel: its own schema, bytes given by their number."""
+        """A recorded channel keeps its own schema; its bytes are given by their number."""
         if said.channel is not None:
             return info_in(self._capture, said.channel)._replace(encoding=JSON, metadata={})
         return KeyInfo(JSON, fg.schema_of(type(said.message)), {})
