@@ -6,8 +6,9 @@
 
 What cannot be read is passed by and told of in `capture.problems`; whoever has read a capture looks there at the end.
 
-By hand, since the package's readers copy every payload, know channels only from the summary where there is one, and end
-at the first damage: READ_WHOLE
+By hand, because the package's readers end at the first damage, know channels only from the summary where there is one,
+and copy every payload: they take 1.1 times as long for frames, and 1.7 to 1.9 times for small messages
+(`python bench/capture_format.py files`).
 """
 
 from __future__ import annotations
