@@ -5,8 +5,8 @@ makes records as slowly as `cocoro.capture.mcap` says: a robot's messages take i
 1.8 times with noisy ones (`python bench/capture_format.py files`).
 
 A frame is copied once, to stand behind its message's head in one piece of memory, so writing 1.54 MB takes up to 3.08
-MB more at the peak, with the packed bytes. That pays: joined and packed at once, a frame takes 1.46 ms (2.81 ms with noisy
-sensors), and 1.76 ms (3.29 ms) when zstd is given head and payload one after the other
+MB more at the peak, with the packed bytes. That pays: joined and packed at once, a frame takes 1.46 ms (2.81 ms with
+noisy sensors), and 1.76 ms (3.29 ms) when zstd is given head and payload one after the other
 (`python bench/capture_format.py records`).
 """
 
