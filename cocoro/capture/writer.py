@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-import msgspec
+from mcap.records import Channel, Schema
 
-from cocoro.about import versions
 from cocoro.capture.compression import Packer
 from cocoro.capture.errors import CaptureError
 from cocoro.capture.file import CaptureFile
@@ -19,10 +17,11 @@ from cocoro.capture.keys import KeyInfo
 from cocoro.capture.schema import TypeSchema
 from cocoro.clock import NS
 
-TALLY = "tally"
-"""The metadata record that a whole file ends with: what it has of each key, and what is missing."""
-LIBRARY = f"cocoro {versions().get('cocoro-mesh', '')}".strip()
 MB = 1_000_000
+
+
+Name = str | tuple[str, int]
+"""A channel of a writer: the key, or the key and a number where the key may have several."""
 
 
 class Entry(NamedTuple):
@@ -35,6 +34,8 @@ class Entry(NamedTuple):
     payload: bytes
     info: KeyInfo | None = None
     """What to write of the key, where that is not to be seen from the payload."""
+    channel: int | None = None
+    """A number, where the key may have several channels; it is not the number in the file."""
 
 
 class Prepared(NamedTuple):
@@ -93,7 +94,10 @@ class Writer:
         self._release = release
         self._prepare = prepare
         self._metadata: dict[str, dict[str, str]] = {}
-        self._infos: dict[str, KeyInfo] = {}
+        self._infos: dict[Name, KeyInfo] = {}
+        self._channels: dict[Name, int] = {}
+        self._schemas: dict[TypeSchema, int] = {}
+        """The numbers of channels and schemas in this file."""
         self._number = 0
         self._first_ns: int | None = None
         self._closed_bytes = 0
@@ -121,16 +125,26 @@ class Writer:
         if self._prepare is not None:
             entry, schema = self._prepare(entry)
         try:
-            if not self.file.has(entry.key):
-                info = self._infos.get(entry.key)
-                if info is None:
-                    info = entry.info or self._info(entry.key, entry.payload)
-                    info = self._infos[entry.key] = info if schema is None else info._replace(schema=schema)
-                self.file.channel(entry.key, *info)
-            self.file.add(entry.key, entry.sequence, entry.log_ns, entry.publish_ns, entry.payload)
+            name: Name = entry.key if entry.channel is None else (entry.key, entry.channel)
+            channel = self._channels.get(name) or self._channel(name, entry, schema)
+            self.file.add(channel, entry.sequence, entry.log_ns, entry.publish_ns, entry.payload)
         except OSError as error:
             raise self._failed(error) from error
         self.messages += 1
+
+    def _channel(self, name: Name, entry: Entry, schema: TypeSchema | None) -> int:
+        """Make a key known to the file."""
+        info = self._infos.get(name)
+        if info is None:
+            info = entry.info or self._info(entry.key, entry.payload)
+            info = self._infos[name] = info if schema is None else info._replace(schema=schema)
+        schema_id = 0
+        if info.schema is not None:
+            schema_id = self._schemas.setdefault(info.schema, len(self._schemas) + 1)
+            self.file.schema(Schema(schema_id, info.schema.data, info.schema.encoding, info.schema.name))
+        channel = self._channels[name] = len(self._channels) + 1
+        self.file.channel(Channel(channel, entry.key, info.encoding, info.metadata, schema_id))
+        return channel
 
     def flush(self) -> None:
         """Give everything to the system; and see whether the disk has room for more."""
@@ -170,7 +184,7 @@ class Writer:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             try:
-                file = CaptureFile(path, self._packer, LIBRARY)
+                file = CaptureFile(path, self._packer)
             except FileExistsError:
                 if self._place(self._number + 1) == path:
                     raise
@@ -194,7 +208,7 @@ class Writer:
         except CaptureError:
             self.close()
             raise
-        self.file = after
+        self.file, self._channels, self._schemas = after, {}, {}
         try:
             self._finish(before)
         except OSError as error:
@@ -204,16 +218,7 @@ class Writer:
         self._closed_raw_bytes += before.raw_bytes
 
     def _finish(self, file: CaptureFile) -> None:
-        file.flush()
-        missing = self._missing()
-        file.metadata(
-            TALLY,
-            {
-                "keys": json.dumps(msgspec.to_builtins(file.tallies)),
-                "dropped": json.dumps(missing.dropped),
-                "lost": json.dumps(missing.lost),
-            },
-        )
+        file.tally(*self._missing())
         self._release(file.finish())
 
     def _failed(self, error: OSError) -> CaptureError:

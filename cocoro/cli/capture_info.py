@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import Any
 
 import msgspec
 
-from cocoro.capture.info import Report, report
+from cocoro.capture.info import AttachmentReport, Report, report
 from cocoro.capture.reader import Capture
 from cocoro.capture.rewrite import REPAIRED
 from cocoro.cli import exits
@@ -27,9 +28,11 @@ def info(file: Path, check: bool, as_json: bool) -> int:
 
 
 def text(found: Report) -> str:
+    several = Counter(key.key for key in found.keys)
+    names = {key.channel: key.key if several[key.key] == 1 else f"{key.key}#{key.channel}" for key in found.keys}
     rows = [
         (
-            key.key, key.type, str(key.messages), f"{key.rate_hz:.1f} Hz", f"{key.size_bytes / MB:.2f} MB",
+            names[key.channel], key.type, str(key.messages), f"{key.rate_hz:.1f} Hz", f"{key.size_bytes / MB:.2f} MB",
             f"{key.longest_gap_s:.3f} s at {key.longest_gap_from_s:.1f}" if key.longest_gap_s else "",
             str(key.lost or ""), str(key.dropped or ""),
         )
@@ -41,11 +44,18 @@ def text(found: Report) -> str:
             *_head(found),
             "",
             table(heads, rows).rstrip(),
-            *(f"{key.key}: {change}" for key in found.keys for change in key.changed),
+            *(f"{names[key.channel]}: {change}" for key in found.keys for change in key.changed),
+            *(f"attachment: {_attachment(each)}" for each in found.attachments),
+            *(f"note: {note}" for note in found.notes),
             *(f"damaged: {problem}" for problem in found.problems),
             "",
         ]
     )
+
+
+def _attachment(found: AttachmentReport) -> str:
+    media = f", {found.media_type}" if found.media_type else ""
+    return f"{found.name}{media}, {found.size_bytes} bytes"
 
 
 def _head(found: Report) -> list[str]:
