@@ -119,6 +119,16 @@ class Driver:
             left, right = left / excess, right / excess
         return BaseCommand(left_mps=left, right_mps=right)
 
+    def within(self, command: BaseCommand, limit_mps: float) -> BaseCommand:
+        """A command made slower, on the same arc, until no wheel is faster than a limit; it goes on from there."""
+        faster_mps = max(abs(command.left_mps), abs(command.right_mps))
+        if faster_mps <= limit_mps:
+            return command
+        share = limit_mps / faster_mps
+        self._speed_mps *= share
+        self._turn_radps *= share
+        return BaseCommand(left_mps=share * command.left_mps, right_mps=share * command.right_mps)
+
     def halt(self) -> BaseCommand:
         """Zero at once: the base's own ramp is all that there is between this and standing."""
         self.reset()
