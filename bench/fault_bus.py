@@ -1,4 +1,4 @@
-"""A participant's bus that can fail, service by service, as a process does that dies, hangs, falls silent or is late."""
+"""A participant's bus that can fail, service by service: as a process that dies, hangs, falls silent or is late."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Scenes in which a robot drives at full speed, drawn at random: to something far off, or behind something that moves."""
+"""Scenes in which a robot drives at full speed, drawn at random: to a thing far off, or behind one that moves."""
 
 from __future__ import annotations
 

@@ -128,9 +128,8 @@ def _print(trials: Sequence[Trial]) -> None:
         print(f"{kind:32s} {of.count:5d} {of.median_s:7.3f} {of.p95_s:7.3f} {of.worst_s:7.3f} {of.margin_s:+7.3f}")
     ramp = Robot.load().base.wheel_acceleration_mps2
     fastest = max(trials, key=lambda trial: trial.speed_mps)
-    print(
-        f"the fastest wheel: {fastest.speed_mps:.3f} m/s, of which the ramp alone takes {fastest.speed_mps / ramp:.3f} s"
-    )
+    ramp_s = fastest.speed_mps / ramp
+    print(f"the fastest wheel: {fastest.speed_mps:.3f} m/s, from where the ramp alone takes {ramp_s:.3f} s")
     for trial in sorted(trials, key=lambda trial: -trial.stand_s)[:5]:
         print(
             f"  {trial.stand_s:.3f} s from {trial.speed_mps:.3f} m/s: trial {trial.number}, {trial.what}, {trial.drive}"

@@ -54,7 +54,7 @@ class Base(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return max(min(self.command_timeout_s, self.stand_within_s - self.stand_reserve_s - ramp_s), 0.0)
 
     def speed_at_age_mps(self, age_s: float) -> float:
-        """The fastest that a wheel may turn on a word of this age, so that it stands in time should it have been the last."""
+        """The fastest that a wheel may turn on a word of this age, so that it stands in time if that was the last."""
         ramp_s = self.stand_within_s - self.stand_reserve_s - age_s
         return max(ramp_s, 0.0) * self.wheel_acceleration_mps2
 

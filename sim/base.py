@@ -64,8 +64,8 @@ class MobileBase:
         """What keeps the wheels from turning as they were asked to; '' when nothing does."""
 
     def command(self, command: BaseCommand, now_ns: int) -> str:
-        """Take wheel speeds, valid for as long as `Base.patience_s` has it, from when they were said (a command without a
-        stamp: from now). Returns '' when taken, otherwise why not."""
+        """Take wheel speeds, valid for as long as `Base.patience_s` has it from when they were said (without a stamp:
+        from now). Returns '' when taken, otherwise why not."""
         if self.latch != "released":
             return _latch_text(self.latch)
         self._wanted = command.left_mps, command.right_mps
