@@ -7,7 +7,8 @@ good: slower than 1 cm/s, at its centre as well as, by turning, where its wheels
 than 0.3 s.
 
 `python -m bench.faults live --count N`: the same with the processes of a robot that is up in real time, killed and
-stopped; see `bench.faults_live`.
+stopped. `python -m bench.faults alarms --count N [--others 2]`: how often patience ends while everyone lives. See
+`bench.faults_live`.
 
 The same seed gives the same trials. Nothing here depends on how busy the machine is but the wall time; that of `live`
 does, and says what it is worth.
@@ -30,6 +31,7 @@ from typing import get_args
 from bench.fault_bus import Way
 from bench.fault_robot import FaultRobot, Happening, NotFastError
 from bench.fault_scenes import DRIVES, Drive, draw_errand
+from bench.faults_live import alarms, live
 from cocoro.robot import Robot
 from cocoro.topics import HARDWARE
 from cocoro.vloop import run_virtual
@@ -138,12 +140,19 @@ def _print(trials: Sequence[Trial]) -> None:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", nargs="?", choices=("virtual", "live", "alarms"), default="virtual")
     parser.add_argument("--count", type=int, default=200)
     parser.add_argument("--first", type=int, default=0, help="the number of the first trial")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--json", action="store_true")
+    parser.add_argument("--others", type=int, default=0, help="alarms: so many processes that keep the cores busy")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="alarms: of the profile")
     asked = parser.parse_args()
+    if asked.what == "live":
+        return 0 if live(asked.count, asked.seed, STAND_S) else 1
+    if asked.what == "alarms":
+        return 0 if alarms(asked.count, asked.others, asked.set) else 1
     began_s = time.monotonic()
     numbers = range(asked.first, asked.first + asked.count)
     with ProcessPoolExecutor(asked.jobs) as pool:
