@@ -146,11 +146,12 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--json", action="store_true")
+    parser.add_argument("--profile", choices=("sim", "sim-wire"), default="sim", help="live: of the robot")
     parser.add_argument("--others", type=int, default=0, help="alarms: so many processes that keep the cores busy")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="alarms: of the profile")
     asked = parser.parse_args()
     if asked.what == "live":
-        return 0 if live(asked.count, asked.seed, STAND_S) else 1
+        return 0 if live(asked.count, asked.seed, asked.profile, STAND_S) else 1
     if asked.what == "alarms":
         return 0 if alarms(asked.count, asked.others, asked.set) else 1
     began_s = time.monotonic()

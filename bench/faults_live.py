@@ -34,7 +34,9 @@ from cocoro.robot import Robot
 from cocoro.rundir import Target
 from sim.motion import Motion, read_motion
 
-VICTIMS = ("planning", "executive", "perception")
+VICTIMS = {"sim": ("planning", "executive", "perception"), "sim-wire": ("base", "arm")}
+"""By profile, services whose processes are killed and stopped; 'arm' is that of all servos. With the simulator itself
+time stands, so nothing moves on."""
 SIGNALS = (signal.SIGKILL, signal.SIGSTOP)
 PATIENCE_S = 40.0
 WATCH_S = 1.2
@@ -111,12 +113,16 @@ class LiveRobot:
 
 
 @asynccontextmanager
-async def robot_up(cocoro: Operator, scene: str, folder: Path, *settings: str) -> AsyncIterator[LiveRobot]:
+async def robot_up(
+    cocoro: Operator, profile: str, scene: str, folder: Path, *settings: str
+) -> AsyncIterator[LiveRobot]:
+    """A robot of a profile in a scene; `folder` is for the record of its motion. Raises CocoroError when it does not
+    come up."""
     motion = folder / "motion"
     options = ["--scene", scene, "--sensors", "real"]
     for setting in (f"service.sim.motion={motion}", *settings):
         options += ["--set", setting]
-    code, said, _ = await asyncio.to_thread(cocoro, "up", "sim", "--detach", *options)
+    code, said, _ = await asyncio.to_thread(cocoro, "up", profile, "--detach", *options)
     if code:
         raise CocoroError(said)
     async with (
@@ -129,13 +135,14 @@ async def robot_up(cocoro: Operator, scene: str, folder: Path, *settings: str) -
 # --- faults ---------------------------------------------------------------------------------------
 
 
-async def _trial(number: int, rng: random.Random) -> LiveTrial:
-    kind, turn = number % (len(VICTIMS) * len(SIGNALS)), number // (len(VICTIMS) * len(SIGNALS))
-    victim, how = VICTIMS[kind % len(VICTIMS)], SIGNALS[kind // len(VICTIMS)]
+async def _trial(number: int, profile: str, rng: random.Random) -> LiveTrial:
+    victims = VICTIMS[profile]
+    turn, kind = divmod(number, len(victims) * len(SIGNALS))
+    victim, how = victims[kind % len(victims)], SIGNALS[kind // len(victims)]
     with operator() as cocoro, tempfile.TemporaryDirectory(prefix="faults") as name:
         folder = Path(name)
         errand = draw_errand(DRIVES[(kind + turn) % len(DRIVES)], rng, folder)
-        async with robot_up(cocoro, str(errand.scene), folder) as robot:
+        async with robot_up(cocoro, profile, str(errand.scene), folder) as robot:
             before = await robot.at_speed(errand, rng)
             target = Target(cocoro.run_dir.path / "claims" / victim)
             sent_ns = time.monotonic_ns()
@@ -153,12 +160,12 @@ async def _trial(number: int, rng: random.Random) -> LiveTrial:
     )  # fmt: skip
 
 
-def live(count: int, seed: int, bound_s: float) -> bool:
+def live(count: int, seed: int, profile: str, bound_s: float) -> bool:
     """Print each trial and what came of all; whether the robot stood in time in every one."""
     trials: list[LiveTrial] = []
     for number in range(count):
         try:
-            trial = asyncio.run(_trial(number, random.Random(f"live/{seed}/{number}")))
+            trial = asyncio.run(_trial(number, profile, random.Random(f"live/{seed}/{number}")))
         except TimeoutError:
             print(f"  {number}: never at full speed in time, which is no trial", flush=True)
             continue
@@ -235,7 +242,7 @@ def _events(whys: Sequence[str], start: str) -> Iterator[str]:
 
 async def _alarms(scene: str, question: TaskRequest, *settings: str) -> Alarms:
     with operator() as cocoro, tempfile.TemporaryDirectory(prefix="faults") as name:
-        async with robot_up(cocoro, scene, Path(name), *settings) as robot:
+        async with robot_up(cocoro, "sim", scene, Path(name), *settings) as robot:
             task_id = await robot.begin(question)
             robot.read()
             first, said = len(robot.rows), len(robot.whys)

@@ -134,6 +134,20 @@ def test_the_longer_somebody_is_late_the_slower_it_drives_so_that_it_could_stand
     assert (planner.under_test.now_ns - heard_ns) / 1e9 <= base.command_timeout_s + 2 * TICK_S
 
 
+@pytest.mark.parametrize("topic", [topics.INTENT, topics.DETECTIONS], ids=lambda topic: topic.name)
+def test_a_short_silence_costs_no_more_speed_than_the_wheels_lose_in_it(planner: Planner, topic: Topic[Any]) -> None:
+    approaching(planner)
+    before_mps = planner.wheels.left_mps
+    planner.silent = {topic.name}
+    while not standing(planner):
+        planner.tick()
+    planner.silent = set()
+    planner.run(0.04)
+    lost_mps = before_mps - planner.wheels.left_mps
+    assert 0.0 < lost_mps <= 0.1 * ROBOT.base.wheel_acceleration_mps2
+    assert planner.wheels.left_mps > 0.05
+
+
 def test_one_lost_word_costs_little_speed_and_no_stop(planner: Planner) -> None:
     approaching(planner)
     full_mps = planner.wheels.left_mps

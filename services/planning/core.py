@@ -164,7 +164,7 @@ class PlanningCore:
         needs_sight = self._intent.behaviour in _NEED_SIGHT
         who, age_s = self._senses.oldest(scene.now_ns, sight=needs_sight)
         if self._senses.intent_age_s(scene.now_ns) > base.command_timeout_s:
-            plan.base, plan.why = driver.halt(), "standing still: the executive is silent"
+            plan.base, plan.why = driver.pause(scene.dt_s), "standing still: the executive is silent"
             return
         # What is commanded now is for the time until the next step.
         limit_mps = base.speed_at_age_mps(age_s + 1.0 / self._config.rate_hz)
@@ -180,7 +180,7 @@ class PlanningCore:
         blind_s = self._senses.blind_s(scene.now_ns)
         if blind_s is None:
             return None
-        plan = Plan(scene.limbs.driver.halt(), scene.still(), "standing still: perception is silent")
+        plan = Plan(scene.limbs.driver.pause(scene.dt_s), scene.still(), "standing still: perception is silent")
         if blind_s > self._config.blind_for_good_s:
             plan.state, plan.reason = "failed", "stale"
         return plan
