@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import logging
 import random
 import sys
 import tempfile
@@ -138,6 +139,11 @@ def _print(trials: Sequence[Trial]) -> None:
         )
 
 
+def _quiet() -> None:
+    """An emergency stop that is pressed on purpose is no news."""
+    logging.getLogger("cocoro").setLevel(logging.ERROR)
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", nargs="?", choices=("virtual", "live", "alarms"), default="virtual")
@@ -156,7 +162,7 @@ def main() -> int:
         return 0 if alarms(asked.count, asked.others, asked.set) else 1
     began_s = time.monotonic()
     numbers = range(asked.first, asked.first + asked.count)
-    with ProcessPoolExecutor(asked.jobs) as pool:
+    with ProcessPoolExecutor(asked.jobs, initializer=_quiet) as pool:
         trials = list(pool.map(run_trial, [asked.seed] * len(numbers), numbers))
     if asked.json:
         spreads = {kind: asdict(of) for kind, of in by_kind(trials).items()}
