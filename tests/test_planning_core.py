@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from math import hypot
 from typing import Any
 
@@ -146,6 +147,19 @@ def test_a_short_silence_costs_no_more_speed_than_the_wheels_lose_in_it(planner:
     lost_mps = before_mps - planner.wheels.left_mps
     assert 0.0 < lost_mps <= 0.1 * ROBOT.base.wheel_acceleration_mps2
     assert planner.wheels.left_mps > 0.05
+
+
+def test_a_clock_that_is_ahead_of_ours_makes_nobody_seem_younger(planner: Planner) -> None:
+    approaching(planner)
+    wants = planner.wants
+    assert wants is not None
+    now_ns = planner.under_test.now_ns
+    planner.silent.add(topics.INTENT.name)
+    planner.under_test.feed(topics.INTENT, copy(wants), stamp_ns=now_ns + round(0.2 * 1e9))
+    planner.tick()
+    assert not standing(planner)
+    planner.run(ROBOT.base.command_timeout_s + TICK_S)
+    assert standing(planner)
 
 
 def test_one_lost_word_costs_little_speed_and_no_stop(planner: Planner) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Mapping
 from itertools import compress
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -100,6 +100,8 @@ class Senses:
         self.sight_lag_s = 0.0
         """How old a sighting is when the next one comes, smoothed: a fast perception makes it small."""
         self._looked_ns: int | None = None
+        self._said_ns: dict[str, int] = {}
+        """Per topic, when its newest message was said."""
         self._sight = Sight(robot.base.command_timeout_s, config.blind_periods)
         self.turning = Turning()
         self.eye: Eye | None = None
@@ -108,6 +110,7 @@ class Senses:
         self._sightings: list[Sighting] = []
 
     def take(self, topic: Topic[Message], message: Message, now_ns: int) -> None:
+        self._said_ns[topic.name] = min(message.stamp_ns, now_ns)
         if isinstance(message, BaseState):
             self.base = message
             resets = self._odometry.resets
@@ -250,16 +253,22 @@ class Senses:
         """For how long perception has been silent for longer than it may be; None while it is not."""
         return self._sight.blind_s(now_ns)
 
+    def _age_s(self, topic: Topic[Any], now_ns: int) -> float:
+        """Since the newest of a topic was said: by its stamp, but where that is ahead of our clock by when it came."""
+        said_ns = self._said_ns.get(topic.name)
+        # What was said later than now was said before the clock began anew.
+        return (now_ns - said_ns) / NS if said_ns is not None and said_ns <= now_ns else float("inf")
+
     def intent_age_s(self, now_ns: int) -> float:
         """Since the executive last said what it wants."""
-        return (now_ns - self.intent.stamp_ns) / NS if self.intent is not None else float("inf")
+        return self._age_s(topics.INTENT, now_ns)
 
     def oldest(self, now_ns: int, *, sight: bool) -> tuple[str, float]:
         """Who of those whom driving depends on was heard the longest ago, and how long ago, seconds; perception is
-        among them with `sight`. Of states it is the age that counts, not when they came."""
+        among them with `sight`."""
         ages = {"the executive": self.intent_age_s(now_ns)}
-        for service, state in (("base", self.base), ("arm", self.arm), ("hand", self.hand)):
-            ages[service] = (now_ns - state.stamp_ns) / NS if state is not None else float("inf")
+        for topic in (topics.BASE_STATE, topics.ARM_STATE, topics.HAND_STATE):
+            ages[topic.publisher] = self._age_s(topic, now_ns)
         if sight:
             ages["perception"] = self._sight.age_s(now_ns)
         who = max(ages, key=ages.__getitem__)
