@@ -30,7 +30,7 @@ SERVICES = ("sim", "perception", "planning", "executive")
 STANDING_MPS = 0.01
 PATIENCE_S = 25.0
 """How long a robot may take until it drives at full speed."""
-WATCH_S = 1.5
+WATCH_S = 1.0
 """How long it is watched after a fault."""
 FRAMES = {"width": 320, "height": 240, "frame_rate_hz": 30.0, "sensors": "real"}
 
@@ -59,9 +59,10 @@ class Happening(NamedTuple):
 
     @property
     def watch_s(self) -> float:
-        """Perception that is late, of itself or for want of frames, is one that is slow when it speaks again, and then
-        drives on."""
-        return LATE_S if self.way == "late" and self.service in ("perception", "kinect") else WATCH_S
+        """Who is late is watched until after he is heard again. But perception that is late, of itself or for want of
+        frames, is one that is slow by then, and the robot drives on."""
+        late_s = LATE_S if self.service in ("perception", "kinect") else LATE_S + 0.5
+        return late_s if self.way == "late" else WATCH_S
 
 
 class FaultRobot:
