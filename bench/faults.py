@@ -97,7 +97,7 @@ async def _try(number: int, happening: Happening, drive: Drive, rng: random.Rand
 
 @dataclass(frozen=True)
 class Spread:
-    """Of some trials: seconds until the robot stood."""
+    """How long it took until the robot stood, in several trials; seconds."""
 
     count: int
     median_s: float

@@ -28,11 +28,11 @@ class Motion(NamedTuple):
     real_ns: int
     """CLOCK_MONOTONIC at that moment: the same clock in every process of the machine."""
     speed_mps: float
-    """Of the body's centre over the floor, by the way it came in this step."""
+    """Speed of the body's centre over the floor, by the way it came in this step."""
     rim_mps: float
-    """Of the wheels' places about the body's centre, by how far the body turned in this step."""
+    """Speed of the wheels' places about the body's centre, by how far the body turned in this step."""
     asked_mps: float
-    """Of the faster wheel, as the base's ramp has it."""
+    """Speed of the faster wheel, as the base's ramp has it."""
     no_command: bool
     """The base's own deadman held the wheels."""
 

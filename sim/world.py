@@ -38,7 +38,7 @@ class Wheels(NamedTuple):
     """How the base turns its wheels now."""
 
     speed_mps: float
-    """Of the faster one, as the ramp has it."""
+    """The faster one's, as the ramp has it."""
     no_command: bool
     """They are stopped because nobody has commanded them of late."""
 
