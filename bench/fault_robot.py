@@ -180,7 +180,7 @@ class FaultRobot:
             await self._flood(rng)
 
     async def _flood(self, rng: random.Random) -> None:
-        """What is no message, what was said already, and what was cut short, on a random key a thousand times a
+        """Publish what is no message, what was said already, and what was cut short, on a random key a thousand times a
         second."""
         keys = sorted(key for key, said in self._said.items() if said)
         while True:

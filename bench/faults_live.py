@@ -52,7 +52,7 @@ class LiveTrial:
     stand_s: float
     """Simulated, from the last step of the physics before the signal until it stood for good."""
     real_s: float
-    """The same by the machine's clock, from when the signal was sent."""
+    """By the machine's clock, from when the signal was sent."""
 
 
 class LiveRobot:
@@ -63,7 +63,7 @@ class LiveRobot:
         self.node = node
         self.states: list[TaskState] = []
         self.whys: list[str] = []
-        """What the planner said that it does, status by status."""
+        """The planner's word on its doings, status by status."""
         self._motion = motion
         self.rows: list[Motion] = []
         node.on(topics.TASK, self.states.append)

@@ -61,7 +61,7 @@ class MobileBase:
         self._valid_until_ns = -1
         self._next_report_ns = 0
         self.stopped_by = ""
-        """What keeps the wheels from turning as they were asked to; '' when nothing does."""
+        """Why the wheels do not turn as they were asked to; '' when they do."""
 
     def command(self, command: BaseCommand, now_ns: int) -> str:
         """Take wheel speeds, valid for as long as `Base.patience_s` has it from when they were said (without a stamp:

@@ -21,7 +21,7 @@ _ROW = struct.Struct("<qqddd?")
 
 
 class Motion(NamedTuple):
-    """What one step of the physics did."""
+    """One step of the physics."""
 
     sim_ns: int
     """Simulated time at the end of the step."""

@@ -1,4 +1,4 @@
-"""What the base asks of its wheels, by its driver and by the simulator's: for how long on one word, at which speed."""
+"""For how long a base turns its wheels on one word, at which speed: the driver, and the simulator's base."""
 
 from __future__ import annotations
 
