@@ -44,8 +44,8 @@ class Base(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     stand_within_s: Positive = 0.3
     """Whoever falls silent: within so long the wheels stand, from whatever speed."""
     stand_reserve_s: Positive = 0.03
-    """The part of that which is kept for the way of a word, a turn of the loop that acts on its absence, and the body behind the
-    ramp of its wheels."""
+    """The part of that which is kept for the way of a word, a turn of the loop that acts on its absence, and the body
+    behind the ramp of its wheels."""
 
     def patience_s(self, speed_mps: float) -> float:
         """How old a word may be on which the faster wheel turns at this speed. What is left of `stand_within_s` is the
