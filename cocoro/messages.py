@@ -101,7 +101,8 @@ class BaseState(Message):
 
 
 class BaseCommand(Message):
-    """Wheel speeds. Valid for 0.15 s: a base that hears nothing newer commands zero."""
+    """Wheel speeds. Valid for 0.15 s at most, and for less the faster they are (`Base.patience_s`): a base that hears
+    nothing newer commands zero."""
 
     left_mps: Finite
     right_mps: Finite

@@ -18,7 +18,7 @@ pytestmark = pytest.mark.sim
 
 HALT_S = 0.3
 """From whatever goes wrong until the robot stands, by the truth."""
-ZERO_S = 0.22
+ZERO_S = 0.2
 """The same until nothing but zero is commanded."""
 
 
