@@ -471,7 +471,7 @@ class TopicHealth(msgspec.Struct, kw_only=True):
     lost: Count = 0
     """Gaps in the sequence: never arrived."""
     rejected: Count = 0
-    """Malformed, wrongly typed, oversized or out of order: counted, dropped."""
+    """Malformed, wrongly typed, oversized, out of order or untimely: counted, dropped."""
     last_error: str = ""
     """Why the last one was rejected."""
     fault: str = ""
