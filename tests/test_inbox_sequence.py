@@ -172,6 +172,7 @@ def test_whatever_bad_message_comes_between_good_ones_soon_all_good_ones_are_tak
             talk.deliver(max(talk.seq - number, 0), ahead_s=-number * PERIOD_NS / NS)
         elif what == "ahead":
             talk.deliver(talk.seq, ahead_s=number)
+            talk.seq += 1
         else:
             talk.deliver(talk.seq + number)
             passed = True
