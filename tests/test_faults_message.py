@@ -127,6 +127,23 @@ def test_one_message_that_could_be_right_and_is_not_stops_nothing_for_long(topic
 
 
 @pytest.mark.parametrize("spoil", [at_once, near, late])
+def test_a_command_from_ahead_lengthens_no_deadman_when_the_planner_dies_after_it(spoil: Spoil) -> None:
+    @in_virtual_time
+    async def scenario() -> None:
+        async with RobotRig() as rig:
+            await rig.driving(0.2)
+            send(rig, topics.BASE_COMMAND, spoil(newest(rig, topics.BASE_COMMAND)))
+            await rig.advance(0.001)
+            died_s = rig.now_s
+            await rig.kill("planning")
+            await rig.advance(1.0)
+            assert not rig.base_obeys_since(died_s + 0.16)
+            assert max(rig.speeds_since(died_s + 0.3)) < HALTED_MPS
+
+    scenario()
+
+
+@pytest.mark.parametrize("spoil", [at_once, near, late])
 def test_the_latch_still_latches_after_a_bad_word_on_it(spoil: Spoil) -> None:
     """By the executive's word alone, as who starts later or missed the request hears it."""
 
