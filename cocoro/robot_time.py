@@ -7,7 +7,8 @@ process that finds no file that holds measures an offset of its own. Its time th
 what the wall clock was stepped by since; readers reject its commands when that makes them too old, or too far ahead.
 
 Each machine of a robot that runs on several has an offset of its own, so their wall clocks must agree when the robot
-starts (NTP does that to milliseconds): CLOCKS_APART_NS of `cocoro.clock` is the bound, and readers check it.
+starts, to 0.1 s (NTP does that to milliseconds; `cocoro doctor` asks). Readers check it: they reject what is stamped
+further ahead of them than CLOCKS_APART_NS of `cocoro.clock`, and commands that are older than their topic allows.
 """
 
 from __future__ import annotations
