@@ -82,9 +82,9 @@ def run(process: str, run_dir: RunDir, profile: dict[str, Any], profile_name: st
 
 
 async def _main(process: str, run_dir: RunDir, data: dict[str, Any], profile_name: str) -> int:
-    from cocoro import processes, profiles  # what follows takes its time, and the parent is watched by now
+    from cocoro import processes, profiles, robot_time  # what follows takes its time, and the parent is watched by now
     from cocoro.bus.zenoh import ZenohBus
-    from cocoro.clock import FollowedClock, RealClock
+    from cocoro.clock import FollowedClock
     from cocoro.node import Node
     from cocoro.robot import Robot
     from cocoro.stop.record import latch_dir
@@ -102,12 +102,14 @@ async def _main(process: str, run_dir: RunDir, data: dict[str, Any], profile_nam
         log = logging.getLogger(f"cocoro.{process}")
         log.info("%s with %s", row.module, config)
         stop = _stop_signal()
+        # Whoever comes first, without a supervisor, fixes the robot's time for those who come later.
+        real_clock = robot_time.clock if run_dir.populated else robot_time.fix
         async with (
             await ZenohBus.open(run_dir.join_as(process, profile.mesh)) as bus,
             Node(
                 process,
                 bus,
-                FollowedClock() if profile.clock == "sim" else RealClock(),
+                FollowedClock() if profile.clock == "sim" else real_clock(run_dir.path),
                 robot,
                 robot_name=profile.robot,
                 latency_s=launch.latency_s,

@@ -472,8 +472,13 @@ class TopicHealth(msgspec.Struct, kw_only=True):
     lost: Count = 0
     """Gaps in the sequence: never arrived."""
     rejected: Count = 0
-    """Malformed, wrongly typed, oversized or out of order: counted, dropped."""
+    """Malformed, wrongly typed, oversized, out of order or untimely: counted, dropped."""
     last_error: str = ""
+    """Why the last one was rejected."""
+    fault: str = ""
+    """Of a reader that has rejected messages of late: key, publisher, how many, why. For people."""
+    unreadable: bool = False
+    """Of a reader: for longer than one can wait, all that came was rejected."""
 
 
 class LoopHealth(msgspec.Struct, kw_only=True):

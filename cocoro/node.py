@@ -81,6 +81,7 @@ class Node:
         self.text = ""
         self.faults: tuple[str, ...] = ()
         self._health_hz = health_hz
+        self._started_ns: int | None = None
         self._inboxes: dict[str, Inbox[Any]] = {}
         self._publishers: dict[str, Publisher[Any]] = {}
         self._meters: list[LoopMeter] = []
@@ -92,7 +93,7 @@ class Node:
 
     async def __aenter__(self) -> Node:
         if isinstance(self.clock, FollowedClock) and not self.clock.driven:
-            self.inbox(topics.CLOCK).add(self._tick)
+            self.inbox(topics.CLOCK).judge = self._tick
         self.serve(topics.ABOUT.of(self.name), self._tell_about)
         self.spawn(self._tell_health())
         return self
@@ -133,9 +134,9 @@ class Node:
             self.log.error("background work failed", exc_info=error)
             self.degraded(f"background work failed: {error}")
 
-    def _tick(self, _key: str, clock: Message) -> None:
+    def _tick(self, clock: Message) -> str:
         assert isinstance(self.clock, FollowedClock)
-        self.clock.tick(clock.stamp_ns, clock.incarnation, getattr(clock, "rate", 1.0))
+        return self.clock.tick(clock.stamp_ns, clock.incarnation, getattr(clock, "rate", 1.0))
 
     def drive_clock(self) -> FollowedClock:
         """The caller ticks this node's clock from now on, since it makes the time, or hears its key anyway."""
@@ -169,6 +170,7 @@ class Node:
             inbox = self._inboxes[topic.name] = Inbox(topic, key, self.clock)
             depth = 2 if topic.qos is Qos.FRAME else 256
             inbox.subscription = self.bus.subscribe(key, topic.qos, inbox.deliver, depth=depth)
+            inbox.trouble.changed = self._readable_or_not
             self._handles.append(inbox.subscription)
         return self._inboxes[topic.name]
 
@@ -284,15 +286,19 @@ class Node:
         return about(self)
 
     async def _tell_health(self) -> None:
-        started_ns: int | None = None
-        topic = HEALTH.of(self.name)
         async for now_ns in every(self.clock, self._health_hz, LoopMeter("health")):
-            started_ns = now_ns if started_ns is None else started_ns
-            self.publish(topic, self.health(now_ns, started_ns))
+            self._started_ns = now_ns if self._started_ns is None else self._started_ns
+            self.publish(HEALTH.of(self.name), self.health(now_ns, self._started_ns))
+
+    def _readable_or_not(self) -> None:
+        """What this service reads can be read no more, or again: who waits for it should know at once."""
+        now_ns = self.clock.now_ns()
+        self.publish(HEALTH.of(self.name), self.health(now_ns, self._started_ns or now_ns))
 
     def health(self, now_ns: int, started_ns: int) -> Health:
         ports: list[Inbox[Any] | Publisher[Any]] = [*self._inboxes.values(), *self._publishers.values()]
         cpu_share, rss_mb = self._process.take() if self._process else (0.0, 0.0)
+        told = tuple(port.health(now_ns) for port in ports if port.topic.name != HEALTH.of(self.name).name)
         return Health(
             service=self.name,
             pid=os.getpid() if self._process else 0,
@@ -301,9 +307,9 @@ class Node:
             uptime_s=(now_ns - started_ns) / NS,
             cpu_share=cpu_share,
             rss_mb=rss_mb,
-            topics=tuple(port.health(now_ns) for port in ports if port.topic.name != HEALTH.of(self.name).name),
+            topics=told,
             loops=tuple(meter.health() for meter in self._meters),
-            faults=self.faults,
+            faults=(*self.faults, *(topic.fault for topic in told if topic.fault)),
         )
 
 

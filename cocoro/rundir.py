@@ -1,6 +1,7 @@
 """The run directory: what of a robot runs on this machine. One folder a robot, below one place for them all.
 
     <run>/<robot>/profile.json     the resolved profile of the last start
+                  clock.json       the robot's time (see cocoro.robot_time)
                   supervisor       held by the supervisor
                   claims/<service> held by the process that is that service
                   logs/            one file a process, of the last starts (or in $COCORO_LOG_DIR/<robot>)

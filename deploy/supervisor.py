@@ -20,6 +20,7 @@ from pathlib import Path
 
 import msgspec
 
+from cocoro import robot_time
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.errors import CocoroError, RefusedError
 from cocoro.profiles import Profile, from_data
@@ -71,6 +72,7 @@ class Supervisor:
             await self._wait_for_leftovers()
             self._run_dir.profile_file.write_bytes(msgspec.json.format(msgspec.json.encode(self._profile)))
             self._prepare_latches()
+            robot_time.fix(self._run_dir.path)
             with _signals(self._on_signal):
                 return await self._run()
         finally:

@@ -11,11 +11,11 @@ from typing import Any
 
 import msgspec
 
-from cocoro import processes
+from cocoro import processes, robot_time
 from cocoro.cli import exits
 from cocoro.cli.ending import told_to_end
 from cocoro.cli.link import Where, joined
-from cocoro.clock import FollowedClock, RealClock
+from cocoro.clock import FollowedClock
 from cocoro.errors import ConfigError
 from cocoro.messages import Recording
 from cocoro.node import Node
@@ -40,7 +40,7 @@ async def record(where: Where, settings: dict[str, Any], seconds: float | None) 
     async with joined(where) as link:
         resolved = link.run_dir.resolved()
         description, measured = (Path(file) if (file := resolved.get(name)) else None for name in _DESCRIPTIONS)
-        clock = FollowedClock() if resolved.get("clock") == "sim" else RealClock()
+        clock = FollowedClock() if resolved.get("clock") == "sim" else robot_time.clock(link.run_dir.path)
         robot = Robot.load(description, measured)
         name = f"record-{os.getpid()}"
         async with Node(name, link.bus, clock, robot, robot_name=link.robot, module=row.module, config=config) as node:

@@ -10,9 +10,9 @@ from typing import Generic, NamedTuple, TypeVar
 
 import msgspec
 
+from cocoro import robot_time
 from cocoro.bus.base import Bus, Handle, Reply
 from cocoro.bus.zenoh import ZenohBus
-from cocoro.clock import RealClock
 from cocoro.errors import CallTimeoutError, ConfigError, MeshError, RemoteError
 from cocoro.inbox import Inbox, Latest, Stream
 from cocoro.messages import Message
@@ -49,7 +49,7 @@ class Link:
         self.run_dir = run_dir
         self.robot = run_dir.robot
         self.bus = bus
-        self._clock = RealClock()
+        self._clock = robot_time.clock(run_dir.path)
 
     async def call(self, request: Request[Q, R], question: Q, timeout_s: float | None = None) -> R:
         """Raises MeshError when nobody serves it or answers in time, RemoteError with the server's words."""
@@ -80,7 +80,7 @@ class Link:
 
     def inbox(self, topic: Topic[M]) -> Inbox[M]:
         """Everything that arrives on a topic from now on; `close` its subscription to end that."""
-        inbox = Inbox(topic, topic.key(self.robot), self._clock)
+        inbox = Inbox(topic, topic.key(self.robot), self._clock, onlooker=True)
         inbox.subscription = self.bus.subscribe(inbox.keyexpr, topic.qos, inbox.deliver, depth=64)
         return inbox
 

@@ -11,6 +11,7 @@ from cocoro.clock import NS
 from cocoro.messages import (
     BaseState,
     CancelRequest,
+    Health,
     KnownObject,
     ObjectsReply,
     ObjectsRequest,
@@ -50,6 +51,8 @@ class Executive:
         self._config = config
         self._catalogue = catalogue
         self._alive: set[str] = set()
+        self._unreadable: dict[str, str] = {}
+        """By service, what it cannot read and why."""
         self._running: asyncio.Task[Any] | None = None
         self._ended: asyncio.Future[tuple[Outcome, str]] | None = None
         """Of the running task: gets its outcome when something outside of it ends it."""
@@ -60,6 +63,7 @@ class Executive:
         self._skills = PlannerSkills(node, self._enter_phase, config.intent_hz, config.planner_silence_s)
         self._estop = Estop(node, config.latch_hz, self._on_latch)
         node.watch_alive(self._on_alive)
+        node.on(topics.HEALTH, self._on_health, service="*")
         node.serve(topics.RUN, self._run)
         node.serve(topics.CANCEL, self._cancel)
         node.serve(topics.OBJECTS, self._objects)
@@ -103,6 +107,8 @@ class Executive:
         missing = [service for service in self._config.needed if service not in self._alive]
         if missing:
             return "not_alive", f"not alive: {', '.join(missing)}; see cocoro status"
+        if self._unreadable:
+            return "not_alive", f"{next(iter(self._unreadable.values()))}; see cocoro status"
         if self._node.clock.stands:  # and what was heard last would seem fresh for as long as it does
             return "not_alive", "the clock stands still; see cocoro status"
         battery = self._base.value.battery_fraction if self._base.value is not None else 1.0
@@ -232,8 +238,20 @@ class Executive:
             self._alive.add(service)
             return
         self._alive.discard(service)
+        self._unreadable.pop(service, None)
         if service in self._config.needed:
             self._end("failed", f"not_alive: {service} died")
+
+    def _on_health(self, health: Health) -> None:
+        """A service that can no longer read what it acts on is no better than a dead one; and it knows why."""
+        if health.service not in (*self._config.needed, self._node.name):
+            return
+        fault = next((topic.fault for topic in health.topics if topic.unreadable), None)
+        if fault is None:
+            self._unreadable.pop(health.service, None)
+            return
+        self._unreadable[health.service] = f"{health.service} cannot read {fault}"
+        self._end("failed", f"unreadable: {self._unreadable[health.service]}")
 
     def _on_latch(self, latched: bool, by: str) -> None:
         if latched:
