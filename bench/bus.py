@@ -30,7 +30,6 @@ from cocoro.topics import Qos
 PING = bytes(1024)
 FRAME = os.urandom(640 * 480 * 5)
 RATE_HZ = 30.0
-NO_SHARED_MEMORY = {"transport/shared_memory/enabled": False}
 
 
 @dataclass(frozen=True)
@@ -44,17 +43,16 @@ class Way:
     shared_memory: bool = True
 
     def config(self, name: str) -> ZenohConfig:
-        options = {} if self.shared_memory else NO_SHARED_MEMORY
         if self.directory is not None:
-            return ZenohConfig(name, directory=Path(self.directory), options=options)
+            return ZenohConfig(name, directory=Path(self.directory), shared_memory=self.shared_memory)
         endpoints = [f"tcp/127.0.0.1:{port}" for port in self.ports]
         if self.router and name == "router":
-            return ZenohConfig(name, mode="router", listen=(endpoints[0],), options=options)
+            return ZenohConfig(name, mode="router", listen=(endpoints[0],), shared_memory=self.shared_memory)
         if self.router:
-            return ZenohConfig(name, mode="client", connect=(endpoints[0],), options=options)
+            return ZenohConfig(name, mode="client", connect=(endpoints[0],), shared_memory=self.shared_memory)
         place = {"bench": 0, "other": 1}.get(name, 2)  # the later one connects
         listen = endpoints[place] if place < 2 else "tcp/127.0.0.1:0"
-        return ZenohConfig(name, listen=(listen,), connect=tuple(endpoints[:place]), options=options)
+        return ZenohConfig(name, listen=(listen,), connect=tuple(endpoints[:place]), shared_memory=self.shared_memory)
 
 
 def free_port() -> int:

@@ -294,7 +294,7 @@ class Node:
             rss_mb=rss_mb,
             topics=tuple(port.health(now_ns) for port in ports if port.topic.name != HEALTH.of(self.name).name),
             loops=tuple(meter.health() for meter in self._meters),
-            faults=self.faults,
+            faults=self.faults + tuple(port.trouble for port in self._publishers.values() if port.trouble),
         )
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import io
 import json
 import logging
 import os
@@ -17,11 +18,12 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import IO
 
 import msgspec
 
 from cocoro.bus.zenoh import ZenohBus
-from cocoro.errors import CocoroError, RefusedError
+from cocoro.errors import CocoroError, ConfigError, RefusedError
 from cocoro.profiles import Profile, from_data
 from cocoro.quit import quit_process
 from cocoro.rundir import RunDir
@@ -58,7 +60,7 @@ class Supervisor:
         try:
             self._log_to_file()
             await self._wait_for_leftovers()
-            self._run_dir.profile_file.write_bytes(msgspec.json.format(msgspec.json.encode(self._profile)))
+            self._run_dir.remember(msgspec.json.format(msgspec.json.encode(self._profile)))
             with _signals(self._on_signal):
                 return await self._run()
         finally:
@@ -133,11 +135,35 @@ class Supervisor:
         self._tell_people(text)
 
     def _log_to_file(self) -> None:
-        handler = logging.FileHandler(self._run_dir.rotate_log("supervisor"))
+        handler = _log_handler(self._run_dir, self._tell_people)
         handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)-7s supervisor: %(message)s"))
         log.handlers[:] = [handler]
         log.setLevel(logging.INFO)
         log.propagate = False
+
+
+class _Log(logging.StreamHandler[IO[str]]):
+    """Says once that nothing can be written any more, and works on."""
+
+    def __init__(self, stream: IO[str], path: Path, tell: Callable[[str], None]) -> None:
+        super().__init__(stream)
+        self._path = path
+        self._tell = tell
+        self._told = False
+
+    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802 # the library's name
+        if not self._told:
+            self._told = True
+            self._tell(f"{self._path} cannot be written ({sys.exc_info()[1]}): the supervisor works on without")
+
+
+def _log_handler(run_dir: RunDir, tell: Callable[[str], None]) -> logging.Handler:
+    try:
+        file = run_dir.new_log("supervisor")
+    except ConfigError as error:
+        tell(f"the supervisor runs without a log: {error}")
+        return logging.NullHandler()
+    return _Log(io.TextIOWrapper(file, write_through=True), run_dir.log("supervisor"), tell)
 
 
 @contextmanager
