@@ -10,13 +10,14 @@ from __future__ import annotations
 
 import importlib
 import inspect
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterable
 from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import msgspec
 
+from cocoro.bus.shared import need_bytes
 from cocoro.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -142,6 +143,12 @@ def table() -> dict[str, Process]:
             raise ConfigError(f"{where}: {point.value} is not a Process named {point.name!r}")
         rows[row.name] = row
     return rows
+
+
+def shared_bytes(rows: Iterable[Process]) -> int:
+    """The room in the machine's shared memory that these processes take for their frames."""
+    kinds = [row.frames for row in rows]
+    return need_bytes(publishers=kinds.count("publishes"), readers=kinds.count("reads"))
 
 
 def named(name: str) -> Process:

@@ -91,7 +91,7 @@ def hold(path: Path, name: str) -> Held | None:
         fcntl.flock(fd, fcntl.LOCK_UN)
         time.sleep(random.uniform(0.0, 0.002))  # of two that try, one is first
     try:
-        os.ftruncate(fd, 1)  # not to 0: what is written takes the room of what the last holder wrote, in a full place, too
+        os.ftruncate(fd, 1)  # not to 0: what is written takes the room of what was there, which there may be no more of
         os.pwrite(fd, about, 0)
     except OSError as error:
         os.close(fd)

@@ -59,6 +59,16 @@ class Child:
     def pid(self) -> int | None:
         return self._process.pid if self._process is not None and not self._exit.done() else None
 
+    @property
+    def attended(self) -> bool:
+        """Whether the end of its process, if it has ended, has been noticed here."""
+        if self._process is None or self._exit.done():
+            return True
+        try:
+            return os.waitid(os.P_PID, self._process.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is None
+        except ChildProcessError:
+            return False
+
     async def start(self) -> None:
         """Start it, and return when it is ready. Raises StartError when it ends before, or takes too long."""
         self._spawn()

@@ -13,7 +13,6 @@ import json
 import logging
 import os
 import signal
-import socket
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -22,11 +21,14 @@ from typing import IO
 
 import msgspec
 
+from cocoro.bus import shared
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.errors import CocoroError, ConfigError, RefusedError
+from cocoro.processes import shared_bytes
 from cocoro.profiles import Profile, from_data
 from cocoro.quit import quit_process
 from cocoro.rundir import RunDir
+from deploy import service_manager
 from deploy.child import Child, StartError
 
 STOPPED, MISCONFIGURED, REFUSED = 0, 2, 3
@@ -60,10 +62,12 @@ class Supervisor:
         try:
             self._log_to_file()
             await self._wait_for_leftovers()
+            self._look_at_shared_memory()
             self._run_dir.remember(msgspec.json.format(msgspec.json.encode(self._profile)))
             with _signals(self._on_signal):
                 return await self._run()
         finally:
+            shared.sweep()  # of processes that were killed
             held.release()
 
     async def _run(self) -> int:
@@ -83,7 +87,7 @@ class Supervisor:
                 try:
                     code = await self._start_and_keep()
                 finally:
-                    _notify_service_manager("STOPPING=1")
+                    service_manager.notify("STOPPING=1")
                     for child in reversed(self._children):
                         await child.stop()
         finally:
@@ -108,13 +112,18 @@ class Supervisor:
             return error.code
         self._tell(f"{self._profile.robot} is up ({self._profile.name})")
         self._on_up()
-        _notify_service_manager("READY=1")
+        service_manager.notify("READY=1")
         async with asyncio.TaskGroup() as group:
             keeping = [group.create_task(child.keep()) for child in self._children]
+            keeping.append(group.create_task(service_manager.keep_watchdog(self._attended)))
             await self._stop.wait()
             for task in keeping:
                 task.cancel()
         return STOPPED
+
+    def _attended(self) -> bool:
+        """Whether everything that became of the processes has been noticed."""
+        return all(child.attended for child in self._children)
 
     async def _wait_for_leftovers(self) -> None:
         """A killed supervisor's processes end by themselves: give them the time for it."""
@@ -125,6 +134,12 @@ class Supervisor:
                 who = ", ".join(f"{service} ({by.name}, pid {by.pid})" for service, by in found.items())
                 raise RefusedError(f"of {self._profile.robot} there runs already: {who}; `cocoro down` ends it")
             await asyncio.sleep(0.05)
+
+    def _look_at_shared_memory(self) -> None:
+        """Make room of what dead processes left, and say when there is too little all the same."""
+        shared.sweep()
+        if why := shared.obstacle(shared_bytes(self._profile.rows())):
+            self._tell(f"no shared memory: {why}; {shared.COSTS}")
 
     def _on_signal(self, number: signal.Signals) -> None:
         self._tell("still stopping" if self._stop.is_set() else f"stopping ({number.name})")
@@ -180,14 +195,6 @@ def _signals(handler: Callable[[signal.Signals], None]) -> Iterator[None]:
     finally:
         for number in numbers:
             loop.remove_signal_handler(number)
-
-
-def _notify_service_manager(state: str) -> None:
-    """systemd's notification protocol (sd_notify(3)); nothing where there is no systemd."""
-    address = os.environ.get("NOTIFY_SOCKET")
-    if address:
-        with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as notify:
-            notify.sendto(state.encode(), f"\0{address[1:]}" if address[0] == "@" else address)
 
 
 def supervise(

@@ -15,6 +15,7 @@ from typing import IO, Any
 import msgspec
 
 from cocoro import launch, private, profiles
+from cocoro.bus import shared
 from cocoro.cli import exits
 from cocoro.cli.options import frames_of, latencies_of
 from cocoro.errors import CocoroError, ConfigError
@@ -148,6 +149,7 @@ def down(robot: str | None) -> int:
     """Stop one robot, or all that are up on this machine."""
     chosen = [RunDir(robot)] if robot is not None else [r for r in robots() if r.supervisor() or r.claims()]
     stopped = [_stop(run_dir) for run_dir in chosen]
+    shared.sweep()  # what killed processes left
     if not any(stopped):
         _say(f"{robot or 'nothing'} was not up" if robot else "nothing was up")
     return exits.DONE
