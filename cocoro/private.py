@@ -7,8 +7,8 @@ refused has not been touched:
 - a directory on the way belongs to root or to this user, and others may not write to it, unless it keeps what is in it
   from being replaced (the sticky bit, as /tmp has it);
 - a link on the way is followed only when it belongs to root or to this user and nobody else may write beside it;
-- the last directory belongs to this user, and nobody else may write to it; a file in it is a regular file of this
-  user's, and is never opened through a link.
+- the last directory is no link, belongs to this user, and nobody else may write to it; a file in it is a regular file
+  of this user's, and is never opened through a link.
 
 Root is a user like any other here: it refuses what is not its own. Who operates another user's robot becomes that user
 (`sudo -u USER`), and does not reach into his directory as root.
@@ -127,8 +127,8 @@ def _open_directory(path: Path, make: bool, own: bool, mode: int, variable: str)
                     raise refusal(at / name, error, variable) from error
                 links += 1
                 target, owner = link
-                if _writable(held) or owner not in _trusted() or links > LINKS:
-                    raise _refusal(at / name, "it is a link where others could have put one", variable) from None
+                if (own and not waiting) or _writable(held) or owner not in _trusted() or links > LINKS:
+                    raise _refusal(at / name, "it is a link, which is not followed here", variable) from None
                 if target.is_absolute():
                     at, below = Path("/"), os.open("/", _WALK)
                 else:

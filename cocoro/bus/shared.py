@@ -55,8 +55,8 @@ def obstacle(wanted_bytes: int) -> str:
     free_bytes = room.f_bavail * room.f_frsize
     if free_bytes < wanted_bytes:
         return (
-            f"{PLACE} has {_mb(free_bytes)} free of {_mb(room.f_blocks * room.f_frsize)}, {_mb(wanted_bytes)} are "
-            f"needed, {_mb(wanted_bytes - free_bytes)} more: make room, or mount it larger"
+            f"{PLACE} has {_mb(free_bytes)} free, {_mb(wanted_bytes)} are needed "
+            f"({_mb(wanted_bytes - free_bytes)} more): make room, or mount it larger"
         )
     may_lock = lockable_bytes()
     if may_lock is not None and may_lock < LOCKED_BYTES:
@@ -147,4 +147,4 @@ def _held() -> Iterable[int]:
 
 
 def _mb(count: int) -> str:
-    return f"{count / 1e6:.1f} MB"
+    return f"{count / 1e6:.1f} MB" if count >= 1e6 else f"{count / 1e3:.0f} kB"
