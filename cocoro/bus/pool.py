@@ -28,7 +28,7 @@ class SharedPool:
                 self.hold(b"warm")
             except zenoh.ZError as error:  # others have filled it since
                 self._provider = None
-                shared.sweep()  # what was begun takes its room all the same
+                shared.drop_failed()
                 self.trouble = shared.obstacle(POOL_BYTES + PROCESS_BYTES) or str(error)
 
     def hold(self, data: bytes) -> zenoh.ZBytes | bytes:

@@ -111,7 +111,7 @@ def open_session(config: ZenohConfig, chosen: dict[str, Any]) -> Opened:
         except MeshError as error:  # others have filled it since
             if NO_SEGMENT not in f"{error} {error.__cause__}":
                 raise
-            shared.sweep()
+            shared.drop_failed()
             why = shared.obstacle(shared.SESSION_BYTES) or str(error)
     log.warning("no shared memory: %s; %s", why, shared.COSTS)
     return Opened(_open(config, chosen | {SHARED_MEMORY: False}), why)

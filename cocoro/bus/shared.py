@@ -93,6 +93,22 @@ def sweep() -> int:
     return removed
 
 
+def drop_failed() -> int:
+    """Remove what zenoh began to make in this process and could not: it stays mapped, and takes its room until the end
+    of the process. How many segments that were."""
+    removed = 0
+    with suppress(OSError):
+        mapped = {line.split(maxsplit=5)[-1] for line in Path("/proc/self/maps").read_text().splitlines()}
+        held = {str(Path(f"/proc/self/fd/{fd}").readlink()) for fd in _held()}
+        for path in (Path(name) for name in mapped - held):
+            if path.parent == PLACE and _SEGMENT.fullmatch(path.name):
+                with suppress(OSError):
+                    os.truncate(path, 0)
+                    path.unlink()
+                    removed += 1
+    return removed
+
+
 def release() -> int:
     """Remove the segments that this process holds and nobody else does: for the end of the process, when its sessions
     have been closed. How many they were."""
