@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import os
+import shlex
 import shutil
 import socket
 import subprocess
@@ -13,6 +15,7 @@ import pytest
 from operator_shell import PATIENCE_S, Shell
 
 from cocoro.bus import shared
+from cocoro.launch import ORPHAN_S
 from cocoro.vloop import run_virtual
 from deploy import service_manager
 
@@ -144,6 +147,24 @@ def test_the_unit_lets_the_robot_do_its_work(unit: dict[str, list[str]]) -> None
     assert {"char-ttyUSB", "char-ttyACM", "char-usb_device", "char-drm", "char-pts"} <= devices
     assert int(unit["LimitMEMLOCK"][0].removesuffix("M")) << 20 >= shared.LOCKED_BYTES
     assert int(unit["WatchdogSec"][0]) > 0
+
+
+def test_the_unit_lets_processes_end_by_themselves_when_their_supervisor_has_died(unit: dict[str, list[str]]) -> None:
+    """Killed at once, base service and guard among them, a Create would drive on."""
+    assert unit["KillMode"] == ["mixed"]
+    (after,) = unit["ExecStopPost"]
+    command = shlex.split(after)[-1].replace("$$", "$").replace("sleep", "echo waits")
+    for result, waits_s in (
+        ("success", ""),
+        ("watchdog", "6"),
+        ("signal", "6"),
+        ("core-dump", "6"),
+        ("exit-code", "6"),
+    ):
+        environment = {"SERVICE_RESULT": result, "PATH": os.defpath}
+        told = subprocess.run(["/bin/sh", "-c", command], env=environment, capture_output=True, text=True, check=True)
+        assert told.stdout.split() == (["waits", waits_s] if waits_s else [])
+        assert not waits_s or float(waits_s) > ORPHAN_S
 
 
 def analyze(*arguments: str) -> subprocess.CompletedProcess[str]:
