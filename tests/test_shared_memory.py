@@ -22,7 +22,10 @@ from cocoro.bus import shared
 from cocoro.bus.base import Payload
 from cocoro.bus.pool import SharedPool
 from cocoro.bus.zenoh import ZenohBus
+from cocoro.checks import Check
+from cocoro.cli import doctor
 from cocoro.processes import PROCESSES, Process, shared_bytes
+from cocoro.rundir import RunDir
 from cocoro.topics import FRAME as FRAME_TOPIC
 from cocoro.topics import Qos
 
@@ -176,6 +179,34 @@ def test_the_limit_is_raised_as_far_as_it_may_be(monkeypatch: pytest.MonkeyPatch
     assert shared.lockable_bytes() == 1 << 26
     limits.append((resource.RLIM_INFINITY, resource.RLIM_INFINITY))
     assert shared.lockable_bytes() is None
+
+
+def test_the_doctor_says_what_the_profile_needs_and_whether_it_is_there(
+    root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def told(profile: str, free_bytes: int) -> Check:
+        monkeypatch.setattr(os, "statvfs", lambda _: Room(free_bytes, 1 << 40))
+        with monkeypatch.context() as patch:
+            patch.setattr(shared, "lockable_bytes", lambda: None)
+            patch.setattr(doctor, "_disk", lambda _: iter(()))
+            return next(check for check in doctor.examine(profiles.read(profile)) if check.name == "shared memory")
+
+    assert told("replay", 1 << 30) == ("shared memory", "ok", "room for the 0.0 MB that the frames take")
+    assert told("sim", 1 << 30) == ("shared memory", "ok", "room for the 26.5 MB that the frames take")
+    why = f"{shared.PLACE} has 16.0 MB free, 26.5 MB are needed (10.5 MB more): make room, or mount it larger"
+    assert told("sim", 16_000_000) == ("shared memory", "note", f"{why}; until then {shared.COSTS}")
+    claims = RunDir("calliope").claim("sim", ["kinect"])
+    assert told("sim", 0).text.endswith(" MB in use")
+    claims[0].release()
+
+
+@needs_root
+def test_the_doctor_names_a_run_directory_that_is_another_user_s(root: Path) -> None:
+    RunDir("calliope").make()
+    os.chown(root / "calliope", 65534, 65534)
+    checks = [check for check in doctor.examine(profiles.read("replay")) if check.name == "robot's folder"]
+    assert [check.state for check in checks] == ["bad"]
+    assert checks[0].text.startswith(f"run directory {root}/calliope: it belongs to nobody")
 
 
 # --- without ------------------------------------------------------------------------------------------

@@ -62,7 +62,11 @@ def examine(profile: Profile) -> Iterator[Check]:
     if profile.clock == "real":
         yield _rules()
         yield from _priority()
-    claims = run_dir.claims()
+    claims: dict[str, Holder] = {}
+    try:
+        claims = run_dir.claims()
+    except ConfigError as error:
+        yield bad("robot's folder", str(error))
     for row in profile.rows():
         running = [service for service in row.services if service in claims]
         if running:
