@@ -51,6 +51,8 @@ class Supervisor:
         self._tell_people = tell
         self._children: list[Child] = []
         self._stop = asyncio.Event()
+        self._unshared = ""
+        """Why frames cannot all be shared, as it was before the processes were started."""
 
     async def run(self) -> int:
         """Start everything, stay until SIGINT or SIGTERM, stop everything. Returns the exit code.
@@ -62,7 +64,8 @@ class Supervisor:
         try:
             self._log_to_file()
             await self._wait_for_leftovers()
-            self._look_at_shared_memory()
+            shared.sweep()  # what dead processes left
+            self._unshared = shared.obstacle(shared_bytes(self._profile.rows()))
             self._run_dir.remember(msgspec.json.format(msgspec.json.encode(self._profile)))
             with _signals(self._on_signal):
                 return await self._run()
@@ -110,6 +113,8 @@ class Supervisor:
         except StartError as error:
             self._tell(str(error))
             return error.code
+        if self._unshared:
+            self._tell(f"no shared memory: {self._unshared}; {shared.COSTS}")
         self._tell(f"{self._profile.robot} is up ({self._profile.name})")
         self._on_up()
         service_manager.notify("READY=1")
@@ -134,12 +139,6 @@ class Supervisor:
                 who = ", ".join(f"{service} ({by.name}, pid {by.pid})" for service, by in found.items())
                 raise RefusedError(f"of {self._profile.robot} there runs already: {who}; `cocoro down` ends it")
             await asyncio.sleep(0.05)
-
-    def _look_at_shared_memory(self) -> None:
-        """Make room of what dead processes left, and say when there is too little all the same."""
-        shared.sweep()
-        if why := shared.obstacle(shared_bytes(self._profile.rows())):
-            self._tell(f"no shared memory: {why}; {shared.COSTS}")
 
     def _on_signal(self, number: signal.Signals) -> None:
         self._tell("still stopping" if self._stop.is_set() else f"stopping ({number.name})")

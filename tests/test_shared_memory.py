@@ -116,6 +116,7 @@ def test_too_little_is_said_with_by_how_much(place: Path, monkeypatch: pytest.Mo
 def test_no_shared_memory_at_all_is_said(place: Path) -> None:
     place.rmdir()
     assert shared.obstacle(1) == f"{place}: No such file or directory"
+    assert shared.obstacle(0) == ""
 
 
 def test_what_may_not_be_locked_in_memory_is_said(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:

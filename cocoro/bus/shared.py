@@ -46,6 +46,8 @@ def need_bytes(publishers: int, readers: int) -> int:
 
 def obstacle(wanted_bytes: int) -> str:
     """Why this process cannot have so much more of it, by how much, and what to do; empty when it can."""
+    if wanted_bytes == 0:
+        return ""
     try:
         room = os.statvfs(PLACE)
     except OSError as error:
