@@ -9,7 +9,6 @@ from __future__ import annotations
 import argparse
 import asyncio
 import faulthandler
-import json
 import logging
 import os
 import signal
@@ -20,6 +19,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from cocoro import private
 from cocoro.errors import CocoroError, RefusedError
 from cocoro.quit import quit_process
 from cocoro.rundir import RunDir
@@ -76,6 +76,12 @@ def run(process: str, run_dir: RunDir, profile: dict[str, Any], profile_name: st
         return REFUSED if isinstance(error, RefusedError) else MISCONFIGURED
     except KeyboardInterrupt:
         return OK
+    except OSError as error:
+        if not private.full(error):
+            log.exception("crashed")
+            return CRASHED
+        log.error("%s: %s; make room there", error.filename or run_dir.path, error.strerror)
+        return MISCONFIGURED
     except Exception:
         log.exception("crashed")
         return CRASHED
@@ -105,7 +111,7 @@ async def _main(process: str, run_dir: RunDir, data: dict[str, Any], profile_nam
         # Whoever comes first, without a supervisor, fixes the robot's time for those who come later.
         real_clock = robot_time.clock if run_dir.populated else robot_time.fix
         async with (
-            await ZenohBus.open(run_dir.join_as(process, profile.mesh)) as bus,
+            await ZenohBus.open(run_dir.join_as(process, profile.mesh, frames=bool(row.frames))) as bus,
             Node(
                 process,
                 bus,
@@ -174,7 +180,7 @@ def main(arguments: list[str] | None = None) -> int:
         watch_parent(options.parent_fd)
     folder: Path = options.run_dir
     run_dir = RunDir(folder.name, folder.parent)
-    profile = json.loads(run_dir.profile_file.read_bytes())
+    profile = run_dir.resolved()
     return run(options.process, run_dir, profile, profile.get("name", ""))
 
 

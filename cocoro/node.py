@@ -309,7 +309,11 @@ class Node:
             rss_mb=rss_mb,
             topics=told,
             loops=tuple(meter.health() for meter in self._meters),
-            faults=(*self.faults, *(topic.fault for topic in told if topic.fault)),
+            faults=(
+                *self.faults,
+                *(topic.fault for topic in told if topic.fault),
+                *(port.trouble for port in self._publishers.values() if port.trouble),
+            ),
         )
 
 

@@ -10,7 +10,9 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from typing import IO
 
+from cocoro.errors import ConfigError
 from cocoro.launch import CRASHED, MISCONFIGURED, REFUSED
 from cocoro.processes import BACKOFF_LIMIT_S, SETTLED_S, Process
 from cocoro.rundir import RunDir
@@ -56,6 +58,16 @@ class Child:
     @property
     def pid(self) -> int | None:
         return self._process.pid if self._process is not None and not self._exit.done() else None
+
+    @property
+    def attended(self) -> bool:
+        """Whether the end of its process, if it has ended, has been noticed here."""
+        if self._process is None or self._exit.done():
+            return True
+        try:
+            return os.waitid(os.P_PID, self._process.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is None
+        except ChildProcessError:
+            return False
 
     async def start(self) -> None:
         """Start it, and return when it is ready. Raises StartError when it ends before, or takes too long."""
@@ -134,7 +146,7 @@ class Child:
         self._was_ready = False
         self._exit = loop.create_future()
         self._started_s = time.monotonic()
-        with self._run_dir.rotate_log(self.row.name).open("wb") as log:
+        with self._log() as log:
             self._process = subprocess.Popen(
                 command,
                 stdin=subprocess.DEVNULL,
@@ -146,6 +158,14 @@ class Child:
             )
         pid_fd = os.pidfd_open(self._process.pid)
         loop.add_reader(pid_fd, self._on_exit, self._process, pid_fd)
+
+    def _log(self) -> IO[bytes]:
+        """Where it writes what it does; nowhere, which is said, when its log cannot be written."""
+        try:
+            return self._run_dir.new_log(self.row.name)
+        except ConfigError as error:
+            self._tell(f"{self.row.name} runs without a log: {error}")
+            return os.fdopen(os.open(os.devnull, os.O_WRONLY), "wb")
 
     def _on_exit(self, process: subprocess.Popen[bytes], pid_fd: int) -> None:
         asyncio.get_running_loop().remove_reader(pid_fd)
@@ -175,7 +195,11 @@ class Child:
     def _last_words(self, code: int | None = None) -> str:
         """The end of its log, to be put after a sentence: of a mistake the line that tells it, else a few."""
         log = self._run_dir.log(self.row.name)
-        with log.open("rb") as file:
+        try:
+            file = self._run_dir.open_log(self.row.name)
+        except (FileNotFoundError, ConfigError):
+            return ""
+        with file:
             file.seek(max(file.seek(0, os.SEEK_END) - LAST_BYTES, 0))
             lines = [line for line in file.read().decode(errors="replace").splitlines() if line.strip()]
         if code in SAID_WHY and lines:

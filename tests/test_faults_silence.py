@@ -29,6 +29,8 @@ PERIOD_S = 1 / 30
 class Mute:
     """In a publisher's place."""
 
+    trouble = ""
+
     def put(self, payload: Payload) -> None:
         pass
 

@@ -51,6 +51,10 @@ class RawPublisher(Handle, Protocol):
     def put(self, payload: Payload) -> None:
         """Send; never blocks the loop noticeably, never raises for want of subscribers."""
 
+    @property
+    def trouble(self) -> str:
+        """Why samples cost more than they should, in words; empty when all is well."""
+
 
 class Subscription(Handle, Protocol):
     @property

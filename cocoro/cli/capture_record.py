@@ -37,7 +37,7 @@ async def record(where: Where, settings: dict[str, Any], seconds: float | None) 
         config = msgspec.convert(settings, component.config)
     except msgspec.ValidationError as error:
         raise ConfigError(f"record: {error}") from error
-    async with joined(where) as link:
+    async with joined(where, frames=True) as link:
         resolved = link.run_dir.resolved()
         description, measured = (Path(file) if (file := resolved.get(name)) else None for name in _DESCRIPTIONS)
         clock = FollowedClock() if resolved.get("clock") == "sim" else robot_time.clock(link.run_dir.path)

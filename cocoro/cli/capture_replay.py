@@ -49,7 +49,7 @@ async def replay(file: Path, only: list[str], hardware: bool, options: dict[str,
         run_dir.make()
         claims = run_dir.claim("replay", services)
         try:
-            async with await ZenohBus.open(run_dir.join_as("replay")) as bus:
+            async with await ZenohBus.open(run_dir.join_as("replay", frames=True)) as bus:
                 await refuse_if_alive(bus, capture.robot, services)
                 await _play(bus, capture, player, hardware, services)
         finally:

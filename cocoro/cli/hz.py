@@ -138,7 +138,7 @@ class Meter:
 async def hz(where: Where, text: str, window_s: float, once: bool, as_json: bool) -> int:
     """Measure until interrupted, or with `once` over one window. Exit code 1 when that heard nothing."""
     meters: dict[str, Meter] = {}
-    async with joined(where) as link:
+    async with joined(where, frames=True) as link:
         ear = Ear(link, keyexpr_of(text, link.robot))
         with told_to_end() as end, _view(as_json, once) as view:
             show_s = time.monotonic() + (window_s if once else SHOW_S)

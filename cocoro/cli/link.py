@@ -115,8 +115,8 @@ def find(where: Where) -> RunDir:
 
 
 @asynccontextmanager
-async def joined(where: Where, patience_s: float | None = None) -> AsyncIterator[Link]:
-    """Join the mesh of a robot. Raises MeshError when it is not there."""
+async def joined(where: Where, patience_s: float | None = None, *, frames: bool = False) -> AsyncIterator[Link]:
+    """Join the mesh of a robot. Raises MeshError when it is not there. `frames`: it is to read them, or everything."""
     if where.profile is not None:
         from cocoro import profiles
 
@@ -128,6 +128,7 @@ async def joined(where: Where, patience_s: float | None = None) -> AsyncIterator
         config = run_dir.join_as("operator")
         if config.directory is not None and not run_dir.populated:
             raise MeshError(f"{run_dir.robot} is not up on this machine: {START}")
+    config = replace(config, shared_memory=frames)
     if patience_s is not None:
         config = replace(config, patience_s=patience_s)
     async with await ZenohBus.open(config, expect_mesh=True) as bus:

@@ -36,7 +36,7 @@ async def run(where: Where, request: TaskRequest, as_json: bool, picture: Path |
     """Run a task to its outcome and return the exit code. `picture`: where to write what is seen at the grasp."""
     if picture is not None:
         check(picture)
-    async with joined(where) as link:
+    async with joined(where, frames=picture is not None) as link:
         follower = Follower(link, request, view(as_json), picture)
         with interrupts(follower.interrupt):
             code, result = await follower.run()
