@@ -6,9 +6,11 @@ import json
 from pathlib import Path
 from typing import Any
 
+from cocoro.cli.ending import on_end
 from cocoro.cli.link import Link, Where, joined
+from cocoro.cli.output import going_on
 from cocoro.cli.progress import View, view
-from cocoro.cli.tasks import Follower, interrupts
+from cocoro.cli.tasks import Follower
 from cocoro.errors import MeshError
 from cocoro.learning.collector import TOPICS, Collector, collector
 from cocoro.messages import AboutRequest, ObjectsRequest, TaskName, TaskRequest, TaskState
@@ -63,7 +65,7 @@ async def babble(where: Where, task: TaskName, wanted: int, file: Path, label: s
             samples.add(lambda _key, message: kept.take(message))
             request = TaskRequest(task=task, label=label, first=kept.next, count=wanted - len(kept))
             follower = Follower(link, request, shown, None)
-            with interrupts(follower.interrupt):
+            with on_end(follower.interrupt), going_on():
                 code, result = await follower.run()
             result |= {"file": str(file), "samples": len(kept)}
     if as_json:
