@@ -49,10 +49,12 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _command(arguments: list[str]) -> int:
+    from typer.main import get_command
+
     from cocoro.cli.app import app
 
     try:
-        app(args=arguments, prog_name="cocoro")
+        get_command(app)(args=arguments, prog_name="cocoro")  # not app itself, which hooks itself into sys.excepthook
     except SystemExit as end:
         if _interrupted(end):  # the command line library has an exit code of its own for it
             return exits.REFUSED
