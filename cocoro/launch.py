@@ -65,8 +65,11 @@ def watch_parent(fd: int) -> None:
     threading.Thread(target=watch, name="parent", daemon=True).start()
 
 
-def run(process: str, run_dir: RunDir, profile: dict[str, Any], profile_name: str) -> int:
-    """Run a process until it is told to end; returns the exit code. Logging is set up already."""
+def run(
+    process: str, run_dir: RunDir, profile: dict[str, Any], profile_name: str, *, raise_crashes: bool = False
+) -> int:
+    """Run a process until it is told to end; returns the exit code. Logging is set up already. A crash is logged with
+    its traceback, or raised for a caller who shows it to a person."""
     log = logging.getLogger(f"cocoro.{process}")
     try:
         with asyncio.Runner() as runner:
@@ -77,6 +80,8 @@ def run(process: str, run_dir: RunDir, profile: dict[str, Any], profile_name: st
     except KeyboardInterrupt:
         return OK
     except Exception:
+        if raise_crashes:
+            raise
         log.exception("crashed")
         return CRASHED
 

@@ -22,6 +22,7 @@ import msgspec
 
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.errors import CocoroError, RefusedError
+from cocoro.launch import CRASHED
 from cocoro.profiles import Profile, from_data
 from cocoro.quit import quit_process
 from cocoro.rundir import RunDir
@@ -209,9 +210,13 @@ def main() -> int:
     pipe = _Pipe(options.report_fd)
     data = json.loads(sys.stdin.buffer.read())
     profile = from_data(data, data.get("name", ""))
-    code = supervise(
-        profile, RunDir(profile.robot, options.run_dir.parent), pipe.line, on_up=lambda: pipe.close(STOPPED)
-    )
+    run_dir = RunDir(profile.robot, options.run_dir.parent)
+    try:
+        code = supervise(profile, run_dir, pipe.line, on_up=lambda: pipe.close(STOPPED))
+    except OSError as error:  # its traceback goes to supervisor.err, unless that is on the same full disk
+        pipe.line(f"{error.filename or run_dir.path}: {error.strerror}; mend it, or choose another by COCORO_RUN_DIR")
+        pipe.close(CRASHED)
+        raise
     pipe.close(code)
     return code
 

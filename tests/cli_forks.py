@@ -34,6 +34,8 @@ NEW_MOUNTS, PRIVATE, RECURSIVE, READ_ONLY = 0x20000, 1 << 18, 1 << 14, 1
 """Of unshare(2) and mount(2)."""
 LATER = 7
 TALKED = 3
+FULL = "size=4k"
+"""Of an empty file system: it is filled."""
 NO_MOUNTS = 77
 """Exit code of a child that may not have mounts of its own."""
 
@@ -268,6 +270,8 @@ def mount(wanted: list[tuple[str, str]]) -> None:
         flags = READ_ONLY if options == "ro" else 0
         data = b"" if options == "ro" else options.encode()
         failed = failed or libc.mount(b"none", os.fsencode(place), b"tmpfs", flags, data)
+        if options == FULL and not failed:
+            (Path(place) / "full").write_bytes(bytes(4096))
     if failed:
         os._exit(NO_MOUNTS)
 

@@ -11,6 +11,7 @@ import os
 import signal
 import sys
 import threading
+from contextlib import suppress
 from types import FrameType, TracebackType
 from typing import TYPE_CHECKING, NoReturn
 
@@ -107,9 +108,22 @@ def _of_system(error: OSError) -> str:
     if error.errno == errno.ENOENT and not _has_place():
         return "the current directory is gone; change to one that is there"
     names = [os.fsdecode(name) for name in (error.filename, error.filename2) if isinstance(name, str | bytes)]
-    where = " to ".join(names) or f"the system{_place(error)}"
+    where = " to ".join(names) or (_full() if error.errno == errno.ENOSPC else "") or f"the system{_place(error)}"
     advice = ADVICE.get(error.errno or 0, f"{output.LEVEL}=debug shows the traceback")
     return f"{where}: {error.strerror or error or type(error).__name__}; {advice}"
+
+
+def _full() -> str:
+    """Which of the places that every command may write to is full: the system does not say that of a write."""
+    import tempfile
+
+    from cocoro.bus.endpoints import default_run_dir
+
+    for place in (default_run_dir(), ".", tempfile.gettempdir()):
+        with suppress(OSError):
+            if not os.statvfs(place).f_bavail:
+                return str(place)
+    return ""
 
 
 def _has_place() -> bool:

@@ -174,7 +174,7 @@ def run(process: str, profile: str | None, settings: list[str]) -> int:
     run_dir.make()
     launch.set_up_logging(process)
     with going_on():
-        return launch.run(process, run_dir, msgspec.to_builtins(read), read.name)
+        return launch.run(process, run_dir, msgspec.to_builtins(read), read.name, raise_crashes=True)
 
 
 def _say(text: str) -> None:
