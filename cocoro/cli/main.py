@@ -38,6 +38,7 @@ ADVICE = {
 def main(arguments: list[str] | None = None) -> int:
     """Run a command; returns its exit code. A mistake of the operator's gets one line, no traceback."""
     arguments = sys.argv[1:] if arguments is None else arguments
+    output.said_already.clear()
     try:
         if arguments and arguments[0] in ESTOP:
             from cocoro.cli import estop

@@ -16,6 +16,7 @@ import io
 import logging
 import os
 import sys
+from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import Any, TextIO
@@ -90,6 +91,8 @@ class _Out(io.RawIOBase):
 
 
 _outs: dict[str, _Out] = {}
+said_already: deque[str] = deque(maxlen=8)
+"""The last complaints of the command that runs."""
 
 
 def take_over() -> None:
@@ -206,8 +209,11 @@ def show_trace(error: BaseException) -> None:
 
 
 def complain(text: str) -> None:
-    """One line on standard error, whatever characters are in it."""
-    print(f"cocoro: {one_line(text)}", file=sys.stderr, flush=True)
+    """One line on standard error, whatever characters are in it; once, though a library may have said it already."""
+    line = f"cocoro: {one_line(text)}"
+    if line not in said_already:
+        said_already.append(line)
+        print(line, file=sys.stderr, flush=True)
 
 
 def one_line(text: str) -> str:

@@ -72,6 +72,10 @@ class Follower:
         """The first one cancels the task on the robot, the second one leaves at once."""
         if self._interrupted.is_set():
             raise KeyboardInterrupt
+        self.cancel()
+
+    def cancel(self) -> None:
+        """Have the task cancelled on the robot, and wait for its outcome."""
         self._interrupted.set()
 
     async def run(self) -> tuple[int, dict[str, object]]:
