@@ -22,7 +22,6 @@ from cocoro.clock import VirtualClock
 from cocoro.errors import MeshError
 from cocoro.messages import (
     CancelRequest,
-    HandSample,
     Latch,
     LatchState,
     Message,
