@@ -131,8 +131,17 @@ def serve() -> None:
         preload()
     gc.disable()  # a collection touches, and so copies, what the children share
     for line in sys.stdin:
-        ending = play(Case(**json.loads(line)))
+        ending = play(Case(**named_here(json.loads(line))))
         print(json.dumps(asdict(ending)), flush=True)
+
+
+def named_here(value: Any) -> Any:
+    """With file names as this process's locale spells them: in that of C, `ü` is two bytes of no character."""
+    if isinstance(value, str):
+        return os.fsdecode(value.encode("utf-8", "surrogateescape"))
+    if isinstance(value, list):
+        return [named_here(each) for each in value]
+    return {key: named_here(each) for key, each in value.items()} if isinstance(value, dict) else value
 
 
 def preload() -> None:
