@@ -27,6 +27,7 @@ from cocoro.capture.compression import Packer
 from cocoro.capture.reader import Capture
 from cocoro.capture.rewrite import rewrite
 from cocoro.cli import exits
+from cocoro.cli.main import failed
 from cocoro.clock import NS
 
 
@@ -163,6 +164,12 @@ def test_a_bug_is_one_line_and_its_traceback_can_be_had(table: Table) -> None:
     assert told.code == exits.FAILED
     assert "Traceback (most recent call last)" in told.err
     assert told.err.endswith(ending.err)
+
+
+def test_the_error_of_one_task_of_several_is_told_as_its_own(capsys: pytest.CaptureFixture[str]) -> None:
+    error = OSError(errno.EACCES, os.strerror(errno.EACCES), "a file")
+    assert failed(ExceptionGroup("tasks", [ExceptionGroup("more", [error])])) == exits.FAILED
+    assert capsys.readouterr().err == "cocoro: a file: Permission denied; choose another place, or have it allowed\n"
 
 
 def line_of(text: str) -> int:

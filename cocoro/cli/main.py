@@ -68,6 +68,8 @@ def failed(error: BaseException) -> int:
     """Say what ended a command, in one line at most; the exit code for it."""
     from cocoro.errors import CocoroError
 
+    while isinstance(error, BaseExceptionGroup) and len(error.exceptions) == 1:  # as a group of tasks wraps it
+        error = error.exceptions[0]
     if isinstance(error, CocoroError):
         output.complain(str(error))
         return code_of(error)
