@@ -1,10 +1,9 @@
-"""The robot as its operator has it, processes on zenoh in real time: `python -m bench.live fetches|periods|stop`.
+"""The robot as its operator has it, processes on zenoh in real time: `python -m bench.live fetches|periods`.
 
 `fetches`: start it, fetch the red can, shut it down, again and again; nothing may fail, nothing may be left over, and
 the truth must say that the can is held and nothing else was touched. With `--profile sim-wire` the real services of
 base and servos drive it over emulated wires.
 `periods`: how evenly wheels and servos are commanded during a fetch, with perception slowed to 2 Hz.
-`stop`: from the call of `cocoro stop` on a robot that drives until its wheels stand, as its base says.
 
 Times are this machine's at this moment: see how busy it is. Exit code 1 when something failed.
 """
@@ -37,7 +36,6 @@ from sim.judge import HELD_S, Judge, Verdict
 from sim.random_scene import find_scene
 
 NAME = "calliope"
-STANDING_MPS = 0.01
 
 
 class Operator:
@@ -46,6 +44,7 @@ class Operator:
     def __init__(self, root: Path) -> None:
         self.run_dir = RunDir(NAME, root)
         self._env = os.environ | {"COCORO_RUN_DIR": str(root), "COCORO_CAPTURE_DIR": str(root / "captures")}
+        self._env |= {"COCORO_STATE_DIR": str(root / "state")}
 
     def start(self, *arguments: str) -> subprocess.Popen[str]:
         command = [sys.executable, "-m", "cocoro.cli.main", *arguments]
@@ -172,50 +171,9 @@ def _loops(status: Any, service: str) -> Any:
     return None
 
 
-# --- stop -----------------------------------------------------------------------------------------
-
-
-async def _stop(cocoro: Operator) -> tuple[float, float]:
-    """Seconds until the wheels stand, as the base says, and until the command has ended."""
-    async with (
-        await ZenohBus.open(cocoro.run_dir.join_as("bench")) as bus,
-        Node("bench", bus, FollowedClock(), Robot.load()) as node,
-    ):
-        states = node.stream(topics.BASE_STATE)
-        fetch = cocoro.start("fetch", "red_can")
-        async for state in states:
-            if state.speed_mps > 0.25:
-                break
-        begun_s = time.monotonic()
-        stop = cocoro.start("stop")
-        async for state in states:
-            if abs(state.speed_mps) < STANDING_MPS:
-                break
-        stood_s = time.monotonic() - begun_s
-        await asyncio.to_thread(stop.communicate)
-        ended_s = time.monotonic() - begun_s
-        await asyncio.to_thread(fetch.communicate)
-    return stood_s, ended_s
-
-
-def stop(count: int) -> bool:
-    stood, ended = [], []
-    for _ in range(count):
-        with operator() as cocoro:
-            code, said, _ = cocoro("up", "sim", "--detach")
-            if code:
-                print(said)
-                return False
-            stood_s, ended_s = asyncio.run(_stop(cocoro))
-            stood.append(stood_s)
-            ended.append(ended_s)
-    print(f"wheels stand after {_spread(stood, 's')}; the command has ended after {_spread(ended, 's')}")
-    return True
-
-
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=["fetches", "periods", "stop"])
+    parser.add_argument("what", choices=["fetches", "periods"])
     parser.add_argument("--count", type=int, default=20)
     parser.add_argument("--latency", type=float, default=0.5, metavar="S", help="of perception, for periods")
     parser.add_argument("--profile", choices=["sim", "sim-wire"], default="sim", help="of the fetches")
@@ -223,10 +181,8 @@ def main() -> int:
     arguments = parser.parse_args()
     if arguments.what == "fetches":
         well = fetches(arguments.count, arguments.profile, arguments.sensors)
-    elif arguments.what == "periods":
-        well = periods(arguments.latency)
     else:
-        well = stop(arguments.count)
+        well = periods(arguments.latency)
     return 0 if well else 1
 
 

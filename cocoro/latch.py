@@ -1,36 +1,94 @@
-"""The emergency stop's latch, as every hardware service keeps it.
+"""The emergency stop's latch, as every service that moves something keeps it.
 
-A service comes up with the latch unknown, which counts as latched, and learns it from the executive's word or from
-an operator's request. What is latched is released only by an operator's reset, never by the executive's word.
+Three ways lead to it, and each latches: the stop path (`cocoro.stop`), a request on the mesh, and the executive's
+word. A service comes up latched when its record on disk says so or cannot be read. Otherwise it comes up with the
+latch unknown, which counts as latched, and learns it from the executive's word or from an operator's request. What is
+latched is released only by an operator's reset, never by the executive's word.
 """
 
 from __future__ import annotations
 
+import asyncio
 import logging
 from collections.abc import Callable
+from concurrent.futures import Future
+from contextlib import suppress
 
 from cocoro import topics
 from cocoro.clock import NS, is_fresh
 from cocoro.messages import EstopReply, EstopRequest, Latch, LatchState
 from cocoro.node import Node
+from cocoro.stop.path import KEPT_S, StopPoint, listen
+from cocoro.stop.record import LatchRecord
 
-_IN_FLIGHT_NS = NS // 2
+IN_FLIGHT_NS = NS // 2
 """For so long after a reset a word from before it may still arrive; it is not listened to."""
 
 
 class LatchKeeper:
-    """Serves `<service>/estop` and follows `executive/latch` for one hardware service.
+    """Keeps the latch of one service: serves `<service>/estop`, follows `executive/latch`, hears the stop path.
 
-    `changed(state, by)` is called at once, in the event loop, so that the hardware stops before the answer goes out.
+    `changed(state, by)` is called in the event loop, before the answer to a request goes out. `halt()` is called at
+    once when the stop path is used, in that path's thread: it must stop what moves even if the event loop hangs, be
+    brief, and bear being called while anything else happens. `changed` follows as soon as the loop gets to it.
     """
 
-    def __init__(self, node: Node, changed: Callable[[LatchState, str], None]) -> None:
+    def __init__(
+        self,
+        node: Node,
+        changed: Callable[[LatchState, str], None],
+        halt: Callable[[], None] = lambda: None,
+        *,
+        follows: bool = True,
+    ) -> None:
+        """`follows` is False for the executive, whose own word it is that the others follow."""
         self.state: LatchState = "unknown"
         self._node = node
         self._changed = changed
+        self._halt = halt
+        self._loop = asyncio.get_running_loop()
+        self._record: LatchRecord | None = None
         self._reset_ns: int | None = None
+        if node.latches is not None:
+            self._record = LatchRecord(node.latches / node.name)
+            if self._record.said.latched:
+                said = self._record.said
+                self._set("latched", f"{said.by}{f', {said.when}' if said.when else ''}")
+            point = StopPoint(node.robot_name, node.name)
+            node.keep(point)
+            listen(point, self._stopped, self._keep_latched)
         node.serve(topics.ESTOP.of(node.name), self._asked)
-        node.on(topics.LATCH, self._heard)
+        if follows:
+            node.on(topics.LATCH, self._heard)
+
+    def stop(self, by: str) -> None:
+        """Latch, in the event loop: another part of the service was told to stop."""
+        if self.state != "latched":
+            self._set("latched", by)
+
+    def word(self, state: LatchState, by: str) -> None:
+        """Take another's word for it: it releases only what is unknown, and it may be from before a reset."""
+        if state == "released" and self.state == "unknown":
+            self._set("released", by)
+        elif state == "latched" and self.state != "latched":
+            since_reset_ns = None if self._reset_ns is None else self._node.now_ns() - self._reset_ns
+            if since_reset_ns is None or not 0 <= since_reset_ns < IN_FLIGHT_NS:
+                self._set("latched", by)
+
+    # --- the stop path --------------------------------------------------------------------------------
+
+    def _stopped(self, by: str) -> None:
+        """In the stop path's thread. The loop latches afterwards in any case, so a reset that comes between the two
+        undoes nothing for longer than a moment."""
+        self._halt()
+        with suppress(RuntimeError):  # the loop has ended, and with it what could move anything
+            self._loop.call_soon_threadsafe(self._set, "latched", by)
+
+    def _keep_latched(self, by: str) -> Future[str]:
+        assert self._record is not None
+        return self._record.keep(True, by)
+
+    # --- the mesh -------------------------------------------------------------------------------------
 
     async def _asked(self, request: EstopRequest) -> EstopReply:
         if request.latched:
@@ -38,23 +96,29 @@ class LatchKeeper:
         else:
             self._reset_ns = self._node.now_ns()
             self._set("released", request.by)
-        return EstopReply(service=self._node.name, latch=self.state)
+        return EstopReply(service=self._node.name, latch=self.state, text=await self._not_kept())
+
+    async def _not_kept(self) -> str:
+        """Why the disk has not what was set last, or ''."""
+        if self._record is None:
+            return ""
+        try:
+            why = await asyncio.wait_for(asyncio.shield(asyncio.wrap_future(self._record.last)), KEPT_S)
+        except TimeoutError:
+            why = f"{self._record.path}: the disk has not taken it within {KEPT_S:g} s"
+        return f"a restart will not remember this: {why}" if why else ""
 
     def _heard(self, latch: Latch) -> None:
-        now_ns = self._node.now_ns()
-        if not is_fresh(latch.stamp_ns, now_ns, topics.LATCH.max_age_s):
-            return
-        if latch.state == "released":
-            if self.state == "unknown":
-                self._set("released", latch.by)
-        elif latch.state == "latched" and self.state != "latched":
-            if self._reset_ns is not None and 0 <= now_ns - self._reset_ns < _IN_FLIGHT_NS:
-                return
-            self._set("latched", latch.by)
+        if is_fresh(latch.stamp_ns, self._node.now_ns(), topics.LATCH.max_age_s):
+            self.word(latch.state, latch.by)
+
+    # --- both -----------------------------------------------------------------------------------------
 
     def _set(self, state: LatchState, by: str) -> None:
         if state != self.state:
             level = logging.WARNING if state == "latched" else logging.INFO
             self._node.log.log(level, "emergency stop %s by %s", state, by or "?")
+        if self._record is not None:
+            self._record.keep(state == "latched", by)
         self.state = state
         self._changed(state, by)

@@ -92,6 +92,7 @@ async def _main(process: str, run_dir: RunDir, data: dict[str, Any], profile_nam
     from cocoro.clock import FollowedClock, RealClock
     from cocoro.node import Node
     from cocoro.robot import Robot
+    from cocoro.stop.record import latch_dir
 
     profile = profiles.from_data(data, profile_name)
     row = processes.named(process)
@@ -118,6 +119,7 @@ async def _main(process: str, run_dir: RunDir, data: dict[str, Any], profile_nam
                 record_steps=launch.record_steps,
                 module=row.module,
                 config=config,
+                latches=latch_dir(profile.robot),
             ) as node,
         ):
             log.info("joined the mesh at %s", bus.where)

@@ -14,6 +14,7 @@ import logging
 import os
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine
+from pathlib import Path
 from typing import Any, TypeVar
 
 import msgspec
@@ -59,9 +60,12 @@ class Node:
         health_hz: float = 1.0,
         module: str = "",
         config: Any = None,
+        latches: Path | None = None,
     ) -> None:
         """`latency_s` is added to every step of a driven core that gives outputs, as if computing them took longer.
-        `module` and `config` are the component that runs here, for those who ask (see `cocoro.about`)."""
+        `module` and `config` are the component that runs here, for those who ask (see `cocoro.about`).
+        `latches` is the folder of the emergency stop's records; without it nothing is kept, and the stop path is not
+        listened to (a service in a process of its own has it)."""
         self.name = name
         self.bus = bus
         self.clock = clock
@@ -71,6 +75,7 @@ class Node:
         self.record_steps = record_steps
         self.module = module
         self.config = config
+        self.latches = latches
         self.log = logging.getLogger(f"cocoro.{name}")
         self.state: str = "starting"
         self.text = ""
@@ -146,8 +151,12 @@ class Node:
         """Another service in this process, on the same bus and clock: the simulator stands in for four."""
         return Node(
             name, self.bus, self.clock, self.robot, robot_name=self.robot_name, health_hz=self._health_hz,
-            module=self.module, config=self.config,
+            module=self.module, config=self.config, latches=self.latches,
         )  # fmt: skip
+
+    def keep(self, handle: Handle) -> None:
+        """Close this when the node ends."""
+        self._handles.append(handle)
 
     # --- reading ----------------------------------------------------------------------------------
 

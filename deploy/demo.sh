@@ -7,8 +7,8 @@ cocoro=$PWD/.venv/bin/cocoro
 mkdir -p out
 COCORO_RUN_DIR=$(mktemp -d)
 export COCORO_RUN_DIR
-rm -rf out/captures
-export COCORO_CAPTURE_DIR=$PWD/out/captures
+rm -rf out/captures out/state
+export COCORO_CAPTURE_DIR=$PWD/out/captures COCORO_STATE_DIR=$PWD/out/state
 
 finish() {
     "$cocoro" down >/dev/null || true

@@ -26,10 +26,13 @@ from cocoro.launch import CRASHED
 from cocoro.profiles import Profile, from_data
 from cocoro.quit import quit_process
 from cocoro.rundir import RunDir
+from cocoro.stop.record import latch_dir, prepare
+from cocoro.topics import STOPPABLE
 from deploy.child import Child, StartError
 
 STOPPED, MISCONFIGURED, REFUSED = 0, 2, 3
 """Exit codes, as of every command."""
+COMES_UP_STOPPED = "the robot comes up stopped, and `cocoro reset` releases it"
 LEFTOVER_S = 8.0
 """How long the processes of a killed supervisor may take to notice it and end."""
 
@@ -40,10 +43,18 @@ class Supervisor:
     """One robot's processes on this machine. `run` does it all."""
 
     def __init__(
-        self, profile: Profile, run_dir: RunDir, tell: Callable[[str], None], on_up: Callable[[], None] = lambda: None
+        self,
+        profile: Profile,
+        run_dir: RunDir,
+        tell: Callable[[str], None],
+        on_up: Callable[[], None] = lambda: None,
+        *,
+        by_hand: bool = True,
     ) -> None:
+        """`by_hand`: a person started it, and not the machine at its own start."""
         self._profile = profile
         self._run_dir = run_dir
+        self._by_hand = by_hand
         self._on_up = on_up
         self._tell_people = tell
         self._children: list[Child] = []
@@ -60,6 +71,7 @@ class Supervisor:
             self._log_to_file()
             await self._wait_for_leftovers()
             self._run_dir.profile_file.write_bytes(msgspec.json.format(msgspec.json.encode(self._profile)))
+            self._prepare_latches()
             with _signals(self._on_signal):
                 return await self._run()
         finally:
@@ -125,6 +137,22 @@ class Supervisor:
                 raise RefusedError(f"of {self._profile.robot} there runs already: {who}; `cocoro down` ends it")
             await asyncio.sleep(0.05)
 
+    def _prepare_latches(self) -> None:
+        """See to it that the emergency stop's latch has its place on the disk before anything moves."""
+        services = {*self._profile.services()} & {*STOPPABLE, "executive"}
+        folder = latch_dir(self._profile.robot)
+        try:
+            records = prepare(folder, services, by_hand=self._by_hand)
+        except OSError as error:
+            self._tell(
+                f"the emergency stop's latch cannot be kept in {folder}: {error.strerror or error}; {COMES_UP_STOPPED}"
+            )
+            return
+        latched = next((said for said in records.values() if said.latched), None)
+        if latched is not None:
+            when = f", {latched.when}" if latched.when else ""
+            self._tell(f"the emergency stop is latched by {latched.by}{when}; {COMES_UP_STOPPED}")
+
     def _on_signal(self, number: signal.Signals) -> None:
         self._tell("still stopping" if self._stop.is_set() else f"stopping ({number.name})")
         self._stop.set()
@@ -166,12 +194,17 @@ def _notify_service_manager(state: str) -> None:
 
 
 def supervise(
-    profile: Profile, run_dir: RunDir, tell: Callable[[str], None], on_up: Callable[[], None] = lambda: None
+    profile: Profile,
+    run_dir: RunDir,
+    tell: Callable[[str], None],
+    on_up: Callable[[], None] = lambda: None,
+    *,
+    by_hand: bool = True,
 ) -> int:
     """Run a robot in the foreground; returns the exit code. `tell` gets a line for people at a time."""
 
     async def run() -> int:
-        return await Supervisor(profile, run_dir, tell, on_up).run()
+        return await Supervisor(profile, run_dir, tell, on_up, by_hand=by_hand).run()
 
     try:
         return asyncio.run(run())
@@ -206,13 +239,15 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m deploy.supervisor", description="Run a robot, detached.")
     parser.add_argument("--run-dir", type=Path, required=True, help="the robot's folder")
     parser.add_argument("--report-fd", type=int, required=True, help="a pipe to tell through until the robot is up")
+    parser.add_argument("--unattended", action="store_true", help="no person started it")
     options = parser.parse_args()
     pipe = _Pipe(options.report_fd)
     data = json.loads(sys.stdin.buffer.read())
     profile = from_data(data, data.get("name", ""))
     run_dir = RunDir(profile.robot, options.run_dir.parent)
+    by_hand = not options.unattended
     try:
-        code = supervise(profile, run_dir, pipe.line, on_up=lambda: pipe.close(STOPPED))
+        code = supervise(profile, run_dir, pipe.line, on_up=lambda: pipe.close(STOPPED), by_hand=by_hand)
     except OSError as error:  # its traceback goes to supervisor.err, unless that is on the same full disk
         pipe.line(f"{error.filename or run_dir.path}: {error.strerror}; mend it, or choose another by COCORO_RUN_DIR")
         pipe.close(CRASHED)

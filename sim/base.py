@@ -71,10 +71,9 @@ class MobileBase:
         return ""
 
     def set_latch(self, state: LatchState) -> None:
-        """Latched and unknown command zero; a command from before counts no more after the release."""
-        if state != "released":
-            self._valid_until_ns = -1
+        """Latched and unknown command zero; a command from before counts no more after the release. From any thread."""
         self.latch = state
+        self._valid_until_ns = -1
 
     def wheels(self, now_ns: int, dt_s: float) -> tuple[float, float]:
         """Advance the ramp by one step. Returns the wheel speeds that the motors are to turn at, left and right."""

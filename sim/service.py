@@ -139,7 +139,10 @@ class Simulator:
         def changed(state: LatchState, by: str) -> None:
             self._world.set_latch(state, node.name)
 
-        LatchKeeper(node, changed)
+        def halt() -> None:
+            self._world.set_latch("latched", node.name)
+
+        LatchKeeper(node, changed, halt)
 
     def _base_state(self) -> BaseState:
         state = self._world.base_state()

@@ -99,6 +99,11 @@ class Servo:
         counts = max(1, round(speed_radps / SPEED_COUNT_RADPS))
         self.speed_limit_radps = min(counts * SPEED_COUNT_RADPS, self.joint.max_speed_radps)
 
+    @property
+    def commanded(self) -> bool:
+        """Whether a command's time is not over."""
+        return self._valid_until_ns is not None
+
     def hold(self) -> None:
         """Stay at the present position, once, whatever was commanded."""
         self._valid_until_ns = None
@@ -189,9 +194,13 @@ class ServoNetwork:
         self.latch = state
 
     def expire(self, now_ns: int) -> None:
-        """Hold the joints whose commands are over. To be called at every step."""
+        """Hold the joints whose commands are over, by their time or by the emergency stop, which may come from another
+        thread just while a command is taken. To be called at every step."""
         if not self._keeps_goal:
+            over = self.latch != "released"
             for servo in self.servos.values():
+                if over and servo.commanded:
+                    servo.hold()
                 servo.expire(now_ns)
 
     def state(self, now_ns: int) -> ServoState:

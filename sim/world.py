@@ -147,7 +147,7 @@ class World:
         return self._networks[network].command(command, self.time_ns)
 
     def set_latch(self, state: LatchState, service: str | None = None) -> None:
-        """The emergency stop of one of base, arm and hand, or of all."""
+        """The emergency stop of one of base, arm and hand, or of all. From any thread."""
         if service in (None, "base"):
             self._base.set_latch(state)
         for name, network in self._networks.items():

@@ -57,6 +57,12 @@ def mesh(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
     return Local() if request.param == "local" else Zenoh(tmp_path_factory.mktemp("m"))
 
 
+@pytest.fixture(autouse=True)
+def latches_of_this_test(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each test begins on a machine that never knew an emergency stop."""
+    monkeypatch.setenv("COCORO_STATE_DIR", str(tmp_path_factory.mktemp("state")))
+
+
 @pytest.fixture(scope="session", autouse=True)
 def captures_of_tests(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """What robots of tests record goes with the tests."""

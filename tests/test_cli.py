@@ -13,14 +13,14 @@ from typing import Any
 
 import pytest
 
-from cocoro.cli import rehearse
+from cocoro.cli import estop, rehearse
 from cocoro.cli.main import main
 from cocoro.cli.options import frames_of, latencies_of
 from cocoro.cli.running import overrides
 from cocoro.cli.table import table
 from cocoro.errors import CocoroError, ConfigError
 from cocoro.rehearsal import RehearsalRequest
-from cocoro.topics import TOPICS
+from cocoro.topics import STOPPABLE, TOPICS
 
 COMMANDS = (
     "up", "down", "status", "fetch", "follow", "park", "put-down", "estop", "reset", "cancel", "objects", "snapshot",
@@ -84,7 +84,8 @@ def test_bad_usage_exits_with_2_and_no_traceback(arguments: list[str], capsys: p
     "arguments",
     [
         ["fetch", "red_can"], ["park"], ["put-down"], ["cancel"], ["status"], ["objects"], ["snapshot", "out.png"],
-        ["estop"], ["stop"], ["estop", "--robot", "calliope"], ["reset"], ["fetch", "red_can", "--robot", "calliope"],
+        ["estop", "--robot", "nobody"], ["stop", "--robot", "nobody"], ["reset"],
+        ["fetch", "red_can", "--robot", "calliope"],
     ],
     ids=" ".join,
 )  # fmt: skip
@@ -139,11 +140,18 @@ def test_the_topics_page_of_the_documentation_is_up_to_date(capsys: pytest.Captu
 
 
 def test_the_emergency_stop_imports_next_to_nothing() -> None:
-    code = "import sys; from cocoro.cli.main import main; main(['estop']); print(*sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    code = "import sys; from cocoro.cli import main, estop; estop.by_path('nobody'); print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-S", "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
     modules = set(done.stdout.split())
-    assert "zenoh" in modules
-    assert modules.isdisjoint({"numpy", "scipy", "cv2", "typer", "click", "rich", "cocoro.node", "cocoro.cli.app"})
+    assert {name for name in modules if name.startswith("cocoro")} == {
+        "cocoro", "cocoro.cli", "cocoro.cli.main", "cocoro.cli.exits", "cocoro.cli.estop", "cocoro.quit", "cocoro.stop",
+        "cocoro.stop.asking",
+    }  # fmt: skip
+    assert modules.isdisjoint({"asyncio", "argparse", "json", "pathlib", "typing_extensions", "msgspec", "zenoh"})
+
+
+def test_the_emergency_stop_knows_what_can_be_stopped() -> None:
+    assert estop.STOPPABLE == STOPPABLE
 
 
 # --- rehearse -------------------------------------------------------------------------------------

@@ -16,7 +16,8 @@ import pytest
 
 from cocoro.bus.endpoints import default
 from cocoro.bus.zenoh import ZenohBus
-from cocoro.cli import estop, exits, objects, reset, snapshot, status
+from cocoro.cli import estop_mesh, exits, objects, reset, snapshot, status
+from cocoro.cli.estop import Stop
 from cocoro.cli.link import Where
 from cocoro.clock import RealClock
 from cocoro.errors import ConfigError
@@ -84,9 +85,9 @@ def answering(node: Node, latch: str, text: str = "") -> None:
     node.serve(ESTOP.of(node.name), answer)
 
 
-async def stop() -> estop.Stop:
+async def stop() -> Stop:
     run_dir = RunDir("calliope")
-    return await estop.stop(run_dir, run_dir.join_as("operator"), time.monotonic(), lambda _: None)
+    return await estop_mesh.stop(run_dir, run_dir.join_as("operator"), time.monotonic())
 
 
 def test_an_emergency_stop_latches_all_that_moves(root: Path) -> None:
@@ -101,7 +102,7 @@ def test_an_emergency_stop_latches_all_that_moves(root: Path) -> None:
 
 
 def test_one_that_does_not_acknowledge_is_named_and_asked_again(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(estop, "GIVE_UP_S", 0.5)
+    monkeypatch.setattr(estop_mesh, "GIVE_UP_S", 0.5)
 
     async def scenario() -> None:
         async with robot("base", "arm", "hand", without_latch=("hand",)) as calliope:
@@ -116,7 +117,7 @@ def test_one_that_does_not_acknowledge_is_named_and_asked_again(root: Path, monk
 def test_one_that_is_held_by_a_process_but_is_not_on_the_mesh_counts_as_not_stopped(
     root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(estop, "GIVE_UP_S", 0.2)
+    monkeypatch.setattr(estop_mesh, "GIVE_UP_S", 0.2)
 
     async def scenario() -> None:
         held = RunDir("calliope").claim("base", ["base"])

@@ -43,9 +43,12 @@ async def test_a_restarted_executive_believes_whoever_is_latched() -> None:
 
 
 @in_virtual_time
-async def test_a_restarted_executive_goes_on_where_the_hardware_does() -> None:
+async def test_a_restarted_executive_goes_on_where_all_of_the_hardware_does() -> None:
     async with robot(ready=False) as it:
-        it.says = {"base": "released"}
+        it.says = {"base": "released", "arm": "unknown"}
+        await it.service.advance(10.0)
+        assert it.latch() == "unknown", "the hand may have been told to stop meanwhile"
+        it.says = {"base": "released", "arm": "unknown", "hand": "released"}
         await it.service.advance(0.2)
         assert it.latch() == "released"
 

@@ -70,21 +70,25 @@ class Bench:
 class FakeService:
     """Stands in for the service: the other end of a guard's socket."""
 
-    def __init__(self, port: str, mode: str = "safe") -> None:
+    def __init__(self, port: str, mode: str = "safe", robot: str = "") -> None:
         self.channel, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self.channel.settimeout(30.0)
         environment = os.environ | {"PYTHONPATH": os.pathsep.join(_PACKAGES)}
         command = [sys.executable, "-S", "-P", "-m", "services.base.guard", port, "--fd", str(theirs.fileno())]
+        arguments = ["--mode", mode, *(["--robot", robot] if robot else [])]
         with theirs:
-            self.guard = subprocess.Popen([*command, "--mode", mode], env=environment, pass_fds=(theirs.fileno(),))
+            self.guard = subprocess.Popen(command + arguments, env=environment, pass_fds=(theirs.fileno(),))
         self._asking = threading.Event()
         self._thread: threading.Thread | None = None
         self.asked_ns = 0
         """When it asked last."""
+        self.reset = 0
+        """How many emergency stops it says that have been reset."""
 
     def ask(self, left: int, right: int, for_s: float = 0.2) -> None:
         self.asked_ns = time.monotonic_ns()
-        self.send({"left": left, "right": right, "until": self.asked_ns + round(for_s * 1e9)})
+        until_ns = self.asked_ns + round(for_s * 1e9)
+        self.send({"left": left, "right": right, "until": until_ns, "reset": self.reset})
 
     def send(self, message: Any) -> None:
         self.channel.send(message if isinstance(message, bytes) else json.dumps(message).encode())
@@ -122,8 +126,8 @@ class FakeService:
 
 
 @contextmanager
-def guarded(bench: Bench, mode: str = "safe") -> Iterator[FakeService]:
-    service = FakeService(bench.port, mode)
+def guarded(bench: Bench, mode: str = "safe", robot: str = "") -> Iterator[FakeService]:
+    service = FakeService(bench.port, mode, robot)
     try:
         yield service
     finally:

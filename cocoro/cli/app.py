@@ -267,6 +267,9 @@ def up(
     latency: Latency = None,
     objects: Objects = None,
     set_: Set = None,
+    unattended: Annotated[
+        bool, typer.Option("--unattended", help="No person starts it: its first start comes up stopped.")
+    ] = False,
 ) -> None:
     """Start a robot's processes and stay until Ctrl-C (or, with --detach, until they are ready)."""
     from cocoro import profiles
@@ -277,7 +280,7 @@ def up(
         overrides.insert(0, running.objects_of(objects))
     overrides[:0] = running.model_of(model, reach, adapt)
     read = profiles.read(profile, overrides)
-    sys.exit(running.up_detached(read) if detach else running.up(read))
+    sys.exit(running.up_detached(read, unattended) if detach else running.up(read, unattended))
 
 
 @app.command(rich_help_panel=RUNNING)

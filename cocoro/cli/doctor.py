@@ -15,7 +15,7 @@ from pathlib import Path
 
 from cocoro import profiles
 from cocoro.checks import Check, bad, note, ok
-from cocoro.cli import exits
+from cocoro.cli import doctor_stop, exits
 from cocoro.errors import ConfigError
 from cocoro.processes import Process, load
 from cocoro.profiles import Profile
@@ -71,6 +71,7 @@ def examine(profile: Profile) -> Iterator[Check]:
     yield _clock(profile)
     yield from _disk(run_dir)
     yield from _mesh(profile, run_dir)
+    yield from doctor_stop.check(profile.robot)
 
 
 def _robot(profile: Profile) -> tuple[Robot, Check | None]:

@@ -1,38 +1,27 @@
-"""`cocoro estop`, in short `stop`: from Enter to wheels halted in under half a second.
+"""`cocoro estop`, in short `stop`: first by the stop path, which nothing can deny, then by the mesh where that left
+something open.
 
-So nothing is imported here that it can do without: no command line library, no numbers library, no node.
+The stop path is used before anything else is imported or read, so it takes no longer than Python takes to start.
 """
 
 from __future__ import annotations
 
-import argparse
-import asyncio
-import json
 import os
 import sys
 import time
-from collections.abc import Callable
-from contextlib import suppress
-from dataclasses import replace
-from pathlib import Path
 from typing import NamedTuple
 
-import msgspec
-
-from cocoro.bus.endpoints import ZenohConfig
-from cocoro.bus.zenoh import ZenohBus
 from cocoro.cli import exits
-from cocoro.errors import CallTimeoutError, CocoroError, ConfigError, MeshError
-from cocoro.messages import EstopReply, EstopRequest
-from cocoro.rundir import RunDir, robots
-from cocoro.topics import ESTOP, STOPPABLE
+from cocoro.stop.asking import Asking, Point
 
-ROUND_S = 0.3
-"""How long one round of asking waits for those that do not answer."""
-PAUSE_S = 0.05
-GIVE_UP_S = 3.0
-PATIENCE_S = 0.15
-"""How long joining the mesh waits for members that do not answer (a stopped process, say)."""
+STOPPABLE = ("base", "arm", "hand")
+"""As `cocoro.topics` has it, which takes its time to import."""
+EXECUTIVE = "executive"
+"""It is told so that it ends its task. It moves nothing itself, so nobody waits for it to find its tongue."""
+ACKNOWLEDGE_S = 0.6
+"""How long the stop path waits for acknowledgements before the mesh is tried, too."""
+KEPT_S = 0.3
+"""How long it then waits to hear whether the latches are on the disk."""
 
 
 class Stop(NamedTuple):
@@ -45,7 +34,13 @@ class Stop(NamedTuple):
     absent: tuple[str, ...]
     """Nobody there to acknowledge."""
     seconds: float
-    """From Enter to the last acknowledgement."""
+    """From Enter to the moment at which the last of them stopped what it moves."""
+    not_kept: tuple[str, ...] = ()
+    """Why latches will not outlive a restart."""
+    owner: int | None = None
+    """User id of a robot that is another's."""
+    latched_ns: dict[str, int] = {}  # noqa: RUF012 # read only
+    """When each service stopped what it moves, CLOCK_MONOTONIC; by the stop path alone."""
 
     @property
     def code(self) -> int:
@@ -54,127 +49,152 @@ class Stop(NamedTuple):
         return exits.DONE if any(service in STOPPABLE for service in self.acknowledged) else exits.NO_MESH
 
     def __str__(self) -> str:
-        text = f"{self.robot}: stopped {', '.join(self.acknowledged) or 'nothing'} in {self.seconds:.2f} s"
+        whose = "" if self.owner is None else f" (of user {self.owner})"
+        text = f"{self.robot}{whose}: stopped {', '.join(self.acknowledged) or 'nothing'} in {self.seconds:.2f} s"
         if self.missing:
             text += f"; NOT ACKNOWLEDGED by {', '.join(self.missing)}"
         if self.absent:
             text += f"; not there: {', '.join(self.absent)}"
+        if self.not_kept:
+            text += f"; A RESTART WILL FORGET IT: {', '.join(self.not_kept)}"
         return text
 
 
 def main(command: str, arguments: list[str]) -> int:
+    robot, profile, as_json = None, None, False
+    if arguments:
+        import argparse
+
+        parser = argparse.ArgumentParser(
+            prog=f"cocoro {command}",
+            description="Latch the emergency stop: wheels, arm and hand hold still until `cocoro reset`. "
+            "Without --robot and --profile every robot on this machine is stopped, whoever's it is.",
+            epilog="Exit code 0 when every service that moves something has acknowledged, 1 when one has not "
+            "(it is named), 4 when no robot is there.",
+        )
+        parser.add_argument("--robot", metavar="NAME")
+        parser.add_argument("--profile", metavar="FILE", help="reach it as this profile says, on another machine")
+        parser.add_argument("--json", action="store_true", help="print one JSON object a robot")
+        try:
+            options = parser.parse_args(arguments)
+        except SystemExit as end:
+            return end.code if isinstance(end.code, int) else exits.USAGE
+        robot, profile, as_json = options.robot, options.profile, options.json
+    if profile is not None:
+        from cocoro import profiles
+        from cocoro.errors import ConfigError
+
+        try:
+            robot = robot or profiles.read(profile).robot
+        except ConfigError as error:
+            print(f"cocoro: {error}", file=sys.stderr)
+            return exits.USAGE
+    stops, troubles = by_path(robot)
     started_s = _process_start_s()
-    parser = argparse.ArgumentParser(
-        prog=f"cocoro {command}",
-        description="Latch the emergency stop: wheels, arm and hand hold still until `cocoro reset`. "
-        "Without --robot and --profile every robot that is up on this machine is stopped.",
-        epilog="Exit code 0 when every service that moves something has acknowledged, 1 when one has not "
-        "(it is named), 4 when no robot is there.",
-    )
-    parser.add_argument("--robot", metavar="NAME")
-    parser.add_argument("--profile", metavar="FILE", help="reach the robot as this profile says, on another machine")
-    parser.add_argument("--json", action="store_true", help="print one JSON object a robot")
+    if profile is not None or not stops or any(stop.missing for stop in stops):
+        stops, troubles, code = _by_mesh_too(robot, profile, started_s, stops, troubles)
+    else:
+        code = exits.DONE
+    for stop in stops:
+        _say(stop, as_json)
+        code = code or stop.code
+    for trouble in troubles:
+        print(f"cocoro: {trouble}", file=sys.stderr)
+    return code
+
+
+def by_path(robot: str | None) -> tuple[list[Stop], list[str]]:
+    """Stop by the stop path; how it went with each robot, and what was in the way."""
     try:
-        options = parser.parse_args(arguments)
-        found = _robots(options.robot, options.profile)
-    except SystemExit as end:
-        return end.code if isinstance(end.code, int) else exits.USAGE
-    except ConfigError as error:
-        print(f"cocoro: {error}", file=sys.stderr)
-        return exits.USAGE
-    if not found:
-        which = "no robot" if options.robot is None else f"no {options.robot}"
-        print(f"cocoro: {which} is up on this machine: start one with `cocoro up sim`", file=sys.stderr)
-        return exits.NO_MESH
-    return asyncio.run(_stop_all(found, started_s, options.json))
+        with Asking(robot) as asking:
+            asking.go_on(time.monotonic() + ACKNOWLEDGE_S)
+            asking.hear_of_the_disk(time.monotonic() + KEPT_S)
+    except OSError as error:
+        return [], [f"the stop path cannot be used ({error}): the mesh alone was asked"]
+    started_s = _process_start_s()
+    groups: dict[tuple[int, str], list[Point]] = {}
+    for point in asking.points.values():
+        if not point.gone:
+            groups.setdefault((point.uid, point.robot), []).append(point)
+    return [_stop_of(uid, name, points, started_s) for (uid, name), points in groups.items()], []
+
+
+def _stop_of(uid: int, robot: str, points: list[Point], started_s: float) -> Stop:
+    there = {point.service for point in points}
+    silent = {point.service for point in points if point.latched_ns is None}
+    acknowledged = sorted(there - silent, key=_in_order)
+    missing = silent - {EXECUTIVE}
+    latched_s = [point.latched_ns / 1e9 for point in points if point.latched_ns is not None]
+    return Stop(
+        robot,
+        tuple(acknowledged),
+        tuple(sorted(missing, key=_in_order)),
+        tuple(service for service in STOPPABLE if service not in there),
+        max(latched_s, default=time.monotonic()) - started_s,
+        tuple(dict.fromkeys(point.why_not_kept for point in points if point.kept is False)),
+        None if uid == os.getuid() else uid,
+        {point.service: point.latched_ns for point in points if point.latched_ns is not None},
+    )
+
+
+def _in_order(service: str) -> tuple[int, str]:
+    """What moves first, in the order in which people name it."""
+    return STOPPABLE.index(service) if service in STOPPABLE else len(STOPPABLE), service
+
+
+def _by_mesh_too(
+    robot: str | None, profile: str | None, started_s: float, stops: list[Stop], troubles: list[str]
+) -> tuple[list[Stop], list[str], int]:
+    """Ask on the mesh what the stop path left open: what both know of each robot, what was in the way, exit code."""
+    from cocoro.cli import estop_mesh
+    from cocoro.errors import CocoroError, ConfigError
+
+    done = {stop.robot for stop in stops if not stop.missing and profile is None}
+    try:
+        which = [(run_dir, config) for run_dir, config in estop_mesh.found(robot, profile) if run_dir.robot not in done]
+        if not which and not stops:
+            name = "no robot" if robot is None else f"no {robot}"
+            return [], [*troubles, f"{name} is up on this machine: start one with `cocoro up sim`"], exits.NO_MESH
+        by_mesh, errors = estop_mesh.stop_all(which, started_s)
+    except (CocoroError, OSError) as error:
+        code = exits.USAGE if isinstance(error, ConfigError) else exits.FAILED
+        return stops, [*troubles, str(error)], code if not stops else exits.DONE
+    troubles = [*troubles, *map(str, errors)]
+    code = exits.DONE if by_mesh or stops or not errors else exits.NO_MESH
+    return [*_merged(stops, by_mesh)], troubles, code
+
+
+def _merged(by_path: list[Stop], by_mesh: list[Stop]) -> list[Stop]:
+    """What either way acknowledged is stopped."""
+    found = {stop.robot: stop for stop in by_mesh}
+    merged = []
+    for one in by_path:
+        if (other := found.pop(one.robot, None) if one.owner is None else None) is not None:
+            acknowledged = sorted({*one.acknowledged, *other.acknowledged}, key=_in_order)
+            missing = tuple(name for name in one.missing if name not in acknowledged)
+            absent = tuple(name for name in one.absent if name not in acknowledged)
+            seconds = max(one.seconds, other.seconds)
+            one = one._replace(acknowledged=tuple(acknowledged), missing=missing, absent=absent, seconds=seconds)
+        merged.append(one)
+    return [*merged, *found.values()]
+
+
+def _say(stop: Stop, as_json: bool) -> None:
+    if as_json:
+        import json
+
+        text = json.dumps(stop._asdict())
+    else:
+        text = str(stop)
+    print(text, file=sys.stderr if stop.code and not as_json else sys.stdout, flush=True)
 
 
 def _process_start_s() -> float:
     """When this process was started, on the monotonic clock: the operator's Enter, to 10 ms (proc_pid_stat(5))."""
     try:
-        ticks = int(Path("/proc/self/stat").read_text().rpartition(")")[2].split()[19])
+        with open("/proc/self/stat") as stat:  # noqa: PTH123 # pathlib takes as long to import as the stop itself
+            ticks = int(stat.read().rpartition(")")[2].split()[19])
         age_s = time.clock_gettime(time.CLOCK_BOOTTIME) - ticks / os.sysconf("SC_CLK_TCK")
-    except (OSError, AttributeError):  # not Linux
+    except (OSError, AttributeError):  # no /proc
         age_s = 0.0
     return time.monotonic() - age_s
-
-
-def _robots(robot: str | None, profile: str | None) -> list[tuple[RunDir, ZenohConfig]]:
-    """Those to be stopped, and how to reach each."""
-    if profile is not None:
-        from cocoro import profiles
-
-        said = profiles.read(profile)
-        run_dir = RunDir(robot or said.robot)
-        return [(run_dir, run_dir.join_as("operator", said.mesh))]
-    here = robots() if robot is None else [run_dir for run_dir in (RunDir(robot),) if run_dir.populated]
-    return [(run_dir, run_dir.join_as("operator")) for run_dir in here]
-
-
-async def _stop_all(found: list[tuple[RunDir, ZenohConfig]], started_s: float, as_json: bool) -> int:
-    def say(result: Stop) -> None:
-        text = json.dumps(result._asdict()) if as_json else str(result)
-        print(text, file=sys.stderr if result.code and not as_json else sys.stdout, flush=True)
-
-    stops = (stop(run_dir, config, started_s, say) for run_dir, config in found)
-    results = await asyncio.gather(*stops, return_exceptions=True)
-    code = exits.DONE
-    for (run_dir, _), result in zip(found, results, strict=True):
-        if isinstance(result, Stop):
-            code = code or result.code
-        elif isinstance(result, CocoroError):
-            print(f"cocoro: {run_dir.robot}: {result}", file=sys.stderr)
-            code = code or (exits.NO_MESH if isinstance(result, MeshError) else exits.FAILED)
-        else:
-            raise result
-    return code
-
-
-async def stop(run_dir: RunDir, config: ZenohConfig, started_s: float, say: Callable[[Stop], None]) -> Stop:
-    """Latch one robot's emergency stop: ask again and again until all who run and move have acknowledged.
-
-    `say` gets the result at once; leaving the mesh may take a while. Raises MeshError when that is not there.
-    """
-    async with await ZenohBus.open(replace(config, patience_s=PATIENCE_S), expect_mesh=True) as bus:
-        acknowledged: dict[str, float] = {}
-        waited = False
-        while True:
-            living, answers = await asyncio.gather(_living(run_dir, bus), _ask(run_dir.robot, bus))
-            took_s = time.monotonic() - started_s
-            for service in answers:
-                acknowledged.setdefault(service, took_s)
-            waiting = [service for service in STOPPABLE if service not in acknowledged]
-            missing = tuple(service for service in waiting if service in living)
-            if not missing or took_s > GIVE_UP_S:
-                break
-            if not waited:
-                print(f"{run_dir.robot}: waiting for {', '.join(missing)}", file=sys.stderr, flush=True)
-            waited = True
-            await asyncio.sleep(PAUSE_S)
-        absent = tuple(service for service in waiting if service not in living)
-        took_s = took_s if missing else max(acknowledged.values(), default=took_s)
-        result = Stop(run_dir.robot, tuple(acknowledged), missing, absent, took_s)
-        say(result)
-        return result
-
-
-async def _ask(robot: str, bus: ZenohBus) -> list[str]:
-    """Ask everybody once; the services that say they are latched."""
-    question = msgspec.msgpack.encode(EstopRequest(latched=True, by="operator"))
-    try:
-        replies = await bus.call(ESTOP.of("*").key(robot), question, ROUND_S)
-    except CallTimeoutError:
-        return []
-    latched = []
-    for reply in replies:
-        with suppress(msgspec.MsgspecError):
-            answer = msgspec.msgpack.decode(reply.payload, type=EstopReply) if reply.ok else None
-            if answer is not None and answer.latch == "latched":
-                latched.append(answer.service)
-    return latched
-
-
-async def _living(run_dir: RunDir, bus: ZenohBus) -> set[str]:
-    """The services that are alive on the mesh, and those that a process here is, though it may have been stopped."""
-    tokens = await bus.alive(f"{run_dir.robot}/*/alive", ROUND_S)
-    return {token.split("/")[1] for token in tokens} | set(run_dir.claims())

@@ -21,9 +21,13 @@ async def reset(where: Where) -> int:
             raise MeshError(f"nothing that moves is alive on {link.robot}: `cocoro status` tells more")
         if "executive" in alive and _refused({"executive"}, await link.call_all(ESTOP.of("executive"), question)):
             return exits.REFUSED
-        if _refused(moving, await link.call_all(ESTOP.of("*"), question)):
+        answers = await link.call_all(ESTOP.of("*"), question)
+        if _refused(moving, answers):
             return exits.REFUSED
     print(f"{link.robot}: released {', '.join(sorted(moving))}")
+    for answer in answers:
+        if answer.reply is not None and answer.reply.text:
+            print(f"cocoro: {answer.service}: {answer.reply.text}", file=sys.stderr)
     return exits.DONE
 
 

@@ -81,22 +81,25 @@ def scene_of(scene: str) -> str:
     return str(Path(scene).resolve())
 
 
-def up(profile: Profile) -> int:
+def up(profile: Profile, unattended: bool) -> int:
     """Supervise a robot in the foreground."""
     run_dir = RunDir(profile.robot)
-    code: int = importlib.import_module(SUPERVISOR).supervise(profile, run_dir, _say, lambda: _say("Ctrl-C stops it"))
+    code: int = importlib.import_module(SUPERVISOR).supervise(
+        profile, run_dir, _say, lambda: _say("Ctrl-C stops it"), by_hand=not unattended
+    )
     return code
 
 
-def up_detached(profile: Profile) -> int:
+def up_detached(profile: Profile, unattended: bool) -> int:
     """Start a supervisor of its own, and return when the robot is up or could not be started."""
     run_dir = RunDir(profile.robot)
     run_dir.make()
     reader_fd, writer_fd = os.pipe()
     errors = run_dir.logs / "supervisor.err"
+    command = [sys.executable, "-P", "-m", SUPERVISOR, "--run-dir", str(run_dir.path), "--report-fd", str(writer_fd)]
     with errors.open("wb") as stderr:
         process = subprocess.Popen(
-            [sys.executable, "-P", "-m", SUPERVISOR, "--run-dir", str(run_dir.path), "--report-fd", str(writer_fd)],
+            command + ["--unattended"] * unattended,
             stdin=subprocess.PIPE,
             stdout=stderr,
             stderr=stderr,

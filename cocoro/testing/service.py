@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Awaitable, Callable, Mapping
+from pathlib import Path
 from types import TracebackType
 from typing import Any, TypeVar
 
@@ -40,6 +41,7 @@ class ServiceUnderTest:
         mesh: LocalMesh | None = None,
         latency_s: float = 0.0,
         record_steps: bool = False,
+        latches: Path | None = None,
     ) -> None:
         """`component` is a module's name ('services.planning.service') or a loaded component; `config` its settings
         (defaults where there are none). The service's name is that of the module's folder unless one is given."""
@@ -58,7 +60,7 @@ class ServiceUnderTest:
         self._bus = self.mesh.join()
         self.node = Node(
             self.name, self._bus, self._clock, self.robot, latency_s=latency_s, record_steps=record_steps,
-            module=module, config=self._config,
+            module=module, config=self._config, latches=latches,
         )  # fmt: skip
         self.tester = Node("tester", self.mesh.join(), self._clock, self.robot)
         """Another participant of the mesh, for what this class has no word for."""

@@ -31,6 +31,8 @@ class Report(msgspec.Struct):
     left: int
     """mm/s, as the Create was told last."""
     right: int
+    stops: int = 0
+    """Emergency stops that the guard has heard by itself."""
     damage: int = 0
     """Bytes and commands so far that were damaged on the line."""
     readings: dict[int, int] | None = None
@@ -71,10 +73,10 @@ class BaseDriver:
         self._until_ns = min(command.stamp_ns, now_ns) + self._timeout_ns
 
     def set_latch(self, state: LatchState) -> None:
-        """Latched and unknown stop the wheels; a command from before counts no more after the release."""
-        if state != "released":
-            self._until_ns = -1
+        """Latched and unknown stop the wheels; a command from before counts no more after the release. From any
+        thread."""
         self.latch = state
+        self._until_ns = -1
 
     def new_epoch(self) -> None:
         """The clock began anew: what was commanded and heard before is of no time that there is."""

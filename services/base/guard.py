@@ -6,13 +6,15 @@ the base service: it passes on what the service asks of the wheels while the ser
 - 0.2 s after the service has asked last (it hangs, it was stopped, it has too much to do),
 - at once when the service's end of the socket closes (it crashed, it was killed),
 - at once on SIGTERM, and on any error of its own,
+- at once when somebody says stop to its own address of the stop path, `ROBOT/wheels` (`cocoro.stop.path`),
 - by the reflexes of `services.base.keeper`: bumpers, cliffs, wheel drops, a Create that left its mode.
 
-    python -m services.base.guard PORT --fd N --mode safe --deadman-ms 200
+    python -m services.base.guard PORT --fd N --robot NAME --mode safe --deadman-ms 200
 
-`--fd` is its end of a SOCK_SEQPACKET pair. Down come {"left": mm/s, "right": mm/s, "until": ns} and {"recover": true},
-up goes a report for each frame, and twenty a second when there are none (`Report` in `services.base.driver`). Times are
-CLOCK_MONOTONIC, which all processes of a machine share. It needs pyserial and nothing else beyond Python.
+`--fd` is its end of a SOCK_SEQPACKET pair. Down come {"left": mm/s, "right": mm/s, "until": ns, "reset": how many
+emergency stops have been reset} and {"recover": true}, up goes a report for each frame, and twenty a second when there
+are none (`Report` in `services.base.driver`). Times are CLOCK_MONOTONIC, which all processes of a machine share. Beyond
+Python and this project's stop path it needs pyserial.
 """
 
 from __future__ import annotations
@@ -32,6 +34,7 @@ from contextlib import suppress
 
 import serial
 
+from cocoro.stop.path import Asked, StopPoint
 from services.base import oi
 from services.base.keeper import MS, Keeper
 
@@ -54,10 +57,11 @@ SENTENCES = {
 class Guard:
     """Keeps one port by one `Keeper`."""
 
-    def __init__(self, path: str, keeper: Keeper, channel: socket.socket) -> None:
+    def __init__(self, path: str, keeper: Keeper, channel: socket.socket, point: StopPoint | None = None) -> None:
         self._path = path
         self._keeper = keeper
         self._channel = channel
+        self._point = point
         self._port: serial.Serial | None = None
         self._why = "not opened yet"
         self._reported_ns = 0
@@ -67,8 +71,9 @@ class Guard:
         """Take what has come in, write what is due. False when the service is gone."""
         if self._port is None:
             self._open()
-        descriptors = [self._channel] if self._port is None else [self._channel, self._port]
+        descriptors = [one for one in (self._channel, self._port, self._point) if one is not None]
         readable, _, _ = select.select(descriptors, [], [], TURN_S)
+        stops = self._take_stops() if self._point in readable else []
         if self._channel in readable and not self._take_commands():
             return False
         now_ns = time.monotonic_ns()
@@ -79,6 +84,8 @@ class Guard:
                 self._write(self._port, self._keeper.poll(now_ns))
             except OSError as error:  # pyserial's own errors are such, too
                 self._lose(_plain(error, self._path))
+        for asked in stops:
+            self._answer(asked, now_ns)
         if now_ns - self._reported_ns > QUIET_NS:
             self._report(now_ns)
         return True
@@ -136,6 +143,21 @@ class Guard:
             with suppress(BlockingIOError):
                 os.write(port.fileno(), data)
 
+    def _take_stops(self) -> list[Asked]:
+        """Stops that have come in; many of them are taken in several turns, so that the port is not forgotten."""
+        assert self._point is not None
+        stops: list[Asked] = []
+        while len(stops) < 16 and (asked := self._point.take(wait=False)) is not None:
+            self._keeper.stop()
+            stops.append(asked)
+        return stops
+
+    def _answer(self, asked: Asked, at_ns: int) -> None:
+        """The service above keeps the latch on disk."""
+        assert self._point is not None
+        self._point.latched(asked, at_ns)
+        self._point.keeps_nothing(asked)
+
     def _take_commands(self) -> bool:
         """False when the other end is closed."""
         for _ in range(16):
@@ -155,6 +177,7 @@ class Guard:
         try:
             command = json.loads(message)
             if "until" in command:
+                self._keeper.reset(int(command.get("reset", 0)))
                 self._keeper.ask(int(command["left"]), int(command["right"]), int(command["until"]), now_ns)
             elif command.get("recover"):
                 self._keeper.recover(now_ns)
@@ -170,6 +193,7 @@ class Guard:
             "why": self._why or self._keeper.allowed(now_ns).why,
             "left": wheels.left_mmps,
             "right": wheels.right_mmps,
+            "stops": self._keeper.stops,
             "damage": self._keeper.damage,
             "readings": readings,
             "counts_lost": self._keeper.take_counts_lost() if readings is not None else False,
@@ -188,6 +212,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m services.base.guard", description="Own a Create's serial port.")
     parser.add_argument("port")
     parser.add_argument("--fd", type=int, required=True, help="this process's end of a socket pair")
+    parser.add_argument("--robot", help="whose emergency stop to hear; without it there is none")
     parser.add_argument("--mode", choices=("safe", "full"), default="safe")
     parser.add_argument("--deadman-ms", type=int, default=200)
     options = parser.parse_args()
@@ -200,7 +225,8 @@ def main() -> int:
     channel = socket.socket(fileno=options.fd)
     channel.setblocking(False)
     fcntl.fcntl(channel, fcntl.F_SETFD, fcntl.FD_CLOEXEC)
-    guard = Guard(options.port, Keeper(options.mode, options.deadman_ms * MS), channel)
+    point = StopPoint(options.robot, "wheels") if options.robot else None
+    guard = Guard(options.port, Keeper(options.mode, options.deadman_ms * MS), channel, point)
     try:
         while not told and guard.turn():
             pass

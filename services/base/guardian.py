@@ -37,10 +37,14 @@ _PACKAGES = (str(Path(__file__).parents[2]), str(Path(serial.__file__).parents[1
 class Guardian:
     """Use it as an asynchronous context manager. `heard(report)` is called in the event loop."""
 
-    def __init__(self, port: str, mode: str, deadman_s: float, heard: Callable[[Report], None]) -> None:
+    def __init__(
+        self, port: str, mode: str, deadman_s: float, heard: Callable[[Report], None], robot: str | None = None
+    ) -> None:
+        """`robot`: whose emergency stop the guard hears by itself."""
         self.starts = 0
         self._port = port
         self._arguments = ["--mode", mode, "--deadman-ms", str(round(deadman_s * 1000))]
+        self._arguments += ["--robot", robot] if robot else []
         self._heard = heard
         self._channel: socket.socket | None = None
         self._process: subprocess.Popen[bytes] | None = None
@@ -65,9 +69,14 @@ class Guardian:
     def pid(self) -> int | None:
         return None if self._process is None else self._process.pid
 
-    def ask(self, left_mmps: int, right_mmps: int, for_ns: int) -> None:
-        """Ask for wheel speeds, for so long from now. To be called steadily: it is what keeps the wheels turning."""
-        self._send({"left": left_mmps, "right": right_mmps, "until": time.monotonic_ns() + for_ns})
+    def ask(self, left_mmps: int, right_mmps: int, for_ns: int, reset: int = 0) -> None:
+        """Ask for wheel speeds, for so long from now. To be called steadily: it is what keeps the wheels turning.
+        `reset`: how many of the emergency stops that the guard heard have been reset."""
+        self._send({"left": left_mmps, "right": right_mmps, "until": time.monotonic_ns() + for_ns, "reset": reset})
+
+    def halt(self) -> None:
+        """Ask for no speed at all, from any thread."""
+        self._send({"left": 0, "right": 0, "until": time.monotonic_ns()})
 
     def recover(self) -> None:
         self._send({"recover": True})
@@ -142,9 +151,9 @@ class Guardian:
             channel.close()
 
     def _send(self, message: dict[str, int | bool]) -> None:
-        if self._channel is not None:
-            with suppress(BlockingIOError, ConnectionError):  # a dead guard is noticed by its silence
-                self._channel.send(json.dumps(message).encode())
+        if (channel := self._channel) is not None:
+            with suppress(OSError):  # a dead guard is noticed by its silence
+                channel.send(json.dumps(message).encode())
 
 
 def _write(port: str, command: bytes) -> None:

@@ -77,6 +77,9 @@ class Keeper:
         """What the Create was told last."""
         self.damage = 0
         """Bytes so far that were no part of a good frame, and commands that did not arrive as they were sent."""
+        self.stops = 0
+        """Emergency stops so far; the wheels stand until each of them has been reset."""
+        self._reset_stops = 0
         self._mode = mode
         self._deadman_ns = deadman_ns
         self._parser = oi.StreamParser((SHORT, LONG))
@@ -112,6 +115,14 @@ class Keeper:
         """Wheel speeds, until then and never for longer than the deadman."""
         self._wanted = Wheels(oi.harmless(left_mmps), oi.harmless(right_mmps))
         self._until_ns = min(until_ns, now_ns + self._deadman_ns)
+
+    def stop(self) -> None:
+        """Emergency stop: what is asked of the wheels does not count until a reset that knows of this stop."""
+        self.stops += 1
+
+    def reset(self, stops: int) -> None:
+        """So many of the emergency stops have been reset by the robot's owner."""
+        self._reset_stops = min(max(stops, 0), self.stops)
 
     def recover(self, now_ns: int) -> None:
         """Somebody says that a Create that left its mode may go on."""
@@ -180,6 +191,8 @@ class Keeper:
         """What the wheels may do now, and why not more."""
         if self.link != "up":
             return Wheels(0, 0, "mode" if self.link == "fallen" else "link")
+        if self.stops > self._reset_stops:
+            return Wheels(0, 0, "estop")
         if now_ns > self._until_ns:
             return Wheels(0, 0, "no command")
         return reflex(self._wanted, self.readings)

@@ -38,10 +38,13 @@ class BaseService:
         self._node = node
         self._driver = BaseDriver(node.robot.base)
         port = port_path(config.port, node.robot_name)
-        self.guardian = Guardian(port, config.mode, config.guard_timeout_s, self._heard)
+        robot = node.robot_name if node.latches is not None else None
+        self.guardian = Guardian(port, config.mode, config.guard_timeout_s, self._heard, robot)
+        self._stops = self._reset_stops = 0
+        """Emergency stops that the guard has heard by itself, and those of them that were reset."""
         self._epoch = node.clock.epoch
         self._changed = asyncio.Event()
-        LatchKeeper(node, self._latched)
+        self._keeper = LatchKeeper(node, self._latched, self._halt)
         node.on(topics.BASE_COMMAND, self._commanded)
         node.serve(topics.RECOVER, self._recover)
 
@@ -65,18 +68,30 @@ class BaseService:
         if self._node.clock.epoch != self._epoch:
             self._epoch = self._node.clock.epoch
             self._driver.new_epoch()
-        self.guardian.ask(*self._driver.wheels(self._node.now_ns()))
+        self.guardian.ask(*self._driver.wheels(self._node.now_ns()), self._reset_stops)
 
     def _commanded(self, command: BaseCommand) -> None:
         self._driver.command(command, self._node.now_ns())
         self._ask()
 
     def _latched(self, state: LatchState, by: str) -> None:
+        if state == "released":
+            self._reset_stops = self._stops
         self._driver.set_latch(state)
         self._ask()
 
+    def _halt(self) -> None:
+        """In the stop path's thread."""
+        self._driver.set_latch("latched")
+        self.guardian.halt()
+
     def _heard(self, report: Report) -> None:
         age_ns = max(time.monotonic_ns() - report.t, 0)
+        stops, self._stops = self._stops, report.stops
+        if report.stops > stops:
+            self._keeper.stop("the guard of its wheels, which was told to stop")
+        elif report.stops < stops:  # another guard, which counts anew
+            self._reset_stops = 0
         before = self._driver.link
         self._driver.take(report, self._node.now_ns() - age_ns)
         if self._driver.link != before:

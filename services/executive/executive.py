@@ -99,7 +99,7 @@ class Executive:
         if self._running is not None:
             return "busy", f"{self._what()} is running; cancel it first (cocoro cancel)"
         if self._estop.state != "released":
-            return "estop", f"the emergency stop is {self._estop.state}; release it first (cocoro reset)"
+            return "estop", f"the emergency stop is {self._estop.words}; release it first (cocoro reset)"
         missing = [service for service in self._config.needed if service not in self._alive]
         if missing:
             return "not_alive", f"not alive: {', '.join(missing)}; see cocoro status"

@@ -85,15 +85,21 @@ class ServoLine:
         rate_hz: float,
         reply_s: float,
         heard: Callable[[Event], None],
+        keeps_goal: bool = False,
     ) -> None:
+        """`keeps_goal`: halted, its servos go on to where they were told to (a hand that holds something)."""
         self._open: Callable[[], Bus] = lambda: Bus(path, baud, reply_s)
         self._settings = settings
         self._period_s = 1.0 / rate_hz
         self._heard = heard
+        self._keeps_goal = keeps_goal
         self._loop = asyncio.get_running_loop()
         self._ended = threading.Event()
         self._tasks: SimpleQueue[Task] = SimpleQueue()
         self._orders: tuple[float, Mapping[int, tuple[int, int]]] = (0.0, {})
+        self._halted = False
+        self._held: dict[int, tuple[int, int]] | None = None
+        """Where the servos were when the line was halted, in counts, and with which speed they hold that."""
         self._misses = dict.fromkeys(settings, 0)
         self._probed_s = 0.0
         self._next_probe = 0
@@ -110,6 +116,15 @@ class ServoLine:
     def order(self, goals: Mapping[int, tuple[int, int]]) -> None:
         """Goal and speed in counts by servo, from now on; to be renewed in every cycle."""
         self._orders = (time.monotonic() + ORDERS_S, goals)  # one assignment: the thread sees the old or the new
+
+    def halt(self) -> None:
+        """Orders are not written from now on, and what moves holds where it is. From any thread, and whatever the event
+        loop does."""
+        self._halted = True
+
+    def go_on(self) -> None:
+        """Orders are written again: the newest were made by who knows of the emergency stop."""
+        self._halted = False
 
     def do(self, task: Task) -> None:
         self._tasks.put(task)
@@ -139,17 +154,35 @@ class ServoLine:
         while not self._ended.wait(max(due_s - time.monotonic(), 0.0)):
             started_s = time.monotonic()
             event = Event()
-            until_s, goals = self._orders
-            if started_s < until_s:
-                bus.go(goals)
+            self._order(bus, started_s)
             for number in self._to_read(started_s):
                 self._read(bus, number, event)
+            if self._halted and self._held is None:
+                self._hold(bus, event.readings)
             self._do_task(bus, event)
             self._check(bus, event)
             event.busy_s = time.monotonic() - started_s
             event.strays = bus.strays
             self._tell(event)
             due_s = max(due_s + self._period_s, time.monotonic())
+
+    def _order(self, bus: Bus, now_s: float) -> None:
+        """Write the newest orders; of a halted line, where its servos were when it was halted."""
+        if not self._halted:
+            self._held = None
+            until_s, goals = self._orders
+            if now_s < until_s:
+                bus.go(goals)
+        elif self._held is not None:
+            bus.go(self._held)
+
+    def _hold(self, bus: Bus, readings: Mapping[int, Reading]) -> None:
+        """Have what is under orders hold where it has just been read; a line that keeps its goals only takes no new
+        ones."""
+        speed = round(HOLD_RADPS / table.SPEED_RADPS)
+        ordered = () if self._keeps_goal else self._orders[1]
+        self._held = {number: (readings[number].position, speed) for number in ordered if number in readings}
+        bus.go(self._held)
 
     def _to_read(self, now_s: float) -> Collection[int]:
         """All that answer; of those that do not, one at a time and not often."""

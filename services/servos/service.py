@@ -51,7 +51,8 @@ class NetworkService:
         self._node = node
         robot = node.robot
         joints = [robot.joints[name] for name in robot.network_joints(node.name)]
-        self._network = Network(joints, keeps_goal=node.name == "hand", timeout_s=robot.base.command_timeout_s)
+        keeps_goal = node.name == "hand"
+        self._network = Network(joints, keeps_goal=keeps_goal, timeout_s=robot.base.command_timeout_s)
         row = robot.networks[node.name]  # type: ignore[index] # one of the two names
         settings = {
             joint.id: Setting(
@@ -61,11 +62,11 @@ class NetworkService:
             for joint in joints
         }
         port = port_path(config.arm_port if node.name == "arm" else config.hand_port, node.robot_name)
-        self._line = ServoLine(port, row.baud, settings, row.rate_hz, config.reply_s, self._heard)
+        self._line = ServoLine(port, row.baud, settings, row.rate_hz, config.reply_s, self._heard, keeps_goal)
         self._state, command = NETWORKS[node.name]
         self._epoch = node.clock.epoch
         self._changed = asyncio.Event()
-        LatchKeeper(node, self._latched)
+        LatchKeeper(node, self._latched, self._line.halt)
         node.on(command, self._commanded)
         node.serve(topics.SERVOS.of(node.name), self._asked)
 
@@ -85,6 +86,7 @@ class NetworkService:
     def _latched(self, state: LatchState, by: str) -> None:
         self._network.set_latch(state)
         self._line.order(self._network.orders(self._node.now_ns()))
+        self._line.go_on()  # these orders know of the latch
 
     def _heard(self, event: Event) -> None:
         """What a cycle found. The line's thread goes by the monotonic clock, the network by the robot's."""

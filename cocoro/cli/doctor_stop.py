@@ -1,0 +1,57 @@
+"""What `cocoro doctor` says of the emergency stop: whether it can be heard, and where its latch is kept."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+
+from cocoro.checks import Check, bad, note, ok
+from cocoro.stop.asking import addresses
+from cocoro.stop.path import StopPoint
+from cocoro.stop.record import latch_dir, read
+
+IN_MEMORY = ("tmpfs", "ramfs")
+
+
+def check(robot: str) -> Iterator[Check]:
+    yield _path()
+    yield _latch(robot)
+
+
+def _path() -> Check:
+    """Take an address as a service of a robot would, and look for it as `cocoro stop` would."""
+    name = f"doctor-{os.getpid()}"
+    try:
+        with closing(StopPoint(name, "doctor")):
+            found = addresses(name)
+    except OSError as error:
+        return bad("emergency stop", f"its path cannot be used ({error}): is /proc mounted?")
+    if not found:
+        return bad("emergency stop", "its addresses are not listed in /proc/net/unix: `cocoro stop` would miss them")
+    return ok("emergency stop", "its path works; everybody who can log in here may stop the robot")
+
+
+def _latch(robot: str) -> Check:
+    folder = latch_dir(robot)
+    there = next(path for path in (folder, *folder.parents) if path.exists())
+    if not there.is_dir() or not os.access(there, os.W_OK):
+        return bad("its latch", f"{there} cannot be written: the robot comes up stopped; COCORO_STATE_DIR says another")
+    if (kind := _filesystem(there)) in IN_MEMORY:
+        return bad("its latch", f"{folder} is in memory ({kind}) and does not outlive a reboot; set COCORO_STATE_DIR")
+    latched = [said for file in sorted(folder.glob("[!.]*")) if (said := read(file)).latched] if folder.is_dir() else []
+    if latched:
+        return note("its latch", f"latched by {latched[0].by}; `cocoro reset` releases it when the robot is up")
+    return ok("its latch", f"kept in {folder}")
+
+
+def _filesystem(path: Path) -> str:
+    """The kind of file system on which a path lies; empty where that is not told."""
+    try:
+        mounts = [line.split() for line in Path("/proc/self/mounts").read_text(errors="replace").splitlines()]
+    except OSError:
+        return ""
+    place = str(path.resolve())
+    over = [(row[1], row[2]) for row in mounts if place == row[1] or place.startswith(row[1].rstrip("/") + "/")]
+    return max(over, key=lambda row: len(row[0]), default=("", ""))[1]

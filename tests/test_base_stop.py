@@ -1,0 +1,185 @@
+"""The emergency stop's own path at the base: the guard hears it by itself, whatever the service above does."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import time
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager
+from copy import copy
+from pathlib import Path
+
+import pytest
+from test_base_service import Driven
+from wire_base import PATIENCE_NS, Bench, FakeService, guarded
+
+from cocoro import topics
+from cocoro.clock import RealClock
+from cocoro.messages import EstopRequest
+from cocoro.robot import Robot
+from cocoro.stop.asking import Asking
+from cocoro.stop.record import prepare, read
+from cocoro.testing import ServiceUnderTest
+
+PATIENCE_S = 60.0
+
+
+@pytest.fixture
+def name() -> str:
+    return f"robot-{os.urandom(4).hex()}"
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Iterator[Bench]:
+    with Bench(tmp_path) as bench:
+        yield bench
+
+
+@pytest.fixture
+def service(bench: Bench, name: str) -> Iterator[FakeService]:
+    """An awake Create whose guard obeys, and hears the emergency stop of a robot of this name."""
+    with guarded(bench, robot=name) as service:
+        bench.until_awake()
+        service.report(link="up")
+        yield service
+
+
+def stop(name: str) -> dict[str, int | None]:
+    """Say stop; when each service did, or None for those that did not say."""
+    with Asking(name) as asking:
+        asking.go_on(time.monotonic() + PATIENCE_S)
+        asking.hear_of_the_disk(time.monotonic() + PATIENCE_S)
+    return {point.service: point.latched_ns for point in asking.points.values()}
+
+
+def test_the_guard_stops_the_wheels_by_itself_and_asking_on_does_not_help(
+    bench: Bench, service: FakeService, name: str
+) -> None:
+    service.keep_asking(200, 200)
+    bench.until_wheels(200, 200)
+    asked_ns = time.monotonic_ns()
+    answers = stop(name)
+    assert answers["wheels"] is not None
+    assert bench.until_wheels(0, 0) - asked_ns < PATIENCE_NS
+    bench.forget()
+    for _ in range(20):  # a second and more of reports, while the service goes on asking
+        assert service.report(why="estop")["stops"] == 1
+    assert bench.emulator.call(bench.create.acted.copy) == []
+
+
+def test_only_a_reset_that_knows_of_the_stop_lets_the_wheels_turn_again(
+    bench: Bench, service: FakeService, name: str
+) -> None:
+    stop(name)
+    service.report(stops=1)
+    stop(name)
+    service.reset = 1  # this one does not know of the second
+    service.keep_asking(200, 200)
+    service.report(stops=2, why="estop")
+    service.reset = 2
+    bench.until_wheels(200, 200)
+
+
+@pytest.mark.parametrize("reset", [-1, 10**30, True])
+def test_a_reset_of_more_stops_than_there_were_resets_none_to_come(
+    bench: Bench, service: FakeService, name: str, reset: int
+) -> None:
+    service.reset = reset
+    service.ask(0, 0)
+    service.report(why="")
+    stop(name)
+    service.reset = 0
+    service.keep_asking(200, 200)
+    service.report(stops=1, why="estop")
+    assert bench.create.wheels_mmps == (0, 0)
+
+
+@asynccontextmanager
+async def driven(bench: Bench, name: str, latches: Path) -> AsyncIterator[Driven]:
+    robot = copy(Robot.load())
+    robot.name = name
+    config = {"port": bench.port}
+    async with ServiceUnderTest(
+        "services.base.service", config, robot=robot, clock=RealClock(), latches=latches
+    ) as service:
+        base = Driven(bench, service)
+        await base.state(lambda state: state.mode == "safe")
+        yield base
+        base.silence()
+
+
+def test_service_and_guard_are_both_told_and_a_reset_releases_both(bench: Bench, name: str, tmp_path: Path) -> None:
+    latches = tmp_path / "latch"
+    prepare(latches, ["base"], by_hand=True)
+
+    async def scenario() -> None:
+        async with driven(bench, name, latches) as base:
+            await base.roll()
+            asked_ns = time.monotonic_ns()
+            answers = await asyncio.to_thread(stop, name)
+            assert set(answers) == {"base", "wheels"}
+            assert None not in answers.values()
+            assert await base.wheels(0, 0) - asked_ns < PATIENCE_NS
+            state = await base.state(lambda state: state.stopped_by == "estop")
+            assert state.latch == "latched"
+            assert read(latches / "base").latched
+            await asyncio.to_thread(stop, name)
+            base.release()  # the executive's word releases nothing
+            await base.state(lambda state: state.latch == "latched")
+            reply = await base.service.ask(topics.ESTOP.of("base"), EstopRequest(latched=False, by="test"))
+            assert reply.latch == "released"
+            await base.wheels(200, 200)
+            assert not read(latches / "base").latched
+
+    asyncio.run(asyncio.wait_for(scenario(), PATIENCE_S))
+
+
+def test_a_loop_that_hangs_keeps_the_wheels_from_nothing(bench: Bench, name: str, tmp_path: Path) -> None:
+    latches = tmp_path / "latch"
+    prepare(latches, ["base"], by_hand=True)
+
+    async def scenario() -> None:
+        async with driven(bench, name, latches) as base:
+            await base.roll()
+            asked_ns = time.monotonic_ns()
+            answers = stop(name)  # in the loop, which hangs meanwhile
+            assert None not in answers.values()
+            assert bench.until_wheels(0, 0) - asked_ns < PATIENCE_NS
+            await base.state(lambda state: state.latch == "latched")
+
+    asyncio.run(asyncio.wait_for(scenario(), PATIENCE_S))
+
+
+def test_a_guard_that_comes_after_a_stop_knows_of_it_from_the_service(bench: Bench, name: str, tmp_path: Path) -> None:
+    latches = tmp_path / "latch"
+    prepare(latches, ["base"], by_hand=True)
+
+    async def scenario() -> None:
+        async with driven(bench, name, latches) as base:
+            await base.roll()
+            await asyncio.to_thread(stop, name)
+            await base.state(lambda state: state.latch == "latched")
+            before = guards(name)
+            for pid in before:
+                os.kill(pid, signal.SIGKILL)
+            bench.forget()
+            state = await base.state(lambda state: state.stopped_by == "estop" and not before & guards(name))
+            assert state.latch == "latched"
+            assert all(wheels == (0, 0) for _, wheels in bench.emulator.call(bench.create.acted.copy))
+
+    asyncio.run(asyncio.wait_for(scenario(), PATIENCE_S))
+
+
+def guards(name: str) -> set[int]:
+    """The processes that are guards of a robot's wheels."""
+    found = set()
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            arguments = (folder / "cmdline").read_bytes().split(b"\0")
+        except OSError:  # it ended just now
+            continue
+        if b"services.base.guard" in arguments and name.encode() in arguments:
+            found.add(int(folder.name))
+    return found

@@ -1,0 +1,144 @@
+"""`cocoro stop`: what it says, and that it is the truth."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator
+from concurrent.futures import Future
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+
+from cocoro.cli import estop, exits
+from cocoro.cli.estop import Stop, _merged
+from cocoro.cli.main import main
+from cocoro.stop.path import StopPoint, listen
+
+
+class Services:
+    """Services of a robot that can be stopped, in this process."""
+
+    def __init__(self, stack: ExitStack) -> None:
+        self.robot = f"robot-{os.urandom(4).hex()}"
+        self.halted: list[str] = []
+        self._stack = stack
+
+    def __call__(self, *services: str, hears: bool = True, not_kept: str = "") -> None:
+        for service in services:
+            point = StopPoint(self.robot, service)
+            self._stack.callback(point.close)
+            if hears:
+                listen(point, lambda _by, service=service: self.halted.append(service), lambda _: told(not_kept))  # type: ignore[misc]
+
+
+def told(text: str) -> Future[str]:
+    done: Future[str] = Future()
+    done.set_result(text)
+    return done
+
+
+@pytest.fixture
+def services(root: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Services]:
+    """There is no mesh to be asked beside them."""
+    monkeypatch.setattr(estop, "ACKNOWLEDGE_S", 5.0)
+    with ExitStack() as stack:
+        yield Services(stack)
+
+
+def test_it_names_who_acknowledged(services: Services, capsys: pytest.CaptureFixture[str]) -> None:
+    services("hand", "executive", "base", "arm")
+    assert main(["stop", "--robot", services.robot]) == exits.DONE
+    said = capsys.readouterr()
+    assert said.out.startswith(f"{services.robot}: stopped base, arm, hand, executive in ")
+    assert said.out.endswith(" s\n")
+    assert said.err == ""
+    assert sorted(services.halted) == ["arm", "base", "executive", "hand"]
+
+
+def test_it_names_who_is_not_there(services: Services, capsys: pytest.CaptureFixture[str]) -> None:
+    services("base")
+    assert main(["stop", "--robot", services.robot]) == exits.DONE
+    assert "; not there: arm, hand\n" in capsys.readouterr().out
+
+
+def test_it_names_who_is_there_and_says_nothing_and_exits_with_1(
+    services: Services, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(estop, "ACKNOWLEDGE_S", 0.1)
+    services("base", "hand")
+    services("arm", hears=False)
+    assert main(["stop", "--robot", services.robot]) == exits.FAILED
+    assert "stopped base, hand in" in (said := capsys.readouterr().err)
+    assert "NOT ACKNOWLEDGED by arm" in said
+    assert sorted(services.halted) == ["base", "hand"]
+
+
+def test_an_executive_that_says_nothing_moves_nothing(
+    services: Services, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(estop, "ACKNOWLEDGE_S", 0.1)
+    services("base", "arm", "hand")
+    services("executive", hears=False)
+    assert main(["stop", "--robot", services.robot]) == exits.DONE
+    assert "stopped base, arm, hand in" in capsys.readouterr().out
+
+
+def test_it_says_which_latches_a_restart_will_forget(services: Services, capsys: pytest.CaptureFixture[str]) -> None:
+    services("base", "arm", "hand", not_kept="/var/latch: No space left on device")
+    assert main(["stop", "--robot", services.robot]) == exits.DONE
+    assert "; A RESTART WILL FORGET IT: /var/latch: No space left on device\n" in capsys.readouterr().out
+
+
+def test_as_data_it_has_the_moment_at_which_each_was_stopped(
+    services: Services, capsys: pytest.CaptureFixture[str]
+) -> None:
+    services("base", "arm", "hand")
+    assert main(["stop", "--robot", services.robot, "--json"]) == exits.DONE
+    told = json.loads(capsys.readouterr().out)
+    assert (told["robot"], told["acknowledged"], told["missing"]) == (services.robot, ["base", "arm", "hand"], [])
+    assert set(told["latched_ns"]) == {"base", "arm", "hand"}
+    assert told["seconds"] >= 0
+
+
+def test_help_stops_nothing(services: Services, capsys: pytest.CaptureFixture[str]) -> None:
+    services("base")
+    assert main(["stop", "--help"]) == exits.DONE
+    assert "whoever's it is" in capsys.readouterr().out
+    assert main(["stop", "--now"]) == exits.USAGE
+    assert services.halted == []
+
+
+def test_a_profile_that_cannot_be_read_is_told_in_a_line(
+    services: Services, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["stop", "--profile", "/nowhere.toml"]) == exits.USAGE
+    assert capsys.readouterr().err.startswith("cocoro: ")
+
+
+def test_where_the_kernel_does_not_list_its_sockets_the_mesh_is_asked_and_that_is_said(
+    services: Services, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("cocoro.stop.asking.SOCKETS", "/nowhere/unix")
+    assert main(["stop", "--robot", services.robot]) == exits.NO_MESH
+    said = capsys.readouterr().err
+    assert "the mesh alone was asked" in said
+    assert f"no {services.robot} is up on this machine" in said
+
+
+def test_what_either_way_acknowledged_is_stopped() -> None:
+    path = Stop("robbie", ("base",), ("arm",), ("hand",), 0.1)
+    mesh = Stop("robbie", ("arm", "hand"), (), (), 0.4)
+    (both,) = _merged([path], [mesh])
+    assert (both.acknowledged, both.missing, both.absent, both.seconds) == (("base", "arm", "hand"), (), (), 0.4)
+    assert both.code == exits.DONE
+    assert _merged([path], []) == [path]
+    assert _merged([], [mesh]) == [mesh]
+    foreign = path._replace(owner=1001)
+    assert _merged([foreign], [mesh]) == [foreign, mesh], "a robot of the same name that is another's is another"
+
+
+def test_a_robot_of_which_nothing_that_moves_answered_is_none() -> None:
+    assert Stop("robbie", ("executive",), (), ("base", "arm", "hand"), 0.1).code == exits.NO_MESH
+    assert "(of user 1001)" in str(Stop("robbie", ("base",), (), (), 0.1, owner=1001))

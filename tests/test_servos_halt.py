@@ -1,0 +1,110 @@
+"""A servo line that is halted by the emergency stop's own path, while the event loop hangs."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Callable, Mapping
+from types import TracebackType
+
+from services.servos.line import ServoLine, Setting
+from services.servos.motion import HOLD_RADPS
+from services.servos.table import SPEED_RADPS, Reading
+
+PATIENCE_S = 60.0
+FAR = {5: (900, 30)}
+HOLD = round(HOLD_RADPS / SPEED_RADPS)
+
+
+class Wire:
+    """Stands in for the bus: an elbow that moves on by one count each time it is read."""
+
+    strays = 0
+
+    def __init__(self) -> None:
+        self.written: list[dict[int, tuple[int, int]]] = []
+        self.position = 512
+        self._news = threading.Condition()
+
+    def __enter__(self) -> Wire:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        pass
+
+    def go(self, orders: Mapping[int, tuple[int, int]]) -> None:
+        with self._news:
+            self.written.append(dict(orders))
+            self._news.notify_all()
+
+    def reading(self, _number: int) -> Reading:
+        self.position += 1
+        return Reading(0, self.position, 0, 0, 12.0, 38, 0)
+
+    def read_block(self, _number: int, _first: int, _length: int) -> tuple[bytes, int]:
+        return b"", 0
+
+    def until(self, good: Callable[[list[dict[int, tuple[int, int]]]], object]) -> None:
+        with self._news:
+            assert self._news.wait_for(lambda: good(self.written), PATIENCE_S)
+
+
+def scenario(keeps_goal: bool, test: Callable[[ServoLine, Wire], None]) -> None:
+    """Run a test in the event loop's own thread, so that the loop does nothing meanwhile."""
+
+    async def run() -> None:
+        wire = Wire()
+        line = ServoLine("nowhere", 1, {5: Setting(32, 1023)}, 200.0, 0.1, lambda _: None, keeps_goal)
+        line._open = lambda: wire  # type: ignore[assignment, return-value]
+        line.start()
+        try:
+            test(line, wire)
+        finally:
+            await line.stop()
+
+    asyncio.run(run())
+
+
+def test_what_is_under_orders_holds_where_it_was_just_read_and_stays_there() -> None:
+    def test(line: ServoLine, wire: Wire) -> None:
+        line.order(FAR)
+        wire.until(lambda written: FAR in written)
+        line.halt()
+        wire.until(lambda written: written[-1] != FAR)
+        held = wire.written[-1]
+        assert held[5][0] <= wire.position
+        assert held[5][1] == HOLD
+        line.order({5: (1000, 30)})  # of a loop that hung, and does not know yet
+        count = len(wire.written)
+        wire.until(lambda written: len(written) > count + 5)
+        assert wire.written[count + 1 :] == [held] * len(wire.written[count + 1 :])
+
+    scenario(False, test)
+
+
+def test_who_knows_of_the_stop_gives_the_orders_again() -> None:
+    def test(line: ServoLine, wire: Wire) -> None:
+        line.order(FAR)
+        line.halt()
+        wire.until(lambda written: written and written[-1] != FAR)
+        line.order({5: (600, HOLD)})
+        line.go_on()
+        wire.until(lambda written: written[-1] == {5: (600, HOLD)})
+
+    scenario(False, test)
+
+
+def test_a_hand_goes_on_holding_what_it_holds_and_takes_no_new_goals() -> None:
+    def test(line: ServoLine, wire: Wire) -> None:
+        line.order(FAR)
+        wire.until(lambda written: FAR in written)
+        line.halt()
+        line.order({5: (100, 30)})
+        wire.until(lambda written: {} in written)
+        count = len(wire.written)
+        wire.until(lambda written: len(written) > count + 5)
+        assert {5: (100, 30)} not in wire.written
+
+    scenario(True, test)

@@ -1,0 +1,152 @@
+"""The emergency stop of a robot that drives, process by process: among hostile neighbours, and over restarts."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from operator_shell import Shell
+
+from bench.stop import SITUATIONS
+from cocoro.cli import exits
+from cocoro.rundir import RunDir
+from cocoro.stop.record import latch_dir, read
+
+pytestmark = [pytest.mark.zenoh, pytest.mark.sim]
+
+ROOT = Path(__file__).parents[1]
+SMALL = ("--frames", "160x120@10")
+
+
+def no_namespaces() -> str:
+    """Why there are none to be had, or ''."""
+    if shutil.which("unshare") is None:
+        return "there is no unshare"
+    command = ["unshare", "--mount", "--net", "mount", "--make-rprivate", "/"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    return done.stderr.strip()
+
+
+needs_namespaces = pytest.mark.skipif(bool(no_namespaces()), reason=f"no namespaces: {no_namespaces()}")
+
+
+@needs_namespaces
+@pytest.mark.parametrize("situation", SITUATIONS)
+def test_a_robot_at_full_speed_is_stopped_whatever_its_neighbours_do(situation: str) -> None:
+    command = [sys.executable, "-m", "bench.stop", situation, "--count", "2", "--any-time", "--json"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    result = json.loads(done.stdout.splitlines()[-1])
+    assert (result["count"], result["faults"]) == (2, [])
+
+
+@pytest.fixture
+def shell(tmp_path: Path) -> Iterator[Shell]:
+    """Commands for a robot of a name that no other robot of this machine has."""
+    with Shell(tmp_path) as shell:
+        shell.run_dir = RunDir(f"robot-{os.urandom(4).hex()}", shell.root)
+        yield shell
+
+
+def up(shell: Shell, *options: str, profile: str = "sim") -> str:
+    done = shell("up", profile, "--detach", *SMALL, "--set", f'robot="{shell.run_dir.robot}"', *options)
+    assert done.returncode == exits.DONE, done.stdout + done.stderr
+    return done.stdout
+
+
+def latch(shell: Shell) -> str:
+    """As the robot tells it, once the executive knows."""
+    for _ in range(100):
+        done = shell("status", "--json", "--robot", shell.run_dir.robot)
+        told = json.loads(done.stdout)
+        if (told.get("latch") or {}).get("state") not in (None, "unknown"):
+            return str(told["latch"]["state"])
+    raise AssertionError(done.stdout + done.stderr)
+
+
+def robot(shell: Shell, *arguments: str) -> subprocess.CompletedProcess[str]:
+    return shell(*arguments, "--robot", shell.run_dir.robot)
+
+
+def kill(shell: Shell, *services: str) -> None:
+    """All at once, as far as that is possible."""
+    targets = [shell.target(service) for service in services]
+    for target in targets:
+        target.signal(signal.SIGKILL)
+    for target in targets:
+        target.wait(60.0)
+        target.close()
+
+
+@pytest.mark.parametrize("profile", ["sim", "sim-wire"])
+def test_the_latch_outlives_the_death_of_everything_and_only_a_reset_releases_it(shell: Shell, profile: str) -> None:
+    assert "stopped" not in up(shell, profile=profile)
+    assert latch(shell) == "released"
+    stopped = robot(shell, "stop", "--json")
+    assert stopped.returncode == exits.DONE, stopped.stdout + stopped.stderr
+    told = json.loads(stopped.stdout)
+    moves = {"base", "arm", "hand"} | ({"wheels"} if profile == "sim-wire" else set())
+    assert (set(told["latched_ns"]) >= moves, told["missing"], told["not_kept"]) == (True, [], [])
+
+    supervisor = shell.run_dir.supervisor()
+    assert supervisor is not None
+    os.kill(supervisor.pid, signal.SIGKILL)
+    kill(shell, "executive", "base", "arm")
+    said = up(shell, profile=profile)
+    assert "the emergency stop is latched by operator (user " in said
+    assert "`cocoro reset` releases it" in said
+    assert latch(shell) == "latched"
+    assert robot(shell, "fetch", "red_can").returncode == exits.REFUSED
+
+    kill(shell, "executive", "base")  # at once, and started again by the supervisor
+    assert latch(shell) == "latched"
+    for _ in range(20):
+        if (reset := robot(shell, "reset")).returncode == exits.DONE:
+            break
+    assert reset.returncode == exits.DONE, reset.stderr
+    assert latch(shell) == "released"
+    assert robot(shell, "down").returncode == exits.DONE
+    assert "stopped" not in up(shell, profile=profile)
+    assert latch(shell) == "released", "what was reset stays so"
+
+
+def test_a_first_start_that_nobody_watches_comes_up_stopped(shell: Shell) -> None:
+    said = up(shell, "--unattended")
+    assert "the emergency stop is latched by a first start that no person watched" in said
+    assert latch(shell) == "latched"
+    assert robot(shell, "reset").returncode == exits.DONE
+    assert latch(shell) == "released"
+
+
+def test_a_latch_that_cannot_be_kept_or_read_comes_up_stopped_and_says_why(
+    shell: Shell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    blocked = shell.folder / "blocked"
+    blocked.write_text("a file where a folder should be")
+    monkeypatch.setenv("COCORO_STATE_DIR", str(blocked))
+    said = up(shell)
+    assert f"the emergency stop's latch cannot be kept in {blocked}" in said
+    assert latch(shell) == "latched"
+    reset = robot(shell, "reset")
+    assert reset.returncode == exits.DONE
+    assert "a restart will not remember this" in reset.stdout + reset.stderr
+    stopped = robot(shell, "stop")
+    assert "A RESTART WILL FORGET IT" in stopped.stdout + stopped.stderr
+
+
+def test_a_record_that_was_damaged_comes_up_stopped(shell: Shell) -> None:
+    up(shell)
+    assert robot(shell, "down").returncode == exits.DONE
+    record = latch_dir(shell.run_dir.robot) / "arm"
+    record.write_bytes(b"?" * 512)
+    assert "which cannot be read: it is damaged" in up(shell)
+    assert latch(shell) == "latched"
+    assert robot(shell, "reset").returncode == exits.DONE
+    assert not read(record).latched

@@ -1,0 +1,251 @@
+"""The emergency stop's own path: who hears it, who is believed, and what cannot deny it."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+
+import pytest
+
+from cocoro.stop import asking as asking_module
+from cocoro.stop.asking import Asking, addresses
+from cocoro.stop.path import PREFIX, StopPoint, listen
+
+PATIENCE_S = 60.0
+ROOT = Path(__file__).parents[1]
+needs_root = pytest.mark.skipif(os.getuid() != 0, reason="only root can be another user")
+
+
+@pytest.fixture
+def robot() -> str:
+    """A robot of that name is nowhere else on this machine, though other tests may run beside this one."""
+    return f"robot-{os.urandom(4).hex()}"
+
+
+def kept(_by: str) -> Future[str]:
+    done: Future[str] = Future()
+    done.set_result("")
+    return done
+
+
+@contextmanager
+def moving(robot: str, *services: str, keep: Callable[[str], Future[str]] = kept) -> Iterator[dict[str, list[str]]]:
+    """Services that can be stopped; for each, by whom it was stopped so far."""
+    halted: dict[str, list[str]] = {service: [] for service in services}
+    with ExitStack() as stack:
+        for service in services:
+            point = StopPoint(robot, service)
+            stack.callback(point.close)
+            listen(point, halted[service].append, keep)
+        yield halted
+
+
+def stop(robot: str | None, within_s: float = PATIENCE_S) -> Asking:
+    with Asking(robot) as asking:
+        asking.go_on(time.monotonic() + within_s)
+        asking.hear_of_the_disk(time.monotonic() + within_s)
+    return asking
+
+
+def another_user(robot: str, code: str) -> subprocess.Popen[str]:
+    """Some Python run by nobody (user 65534), without one variable of the environment; `robot` is its argument."""
+    imports = f"import os, socket, sys, time; sys.path.insert(0, {str(ROOT)!r}); from cocoro.stop.asking import Asking;"
+    become = "os.setgroups([]); os.setgid(65534); os.setuid(65534);"
+    command = [sys.executable, "-I", "-S", "-c", imports + become + code, robot]
+    return subprocess.Popen(command, env={}, cwd="/", stdout=subprocess.PIPE, text=True)
+
+
+def test_everything_that_moves_is_halted_before_it_answers_and_says_that_the_latch_is_kept(robot: str) -> None:
+    with moving(robot, "base", "arm", "hand") as halted:
+        before_ns = time.monotonic_ns()
+        asking = stop(robot)
+        after_ns = time.monotonic_ns()
+        assert {point.service for point in asking.points.values()} == {"base", "arm", "hand"}
+        for point in asking.points.values():
+            assert before_ns <= (point.latched_ns or 0) <= after_ns
+            assert (point.kept, point.why_not_kept) == (True, "")
+            assert halted[point.service] == [f"operator (user {os.getuid()}, pid {os.getpid()})"]
+        assert not asking.waiting
+
+
+def test_a_robot_is_stopped_by_its_name_and_another_is_not(robot: str) -> None:
+    with moving(robot, "base") as ours, moving(f"{robot}-2", "base") as other:
+        assert len(stop(robot).points) == 1
+        assert (len(ours["base"]), len(other["base"])) == (1, 0)
+
+
+def test_without_a_name_every_robot_is_told() -> None:
+    names = [f"all-{os.urandom(4).hex()}" for _ in range(2)]
+    with moving(names[0], "base"), moving(names[1], "arm"):
+        found = {address.split("/")[2] for address in addresses()}
+        assert found >= set(names)
+
+
+def test_who_has_ended_is_not_waited_for(robot: str) -> None:
+    with moving(robot, "base"):
+        pass
+    assert not stop(robot).points
+
+
+def test_a_latch_that_the_disk_did_not_take_is_told(robot: str) -> None:
+    def full(_by: str) -> Future[str]:
+        done: Future[str] = Future()
+        done.set_result("the disk is full")
+        return done
+
+    with moving(robot, "base", keep=full) as halted:
+        (point,) = stop(robot).points.values()
+        assert (point.kept, point.why_not_kept) == (False, "the disk is full")
+        assert halted["base"]
+
+
+@pytest.mark.parametrize("datagram", [b"", b"hello", b"\xff" * 100, bytes(5000)])
+def test_every_datagram_is_a_stop_whatever_it_says(robot: str, datagram: bytes) -> None:
+    with moving(robot, "base") as halted:
+        (address,) = addresses(robot)
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender:  # without an address to answer to
+            sender.sendto(datagram, b"\0" + address[1:].encode())
+        assert stop(robot).waiting == []
+        assert len(halted["base"]) == 2
+
+
+def test_what_a_sender_calls_himself_cannot_spoil_a_line_and_who_he_is_says_the_kernel(robot: str) -> None:
+    with moving(robot, "base") as halted:
+        with Asking(robot, by="the king\n\x1b[2J") as asking:
+            asking.go_on(time.monotonic() + PATIENCE_S)
+        assert halted["base"] == [f"the king[2J (user {os.getuid()}, pid {os.getpid()})"]
+
+
+def test_a_flood_of_datagrams_stops_the_robot_and_keeps_nobody_else_from_stopping_it(robot: str) -> None:
+    ended = threading.Event()
+
+    def flood(address: bytes) -> None:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender:
+            while not ended.is_set():
+                sender.sendto(b"rubbish", address)
+
+    with moving(robot, "base") as halted:
+        (address,) = addresses(robot)
+        flooding = threading.Thread(target=flood, args=(b"\0" + address[1:].encode(),))
+        flooding.start()
+        try:
+            asking = stop(robot)
+            assert not asking.waiting
+            assert len(halted["base"]) > 1
+        finally:
+            ended.set()
+            flooding.join()
+
+
+def test_who_does_not_read_is_named_and_holds_up_nobody(robot: str) -> None:
+    deaf = StopPoint(robot, "arm")
+    try:
+        with moving(robot, "base") as halted:
+            asking = stop(robot, within_s=0.1)
+            assert [point.service for point in asking.waiting] == ["arm"]
+            assert halted["base"]
+            # What was sent waits for it: it is stopped as soon as it goes on.
+            taken = deaf.take(wait=False)
+            assert taken is not None
+            assert taken.by.startswith("operator")
+    finally:
+        deaf.close()
+
+
+def test_full_queues_are_tried_again(robot: str) -> None:
+    slow = StopPoint(robot, "base")
+    (address,) = addresses(robot)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as sender:
+        with suppress(BlockingIOError):
+            while True:
+                sender.sendto(b"", b"\0" + address[1:].encode())
+        with Asking(robot) as asking:
+            (point,) = asking.points.values()
+            assert not point.told
+            halted: list[str] = []
+            listen(slow, halted.append, kept)
+            asking.go_on(time.monotonic() + PATIENCE_S)
+            assert point.told
+            assert point.latched_ns
+            assert halted[-1].startswith("operator")
+    slow.close()
+
+
+def test_one_who_appears_while_others_are_waited_for_is_told_too(robot: str) -> None:
+    deaf = StopPoint(robot, "arm")
+    with Asking(robot) as asking:
+        assert len(asking.points) == 1
+        with moving(robot, "base") as halted:
+            asking.go_on(time.monotonic() + 5 * asking_module.LOOK_AGAIN_S)
+            while not halted["base"]:
+                asking.go_on(time.monotonic() + asking_module.LOOK_AGAIN_S)
+        assert {point.service for point in asking.points.values()} == {"arm", "base"}
+    deaf.close()
+
+
+def test_rubbish_in_the_list_of_sockets_is_passed_over(robot: str) -> None:
+    with ExitStack() as stack, moving(robot, "base"):
+        for number, name in enumerate((f"{PREFIX}x/{robot}/base/1", f"{PREFIX}0/{robot}", f"{PREFIX}0/{robot}/a/b/c")):
+            squatter = stack.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM))
+            squatter.bind(b"\0" + name.encode() + b"\xff" * number)
+        asking = stop(robot)
+        assert [point.service for point in asking.points.values()] == ["base"]
+        assert not asking.waiting
+
+
+def test_a_thread_that_fails_halts(robot: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    failed = threading.Event()
+    monkeypatch.setattr(threading, "excepthook", lambda _: failed.set())
+    halted: list[str] = []
+
+    def fail(_by: str) -> Future[str]:
+        raise RuntimeError("out of order")
+
+    point = StopPoint(robot, "base")
+    listen(point, halted.append, fail)
+    stop(robot, within_s=0.2)
+    assert failed.wait(PATIENCE_S)
+    assert halted[-1] == "the failure of its own path"
+    point.close()
+
+
+def test_names_that_make_no_address_are_refused() -> None:
+    with pytest.raises(OSError, match="too long"):
+        StopPoint("r" * 100, "base")
+
+
+@needs_root
+def test_another_user_without_any_variable_can_stop_the_robot(robot: str) -> None:
+    code = (
+        "a = Asking(sys.argv[1]); a.go_on(time.monotonic() + 60);"
+        "print([p.service for p in a.points.values() if p.latched_ns])"
+    )
+    with moving(robot, "base") as halted, another_user(robot, code) as stranger:
+        assert stranger.communicate()[0] == "['base']\n"
+        assert halted["base"] == [f"operator (user 65534, pid {stranger.pid})"]
+
+
+@needs_root
+def test_an_answer_from_another_user_than_the_robots_does_not_count(robot: str) -> None:
+    code = (
+        "s = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM);"
+        f"s.bind(b'\\0{PREFIX}0/' + sys.argv[1].encode() + b'/base/liar');"
+        "print('there', flush=True); _, who = s.recvfrom(100); s.sendto(b'latched base 1', who); s.recvfrom(100)"
+    )
+    with another_user(robot, code) as liar:
+        try:
+            assert liar.stdout is not None
+            assert liar.stdout.readline() == "there\n"
+            with moving(robot, "arm"):
+                asking = stop(robot, within_s=0.3)
+            assert [point.service for point in asking.waiting] == ["base"]
+        finally:
+            liar.kill()

@@ -1,0 +1,193 @@
+"""The emergency stop's latch on disk."""
+
+from __future__ import annotations
+
+import os
+import threading
+from pathlib import Path
+
+import pytest
+
+from cocoro.cli import doctor_stop
+from cocoro.stop import asking, record
+from cocoro.stop.record import RECORD_BYTES, LatchRecord, latch_dir, prepare, read
+
+PATIENCE_S = 60.0
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return tmp_path / "robbie" / "latch"
+
+
+def test_a_machine_that_never_knew_a_latch_is_released_by_a_person_only(folder: Path, tmp_path: Path) -> None:
+    said = prepare(folder, ["base", "arm"], by_hand=True)
+    assert [one.latched for one in said.values()] == [False, False]
+    unwatched = prepare(tmp_path / "other", ["base", "arm"], by_hand=False)
+    assert [one.latched for one in unwatched.values()] == [True, True]
+    assert unwatched["base"].by == "a first start that no person watched"
+
+
+def test_a_record_that_is_missing_beside_others_is_latched(folder: Path) -> None:
+    prepare(folder, ["base", "arm"], by_hand=True)
+    (folder / "base").unlink()
+    said = prepare(folder, ["base", "arm"], by_hand=True)
+    assert said["base"].latched
+    assert said["base"].by == "its record was missing"
+    assert not said["arm"].latched
+
+
+def test_what_is_kept_is_what_the_next_process_reads(folder: Path) -> None:
+    prepare(folder, ["base"], by_hand=True)
+    before = LatchRecord(folder / "base")
+    assert not before.said.latched
+    assert before.keep(True, "operator (user 7, pid 8)").result(PATIENCE_S) == ""
+    after = LatchRecord(folder / "base")
+    assert (after.said.latched, after.said.by) == (True, "operator (user 7, pid 8)")
+    assert after.said.when
+    assert prepare(folder, ["base"], by_hand=True)["base"].latched, "a start releases nothing"
+    assert after.keep(False, "operator").result(PATIENCE_S) == ""
+    assert not read(folder / "base").latched
+
+
+@pytest.mark.parametrize("by", ["", "x" * 5000, "Jörg \N{ROBOT FACE}" * 50, '"\\' * 500, "a\nb\0c\x1b", "\udcff"])
+def test_a_record_never_grows_whoever_wrote_it(folder: Path, by: str) -> None:
+    prepare(folder, ["base"], by_hand=True)
+    assert LatchRecord(folder / "base").keep(True, by).result(PATIENCE_S) == ""
+    assert (folder / "base").stat().st_size == RECORD_BYTES
+    assert read(folder / "base").latched
+    assert "cannot be read" not in read(folder / "base").by
+
+
+@pytest.mark.parametrize("byte", range(0, RECORD_BYTES, 7))
+def test_a_record_of_which_one_byte_is_damaged_is_latched(folder: Path, byte: int) -> None:
+    prepare(folder, ["base"], by_hand=True)
+    data = bytearray((folder / "base").read_bytes())
+    data[byte] ^= 0x10
+    (folder / "base").write_bytes(data)
+    assert read(folder / "base").latched
+
+
+@pytest.mark.parametrize("content", [b"", b"\0" * RECORD_BYTES, b"{}", b"x" * 100_000])
+def test_rubbish_is_latched_says_why_and_is_put_right_by_the_next_word(folder: Path, content: bytes) -> None:
+    prepare(folder, ["base"], by_hand=True)
+    (folder / "base").write_bytes(content)
+    kept = LatchRecord(folder / "base")
+    assert kept.said.latched
+    assert kept.said.by == f"the record {folder}/base, which cannot be read: it is damaged"
+    assert kept.keep(False, "operator").result(PATIENCE_S) == ""
+    assert not read(folder / "base").latched
+
+
+def test_a_missing_record_is_latched_and_made_by_the_next_word(folder: Path) -> None:
+    folder.mkdir(parents=True)
+    kept = LatchRecord(folder / "base")
+    assert kept.said.latched
+    assert "No such file" in kept.said.by
+    assert kept.keep(False, "operator").result(PATIENCE_S) == ""
+    assert not read(folder / "base").latched
+
+
+def test_a_record_that_was_removed_meanwhile_is_made_anew(folder: Path) -> None:
+    prepare(folder, ["base"], by_hand=True)
+    kept = LatchRecord(folder / "base")
+    (folder / "base").unlink()
+    assert kept.keep(True, "operator").result(PATIENCE_S) == ""
+    assert read(folder / "base").latched
+
+
+def test_where_it_cannot_be_written_it_says_so_and_tries_again_at_the_next_word(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    prepare(folder, ["base"], by_hand=True)
+    kept = LatchRecord(folder / "base")
+
+    def full(*_: object) -> int:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "pwrite", full)
+        assert kept.keep(True, "operator").result(PATIENCE_S) == f"{folder}/base: No space left on device"
+        assert "No space" in kept.keep(True, "operator").result(PATIENCE_S)
+    assert kept.keep(True, "operator").result(PATIENCE_S) == ""
+    assert read(folder / "base").latched
+
+
+def test_a_flood_of_stops_is_written_once(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    prepare(folder, ["base"], by_hand=True)
+    kept = LatchRecord(folder / "base")
+    go_on = threading.Event()
+    written: list[bytes] = []
+
+    def slow(fd: int, data: bytes, at: int) -> int:
+        go_on.wait(PATIENCE_S)
+        written.append(data)
+        return len(data)
+
+    monkeypatch.setattr(os, "pwrite", slow)
+    waiting = [kept.keep(True, "operator") for _ in range(1000)]
+    assert not waiting[0].done(), "nobody waits for a slow disk"
+    go_on.set()
+    assert {one.result(PATIENCE_S) for one in waiting} == {""}
+    assert len(written) == 1
+
+
+def test_links_are_not_followed(folder: Path, tmp_path: Path) -> None:
+    victim = tmp_path / "victim"
+    victim.write_bytes(b"precious")
+    prepare(folder, ["arm"], by_hand=True)
+    (folder / "base").symlink_to(victim)
+    said = prepare(folder, ["base", "arm"], by_hand=True)
+    assert said["base"].latched
+    kept = LatchRecord(folder / "base")
+    kept.keep(True, "operator").result(PATIENCE_S)
+    assert victim.read_bytes() == b"precious"
+
+
+def test_a_folder_that_others_can_write_to_is_refused(folder: Path) -> None:
+    folder.mkdir(parents=True)
+    folder.chmod(0o777)
+    with pytest.raises(PermissionError):
+        prepare(folder, ["base"], by_hand=True)
+
+
+def test_the_place_outlives_a_reboot(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in (record.STATE_DIR, "STATE_DIRECTORY", "XDG_STATE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("HOME", "/home/robbie")
+    assert latch_dir("calliope") == Path("/home/robbie/.local/state/cocoro/calliope/latch")
+    monkeypatch.setenv("XDG_STATE_HOME", "/home/robbie/state")
+    assert latch_dir("calliope") == Path("/home/robbie/state/cocoro/calliope/latch")
+    monkeypatch.setenv("STATE_DIRECTORY", "/var/lib/cocoro:/var/lib/other")
+    assert latch_dir("calliope") == Path("/var/lib/cocoro/calliope/latch")
+    monkeypatch.setenv(record.STATE_DIR, "/somewhere")
+    assert latch_dir("calliope") == Path("/somewhere/calliope/latch")
+
+
+# --- what the doctor says of it ---------------------------------------------------------------------
+
+
+def test_the_doctor_says_where_the_latch_is_kept_and_that_it_is_latched() -> None:
+    path, latch = doctor_stop.check("robbie")
+    assert (path.state, latch.state) == ("ok", "ok")
+    assert str(latch_dir("robbie")) in latch.text
+    prepare(latch_dir("robbie"), ["base"], by_hand=False)
+    _, latch = doctor_stop.check("robbie")
+    assert (latch.state, "`cocoro reset`" in latch.text) == ("note", True)
+
+
+def test_the_doctor_warns_of_a_place_that_does_not_outlive_a_reboot_or_cannot_be_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert doctor_stop._filesystem(Path("/proc")) != "tmpfs"
+    monkeypatch.setattr(doctor_stop, "_filesystem", lambda _: "tmpfs")
+    assert [one.state for one in doctor_stop.check("robbie")] == ["ok", "bad"]
+    (tmp_path / "file").touch()
+    monkeypatch.setenv(record.STATE_DIR, str(tmp_path / "file"))
+    assert "comes up stopped" in list(doctor_stop.check("robbie"))[1].text
+
+
+def test_the_doctor_says_when_the_kernels_list_cannot_be_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(asking, "SOCKETS", "/nowhere/unix")
+    path, _ = doctor_stop.check("robbie")
+    assert (path.state, "is /proc mounted?" in path.text) == ("bad", True)
