@@ -15,6 +15,7 @@ import gc
 import importlib
 import io
 import json
+import logging
 import os
 import pkgutil
 import select
@@ -76,7 +77,7 @@ class Case:
     fresh: bool = False
     """With what the command imports of this project not yet imported."""
     instead: tuple[str, str] | None = None
-    """A function as `module:name`, and which of this file's is called in its place: `bug` or `talk`."""
+    """A function as `module:name`, and which of this file's is called in its place: `bug`, `talk` or `log`."""
 
 
 @dataclass(frozen=True)
@@ -236,7 +237,7 @@ def live(case: Case, kept: dict[str, int], narrow: int, counted: int) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN if case.deaf else signal.default_int_handler)
     if case.instead is not None:
         module, _, name = case.instead[0].partition(":")
-        setattr(importlib.import_module(module), name, {"bug": bug, "talk": talk}[case.instead[1]])
+        setattr(importlib.import_module(module), name, {"bug": bug, "talk": talk, "log": log}[case.instead[1]])
     if case.fresh:
         for name in [name for name in sys.modules if name.partition(".")[0] in ("cocoro", "services", "sim", "deploy")]:
             del sys.modules[name]
@@ -295,6 +296,12 @@ def talk(*_: object) -> int:
         for stream in (sys.stdout, sys.stderr):
             print(line, file=stream, flush=True)
     return TALKED
+
+
+def log(*_: object) -> str:
+    """A fault that a library, the event loop say, logs and goes on after."""
+    logging.getLogger("asyncio").error("a callback failed\nwith details", exc_info=ValueError("of two\nlines"))
+    return ""
 
 
 def signal_at(case: Case, counted: int) -> None:

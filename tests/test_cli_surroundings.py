@@ -106,7 +106,7 @@ def test_all_is_well_where_nothing_is_wrong(table: Table) -> None:
 
 SPREAD = (0.05, 0.3, 0.6, 0.95)
 """Where in a command a signal comes, as a share of its calls of Python functions."""
-FIRST = 4
+FIRST = 25
 """Calls after which the command hears signals: until then Python itself does, as while it starts."""
 
 
@@ -164,6 +164,15 @@ def test_a_bug_is_one_line_and_its_traceback_can_be_had(table: Table) -> None:
     assert told.code == exits.FAILED
     assert "Traceback (most recent call last)" in told.err
     assert told.err.endswith(ending.err)
+
+
+def test_what_is_logged_is_a_line_each(table: Table) -> None:
+    logs = {"instead": ("cocoro.cli.topics:table", "log")}
+    ending = table.play("topics", Surroundings(logs))
+    assert (ending.code, ending.err) == (exits.DONE, "cocoro: a callback failed: ValueError: of two\\nlines\n")
+    assert (
+        "ValueError: of two\nlines" in table.play("topics", Surroundings(logs | {"env": {"COCORO_LOG": "debug"}})).err
+    )
 
 
 def test_the_error_of_one_task_of_several_is_told_as_its_own(capsys: pytest.CaptureFixture[str]) -> None:

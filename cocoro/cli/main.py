@@ -53,8 +53,11 @@ def main(arguments: list[str] | None = None) -> int:
 def _command(arguments: list[str]) -> int:
     from typer.main import get_command
 
+    from cocoro.cli import log_lines
     from cocoro.cli.app import app
 
+    if output.taken_over():
+        log_lines.take_over()
     try:
         get_command(app)(args=arguments, prog_name="cocoro")  # not app itself, which hooks itself into sys.excepthook
     except SystemExit as end:

@@ -13,7 +13,6 @@ from __future__ import annotations
 import codecs
 import errno
 import io
-import logging
 import os
 import sys
 from collections import deque
@@ -112,7 +111,11 @@ def take_over() -> None:
         sys.stdin = open(0, encoding="utf-8", errors="replace", closefd=False)  # noqa: SIM115 # a number
     sys.stdout = _stream(sys.stdout, _Out(1, "<stdout>", vital=True, closed=1 in closed))
     sys.stderr = _stream(sys.stderr, _Out(2, "<stderr>", vital=False, closed=2 in closed))
-    logging.lastResort = _Warnings(logging.WARNING)
+
+
+def taken_over() -> bool:
+    """Whether the standard streams are those of `take_over`: this is the process `cocoro`, and no test of it."""
+    return bool(_outs)
 
 
 def _is_open(fd: int) -> bool:
@@ -181,18 +184,6 @@ def finish(code: int) -> int:
         advice = ADVICE.get(number, "write it elsewhere")
         complain(f"standard output: {out.failure.strerror}, so not all that was to be said has been; {advice}")
     return code or exits.FAILED
-
-
-class _Warnings(logging.Handler):
-    """Where no log was set up: what libraries, callbacks and forgotten tasks have to say, in a line each."""
-
-    def emit(self, record: logging.LogRecord) -> None:
-        error = record.exc_info[1] if record.exc_info else None
-        if isinstance(error, OutputError):  # `finish` says it
-            return
-        complain(" ".join(record.getMessage().split("\n", 1)[:1]) + (f": {named(error)}" if error else ""))
-        if error is not None:
-            show_trace(error)
 
 
 def named(error: BaseException) -> str:
