@@ -93,7 +93,7 @@ def holder(path: Path) -> Holder | None:
     """Who holds a file now."""
     try:
         fd = os.open(path, os.O_RDONLY)
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         return None
     try:
         deadline_s = time.monotonic() + LOOK_S
