@@ -1,5 +1,22 @@
 """The errors that a user can cause or must know of; the CLI shows their text and no traceback."""
 
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from os import PathLike, fspath
+
+
+@contextmanager
+def naming(path: PathLike[str]) -> Iterator[None]:
+    """While a file is written: the system says which file could not be opened, but not which could not be written."""
+    try:
+        yield
+    except OSError as error:
+        if error.filename is None:
+            error.filename = fspath(path)
+        raise
+
 
 class CocoroError(Exception):
     """What went wrong, where, and what to do about it, in one sentence or two."""

@@ -65,8 +65,11 @@ def watch_parent(fd: int) -> None:
     threading.Thread(target=watch, name="parent", daemon=True).start()
 
 
-def run(process: str, run_dir: RunDir, profile: dict[str, Any], profile_name: str) -> int:
-    """Run a process until it is told to end; returns the exit code. Logging is set up already."""
+def run(
+    process: str, run_dir: RunDir, profile: dict[str, Any], profile_name: str, *, raise_crashes: bool = False
+) -> int:
+    """Run a process until it is told to end; returns the exit code. Logging is set up already. A crash is logged with
+    its traceback, or raised for a caller who shows it to a person."""
     log = logging.getLogger(f"cocoro.{process}")
     try:
         with asyncio.Runner() as runner:
@@ -83,6 +86,8 @@ def run(process: str, run_dir: RunDir, profile: dict[str, Any], profile_name: st
         log.error("%s: %s; make room there", error.filename or run_dir.path, error.strerror)
         return MISCONFIGURED
     except Exception:
+        if raise_crashes:
+            raise
         log.exception("crashed")
         return CRASHED
 
@@ -143,13 +148,15 @@ def _path(file: str | None) -> Path | None:
 def _stop_signal() -> asyncio.Event:
     """Set by the first SIGTERM or SIGINT; a second one ends the process at once."""
     loop, stop = asyncio.get_running_loop(), asyncio.Event()
+    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
 
     def told() -> None:
         stop.set()
-        for number in (signal.SIGTERM, signal.SIGINT):
+        for number, handler in before.items():
             loop.remove_signal_handler(number)
+            signal.signal(number, handler)
 
-    for number in (signal.SIGTERM, signal.SIGINT):
+    for number in before:
         loop.add_signal_handler(number, told)
     return stop
 

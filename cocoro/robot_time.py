@@ -13,15 +13,18 @@ further ahead of them than CLOCKS_APART_NS of `cocoro.clock`, and commands that 
 
 from __future__ import annotations
 
-import os
 from contextlib import suppress
 from pathlib import Path
 
 import msgspec
 
+from cocoro import private
 from cocoro.clock import RealClock, wall_offset_ns
+from cocoro.errors import ConfigError
 
 FILE = "clock.json"
+LONGEST = 4096
+"""Bytes of it that are read."""
 
 
 class RobotTime(msgspec.Struct, frozen=True):
@@ -33,18 +36,17 @@ class RobotTime(msgspec.Struct, frozen=True):
 
 
 def fix(folder: Path) -> RealClock:
-    """Fix the robot's time anew, from the wall clock as it is now, for all who come later."""
+    """Fix the robot's time anew, from the wall clock as it is now, for all who come later. Raises ConfigError,
+    FullError."""
     time = RobotTime(boot=_boot(), offset_ns=wall_offset_ns())
-    written = folder / f"{FILE}.{os.getpid()}"
-    written.write_bytes(msgspec.json.encode(time))
-    written.replace(folder / FILE)  # at once, so that nobody reads half of it
+    private.write(folder / FILE, msgspec.json.encode(time))
     return RealClock(time.offset_ns)
 
 
 def clock(folder: Path) -> RealClock:
     """The robot's clock as it was fixed; one of its own for this process where that is not known."""
-    with suppress(OSError, msgspec.MsgspecError):
-        time = msgspec.json.decode((folder / FILE).read_bytes(), type=RobotTime)
+    with suppress(OSError, ConfigError, msgspec.MsgspecError):
+        time = msgspec.json.decode(private.read(folder / FILE, LONGEST), type=RobotTime)
         if time.boot == _boot():
             return RealClock(time.offset_ns)
     return RealClock()

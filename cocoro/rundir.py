@@ -104,7 +104,7 @@ def holder(path: Path) -> Holder | None:
     """Who holds a file now; named "" with the number 0 when that cannot be read. Raises ConfigError."""
     try:
         fd = private.open_file(path, os.O_RDONLY)
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         return None
     try:
         deadline_s = time.monotonic() + LOOK_S

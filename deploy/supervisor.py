@@ -25,6 +25,7 @@ from cocoro import robot_time
 from cocoro.bus import shared
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.errors import CocoroError, ConfigError, RefusedError
+from cocoro.launch import CRASHED
 from cocoro.processes import shared_bytes
 from cocoro.profiles import Profile, from_data
 from cocoro.quit import quit_process
@@ -277,13 +278,14 @@ def main() -> int:
     pipe = _Pipe(options.report_fd)
     data = json.loads(sys.stdin.buffer.read())
     profile = from_data(data, data.get("name", ""))
-    code = supervise(
-        profile,
-        RunDir(profile.robot, options.run_dir.parent),
-        pipe.line,
-        on_up=lambda: pipe.close(STOPPED),
-        by_hand=not options.unattended,
-    )
+    run_dir = RunDir(profile.robot, options.run_dir.parent)
+    by_hand = not options.unattended
+    try:
+        code = supervise(profile, run_dir, pipe.line, on_up=lambda: pipe.close(STOPPED), by_hand=by_hand)
+    except OSError as error:  # its traceback goes to supervisor.err, unless that is on the same full disk
+        pipe.line(f"{error.filename or run_dir.path}: {error.strerror}; mend it, or choose another by COCORO_RUN_DIR")
+        pipe.close(CRASHED)
+        raise
     pipe.close(code)
     return code
 

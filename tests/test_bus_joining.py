@@ -77,6 +77,7 @@ def test_a_directory_that_cannot_be_made_is_refused(directory: Path) -> None:
     [
         ({"directory": Path("/" + "x" * 100)}, "too long for a Unix socket"),
         ({"directory": Path("/run/a#b")}, "may not contain"),
+        ({"directory": Path("/run/caf\udce9")}, "must be UTF-8"),
         ({"directory": Path("/run/a"), "mode": "client"}, "without mode, listen and connect"),
         ({"directory": Path("/run/a"), "connect": ("tcp/127.0.0.1:1",)}, "without mode, listen and connect"),
         ({}, "say a directory, or where to listen or connect"),

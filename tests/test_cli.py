@@ -144,8 +144,8 @@ def test_the_emergency_stop_imports_next_to_nothing() -> None:
     done = subprocess.run([sys.executable, "-S", "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
     modules = set(done.stdout.split())
     assert {name for name in modules if name.startswith("cocoro")} == {
-        "cocoro", "cocoro.cli", "cocoro.cli.main", "cocoro.cli.exits", "cocoro.cli.estop", "cocoro.quit", "cocoro.stop",
-        "cocoro.stop.asking",
+        "cocoro", "cocoro.cli", "cocoro.cli.main", "cocoro.cli.exits", "cocoro.cli.output", "cocoro.cli.estop",
+        "cocoro.quit", "cocoro.stop", "cocoro.stop.asking",
     }  # fmt: skip
     assert modules.isdisjoint({"asyncio", "argparse", "json", "pathlib", "typing_extensions", "msgspec", "zenoh"})
 

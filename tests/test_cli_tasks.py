@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import io
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
@@ -13,12 +14,22 @@ import pytest
 
 from cocoro.bus.local import LocalMesh
 from cocoro.cli import exits
+from cocoro.cli.babble import Keeper
 from cocoro.cli.link import Link
 from cocoro.cli.progress import Lines, Live, View
 from cocoro.cli.tasks import Follower
 from cocoro.clock import VirtualClock
 from cocoro.errors import MeshError
-from cocoro.messages import CancelRequest, Latch, LatchState, Phase, TaskReply, TaskRequest, TaskState
+from cocoro.messages import (
+    CancelRequest,
+    Latch,
+    LatchState,
+    Message,
+    Phase,
+    TaskReply,
+    TaskRequest,
+    TaskState,
+)
 from cocoro.node import Node
 from cocoro.robot import Robot
 from cocoro.rundir import RunDir
@@ -176,6 +187,30 @@ async def test_the_first_interrupt_cancels_on_the_robot_and_waits_for_the_outcom
     code, _ = await running
     assert (code, executive.cancelled) == (exits.REFUSED, [ID])
     assert scene.out.getvalue().splitlines()[-1] == "cancelled: fetch red_can after 2.0 s: by the operator"
+
+
+@in_virtual_time
+async def test_babbling_that_cannot_be_kept_is_cancelled_on_the_robot(scene: Scene) -> None:
+    """It would move for nothing."""
+
+    class Full:
+        taken = 0
+
+        def take(self, _message: Message) -> None:
+            self.taken += 1
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    executive = Executive(scene.node)
+    executive.on_cancel = lambda: executive.tell("end", 2.0, outcome="cancelled")
+    follower, full = scene.follower(), Full()
+    keeper = Keeper(full, follower.cancel)  # type: ignore[arg-type]
+    running = await following(follower)
+    keeper.take(Message())
+    keeper.take(Message())
+    assert (await running)[0] == exits.REFUSED
+    assert executive.cancelled == [ID]
+    assert full.taken == 1
+    assert keeper.failure is not None
 
 
 @in_virtual_time

@@ -55,6 +55,8 @@ class ZenohConfig:
                 raise ConfigError(f"mesh directory {path}: the path is too long for a Unix socket, choose a shorter")
             if any(c in path for c in FORBIDDEN):
                 raise ConfigError(f"mesh directory {path}: the path may not contain any of {FORBIDDEN}")
+            if any("\udc80" <= c <= "\udcff" for c in path):
+                raise ConfigError(f"mesh directory {path}: the path must be UTF-8, choose another by COCORO_RUN_DIR")
         elif not self.listen and not self.connect:
             raise ConfigError(f"mesh of {self.name}: say a directory, or where to listen or connect")
 

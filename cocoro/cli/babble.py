@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from cocoro.cli.ending import on_end
 from cocoro.cli.link import Link, Where, joined
+from cocoro.cli.output import going_on
 from cocoro.cli.progress import View, view
-from cocoro.cli.tasks import Follower, interrupts
-from cocoro.errors import MeshError
+from cocoro.cli.tasks import Follower
+from cocoro.errors import CocoroError, MeshError
 from cocoro.learning.collector import TOPICS, Collector, collector
-from cocoro.messages import AboutRequest, ObjectsRequest, TaskName, TaskRequest, TaskState
+from cocoro.messages import AboutRequest, Message, ObjectsRequest, TaskName, TaskRequest, TaskState
 from cocoro.robot import Robot
 from cocoro.topics import ABOUT, OBJECTS
 
@@ -47,6 +50,23 @@ class BabbleView:
         return f"[{'#' * full}{'.' * (BAR - full)}] {count} of {self._wanted}: {self._kept.said}{left}"
 
 
+class Keeper:
+    """Keeps what is reported. When the file takes no more, it cancels: the robot need not move for nothing."""
+
+    def __init__(self, kept: Collector[Any], cancel: Callable[[], None]) -> None:
+        self.failure: OSError | None = None
+        self._kept = kept
+        self._cancel = cancel
+
+    def take(self, message: Message) -> None:
+        if self.failure is None:
+            try:
+                self._kept.take(message)
+            except OSError as error:
+                self.failure = error
+                self._cancel()
+
+
 async def babble(where: Where, task: TaskName, wanted: int, file: Path, label: str, as_json: bool) -> int:
     """Babble until the file holds `wanted` samples or trials. Ctrl-C stops the robot and keeps them. Returns the exit
     code; raises ConfigError or RefusedError for a file that cannot be gone on with."""
@@ -60,11 +80,17 @@ async def babble(where: Where, task: TaskName, wanted: int, file: Path, label: s
             if len(kept):
                 shown.say(f"going on from {file}: {kept.said}")
             samples = link.inbox(TOPICS[task])  # before the task is asked for, so that nothing is missed
-            samples.add(lambda _key, message: kept.take(message))
             request = TaskRequest(task=task, label=label, first=kept.next, count=wanted - len(kept))
             follower = Follower(link, request, shown, None)
-            with interrupts(follower.interrupt):
+            keeper = Keeper(kept, follower.cancel)
+            samples.add(lambda _key, message: keeper.take(message))
+            with on_end(follower.interrupt), going_on():
                 code, result = await follower.run()
+            if keeper.failure is not None:
+                raise CocoroError(
+                    f"samples {file}: {keeper.failure.strerror}, so babbling was cancelled; make room there, and the "
+                    f"same command goes on with the {len(kept)} that it has"
+                )
             result |= {"file": str(file), "samples": len(kept)}
     if as_json:
         print(json.dumps(result))

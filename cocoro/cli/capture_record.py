@@ -15,6 +15,7 @@ from cocoro import processes, robot_time
 from cocoro.cli import exits
 from cocoro.cli.ending import told_to_end
 from cocoro.cli.link import Where, joined
+from cocoro.cli.output import going_on
 from cocoro.clock import FollowedClock
 from cocoro.errors import ConfigError
 from cocoro.messages import Recording
@@ -46,7 +47,7 @@ async def record(where: Where, settings: dict[str, Any], seconds: float | None) 
         async with Node(name, link.bus, clock, robot, robot_name=link.robot, module=row.module, config=config) as node:
             view = _View()
             node.on(RECORDING.of(name), view.show)
-            with told_to_end() as end:
+            with told_to_end() as end, going_on():
                 await _work(component.run(node, config), end, view.failed, seconds)
                 with suppress(TimeoutError):
                     await asyncio.wait_for(view.ended.wait(), LAST_WORDS_S)

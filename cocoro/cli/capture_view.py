@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
-import signal
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -15,6 +13,7 @@ from cocoro.bus.base import Bus, Payload
 from cocoro.capture.export.rerun_scene import Teller, library, no_viewer, opened, tell
 from cocoro.capture.reader import Capture
 from cocoro.cli import exits
+from cocoro.cli.ending import told_to_end
 from cocoro.cli.link import Where, joined
 from cocoro.messages import Message
 from cocoro.objects import Catalogue
@@ -47,10 +46,8 @@ async def view_mesh(where: Where) -> int:
         recording = opened(rr)
         watch(link.bus, link.robot, Teller(recording, Robot.load(description, measured), Catalogue.load()))
         print("Ctrl-C ends it")
-        end, loop = asyncio.Event(), asyncio.get_running_loop()
-        for number in (signal.SIGINT, signal.SIGTERM):
-            loop.add_signal_handler(number, end.set)
-        await end.wait()
+        with told_to_end() as end:
+            await end.wait()
     return exits.DONE
 
 

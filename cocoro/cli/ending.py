@@ -4,21 +4,35 @@ from __future__ import annotations
 
 import asyncio
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+
+ENDS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+@contextmanager
+def on_end(handler: Callable[[], None]) -> Iterator[None]:
+    """Ctrl-C, being told to end and a closed terminal all go to `handler`, for as long as this context lasts. What is
+    ignored, as nohup and scripts in the background have it, stays so, but for SIGTERM."""
+    loop = asyncio.get_running_loop()
+    before = {number: signal.getsignal(number) for number in ENDS}
+    numbers = [number for number in ENDS if before[number] != signal.SIG_IGN or number == signal.SIGTERM]
+    for number in numbers:
+        loop.add_signal_handler(number, handler)
+    try:
+        yield
+    finally:
+        for number in numbers:
+            loop.remove_signal_handler(number)
+            signal.signal(number, before[number])  # the loop leaves Python's own, by which SIGTERM kills
 
 
 @contextmanager
 def told_to_end() -> Iterator[asyncio.Event]:
-    """Set by Ctrl-C and by SIGTERM, for as long as this context lasts."""
-    loop, end = asyncio.get_running_loop(), asyncio.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, end.set)
-    try:
+    """Set by whatever tells a command to end."""
+    end = asyncio.Event()
+    with on_end(end.set):
         yield end
-    finally:
-        for number in (signal.SIGINT, signal.SIGTERM):
-            loop.remove_signal_handler(number)
 
 
 async def passed(end: asyncio.Event, seconds: float | None) -> bool:

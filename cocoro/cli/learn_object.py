@@ -16,7 +16,7 @@ from cocoro.appearance.learn import Learnt, Wanted, learn
 from cocoro.cli import exits
 from cocoro.cli.learn_sight import Sight, of_picture, of_robot, preview
 from cocoro.cli.link import Where
-from cocoro.errors import ConfigError
+from cocoro.errors import ConfigError, naming
 from cocoro.objects import Catalogue, KnownObject
 from cocoro.objects_file import save, text_of, with_object
 from cocoro.picture import save_png
@@ -93,7 +93,8 @@ def _show(sight: Sight, learnt: Learnt, path: Path, picture: Path) -> list[str]:
     """Write the picture; what the robot would say that it sees, with the new object in its catalogue."""
     with tempfile.TemporaryDirectory() as folder:
         draft = Path(folder) / "objects.toml"
-        draft.write_text(with_object(text_of(path), learnt.known), encoding="utf-8")
+        with naming(draft):
+            draft.write_text(with_object(text_of(path), learnt.known), encoding="utf-8")
         image, seen = preview(sight, learnt, draft)
     save_png(image, picture)
     return seen

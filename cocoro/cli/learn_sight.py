@@ -21,7 +21,7 @@ from cocoro.core import Sample
 from cocoro.errors import ConfigError, MeshError
 from cocoro.messages import Detections, Frame, Message, ServoState
 from cocoro.objects import Catalogue
-from cocoro.picture import colour_of, describe, draw
+from cocoro.picture import colour_of, describe, draw, load
 from cocoro.robot import Robot
 from cocoro.topics import ARM_STATE, FRAME
 
@@ -49,7 +49,7 @@ def of_picture(path: Path) -> Sight:
     """A picture file, taken to be the robot's camera's. Raises ConfigError when it is none."""
     if not path.is_file():
         raise ConfigError(f"there is no picture {path}; --from names a file, or says live")
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    image = load(path)
     if image is None:
         raise ConfigError(f"{path} is no picture that can be read (PNG, JPEG)")
     colour = np.ascontiguousarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)

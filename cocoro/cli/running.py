@@ -18,6 +18,7 @@ from cocoro import launch, private, profiles
 from cocoro.bus import shared
 from cocoro.cli import exits
 from cocoro.cli.options import frames_of, latencies_of
+from cocoro.cli.output import going_on
 from cocoro.errors import CocoroError, ConfigError
 from cocoro.profiles import Profile
 from cocoro.rundir import RunDir, Target, robots, targets
@@ -194,11 +195,10 @@ def run(process: str, profile: str | None, settings: list[str]) -> int:
     run_dir = RunDir(read.robot)
     run_dir.make()
     launch.set_up_logging(process)
-    return launch.run(process, run_dir, msgspec.to_builtins(read), read.name)
+    with going_on():
+        return launch.run(process, run_dir, msgspec.to_builtins(read), read.name, raise_crashes=True)
 
 
 def _say(text: str) -> None:
-    try:
+    with going_on():  # when nobody reads any more, as with `cocoro up | head`, the robot must not mind
         print(text, flush=True)
-    except BrokenPipeError:  # nobody reads any more, as with `cocoro up | head`; the robot must not mind
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import asyncio
 import json
-import signal
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import msgspec
 
 from cocoro.cli import exits
+from cocoro.cli.ending import on_end
 from cocoro.cli.link import Link, Where, joined
+from cocoro.cli.output import going_on
 from cocoro.cli.progress import View, view
 from cocoro.cli.snapshot import Snapshot, check
 from cocoro.errors import CallTimeoutError, CocoroError
@@ -38,7 +37,7 @@ async def run(where: Where, request: TaskRequest, as_json: bool, picture: Path |
         check(picture)
     async with joined(where, frames=picture is not None) as link:
         follower = Follower(link, request, view(as_json), picture)
-        with interrupts(follower.interrupt):
+        with on_end(follower.interrupt), going_on():
             code, result = await follower.run()
     if as_json:
         print(json.dumps(result))
@@ -73,6 +72,10 @@ class Follower:
         """The first one cancels the task on the robot, the second one leaves at once."""
         if self._interrupted.is_set():
             raise KeyboardInterrupt
+        self.cancel()
+
+    def cancel(self) -> None:
+        """Have the task cancelled on the robot, and wait for its outcome."""
         self._interrupted.set()
 
     async def run(self) -> tuple[int, dict[str, object]]:
@@ -161,18 +164,3 @@ class Follower:
         reason = f": {state.reason}" if state.reason and state.outcome != "done" else ""
         self._view.result(f"{state.outcome}: {self._name}{time}{reason}")
         return code, msgspec.to_builtins(state)
-
-
-@contextmanager
-def interrupts(handler: Callable[[], None]) -> Iterator[None]:
-    """Ctrl-C, being told to end and a closed terminal all go to `handler`: a task is not left running by itself."""
-    loop = asyncio.get_running_loop()
-    ends = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-    numbers = [number for number in ends if signal.getsignal(number) != signal.SIG_IGN]  # as nohup has it
-    for number in numbers:
-        loop.add_signal_handler(number, handler)
-    try:
-        yield
-    finally:
-        for number in numbers:
-            loop.remove_signal_handler(number)

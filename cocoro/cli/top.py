@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
 import sys
 import time
 from functools import partial
@@ -75,7 +76,7 @@ class Watch:
         self._before: dict[tuple[str, str, str], int] = {}
         """Counts of the last report, by reader, key and what is counted."""
         self._changed = asyncio.Event()
-        psutil.cpu_percent()  # the first of these calls has nothing to compare with
+        _machine()  # the first of these calls has nothing to compare with
         link.inbox(HEALTH.of("*")).add(lambda _key, health: self._on_health(health))
         for what, topic in NEWS.items():
             link.inbox(topic).add(partial(self._on_news, what))
@@ -109,7 +110,7 @@ class Watch:
         return {
             "robot": self._link.robot,
             "profile": resolved.get("name", ""),
-            "machine": {"cores": psutil.cpu_count() or 1, "cpu_share": psutil.cpu_percent() / 100},
+            "machine": _machine(),
             **{what: msgspec.to_builtins(self._news.get(what)) for what in NEWS},
             "services": [self._service(name, rows.get(name)) for name in ordered],
             "topics": self._topics(),
@@ -181,6 +182,15 @@ class Watch:
 
 
 COUNTS = ("skipped", "lost", "rejected")
+
+
+def _machine() -> dict[str, Any]:
+    """Its cores, and the share of them that is used since the last call; None where /proc does not tell it."""
+    try:
+        used = psutil.cpu_percent() / 100
+    except (psutil.Error, OSError):
+        used = None
+    return {"cores": os.cpu_count() or 1, "cpu_share": used}
 
 
 def _place(name: str, rows: dict[str, Process], names: list[str]) -> tuple[int, bool, int]:

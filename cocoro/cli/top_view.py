@@ -54,7 +54,8 @@ def _headline(report: dict[str, Any]) -> Text:
     if report["profile"]:
         text.append(f" ({report['profile']})")
     machine = report["machine"]
-    text.append(f"  cpu {100 * machine['cpu_share']:.0f}% of {machine['cores']} cores")
+    used = machine["cpu_share"]
+    text.append(f"  cpu {'unknown (no /proc)' if used is None else f'{100 * used:.0f}%'} of {machine['cores']} cores")
     if (clock := report["clock"]) is not None:
         slow = clock["paused"] or clock["rate"] < SLOW
         rate = "stands" if clock["paused"] else f"x{clock['rate']:.2f}"

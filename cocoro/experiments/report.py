@@ -14,6 +14,7 @@ from typing import Any
 import msgspec
 
 from cocoro.about import DISTRIBUTIONS
+from cocoro.errors import naming
 from cocoro.experiments.section import Row, Section
 from cocoro.experiments.settings import Settings
 from cocoro.learning.dataset import fingerprint_of
@@ -129,4 +130,5 @@ def _figure(path: Path, caption: str) -> str:
 
 
 def _write(path: Path, text: str) -> None:
-    path.write_text(text, encoding="utf-8")
+    with naming(path):
+        path.write_text(text, encoding="utf-8")

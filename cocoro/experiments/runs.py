@@ -16,7 +16,7 @@ from typing import Any, Literal, Protocol
 
 import msgspec
 
-from cocoro.errors import CocoroError
+from cocoro.errors import CocoroError, naming
 from cocoro.rehearsal import RehearsalRequest
 
 SIMULATOR = "sim.rehearse"
@@ -148,7 +148,8 @@ def _keep(run: Run, folder: Path, results: Mapping[str, Result]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     beside = path.with_suffix(".part")
     data = {"kind": run.kind, "fields": _plain(run.fields), "after": _after(run, results), "result": result}
-    beside.write_text(json.dumps(data))
+    with naming(beside):
+        beside.write_text(json.dumps(data))
     beside.replace(path)
 
 

@@ -192,10 +192,19 @@ class Writer(Generic[Row]):
         self._file.close()
 
     def append(self, rows: Iterable[Row]) -> None:
-        """Write rows at once: when this returns they outlive the process."""
+        """Write rows at once: when this returns they outlive the process. Raises OSError with the file's name."""
         added = list(rows)
-        self._file.write(b"".join(msgspec.json.encode(row) + b"\n" for row in added))
+        self._write(b"".join(msgspec.json.encode(row) + b"\n" for row in added))
         self.rows += added
+
+    def _write(self, data: bytes) -> None:
+        rest = memoryview(data)
+        try:
+            while rest:  # a disk that is filling takes a part, and says so with the next
+                rest = rest[self._file.write(rest) :]
+        except OSError as error:
+            error.filename = str(self.path)
+            raise
 
     def _lock(self) -> None:
         try:
@@ -210,7 +219,7 @@ class Writer(Generic[Row]):
         if whole < len(data):
             self._file.truncate(whole)  # the line that was being written when the last process ended
         if not whole:
-            self._file.write(msgspec.json.encode(header) + b"\n")
+            self._write(msgspec.json.encode(header) + b"\n")
             return []
         found = _parse(self.path, data, kind, robot)
         if (found.header.joints, found.header.roll_rad) != (header.joints, header.roll_rad):

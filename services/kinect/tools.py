@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 
 from cocoro.clock import RealClock
 from cocoro.errors import CocoroError, ConfigError
+from cocoro.picture import load as load_picture
+from cocoro.picture import save as save_picture
 from services.kinect.calibration import Array, Board, View, find_corners
 from services.kinect.config import Config
 from services.kinect.device import DepthCamera, Shot, open_device
@@ -159,8 +161,10 @@ def save(folder: Path, number: int, colour: NDArray[np.uint8], depth: NDArray[np
     """As two PNG files, the depth's of 16 bits."""
     for what, picture in (("colour", cv2.cvtColor(colour, cv2.COLOR_RGB2BGR)), ("depth", depth)):
         file = folder / f"view-{number:02}-{what}.png"
-        if not cv2.imwrite(str(file), picture):
-            raise ConfigError(f"{file} cannot be written")
+        try:
+            save_picture(picture, file)
+        except OSError as error:
+            raise ConfigError(f"{file} cannot be written: {error.strerror}; choose another place") from error
 
 
 def read(folder: Path, board: Board, tell: Tell) -> list[View]:
@@ -180,9 +184,9 @@ def _pictures(folder: Path) -> Iterator[tuple[Path, NDArray[np.uint8], NDArray[n
     if not files:
         raise ConfigError(f"{folder} holds no views: view-01-colour.png, view-01-depth.png and so on")
     for file in files:
-        colour = cv2.imread(str(file), cv2.IMREAD_COLOR)
+        colour = load_picture(file)
         other = file.with_name(file.name.replace("-colour", "-depth"))
-        depth = cv2.imread(str(other), cv2.IMREAD_UNCHANGED) if other.exists() else None
+        depth = load_picture(other, cv2.IMREAD_UNCHANGED) if other.exists() else None
         if colour is None or depth is None or depth.dtype != np.uint16 or depth.shape != colour.shape[:2]:
             raise ConfigError(f"{file} and {other.name} are no view: a colour picture, and one of 16 bits and its size")
         yield file, np.asarray(cv2.cvtColor(colour, cv2.COLOR_BGR2RGB), np.uint8), np.asarray(depth, np.uint16)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 import cv2
 
 from cocoro.capture.errors import CaptureError
+from cocoro.capture.export.opencv_file import Complaints, spelt_for_opencv, why_not_more
 from cocoro.capture.export.outfile import making
 from cocoro.capture.export.story import Story, catalogue_of, read
 from cocoro.capture.reader import Capture
@@ -33,28 +35,33 @@ def export(capture: Capture, out: Path, progress: Callable[[float], None] = lamb
 def _export(capture: Capture, out: Path, progress: Callable[[float], None]) -> int:
     story, catalogue = Story(capture), catalogue_of(capture)
     film: _Film | None = None
-    for record, frame in read(capture, FRAME):
-        at_s = (record.log_ns - capture.start_ns) / NS
+    with spelt_for_opencv(out) as name, closing(Complaints()) as complaints:
+        for record, frame in read(capture, FRAME):
+            at_s = (record.log_ns - capture.start_ns) / NS
+            if film is None:
+                film = _Film(out, name, complaints, frame, at_s)
+            seen = story.seen_in(frame.incarnation, frame.seq)
+            film.show(at_s, draw(frame, seen, catalogue, _caption(story, record.log_ns, at_s)))
+            progress(at_s)
         if film is None:
-            film = _Film(out, frame, at_s)
-        seen = story.seen_in(frame.incarnation, frame.seq)
-        film.show(at_s, draw(frame, seen, catalogue, _caption(story, record.log_ns, at_s)))
-        progress(at_s)
-    if film is None:
-        raise CaptureError(f"{capture.path}: it has no pictures")
-    return film.close()
+            raise CaptureError(f"{capture.path}: it has no pictures")
+        return film.close()
 
 
 class _Film:
-    def __init__(self, out: Path, first: Frame, start_s: float) -> None:
+    def __init__(self, out: Path, name: str, complaints: Complaints, first: Frame, start_s: float) -> None:
         self._out = out
+        self._name = name
+        self._complaints = complaints
         self._size = first.width, first.height
         self._start_s = start_s
         self._count = 0
         self._picture: Pixels | None = None
-        self._writer = cv2.VideoWriter(str(out), cv2.VideoWriter.fourcc(*CODEC), RATE_HZ, self._size)
+        with complaints:
+            self._writer = cv2.VideoWriter(name, cv2.VideoWriter.fourcc(*CODEC), RATE_HZ, self._size)
         if not self._writer.isOpened():
-            raise CaptureError(f"{out}: OpenCV cannot write a film there")
+            raise CaptureError(f"{out}: OpenCV cannot write a film there; choose another place")
+        complaints.are_new()  # of opening it: it is open
 
     def show(self, at_s: float, picture: Pixels) -> None:
         self._hold_until(at_s)
@@ -65,14 +72,16 @@ class _Film:
     def close(self) -> int:
         if self._picture is not None:
             self._write(self._picture)
-        self._writer.release()
-        if not self._is_whole():
-            raise CaptureError(f"{self._out}: the film could not be written to its end; the disk may be full")
+        with self._complaints:
+            self._writer.release()
+            whole = self._is_whole()
+        if not whole:
+            raise self._broken(why_not_more(self._out) or "it cannot be opened")
         return self._count
 
     def _is_whole(self) -> bool:
-        """OpenCV does not say when the disk takes no more; a film whose end is missing cannot be opened."""
-        film = cv2.VideoCapture(str(self._out))
+        """A film whose end is missing cannot be opened."""
+        film = cv2.VideoCapture(self._name)
         try:
             return film.isOpened() and round(film.get(cv2.CAP_PROP_FRAME_COUNT)) == self._count
         finally:
@@ -83,8 +92,18 @@ class _Film:
             self._write(self._picture)
 
     def _write(self, picture: Pixels) -> None:
-        self._writer.write(cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
+        with self._complaints:
+            self._writer.write(cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
         self._count += 1
+        if self._complaints.are_new() and (reason := why_not_more(self._out)):
+            with self._complaints:
+                self._writer.release()
+            raise self._broken(reason)
+
+    def _broken(self, reason: str) -> CaptureError:
+        return CaptureError(
+            f"{self._out}: the film could not be written to its end: {reason}; make room there, or choose another place"
+        )
 
 
 def _caption(story: Story, log_ns: int, at_s: float) -> str:

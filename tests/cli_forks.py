@@ -1,0 +1,328 @@
+"""Runs the command in many situations, cheaply: one process that has imported it, and forks for each of them.
+
+`Forks` is used by tests. What it starts is this very file, as a program that takes one situation a line, as JSON, and
+answers with how the command ended in it. A forked child opens no zenoh session: the commands that it is given end
+before.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import fcntl
+import functools
+import gc
+import importlib
+import io
+import json
+import logging
+import os
+import pkgutil
+import select
+import signal
+import subprocess
+import sys
+import tempfile
+import termios
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+PATIENCE_S = 60.0
+"""Far more than any of the commands takes, on however busy a machine: it hangs."""
+NEW_MOUNTS, PRIVATE, RECURSIVE, READ_ONLY = 0x20000, 1 << 18, 1 << 14, 1
+"""Of unshare(2) and mount(2)."""
+LATER = 7
+TALKED = 3
+FULL = "size=4k"
+"""Of an empty file system: it is filled."""
+NO_MOUNTS = 77
+"""Exit code of a child that may not have mounts of its own."""
+
+
+OFTEN = (
+    "services.base.doctor", "services.capture.service", "services.kinect.doctor", "services.kinect.tools",
+    "services.servos.doctor", "services.servos.tools", "cocoro.capture.export.foxglove", "cocoro.capture.export.video",
+)  # fmt: skip
+"""What commands import when they are called."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """A command's situation."""
+
+    arguments: list[str]
+    folder: str
+    """The current directory."""
+    stdin: str = "null"
+    stdout: str = "kept"
+    stderr: str = "kept"
+    """kept, null, closed, full (of /dev/full), gone (a pipe that nobody reads) or narrow (a terminal of one column)."""
+    unbuffered: bool = False
+    encoding: str = "utf-8"
+    env: dict[str, str | None] = field(default_factory=dict)
+    """None takes a variable away."""
+    no_folder: bool = False
+    """The current directory is removed."""
+    mounts: list[tuple[str, str]] = field(default_factory=list)
+    """Where an empty file system is, and its options (`ro` is read-only); the command alone sees it."""
+    at_call: int | None = None
+    """In which call of a Python function a signal comes; -1 counts them."""
+    number: int = signal.SIGINT
+    again: bool = False
+    """And once more, a few calls later."""
+    deaf: bool = False
+    """Ctrl-C is ignored."""
+    fresh: bool = False
+    """With what the command imports of this project not yet imported."""
+    instead: tuple[str, str] | None = None
+    """A function as `module:name`, and which of this file's is called in its place: `bug`, `talk` or `log`."""
+
+
+@dataclass(frozen=True)
+class Ending:
+    """How a command ended."""
+
+    code: int
+    """Negative for a signal."""
+    out: str
+    err: str
+    hung: bool = False
+    calls: int = 0
+
+
+class Forks:
+    """A context manager, and called with a Case, which it plays."""
+
+    def __init__(self, **env: str) -> None:
+        threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+        self._process = subprocess.Popen(
+            [sys.executable, __file__],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            env=os.environ | threads | env,
+            text=True,
+            encoding="ascii",
+        )
+
+    def __enter__(self) -> Forks:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._process.stdin.close()
+        self._process.stdout.close()
+        self._process.wait(PATIENCE_S)
+
+    def __call__(self, case: Case) -> Ending:
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        print(json.dumps(asdict(case)), file=self._process.stdin, flush=True)
+        return Ending(**json.loads(self._process.stdout.readline()))
+
+
+# --- the program that forks -----------------------------------------------------------------------
+
+
+def serve() -> None:
+    """Import everything, then play what comes."""
+    with contextlib.redirect_stdout(sys.stderr):
+        preload()
+    gc.disable()  # a collection touches, and so copies, what the children share
+    for line in sys.stdin:
+        ending = play(Case(**named_here(json.loads(line))))
+        print(json.dumps(asdict(ending)), flush=True)
+
+
+def named_here(value: Any) -> Any:
+    """With file names as this process's locale spells them: in that of C, `ü` is two bytes of no character."""
+    if isinstance(value, str):
+        return os.fsdecode(value.encode("utf-8", "surrogateescape"))
+    if isinstance(value, list):
+        return [named_here(each) for each in value]
+    return {key: named_here(each) for key, each in value.items()} if isinstance(value, dict) else value
+
+
+def preload() -> None:
+    import typer.main
+
+    typer.main.get_command = functools.cache(typer.main.get_command)  # to make them is most of what a command costs
+    from cocoro import cli
+    from cocoro.cli.main import main
+
+    for module in pkgutil.iter_modules(cli.__path__, "cocoro.cli."):
+        importlib.import_module(module.name)
+    for name in OFTEN:
+        importlib.import_module(name)
+    with (
+        Path(os.devnull).open("w") as nowhere,
+        contextlib.redirect_stdout(nowhere),
+        contextlib.redirect_stderr(nowhere),
+    ):
+        main(["topics", "--help"])
+        main(["no-such-command"])
+
+
+def play(case: Case) -> Ending:
+    kept = {name: os.memfd_create(name) for name in ("out", "err")}
+    counted = os.memfd_create("calls")
+    master, narrow = os.openpty()
+    termios.tcsetwinsize(narrow, (24, 1))
+    child = os.fork()
+    if not child:
+        try:
+            live(case, kept, narrow, counted)
+        except BaseException as error:  # as the interpreter does; the command never returns
+            sys.excepthook(type(error), error, error.__traceback__)
+        os._exit(99)
+    os.close(narrow)
+    hung = not ended(child, master, kept["out"])
+    if hung:
+        os.kill(child, signal.SIGKILL)
+    status = os.waitpid(child, 0)[1]
+    texts = {name: os.pread(fd, 1 << 20, 0).decode("utf-8", "surrogateescape") for name, fd in kept.items()}
+    calls = int(os.pread(counted, 20, 0) or 0)
+    for fd in (master, counted, *kept.values()):
+        os.close(fd)
+    return Ending(os.waitstatus_to_exitcode(status), texts["out"], texts["err"], hung, calls)
+
+
+def ended(child: int, master: int, out: int) -> bool:
+    """Whether it ends; takes what it writes on its terminal meanwhile."""
+    pid_fd = os.pidfd_open(child)
+    try:
+        while True:
+            ready, _, _ = select.select([pid_fd, master], [], [], PATIENCE_S)
+            if master in ready:
+                try:
+                    os.write(out, os.read(master, 65536))
+                except OSError:  # nobody has the terminal any more
+                    return bool(select.select([pid_fd], [], [], PATIENCE_S)[0])
+            else:
+                return pid_fd in ready
+    finally:
+        os.close(pid_fd)
+
+
+# --- the child ------------------------------------------------------------------------------------
+
+
+def live(case: Case, kept: dict[str, int], narrow: int, counted: int) -> None:
+    """Be the process `cocoro`, as the interpreter has it when its first line runs."""
+    for name, value in case.env.items():
+        if value is None:
+            os.environ.pop(name, None)
+        else:
+            os.environ[name] = value
+    tempfile.tempdir = None  # it has been asked for here
+    mount(case.mounts)
+    os.chdir(case.folder)
+    if case.no_folder:
+        Path(case.folder).rmdir()
+    places = {"out": case.stdout, "err": case.stderr}
+    fds = [opened(case.stdin, -1, narrow)]
+    fds += [opened(place, kept[name], narrow) for name, place in places.items()]
+    for number, fd in enumerate(fds):
+        if fd is None:
+            os.close(number)
+        else:
+            os.dup2(fd, number)
+    os.closerange(3, counted)
+    sys.stdin = sys.__stdin__ = stream(0, "r", case)  # type: ignore[assignment,misc]
+    sys.stdout = sys.__stdout__ = stream(1, "w", case)  # type: ignore[assignment,misc]
+    sys.stderr = sys.__stderr__ = stream(2, "w", case)  # type: ignore[assignment,misc]
+    sys.argv = ["cocoro", *case.arguments]
+    signal.signal(signal.SIGINT, signal.SIG_IGN if case.deaf else signal.default_int_handler)
+    if case.instead is not None:
+        module, _, name = case.instead[0].partition(":")
+        setattr(importlib.import_module(module), name, {"bug": bug, "talk": talk, "log": log}[case.instead[1]])
+    if case.fresh:
+        for name in [name for name in sys.modules if name.partition(".")[0] in ("cocoro", "services", "sim", "deploy")]:
+            del sys.modules[name]
+    from cocoro.cli.main import run
+
+    if case.at_call is not None:
+        signal_at(case, counted)
+    run()
+
+
+def opened(place: str, kept: int, narrow: int) -> int | None:
+    """A descriptor of what a standard stream is to be; None for none."""
+    if place == "gone":
+        reader, writer = os.pipe()
+        os.close(reader)
+        return writer
+    files = {"null": os.devnull, "full": "/dev/full"}
+    return {"kept": kept, "narrow": narrow, "closed": None}[place] if place not in files else os.open(files[place], 2)
+
+
+def stream(fd: int, mode: str, case: Case) -> Any:
+    try:
+        fcntl.fcntl(fd, fcntl.F_GETFD)
+    except OSError:
+        return None
+    errors = "backslashreplace" if fd == 2 else "strict"
+    buffering = 0 if case.unbuffered and mode == "w" else -1
+    file: Any = open(fd, f"{mode}b", closefd=False, buffering=buffering)  # noqa: SIM115
+    text = io.TextIOWrapper(file, encoding=case.encoding, errors=errors, line_buffering=fd == 2 or os.isatty(fd))
+    text.reconfigure(write_through=case.unbuffered)
+    return text
+
+
+def mount(wanted: list[tuple[str, str]]) -> None:
+    if not wanted:
+        return
+    libc = ctypes.CDLL(None, use_errno=True)
+    failed = libc.unshare(NEW_MOUNTS) or libc.mount(None, b"/", None, RECURSIVE | PRIVATE, None)
+    for place, options in wanted:
+        flags = READ_ONLY if options == "ro" else 0
+        data = b"" if options == "ro" else options.encode()
+        failed = failed or libc.mount(b"none", os.fsencode(place), b"tmpfs", flags, data)
+        if options == FULL and not failed:
+            (Path(place) / "full").write_bytes(bytes(4096))
+    if failed:
+        os._exit(NO_MOUNTS)
+
+
+def bug(*_: object, **__: object) -> None:
+    raise ZeroDivisionError("a bug\nof two lines")
+
+
+def talk(*_: object) -> int:
+    """A command that has much to say, each time at once, and gets to its end."""
+    for line in range(3):
+        for stream in (sys.stdout, sys.stderr):
+            print(line, file=stream, flush=True)
+    return TALKED
+
+
+def log(*_: object) -> str:
+    """A fault that a library, the event loop say, logs and goes on after."""
+    logging.getLogger("asyncio").error("a callback failed\nwith details", exc_info=ValueError("of two\nlines"))
+    return ""
+
+
+def signal_at(case: Case, counted: int) -> None:
+    """Have a signal in the nth call of a Python function."""
+    calls = 0
+    wanted = {case.at_call, case.at_call + LATER if case.again else case.at_call}
+
+    def trace(_frame: FrameType, event: str, _argument: Any) -> None:
+        nonlocal calls
+        if event == "call":
+            calls += 1
+            if calls in wanted:
+                wanted.remove(calls)
+                if not wanted:
+                    sys.setprofile(None)
+                signal.raise_signal(case.number)
+            elif case.at_call < 0:
+                os.pwrite(counted, str(calls).encode(), 0)
+
+    sys.setprofile(trace)
+
+
+if __name__ == "__main__":
+    serve()

@@ -1,0 +1,198 @@
+"""Every command of `cocoro`, the surroundings in which each is tried, and what must hold of it there."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import typer.main
+from cli_forks import Case, Ending
+
+from cocoro.cli import exits
+from cocoro.cli.app import app
+
+GOLDEN = Path(__file__).parent / "golden" / "fetch.mcap"
+CODES = (exits.DONE, exits.FAILED, exits.USAGE, exits.REFUSED, exits.NO_MESH)
+
+ARGUMENTS: dict[str, str] = {
+    "fetch": "{name}",
+    "follow": "{name}",
+    "touch": "{name}",
+    "go-to": "{name}",
+    "rehearse": "dance",
+    "snapshot": "{name}.png",
+    "record": "--out {name}",
+    "replay": "{capture} --paused",
+    "export": "{capture} --foxglove {name}.mcap",
+    "view": "{capture}",
+    "echo": "{name}",
+    "hz": "{name}",
+    "experiment": "E9",
+    "up": "{name}.toml",
+    "run": "{name}",
+    "estop": "--robot {name}",  # else it would stop every robot on this machine
+    "stop": "--robot {name}",
+    "objects learn": "mug --from {name}.png",
+    "capture info": "{capture}",
+    "capture repair": "{capture} --out {name}.mcap",
+    "capture rerun": "{capture} --service {name}",
+    "new service": "nearest --into {name}",
+    "servos set-id": "1 2 --port {name}",
+    "servos calibrate": "elbow",
+    "servos limits": "elbow",
+    "kinect tilt": "5",
+    "learn arm": "{name}.jsonl",
+    "learn wheels": "{name}.jsonl",
+}
+"""For each command arguments with which it ends soon and, where it can without a robot, well. No zenoh session may be
+opened: the commands run in forked children."""
+
+
+def commands(command: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[str, Any]]:
+    """Each that can be called, by its name."""
+    if not hasattr(command, "commands"):
+        yield " ".join(path), command
+        return
+    if path and command.invoke_without_command:
+        yield " ".join(path), command
+    for name, sub in command.commands.items():
+        yield from commands(sub, (*path, name))
+
+
+COMMANDS = dict(commands(typer.main.get_command(app)))
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """What is wrong around a command."""
+
+    what: dict[str, Any] = field(default_factory=dict)
+    """Fields of a Case; in `env` and `mounts` {root} is a folder of the test's own."""
+    odd: str = ""
+    """Is in the names of all folders and files."""
+    lost: bool = False
+    """Standard output does not arrive."""
+    same: bool = True
+    """It ends with the exit code that it has when all is well."""
+    lines: int = 1
+    """At most so many things are said of it."""
+    helps: bool = False
+    """`--help` is tried, too."""
+
+
+NOT_UTF8 = "caf\udce9"
+
+SURROUNDINGS: dict[str, Surroundings] = {
+    "stdout closed": Surroundings({"stdout": "closed"}, lost=True, helps=True),
+    "stdin and stderr closed": Surroundings({"stdin": "closed", "stderr": "closed"}),
+    "all closed": Surroundings({"stdin": "closed", "stdout": "closed", "stderr": "closed"}, lost=True),
+    "stdout on a full device": Surroundings({"stdout": "full"}, lost=True),
+    "both unbuffered on a full device": Surroundings(
+        {"stdout": "full", "stderr": "full", "unbuffered": True}, lost=True
+    ),
+    "a pipe that nobody reads": Surroundings({"stdout": "gone"}, lost=True),
+    "ASCII alone": Surroundings({"encoding": "ascii"}, odd="für", helps=True),
+    "names that are no UTF-8": Surroundings(
+        {"env": {"COCORO_RUN_DIR": f"{{root}}/{NOT_UTF8}"}}, odd=NOT_UTF8, same=False
+    ),
+    "names of several lines": Surroundings(odd="a\nb\x1b[2Jc"),
+    "a current directory that was removed": Surroundings({"no_folder": True}, same=False),
+    "no home, and a width that is none": Surroundings(
+        {"env": {"HOME": None, "XDG_RUNTIME_DIR": None, "COCORO_RUN_DIR": None, "COLUMNS": "wide", "LINES": "-1"}}
+    ),
+    "a home and a run directory that are read-only": Surroundings(
+        {"env": {"HOME": "{root}/disk", "COCORO_RUN_DIR": "{root}/disk/run"}, "mounts": [("{root}/disk", "ro")]}
+    ),
+    "no terminal to speak of": Surroundings({"env": {"TERM": None, "COLUMNS": "1", "LINES": "1"}, "stdout": "narrow"}),
+    "a dumb terminal": Surroundings(
+        {"env": {"TERM": "dumb", "COLUMNS": None}, "stdout": "narrow", "stderr": "narrow"}, helps=True
+    ),
+    "a run directory that is a file": Surroundings({"env": {"COCORO_RUN_DIR": str(GOLDEN)}}),
+    "a run directory that is a broken link": Surroundings({"env": {"COCORO_RUN_DIR": "{root}/broken"}}),
+    "a run directory too long for a socket": Surroundings({"env": {"COCORO_RUN_DIR": "{root}/" + "x" * 120}}),
+    "a run directory too long for a file": Surroundings({"env": {"COCORO_RUN_DIR": "{root}/" + "x" * 300}}, same=False),
+    "no /proc": Surroundings({"mounts": [("/proc", "size=64k")]}, lines=2),
+}
+
+NEVER_SAID = (
+    "Traceback", "Exception ignored", "internal error", "excepthook", "WARN", "Fatal", "Error in", "Aborted",
+)  # fmt: skip
+
+
+class Table:
+    """Plays commands in surroundings."""
+
+    def __init__(self, forks: Callable[[Case], Ending], root: Path) -> None:
+        self._forks = forks
+        self._root = root
+        self._usual: dict[tuple[str, bool], Ending] = {}
+        self._calls: dict[tuple[str, bool], int] = {}
+
+    def play(self, command: str, surroundings: Surroundings, help_: bool = False, arguments: str = "") -> Ending:
+        folder = Path(tempfile.mkdtemp(prefix=surroundings.odd, dir=self._root))
+        name = f"{surroundings.odd}x"
+        (folder / f"{name}_capture.mcap").symlink_to(self._root / "capture.mcap")
+        (folder / f"{name}_picture.png").symlink_to(self._root / "picture.png")
+        words = {
+            "name": name,
+            "capture": str(folder / f"{name}_capture.mcap"),
+            "golden": str(GOLDEN),
+            "picture": str(folder / f"{name}_picture.png"),
+        }
+        what = dict(surroundings.what)
+        run = Path(tempfile.mkdtemp(dir=self._root))
+        env = {"COCORO_RUN_DIR": str(run), "TMPDIR": str(run), "NO_COLOR": None} | what.pop("env", {})
+        env = {key: value and value.format(root=self._root) for key, value in env.items()}
+        mounts = [(place.format(root=self._root), options) for place, options in what.pop("mounts", ())]
+        given = (
+            ["--help"]
+            if help_
+            else [word.format(**words) for word in (arguments or ARGUMENTS.get(command, "")).split()]
+        )
+        place = folder
+        if what.get("no_folder"):
+            place = Path(tempfile.mkdtemp(dir=self._root))
+        try:
+            return self._forks(Case([*command.split(), *given], str(place), env=env, mounts=mounts, **what))
+        finally:
+            shutil.rmtree(folder)
+            shutil.rmtree(run)
+
+    def calls(self, command: str, fresh: bool) -> int:
+        """How many functions of Python's it calls."""
+        if (command, fresh) not in self._calls:
+            self._calls[command, fresh] = self.play(command, Surroundings({"at_call": -1, "fresh": fresh})).calls
+        return self._calls[command, fresh]
+
+    def usual(self, command: str, help_: bool = False) -> Ending:
+        """How it ends when all is well."""
+        if (command, help_) not in self._usual:
+            self._usual[command, help_] = self.play(command, Surroundings(), help_)
+        return self._usual[command, help_]
+
+
+def wrong(ending: Ending, usual: Ending, surroundings: Surroundings) -> list[str]:
+    """What is not as it must be."""
+    found = []
+    said = ending.out + ending.err
+    lines = [line for line in ending.err.splitlines() if line.startswith("cocoro: ")]
+    lost = surroundings.lost and bool(usual.out)
+    kept = surroundings.what.get("stderr", "kept") == "kept"
+    code = (usual.code or exits.FAILED) if lost else usual.code
+    if ending.hung:
+        found.append("hangs")
+    if ending.code not in CODES or (surroundings.same and ending.code != code):
+        found.append(f"exit code {ending.code}, usually {usual.code}")
+    if words := [word for word in NEVER_SAID if word in said]:
+        found.append(f"says {words[0]}")
+    if lost and kept and not any("standard output" in line for line in lines):
+        found.append("does not say that its output is lost")
+    if len(set(lines)) > surroundings.lines + lost:  # Ctrl-C while a line is written may write it twice
+        found.append("says several things")
+    if kept and ending.code and not ending.err.strip() and not ending.out.strip():
+        found.append("fails in silence")
+    return found
