@@ -85,8 +85,10 @@ async def _main(process: str, run_dir: RunDir, data: dict[str, Any], profile_nam
     from cocoro import processes, profiles  # what follows takes its time, and the parent is watched by now
     from cocoro.bus.zenoh import ZenohBus
     from cocoro.clock import FollowedClock, RealClock
+    from cocoro.contact import Contact
     from cocoro.node import Node
     from cocoro.robot import Robot
+    from cocoro.vigil import Vigil
 
     profile = profiles.from_data(data, profile_name)
     row = processes.named(process)
@@ -113,6 +115,7 @@ async def _main(process: str, run_dir: RunDir, data: dict[str, Any], profile_nam
                 record_steps=launch.record_steps,
                 module=row.module,
                 config=config,
+                contact=Contact(run_dir, Vigil(log.warning)),
             ) as node,
         ):
             log.info("joined the mesh at %s", bus.where)

@@ -173,9 +173,13 @@ class RunDir:
             held.append(claim)
         return held
 
+    def claimant(self, service: str) -> Holder | None:
+        """The process of this machine that is a service now."""
+        return holder(self.path / "claims" / service)
+
     def claims(self) -> dict[str, Holder]:
         """Each service that a process of this machine is, and which process that is."""
-        found = ((file.name, holder(file)) for file in sorted((self.path / "claims").glob("*")))
+        found = ((file.name, self.claimant(file.name)) for file in sorted((self.path / "claims").glob("*")))
         return {service: by for service, by in found if by is not None and by.pid}
 
     # --- the mesh ---------------------------------------------------------------------------------

@@ -25,6 +25,7 @@ from cocoro.errors import CocoroError, RefusedError
 from cocoro.profiles import Profile, from_data
 from cocoro.quit import quit_process
 from cocoro.rundir import RunDir
+from cocoro.vigil import Vigil
 from deploy.child import Child, StartError
 
 STOPPED, MISCONFIGURED, REFUSED = 0, 2, 3
@@ -47,6 +48,7 @@ class Supervisor:
         self._tell_people = tell
         self._children: list[Child] = []
         self._stop = asyncio.Event()
+        self._vigil = Vigil(self._tell)
 
     async def run(self) -> int:
         """Start everything, stay until SIGINT or SIGTERM, stop everything. Returns the exit code.
@@ -69,7 +71,9 @@ class Supervisor:
         reader_fd, writer_fd = os.pipe()  # the children hold its reading end: it closes when this process ends
         try:
             async with await ZenohBus.open(self._run_dir.join_as("supervisor", self._profile.mesh)) as bus:
-                self._children = [Child(row, self._run_dir, reader_fd, self._tell) for row in self._profile.rows()]
+                self._children = [
+                    Child(row, self._run_dir, reader_fd, self._tell, self._vigil) for row in self._profile.rows()
+                ]
                 by_service = {service: child for child in self._children for service in child.row.services}
 
                 def on_alive(key: str, alive: bool) -> None:
@@ -78,9 +82,11 @@ class Supervisor:
                         by_service[service].on_alive(service, alive)
 
                 bus.watch_alive(f"{self._profile.robot}/*/alive", on_alive)
+                keeping_vigil = asyncio.ensure_future(self._vigil.keep())
                 try:
                     code = await self._start_and_keep()
                 finally:
+                    keeping_vigil.cancel()
                     _notify_service_manager("STOPPING=1")
                     for child in reversed(self._children):
                         await child.stop()
