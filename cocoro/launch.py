@@ -96,9 +96,11 @@ async def _main(process: str, run_dir: RunDir, data: dict[str, Any], profile_nam
     from cocoro import processes, profiles, robot_time  # what follows takes its time, and the parent is watched by now
     from cocoro.bus.zenoh import ZenohBus
     from cocoro.clock import FollowedClock
+    from cocoro.contact import Contact
     from cocoro.node import Node
     from cocoro.robot import Robot
     from cocoro.stop.record import latch_dir
+    from cocoro.vigil import Vigil
 
     profile = profiles.from_data(data, profile_name)
     row = processes.named(process)
@@ -128,6 +130,7 @@ async def _main(process: str, run_dir: RunDir, data: dict[str, Any], profile_nam
                 module=row.module,
                 config=config,
                 latches=latch_dir(profile.robot),
+                contact=Contact(run_dir, Vigil(log.warning)),
             ) as node,
         ):
             log.info("joined the mesh at %s", bus.where)

@@ -24,6 +24,7 @@ from cocoro.about import about
 from cocoro.bus.base import Bus, Handle, Payload, Reply
 from cocoro.clock import NS, Clock, FollowedClock, VirtualClock
 from cocoro.clock import sleep as clock_sleep
+from cocoro.contact import Contact
 from cocoro.core import Core
 from cocoro.errors import CocoroError, MeshError, RemoteError
 from cocoro.inbox import Inbox, Latest, Stream
@@ -61,11 +62,13 @@ class Node:
         module: str = "",
         config: Any = None,
         latches: Path | None = None,
+        contact: Contact | None = None,
     ) -> None:
         """`latency_s` is added to every step of a driven core that gives outputs, as if computing them took longer.
         `module` and `config` are the component that runs here, for those who ask (see `cocoro.about`).
         `latches` is the folder of the emergency stop's records; without it nothing is kept, and the stop path is not
-        listened to (a service in a process of its own has it)."""
+        listened to (a service in a process of its own has it). `contact` knows what became of services that are not
+        heard any more."""
         self.name = name
         self.bus = bus
         self.clock = clock
@@ -76,6 +79,7 @@ class Node:
         self.module = module
         self.config = config
         self.latches = latches
+        self.contact = contact or Contact()
         self.log = logging.getLogger(f"cocoro.{name}")
         self.state: str = "starting"
         self.text = ""
@@ -87,6 +91,7 @@ class Node:
         self._meters: list[LoopMeter] = []
         self._handles: list[Handle] = []
         self._tasks: set[asyncio.Task[Any]] = set()
+        self._watches = False
         self._process = None if isinstance(clock, VirtualClock) else ProcessMeter()
 
     # --- lifecycle --------------------------------------------------------------------------------
@@ -185,11 +190,18 @@ class Node:
         self.inbox(topic, service=service).add(lambda _key, message: handler(message))
 
     def watch_alive(self, handler: Callable[[str, bool], None]) -> None:
-        """Call `handler(service, alive)` as services of this robot come and go, at once for those that live."""
+        """Call `handler(service, alive)` as services of this robot come and go, at once for those that live. One that
+        went need not be dead: `contact` tells more."""
 
         def tell(key: str, alive: bool) -> None:
-            handler(key.split("/")[1], alive)
+            service = key.split("/")[1]
+            if alive:
+                self.contact.met(service)
+            handler(service, alive)
 
+        if self.contact.vigil is not None and not self._watches:
+            self._watches = True
+            self.spawn(self.contact.vigil.keep())
         self._handles.append(self.bus.watch_alive(alive_key(self.robot_name, "*"), tell))
 
     # --- publishing -------------------------------------------------------------------------------

@@ -182,6 +182,10 @@ class RunDir:
             held.append(claim)
         return held
 
+    def claimant(self, service: str) -> Holder | None:
+        """The process of this machine that is a service now."""
+        return holder(self.path / "claims" / service)
+
     def claims(self) -> dict[str, Holder]:
         """Each service that a process of this machine is, and which process that is."""
         folder = self.path / "claims"
@@ -190,7 +194,7 @@ class RunDir:
                 names = sorted(os.listdir(fd))  # noqa: PTH208 # by descriptor
         except FileNotFoundError:
             return {}
-        found = ((name, holder(folder / name)) for name in names)
+        found = ((name, self.claimant(name)) for name in names)
         return {service: by for service, by in found if by is not None and by.pid}
 
     # --- the mesh ---------------------------------------------------------------------------------

@@ -16,6 +16,7 @@ from cocoro.errors import ConfigError
 from cocoro.launch import CRASHED, MISCONFIGURED, REFUSED
 from cocoro.processes import BACKOFF_LIMIT_S, SETTLED_S, Process
 from cocoro.rundir import RunDir
+from cocoro.vigil import RECOVERY_S, Vigil
 
 SAID_WHY = (MISCONFIGURED, REFUSED)
 """Exit codes with which a process's last line says it all."""
@@ -40,12 +41,18 @@ class StartError(Exception):
 class Child:
     """`start`, then `keep` for ever, then `stop`. `tell` gets what people should know, a line at a time."""
 
-    def __init__(self, row: Process, run_dir: RunDir, parent_fd: int, tell: Callable[[str], None]) -> None:
+    def __init__(
+        self, row: Process, run_dir: RunDir, parent_fd: int, tell: Callable[[str], None], vigil: Vigil
+    ) -> None:
+        """`vigil` knows whether this process was itself asleep."""
         self.row = row
         self.restarts = 0
         self._run_dir = run_dir
         self._parent_fd = parent_fd
         self._tell = tell
+        self._vigil = vigil
+        self._doubt: asyncio.TimerHandle | None = None
+        """Says that it is silent, unless it is back by then."""
         self._alive: set[str] = set()
         self._ready = asyncio.Event()
         self._was_ready = False
@@ -131,9 +138,29 @@ class Child:
             self._ready.set()
         else:
             self._ready.clear()
-        if self._was_ready and self.pid is not None and not self._stopping and ready == self._silent:
-            self._silent = not ready
-            self._tell(f"{self.row.name} is back" if ready else f"{self.row.name} is silent: no sign of {service}")
+        self._say_silence(ready)
+
+    def _say_silence(self, ready: bool) -> None:
+        """Say that it has fallen silent, or is back. Who was itself asleep gives it time before that is said of it."""
+        if self._doubt is not None and ready:
+            self._doubt.cancel()
+            self._doubt = None
+        if not self._was_ready or self.pid is None or self._stopping or ready != self._silent:
+            return
+        if ready:
+            self._silent = False
+            self._tell(f"{self.row.name} is back")
+        elif self._vigil.look():
+            if self._doubt is None:
+                self._doubt = asyncio.get_running_loop().call_later(RECOVERY_S, self._say_silence_after_all)
+        else:
+            self._silent = True
+            missing = ", ".join(sorted(set(self.row.services) - self._alive))
+            self._tell(f"{self.row.name} is silent: no sign of {missing}")
+
+    def _say_silence_after_all(self) -> None:
+        self._doubt = None
+        self._say_silence(self._alive >= set(self.row.services))
 
     # --- the process ------------------------------------------------------------------------------
 

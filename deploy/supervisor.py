@@ -32,6 +32,7 @@ from cocoro.quit import quit_process
 from cocoro.rundir import RunDir
 from cocoro.stop.record import latch_dir, prepare
 from cocoro.topics import STOPPABLE
+from cocoro.vigil import Vigil
 from deploy import service_manager
 from deploy.child import Child, StartError
 
@@ -66,6 +67,7 @@ class Supervisor:
         self._stop = asyncio.Event()
         self._unshared = ""
         """Why frames cannot all be shared, as it was before the processes were started."""
+        self._vigil = Vigil(self._tell)
 
     async def run(self) -> int:
         """Start everything, stay until SIGINT or SIGTERM, stop everything. Returns the exit code.
@@ -93,7 +95,9 @@ class Supervisor:
         reader_fd, writer_fd = os.pipe()  # the children hold its reading end: it closes when this process ends
         try:
             async with await ZenohBus.open(self._run_dir.join_as("supervisor", self._profile.mesh)) as bus:
-                self._children = [Child(row, self._run_dir, reader_fd, self._tell) for row in self._profile.rows()]
+                self._children = [
+                    Child(row, self._run_dir, reader_fd, self._tell, self._vigil) for row in self._profile.rows()
+                ]
                 by_service = {service: child for child in self._children for service in child.row.services}
 
                 def on_alive(key: str, alive: bool) -> None:
@@ -102,9 +106,11 @@ class Supervisor:
                         by_service[service].on_alive(service, alive)
 
                 bus.watch_alive(f"{self._profile.robot}/*/alive", on_alive)
+                keeping_vigil = asyncio.ensure_future(self._vigil.keep())
                 try:
                     code = await self._start_and_keep()
                 finally:
+                    keeping_vigil.cancel()
                     service_manager.notify("STOPPING=1")
                     for child in reversed(self._children):
                         await child.stop()

@@ -27,7 +27,7 @@ class Heard(NamedTuple):
     key: str
     payload: Payload
     heard_ns: int
-    """When it came in: Unix time between processes, the loop's time within one."""
+    """When it came in: by `cocoro.boottime` between processes, by the loop's time within one."""
 
 
 OnLot = Callable[[list[Heard]], None]

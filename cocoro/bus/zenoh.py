@@ -11,7 +11,6 @@ import contextlib
 import logging
 import secrets
 import threading
-import time
 from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
@@ -20,6 +19,7 @@ from typing import TypeVar
 import zenoh
 from zenoh.handlers import Callback
 
+from cocoro.boottime import boottime_ns
 from cocoro.bus.answer import answer
 from cocoro.bus.base import Heard, OnAlive, OnLot, OnSample, Reply, Server
 from cocoro.bus.declared import QOS, Declared, ZenohListening, ZenohPublisher, ZenohSubscription
@@ -168,10 +168,10 @@ class ZenohBus:
             handler([Heard(key, data, heard_ns) for key, data, heard_ns in found if data is not None])
 
         lots = Lots(self._loop, deliver, every_s)
-        push, time_ns = lots.push, time.time_ns
+        push = lots.push
 
         def on_sample(sample: zenoh.Sample) -> None:
-            push((sample, time_ns()))
+            push((sample, boottime_ns()))
 
         return self._keep(
             ZenohListening(self._session.declare_subscriber(keyexpr, Callback(on_sample, indirect=False)), lots)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,9 +16,14 @@ from cocoro.capture.errors import CaptureError
 from cocoro.capture.file import CaptureFile
 from cocoro.capture.keys import KeyInfo
 from cocoro.capture.schema import TypeSchema
+from cocoro.capture.whereabouts import whereabouts
 from cocoro.clock import NS
+from cocoro.messages import DisturbedFile
 
 MB = 1_000_000
+LOOK_S = 1.0
+"""How often it is looked whether the file is still where it was made."""
+KEPT_DISTURBED = 20
 
 
 Name = str | tuple[str, int]
@@ -83,6 +89,7 @@ class Writer:
         missing: Callable[[], Missing] = lambda: Missing({}, {}),
         release: Callable[[int], None] = sync_and_close,
         prepare: Callable[[Entry], Prepared] | None = None,
+        monotonic_s: Callable[[], float] = time.monotonic,
     ) -> None:
         """`place(n)` is the nth file's path, from 1 on; `info(key, payload)` says what to write of a key; `release`
         gets the descriptor of a file that is whole; `prepare` may put something else in an entry's place."""
@@ -93,6 +100,8 @@ class Writer:
         self._missing = missing
         self._release = release
         self._prepare = prepare
+        self._monotonic_s = monotonic_s
+        self._look_at_s = 0.0
         self._metadata: dict[str, dict[str, str]] = {}
         self._infos: dict[Name, KeyInfo] = {}
         self._channels: dict[Name, int] = {}
@@ -102,16 +111,25 @@ class Writer:
         self._first_ns: int | None = None
         self._closed_bytes = 0
         self._closed_raw_bytes = 0
+        self._ended: CaptureFile | None = None
+        """The last one that is closed."""
         self.messages = 0
+        """Written, but for those of files that were removed while they were being written."""
+        self.removed = 0
+        """Those of such files."""
+        self.disturbed: tuple[DisturbedFile, ...] = ()
+        """The newest of the files that were moved or removed while they were being written."""
         self.file = self._open()
+        self.where = str(self.file.path)
+        """Where the file is that is being written, or was written last; '' when it is not on the disk any more."""
 
     @property
     def size_bytes(self) -> int:
-        return self._closed_bytes + self.file.size_bytes
+        return self._closed_bytes + (0 if self._ended is self.file else self.file.size_bytes)
 
     @property
     def raw_bytes(self) -> int:
-        return self._closed_raw_bytes + self.file.raw_bytes
+        return self._closed_raw_bytes + (0 if self._ended is self.file else self.file.raw_bytes)
 
     def put(self, entry: Entry) -> None:
         if self._first_ns is None:
@@ -147,10 +165,12 @@ class Writer:
         return channel
 
     def flush(self) -> None:
-        """Give everything to the system; and see whether the disk has room for more."""
+        """Give everything to the system; and see whether the file is still where it was made, and whether the disk has
+        room for more."""
         try:
             self.file.flush()
-            room = os.statvfs(self.file.path.parent)
+            self._look()
+            room = os.fstatvfs(self.file.fileno())
         except OSError as error:
             raise self._failed(error) from error
         if room.f_bavail * room.f_frsize < self._limits.min_free_bytes:
@@ -175,8 +195,18 @@ class Writer:
         try:
             self._finish(self.file)
         except OSError as error:
-            self.file.abandon()
+            self._abandon(self.file)
             raise _told(error, self.file.path) from error
+
+    def _look(self) -> None:
+        """Go on in a new file when somebody has moved or removed this one."""
+        now_s = self._monotonic_s()
+        if now_s < self._look_at_s:
+            return
+        self._look_at_s = now_s + LOOK_S
+        if whereabouts(self.file.path, self.file.fileno()).state != "there":
+            self._rotate()
+            self._first_ns = None
 
     def _open(self) -> CaptureFile:
         self._number += 1
@@ -212,21 +242,45 @@ class Writer:
         try:
             self._finish(before)
         except OSError as error:
-            before.abandon()
+            self._abandon(before)
             raise self._failed(error) from error
-        self._closed_bytes += before.size_bytes
-        self._closed_raw_bytes += before.raw_bytes
+        self.where = str(after.path)
 
     def _finish(self, file: CaptureFile) -> None:
+        file.flush()
         file.tally(*self._missing())
-        self._release(file.finish())
+        fd = file.finish()
+        self._account(file)
+        self._release(fd)
+
+    def _abandon(self, file: CaptureFile) -> None:
+        self._account(file)
+        file.abandon()
+
+    def _account(self, file: CaptureFile) -> None:
+        """See, once, what has become of a file that gets no more, before it is closed."""
+        if self._ended is file:
+            return
+        found = whereabouts(file.path, file.fileno())
+        self._ended, self.where = file, found.path
+        if found.state == "removed":
+            lost = sum(tally.messages for tally in file.tallies.values())
+            self.messages -= lost
+            self.removed += lost
+        else:
+            lost = 0
+            self._closed_bytes += file.size_bytes
+            self._closed_raw_bytes += file.raw_bytes
+        if found.state != "there":
+            told = DisturbedFile(file=str(file.path), became=found.state, now=found.path, lost=lost)
+            self.disturbed = (*self.disturbed, told)[-KEPT_DISTURBED:]
 
     def _failed(self, error: OSError) -> CaptureError:
         """Leave the file as good as it can be."""
         try:
             self._finish(self.file)
         except OSError:
-            self.file.abandon()
+            self._abandon(self.file)
         return _told(error, self.file.path)
 
 

@@ -11,6 +11,7 @@ from typing import Any
 import msgspec
 
 from cocoro.capture.info import AttachmentReport, Report, report
+from cocoro.capture.log_clock import WALL_CLOCK, Step, words
 from cocoro.capture.reader import Capture
 from cocoro.capture.rewrite import REPAIRED
 from cocoro.cli import exits
@@ -70,6 +71,7 @@ def _head(found: Report) -> list[str]:
         ("robot", found.robot or "unknown"),
         ("started", start if found.messages else ""),
         ("lasts", f"{found.duration_s:.3f} s"),
+        ("clock", "; ".join(_steps(found))),
         ("messages", f"{found.messages}"),
         ("size", f"{found.size_bytes / MB:.1f} MB, of {found.raw_bytes / MB:.1f} MB of payloads"),
         ("state", _state(found)),
@@ -81,6 +83,20 @@ def _head(found: Report) -> list[str]:
         ("metadata", ", ".join(found.metadata)),
     ]
     return [f"{name:<9} {value}" for name, value in lines if value]
+
+
+def _steps(found: Report) -> list[str]:
+    """How somebody set the wall clock while it was recorded; times since the capture's start."""
+    try:
+        steps = msgspec.convert(found.metadata.get(WALL_CLOCK, {}).get("steps", ()), tuple[Step, ...])
+    except msgspec.ValidationError:  # somebody else's record of this name
+        return []
+    told = []
+    for step in steps:
+        at_s = (step.log_ns - found.start_ns) / NS
+        when = f"at {at_s:.3f} s" if at_s >= 0 else f"{-at_s:.3f} s before this file began"
+        told.append(f"{words(step)} {when}")
+    return told
 
 
 def _state(found: Report) -> str:

@@ -45,7 +45,9 @@ class Answer(NamedTuple, Generic[R]):
 class Link:
     """Make it with `joined`."""
 
-    def __init__(self, run_dir: RunDir, bus: Bus) -> None:
+    def __init__(self, run_dir: RunDir, bus: Bus, private: bool = True) -> None:
+        """`private`: all who can be in this mesh are processes of this machine."""
+        self._private = private
         self.run_dir = run_dir
         self.robot = run_dir.robot
         self.bus = bus
@@ -87,6 +89,11 @@ class Link:
     async def alive(self) -> list[str]:
         """The services that live now."""
         return sorted(key.split("/")[1] for key in await self.bus.alive(f"{self.robot}/*/alive"))
+
+    def unheard(self, service: str) -> str:
+        """What is true of a service whose token is not there, as a state: `no contact` with it, which its process may
+        live without, or `not alive`, when no process of this machine is it."""
+        return "not alive" if self._private and self.run_dir.claimant(service) is None else "no contact"
 
     def watch_alive(self, service: str, handler: Callable[[bool], None]) -> Handle:
         return self.bus.watch_alive(f"{self.robot}/{service}/alive", lambda _key, alive: handler(alive))
@@ -132,7 +139,7 @@ async def joined(where: Where, patience_s: float | None = None, *, frames: bool 
     if patience_s is not None:
         config = replace(config, patience_s=patience_s)
     async with await ZenohBus.open(config, expect_mesh=True) as bus:
-        yield Link(run_dir, bus)
+        yield Link(run_dir, bus, private=config.directory is not None)
 
 
 async def within(timeout_s: float, condition: Callable[[], bool], changed: asyncio.Event) -> bool:
