@@ -2,7 +2,7 @@
 
 By hand, because the package's writer has one level of zstd, puts frames and small messages into the same chunks, and
 makes records as slowly as `cocoro.capture.mcap` says: a robot's messages take it 1.2 times as long with ideal sensors
-and 1.8 times with noisy ones, those without frames 1.4 times (`python bench/capture_format.py files`).
+and 1.8 times with noisy ones, those without frames 1.2 to 1.4 times (`python bench/capture_format.py files`).
 
 A frame is copied once, to stand behind its message's head in one piece of memory, so writing 1.54 MB takes up to 3.08
 MB more at the peak, with the packed bytes. That pays: joined and packed at once, a frame takes 1.74 ms (3.26 ms with
