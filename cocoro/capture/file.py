@@ -1,12 +1,12 @@
 """One MCAP file in the making: what is added is in the system's hands after each `flush`, whatever becomes of us.
 
 By hand, because the package's writer has one level of zstd, puts frames and small messages into the same chunks, and
-makes records as slowly as `cocoro.capture.mcap` says: a robot's messages take it 1.2 times as long with ideal sensors,
-1.8 times with noisy ones (`python bench/capture_format.py files`).
+makes records as slowly as `cocoro.capture.mcap` says: a robot's messages take it 1.2 times as long with ideal sensors
+and 1.8 times with noisy ones, those without frames 1.2 to 1.4 times (`python bench/capture_format.py files`).
 
 A frame is copied once, to stand behind its message's head in one piece of memory, so writing 1.54 MB takes up to 3.08
-MB more at the peak, with the packed bytes. That pays: joined and packed at once, a frame takes 1.46 ms (2.81 ms with
-noisy sensors), and 1.76 ms (3.29 ms) when zstd is given head and payload one after the other
+MB more at the peak, with the packed bytes. That pays: joined and packed at once, a frame takes 1.74 ms (3.26 ms with
+noisy sensors), and 1.99 ms (3.71 ms) when zstd is given head and payload one after the other
 (`python bench/capture_format.py records`).
 """
 

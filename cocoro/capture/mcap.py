@@ -143,7 +143,7 @@ class Message(NamedTuple):
 def records(content: Bytes) -> Iterator[tuple[int, memoryview, int]]:
     """Opcode, content and offset of each record in a run of them. Raises DamageError where one does not fit.
 
-    By hand, with `message`: 2.6 times as fast as the package on messages of 220 bytes.
+    By hand, with `message`: 2.1 to 2.6 times as fast as the package on messages of 220 bytes.
     """
     view = memoryview(content)
     at = 0
@@ -176,7 +176,7 @@ def message(content: memoryview) -> Message:
 def message_head(channel_id: int, sequence: int, log_ns: int, publish_ns: int, payload_bytes: int) -> bytes:
     """Pack the prefix and the fields of a message; the payload follows.
 
-    By hand: 3.9 times as fast as the package on messages of 220 bytes.
+    By hand: about 4 times as fast as the package on messages of 220 bytes.
     """
     length = MESSAGE_FIELDS.size + payload_bytes
     return MESSAGE_HEAD.pack(Opcode.MESSAGE, length, channel_id, sequence, log_ns, publish_ns)
@@ -185,7 +185,7 @@ def message_head(channel_id: int, sequence: int, log_ns: int, publish_ns: int, p
 def message_index(channel_id: int, entries: Sequence[int]) -> bytes:
     """`entries` are log time and offset in the chunk's records before compression, of one message after another.
 
-    By hand: 9.1 times as fast as the package on indices of 20 messages.
+    By hand: 9 times as fast as the package on indices of 20 messages.
     """
     content = struct.pack(f"<HI{len(entries)}Q", channel_id, 8 * len(entries), *entries)
     return PREFIX.pack(Opcode.MESSAGE_INDEX, len(content)) + content
@@ -203,8 +203,9 @@ def check_message_index(content: Bytes) -> int:
 class ChunkHead:
     """The fields of a chunk before its records.
 
-    By hand, because the package has a chunk only as a whole, and copies the packed records into the record. A chunk of
-    one frame of noisy sensors takes 0.06 ms by the package, and 0.002 ms here.
+    By hand, because the package has a chunk only as a whole, and copies the packed records into the record. Of a
+    packed frame of noisy sensors, making the record takes the package 0.06 to 0.2 ms, and the head takes 0.003 ms here;
+    reading it takes the package 1.2 times as long.
     """
 
     start_ns: int

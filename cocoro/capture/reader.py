@@ -7,7 +7,7 @@
 What cannot be read is passed by and told of in `capture.problems`; whoever has read a capture looks there at the end.
 
 By hand, because the package's readers end at the first damage, know channels only from the summary where there is one,
-and copy every payload: they take 1.1 times as long for frames, and 1.7 to 1.9 times for small messages
+and copy every payload: they take 1.0 to 1.4 times as long for frames, 1.5 to 2.0 times for small messages
 (`python bench/capture_format.py files`).
 """
 
