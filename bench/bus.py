@@ -30,7 +30,6 @@ from cocoro.topics import Qos
 PING = bytes(1024)
 FRAME = os.urandom(640 * 480 * 5)
 RATE_HZ = 30.0
-NO_SHARED_MEMORY = {"transport/shared_memory/enabled": False}
 
 
 @dataclass(frozen=True)
@@ -42,19 +41,21 @@ class Way:
     ports: tuple[int, ...] = ()
     router: bool = False
     shared_memory: bool = True
+    receiver_too: bool = True
+    """Whether who receives the frames shares memory, too."""
 
     def config(self, name: str) -> ZenohConfig:
-        options = {} if self.shared_memory else NO_SHARED_MEMORY
         if self.directory is not None:
-            return ZenohConfig(name, directory=Path(self.directory), options=options)
+            shares = self.shared_memory and (self.receiver_too or name != "bench")
+            return ZenohConfig(name, directory=Path(self.directory), shared_memory=shares)
         endpoints = [f"tcp/127.0.0.1:{port}" for port in self.ports]
         if self.router and name == "router":
-            return ZenohConfig(name, mode="router", listen=(endpoints[0],), options=options)
+            return ZenohConfig(name, mode="router", listen=(endpoints[0],), shared_memory=self.shared_memory)
         if self.router:
-            return ZenohConfig(name, mode="client", connect=(endpoints[0],), options=options)
+            return ZenohConfig(name, mode="client", connect=(endpoints[0],), shared_memory=self.shared_memory)
         place = {"bench": 0, "other": 1}.get(name, 2)  # the later one connects
         listen = endpoints[place] if place < 2 else "tcp/127.0.0.1:0"
-        return ZenohConfig(name, listen=(listen,), connect=tuple(endpoints[:place]), options=options)
+        return ZenohConfig(name, listen=(listen,), connect=tuple(endpoints[:place]), shared_memory=self.shared_memory)
 
 
 def free_port() -> int:
@@ -107,7 +108,7 @@ async def serve(way: Way, name: str) -> None:
 
 @asynccontextmanager
 async def process(way: Way, name: str) -> AsyncIterator[None]:
-    arguments = json.dumps([way.title, way.directory, way.ports, way.router, way.shared_memory])
+    arguments = json.dumps([way.title, way.directory, way.ports, way.router, way.shared_memory, way.receiver_too])
     started = await asyncio.create_subprocess_exec(
         sys.executable, __file__, "--serve", arguments, name, stdin=subprocess.PIPE
     )
@@ -285,6 +286,7 @@ async def main(pings: int, seconds: float) -> None:
         ways = [
             Way("peers, Unix sockets", directory=f"{temporary}/a"),
             Way("the same, no shared memory", directory=f"{temporary}/b", shared_memory=False),
+            Way("the same, the receiver without", directory=f"{temporary}/c", receiver_too=False),
             Way("peers, tcp", ports=(free_port(), free_port())),
             Way("clients of a router, tcp", ports=(free_port(),), router=True),
             Way("the same, no shared memory", ports=(free_port(),), router=True, shared_memory=False),

@@ -1,6 +1,9 @@
 """Clocks: real, virtual (the event loop's own time), and followed (the simulator's clock key).
 
-A clock that jumps back starts a new epoch; whoever keeps ages, histories or deadlines begins anew then.
+Nothing that decides reads the wall clock: it can be set, and then ages and deadlines would be wrong. The real clock
+goes by the time since the machine was started, the followed clock by the simulator's ticks. A followed clock can begin
+anew (the simulator was started again, a replay went back). That is a new epoch, and whoever keeps ages, histories or
+deadlines begins anew then. The real clock has one epoch for ever.
 """
 
 from __future__ import annotations
@@ -8,11 +11,27 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 NS = 1_000_000_000
 CLOCKS_APART_NS = NS // 4
-"""A stamp may be this far ahead of our clock: two machines' clocks are never quite the same."""
+"""The clocks of two machines of one robot may differ by this much. `cocoro.inbox` checks it: it rejects a stamp that is
+further ahead of the reader's clock."""
+
+
+def steady_ns() -> int:
+    """Nanoseconds since this machine was started, on the one clock that nobody can set (CLOCK_BOOTTIME).
+
+    It counts the time that the machine was suspended, which CLOCK_MONOTONIC does not: a command from before a
+    suspension must not seem fresh after it.
+    """
+    return time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+
+
+def wall_offset_ns() -> int:
+    """Wall time less `steady_ns`, as it is now: the only place where the wall clock is read."""
+    before_ns, wall_ns, after_ns = steady_ns(), time.time_ns(), steady_ns()
+    return wall_ns - (before_ns + after_ns) // 2
 
 
 def is_fresh(stamp_ns: int, now_ns: int, max_age_s: float) -> bool:
@@ -43,39 +62,29 @@ async def sleep(clock: Clock, seconds: float) -> bool:
 
 
 class RealClock:
-    """The system's clock. Waiting is paced by the monotonic clock, in slices so that a step is noticed."""
+    """The robot's clock where nobody simulates it: `steady_ns` plus an offset to wall time that is read once.
 
-    STEP_NS = NS // 2
-    """A jump back by more than this is a new epoch (a smaller one is the time daemon's work)."""
+    So stamps read as wall time, and setting the wall clock later changes nothing. All processes of a robot on a machine
+    take the same offset: see `cocoro.robot_time`.
+    """
 
-    def __init__(self) -> None:
-        self._newest_ns = 0
-        self._epoch = 0
-
+    epoch = 0
     stands = False
+    SLICE_S = 1.0
+    """Waiting is done in pieces of this length: this clock counts a suspension, the event loop's timers do not."""
 
-    @property
-    def epoch(self) -> int:
-        self.now_ns()
-        return self._epoch
+    def __init__(self, offset_ns: int | None = None) -> None:
+        """`offset_ns`: what `steady_ns` lacks to wall time; measured now when it is not given."""
+        self.offset_ns = wall_offset_ns() if offset_ns is None else offset_ns
 
     def now_ns(self) -> int:
-        now = time.time_ns()
-        if now < self._newest_ns:
-            if self._newest_ns - now <= self.STEP_NS:
-                return self._newest_ns
-            self._epoch += 1
-        self._newest_ns = now
-        return now
+        return steady_ns() + self.offset_ns
 
     async def sleep_until(self, when_ns: int) -> bool:
-        epoch = self.epoch
         await asyncio.sleep(0)
-        while (left_ns := when_ns - self.now_ns()) > 0:
-            if self._epoch != epoch:
-                return False
-            await asyncio.sleep(min(left_ns / NS, 1.0))
-        return self._epoch == epoch
+        while (left_ns := when_ns - self.now_ns()) > 0:  # noqa: ASYNC110 # time itself is what is waited for
+            await asyncio.sleep(min(left_ns / NS, self.SLICE_S))
+        return True
 
 
 class VirtualClock:
@@ -106,12 +115,30 @@ def _finish(done: asyncio.Future[None]) -> None:
         done.set_result(None)
 
 
+class Ticks(NamedTuple):
+    """Ticks in a row that were not believed, each consistent with the one before."""
+
+    length: int
+    stamp_ns: int
+    at_ns: int
+
+
 class FollowedClock:
     """Follows ticks of simulated time. Between ticks it runs on at the simulator's rate, for at most
-    `run_on_s`: when the simulator stands still, time stands still."""
+    `run_on_s`: when the simulator stands still, time stands still.
+
+    One tick that cannot be right moves nothing: one that lies back, and one that is further ahead than CLOCKS_APART_NS
+    plus twice what the last tick's rate gives in the real time that has passed. When `FOLLOWED_AFTER` ticks in a row
+    are wrong in this way and agree with one another, the clock follows them. Ahead, that is just later (a replay was
+    moved on). Back by more than CLOCKS_APART_NS, it is a new epoch: the tick before them was the wrong one. Back by
+    less than that, the clock waits until the ticks have caught up.
+    """
 
     STANDS_NS = NS
     """Without a tick for so long of real time, the clock stands: the slowest simulator ticks oftener."""
+    FOLLOWED_AFTER = 3
+    FASTEST = 100.0
+    """Simulated seconds a real second, of a replay."""
 
     def __init__(self, run_on_s: float = 0.03) -> None:
         self.driven = False
@@ -123,6 +150,8 @@ class FollowedClock:
         self._tick_real_ns = 0
         self._newest_ns = 0
         self._rate = 1.0
+        self._pace = 1.0
+        self._doubted: Ticks | None = None
         self._sleeping: dict[asyncio.Future[None], int] = {}
         """Until when each wants to sleep. A tick wakes only those to whom it matters: there are a hundred a second."""
 
@@ -136,32 +165,61 @@ class FollowedClock:
 
     @property
     def stands(self) -> bool:
-        return time.monotonic_ns() - self._tick_real_ns > self.STANDS_NS
+        return steady_ns() - self._tick_real_ns > self.STANDS_NS
 
-    def tick(self, stamp_ns: int, incarnation: int, rate: float = 1.0) -> None:
-        """A sample of the clock key. Ticks that arrive late within an incarnation are ignored."""
+    def tick(self, stamp_ns: int, incarnation: int, rate: float = 1.0) -> str:
+        """Take a sample of the clock key. Returns why it is not believed, '' when it is."""
+        real_ns = steady_ns()
         anew = incarnation != self._incarnation
+        if not anew:
+            ahead_ns = stamp_ns - self._tick_ns
+            if not 0 <= ahead_ns <= self._credible_ns(real_ns - self._tick_real_ns):
+                if not self._insists(stamp_ns, real_ns):
+                    return _disbelief(ahead_ns, real_ns - self._tick_real_ns)
+                anew = ahead_ns < 0
         if anew:
             if self._incarnation is not None:
                 self._epoch += 1
             self._incarnation = incarnation
             self._newest_ns = 0
-        elif stamp_ns < self._tick_ns:
-            return
+        self._doubted = None
         self._tick_ns = stamp_ns
-        self._tick_real_ns = time.monotonic_ns()
+        self._tick_real_ns = real_ns
         self._rate = min(max(rate, 0.01), 2.0)
+        self._pace = min(max(rate, 1.0), self.FASTEST)
         reachable_ns = stamp_ns + self._run_on_ns
         for sleeper, when_ns in self._sleeping.items():
             if (anew or when_ns <= reachable_ns) and not sleeper.done():
                 sleeper.set_result(None)
+        return ""
+
+    def _credible_ns(self, passed_ns: int) -> int:
+        """How far the ticks can have come on in some real time."""
+        return CLOCKS_APART_NS + round(2 * self._pace * passed_ns)
+
+    def _insists(self, stamp_ns: int, real_ns: int) -> bool:
+        """Whether a tick that is not believed is the last of so many that agree that it is to be followed."""
+        if 0 < self._tick_ns - stamp_ns <= CLOCKS_APART_NS:
+            return False
+        length, before = 1, self._doubted
+        if before is not None and 0 < stamp_ns - before.stamp_ns <= self._credible_ns(real_ns - before.at_ns):
+            length = before.length + 1
+        self._doubted = Ticks(length, stamp_ns, real_ns)
+        return length >= self.FOLLOWED_AFTER
 
     def now_ns(self) -> int:
         if self._incarnation is None:
             return 0
-        run_on = min(round((time.monotonic_ns() - self._tick_real_ns) * self._rate), self._run_on_ns)
+        run_on = min(round((steady_ns() - self._tick_real_ns) * self._rate), self._run_on_ns)
         self._newest_ns = max(self._newest_ns, self._tick_ns + run_on)
         return self._newest_ns
+
+    def latest_ns(self) -> int | None:
+        """The latest time that it can be by now: ticks may be on their way, or wait for this process. None before the
+        first tick."""
+        if self._incarnation is None:
+            return None
+        return self._tick_ns + self._credible_ns(steady_ns() - self._tick_real_ns) - CLOCKS_APART_NS
 
     async def wait_started(self) -> None:
         while self._incarnation is None:
@@ -188,3 +246,14 @@ class FollowedClock:
             await sleeper
         finally:
             del self._sleeping[sleeper]
+
+
+def _disbelief(ahead_ns: int, passed_ns: int) -> str:
+    if ahead_ns < 0:
+        return f"a tick {-ahead_ns / NS:.3f} s before the last one"
+    return f"a tick {ahead_ns / NS:.3f} s ahead, {passed_ns / NS:.3f} s after the last one"
+
+
+def latest_ns(clock: Clock) -> int | None:
+    """The latest time that it can be by now on a clock; None when it has not started."""
+    return clock.latest_ns() if isinstance(clock, FollowedClock) else clock.now_ns()

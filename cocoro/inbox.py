@@ -5,14 +5,17 @@ from __future__ import annotations
 import asyncio
 from collections import deque
 from collections.abc import AsyncIterator, Callable
+from math import inf
 from typing import Any, Generic, TypeVar
 
 import msgspec
 
 from cocoro.bus.base import Payload, Subscription
-from cocoro.clock import NS, Clock, is_fresh
+from cocoro.clock import CLOCKS_APART_NS, NS, Clock, is_fresh, latest_ns
 from cocoro.messages import Message, TopicHealth
+from cocoro.source import ANY_HZ, Source
 from cocoro.topics import CLOCK, Qos, Topic
+from cocoro.trouble import Trouble
 
 M = TypeVar("M", bound=Message)
 
@@ -34,19 +37,19 @@ class Rate:
         return (self.count - counted) * NS / (now_ns - since_ns)
 
 
-class Source:
-    """One publisher's key, as its reader follows it."""
-
-    def __init__(self) -> None:
-        self.incarnation = -1
-        self.seq = -1
-        self.gaps = 0
-
-
 class Inbox(Generic[M]):
-    """All that arrives on one topic's keys; every reader of the topic in this node hangs on the one inbox."""
+    """All that arrives on one topic's keys; every reader of the topic in this node hangs on the one inbox.
 
-    def __init__(self, topic: Topic[M], keyexpr: str, clock: Clock) -> None:
+    What is rejected is counted and dropped, and never the reason to reject what comes after it:
+
+    - what is malformed, of the wrong type, or larger than the topic's row allows;
+    - a command that is older than its row allows, a command or state that is stamped more than CLOCKS_APART_NS ahead of
+      this reader's clock (events are told whenever they come, and the clock's own key is judged by `judge`);
+    - what is out of sequence, by the rules of `cocoro.source`.
+    """
+
+    def __init__(self, topic: Topic[M], keyexpr: str, clock: Clock, *, onlooker: bool = False) -> None:
+        """An onlooker acts on nothing: it takes messages whatever their stamps."""
         self.topic = topic
         self.keyexpr = keyexpr
         self.rate = Rate()
@@ -56,10 +59,17 @@ class Inbox(Generic[M]):
         self.last_error = ""
         self.newest_stamp_ns: int | None = None
         self.subscription: Subscription | None = None
+        self.judge: Callable[[M], str] | None = None
+        """Says why a message that is in order is not to be taken all the same ('' when it is)."""
+        self.trouble = Trouble(topic)
         self._decoder = msgspec.msgpack.Decoder(topic.type)
         self._clock = clock
         self._sources: dict[str, Source] = {}
         self._readers: list[Callable[[str, M], None]] = []
+        timeless = onlooker or topic.name == CLOCK.name
+        self._expires = topic.qos is Qos.COMMAND and not timeless
+        self._horizon_ns: float = inf if timeless or topic.qos is Qos.EVENT else 0
+        """What is stamped up to here is surely not ahead of the clock; it is looked at again when something is not."""
 
     def add(self, reader: Callable[[str, M], None]) -> None:
         """`reader(key, message)` is called for each good message, in order per key."""
@@ -72,49 +82,70 @@ class Inbox(Generic[M]):
     def deliver(self, key: str, payload: Payload) -> None:
         """The bus's callback: a bad payload is counted and dropped, whatever it is."""
         if len(payload) > self.topic.max_bytes:
-            self._reject(f"{len(payload)} bytes, at most {self.topic.max_bytes} are taken")
+            self._reject(key, f"{len(payload)} bytes, at most {self.topic.max_bytes} are taken")
             return
         try:
             message = self._decoder.decode(payload)
         except (msgspec.MsgspecError, ValueError, RecursionError, OverflowError) as error:
-            self._reject(str(error))
+            self._reject(key, str(error))
             return
-        if not self._in_order(key, message) or not self._timely(message):
+        source = self._sources.get(key)
+        if source is None:
+            source = self._sources[key] = Source()
+        seq, stamp_ns = message.seq, message.stamp_ns
+        if self._expires:
+            now_ns = self._clock.now_ns()
+            if not is_fresh(stamp_ns, now_ns, self.topic.max_age_s):
+                self._refuse(key, source, message, _untimely(stamp_ns - now_ns))
+                return
+        elif stamp_ns > self._horizon_ns and (ahead_ns := self._ahead_ns(stamp_ns)) > CLOCKS_APART_NS:
+            self._refuse(key, source, message, _untimely(ahead_ns))
             return
+        lost: int | None = 0
+        if message.incarnation != source.incarnation:
+            source.begin(message.incarnation)
+        elif seq != source.seq + 1:
+            lost = source.jump(seq, stamp_ns, self.topic.rate_hz or ANY_HZ, latest_ns(self._clock))
+            if lost is None:
+                self._reject(key, source.why(seq))
+                return
+        if self.judge is not None and (why := self.judge(message)):
+            self._refuse(key, source, message, why)
+            return
+        source.seq, source.stamp_ns = seq, stamp_ns
+        if lost:
+            source.gaps += lost
+        if source.troubled:
+            source.settle()
+        if self.trouble.since_s is not None:
+            self.trouble.ends()
         self.rate.count += 1
-        self.newest_stamp_ns = message.stamp_ns
+        self.newest_stamp_ns = stamp_ns
         for reader in list(self._readers):
             reader(key, message)
 
-    def _in_order(self, key: str, message: M) -> bool:
-        source = self._sources.setdefault(key, Source())
-        if message.incarnation != source.incarnation:
-            source.incarnation, source.seq = message.incarnation, message.seq
-            return True
-        if message.seq <= source.seq:
-            self._reject(f"sequence number {message.seq} after {source.seq}")
-            return False
-        source.gaps += message.seq - source.seq - 1
-        source.seq = message.seq
-        return True
+    def _ahead_ns(self, stamp_ns: int) -> int:
+        """How far a stamp is ahead of the clock; 0 when the clock has not started."""
+        now_ns = latest_ns(self._clock)
+        if now_ns is None:
+            return 0
+        self._horizon_ns = now_ns + CLOCKS_APART_NS
+        return stamp_ns - now_ns
 
-    def _timely(self, message: M) -> bool:
-        """A command beyond its age must not act, however it got here; nor one from the future."""
-        if self.topic.qos is not Qos.COMMAND or self.topic.name == CLOCK.name:
-            return True
-        now_ns = self._clock.now_ns()
-        if not is_fresh(message.stamp_ns, now_ns, self.topic.max_age_s):
-            self._reject(f"stale: stamped {(now_ns - message.stamp_ns) / NS:.3f} s ago")
-            return False
-        return True
+    def _refuse(self, key: str, source: Source, message: M, why: str) -> None:
+        source.refuse(message.incarnation, message.seq)
+        self._reject(key, why)
 
-    def _reject(self, why: str) -> None:
+    def _reject(self, key: str, why: str) -> None:
         self.rejected += 1
         self.last_error = why
+        self.trouble.grows(key)
 
     def health(self, now_ns: int) -> TopicHealth:
         overwritten = self.subscription.skipped if self.subscription is not None else 0
         gaps = sum(source.gaps for source in self._sources.values())
+        if self._horizon_ns < inf:
+            self._horizon_ns = 0  # a clock that began anew may be far before it
         return TopicHealth(
             key=self.keyexpr,
             direction="in",
@@ -125,7 +156,15 @@ class Inbox(Generic[M]):
             lost=max(gaps - overwritten, 0),
             rejected=self.rejected,
             last_error=self.last_error,
+            fault=self.trouble.told(self.rejected, self.last_error),
+            unreadable=self.trouble.unreadable,
         )
+
+
+def _untimely(ahead_ns: int) -> str:
+    if ahead_ns > 0:
+        return f"stamped {ahead_ns / NS:.3f} s ahead; clocks may be {CLOCKS_APART_NS / NS:g} s apart"
+    return f"stale: stamped {-ahead_ns / NS:.3f} s ago"
 
 
 class Latest(Generic[M]):

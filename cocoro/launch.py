@@ -9,7 +9,6 @@ from __future__ import annotations
 import argparse
 import asyncio
 import faulthandler
-import json
 import logging
 import os
 import signal
@@ -20,6 +19,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from cocoro import private
 from cocoro.errors import CocoroError, RefusedError
 from cocoro.quit import quit_process
 from cocoro.rundir import RunDir
@@ -79,6 +79,12 @@ def run(
         return REFUSED if isinstance(error, RefusedError) else MISCONFIGURED
     except KeyboardInterrupt:
         return OK
+    except OSError as error:
+        if not private.full(error):
+            log.exception("crashed")
+            return CRASHED
+        log.error("%s: %s; make room there", error.filename or run_dir.path, error.strerror)
+        return MISCONFIGURED
     except Exception:
         if raise_crashes:
             raise
@@ -87,12 +93,14 @@ def run(
 
 
 async def _main(process: str, run_dir: RunDir, data: dict[str, Any], profile_name: str) -> int:
-    from cocoro import processes, profiles  # what follows takes its time, and the parent is watched by now
+    from cocoro import processes, profiles, robot_time  # what follows takes its time, and the parent is watched by now
     from cocoro.bus.zenoh import ZenohBus
-    from cocoro.clock import FollowedClock, RealClock
+    from cocoro.clock import FollowedClock
+    from cocoro.contact import Contact
     from cocoro.node import Node
     from cocoro.robot import Robot
     from cocoro.stop.record import latch_dir
+    from cocoro.vigil import Vigil
 
     profile = profiles.from_data(data, profile_name)
     row = processes.named(process)
@@ -107,12 +115,14 @@ async def _main(process: str, run_dir: RunDir, data: dict[str, Any], profile_nam
         log = logging.getLogger(f"cocoro.{process}")
         log.info("%s with %s", row.module, config)
         stop = _stop_signal()
+        # Whoever comes first, without a supervisor, fixes the robot's time for those who come later.
+        real_clock = robot_time.clock if run_dir.populated else robot_time.fix
         async with (
-            await ZenohBus.open(run_dir.join_as(process, profile.mesh)) as bus,
+            await ZenohBus.open(run_dir.join_as(process, profile.mesh, frames=bool(row.frames))) as bus,
             Node(
                 process,
                 bus,
-                FollowedClock() if profile.clock == "sim" else RealClock(),
+                FollowedClock() if profile.clock == "sim" else real_clock(run_dir.path),
                 robot,
                 robot_name=profile.robot,
                 latency_s=launch.latency_s,
@@ -120,6 +130,7 @@ async def _main(process: str, run_dir: RunDir, data: dict[str, Any], profile_nam
                 module=row.module,
                 config=config,
                 latches=latch_dir(profile.robot),
+                contact=Contact(run_dir, Vigil(log.warning)),
             ) as node,
         ):
             log.info("joined the mesh at %s", bus.where)
@@ -179,7 +190,7 @@ def main(arguments: list[str] | None = None) -> int:
         watch_parent(options.parent_fd)
     folder: Path = options.run_dir
     run_dir = RunDir(folder.name, folder.parent)
-    profile = json.loads(run_dir.profile_file.read_bytes())
+    profile = run_dir.resolved()
     return run(options.process, run_dir, profile, profile.get("name", ""))
 
 

@@ -101,7 +101,8 @@ class BaseState(Message):
 
 
 class BaseCommand(Message):
-    """Wheel speeds. Valid for 0.15 s: a base that hears nothing newer commands zero."""
+    """Wheel speeds. Valid for 0.15 s at most, and for less the faster they are (`Base.patience_s`): a base that hears
+    nothing newer commands zero."""
 
     left_mps: Finite
     right_mps: Finite
@@ -471,8 +472,13 @@ class TopicHealth(msgspec.Struct, kw_only=True):
     lost: Count = 0
     """Gaps in the sequence: never arrived."""
     rejected: Count = 0
-    """Malformed, wrongly typed, oversized or out of order: counted, dropped."""
+    """Malformed, wrongly typed, oversized, out of order or untimely: counted, dropped."""
     last_error: str = ""
+    """Why the last one was rejected."""
+    fault: str = ""
+    """Of a reader that has rejected messages of late: key, publisher, how many, why. For people."""
+    unreadable: bool = False
+    """Of a reader: for longer than one can wait, all that came was rejected."""
 
 
 class LoopHealth(msgspec.Struct, kw_only=True):
@@ -562,13 +568,26 @@ class AboutReply(msgspec.Struct, kw_only=True):
     files: tuple[AboutFile, ...] = ()
 
 
+class DisturbedFile(msgspec.Struct, kw_only=True):
+    """Somebody moved or removed a file while it was being recorded."""
+
+    file: str
+    """The name that it was recorded under."""
+    became: Literal["moved", "removed"]
+    """A move to another disk is a copy and a removal."""
+    now: str = ""
+    """Where it was when that was noticed; '' when that is not known."""
+    lost: Count = 0
+    """Messages that were in it, when it was removed."""
+
+
 class Recording(Message):
     """How a recorder is getting on."""
 
     file: str = ""
-    """The MCAP file that is being written."""
+    """The MCAP file that is being written; '' when it is not on the disk any more."""
     messages: Count = 0
-    """Written since the recorder's start, over all its files."""
+    """Written since the recorder's start, over all its files, but for those that somebody removed meanwhile."""
     size_bytes: Count = 0
     """The same, as it takes room on the disk."""
     raw_bytes: Count = 0
@@ -579,6 +598,10 @@ class Recording(Message):
     """By key: received, but there was no room to keep them until the disk took them."""
     lost: dict[str, Count] = {}
     """By key: gaps in the sequence, so sent and never received."""
+    disturbed: tuple[DisturbedFile, ...] = ()
+    """The newest of those that somebody moved or removed while they were being recorded."""
+    removed: Count = 0
+    """Messages that were in the removed ones, all of them together."""
     longest_sync_ms: NonNegative = 0.0
     """That the disk took to make sure of what it was given."""
     fault: str = ""

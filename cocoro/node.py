@@ -24,6 +24,7 @@ from cocoro.about import about
 from cocoro.bus.base import Bus, Handle, Payload, Reply
 from cocoro.clock import NS, Clock, FollowedClock, VirtualClock
 from cocoro.clock import sleep as clock_sleep
+from cocoro.contact import Contact
 from cocoro.core import Core
 from cocoro.errors import CocoroError, MeshError, RemoteError
 from cocoro.inbox import Inbox, Latest, Stream
@@ -61,11 +62,13 @@ class Node:
         module: str = "",
         config: Any = None,
         latches: Path | None = None,
+        contact: Contact | None = None,
     ) -> None:
         """`latency_s` is added to every step of a driven core that gives outputs, as if computing them took longer.
         `module` and `config` are the component that runs here, for those who ask (see `cocoro.about`).
         `latches` is the folder of the emergency stop's records; without it nothing is kept, and the stop path is not
-        listened to (a service in a process of its own has it)."""
+        listened to (a service in a process of its own has it). `contact` knows what became of services that are not
+        heard any more."""
         self.name = name
         self.bus = bus
         self.clock = clock
@@ -76,23 +79,26 @@ class Node:
         self.module = module
         self.config = config
         self.latches = latches
+        self.contact = contact or Contact()
         self.log = logging.getLogger(f"cocoro.{name}")
         self.state: str = "starting"
         self.text = ""
         self.faults: tuple[str, ...] = ()
         self._health_hz = health_hz
+        self._started_ns: int | None = None
         self._inboxes: dict[str, Inbox[Any]] = {}
         self._publishers: dict[str, Publisher[Any]] = {}
         self._meters: list[LoopMeter] = []
         self._handles: list[Handle] = []
         self._tasks: set[asyncio.Task[Any]] = set()
+        self._watches = False
         self._process = None if isinstance(clock, VirtualClock) else ProcessMeter()
 
     # --- lifecycle --------------------------------------------------------------------------------
 
     async def __aenter__(self) -> Node:
         if isinstance(self.clock, FollowedClock) and not self.clock.driven:
-            self.inbox(topics.CLOCK).add(self._tick)
+            self.inbox(topics.CLOCK).judge = self._tick
         self.serve(topics.ABOUT.of(self.name), self._tell_about)
         self.spawn(self._tell_health())
         return self
@@ -133,9 +139,9 @@ class Node:
             self.log.error("background work failed", exc_info=error)
             self.degraded(f"background work failed: {error}")
 
-    def _tick(self, _key: str, clock: Message) -> None:
+    def _tick(self, clock: Message) -> str:
         assert isinstance(self.clock, FollowedClock)
-        self.clock.tick(clock.stamp_ns, clock.incarnation, getattr(clock, "rate", 1.0))
+        return self.clock.tick(clock.stamp_ns, clock.incarnation, getattr(clock, "rate", 1.0))
 
     def drive_clock(self) -> FollowedClock:
         """The caller ticks this node's clock from now on, since it makes the time, or hears its key anyway."""
@@ -169,6 +175,7 @@ class Node:
             inbox = self._inboxes[topic.name] = Inbox(topic, key, self.clock)
             depth = 2 if topic.qos is Qos.FRAME else 256
             inbox.subscription = self.bus.subscribe(key, topic.qos, inbox.deliver, depth=depth)
+            inbox.trouble.changed = self._readable_or_not
             self._handles.append(inbox.subscription)
         return self._inboxes[topic.name]
 
@@ -183,11 +190,18 @@ class Node:
         self.inbox(topic, service=service).add(lambda _key, message: handler(message))
 
     def watch_alive(self, handler: Callable[[str, bool], None]) -> None:
-        """Call `handler(service, alive)` as services of this robot come and go, at once for those that live."""
+        """Call `handler(service, alive)` as services of this robot come and go, at once for those that live. One that
+        went need not be dead: `contact` tells more."""
 
         def tell(key: str, alive: bool) -> None:
-            handler(key.split("/")[1], alive)
+            service = key.split("/")[1]
+            if alive:
+                self.contact.met(service)
+            handler(service, alive)
 
+        if self.contact.vigil is not None and not self._watches:
+            self._watches = True
+            self.spawn(self.contact.vigil.keep())
         self._handles.append(self.bus.watch_alive(alive_key(self.robot_name, "*"), tell))
 
     # --- publishing -------------------------------------------------------------------------------
@@ -284,15 +298,19 @@ class Node:
         return about(self)
 
     async def _tell_health(self) -> None:
-        started_ns: int | None = None
-        topic = HEALTH.of(self.name)
         async for now_ns in every(self.clock, self._health_hz, LoopMeter("health")):
-            started_ns = now_ns if started_ns is None else started_ns
-            self.publish(topic, self.health(now_ns, started_ns))
+            self._started_ns = now_ns if self._started_ns is None else self._started_ns
+            self.publish(HEALTH.of(self.name), self.health(now_ns, self._started_ns))
+
+    def _readable_or_not(self) -> None:
+        """What this service reads can be read no more, or again: who waits for it should know at once."""
+        now_ns = self.clock.now_ns()
+        self.publish(HEALTH.of(self.name), self.health(now_ns, self._started_ns or now_ns))
 
     def health(self, now_ns: int, started_ns: int) -> Health:
         ports: list[Inbox[Any] | Publisher[Any]] = [*self._inboxes.values(), *self._publishers.values()]
         cpu_share, rss_mb = self._process.take() if self._process else (0.0, 0.0)
+        told = tuple(port.health(now_ns) for port in ports if port.topic.name != HEALTH.of(self.name).name)
         return Health(
             service=self.name,
             pid=os.getpid() if self._process else 0,
@@ -301,9 +319,13 @@ class Node:
             uptime_s=(now_ns - started_ns) / NS,
             cpu_share=cpu_share,
             rss_mb=rss_mb,
-            topics=tuple(port.health(now_ns) for port in ports if port.topic.name != HEALTH.of(self.name).name),
+            topics=told,
             loops=tuple(meter.health() for meter in self._meters),
-            faults=self.faults,
+            faults=(
+                *self.faults,
+                *(topic.fault for topic in told if topic.fault),
+                *(port.trouble for port in self._publishers.values() if port.trouble),
+            ),
         )
 
 

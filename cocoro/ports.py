@@ -6,6 +6,7 @@ import os
 from contextlib import suppress
 from pathlib import Path
 
+from cocoro import private
 from cocoro.checks import Check, bad, note, ok
 from cocoro.rundir import RunDir
 
@@ -21,8 +22,13 @@ def wire_dir(robot: str) -> Path:
 
 
 def port_path(name: str, robot: str) -> str:
-    """The path to open."""
-    return str(wire_dir(robot) / name.removeprefix(WIRE)) if name.startswith(WIRE) else name
+    """The path to open. Raises ConfigError for an emulated port in a folder that is not this user's alone."""
+    if not name.startswith(WIRE):
+        return name
+    folder = wire_dir(robot)
+    with suppress(FileNotFoundError), private.directory(folder):
+        pass
+    return str(folder / name.removeprefix(WIRE))
 
 
 def check_port(what: str, name: str, robot: str, *, quick: bool) -> list[Check]:

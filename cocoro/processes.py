@@ -10,13 +10,14 @@ from __future__ import annotations
 
 import importlib
 import inspect
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterable
 from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import msgspec
 
+from cocoro.bus.shared import need_bytes
 from cocoro.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -51,6 +52,9 @@ class Process:
     """It must be ready by then."""
     stop_s: float = 5.0
     """From SIGTERM to SIGKILL."""
+    frames: Literal["", "reads", "publishes"] = ""
+    """Whether it publishes frames or reads them: these travel in shared memory then. For who does not say so, they are
+    copied, which costs more."""
     nice: int = 0
     """Steps by which it yields the processor to others: what may be late must not make commands late. Below 0 the
     others yield to it, where that is allowed (LimitNICE in the unit file)."""
@@ -68,12 +72,12 @@ PROCESSES: tuple[Process, ...] = (
     Process(
         name="sim", module="sim.service", services=("kinect", "base", "arm", "hand"),
         doc="The simulated robot: stands in for all hardware services, key for key.",
-        start_s=60.0, cpu_share=1.0, rss_mb=600.0,
+        frames="publishes", start_s=60.0, cpu_share=1.0, rss_mb=600.0,
     ),
     Process(
         name="kinect", module="services.kinect.service", services=("kinect",),
         doc="The Kinect: colour and raw depth.",
-        restart="always", cpu_share=0.3, rss_mb=200.0,
+        frames="publishes", restart="always", cpu_share=0.3, rss_mb=200.0,
     ),
     Process(
         name="base", module="services.base.service", services=("base",),
@@ -88,7 +92,7 @@ PROCESSES: tuple[Process, ...] = (
     Process(
         name="perception", module="services.perception.service", services=("perception",),
         doc="Finds the known objects in each frame.",
-        nice=5, cpu_share=0.5, rss_mb=250.0,
+        frames="reads", nice=5, cpu_share=0.5, rss_mb=250.0,
     ),
     Process(
         name="planning", module="services.planning.service", services=("planning",),
@@ -103,12 +107,12 @@ PROCESSES: tuple[Process, ...] = (
     Process(
         name="capture", module="services.capture.service", services=("capture",),
         doc="Records the mesh into MCAP files.",
-        nice=10, cpu_share=0.3, rss_mb=300.0,
+        frames="reads", nice=10, cpu_share=0.3, rss_mb=300.0,
     ),
     Process(
         name="wire", module="sim.wire.service", services=("kinect",), settings="sim",
         doc="The simulated robot behind wires: the camera, and ports with base and servos at their other ends.",
-        start_s=60.0, cpu_share=1.0, rss_mb=600.0,
+        frames="publishes", start_s=60.0, cpu_share=1.0, rss_mb=600.0,
     ),
 )  # fmt: skip
 
@@ -139,6 +143,12 @@ def table() -> dict[str, Process]:
             raise ConfigError(f"{where}: {point.value} is not a Process named {point.name!r}")
         rows[row.name] = row
     return rows
+
+
+def shared_bytes(rows: Iterable[Process]) -> int:
+    """The room in the machine's shared memory that these processes take for their frames."""
+    kinds = [row.frames for row in rows]
+    return need_bytes(publishers=kinds.count("publishes"), readers=kinds.count("reads"))
 
 
 def named(name: str) -> Process:

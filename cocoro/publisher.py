@@ -47,6 +47,11 @@ class Publisher(Generic[M]):
     def close(self) -> None:
         self._raw.close()
 
+    @property
+    def trouble(self) -> str:
+        """Why its messages cost more than they should; empty when all is well."""
+        return f"{self.topic.name}: {self._raw.trouble}" if self._raw.trouble else ""
+
     def health(self, now_ns: int) -> TopicHealth:
         age_s = None if self.newest_stamp_ns is None else (now_ns - self.newest_stamp_ns) / NS
         return TopicHealth(

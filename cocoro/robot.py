@@ -39,7 +39,24 @@ class Base(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_wheel_speed_mps: Positive
     wheel_acceleration_mps2: Positive
     command_timeout_s: Positive
+    """No word counts for longer, however slow the wheels turn."""
     state_rate_hz: Positive
+    stand_within_s: Positive = 0.3
+    """Whoever falls silent: within so long the wheels stand, from whatever speed."""
+    stand_reserve_s: Positive = 0.03
+    """The part of that which is kept for the way of a word, a turn of the loop that acts on its absence, and the body
+    behind the ramp of its wheels."""
+
+    def patience_s(self, speed_mps: float) -> float:
+        """How old a word may be on which the faster wheel turns at this speed. What is left of `stand_within_s` is the
+        ramp down to standing."""
+        ramp_s = abs(speed_mps) / self.wheel_acceleration_mps2
+        return max(min(self.command_timeout_s, self.stand_within_s - self.stand_reserve_s - ramp_s), 0.0)
+
+    def speed_at_age_mps(self, age_s: float) -> float:
+        """The fastest that a wheel may turn on a word of this age, so that it stands in time if that was the last."""
+        ramp_s = self.stand_within_s - self.stand_reserve_s - age_s
+        return max(ramp_s, 0.0) * self.wheel_acceleration_mps2
 
 
 class Kinect(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

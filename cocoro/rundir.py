@@ -1,6 +1,7 @@
 """The run directory: what of a robot runs on this machine. One folder a robot, below one place for them all.
 
     <run>/<robot>/profile.json     the resolved profile of the last start
+                  clock.json       the robot's time (see cocoro.robot_time)
                   supervisor       held by the supervisor
                   claims/<service> held by the process that is that service
                   logs/            one file a process, of the last starts (or in $COCORO_LOG_DIR/<robot>)
@@ -8,6 +9,9 @@
 
 "Held" means locked for as long as its process lives, however that ends: so a process number that is read from a
 held file is that process, and never one that got the number later.
+
+The folders are this user's alone, and so are the files in them (see `cocoro.private`): what is not is refused with a
+ConfigError, and when the place is full, what must be written raises FullError.
 """
 
 from __future__ import annotations
@@ -20,23 +24,26 @@ import select
 import signal
 import time
 from collections.abc import Iterable, Iterator
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import IO, Annotated, Any, Literal, NamedTuple
 
 import msgspec
 from msgspec import Meta
 
+from cocoro import private
 from cocoro.bus.endpoints import ZenohConfig, default, default_run_dir
-from cocoro.bus.members import members
-from cocoro.errors import ConfigError, RefusedError
+from cocoro.bus.members import Who, members
+from cocoro.errors import RefusedError
 
 LOG_DIR = "COCORO_LOG_DIR"
 """Environment variable with a place for the logs that outlives the run directory."""
 LOOK_S = 1.0
 """Longer than anyone takes to look who holds a file."""
+PROFILE_BYTES = 1024 * 1024
+"""More than any profile has."""
 KEPT_LOGS = 5
 """Of earlier starts, for each process."""
 
@@ -73,9 +80,9 @@ class Held:
 
 
 def hold(path: Path, name: str) -> Held | None:
-    """Hold a file in the name of this process; None when another one holds it."""
-    path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-    fd = os.open(path, os.O_CREAT | os.O_RDWR, 0o600)
+    """Hold a file in the name of this process; None when another one holds it. Raises ConfigError, FullError."""
+    fd = private.open_file(path, os.O_CREAT | os.O_RDWR, make=True)
+    about = json.dumps({"name": name, "pid": os.getpid()}).encode()
     deadline_s = time.monotonic() + LOOK_S
     while not _locked(fd, fcntl.LOCK_EX):
         if not _locked(fd, fcntl.LOCK_SH) or time.monotonic() > deadline_s:
@@ -84,27 +91,30 @@ def hold(path: Path, name: str) -> Held | None:
         # Nobody holds it: somebody only looks, as `holder` does, and has done so in a moment.
         fcntl.flock(fd, fcntl.LOCK_UN)
         time.sleep(random.uniform(0.0, 0.002))  # of two that try, one is first
-    os.ftruncate(fd, 0)
-    os.write(fd, json.dumps({"name": name, "pid": os.getpid()}).encode())
+    try:
+        os.ftruncate(fd, 1)  # not to 0: what is written takes the room of what was there, which there may be no more of
+        os.pwrite(fd, about, 0)
+    except OSError as error:
+        os.close(fd)
+        raise private.refusal(path, error) from error
     return Held(fd)
 
 
 def holder(path: Path) -> Holder | None:
-    """Who holds a file now."""
+    """Who holds a file now; named "" with the number 0 when that cannot be read. Raises ConfigError."""
     try:
-        fd = os.open(path, os.O_RDONLY)
+        fd = private.open_file(path, os.O_RDONLY)
     except (FileNotFoundError, NotADirectoryError):
         return None
     try:
         deadline_s = time.monotonic() + LOOK_S
         while not _locked(fd, fcntl.LOCK_SH):
-            try:
-                about = json.loads(os.pread(fd, 4096, 0))
-                return Holder(about["name"], about["pid"])
-            except ValueError:  # it was taken this very moment
-                if time.monotonic() > deadline_s:
-                    return Holder("", 0)
-                time.sleep(0.001)  # its holder is about to write who it is
+            who = Who.of(os.pread(fd, 4096, 0))
+            if who is not None:
+                return Holder(who.name, who.pid)
+            if time.monotonic() > deadline_s:
+                return Holder("", 0)
+            time.sleep(0.001)  # it was taken this very moment: its holder is about to write who it is
         return None
     finally:
         os.close(fd)
@@ -128,16 +138,15 @@ class RunDir:
         self.path = self.root / robot
         self.profile_file = self.path / "profile.json"
         elsewhere = os.environ.get(LOG_DIR)
+        self._log_variable = LOG_DIR if elsewhere else private.RUN_DIR
         self.logs = Path(elsewhere) / robot if elsewhere else self.path / "logs"
 
     def make(self) -> None:
-        try:
-            self.path.mkdir(mode=0o700, parents=True, exist_ok=True)
-            self.logs.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise ConfigError(
-                f"run directory {error.filename}: {error.strerror}; choose another by COCORO_RUN_DIR"
-            ) from error
+        """Make the folders. Raises ConfigError for those that cannot be, or are not this user's alone."""
+        with private.directory(self.path, make=True):
+            pass
+        with suppress(private.FullError), self._log_folder(make=True):
+            pass
 
     # --- who runs ---------------------------------------------------------------------------------
 
@@ -173,29 +182,48 @@ class RunDir:
             held.append(claim)
         return held
 
+    def claimant(self, service: str) -> Holder | None:
+        """The process of this machine that is a service now."""
+        return holder(self.path / "claims" / service)
+
     def claims(self) -> dict[str, Holder]:
         """Each service that a process of this machine is, and which process that is."""
-        found = ((file.name, holder(file)) for file in sorted((self.path / "claims").glob("*")))
+        folder = self.path / "claims"
+        try:
+            with private.directory(folder) as fd:
+                names = sorted(os.listdir(fd))  # noqa: PTH208 # by descriptor
+        except FileNotFoundError:
+            return {}
+        found = ((name, self.claimant(name)) for name in names)
         return {service: by for service, by in found if by is not None and by.pid}
 
     # --- the mesh ---------------------------------------------------------------------------------
 
-    def join_as(self, name: str, mesh: Mesh | None = None) -> ZenohConfig:
-        """How a process called `name` gets into the mesh that a profile tells of (the last start's by default)."""
+    def join_as(self, name: str, mesh: Mesh | None = None, *, frames: bool = False) -> ZenohConfig:
+        """How a process called `name` gets into the mesh that a profile tells of (the last start's by default).
+        `frames`: it publishes or reads them, and would have them in shared memory."""
         if mesh is None:
             mesh = msgspec.convert(self.resolved().get("mesh", {}), Mesh)
         if not mesh.listen and not mesh.connect:
             ours = default(self.robot, name, self.root)
-            return replace(ours, lease_s=mesh.lease_s, patience_s=mesh.patience_s, options=mesh.options)
+            return replace(
+                ours, lease_s=mesh.lease_s, patience_s=mesh.patience_s, shared_memory=frames, options=mesh.options
+            )
         fields = msgspec.structs.asdict(mesh)
-        return ZenohConfig(name=name, **fields)
+        return ZenohConfig(name=name, shared_memory=frames, **fields)
 
     def resolved(self) -> dict[str, Any]:
-        """The profile of the last start, as data; empty when there was none."""
+        """The profile of the last start, as data; empty when there was none, or it is damaged. Raises ConfigError."""
         try:
-            return dict(json.loads(self.profile_file.read_bytes()))
-        except (FileNotFoundError, ValueError):
+            data = json.loads(private.read(self.profile_file, PROFILE_BYTES))
+        except (FileNotFoundError, ValueError, RecursionError):
             return {}
+        return data if isinstance(data, dict) else {}
+
+    def remember(self, profile: bytes) -> None:
+        """Write the profile of this start, for those that are started and for those that ask. Raises ConfigError,
+        FullError."""
+        private.write(self.profile_file, profile)
 
     @property
     def populated(self) -> bool:
@@ -207,23 +235,46 @@ class RunDir:
     def log(self, process: str) -> Path:
         return self.logs / f"{process}.log"
 
-    def rotate_log(self, process: str) -> Path:
-        """Set the last start's log aside, and forget the oldest."""
+    def new_log(self, process: str) -> IO[bytes]:
+        """A new file for what a process writes; the last start's is set aside, and the oldest forgotten. Raises
+        ConfigError, FullError: who runs can run without."""
         log = self.log(process)
         files = [log, *(self.logs / f"{process}.log.{n}" for n in range(1, KEPT_LOGS + 1))]
-        for newer, older in reversed(list(pairwise(files))):
-            with suppress(FileNotFoundError):
-                newer.replace(older)
-        return log
+        with self._log_folder(make=True) as fd:
+            try:
+                for newer, older in reversed(list(pairwise(files))):
+                    with suppress(FileNotFoundError):
+                        os.replace(newer.name, older.name, src_dir_fd=fd, dst_dir_fd=fd)
+            except OSError as error:
+                raise private.refusal(log, error, self._log_variable) from error
+        flags = os.O_CREAT | os.O_WRONLY | os.O_TRUNC | os.O_APPEND
+        return os.fdopen(private.open_file(log, flags, mode=0o644, variable=self._log_variable), "wb", buffering=0)
+
+    def open_log(self, process: str) -> IO[bytes]:
+        """What a process has written since its last start, to be read. Raises FileNotFoundError, ConfigError."""
+        return os.fdopen(private.open_file(self.log(process), os.O_RDONLY, variable=self._log_variable), "rb")
+
+    def _log_folder(self, make: bool) -> AbstractContextManager[int]:
+        mode = 0o700 if self._log_variable == private.RUN_DIR else 0o755
+        return private.directory(self.logs, make=make, mode=mode, variable=self._log_variable)
 
 
 def robots(root: Path | None = None) -> list[RunDir]:
-    """The robots of which something runs on this machine."""
+    """This user's robots of which something runs on this machine. Raises ConfigError for a place that is not to be
+    trusted."""
+    return [run_dir for run_dir in folders(root) if run_dir.populated]
+
+
+def folders(root: Path | None = None) -> list[RunDir]:
+    """The robots of which this user has a folder, running or not. Raises ConfigError as `robots` does."""
     root = root or default_run_dir()
-    if not root.is_dir():
+    try:
+        with private.directory(root, own=False) as fd, os.scandir(fd) as entries:
+            ours = [e.name for e in entries if e.is_dir(follow_symlinks=False)]
+            ours = [name for name in ours if os.stat(name, dir_fd=fd).st_uid == os.geteuid()]
+    except FileNotFoundError:
         return []
-    found = (RunDir(folder.name, root) for folder in sorted(root.iterdir()) if folder.is_dir())
-    return [run_dir for run_dir in found if run_dir.populated]
+    return [RunDir(name, root) for name in sorted(ours)]
 
 
 class Target:

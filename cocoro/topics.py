@@ -84,7 +84,7 @@ FRAME = Topic(
 )  # fmt: skip
 BASE_STATE = Topic(
     "base/state", m.BaseState, Qos.STATE, "base", 50.0, 0.15,
-    "Odometry, bumpers, battery. Beyond its age the planner stops the base.",
+    "Odometry, bumpers, battery. Beyond its age the planner stops the base; until then it drives the slower.",
 )  # fmt: skip
 BASE_COMMAND = Topic(
     "base/command", m.BaseCommand, Qos.COMMAND, "planning", 50.0, 0.15,
@@ -133,7 +133,7 @@ MODEL = Topic(
 )  # fmt: skip
 INTENT = Topic(
     "executive/intent", m.Intent, Qos.COMMAND, "executive", 50.0, 0.3,
-    "The behaviour that is wanted. The wheels stand when it is 0.12 s old; beyond its age the planner goes idle.",
+    "The behaviour that is wanted. The wheels stand when it is 0.15 s old; beyond its age the planner goes idle.",
 )  # fmt: skip
 TASK = Topic(
     "executive/task", m.TaskState, Qos.EVENT, "executive", 5.0, 2.0,

@@ -10,10 +10,13 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from typing import IO
 
+from cocoro.errors import ConfigError
 from cocoro.launch import CRASHED, MISCONFIGURED, REFUSED
 from cocoro.processes import BACKOFF_LIMIT_S, SETTLED_S, Process
 from cocoro.rundir import RunDir
+from cocoro.vigil import RECOVERY_S, Vigil
 
 SAID_WHY = (MISCONFIGURED, REFUSED)
 """Exit codes with which a process's last line says it all."""
@@ -38,12 +41,18 @@ class StartError(Exception):
 class Child:
     """`start`, then `keep` for ever, then `stop`. `tell` gets what people should know, a line at a time."""
 
-    def __init__(self, row: Process, run_dir: RunDir, parent_fd: int, tell: Callable[[str], None]) -> None:
+    def __init__(
+        self, row: Process, run_dir: RunDir, parent_fd: int, tell: Callable[[str], None], vigil: Vigil
+    ) -> None:
+        """`vigil` knows whether this process was itself asleep."""
         self.row = row
         self.restarts = 0
         self._run_dir = run_dir
         self._parent_fd = parent_fd
         self._tell = tell
+        self._vigil = vigil
+        self._doubt: asyncio.TimerHandle | None = None
+        """Says that it is silent, unless it is back by then."""
         self._alive: set[str] = set()
         self._ready = asyncio.Event()
         self._was_ready = False
@@ -56,6 +65,16 @@ class Child:
     @property
     def pid(self) -> int | None:
         return self._process.pid if self._process is not None and not self._exit.done() else None
+
+    @property
+    def attended(self) -> bool:
+        """Whether the end of its process, if it has ended, has been noticed here."""
+        if self._process is None or self._exit.done():
+            return True
+        try:
+            return os.waitid(os.P_PID, self._process.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is None
+        except ChildProcessError:
+            return False
 
     async def start(self) -> None:
         """Start it, and return when it is ready. Raises StartError when it ends before, or takes too long."""
@@ -119,9 +138,29 @@ class Child:
             self._ready.set()
         else:
             self._ready.clear()
-        if self._was_ready and self.pid is not None and not self._stopping and ready == self._silent:
-            self._silent = not ready
-            self._tell(f"{self.row.name} is back" if ready else f"{self.row.name} is silent: no sign of {service}")
+        self._say_silence(ready)
+
+    def _say_silence(self, ready: bool) -> None:
+        """Say that it has fallen silent, or is back. Who was itself asleep gives it time before that is said of it."""
+        if self._doubt is not None and ready:
+            self._doubt.cancel()
+            self._doubt = None
+        if not self._was_ready or self.pid is None or self._stopping or ready != self._silent:
+            return
+        if ready:
+            self._silent = False
+            self._tell(f"{self.row.name} is back")
+        elif self._vigil.look():
+            if self._doubt is None:
+                self._doubt = asyncio.get_running_loop().call_later(RECOVERY_S, self._say_silence_after_all)
+        else:
+            self._silent = True
+            missing = ", ".join(sorted(set(self.row.services) - self._alive))
+            self._tell(f"{self.row.name} is silent: no sign of {missing}")
+
+    def _say_silence_after_all(self) -> None:
+        self._doubt = None
+        self._say_silence(self._alive >= set(self.row.services))
 
     # --- the process ------------------------------------------------------------------------------
 
@@ -134,7 +173,7 @@ class Child:
         self._was_ready = False
         self._exit = loop.create_future()
         self._started_s = time.monotonic()
-        with self._run_dir.rotate_log(self.row.name).open("wb") as log:
+        with self._log() as log:
             self._process = subprocess.Popen(
                 command,
                 stdin=subprocess.DEVNULL,
@@ -146,6 +185,14 @@ class Child:
             )
         pid_fd = os.pidfd_open(self._process.pid)
         loop.add_reader(pid_fd, self._on_exit, self._process, pid_fd)
+
+    def _log(self) -> IO[bytes]:
+        """Where it writes what it does; nowhere, which is said, when its log cannot be written."""
+        try:
+            return self._run_dir.new_log(self.row.name)
+        except ConfigError as error:
+            self._tell(f"{self.row.name} runs without a log: {error}")
+            return os.fdopen(os.open(os.devnull, os.O_WRONLY), "wb")
 
     def _on_exit(self, process: subprocess.Popen[bytes], pid_fd: int) -> None:
         asyncio.get_running_loop().remove_reader(pid_fd)
@@ -175,7 +222,11 @@ class Child:
     def _last_words(self, code: int | None = None) -> str:
         """The end of its log, to be put after a sentence: of a mistake the line that tells it, else a few."""
         log = self._run_dir.log(self.row.name)
-        with log.open("rb") as file:
+        try:
+            file = self._run_dir.open_log(self.row.name)
+        except (FileNotFoundError, ConfigError):
+            return ""
+        with file:
             file.seek(max(file.seek(0, os.SEEK_END) - LAST_BYTES, 0))
             lines = [line for line in file.read().decode(errors="replace").splitlines() if line.strip()]
         if code in SAID_WHY and lines:

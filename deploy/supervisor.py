@@ -8,26 +8,32 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import io
 import json
 import logging
 import os
 import signal
-import socket
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import IO
 
 import msgspec
 
+from cocoro import robot_time
+from cocoro.bus import shared
 from cocoro.bus.zenoh import ZenohBus
-from cocoro.errors import CocoroError, RefusedError
+from cocoro.errors import CocoroError, ConfigError, RefusedError
 from cocoro.launch import CRASHED
+from cocoro.processes import shared_bytes
 from cocoro.profiles import Profile, from_data
 from cocoro.quit import quit_process
 from cocoro.rundir import RunDir
 from cocoro.stop.record import latch_dir, prepare
 from cocoro.topics import STOPPABLE
+from cocoro.vigil import Vigil
+from deploy import service_manager
 from deploy.child import Child, StartError
 
 STOPPED, MISCONFIGURED, REFUSED = 0, 2, 3
@@ -59,6 +65,9 @@ class Supervisor:
         self._tell_people = tell
         self._children: list[Child] = []
         self._stop = asyncio.Event()
+        self._unshared = ""
+        """Why frames cannot all be shared, as it was before the processes were started."""
+        self._vigil = Vigil(self._tell)
 
     async def run(self) -> int:
         """Start everything, stay until SIGINT or SIGTERM, stop everything. Returns the exit code.
@@ -70,11 +79,15 @@ class Supervisor:
         try:
             self._log_to_file()
             await self._wait_for_leftovers()
-            self._run_dir.profile_file.write_bytes(msgspec.json.format(msgspec.json.encode(self._profile)))
+            shared.sweep()  # what dead processes left
+            self._unshared = shared.obstacle(shared_bytes(self._profile.rows()))
+            self._run_dir.remember(msgspec.json.format(msgspec.json.encode(self._profile)))
             self._prepare_latches()
+            robot_time.fix(self._run_dir.path)
             with _signals(self._on_signal):
                 return await self._run()
         finally:
+            shared.sweep()  # of processes that were killed
             held.release()
 
     async def _run(self) -> int:
@@ -82,7 +95,9 @@ class Supervisor:
         reader_fd, writer_fd = os.pipe()  # the children hold its reading end: it closes when this process ends
         try:
             async with await ZenohBus.open(self._run_dir.join_as("supervisor", self._profile.mesh)) as bus:
-                self._children = [Child(row, self._run_dir, reader_fd, self._tell) for row in self._profile.rows()]
+                self._children = [
+                    Child(row, self._run_dir, reader_fd, self._tell, self._vigil) for row in self._profile.rows()
+                ]
                 by_service = {service: child for child in self._children for service in child.row.services}
 
                 def on_alive(key: str, alive: bool) -> None:
@@ -91,10 +106,12 @@ class Supervisor:
                         by_service[service].on_alive(service, alive)
 
                 bus.watch_alive(f"{self._profile.robot}/*/alive", on_alive)
+                keeping_vigil = asyncio.ensure_future(self._vigil.keep())
                 try:
                     code = await self._start_and_keep()
                 finally:
-                    _notify_service_manager("STOPPING=1")
+                    keeping_vigil.cancel()
+                    service_manager.notify("STOPPING=1")
                     for child in reversed(self._children):
                         await child.stop()
         finally:
@@ -117,15 +134,22 @@ class Supervisor:
         except StartError as error:
             self._tell(str(error))
             return error.code
+        if self._unshared:
+            self._tell(f"no shared memory: {self._unshared}; {shared.COSTS}")
         self._tell(f"{self._profile.robot} is up ({self._profile.name})")
         self._on_up()
-        _notify_service_manager("READY=1")
+        service_manager.notify("READY=1")
         async with asyncio.TaskGroup() as group:
             keeping = [group.create_task(child.keep()) for child in self._children]
+            keeping.append(group.create_task(service_manager.keep_watchdog(self._attended)))
             await self._stop.wait()
             for task in keeping:
                 task.cancel()
         return STOPPED
+
+    def _attended(self) -> bool:
+        """Whether everything that became of the processes has been noticed."""
+        return all(child.attended for child in self._children)
 
     async def _wait_for_leftovers(self) -> None:
         """A killed supervisor's processes end by themselves: give them the time for it."""
@@ -162,11 +186,35 @@ class Supervisor:
         self._tell_people(text)
 
     def _log_to_file(self) -> None:
-        handler = logging.FileHandler(self._run_dir.rotate_log("supervisor"))
+        handler = _log_handler(self._run_dir, self._tell_people)
         handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)-7s supervisor: %(message)s"))
         log.handlers[:] = [handler]
         log.setLevel(logging.INFO)
         log.propagate = False
+
+
+class _Log(logging.StreamHandler[IO[str]]):
+    """Says once that nothing can be written any more, and works on."""
+
+    def __init__(self, stream: IO[str], path: Path, tell: Callable[[str], None]) -> None:
+        super().__init__(stream)
+        self._path = path
+        self._tell = tell
+        self._told = False
+
+    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802 # the library's name
+        if not self._told:
+            self._told = True
+            self._tell(f"{self._path} cannot be written ({sys.exc_info()[1]}): the supervisor works on without")
+
+
+def _log_handler(run_dir: RunDir, tell: Callable[[str], None]) -> logging.Handler:
+    try:
+        file = run_dir.new_log("supervisor")
+    except ConfigError as error:
+        tell(f"the supervisor runs without a log: {error}")
+        return logging.NullHandler()
+    return _Log(io.TextIOWrapper(file, write_through=True), run_dir.log("supervisor"), tell)
 
 
 @contextmanager
@@ -183,14 +231,6 @@ def _signals(handler: Callable[[signal.Signals], None]) -> Iterator[None]:
     finally:
         for number in numbers:
             loop.remove_signal_handler(number)
-
-
-def _notify_service_manager(state: str) -> None:
-    """systemd's notification protocol (sd_notify(3)); nothing where there is no systemd."""
-    address = os.environ.get("NOTIFY_SOCKET")
-    if address:
-        with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as notify:
-            notify.sendto(state.encode(), f"\0{address[1:]}" if address[0] == "@" else address)
 
 
 def supervise(

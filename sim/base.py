@@ -60,15 +60,22 @@ class MobileBase:
         self._wanted = (0.0, 0.0)
         self._valid_until_ns = -1
         self._next_report_ns = 0
-        self._stopped_by = ""
+        self.stopped_by = ""
+        """Why the wheels do not turn as they were asked to; '' when they do."""
 
     def command(self, command: BaseCommand, now_ns: int) -> str:
-        """Take wheel speeds, valid for the deadman's time. Returns '' when taken, otherwise why not."""
+        """Take wheel speeds, valid for as long as `Base.patience_s` has it from when they were said (without a stamp:
+        from now). Returns '' when taken, otherwise why not."""
         if self.latch != "released":
             return _latch_text(self.latch)
         self._wanted = command.left_mps, command.right_mps
-        self._valid_until_ns = now_ns + round(self._base.command_timeout_s * 1e9)
+        said_ns = min(command.stamp_ns or now_ns, now_ns)
+        self._valid_until_ns = said_ns + round(self._base.patience_s(self._faster_mps()) * 1e9)
         return ""
+
+    def _faster_mps(self) -> float:
+        """The faster wheel's speed, of what is wanted."""
+        return min(max(abs(speed) for speed in self._wanted), self._base.max_wheel_speed_mps)
 
     def set_latch(self, state: LatchState) -> None:
         """Latched and unknown command zero; a command from before counts no more after the release. From any thread."""
@@ -103,22 +110,22 @@ class MobileBase:
             bump_left=self.bumper.left,
             bump_right=self.bumper.right,
             latch=self.latch,
-            stopped_by=self._stopped_by,
+            stopped_by=self.stopped_by,
         )
 
     def _obeyed(self, now_ns: int) -> tuple[float, float]:
         """The commanded speeds as far as the reflexes let them through."""
-        self._stopped_by = ""
+        self.stopped_by = ""
         if self.latch != "released":
-            self._stopped_by = _latch_text(self.latch)
+            self.stopped_by = _latch_text(self.latch)
             return 0.0, 0.0
         if now_ns > self._valid_until_ns:
-            self._stopped_by = "no command"
+            self.stopped_by = "no command"
             return 0.0, 0.0
         left, right = self._wanted
         if self.bumper.pressed and left + right > 0.0:
             # Forward is forbidden, turning on the spot is not: a round base may turn away.
-            self._stopped_by = "bump"
+            self.stopped_by = "bump"
             ahead = (left + right) / 2
             return left - ahead, right - ahead
         return left, right

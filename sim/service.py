@@ -5,8 +5,9 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Callable, Mapping
-from contextlib import AsyncExitStack
+from contextlib import AsyncExitStack, ExitStack
 from heapq import heappop, heappush
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import msgspec
@@ -21,6 +22,7 @@ from cocoro.node import Node
 from cocoro.publisher import Publisher
 from cocoro.robot import Robot
 from sim.camera import Kinect
+from sim.motion import MotionWriter
 from sim.random_scene import find_scene
 from sim.realism import BodyRealism
 from sim.render import make_renderer
@@ -60,6 +62,8 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Worn: the body differs from its drawing, as the seed says; no service knows how."""
     bend_at_s: Annotated[float, Meta(ge=0)] | None = None
     """When somebody bends the forearm, by 3 cm at the hand."""
+    motion: str = ""
+    """A file for how the body moves at each step of the physics (`sim.motion`); empty: none."""
 
 
 class _Outbox:
@@ -113,6 +117,7 @@ class Simulator:
         self._truth = node.publisher(topics.TRUTH)
         self._states: tuple[tuple[Publisher[Any], Callable[[], Message]], ...] = ()
         self.rate = 1.0
+        self._motion: MotionWriter | None = None
         if isinstance(self._clock, FollowedClock):
             node.drive_clock()
 
@@ -160,6 +165,8 @@ class Simulator:
         world = self._world
         for _ in range(self._config.physics_hz // TICK_HZ):
             world.step()
+            if self._motion is not None:
+                self._motion.step()
             now_ns = world.time_ns
             if self._state_due.due(now_ns):
                 for publisher, state in self._states:
@@ -171,6 +178,13 @@ class Simulator:
                 self._outbox.put(self._frames, frame, now_ns + self._frame_latency_ns)
         self.tell_time()
         self._outbox.flush(world.time_ns)
+        if self._motion is not None:
+            self._motion.flush()
+
+    def write_motion(self, path: Path) -> MotionWriter:
+        """Write how the body moves from now on; closed by leaving what this returns. Raises ConfigError."""
+        self._motion = MotionWriter(path, self._world)
+        return self._motion
 
     def tell_time(self) -> None:
         sent = self._ticks.put(ClockMessage(rate=self.rate), self._world.time_ns)
@@ -216,10 +230,13 @@ def make_kinect(robot: Robot, config: Config, world: World) -> Kinect:
 
 async def keep_going(node: Node, config: Config, simulator: Simulator) -> None:
     """Tick for ever, and with it the clock."""
-    if isinstance(node.clock, FollowedClock):
-        await _in_real_time(simulator, config.pace)
-    else:
-        await _in_virtual_time(simulator, node.clock)
+    with ExitStack() as stack:
+        if config.motion:
+            stack.enter_context(simulator.write_motion(Path(config.motion)))
+        if isinstance(node.clock, FollowedClock):
+            await _in_real_time(simulator, config.pace)
+        else:
+            await _in_virtual_time(simulator, node.clock)
 
 
 async def _in_virtual_time(simulator: Simulator, clock: Clock) -> None:
@@ -251,7 +268,7 @@ async def _in_real_time(simulator: Simulator, pace: float) -> None:
 
 
 def _with_timeout(robot: Robot, timeout_s: float | None) -> Robot:
-    """The robot with another deadman."""
+    """The robot with another deadman, which is the same at all speeds."""
     if timeout_s is None:
         return robot
-    return robot.with_base(command_timeout_s=timeout_s)
+    return robot.with_base(command_timeout_s=timeout_s, stand_within_s=timeout_s + 1.0)

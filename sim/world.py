@@ -34,6 +34,15 @@ CONTACT_MEMORY = 2
 NETWORKS = ("arm", "hand")
 
 
+class Wheels(NamedTuple):
+    """How the base turns its wheels now."""
+
+    speed_mps: float
+    """The faster one's, as the ramp has it."""
+    no_command: bool
+    """They are stopped because nobody has commanded them of late."""
+
+
 class Motors(NamedTuple):
     """What the wheels and joints are driven by, and what measures them."""
 
@@ -231,6 +240,15 @@ class World:
                 frozenset(self._stage.labels[: self._stage.object_count]),
             ),
         )
+
+    def body_pose(self) -> Array:
+        """World pose of the body frame: 4 x 4."""
+        return self._mechanism.root_pose()
+
+    def wheels(self) -> Wheels:
+        """How the wheels are turned, whatever the base says of it."""
+        ramp = self._base.ramp
+        return Wheels(max(abs(ramp.left_mps), abs(ramp.right_mps)), self._base.stopped_by == "no command")
 
     @property
     def light(self) -> Light:

@@ -7,6 +7,7 @@ import functools
 import itertools
 from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import asynccontextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -51,7 +52,7 @@ class Zenoh:
         asyncio.run(scenario)
 
     async def join(self) -> Bus:
-        return await ZenohBus.open(default("robot", "test", self.run_dir))
+        return await ZenohBus.open(replace(default("robot", "test", self.run_dir), shared_memory=True))
 
     async def drop(self, bus: Bus) -> None:
         await bus.close()

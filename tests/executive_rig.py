@@ -10,6 +10,7 @@ import msgspec
 
 from cocoro import topics
 from cocoro.clock import NS, Clock
+from cocoro.contact import Contact
 from cocoro.messages import (
     BaseState,
     EstopReply,
@@ -124,9 +125,14 @@ class Robot:
 
 
 @asynccontextmanager
-async def robot(clock: Clock | None = None, ready: bool = True, **config: Any) -> AsyncIterator[Robot]:
+async def robot(
+    clock: Clock | None = None, ready: bool = True, contact: Contact | None = None, **config: Any
+) -> AsyncIterator[Robot]:
     """A robot whose services all live and whose hardware is released, or (`ready=False`) nothing yet."""
-    async with ServiceUnderTest("services.executive.service", config, clock=clock) as service:
+    under_test = ServiceUnderTest("services.executive.service", config, clock=clock)
+    if contact is not None:
+        under_test.node.contact = contact
+    async with under_test as service:
         robot = Robot(service)
         if ready:
             service.others_live(*HARDWARE, "perception", "planning")

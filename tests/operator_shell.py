@@ -90,6 +90,8 @@ class Shell:
         self.folder = folder
         self.root = Path(tempfile.mkdtemp(prefix="cocoro"))  # short: sockets live there
         self.run_dir = RunDir("robbie", self.root)
+        self.prefix: list[str] = []
+        """In front of every command, as that which has it run in a namespace."""
         self._started: list[Running] = []
         install_parts(folder)
 
@@ -117,11 +119,11 @@ class Shell:
         return str(path)
 
     def __call__(self, *arguments: str) -> subprocess.CompletedProcess[str]:
-        command = [sys.executable, "-m", "cocoro.cli.main", *arguments]
+        command = [*self.prefix, sys.executable, "-m", "cocoro.cli.main", *arguments]
         return subprocess.run(command, env=self.env, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
 
     def start(self, *arguments: str) -> Running:
-        self._started.append(Running([sys.executable, "-m", "cocoro.cli.main", *arguments], self.env))
+        self._started.append(Running([*self.prefix, sys.executable, "-m", "cocoro.cli.main", *arguments], self.env))
         return self._started[-1]
 
     def pid(self, service: str) -> int:

@@ -13,7 +13,7 @@ import msgspec
 
 from cocoro import topics
 from cocoro.bus.local import LocalBus, LocalMesh
-from cocoro.clock import NS, VirtualClock
+from cocoro.clock import NS, Clock, VirtualClock
 from cocoro.frames import wrap_rad
 from cocoro.messages import (
     BaseState,
@@ -55,13 +55,15 @@ class RobotRig:
         record_steps: bool = False,
         name: str = "",
         mesh: LocalMesh | None = None,
+        clock_of: Callable[[str], Clock] | None = None,
     ) -> None:
         """`settings` by service; frames are small unless those of 'sim' say otherwise. `name` and `mesh`: for more
-        than one robot on a mesh."""
+        than one robot on a mesh. `clock_of` gives each service its clock, instead of virtual time."""
         self._settings = {"sim": SMALL_FRAMES} | dict(settings or {})
         self._latency_s = latency_s or {}
         self._record_steps = record_steps
         self._clock = VirtualClock()
+        self._clock_of = clock_of or (lambda _: self._clock)
         self._robot = Robot.load()
         self._robot.name = name or self._robot.name
         self.mesh = mesh or LocalMesh()
@@ -94,7 +96,7 @@ class RobotRig:
         config = msgspec.convert(self._settings.get(name, {}), component.config)
         bus = self.mesh.join()
         node = Node(
-            name, bus, self._clock, self._robot,
+            name, bus, self._clock_of(name), self._robot,
             latency_s=self._latency_s.get(name, 0.0), record_steps=self._record_steps,
         )  # fmt: skip
         await node.__aenter__()

@@ -56,19 +56,19 @@ async def test_the_register_says_who_is_there_and_forgets_the_dead(directory: Pa
 def test_a_directory_that_others_may_write_to_is_refused(directory: Path) -> None:
     directory.mkdir()
     directory.chmod(0o777)
-    with pytest.raises(ConfigError, match="only this user can write to"):
+    with pytest.raises(ConfigError, match="others may write to it"):
         Membership.register(directory, "x")
 
 
 def test_a_directory_that_others_may_replace_is_refused(directory: Path) -> None:
     directory.parent.chmod(0o777)
-    with pytest.raises(ConfigError, match="only this user can write to or replace"):
+    with pytest.raises(ConfigError, match="others may replace what is in it"):
         Membership.register(directory, "x")
 
 
 def test_a_directory_that_cannot_be_made_is_refused(directory: Path) -> None:
     directory.write_text("a file")
-    with pytest.raises(ConfigError, match="choose another run directory"):
+    with pytest.raises(ConfigError, match="Not a directory; put that right, or choose another by COCORO_RUN_DIR"):
         Membership.register(directory, "x")
 
 

@@ -161,7 +161,7 @@ def test_a_record_that_its_recorder_did_not_finish_is_no_damage_but_told_of(
     path = tmp_path / "killed.mcap"
     path.write_bytes(whole)
     with Capture.open(path) as capture:
-        last = capture.chunks[-1]
+        last = capture.places[-1]
     path.write_bytes(whole[: last.offset + last.length - 10])
     with Capture.open(path) as capture:
         assert capture.problems == []

@@ -123,7 +123,7 @@ def test_keys_never_heard_of_are_kept_as_what_they_seem_to_be(tmp_path: Path) ->
         written.put(entry(key, number, payload))
     written.close()
     with Capture.open(written.file.path) as capture:
-        assert {key: channel.encoding for key, channel in capture.keys.items()} == {
+        assert {channel.topic: channel.message_encoding for channel in capture.channels.values()} == {
             "calliope/arm2/x": "msgpack", "calliope/web/y": "json", "calliope/raw/z": "application/octet-stream",
         }  # fmt: skip
         assert [capture.decode(record) for record in capture.messages()] == [{"a": 1}, {"a": 1}, b"\xc1\xc1\xff"]
@@ -329,7 +329,7 @@ def test_lossy_frames_look_like_the_frames_and_keep_their_depth(tmp_path: Path) 
     written.close()
     with Capture.open(written.file.path) as capture:
         kept, _ = capture.messages()
-        schema = capture.schema(kept.key)
+        schema = capture.schema(kept.channel)
         assert schema is not None
         assert schema.name == LossyFrame.__name__
         assert len(kept.payload) < len(smooth) + len(depth)

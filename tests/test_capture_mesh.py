@@ -20,11 +20,15 @@ from cocoro import topics
 from cocoro.bus.endpoints import default
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.capture.compression import Packer
+from cocoro.capture.info import report
+from cocoro.capture.log_clock import WALL_CLOCK, LogClock
 from cocoro.capture.reader import Capture
 from cocoro.capture.rewrite import rewrite
-from cocoro.clock import RealClock
+from cocoro.cli import capture_info
+from cocoro.clock import NS, RealClock
 from cocoro.messages import BaseState
 from cocoro.node import Node
+from cocoro.processes import load, named
 from cocoro.robot import Robot
 from cocoro.tokens import recorder_key
 
@@ -127,6 +131,100 @@ def test_a_recording_ends_well_when_it_is_told_to(short_path: Path) -> None:
                 assert capture.metadata["service/base"]["service"] == "base"
 
     asyncio.run(scenario())
+
+
+@pytest.mark.parametrize("became", ["moved", "removed"])
+def test_a_recording_whose_file_is_taken_away_goes_on_in_the_next_one_and_says_what_is_on_the_disk(
+    became: str, short_path: Path
+) -> None:
+    out, kept = short_path / "out", short_path / "kept.mcap"
+
+    async def scenario() -> None:
+        async with robot(short_path) as (bus, _):
+            recorder = await cocoro(short_path, "record", "--out", str(out))
+            await heard_by_a_recorder(bus)
+            (first,) = await files_of(out, 1)
+            if became == "moved":
+                first.rename(kept)
+            else:
+                first.unlink()
+            (second,) = await files_of(out, 1)
+            assert second.name.endswith("-002.mcap")
+            recorder.terminate()
+            said, err = await asyncio.wait_for(recorder.communicate(), PATIENCE_S)
+            paths = [second, kept] if became == "moved" else [second]
+            count = sum(len(all_of(path)) for path in paths)
+            last = said.decode().splitlines()[-1]
+            assert f": {count} messages" in last
+            assert last.startswith(str(second))
+            if became == "moved":
+                assert f"{first} was moved to {kept} while it was recorded" in err.decode()
+            else:
+                assert f"{first} was removed (or moved to another disk) while it was recorded" in err.decode()
+            assert recorder.returncode == (0 if became == "moved" else 1)
+
+    asyncio.run(scenario())
+
+
+async def files_of(folder: Path, count: int) -> list[Path]:
+    """A folder's captures, as soon as there are so many."""
+    return await asyncio.to_thread(_files_of, folder, count)
+
+
+def _files_of(folder: Path, count: int) -> list[Path]:
+    until_s = time.monotonic() + PATIENCE_S
+    while len(found := sorted(folder.glob("*.mcap"))) < count:
+        assert time.monotonic() < until_s, f"{folder} has {len(found)} captures, not {count}"
+        time.sleep(0.05)
+    return found
+
+
+class Wall:
+    """A wall clock that a test sets."""
+
+    def __init__(self) -> None:
+        self.ahead_ns = 0
+
+    def __call__(self) -> int:
+        return time.time_ns() + self.ahead_ns
+
+
+@pytest.mark.parametrize("by_s", [-3600, 3600])
+def test_a_recorder_whose_wall_clock_is_set_goes_on_as_if_it_had_not_been_and_notes_it(
+    by_s: int, short_path: Path
+) -> None:
+    out, wall = short_path / "out", Wall()
+    component = load(named("capture"))
+    config = component.config(folder=str(out), rotate_s=0.5)
+
+    async def scenario() -> None:
+        async with (
+            robot(short_path) as (bus, _),
+            await ZenohBus.open(default(ROBOT, "recorder", short_path)) as other,
+            Node("capture", other, RealClock(), Robot.load(), config=config) as node,
+        ):
+            recording = asyncio.ensure_future(component.run(node, config, LogClock(wall)))
+            await heard_by_a_recorder(bus)
+            count = len(await files_of(out, 2))
+            wall.ahead_ns += by_s * NS
+            await files_of(out, count + 4)
+            recording.cancel()
+            await asyncio.gather(recording, return_exceptions=True)
+
+    began_ns = time.time_ns()
+    asyncio.run(scenario())
+    took_ns = time.time_ns() - began_ns
+    files = sorted(out.glob("*.mcap"))
+    states = [record for path in files for record in all_of(path, "base/state")]
+    assert [each.log_ns for each in states] == sorted(each.log_ns for each in states)
+    late_ns = [each.log_ns - each.publish_ns for each in states]
+    assert -NS // 100 < min(late_ns) <= max(late_ns) < took_ns, "received after it was sent, and before the end"
+    assert states[-1].log_ns - states[0].log_ns > (len(files) - 2) * NS // 2
+    with Capture.open(files[-1]) as capture:
+        found = report(capture)
+    (step,) = found.metadata[WALL_CLOCK]["steps"]
+    assert step["by_s"] == pytest.approx(by_s, abs=0.01)
+    assert f"clock     set {'forward' if by_s > 0 else 'back'} by {abs(step['by_s']):.3f} s" in capture_info.text(found)
 
 
 def test_a_recorder_without_a_place_to_write_says_so_and_exits_with_1(short_path: Path) -> None:

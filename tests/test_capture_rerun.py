@@ -166,7 +166,7 @@ def test_steps_before_the_capture_began_are_counted_as_not_executable(tmp_path: 
 def test_lossy_frames_are_no_inputs(tmp_path: Path) -> None:
     path = tmp_path / "lossy.mcap"
     with Capture.open(GOLDEN) as capture:
-        infos = {key: info_in(capture, key) for key in capture.keys}
+        infos = {key: info_in(capture, capture.keys[key][0]) for key in capture.keys}
         out = Writer(lambda _: path, Packer("lz4"), Limits(), lambda key, _: infos[key], prepare=lossy(80))
         for name, entries in capture.metadata.items():
             out.remember(name, entries)
@@ -193,7 +193,7 @@ def of_an_older_version(out: Path, change: Callable[[dict[str, Any]], None] = la
         return msgspec.msgpack.encode({**status, "mood": "good"})
 
     with Capture.open(GOLDEN) as capture:
-        infos = {key: info_in(capture, key) for key in capture.keys}
+        infos = {key: info_in(capture, capture.keys[key][0]) for key in capture.keys}
         schema = infos["calliope/planning/status"].schema
         assert schema is not None
         then = json.loads(schema.data)
@@ -257,7 +257,7 @@ def test_a_capture_that_does_not_have_what_it_takes_is_told_of(service: str, wor
 def started_otherwise(out: Path, change: Callable[[dict[str, Any]], object]) -> Path:
     """The golden capture as it were if the planner had had other settings."""
     with Capture.open(GOLDEN) as capture:
-        infos = {key: info_in(capture, key) for key in capture.keys}
+        infos = {key: info_in(capture, capture.keys[key][0]) for key in capture.keys}
         written = Writer(lambda _: out, Packer("lz4"), Limits(), lambda key, _: infos[key])
         for name, entries in capture.metadata.items():
             if name == "service/planning":

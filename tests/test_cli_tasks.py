@@ -167,14 +167,94 @@ async def test_an_outcome_that_comes_with_the_reply_is_not_missed(scene: Scene) 
     assert code == exits.FAILED
 
 
-@in_virtual_time
-async def test_when_the_executive_dies_so_does_the_task(scene: Scene) -> None:
+class Claimed(Scene):
+    """The executive is a process of this machine, which holds its claim."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__()
+        run_dir = RunDir("calliope", folder)
+        (self.claim,) = run_dir.claim("executive", ["executive"])
+        self.link = Link(run_dir, self.mesh.join())
+
+    def returns(self) -> Executive:
+        """The executive, on the mesh again as it was before."""
+        self.bus = self.mesh.join()
+        self.node = Node("executive", self.bus, VirtualClock(), Robot.load())
+        return Executive(self.node)
+
+
+def with_claim(scenario: Callable[[Claimed], Awaitable[None]]) -> Callable[[Path], None]:
+    def test(tmp_path: Path) -> None:
+        async def run() -> None:
+            scene = Claimed(tmp_path)
+            async with scene.node:
+                await scenario(scene)
+            scene.claim.release()
+
+        run_virtual(run())
+
+    test.__name__ = scenario.__name__
+    return test
+
+
+@with_claim
+async def test_when_the_executive_dies_so_does_the_task(scene: Claimed) -> None:
     Executive(scene.node)
     running = await following(scene.follower())
     scene.bus.kill()
-    code, result = await running
+    scene.claim.release()
+    code, result = await asyncio.wait_for(running, 1.0)
     assert (code, result["outcome"], result["reason"]) == (exits.FAILED, "failed", "executive died")
     assert scene.out.getvalue() == "failed: fetch red_can: executive died\n"
+
+
+@with_claim
+async def test_an_executive_that_is_lost_and_heard_again_says_the_outcome_itself(scene: Claimed) -> None:
+    Executive(scene.node)
+    running = await following(scene.follower())
+    scene.bus.kill()
+    await asyncio.sleep(5.0)
+    executive = scene.returns()
+    executive.tell("approach", 6.0)
+    await asyncio.sleep(30.0)
+    executive.tell("end", 40.0, outcome="done")
+    code, _ = await running
+    assert code == exits.DONE
+    assert scene.out.getvalue().splitlines()[0] == (
+        "lost contact with executive: waiting for the executive to be heard again"
+    )
+
+
+@with_claim
+async def test_an_executive_that_dies_while_it_is_not_heard_has_died(scene: Claimed) -> None:
+    Executive(scene.node)
+    running = await following(scene.follower())
+    scene.bus.kill()
+    await asyncio.sleep(5.0)
+    scene.claim.release()
+    code, result = await asyncio.wait_for(running, 1.0)
+    assert (code, result["reason"]) == (exits.FAILED, "executive died")
+
+
+@in_virtual_time
+async def test_of_an_executive_that_is_not_heard_any_more_it_is_not_said_that_it_died(scene: Scene) -> None:
+    Executive(scene.node)
+    running = await following(scene.follower())
+    scene.bus.kill()
+    code, result = await asyncio.wait_for(running, 15.0)
+    reason = "lost contact with executive; the task may still be running: see cocoro status"
+    assert (code, result["outcome"], result["reason"]) == (exits.FAILED, "failed", reason)
+
+
+@with_claim
+async def test_an_executive_that_comes_back_without_the_task_is_not_waited_for(scene: Claimed) -> None:
+    Executive(scene.node)
+    running = await following(scene.follower())
+    scene.bus.kill()
+    await asyncio.sleep(5.0)
+    scene.returns().tell("", 0.0, task_id="")
+    code, result = await asyncio.wait_for(running, 1.0)
+    assert (code, result["reason"]) == (exits.FAILED, "the executive knows nothing of the task any more")
 
 
 @in_virtual_time

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import time
 from collections.abc import Coroutine
 from typing import Any
 
 import pytest
 
 import cocoro.clock
-from cocoro.clock import NS, FollowedClock, RealClock, VirtualClock, sleep
+from cocoro.clock import NS, FollowedClock, RealClock, VirtualClock, is_fresh, sleep
 from cocoro.vloop import run_virtual
 
 
@@ -19,21 +20,23 @@ def real_time(monkeypatch: pytest.MonkeyPatch) -> None:
     """The system's clocks as the virtual loop's time, from 100 s on, so that a test decides what passes."""
 
     class Time:
-        offset_ns = 100 * NS
+        CLOCK_BOOTTIME = "boottime"
+        wall_ns = 1_000_000 * NS
 
         @classmethod
-        def monotonic_ns(cls) -> int:
+        def clock_gettime_ns(cls, which: object) -> int:
+            assert which == cls.CLOCK_BOOTTIME, "the only clock that decides"
             return 100 * NS + round(asyncio.get_running_loop().time() * NS)
 
         @classmethod
         def time_ns(cls) -> int:
-            return cls.offset_ns + round(asyncio.get_running_loop().time() * NS)
+            return cls.wall_ns + round(asyncio.get_running_loop().time() * NS)
 
     monkeypatch.setattr(cocoro.clock, "time", Time)
 
 
-def step_system_clock(seconds: float) -> None:
-    cocoro.clock.time.offset_ns += round(seconds * NS)  # type: ignore[attr-defined]
+def step_wall_clock(seconds: float) -> None:
+    cocoro.clock.time.wall_ns += round(seconds * NS)  # type: ignore[attr-defined]
 
 
 def loop_s() -> float:
@@ -119,59 +122,78 @@ def test_sleeping_until_the_past_gives_others_their_turn(kind: type[VirtualClock
 
 
 @pytest.mark.usefixtures("real_time")
-def test_the_real_clock_sleeps_until_its_time() -> None:
+def test_the_real_clock_reads_as_wall_time_and_sleeps_until_its_time() -> None:
     async def main() -> None:
         clock = RealClock()
-        assert clock.now_ns() == 100 * NS
-        assert await clock.sleep_until(103 * NS + 500)
-        assert clock.now_ns() == 103 * NS + 500
+        assert clock.now_ns() == 1_000_000 * NS
+        assert await clock.sleep_until(clock.now_ns() + 3 * NS + 500)
+        assert clock.now_ns() == 1_000_003 * NS + 500
         assert clock.epoch == 0
 
     run_virtual(main())
 
 
 @pytest.mark.usefixtures("real_time")
-def test_a_small_step_back_of_the_system_holds_the_real_clock_still() -> None:
+@pytest.mark.parametrize("step_s", [-36_000.0, -0.49, -0.01, 0.01, 0.3, 36_000.0])
+def test_a_step_of_the_wall_clock_changes_nothing(step_s: float) -> None:
     async def main() -> None:
         clock = RealClock()
+        deadline_ns = clock.now_ns() + 10 * NS
+        waiting = await started(clock.sleep_until(deadline_ns))
+        await asyncio.sleep(0.5)
         before_ns = clock.now_ns()
-        step_system_clock(-0.2)
+        step_wall_clock(step_s)
         assert (clock.now_ns(), clock.epoch) == (before_ns, 0)
-        await asyncio.sleep(0.1)
-        assert (clock.now_ns(), clock.epoch) == (before_ns, 0)
-        await asyncio.sleep(0.3)
-        assert clock.now_ns() == before_ns + 200_000_000
-
-    run_virtual(main())
-
-
-@pytest.mark.usefixtures("real_time")
-def test_a_large_step_back_is_a_new_epoch_and_ends_waits() -> None:
-    async def main() -> None:
-        clock = RealClock()
-        waiting = await started(clock.sleep_until(clock.now_ns() + 10 * NS))
-        await asyncio.sleep(0.5)
-        step_system_clock(-3600.0)
-        assert not await waiting
-        assert loop_s() <= 1.0
-        assert clock.epoch == 1
-        assert clock.now_ns() < 100 * NS
-
-    run_virtual(main())
-
-
-@pytest.mark.usefixtures("real_time")
-def test_a_step_forward_is_noticed_within_a_second() -> None:
-    async def main() -> None:
-        clock = RealClock()
-        waiting = await started(clock.sleep_until(clock.now_ns() + 3600 * NS))
-        await asyncio.sleep(0.5)
-        step_system_clock(+3600.0)
         assert await waiting
-        assert loop_s() <= 1.5
-        assert clock.epoch == 0
+        assert loop_s() == pytest.approx(10.0)
+        assert clock.now_ns() == deadline_ns
 
     run_virtual(main())
+
+
+@pytest.mark.usefixtures("real_time")
+def test_processes_with_one_offset_have_one_time_whenever_they_start() -> None:
+    async def main() -> None:
+        first = RealClock()
+        step_wall_clock(-0.49)
+        restarted, alone = RealClock(first.offset_ns), RealClock()
+        assert restarted.now_ns() == first.now_ns()
+        assert alone.now_ns() == first.now_ns() - 490_000_000
+
+    run_virtual(main())
+
+
+def test_what_was_said_before_a_suspension_is_not_fresh_after_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Linux's CLOCK_BOOTTIME counts the time asleep; the event loop's timers, on CLOCK_MONOTONIC, do not."""
+
+    class Asleep:
+        CLOCK_BOOTTIME = "boottime"
+        slept_ns = 0
+
+        @classmethod
+        def clock_gettime_ns(cls, _: object) -> int:
+            return cls.slept_ns + round(asyncio.get_running_loop().time() * NS)
+
+        time_ns = time.time_ns
+
+    monkeypatch.setattr(cocoro.clock, "time", Asleep)
+
+    async def main() -> None:
+        clock = RealClock()
+        said_ns = clock.now_ns()
+        waiting = await started(clock.sleep_until(said_ns + 3600 * NS))
+        await asyncio.sleep(0.05)
+        assert is_fresh(said_ns, clock.now_ns(), 0.15)
+        Asleep.slept_ns = 3600 * NS
+        assert not is_fresh(said_ns, clock.now_ns(), 0.15)
+        assert await waiting
+        assert loop_s() <= RealClock.SLICE_S, "a deadline that passed meanwhile is noticed"
+
+    run_virtual(main())
+
+
+def test_on_this_machine_it_reads_as_wall_time() -> None:
+    assert abs(RealClock().now_ns() - time.time_ns()) < NS
 
 
 # The clock that follows the simulator's
@@ -228,6 +250,110 @@ def test_a_late_tick_is_ignored() -> None:
         clock.tick(1 * NS, 1, rate=0.01)
         await asyncio.sleep(0.01)
         assert clock.now_ns() == 2 * NS + 10_000_000
+
+    run_virtual(main())
+
+
+TICK_NS = NS // 120
+
+
+@pytest.mark.usefixtures("real_time")
+@pytest.mark.parametrize("ahead_s", [0.3, 1.0, 3600.0, 2.0**62 / NS])
+def test_one_tick_from_far_ahead_moves_nothing(ahead_s: float) -> None:
+    async def main() -> None:
+        clock = FollowedClock()
+        seen = []
+        for tick in range(240):
+            assert clock.tick(tick * TICK_NS, 1) == ""
+            if tick == 100:
+                assert "s ahead" in clock.tick(tick * TICK_NS + round(ahead_s * NS), 1)
+            seen.append(clock.now_ns())
+            await asyncio.sleep(1 / 120)
+        assert seen == [tick * TICK_NS for tick in range(240)]
+        assert clock.epoch == 0
+
+    run_virtual(main())
+
+
+@pytest.mark.usefixtures("real_time")
+def test_a_tick_that_is_a_little_ahead_holds_time_still_until_the_others_have_caught_up() -> None:
+    async def main() -> None:
+        clock = FollowedClock()
+        stood_s = 0.0
+        for tick in range(240):
+            if tick == 100:
+                assert clock.tick(tick * TICK_NS + NS // 4, 1) == ""
+            clock.tick(tick * TICK_NS, 1)
+            before_ns = clock.now_ns()
+            await asyncio.sleep(1 / 120)
+            stood_s += (1 / 120) * (clock.now_ns() == before_ns)
+        assert clock.epoch == 0
+        assert clock.now_ns() == 240 * TICK_NS
+        assert 0.15 < stood_s < 0.26
+
+    run_virtual(main())
+
+
+@pytest.mark.usefixtures("real_time")
+def test_ticks_that_agree_are_followed_ahead_as_a_replay_is_moved_on() -> None:
+    async def main() -> None:
+        clock = FollowedClock()
+        clock.tick(NS, 1)
+        for number in range(FollowedClock.FOLLOWED_AFTER):
+            assert clock.now_ns() < 2 * NS
+            clock.tick(60 * NS + number * TICK_NS, 1)
+            await asyncio.sleep(1 / 120)
+        assert (clock.now_ns(), clock.epoch) == (60 * NS + 3 * TICK_NS, 0)
+
+    run_virtual(main())
+
+
+@pytest.mark.usefixtures("real_time")
+def test_when_the_very_first_tick_was_wrong_the_others_begin_time_anew() -> None:
+    async def main() -> None:
+        clock = FollowedClock()
+        clock.tick(2**62, 1)
+        for tick in range(3):
+            clock.tick(5 * NS + tick * TICK_NS, 1)
+            await asyncio.sleep(1 / 120)
+        assert (clock.now_ns(), clock.epoch) == (5 * NS + 3 * TICK_NS, 1)
+
+    run_virtual(main())
+
+
+@pytest.mark.usefixtures("real_time")
+def test_ticks_that_do_not_agree_are_never_followed() -> None:
+    async def main() -> None:
+        clock = FollowedClock()
+        clock.tick(NS, 1)
+        for wrong_s in (60, 20, 300, 10, 9, 8, 7):
+            assert clock.tick(wrong_s * NS, 1)
+            await asyncio.sleep(1 / 120)
+        assert (clock.now_ns(), clock.epoch) == (NS + 30_000_000, 0)
+
+    run_virtual(main())
+
+
+@pytest.mark.usefixtures("real_time")
+def test_who_was_stopped_for_a_while_takes_the_next_tick() -> None:
+    async def main() -> None:
+        clock = FollowedClock()
+        clock.tick(NS, 1)
+        await asyncio.sleep(10.0)
+        assert clock.latest_ns() == NS + 2 * 10 * NS, "it may have gone twice as fast as it seemed"
+        assert clock.tick(11 * NS, 1) == ""
+        assert clock.now_ns() == 11 * NS
+
+    run_virtual(main())
+
+
+@pytest.mark.usefixtures("real_time")
+def test_a_replay_at_a_hundred_times_real_time_is_followed() -> None:
+    async def main() -> None:
+        clock = FollowedClock()
+        for tick in range(50):
+            assert clock.tick(tick * 100 * TICK_NS, 1, rate=100.0) == ""
+            await asyncio.sleep(1 / 120)
 
     run_virtual(main())
 

@@ -185,7 +185,7 @@ async def test_until_everyone_lives_no_task_begins() -> None:
         assert (await it.ask()).refusal == "not_alive"
         it.service.others_live(*HARDWARE, "perception")
         await it.service.settle()
-        assert (await it.ask()).text == "not alive: planning; see cocoro status"
+        assert (await it.ask()).text == "no contact with planning; see cocoro status"
         it.service.others_live("planning")
         await it.service.settle()
         assert (await it.ask()).accepted

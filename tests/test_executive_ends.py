@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import asyncio
+from pathlib import Path
 
 import pytest
 from executive_rig import idle_again, robot
 
 from cocoro import topics
 from cocoro.clock import NS
+from cocoro.contact import Contact
 from cocoro.messages import CancelRequest
+from cocoro.rundir import RunDir, hold
 from cocoro.testing import JumpingClock, in_virtual_time
 from cocoro.topics import HARDWARE
+from cocoro.vigil import Vigil
 from services.executive import executive
 
 
@@ -84,7 +88,7 @@ def test_whatever_ends_a_task_and_whenever_it_ends_once_and_another_can_follow(e
 
 
 @pytest.mark.parametrize("service", [*HARDWARE, "perception", "planning"])
-def test_a_task_fails_when_a_service_that_it_needs_dies(service: str) -> None:
+def test_a_task_fails_when_a_service_that_it_needs_is_not_heard_any_more(service: str) -> None:
     @in_virtual_time
     async def scenario() -> None:
         async with robot() as it:
@@ -93,9 +97,75 @@ def test_a_task_fails_when_a_service_that_it_needs_dies(service: str) -> None:
             await it.phase("search")
             it.service.other_dies(service)
             state = await it.outcome()
-            assert (state.outcome, state.reason) == ("failed", f"not_alive: {service} died")
+            assert (state.outcome, state.reason) == ("failed", f"not_alive: lost contact with {service}")
             refused = await it.ask()
-            assert (refused.refusal, refused.text) == ("not_alive", f"not alive: {service}; see cocoro status")
+            assert (refused.refusal, refused.text) == ("not_alive", f"no contact with {service}; see cocoro status")
+
+    scenario()
+
+
+class Sleepy:
+    """A clock of a process that may be stopped."""
+
+    def __init__(self) -> None:
+        self.slept_ns = 0
+
+    def __call__(self) -> int:
+        return round(asyncio.get_running_loop().time() * NS) + self.slept_ns
+
+
+@pytest.mark.parametrize(
+    ("fate", "reason", "refusal"),
+    [
+        ("dies", "not_alive: perception died", "not alive: perception; see cocoro status"),
+        ("dies a little later", "not_alive: perception died", "not alive: perception; see cocoro status"),
+        ("is begun anew", "not_alive: perception died", "not alive: perception; see cocoro status"),
+        ("is stopped", "not_alive: lost contact with perception", "no contact with perception; see cocoro status"),
+        (
+            "is unheard since all slept",
+            "not_alive: this machine was asleep or starved for 15 s",
+            "no contact with perception; see cocoro status",
+        ),
+        ("dies while all sleep", "not_alive: perception died", "not alive: perception; see cocoro status"),
+    ],
+)
+def test_only_of_one_that_is_known_to_be_dead_it_is_said_that_it_died(
+    fate: str, reason: str, refusal: str, tmp_path: Path
+) -> None:
+    run_dir = RunDir("calliope", tmp_path)
+    claims = run_dir.claim("perception", ["perception"])
+
+    @in_virtual_time
+    async def scenario() -> None:
+        clock, said = Sleepy(), []
+        async with robot(contact=Contact(run_dir, Vigil(said.append, clock))) as it:
+            it.script = {"search": ["never"]}
+            await it.begin()
+            await it.phase("search")
+            await it.service.advance(20.0)
+            assert said == []
+            fault_ns = it.service.tester.now_ns()
+            if "all" in fate:
+                clock.slept_ns += 15 * NS
+            if fate in ("dies", "dies while all sleep", "is begun anew"):
+                claims[0].release()
+            if fate == "is begun anew":
+                path = run_dir.path / "claims" / "perception"
+                another = hold(path, "perception")
+                assert another is not None
+                path.write_text('{"name": "perception", "pid": 1}')
+            it.service.other_dies("perception")
+            if fate == "dies a little later":
+                await it.service.advance(0.3)
+                assert idle_again(it), "the robot stands at once"
+                assert it.state().outcome is None
+                claims[0].release()
+            state = await it.outcome()
+            assert (state.outcome, state.reason) == ("failed", reason)
+            assert state.stamp_ns - fault_ns < 0.7 * NS
+            assert (await it.ask()).text == refusal
+            await it.service.advance(20.0)
+            assert said == (["this machine was asleep or starved for 15 s"] if "all" in fate else [])
 
     scenario()
 

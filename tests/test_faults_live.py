@@ -78,7 +78,7 @@ def test_who_is_stopped_or_killed_while_driving_leaves_a_robot_that_stands(
     asyncio.run(scenario())
 
 
-def test_who_is_stopped_for_longer_than_the_lease_counts_as_dead_and_is_back_when_it_goes_on(
+def test_who_is_stopped_for_longer_than_the_lease_ends_the_task_and_is_back_when_it_goes_on(
     tmp_path: Path, far: Path
 ) -> None:
     async def scenario() -> None:
@@ -87,7 +87,7 @@ def test_who_is_stopped_for_longer_than_the_lease_counts_as_dead_and_is_back_whe
             pid = robot.pid("perception")
             stopped_s = await fault(robot, "perception", signal.SIGSTOP)
             state = await robot.outcome(task_id)
-            assert (state.outcome, state.reason) == ("failed", "not_alive: perception died")
+            assert (state.outcome, state.reason) == ("failed", "not_alive: lost contact with perception")
             await stands_in_time(robot, stopped_s)
             await robot.told("perception is silent: no sign of perception")
             assert (await robot.ask(TaskRequest(task="park"))).refusal == "not_alive"

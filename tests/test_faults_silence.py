@@ -18,7 +18,7 @@ from cocoro.testing import in_virtual_time
 
 pytestmark = pytest.mark.sim
 
-ZERO_S = 0.22
+ZERO_S = 0.2
 """From the moment of the fault until nothing but zero is commanded."""
 STAND_S = 0.3
 """The same until the body truly stands."""
@@ -28,6 +28,8 @@ PERIOD_S = 1 / 30
 
 class Mute:
     """In a publisher's place."""
+
+    trouble = ""
 
     def put(self, payload: Payload) -> None:
         pass

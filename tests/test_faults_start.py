@@ -111,7 +111,9 @@ def test_a_run_directory_that_cannot_be_is_named_in_a_line(shell: Shell, tmp_pat
         env=shell.env | {"COCORO_RUN_DIR": str(place)}, capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert told.returncode == exits.USAGE
-    assert one_line(told).startswith(f"run directory {place}/robbie: Not a directory; choose another by COCORO_RUN_DIR")
+    assert one_line(told).startswith(
+        f"run directory {place}: Not a directory; put that right, or choose another by COCORO_RUN_DIR"
+    )
 
 
 # --- an unreadable scene ------------------------------------------------------------------------------

@@ -10,52 +10,18 @@ import msgspec
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from inbox_rig import FAR, KEY, StillClock, inbox_of, payload
 from message_samples import data_of
 
 from cocoro import topics
 from cocoro.bus.local import LocalMesh
-from cocoro.clock import NS
+from cocoro.clock import NS, FollowedClock
 from cocoro.inbox import Inbox, Intake, Latest, Stream
-from cocoro.messages import Message
 from cocoro.testing import in_virtual_time
 from cocoro.topics import TOPICS, Qos, Topic
 
-KEY = "calliope/key"
 MS = NS // 1000
 every_topic = pytest.mark.parametrize("topic", TOPICS, ids=lambda topic: topic.name)
-
-
-class StillClock:
-    """Stands where it is put."""
-
-    epoch = 0
-    stands = True
-
-    def __init__(self, now_ns: int = 100 * NS) -> None:
-        self.at_ns = now_ns
-
-    def now_ns(self) -> int:
-        return self.at_ns
-
-    async def sleep_until(self, when_ns: int) -> bool:
-        raise AssertionError("nobody waits here")
-
-
-def inbox_of(topic: Topic[Any], clock: StillClock | None = None) -> tuple[Inbox[Any], list[Message]]:
-    inbox = Inbox(topic, KEY, clock or StillClock())
-    got: list[Message] = []
-    inbox.add(lambda _key, message: got.append(message))
-    return inbox, got
-
-
-def payload(topic: Topic[Any], seq: int = 0, incarnation: int = 1, stamp_ns: int = 100 * NS, **fields: Any) -> bytes:
-    goods: dict[str, dict[str, Any]] = {
-        topics.BASE_COMMAND.name: {"left_mps": 0.1, "right_mps": 0.1},
-        topics.BASE_STATE.name: {"odometry_m": (0, 0), "odometry_yaw_rad": 0, "speed_mps": 0, "turn_rate_radps": 0},
-    }
-    return msgpack.packb(
-        goods.get(topic.name, {}) | {"seq": seq, "incarnation": incarnation, "stamp_ns": stamp_ns} | fields
-    )
 
 
 # --- at the border --------------------------------------------------------------------------------
@@ -166,6 +132,59 @@ def test_a_command_acts_neither_after_its_time_nor_before_it(age_s: float, taken
     inbox, got = inbox_of(topics.BASE_COMMAND)
     inbox.deliver(KEY, payload(topics.BASE_COMMAND, stamp_ns=100 * NS - round(age_s * NS)))
     assert (len(got), inbox.rejected) == (taken, 1 - taken)
+
+
+@pytest.mark.parametrize(
+    ("topic", "ahead_s", "taken"),
+    [
+        (topics.BASE_STATE, 0.2, 1), (topics.BASE_STATE, 0.3, 0), (topics.BASE_STATE, FAR / NS, 0),
+        (topics.LATCH, 1.0, 0), (topics.FRAME, 1.0, 0), (topics.TASK, 1.0, 1),
+    ],
+)  # fmt: skip
+def test_states_from_the_future_are_rejected_and_nothing_after_them(
+    topic: Topic[Any], ahead_s: float, taken: int
+) -> None:
+    pixels = {"width": 1, "height": 1, "colour": bytes(3), "depth": bytes(2)} if topic is topics.FRAME else {}
+    fields = {"state": "released"} if topic is topics.LATCH else pixels
+    clock = StillClock()
+    inbox, got = inbox_of(topic, clock)
+    for seq in range(20):
+        clock.at_ns += NS // 10
+        inbox.deliver(KEY, payload(topic, seq, stamp_ns=clock.at_ns, **fields))
+    inbox.deliver(KEY, payload(topic, 20, stamp_ns=clock.at_ns + round(ahead_s * NS), **fields))
+    assert (len(got), inbox.rejected) == (20 + taken, 1 - taken)
+    inbox.deliver(KEY, payload(topic, 21, stamp_ns=clock.at_ns, **fields))
+    assert got[-1].seq == 21
+    assert inbox.health(0).lost == 0
+
+
+def test_an_onlooker_whose_clock_is_wrong_sees_everything() -> None:
+    for topic in (topics.BASE_STATE, topics.BASE_COMMAND):
+        inbox = Inbox(topic, KEY, StillClock(), onlooker=True)
+        for seq, stamp_s in enumerate((1, 10_000)):
+            inbox.deliver(KEY, payload(topic, seq, stamp_ns=stamp_s * NS))
+        assert (inbox.rejected, inbox.rate.count) == (0, 2)
+
+
+def test_before_a_followed_clock_has_started_nothing_is_from_the_future() -> None:
+    clock = FollowedClock()
+    inbox = Inbox(topics.BASE_STATE, KEY, clock)
+    inbox.deliver(KEY, payload(topics.BASE_STATE, 0))
+    clock.tick(NS, 1)
+    inbox.deliver(KEY, payload(topics.BASE_STATE, 1))
+    assert (inbox.rate.count, inbox.rejected) == (1, 1)
+
+
+def test_after_a_clock_has_begun_anew_stamps_are_judged_by_the_new_time() -> None:
+    clock = FollowedClock()
+    inbox = Inbox(topics.BASE_STATE, KEY, clock)
+    clock.tick(1000 * NS, 1)
+    inbox.deliver(KEY, payload(topics.BASE_STATE, 0, stamp_ns=1000 * NS))
+    clock.tick(NS, 2)
+    inbox.health(NS)
+    inbox.deliver(KEY, payload(topics.BASE_STATE, 1, stamp_ns=900 * NS))
+    inbox.deliver(KEY, payload(topics.BASE_STATE, 2, stamp_ns=NS))
+    assert (inbox.rate.count, inbox.rejected) == (2, 1)
 
 
 def test_an_old_state_is_handed_on_for_its_reader_to_judge() -> None:

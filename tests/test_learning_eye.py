@@ -55,7 +55,7 @@ def test_an_eye_that_is_as_drawn_changes_nothing(robot: Robot) -> None:
 def test_the_floor_that_a_tilted_eye_lifts_is_no_obstacle(robot: Robot) -> None:
     floor, box = seen(robot, (1.9, 0.2, 0.0), 0.03), seen(robot, (1.9, -0.2, 0.2), 0.03)
     assert floor[2] > 0.05  # higher than what counts as floor so far off
-    senses = Senses(Config(), robot.joints)
+    senses = Senses(Config(), robot)
     obstacles = Obstacles(points_m=(floor, box), origin_m=(0.06, 0.0))
     assert senses._standing(obstacles).points_m == (floor, box)
     senses.eye = Eye(robot, 0.03)

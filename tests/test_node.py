@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from itertools import pairwise
 
 import msgspec
 import pytest
@@ -126,6 +127,29 @@ async def test_health_tells_of_every_topic_and_loop() -> None:
         assert ports["calliope/base/state", "out"].rate_hz == pytest.approx(10.0)
         assert [loop.name for loop in second.loops] == ["beat"]
         assert second.loops[0].period_median_ms == pytest.approx(100.0)
+        assert second.faults == (f"base/command of planning: 1 rejected: {command.last_error}",)
+
+
+@in_virtual_time
+async def test_a_topic_that_can_be_read_no_more_is_told_at_once_and_so_is_its_return() -> None:
+    mesh = Mesh()
+    async with mesh.node("base") as node, mesh.node("feeder") as feeder:
+        node.ready("works")
+        node.stream(topics.BASE_COMMAND)
+        told: list[tuple[int, bool]] = []
+        feeder.on(
+            topics.HEALTH,
+            lambda health: told.append((health.stamp_ns, any(port.unreadable for port in health.topics))),
+            service="base",
+        )
+        await asyncio.sleep(0.3)
+        for _ in range(50):
+            feeder.publish(topics.BASE_COMMAND, BaseCommand(left_mps=0.0, right_mps=0.0), 1)
+            await asyncio.sleep(0.02)
+        feeder.publish(topics.BASE_COMMAND, BaseCommand(left_mps=0.0, right_mps=0.0))
+        await asyncio.sleep(0.1)
+        changes = [(b[0] / NS, b[1]) for a, b in pairwise(told) if a[1] != b[1]]
+        assert changes == [(pytest.approx(0.9, abs=0.03), True), (pytest.approx(1.3, abs=0.03), False)]
 
 
 @in_virtual_time

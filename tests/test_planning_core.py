@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from math import hypot
 from typing import Any
 
@@ -12,7 +13,7 @@ import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 from message_samples import data_of
-from planner_rig import CAN_M, ROBOT, Planner, standing, started
+from planner_rig import CAN_M, ROBOT, TICK_S, Planner, standing, started
 
 from cocoro import topics
 from cocoro.messages import Behaviour, Detection, Detections, Message, ServoState
@@ -31,6 +32,11 @@ def approaching(planner: Planner) -> None:
     planner.want("approach", "red_can")
     planner.run(2.0)
     assert planner.wheels.left_mps > 0.1
+
+
+def only_stands(planner: Planner) -> bool:
+    """Nothing is commanded but zero to the wheels."""
+    return planner.commanded == {topics.BASE_COMMAND.name} and standing(planner)
 
 
 # --- idle -----------------------------------------------------------------------------------------
@@ -66,11 +72,11 @@ def test_every_behaviour_says_why_and_whose_step_it_is(planner: Planner, behavio
 def test_a_silent_executive_first_halts_the_wheels_and_then_ends_what_was_asked(planner: Planner) -> None:
     approaching(planner)
     planner.silent.add(topics.INTENT.name)
-    planner.run(0.12)
+    planner.run(ROBOT.base.command_timeout_s - 0.01)
     assert not standing(planner)
     status = planner.tick()
     assert standing(planner)
-    assert status.behaviour == "approach"
+    assert (status.behaviour, status.why) == ("approach", "standing still: the executive is silent")
     status = planner.run(0.2)
     assert (status.behaviour, status.why) == ("idle", "standing still: the executive is silent")
     assert standing(planner)
@@ -89,19 +95,82 @@ def test_an_executive_that_speaks_again_is_obeyed_again(planner: Planner) -> Non
 @pytest.mark.parametrize(
     "topic", [topics.BASE_STATE, topics.ARM_STATE, topics.HAND_STATE], ids=lambda topic: topic.name
 )
-def test_beyond_its_states_age_it_commands_nothing_and_in_time_it_gives_up(planner: Planner, topic: Topic[Any]) -> None:
+def test_beyond_its_states_age_it_only_stands_and_in_time_it_gives_up(planner: Planner, topic: Topic[Any]) -> None:
     approaching(planner)
     planner.silent.add(topic.name)
     planner.run(topic.max_age_s - 0.01)
     assert planner.commanded == {topic.name for topic in MOVING}
     status = planner.run(0.04)
-    assert planner.commanded == set()
+    assert only_stands(planner)
     assert (status.state, topic.name in status.why) == ("running", True)
     status = planner.run(1.1)
     assert (status.state, status.reason) == ("failed", "stale")
     planner.silent.clear()
     planner.tick()
     assert planner.commanded == {topic.name for topic in MOVING}
+
+
+@pytest.mark.parametrize(
+    "topic",
+    [topics.INTENT, topics.DETECTIONS, topics.BASE_STATE, topics.ARM_STATE, topics.HAND_STATE],
+    ids=lambda topic: topic.name,
+)
+def test_the_longer_somebody_is_late_the_slower_it_drives_so_that_it_could_stand_in_time(
+    planner: Planner, topic: Topic[Any]
+) -> None:
+    approaching(planner)
+    full_mps = planner.wheels.left_mps
+    assert full_mps > 0.3
+    heard_ns = planner.under_test.now_ns
+    planner.silent.add(topic.name)
+    base = ROBOT.base
+    while not standing(planner):
+        status = planner.tick()
+        wheels = planner.wheels
+        until_s = (planner.under_test.now_ns - heard_ns) / 1e9 + TICK_S  # it is what counts until the next step
+        ramp_s = max(abs(wheels.left_mps), abs(wheels.right_mps)) / base.wheel_acceleration_mps2
+        assert until_s + ramp_s <= base.stand_within_s - base.stand_reserve_s + 1e-9 or standing(planner)
+        if 0 < wheels.left_mps < 0.9 * full_mps:
+            assert status.why.startswith("slower, for ")
+    assert (planner.under_test.now_ns - heard_ns) / 1e9 <= base.command_timeout_s + 2 * TICK_S
+
+
+@pytest.mark.parametrize("topic", [topics.INTENT, topics.DETECTIONS], ids=lambda topic: topic.name)
+def test_a_short_silence_costs_no_more_speed_than_the_wheels_lose_in_it(planner: Planner, topic: Topic[Any]) -> None:
+    approaching(planner)
+    before_mps = planner.wheels.left_mps
+    planner.silent = {topic.name}
+    while not standing(planner):
+        planner.tick()
+    planner.silent = set()
+    planner.run(0.04)
+    lost_mps = before_mps - planner.wheels.left_mps
+    assert 0.0 < lost_mps <= 0.1 * ROBOT.base.wheel_acceleration_mps2
+    assert planner.wheels.left_mps > 0.05
+
+
+def test_a_clock_that_is_ahead_of_ours_makes_nobody_seem_younger(planner: Planner) -> None:
+    approaching(planner)
+    wants = planner.wants
+    assert wants is not None
+    now_ns = planner.under_test.now_ns
+    planner.silent.add(topics.INTENT.name)
+    planner.under_test.feed(topics.INTENT, copy(wants), stamp_ns=now_ns + round(0.2 * 1e9))
+    planner.tick()
+    assert not standing(planner)
+    planner.run(ROBOT.base.command_timeout_s + TICK_S)
+    assert standing(planner)
+
+
+def test_one_lost_word_costs_little_speed_and_no_stop(planner: Planner) -> None:
+    approaching(planner)
+    full_mps = planner.wheels.left_mps
+    for topic in (topics.INTENT, topics.DETECTIONS, topics.BASE_STATE):
+        planner.silent = {topic.name}
+        planner.run(0.06)
+        planner.silent = set()
+        assert planner.wheels.left_mps > 0.9 * full_mps
+        planner.run(0.2)
 
 
 @pytest.mark.parametrize("latch", ["latched", "unknown"])
@@ -137,7 +206,7 @@ def test_a_state_that_lacks_a_joint_is_no_state(planner: Planner, joint: str) ->
         topic, ServoState(joints=names, position_rad=zeros, speed_radps=zeros, load=zeros, latch="released")
     )
     status = planner.tick()
-    assert planner.commanded == set()
+    assert only_stands(planner)
     assert status.why == f"standing still: no angle of {joint}"
 
 
@@ -151,7 +220,7 @@ def test_when_the_clock_begins_anew_nothing_from_before_is_acted_on(planner: Pla
     planner.incarnation = 2
     planner.silent = {topics.INTENT.name, topics.ARM_STATE.name}
     status = planner.run(0.2)
-    assert planner.commanded == set(), "the arm's state is from the time before"
+    assert only_stands(planner), "the arm's state is from the time before"
     assert status.behaviour == "idle", "and so is the intent"
     planner.silent = set()
     status = planner.run(0.5)

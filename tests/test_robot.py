@@ -129,6 +129,30 @@ def test_a_description_comes_back_from_plain_data() -> None:
     assert robot.links == ROBOT.links
 
 
+@pytest.mark.parametrize("speed_mps", [-0.5, 0.0, 0.1, 0.35, 0.48, 0.5])
+def test_patience_and_the_ramp_that_follows_it_stay_within_the_time_to_stand(speed_mps: float) -> None:
+    base = ROBOT.base
+    patience_s = base.patience_s(speed_mps)
+    assert 2 / 50.0 < patience_s <= base.command_timeout_s, "two commands at least"
+    ramp_s = abs(speed_mps) / base.wheel_acceleration_mps2
+    assert patience_s + ramp_s <= base.stand_within_s - base.stand_reserve_s + 1e-12
+    assert base.speed_at_age_mps(patience_s) >= abs(speed_mps) - 1e-12
+    assert base.speed_at_age_mps(base.stand_within_s) == 0.0
+
+
+def test_a_robot_whose_wheels_ramp_too_slowly_for_a_speed_is_not_patient_at_it() -> None:
+    base = ROBOT.with_base(wheel_acceleration_mps2=1.0).base
+    assert base.patience_s(0.5) == 0.0
+    assert base.patience_s(0.2) > 0.0
+
+
+def test_a_description_from_before_there_was_a_time_to_stand_has_one() -> None:
+    data = ROBOT.to_data()
+    for name in ("stand_within_s", "stand_reserve_s"):
+        del data["base"][name]
+    assert Robot.from_data(data).base.stand_within_s == ROBOT.base.stand_within_s
+
+
 def test_another_deadman_leaves_the_robot_itself_alone() -> None:
     assert ROBOT.with_base(command_timeout_s=9.0).base.command_timeout_s == 9.0
     assert ROBOT.base.command_timeout_s == 0.15

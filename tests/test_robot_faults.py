@@ -18,7 +18,7 @@ pytestmark = pytest.mark.sim
 
 HALT_S = 0.3
 """From whatever goes wrong until the robot stands, by the truth."""
-ZERO_S = 0.22
+ZERO_S = 0.2
 """The same until nothing but zero is commanded."""
 
 
@@ -155,9 +155,9 @@ def test_who_dies_while_driving_leaves_a_robot_that_stands(service: str, speed_m
             assert stands_since(rig, died_s + HALT_S)
             if service != "executive":
                 state = rig.state(task_id)
-                assert (state.outcome, state.reason) == ("failed", f"not_alive: {service} died")
+                assert (state.outcome, state.reason) == ("failed", f"not_alive: lost contact with {service}")
                 refused = await rig.ask("fetch", "red_can")
-                assert (refused.refusal, refused.text) == ("not_alive", f"not alive: {service}; see cocoro status")
+                assert (refused.refusal, refused.text) == ("not_alive", f"no contact with {service}; see cocoro status")
 
             await rig.start(service)
             await rig.advance(2.0)
@@ -190,7 +190,7 @@ async def test_when_the_robot_itself_dies_the_task_says_so() -> None:
         await rig.kill("sim")
         state = await rig.outcome(task_id, timeout_s=10.0)
         assert state.outcome == "failed"
-        assert state.reason in {f"not_alive: {part} died" for part in topics.HARDWARE}
+        assert state.reason in {f"not_alive: lost contact with {part}" for part in topics.HARDWARE}
 
 
 # --- slow services --------------------------------------------------------------------------------

@@ -163,6 +163,16 @@ def test_gaps_in_the_sequence_are_losses_and_a_restart_is_none() -> None:
     assert report.lost == 3
 
 
+def test_a_number_that_cannot_be_traffic_is_no_loss() -> None:
+    meter = Meter("calliope/base/command", 50.0, window_s=5.0)
+    for number, seq in enumerate([5, 6, 2**62, 7, 9]):
+        message = BaseCommand(left_mps=0, right_mps=0, seq=seq, incarnation=1, stamp_ns=number * 20_000_000)
+        meter.hear(msgspec.msgpack.encode(message), number * 0.02)
+    report = meter.report(0.1)
+    assert report is not None
+    assert (report.lost, report.messages) == (1, 5)
+
+
 def test_what_is_no_message_of_ours_has_a_rate_all_the_same() -> None:
     meter = Meter("calliope/somebody/else", None, window_s=5.0)
     assert meter.report(0.0) is None

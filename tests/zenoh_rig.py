@@ -36,7 +36,8 @@ def say(*words):
 NAME = sys.argv[2]
 
 async def join(**options):
-    return await ZenohBus.open(ZenohConfig(NAME, directory=Path(sys.argv[1]), lease_s=1.0, **options))
+    options = {"lease_s": 1.0, "shared_memory": True} | options
+    return await ZenohBus.open(ZenohConfig(NAME, directory=Path(sys.argv[1]), **options))
 """
 
 SERVICE = (
@@ -101,7 +102,7 @@ def scenario(test: Callable[..., Coroutine[Any, Any, None]]) -> Callable[..., No
 
 
 def local(directory: Path, name: str = "test", **options: Any) -> ZenohConfig:
-    return ZenohConfig(name, directory=directory, **{"lease_s": 1.0, **options})
+    return ZenohConfig(name, directory=directory, **{"lease_s": 1.0, "shared_memory": True, **options})
 
 
 @asynccontextmanager

@@ -27,7 +27,7 @@ class Heard(NamedTuple):
     key: str
     payload: Payload
     heard_ns: int
-    """When it came in: Unix time between processes, the loop's time within one."""
+    """When it came in: by `cocoro.boottime` between processes, by the loop's time within one."""
 
 
 OnLot = Callable[[list[Heard]], None]
@@ -50,6 +50,10 @@ class Handle(Protocol):
 class RawPublisher(Handle, Protocol):
     def put(self, payload: Payload) -> None:
         """Send; never blocks the loop noticeably, never raises for want of subscribers."""
+
+    @property
+    def trouble(self) -> str:
+        """Why samples cost more than they should, in words; empty when all is well."""
 
 
 class Subscription(Handle, Protocol):

@@ -76,10 +76,17 @@ class ZenohSubscription(Declared):
 
 
 class ZenohPublisher(Declared):
-    def __init__(self, publisher: zenoh.Publisher, outbox: Outbox | None, pool: SharedPool | None) -> None:
+    def __init__(
+        self, publisher: zenoh.Publisher, outbox: Outbox | None, pool: SharedPool | None, trouble: str = ""
+    ) -> None:
         super().__init__(publisher)
         self._outbox = outbox
         self._pool = pool
+        self._trouble = trouble
+
+    @property
+    def trouble(self) -> str:
+        return self._trouble
 
     def put(self, payload: Payload) -> None:
         if self._closed:

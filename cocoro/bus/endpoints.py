@@ -41,6 +41,8 @@ class ZenohConfig:
     at once."""
     patience_s: float = 1.0
     """How long opening waits for the mesh, and for a member of it that does not answer."""
+    shared_memory: bool = False
+    """Whether it publishes frames or reads them: then they travel in shared memory, where that can be had."""
     options: Mapping[str, Any] = field(default_factory=dict)
     """Further zenoh options by path ('transport/link/tls/...'), for certificates and access control."""
 
@@ -68,7 +70,8 @@ def default(robot: str, name: str, run_dir: Path | None = None) -> ZenohConfig:
     """The mesh of a robot that lives on this machine: a directory for it below the run directory.
 
     The run directory is, in this order: the argument, $COCORO_RUN_DIR, `cocoro` in $XDG_RUNTIME_DIR, a directory
-    of this user's in the system's place for temporary files. It must be this user's alone.
+    of this user's in the system's place for temporary files. What is in it must be this user's alone (see
+    `cocoro.private`).
     Raises ConfigError for a robot's name that cannot be part of a path and of a key.
     """
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", robot):

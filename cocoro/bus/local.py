@@ -129,6 +129,10 @@ class LocalPublisher:
         self._mesh: LocalMesh | None = mesh
         self._key = key
 
+    @property
+    def trouble(self) -> str:
+        return ""
+
     def put(self, payload: Payload) -> None:
         if self._mesh is not None:
             self._mesh.publish(self._key, bytes(payload))

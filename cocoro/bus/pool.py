@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import logging
-
 import zenoh
 from zenoh import shm
 
-log = logging.getLogger(__name__)
-
-POOL_BYTES = 24 * 1024 * 1024
-"""Fifteen colour and depth frames of 640 x 480. Receivers hold one or two each; one that has stopped holds all."""
+from cocoro.bus import shared
+from cocoro.bus.shared import POOL_BYTES, PROCESS_BYTES
 
 POLICY = shm.Defragment(shm.GarbageCollect(safe=False))
 """Take back what is free, and what a receiver that has stopped still holds: should it go on, it finds its samples
@@ -23,13 +19,17 @@ class SharedPool:
     def __init__(self) -> None:
         self.missed = 0
         """Samples for which there was no room, and that went by copy instead."""
-        self._provider: shm.ShmProvider | None
-        try:
-            self._provider = shm.ShmProvider.default_backend(POOL_BYTES)
-            self.hold(b"warm")
-        except zenoh.ZError as error:
-            log.warning("no shared memory (%s): large samples are copied through sockets, which costs more", error)
-            self._provider = None
+        self.trouble = shared.obstacle(POOL_BYTES + PROCESS_BYTES)
+        """Why there is none; empty when there is. It stays so: what could not be had at the start is done without."""
+        self._provider: shm.ShmProvider | None = None
+        if not self.trouble:
+            try:
+                self._provider = shm.ShmProvider.default_backend(POOL_BYTES)
+                self.hold(b"warm")
+            except zenoh.ZError as error:  # others have filled it since
+                self._provider = None
+                shared.drop_failed()
+                self.trouble = shared.obstacle(POOL_BYTES + PROCESS_BYTES) or str(error)
 
     def hold(self, data: bytes) -> zenoh.ZBytes | bytes:
         """The data in shared memory, or itself where that is missing or full."""

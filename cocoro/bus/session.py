@@ -6,18 +6,21 @@ import asyncio
 import atexit
 import contextlib
 import json
+import logging
 import os
 import re
 import threading
 import time
 from collections.abc import Callable
-from typing import Any, TypeVar, cast
+from typing import Any, NamedTuple, TypeVar, cast
 
 import zenoh
 
+from cocoro.bus import shared
 from cocoro.bus.endpoints import ZenohConfig
 from cocoro.errors import ConfigError, MeshError
 
+log = logging.getLogger(__name__)
 T = TypeVar("T")
 
 LEAVE_S = 2.0
@@ -30,6 +33,11 @@ FRAGMENT_WAIT_US = 25_000
 PACKETS = 16
 """May wait for the network in each priority, which is all that zenoh allows. An express sample is a packet by itself,
 and a service publishes several at once: of zenoh's usual 2, a busy processor would lose some."""
+ACCEPT_PENDING = 500
+ACCEPT_MS = 3000
+SHARED_MEMORY = "transport/shared_memory/enabled"
+NO_SEGMENT = "shm segment"
+"""In what zenoh says when it could not make one."""
 SMALL_PRIORITIES = ("control", "real_time", "interactive_high", "interactive_low", "data_high", "data")
 
 
@@ -62,8 +70,13 @@ def options(config: ZenohConfig, identity: str, listen: list[str], connect: list
         "connect/endpoints": connect,
         "connect/timeout_ms": patience_ms if config.mode == "client" else -1,
         "connect/retry": {"period_init_ms": 20, "period_max_ms": 2000, "period_increase_factor": 2},
+        # Who connects and says nothing takes one of so many places, for so long: of a thousand idle connections none
+        # keeps a new session out for longer, and what they take is far from all that a process may have open.
+        "transport/unicast/accept_pending": ACCEPT_PENDING,
+        "transport/unicast/accept_timeout": ACCEPT_MS,
         "transport/link/tx/lease": round(config.lease_s * 1000),
         "transport/link/tx/queue/size": dict.fromkeys(SMALL_PRIORITIES, PACKETS),
+        SHARED_MEMORY: config.shared_memory,
         # Frames have pools of their own (see `pool`).
         "transport/shared_memory/transport_optimization/enabled": False,
     }
@@ -72,8 +85,39 @@ def options(config: ZenohConfig, identity: str, listen: list[str], connect: list
     return {**chosen, **config.options}
 
 
-def open_session(config: ZenohConfig, chosen: dict[str, Any]) -> zenoh.Session:
-    """Blocks for at most the configuration's patience. MeshError, ConfigError."""
+_UNASKED = "the process did not ask for it (`frames` of its row in the process table)"
+
+
+class Opened(NamedTuple):
+    """A session, and why it does without shared memory; empty when it has it."""
+
+    session: zenoh.Session
+    unshared: str
+
+    def close(self) -> None:
+        close_session(self.session)
+
+
+def open_session(config: ZenohConfig, chosen: dict[str, Any]) -> Opened:
+    """Blocks for at most the configuration's patience. MeshError, ConfigError.
+
+    A session that is to have shared memory and cannot opens without, which is said in the log."""
+    if not chosen[SHARED_MEMORY]:
+        return Opened(_open(config, chosen), _UNASKED if not config.shared_memory else "the mesh's options say so")
+    why = shared.obstacle(shared.SESSION_BYTES)
+    if not why:
+        try:
+            return Opened(_open(config, chosen), "")
+        except MeshError as error:  # others have filled it since
+            if NO_SEGMENT not in f"{error} {error.__cause__}":
+                raise
+            shared.drop_failed()
+            why = shared.obstacle(shared.SESSION_BYTES) or str(error)
+    log.warning("no shared memory: %s; %s", why, shared.COSTS)
+    return Opened(_open(config, chosen | {SHARED_MEMORY: False}), why)
+
+
+def _open(config: ZenohConfig, chosen: dict[str, Any]) -> zenoh.Session:
     settings = zenoh.Config()
     for path, value in chosen.items():
         try:
@@ -152,6 +196,7 @@ class ExitGuard:
             thread.join(LEAVE_S)
         if self._used:
             time.sleep(LAST_TURN_S)
+            shared.release()
 
 
 exit_guard = ExitGuard()

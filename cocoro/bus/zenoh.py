@@ -11,14 +11,15 @@ import contextlib
 import logging
 import secrets
 import threading
-import time
 from collections.abc import Callable
+from pathlib import Path
 from types import TracebackType
 from typing import TypeVar
 
 import zenoh
 from zenoh.handlers import Callback
 
+from cocoro.boottime import boottime_ns
 from cocoro.bus.answer import answer
 from cocoro.bus.base import Heard, OnAlive, OnLot, OnSample, Reply, Server
 from cocoro.bus.declared import QOS, Declared, ZenohListening, ZenohPublisher, ZenohSubscription
@@ -28,8 +29,10 @@ from cocoro.bus.members import Membership, members, new_identity
 from cocoro.bus.outbox import Outbox
 from cocoro.bus.pool import SharedPool, read
 from cocoro.bus.ring import Ring
-from cocoro.bus.session import LEAVE_S, close_session, exit_guard, in_thread, no_mesh, open_session, options
+from cocoro.bus.session import LEAVE_S, Opened, close_session, exit_guard, in_thread, no_mesh, open_session, options
+from cocoro.bus.shared import COSTS
 from cocoro.errors import CallTimeoutError, MeshError
+from cocoro.private import FullError
 from cocoro.topics import Qos
 
 log = logging.getLogger(__name__)
@@ -46,9 +49,10 @@ LATER_S = 1.0
 class ZenohBus:
     """One process's place in the mesh. Make it with `await ZenohBus.open(config)`, best in `async with`."""
 
-    def __init__(self, config: ZenohConfig, session: zenoh.Session, membership: Membership | None) -> None:
+    def __init__(self, config: ZenohConfig, opened: Opened, membership: Membership | None) -> None:
         self._config = config
-        self._session = session
+        self._session = opened.session
+        self._unshared = opened.unshared
         self._membership = membership
         self._loop = asyncio.get_running_loop()
         self._declared: set[Declared] = set()
@@ -64,20 +68,21 @@ class ZenohBus:
         """Join the mesh. When this returns, what its members have declared is known: a first call reaches them all.
 
         With `expect_mesh` somebody must be there already: MeshError, after `config.patience_s` at the latest, when
-        nobody is. ConfigError when the configuration cannot be.
+        nobody is. Then it needs no room in the mesh's directory: where that is full it only connects, and is not
+        found by who comes later. ConfigError when the configuration cannot be, FullError when there is no room.
         """
         membership, identity = None, new_identity()
         listen, connect = list(config.listen), list(config.connect)
         if config.directory is not None:
-            membership = Membership.register(config.directory, config.name)
-            identity, listen, connect = membership.member.identity, [membership.listen], membership.connect
+            membership = _join(config.directory, config.name, visit=expect_mesh)
+            identity, listen, connect = membership.member.identity, membership.listen, membership.connect
         bus: ZenohBus | None = None
         try:
             if expect_mesh and not connect:
                 raise no_mesh(config)
             chosen = options(config, identity, listen, connect)
-            session = await in_thread(lambda: open_session(config, chosen), undo=close_session)
-            bus = cls(config, session, membership)
+            opened = await in_thread(lambda: open_session(config, chosen), undo=Opened.close)
+            bus = cls(config, opened, membership)
             await bus._settle(identity, expect_mesh)
         except BaseException:
             if bus is not None:
@@ -131,8 +136,15 @@ class ZenohBus:
         if qos is Qos.EVENT and self._outbox is None:
             self._outbox = Outbox(self._config.name)
         outbox = self._outbox if qos is Qos.EVENT else None
-        pool = SharedPool() if qos is Qos.FRAME else None
-        return self._keep(ZenohPublisher(self._session.declare_publisher(key, **QOS[qos]), outbox, pool))
+        pool, trouble = None, ""
+        if qos is Qos.FRAME and not self._unshared:
+            pool = SharedPool()
+            trouble = f"no shared memory: {pool.trouble}; {COSTS}" if pool.trouble else ""
+            if trouble:
+                log.warning("%s: %s", key, trouble)
+        elif qos is Qos.FRAME:
+            trouble = f"no shared memory: {self._unshared}; {COSTS}"
+        return self._keep(ZenohPublisher(self._session.declare_publisher(key, **QOS[qos]), outbox, pool, trouble))
 
     def subscribe(self, keyexpr: str, qos: Qos, handler: OnSample, *, depth: int) -> ZenohSubscription:
         def deliver(key: str, payload: zenoh.ZBytes) -> None:
@@ -156,10 +168,10 @@ class ZenohBus:
             handler([Heard(key, data, heard_ns) for key, data, heard_ns in found if data is not None])
 
         lots = Lots(self._loop, deliver, every_s)
-        push, time_ns = lots.push, time.time_ns
+        push = lots.push
 
         def on_sample(sample: zenoh.Sample) -> None:
-            push((sample, time_ns()))
+            push((sample, boottime_ns()))
 
         return self._keep(
             ZenohListening(self._session.declare_subscriber(keyexpr, Callback(on_sample, indirect=False)), lots)
@@ -290,6 +302,16 @@ class ZenohBus:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         await self.close()
+
+
+def _join(directory: Path, name: str, visit: bool) -> Membership:
+    try:
+        return Membership.register(directory, name)
+    except FullError as error:
+        if not visit:
+            raise
+        log.warning("%s; until then, services that start from now on are not seen here", error)
+        return Membership.visit(directory, name)
 
 
 async def _answer(server: Server, key: str, query: zenoh.Query) -> None:

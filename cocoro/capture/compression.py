@@ -17,14 +17,16 @@ from cocoro.capture.errors import DamageError
 
 Compression = Literal["zstd", "lz4", "none"]
 COMPRESSIONS: tuple[Compression, ...] = get_args(Compression)
+KNOWN = ("", "zstd", "lz4")
+"""As they stand in a chunk."""
 
-LARGEST_CHUNK = 256 * 1024 * 1024
-"""Bytes before compression; what claims to be larger is damaged."""
+LARGEST_CHUNK = 4 << 30
+"""Bytes, before compression and after, as the mcap package has it; what claims to be larger is damaged."""
 WORTH = 0.95
 """What does not become smaller than this share of itself is stored as it is: then reading it costs nothing."""
 
 
-_QUICK = zstandard.ZstdCompressionParameters.from_level(1, window_log=17, hash_log=12, chain_log=12, min_match=7)
+QUICK = zstandard.ZstdCompressionParameters.from_level(1, window_log=17, hash_log=12, chain_log=12, min_match=7)
 """Level 1 with a table that fits a processor's nearest memory, and no short matches: for frames 6% less time, and
 nothing lost in size."""
 
@@ -37,7 +39,7 @@ class Packer:
         self._name = "" if compression == "none" else compression
         self._pack: Callable[[bytes | memoryview], bytes] | None = None
         if compression == "zstd" and level == 1:
-            self._pack = zstandard.ZstdCompressor(compression_params=_QUICK).compress
+            self._pack = zstandard.ZstdCompressor(compression_params=QUICK).compress
         elif compression == "zstd":
             self._pack = zstandard.ZstdCompressor(level=level).compress
         elif compression == "lz4":

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from cocoro.errors import CocoroError
+from cocoro.errors import CocoroError, ConfigError
 
 
 class CaptureError(CocoroError):
     """A capture cannot be read, or written; the text names the file."""
+
+
+class NotAFileError(CaptureError, ConfigError):
+    """Something else than a file was named: a pipe, a device."""
 
 
 class DamageError(Exception):

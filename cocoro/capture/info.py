@@ -1,4 +1,4 @@
-"""What a capture has: its keys with their counts, rates, gaps and losses, and where it came from."""
+"""The report on a capture: its channels with their counts, rates, gaps and losses, and where it came from."""
 
 from __future__ import annotations
 
@@ -8,20 +8,28 @@ from typing import Any
 
 import msgspec
 
+from cocoro.capture import mcap
 from cocoro.capture.errors import DamageError
-from cocoro.capture.file import KeyTally
+from cocoro.capture.file import TALLY, KeyTally, tally_names
 from cocoro.capture.keys import MADE_HERE
 from cocoro.capture.pictures import LossyFrame
 from cocoro.capture.reader import Capture
 from cocoro.capture.schema import changes, schema_of
-from cocoro.capture.writer import TALLY
 from cocoro.clock import NS
 from cocoro.messages import Message
 from cocoro.topics import RECORDING, topic_named
 
+MESSAGE_HEAD_BYTES = mcap.MESSAGE_HEAD.size
+
 
 class KeyReport(msgspec.Struct, kw_only=True):
+    """One channel of a key; most keys have one."""
+
     key: str
+    channel: int
+    """Its number in the file."""
+    encoding: str
+    """Message encoding, as the file has it."""
     type: str
     """The recorded schema's name; '' where there is none."""
     messages: int
@@ -36,6 +44,15 @@ class KeyReport(msgspec.Struct, kw_only=True):
     """Received, and not written for want of room, since the recorder's start."""
     changed: tuple[str, ...] = ()
     """What is different in today's type."""
+
+
+class AttachmentReport(msgspec.Struct, kw_only=True):
+    name: str
+    media_type: str
+    size_bytes: int
+    log_ns: int
+    created_ns: int
+    """0: unknown."""
 
 
 class Report(msgspec.Struct, kw_only=True):
@@ -55,18 +72,26 @@ class Report(msgspec.Struct, kw_only=True):
     duration_s: float
     messages: int
     keys: tuple[KeyReport, ...]
+    attachments: tuple[AttachmentReport, ...]
+    notes: tuple[str, ...]
+    """Contradictions and records that are passed by, in words; no damage."""
     metadata: dict[str, dict[str, Any]]
 
 
 def report(capture: Capture, check: bool = False) -> Report:
-    """Of a whole capture by what it says of itself (its checksums vouch for that), unless `check` asks to read it
-    all; of any other by reading it all."""
-    tallies = None if check or not capture.whole else _told_tallies(capture)
-    checked = tallies is None
-    if tallies is None:
-        tallies = _counted(capture)
+    """Report on a capture. The counts of a whole capture are those of its own tally (checksums vouch for it), where
+    that agrees with its statistics and chunks. Of any other capture, and with `check`, all is read and counted."""
+    told = _told_tallies(capture) if capture.whole and capture.summarised else None
+    tallies = told if told is not None and not check else _counted(capture)
+    checked = check or tallies is not told
+    if checked:
+        capture.check()
+    notes = [*capture.notes, *_contradictions(capture, tallies)]
     dropped, lost = missing_of(capture)
-    keys = tuple(_key_report(capture, key, tallies[key], dropped, lost) for key in sorted(tallies))
+    names = sorted(capture.keys)
+    keys = tuple(
+        _key_report(capture, channel, tallies[channel], dropped, lost) for key in names for channel in capture.keys[key]
+    )
     return Report(
         path=str(capture.path),
         size_bytes=capture.size_bytes,
@@ -80,29 +105,71 @@ def report(capture: Capture, check: bool = False) -> Report:
         duration_s=(capture.end_ns - capture.start_ns) / NS,
         messages=sum(tally.messages for tally in tallies.values()),
         keys=keys,
+        attachments=tuple(
+            AttachmentReport(
+                name=index.name,
+                media_type=index.media_type,
+                size_bytes=index.data_size,
+                log_ns=index.log_time,
+                created_ns=index.create_time,
+            )
+            for index in capture.attachments
+        ),
+        notes=tuple(notes),
         metadata={
             name: {entry: _plain(value) for entry, value in entries.items()}
             for name, entries in capture.metadata.items()
-            if name != TALLY
+            if name != TALLY or not capture.follows_page
         },
     )
 
 
-def _told_tallies(capture: Capture) -> dict[str, KeyTally] | None:
-    told = capture.metadata.get(TALLY)
-    if told is None:
+def _told_tallies(capture: Capture) -> dict[int, KeyTally] | None:
+    """By channel, as the tally has it; None where it is not of this file: metadata may have been copied from another.
+    It agrees with the statistics on each channel's messages and on the first and last time, and with the chunks on how
+    many bytes there are."""
+    entries, statistics = capture.metadata.get(TALLY), capture.statistics
+    if entries is None or statistics is None:
         return None
     try:
-        return msgspec.json.decode(told["keys"], type=dict[str, KeyTally])
+        told = msgspec.json.decode(entries["keys"], type=dict[str, KeyTally])
     except (KeyError, msgspec.MsgspecError):
         return None
+    names = tally_names(capture.channels)
+    if told.keys() != set(names.values()):
+        return None
+    tallies = {id: told[name] for id, name in names.items()}
+    busy = [tally for tally in tallies.values() if tally.messages]
+    first_ns = min((tally.first_ns for tally in busy), default=0)
+    last_ns = max((tally.last_ns for tally in busy), default=0)
+    counts = statistics.channel_message_counts
+    if any(tally.messages != counts.get(id, 0) for id, tally in tallies.items()):
+        return None
+    if (first_ns, last_ns) != (statistics.message_start_time, statistics.message_end_time):
+        return None
+    declared = len(mcap.packed(*capture.schemas.values(), *capture.channels.values()))
+    messages = sum(tally.size_bytes + MESSAGE_HEAD_BYTES * tally.messages for tally in busy)
+    return tallies if messages + declared == capture.chunk_bytes else None
 
 
-def _counted(capture: Capture) -> dict[str, KeyTally]:
-    tallies = {key: KeyTally() for key in capture.keys}
+def _counted(capture: Capture) -> dict[int, KeyTally]:
+    tallies = {channel: KeyTally() for channel in capture.channels}
     for record in capture.messages():
-        tallies[record.key].add(record.log_ns, len(record.payload))
+        tallies[record.channel].add(record.log_ns, len(record.payload))
     return tallies
+
+
+def _contradictions(capture: Capture, tallies: Mapping[int, KeyTally]) -> list[str]:
+    """False statements of the file about itself, in words. MCAP readers do not look at them, so they are no damage."""
+    if capture.problems:
+        return []
+    found, counted = [], sum(tally.messages for tally in tallies.values())
+    statistics = capture.statistics
+    if statistics is not None and statistics.message_count != counted:
+        found.append(f"its statistics say {statistics.message_count} messages, and it has {counted}")
+    if capture.follows_page and TALLY in capture.metadata and capture.summarised and _told_tallies(capture) is None:
+        found.append(f"its metadata {TALLY!r} is not of this file, so its messages were counted")
+    return found
 
 
 def missing_of(capture: Capture) -> tuple[dict[str, int], dict[str, int]]:
@@ -123,29 +190,33 @@ def missing_of(capture: Capture) -> tuple[dict[str, int], dict[str, int]]:
 
 
 def _key_report(
-    capture: Capture, key: str, tally: KeyTally, dropped: Mapping[str, int], lost: Mapping[str, int]
+    capture: Capture, channel: int, tally: KeyTally, dropped: Mapping[str, int], lost: Mapping[str, int]
 ) -> KeyReport:
     span_s = (tally.last_ns - tally.first_ns) / NS
-    schema = capture.schema(key)
+    schema = capture.schema(channel)
+    key = capture.channels[channel].topic
+    first = channel == capture.keys[key][0]  # what is missing is counted by key
     return KeyReport(
         key=key,
+        channel=channel,
+        encoding=capture.channels[channel].message_encoding,
         type="" if schema is None else schema.name,
         messages=tally.messages,
         rate_hz=(tally.messages - 1) / span_s if span_s > 0 else 0.0,
         size_bytes=tally.size_bytes,
         longest_gap_s=tally.longest_gap_ns / NS,
         longest_gap_from_s=max(tally.longest_gap_from_ns - capture.start_ns, 0) / NS,
-        lost=lost.get(key, 0),
-        dropped=dropped.get(key, 0),
-        changed=tuple(changed_since(capture, key)),
+        lost=lost.get(key, 0) if first else 0,
+        dropped=dropped.get(key, 0) if first else 0,
+        changed=tuple(changed_since(capture, channel)),
     )
 
 
-def changed_since(capture: Capture, key: str) -> list[str]:
-    """What is different in today's type of a key, in words."""
-    schema = capture.schema(key)
+def changed_since(capture: Capture, channel: int) -> list[str]:
+    """Differences between the recorded schema of a channel and today's type of its key, in words."""
+    schema, key = capture.schema(channel), capture.channels[channel].topic
     topic = topic_named(key.removeprefix(f"{capture.robot}/"))
-    if schema is None or topic is None or capture.keys[key].metadata.get("publisher") == MADE_HERE:
+    if schema is None or topic is None or capture.channels[channel].metadata.get("publisher") == MADE_HERE:
         return []
     if schema.name == LossyFrame.__name__:
         return []

@@ -106,5 +106,5 @@ def _taken(step: tuple[int, StepRecord], known: dict[Id, Found], wanted: set[Id]
 
 def _lossy(capture: Capture, record: Record) -> bool:
     """A frame that was kept with loss is not what the step was given."""
-    schema = capture.schema(record.key)
+    schema = capture.schema(record.channel)
     return schema is not None and schema.name == LossyFrame.__name__

@@ -1,91 +1,137 @@
-"""The records of an MCAP file (https://mcap.dev/spec), to and from bytes. Pure: no files, no policy.
+"""MCAP records (https://mcap.dev/spec), to and from bytes. Pure: no files, no policy.
 
-Ours rather than the mcap package's, because a capture wants three things of its writer and reader that it does not
-offer: a frame goes from the mesh to the disk without being copied, each chunk has the compression that suits it, and
-a damaged file is read as far as its checksums vouch for it, never further.
+The `mcap` package has the format: opcodes, record types, their fields. By hand is only what it is too slow for (each
+with its figure, by `python bench/capture_format.py records`): messages, a chunk's index of them, and its head.
 """
 
 from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
-from enum import IntEnum
-from typing import NamedTuple
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from io import BytesIO
+from typing import Any, NamedTuple, Protocol, TypeVar
+
+from mcap.data_stream import ReadDataStream, RecordBuilder
+from mcap.exceptions import EndOfFile
+from mcap.opcode import Opcode
+from mcap.records import Attachment, AttachmentIndex, Footer, McapRecord
+from mcap.writer import MCAP0_MAGIC
 
 from cocoro.capture.errors import DamageError
 
-MAGIC = b"\x89MCAP0\r\n"
+MAGIC = MCAP0_MAGIC
 Bytes = bytes | memoryview
-
-
-class Op(IntEnum):
-    HEADER = 0x01
-    FOOTER = 0x02
-    SCHEMA = 0x03
-    CHANNEL = 0x04
-    MESSAGE = 0x05
-    CHUNK = 0x06
-    MESSAGE_INDEX = 0x07
-    CHUNK_INDEX = 0x08
-    ATTACHMENT = 0x09
-    ATTACHMENT_INDEX = 0x0A
-    STATISTICS = 0x0B
-    METADATA = 0x0C
-    METADATA_INDEX = 0x0D
-    SUMMARY_OFFSET = 0x0E
-    DATA_END = 0x0F
-
 
 PREFIX = struct.Struct("<BQ")
 """Opcode and length of what follows."""
 MESSAGE_HEAD = struct.Struct("<BQHIQQ")
 """The prefix, then channel, sequence, log time, publish time; the payload is the rest."""
-_CHUNK_TIMES = struct.Struct("<QQQI")
-_FOOTER = struct.Struct("<QQI")
-FOOTER_LENGTH = PREFIX.size + _FOOTER.size
+MESSAGE_FIELDS = struct.Struct("<HIQQ")
+"""A message's head without the prefix."""
+_CHUNK_FIELDS = struct.Struct("<QQQII")
+_LENGTH = struct.Struct("<Q")
+_FOOTER_FIELDS = struct.Struct("<QQI")
+FOOTER_LENGTH = PREFIX.size + _FOOTER_FIELDS.size
+LONGEST_CHUNK_HEAD = _CHUNK_FIELDS.size + 16 + _LENGTH.size
+"""Bytes, with a compression's name of up to 16."""
 
 
-@dataclass(frozen=True)
-class Schema:
-    id: int
-    name: str
-    encoding: str
-    data: bytes
-
-    def pack(self) -> bytes:
-        head = struct.pack("<H", self.id) + _string(self.name) + _string(self.encoding)
-        return record(Op.SCHEMA, head, struct.pack("<I", len(self.data)), self.data)
-
-    @classmethod
-    def unpack(cls, content: Bytes) -> Schema:
-        take = Take(content)
-        return cls(take.number("<H"), take.string(), take.string(), take.bytes(take.number("<I")))
+# --- by the package -------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Channel:
-    id: int
-    schema_id: int
-    """0: there is no schema."""
-    topic: str
-    encoding: str
-    metadata: Mapping[str, str] = field(default_factory=dict)
+class _Kind(Protocol):
+    @staticmethod
+    def read(stream: ReadDataStream) -> Any: ...
 
-    def pack(self) -> bytes:
-        head = struct.pack("<HH", self.id, self.schema_id) + _string(self.topic) + _string(self.encoding)
-        return record(Op.CHANNEL, head, _string_map(self.metadata))
 
-    @classmethod
-    def unpack(cls, content: Bytes) -> Channel:
-        take = Take(content)
-        ids = take.number("<H"), take.number("<H")
-        return cls(*ids, take.string(), take.string(), take.string_map())
+K = TypeVar("K", bound=_Kind)
+
+
+class _Exact(ReadDataStream):
+    """The package takes fewer bytes than it asked for without a word; here that is damage."""
+
+    def read(self, length: int) -> bytes:
+        data = super().read(length)
+        if len(data) < length:
+            raise DamageError("a record ends in the middle of a field")
+        return data
+
+
+def packed(*records: McapRecord) -> bytes:
+    """Records with their prefixes, one after another."""
+    builder = RecordBuilder()
+    for record in records:
+        record.write(builder)
+    return ended(builder)
+
+
+def ended(builder: RecordBuilder) -> bytes:
+    """Take the bytes that a builder has gathered."""
+    data: bytes = builder.end()  # type: ignore[no-untyped-call]
+    return data
+
+
+def parsed(kind: type[K], content: Bytes) -> tuple[K, int]:
+    """A record from what follows its prefix, and how many bytes of that it takes: records may be longer than their
+    known fields. Raises DamageError for what can be none."""
+    stream = _Exact(BytesIO(content))
+    try:
+        record: K = kind.read(stream)
+    except UnicodeDecodeError as error:
+        raise DamageError("a text is not UTF-8") from error
+    except (EndOfFile, struct.error) as error:
+        raise DamageError("a record ends in the middle of a field") from error
+    return record, stream.count
+
+
+def attachment_index(content: Bytes, offset: int, length: int) -> tuple[AttachmentIndex, int]:
+    """Read the head of an attachment from the beginning of its record: its index, and the offset of its data in the
+    record. `offset` and `length` are those of the record with its prefix. Raises DamageError. By hand, because the
+    package reads an attachment only with all its data, however large."""
+    stream = _Exact(BytesIO(content))
+    try:
+        log_time, create_time = stream.read8(), stream.read8()
+        name, media_type = stream.read_prefixed_string(), stream.read_prefixed_string()
+        size = stream.read8()
+    except (UnicodeDecodeError, EndOfFile) as error:
+        raise DamageError("an attachment's head is damaged") from error
+    if PREFIX.size + stream.count + size + 4 > length:
+        raise DamageError("an attachment is longer than its record")
+    return AttachmentIndex(offset, length, log_time, create_time, size, name, media_type), stream.count
+
+
+def attachment(content: Bytes) -> Attachment:
+    """An attachment whose checksum is right, or that has none (0); the package never looks. Raises DamageError."""
+    found, taken = parsed(Attachment, content)
+    view = memoryview(content)
+    (crc,) = struct.unpack("<I", view[taken - 4 : taken])
+    if crc not in (0, zlib.crc32(view[: taken - 4])):
+        raise DamageError(f"the checksum of the attachment {found.name!r} is wrong")
+    return found
+
+
+def footer(summary: bytes, summary_start: int, offsets_start: int) -> bytes:
+    """`summary` is the whole of the summary section, whose checksum goes in here."""
+    return packed(Footer(summary_start, offsets_start, _footer_crc(summary, summary_start, offsets_start)))
+
+
+def vouches_for(footer: Footer, summary: bytes) -> bool:
+    """Whether the summary section is what it was when it was written; True when the writer gave no checksum (0)."""
+    return footer.summary_crc in (0, _footer_crc(summary, footer.summary_start, footer.summary_offset_start))
+
+
+def _footer_crc(summary: bytes, summary_start: int, offsets_start: int) -> int:
+    head = PREFIX.pack(Opcode.FOOTER, _FOOTER_FIELDS.size) + struct.pack("<QQ", summary_start, offsets_start)
+    return zlib.crc32(head, zlib.crc32(summary))
+
+
+# --- by hand --------------------------------------------------------------------------------------
 
 
 class Message(NamedTuple):
-    """As it stands in a chunk."""
+    """As it stands in a file; the payload is a view of what was read, where the package makes a copy."""
 
     channel_id: int
     sequence: int
@@ -94,188 +140,11 @@ class Message(NamedTuple):
     payload: memoryview
 
 
-@dataclass(frozen=True)
-class ChunkHead:
-    """What stands before a chunk's records."""
-
-    start_ns: int
-    end_ns: int
-    raw_bytes: int
-    crc: int
-    """Of the records before compression; 0: there is none."""
-    compression: str
-    packed_bytes: int
-
-    def pack(self) -> bytes:
-        """With the record's prefix; the (packed) records follow."""
-        times = _CHUNK_TIMES.pack(self.start_ns, self.end_ns, self.raw_bytes, self.crc)
-        head = times + _string(self.compression) + struct.pack("<Q", self.packed_bytes)
-        return PREFIX.pack(Op.CHUNK, len(head) + self.packed_bytes) + head
-
-    @classmethod
-    def unpack(cls, content: Bytes) -> tuple[ChunkHead, int]:
-        """The head, and how long it is; `content` needs hold no more than the head."""
-        take = Take(content)
-        start_ns, end_ns, raw_bytes, crc = _CHUNK_TIMES.unpack(take.bytes(_CHUNK_TIMES.size))
-        compression = take.string()
-        return cls(start_ns, end_ns, raw_bytes, crc, compression, take.number("<Q")), take.at
-
-
-LONGEST_CHUNK_HEAD = _CHUNK_TIMES.size + 4 + 16 + 8
-"""Bytes, with a compression's name of up to 16."""
-
-
-@dataclass(frozen=True)
-class ChunkIndex:
-    start_ns: int
-    end_ns: int
-    offset: int
-    length: int
-    """Of the whole chunk record, its prefix included."""
-    index_offsets: Mapping[int, int]
-    """Where each channel's message index stands; so also which channels the chunk has."""
-    index_length: int
-    compression: str
-    packed_bytes: int
-    raw_bytes: int
-
-    def pack(self) -> bytes:
-        offsets = b"".join(struct.pack("<HQ", *pair) for pair in self.index_offsets.items())
-        return record(
-            Op.CHUNK_INDEX,
-            struct.pack("<QQQQI", self.start_ns, self.end_ns, self.offset, self.length, len(offsets)),
-            offsets,
-            struct.pack("<Q", self.index_length),
-            _string(self.compression),
-            struct.pack("<QQ", self.packed_bytes, self.raw_bytes),
-        )
-
-    @classmethod
-    def unpack(cls, content: Bytes) -> ChunkIndex:
-        take = Take(content)
-        start_ns, end_ns, offset, length = (take.number("<Q") for _ in range(4))
-        pairs = take.bytes(take.number("<I"))
-        if len(pairs) % 10:
-            raise DamageError("a chunk index has half an entry")
-        offsets = dict(struct.iter_unpack("<HQ", pairs))
-        index_length, compression = take.number("<Q"), take.string()
-        sizes = take.number("<Q"), take.number("<Q")
-        return cls(start_ns, end_ns, offset, length, offsets, index_length, compression, *sizes)
-
-
-@dataclass(frozen=True)
-class Statistics:
-    messages: int
-    schemas: int
-    channels: int
-    metadata: int
-    chunks: int
-    start_ns: int
-    end_ns: int
-    by_channel: Mapping[int, int]
-    attachments: int = 0
-
-    def pack(self) -> bytes:
-        counts = b"".join(struct.pack("<HQ", *pair) for pair in self.by_channel.items())
-        numbers = (self.schemas, self.channels, self.attachments, self.metadata, self.chunks)
-        times = (self.start_ns, self.end_ns, len(counts))
-        return record(Op.STATISTICS, struct.pack("<QHIIIIQQI", self.messages, *numbers, *times), counts)
-
-    @classmethod
-    def unpack(cls, content: Bytes) -> Statistics:
-        take = Take(content)
-        messages, schemas = take.number("<Q"), take.number("<H")
-        channels, attachments, metadata, chunks = (take.number("<I") for _ in range(4))
-        start_ns, end_ns = take.number("<Q"), take.number("<Q")
-        pairs = take.bytes(take.number("<I"))
-        if len(pairs) % 10:
-            raise DamageError("the statistics have half an entry")
-        by_channel = dict(struct.iter_unpack("<HQ", pairs))
-        return cls(messages, schemas, channels, metadata, chunks, start_ns, end_ns, by_channel, attachments)
-
-
-class Metadata(NamedTuple):
-    name: str
-    entries: Mapping[str, str]
-
-    def pack(self) -> bytes:
-        return record(Op.METADATA, _string(self.name), _string_map(self.entries))
-
-    @classmethod
-    def unpack(cls, content: Bytes) -> Metadata:
-        take = Take(content)
-        return cls(take.string(), take.string_map())
-
-
-class MetadataIndex(NamedTuple):
-    offset: int
-    length: int
-    name: str
-
-    def pack(self) -> bytes:
-        return record(Op.METADATA_INDEX, struct.pack("<QQ", self.offset, self.length), _string(self.name))
-
-    @classmethod
-    def unpack(cls, content: Bytes) -> MetadataIndex:
-        take = Take(content)
-        return cls(take.number("<Q"), take.number("<Q"), take.string())
-
-
-def header(profile: str, library: str) -> bytes:
-    return record(Op.HEADER, _string(profile), _string(library))
-
-
-def message_index(channel_id: int, entries: list[tuple[int, int]]) -> bytes:
-    """`entries` are log time and offset in the chunk's records before compression."""
-    packed = b"".join(struct.pack("<QQ", *entry) for entry in entries)
-    return record(Op.MESSAGE_INDEX, struct.pack("<HI", channel_id, len(packed)), packed)
-
-
-def check_message_index(content: Bytes) -> None:
-    """Raises DamageError for what can be none."""
-    if len(content) < 6 or struct.unpack_from("<I", content, 2)[0] != len(content) - 6 or (len(content) - 6) % 16:
-        raise DamageError("a message index has a wrong length")
-
-
-def summary_offset(group: Op, start: int, length: int) -> bytes:
-    return record(Op.SUMMARY_OFFSET, struct.pack("<BQQ", group, start, length))
-
-
-def data_end() -> bytes:
-    """Without a checksum over all the data: each chunk has its own."""
-    return record(Op.DATA_END, bytes(4))
-
-
-def footer(summary: bytes, summary_start: int, offsets_start: int) -> bytes:
-    """`summary` is the whole of the summary section, whose checksum goes in here."""
-    head = PREFIX.pack(Op.FOOTER, _FOOTER.size) + struct.pack("<QQ", summary_start, offsets_start)
-    return head + struct.pack("<I", zlib.crc32(head, zlib.crc32(summary)))
-
-
-class Footer(NamedTuple):
-    summary_start: int
-    offsets_start: int
-    crc: int
-
-    @classmethod
-    def unpack(cls, content: Bytes) -> Footer:
-        if len(content) != _FOOTER.size:
-            raise DamageError("the footer has a wrong length")
-        return cls(*_FOOTER.unpack(content))
-
-    def vouches_for(self, summary: bytes) -> bool:
-        """Whether the summary section is what it was when it was written; True when the writer gave no checksum."""
-        head = PREFIX.pack(Op.FOOTER, _FOOTER.size) + struct.pack("<QQ", self.summary_start, self.offsets_start)
-        return self.crc in (0, zlib.crc32(head, zlib.crc32(summary)))
-
-
-def record(op: Op, *parts: bytes) -> bytes:
-    content = b"".join(parts)
-    return PREFIX.pack(op, len(content)) + content
-
-
 def records(content: Bytes) -> Iterator[tuple[int, memoryview, int]]:
-    """Opcode, content and offset of each record in a run of them. Raises DamageError where one does not fit."""
+    """Opcode, content and offset of each record in a run of them. Raises DamageError where one does not fit.
+
+    By hand, with `message`: 2.6 times as fast as the package on messages of 220 bytes.
+    """
     view = memoryview(content)
     at = 0
     while at < len(view):
@@ -298,49 +167,69 @@ def channel_of(content: memoryview) -> int:
 
 def message(content: memoryview) -> Message:
     """From a message record's content."""
-    if len(content) < MESSAGE_HEAD.size - PREFIX.size:
+    if len(content) < MESSAGE_FIELDS.size:
         raise DamageError("a message is shorter than its head")
-    channel_id, sequence, log_ns, publish_ns = struct.unpack_from("<HIQQ", content)
-    return Message(channel_id, sequence, log_ns, publish_ns, content[MESSAGE_HEAD.size - PREFIX.size :])
+    channel_id, sequence, log_ns, publish_ns = MESSAGE_FIELDS.unpack_from(content)
+    return Message(channel_id, sequence, log_ns, publish_ns, content[MESSAGE_FIELDS.size :])
 
 
-class Take:
-    """Takes values off bytes, one after another. Whatever does not fit raises DamageError."""
+def message_head(channel_id: int, sequence: int, log_ns: int, publish_ns: int, payload_bytes: int) -> bytes:
+    """Pack the prefix and the fields of a message; the payload follows.
 
-    def __init__(self, content: Bytes) -> None:
-        self.at = 0
-        self._content = memoryview(content)
+    By hand: 3.9 times as fast as the package on messages of 220 bytes.
+    """
+    length = MESSAGE_FIELDS.size + payload_bytes
+    return MESSAGE_HEAD.pack(Opcode.MESSAGE, length, channel_id, sequence, log_ns, publish_ns)
 
-    def bytes(self, count: int) -> bytes:
-        if count > len(self._content) - self.at:
-            raise DamageError("a record ends in the middle of a field")
-        self.at += count
-        return bytes(self._content[self.at - count : self.at])
 
-    def number(self, form: str) -> int:
-        number: int = struct.unpack(form, self.bytes(struct.calcsize(form)))[0]
-        return number
+def message_index(channel_id: int, entries: Sequence[int]) -> bytes:
+    """`entries` are log time and offset in the chunk's records before compression, of one message after another.
 
-    def string(self) -> str:
+    By hand: 9.1 times as fast as the package on indices of 20 messages.
+    """
+    content = struct.pack(f"<HI{len(entries)}Q", channel_id, 8 * len(entries), *entries)
+    return PREFIX.pack(Opcode.MESSAGE_INDEX, len(content)) + content
+
+
+def check_message_index(content: Bytes) -> int:
+    """How many bytes it takes. Raises DamageError for what can be none."""
+    length = struct.unpack_from("<I", content, 2)[0] if len(content) >= 6 else 1
+    if length % 16 or 6 + length > len(content):
+        raise DamageError("a message index has a wrong length")
+    return 6 + int(length)
+
+
+@dataclass(frozen=True)
+class ChunkHead:
+    """The fields of a chunk before its records.
+
+    By hand, because the package has a chunk only as a whole, and copies the packed records into the record. A chunk of
+    one frame of noisy sensors takes 0.06 ms by the package, and 0.002 ms here.
+    """
+
+    start_ns: int
+    end_ns: int
+    raw_bytes: int
+    crc: int
+    """Checksum of the records before compression; 0: there is none."""
+    compression: str
+    packed_bytes: int
+
+    def pack(self) -> bytes:
+        """With the record's prefix; the (packed) records follow."""
+        name = self.compression.encode()
+        fields = _CHUNK_FIELDS.pack(self.start_ns, self.end_ns, self.raw_bytes, self.crc, len(name))
+        head = fields + name + _LENGTH.pack(self.packed_bytes)
+        return PREFIX.pack(Opcode.CHUNK, len(head) + self.packed_bytes) + head
+
+    @classmethod
+    def unpack(cls, content: Bytes) -> tuple[ChunkHead, int]:
+        """The head, and how long it is; `content` needs hold no more than the head. Raises DamageError."""
         try:
-            return str(self.bytes(self.number("<I")), "utf-8")
-        except UnicodeDecodeError as error:
-            raise DamageError("a text is not UTF-8") from error
-
-    def string_map(self) -> dict[str, str]:
-        inner = Take(self.bytes(self.number("<I")))
-        found: dict[str, str] = {}
-        while inner.at < len(inner._content):
-            name = inner.string()
-            found[name] = inner.string()
-        return found
-
-
-def _string(text: str) -> bytes:
-    data = text.encode()
-    return struct.pack("<I", len(data)) + data
-
-
-def _string_map(entries: Mapping[str, str]) -> bytes:
-    data = b"".join(_string(name) + _string(value) for name, value in entries.items())
-    return struct.pack("<I", len(data)) + data
+            start_ns, end_ns, raw_bytes, crc, name_length = _CHUNK_FIELDS.unpack_from(content)
+            at = _CHUNK_FIELDS.size + name_length
+            name = str(content[_CHUNK_FIELDS.size : at], "utf-8")
+            (packed_bytes,) = _LENGTH.unpack_from(content, at)
+        except (struct.error, UnicodeDecodeError) as error:
+            raise DamageError("a chunk's head is damaged") from error
+        return cls(start_ns, end_ns, raw_bytes, crc, name, packed_bytes), at + _LENGTH.size

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterator
 
+from cocoro.capture.keys import MADE_HERE
 from cocoro.capture.reader import Capture, Record
 from cocoro.clock import NS
 from cocoro.topics import FRAME
@@ -30,8 +31,14 @@ class Player:
         loop: bool = False,
         paused: bool = False,
     ) -> None:
-        """`start_s` and `end_s` are seconds of the capture; `chosen(key)` says which keys are played."""
+        """`start_s` and `end_s` are seconds of the capture; `chosen(key)` says which keys are played. What recorders
+        noted is not, since nobody published it."""
         self.keys = tuple(key for key in capture.keys if chosen(key))
+        self._channels = [
+            id
+            for id, channel in capture.channels.items()
+            if channel.topic in self.keys and channel.metadata.get("publisher") != MADE_HERE
+        ]
         self.rate = rate
         self.loop = loop
         self.paused = paused
@@ -140,9 +147,7 @@ class Player:
         self._anchor_s, self._position_ns = now_s, position_ns
 
     def _go_to(self, start_ns: int) -> None:
-        self._records = (
-            self._capture.messages(*self.keys, start_ns=start_ns, end_ns=self._end_ns + 1) if self.keys else iter(())
-        )
+        self._records = self._capture.messages(start_ns=start_ns, end_ns=self._end_ns + 1, channels=self._channels)
         self._next.clear()
         self._advance()
 

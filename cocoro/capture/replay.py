@@ -39,11 +39,11 @@ def played_keys(capture: Capture, only: Iterable[str], hardware: bool) -> frozen
     choice = Choice(robot, only)
     keys = {
         key
-        for key, channel in capture.keys.items()
+        for key, channels in capture.keys.items()
         if key in choice
         and key.startswith(f"{robot}/")
         and key.split("/")[1] not in recorders
-        and channel.metadata.get("publisher") != MADE_HERE
+        and any(capture.channels[channel].metadata.get("publisher") != MADE_HERE for channel in channels)
     }
     if hardware:
         keys &= {topic.key(robot) for topic in (*HARDWARE_TOPICS, CLOCK)}
@@ -139,7 +139,7 @@ class Replay:
 
     def _payload(self, record: Record) -> bytes | memoryview:
         """As it was published; a frame that was kept with loss, as near to that as can be."""
-        schema = self._capture.schema(record.key)
+        schema = self._capture.schema(record.channel)
         if schema is None or schema.name != LossyFrame.__name__:
             return record.payload
         try:

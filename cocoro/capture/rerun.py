@@ -98,7 +98,7 @@ class _Rerun:
         self._core: Core | None = None
         self._latency_ns = 0
         self._inputs_missed = False
-        self._looked_at: set[tuple[Path, str]] = set()
+        self._looked_at: set[tuple[Path, int]] = set()
         self.changed: dict[str, None] = {}
         self._encoder = msgspec.msgpack.Encoder(enc_hook=_plain)
 
@@ -197,7 +197,7 @@ class _Rerun:
         recorded = found.capture.read(found.record)
         now = found.capture.read(found.record._replace(payload=memoryview(payload)))
         plain = [msgspec.to_builtins(message, builtin_types=(bytes, memoryview)) for message in (recorded, now)]
-        schema = found.capture.schema(found.record.key)
+        schema = found.capture.schema(found.record.channel)
         if schema is not None:
             plain = [known_to(schema.data, message) for message in plain]
         unlike = difference(plain[0], plain[1], self._tolerance or 0.0)
@@ -205,10 +205,10 @@ class _Rerun:
 
     def _look_at(self, found: Found) -> None:
         """Whether the type of its key has changed since."""
-        key = found.record.key
-        if (found.capture.path, key) not in self._looked_at:
-            self._looked_at.add((found.capture.path, key))
-            self.changed.update(dict.fromkeys(f"{key}: {text}" for text in changed_since(found.capture, key)))
+        key, channel = found.record.key, found.record.channel
+        if (found.capture.path, channel) not in self._looked_at:
+            self._looked_at.add((found.capture.path, channel))
+            self.changed.update(dict.fromkeys(f"{key}: {text}" for text in changed_since(found.capture, channel)))
 
     def _cannot(self, reason: str, count: int = 1, inputs: bool = True) -> None:
         self._inputs_missed |= inputs

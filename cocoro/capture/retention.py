@@ -9,8 +9,12 @@ from pathlib import Path
 
 
 def file_name(robot: str, started: datetime, number: int) -> str:
-    """Of a run's nth file; names sort by time."""
-    return f"{robot}-{started:%Y%m%dT%H%M%SZ}-{number:03}.mcap"
+    """Of a run's nth file; names sort by time, as the wall clock told it when the run began."""
+    return f"{_run(robot, started)}-{number:03}.mcap"
+
+
+def _run(robot: str, started: datetime) -> str:
+    return f"{robot}-{started:%Y%m%dT%H%M%SZ}"
 
 
 def captures(folder: Path, robot: str) -> list[Path]:
@@ -19,9 +23,14 @@ def captures(folder: Path, robot: str) -> list[Path]:
     return sorted(path for path in folder.glob("*.mcap") if pattern.fullmatch(path.name))
 
 
-def make_room(folder: Path, robot: str, keep_bytes: int) -> list[Path]:
-    """Delete the oldest captures until the others take no more than this; never the newest. Returns those deleted."""
-    files = captures(folder, robot)
+def make_room(folder: Path, robot: str, keep_bytes: int, started: datetime | None = None) -> list[Path]:
+    """Delete the oldest captures until the others take no more than this; never the newest. Returns those deleted.
+
+    The files of the run that goes on, begun at `started`, are the newest, in the order of their numbers, whatever the
+    wall clock said when the others were begun.
+    """
+    own = "" if started is None else f"{_run(robot, started)}-"
+    files = sorted(captures(folder, robot), key=lambda path: _age(path, own))
     sizes = {path: path.stat().st_size for path in files}
     left = sum(sizes.values())
     gone = []
@@ -33,3 +42,10 @@ def make_room(folder: Path, robot: str, keep_bytes: int) -> list[Path]:
             left -= sizes[path]
             gone.append(path)
     return gone
+
+
+def _age(path: Path, own: str) -> tuple[bool, int, str]:
+    """Sorts the oldest first."""
+    if own and path.name.startswith(own):
+        return True, int(path.stem.rpartition("-")[2]), path.name
+    return False, 0, path.name

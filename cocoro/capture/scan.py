@@ -1,82 +1,37 @@
-"""Finding what is whole in a file of records: by its summary where there is one, else from front to back.
+"""Finding what is in a file of records: by its summary where that can be relied on, else from front to back.
 
-Nothing is believed that no checksum vouches for, but for the framing of records; where that breaks, the next chunk
-is searched for whose checksum is right.
+A summary is relied on when its checksum, if it has one, is right, and it lists as many schemas, channels, chunks,
+attachments and metadata as its statistics say and the file has; what it does not list is looked for between the chunks,
+from record to record. Any other file is read from front to back: that is slower, and no fault of the file's.
+
+Resynchronisation in damaged files is by hand, since the package ends at the first damage: where the framing of records
+breaks, the next chunk is searched for whose checksum is right.
 """
 
 from __future__ import annotations
 
-import os
 import struct
-import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass, field
-from typing import NamedTuple
+
+from mcap.opcode import Opcode
+from mcap.records import ChunkIndex, Footer, Statistics
 
 from cocoro.capture import mcap
-from cocoro.capture.compression import LARGEST_CHUNK, unpack
+from cocoro.capture.contents import Contents, Disk, Place, header_of, read_chunk
 from cocoro.capture.errors import CutOffError, DamageError
-from cocoro.capture.file import CHECKSUM, PROFILE, checksum
-from cocoro.capture.mcap import MAGIC, PREFIX, Op
+from cocoro.capture.mcap import MAGIC, PREFIX
+from cocoro.capture.walk import Walk
 
 LARGEST_SUMMARY = 1 << 30
-LARGEST_RECORD = 1 << 26
-"""Of records other than chunks."""
 _SEARCHED = 1 << 20
 _MARKS = (struct.pack("<I", 4) + b"zstd", struct.pack("<I", 3) + b"lz4", struct.pack("<I", 0))
 """A chunk's compression, as it stands in its head."""
 _MARK_AT = PREFIX.size + 28
+_MCAPS = frozenset(Opcode)
 
 
-class ChunkPlace(NamedTuple):
-    """Where a chunk is, and what is in it."""
-
-    offset: int
-    length: int
-    """Of the record, its prefix included."""
-    start_ns: int
-    end_ns: int
-    channels: frozenset[int] | None
-    """None: not known without looking."""
-
-
-@dataclass
-class Contents:
-    """What a file has."""
-
-    schemas: dict[int, mcap.Schema] = field(default_factory=dict)
-    channels: dict[int, mcap.Channel] = field(default_factory=dict)
-    chunks: list[ChunkPlace] = field(default_factory=list)
-    metadata: list[mcap.Metadata] = field(default_factory=list)
-    statistics: mcap.Statistics | None = None
-    whole: bool = False
-    """The file was closed, and its summary is as it was written."""
-    cut_bytes: int = 0
-    """At the end, of a record that was never finished: what the death of a recorder leaves, so no damage."""
-    problems: list[str] = field(default_factory=list)
-    foreign: bool = False
-    """It has messages outside of chunks, which captures never do."""
-    ours: bool = False
-    """It was written by a recorder, so each metadata record has its checksum."""
-
-
-class Disk:
-    """A file to read from at any place. Shorter than wanted is damage, not an error of the disk's."""
-
-    def __init__(self, fd: int) -> None:
-        self._fd = fd
-        self.size = os.fstat(fd).st_size
-
-    def read(self, offset: int, length: int) -> bytes:
-        if offset < 0 or offset + length > self.size:
-            raise CutOffError(f"{length} bytes at byte {offset} are beyond the file's end")
-        data = os.pread(self._fd, length, offset)
-        while len(data) < length:
-            more = os.pread(self._fd, length - len(data), offset + len(data))
-            if not more:
-                raise CutOffError(f"the file has become shorter than {offset + length} bytes")
-            data += more
-        return data
+class _UnsureError(Exception):
+    """The summary does not say all; the text is '' unless that is damage."""
 
 
 def contents(disk: Disk) -> Contents:
@@ -87,76 +42,101 @@ def contents(disk: Disk) -> Contents:
         raise DamageError("this is no MCAP file")
     try:
         return _by_summary(disk)
-    except DamageError as damage:
+    except (_UnsureError, DamageError) as reason:
         found = scan(disk)
-        if str(damage):
-            found.problems.insert(0, str(damage))
+        if isinstance(reason, _UnsureError) and str(reason):
+            found.problems.insert(0, str(reason))
         return found
+
+
+def _begun(disk: Disk) -> Contents:
+    header = header_of(disk)
+    return Contents(header.profile, header.library)
 
 
 # --- by the summary -------------------------------------------------------------------------------
 
 
 def _by_summary(disk: Disk) -> Contents:
-    tail = mcap.FOOTER_LENGTH + len(MAGIC)
-    if disk.size < len(MAGIC) + tail or disk.read(disk.size - len(MAGIC), len(MAGIC)) != MAGIC:
-        raise DamageError("")  # it was never closed, which is no damage: what there is is as good as ever
-    footer_at = disk.size - tail
-    head = disk.read(footer_at, mcap.FOOTER_LENGTH)
-    if PREFIX.unpack_from(head) != (Op.FOOTER, mcap.FOOTER_LENGTH - PREFIX.size):
-        raise DamageError("the file's footer is damaged")
-    footer = mcap.Footer.unpack(head[PREFIX.size :])
-    if footer.summary_start == 0 or footer.crc == 0:
-        raise DamageError("the file has no summary, or one without a checksum")
-    if not len(MAGIC) <= footer.summary_start <= footer_at or footer_at - footer.summary_start > LARGEST_SUMMARY:
-        raise DamageError("the file's footer is damaged")
-    summary = disk.read(footer.summary_start, footer_at - footer.summary_start)
-    if not footer.vouches_for(summary):
-        raise DamageError("the file's summary is damaged")
-    found = Contents(whole=True, ours=_profile(disk) == PROFILE)
-    indices = []
+    """Raises _UnsureError, or DamageError for what a reading from front to back will find, too."""
+    summary, summary_start = _summary(disk)
+    found, indices = _begun(disk), []
     for op, content, _ in mcap.records(summary):
-        if op == Op.SCHEMA:
-            _add_schema(found, content)
-        elif op == Op.CHANNEL:
-            _add_channel(found, content)
-        elif op == Op.STATISTICS:
-            found.statistics = mcap.Statistics.unpack(content)
-        elif op == Op.CHUNK_INDEX:
-            chunk = mcap.ChunkIndex.unpack(content)
-            channels = frozenset(chunk.index_offsets) or None
-            found.chunks.append(ChunkPlace(chunk.offset, chunk.length, chunk.start_ns, chunk.end_ns, channels))
-        elif op == Op.METADATA_INDEX:
-            indices.append(mcap.MetadataIndex.unpack(content))
-    if found.statistics is None or found.statistics.chunks != len(found.chunks):
-        raise DamageError("the file's summary does not list its chunks")
-    for index in indices:
-        try:
-            _read_metadata(disk, index, found)
-        except DamageError as damage:
-            found.problems.append(f"metadata {index.name!r} at byte {index.offset}: {damage}")
+        if op == Opcode.SCHEMA:
+            found.add_schema(content)
+        elif op == Opcode.CHANNEL:
+            found.add_channel(content)
+        elif op == Opcode.STATISTICS:
+            found.statistics, _ = mcap.parsed(Statistics, content)
+        elif op == Opcode.CHUNK_INDEX:
+            indices.append(mcap.parsed(ChunkIndex, content)[0])
+        elif op not in _MCAPS:
+            found.unknown[op] += 1
+    if found.statistics is None:
+        raise _UnsureError
+    indices.sort(key=lambda index: index.chunk_start_offset)
+    _between_chunks(disk, found, indices, summary_start)
+    found.places += map(_place, indices)
+    found.places.sort()
+    found.raw_bytes += sum(index.uncompressed_size for index in indices)
+    told = found.statistics
+    listed = (told.schema_count, told.channel_count, told.chunk_count, told.attachment_count, told.metadata_count)
+    chunks = sum(not place.loose for place in found.places)
+    if listed != (len(found.schemas), len(found.channels), chunks, len(found.attachments), len(found.metadata)):
+        raise _UnsureError
+    if any(place.channels is not None and not place.channels <= found.channels.keys() for place in found.places):
+        raise _UnsureError
+    found.closed = found.summarised = True
     return found
 
 
-def _read_metadata(disk: Disk, index: mcap.MetadataIndex, found: Contents) -> None:
-    if index.length > LARGEST_RECORD:
-        raise DamageError("no record is so large")
-    there = list(mcap.records(disk.read(index.offset, index.length)))
-    if [op for op, _, _ in there] != [Op.METADATA]:
-        raise DamageError("it is not there")
-    _add_metadata(found, there[0][1])
-    if found.metadata[-1].name != index.name:
-        del found.metadata[-1]
-        raise DamageError("it is not there")
+def _footer(disk: Disk) -> tuple[Footer, int]:
+    """Read the footer; also the offset of its record. Raises _UnsureError where there is none with a summary."""
+    if not _ends(disk):
+        raise _UnsureError  # it was never closed, which is no damage; or its footer is longer than what is known of it
+    at = disk.size - mcap.FOOTER_LENGTH - len(MAGIC)
+    footer, _ = mcap.parsed(Footer, disk.read(at + PREFIX.size, mcap.FOOTER_LENGTH - PREFIX.size))
+    if footer.summary_start == 0:
+        raise _UnsureError
+    return footer, at
 
 
-def _profile(disk: Disk) -> str:
-    """Whose conventions hold, by the file's header."""
+def _summary(disk: Disk) -> tuple[bytes, int]:
+    """Read the summary section, which its checksum vouches for, and the offset at which it begins."""
+    footer, footer_at = _footer(disk)
+    if not len(MAGIC) <= footer.summary_start <= footer_at or footer_at - footer.summary_start > LARGEST_SUMMARY:
+        raise _UnsureError("the file's footer is damaged")
+    summary = disk.read(footer.summary_start, footer_at - footer.summary_start)
+    if not mcap.vouches_for(footer, summary):
+        raise _UnsureError("the file's summary is damaged")
+    return summary, footer.summary_start
+
+
+def _summary_is_right(disk: Disk) -> bool:
     try:
-        op, length = PREFIX.unpack(disk.read(len(MAGIC), PREFIX.size))
-        return mcap.Take(disk.read(len(MAGIC) + PREFIX.size, length)).string() if op == Op.HEADER else ""
-    except DamageError:
-        return ""
+        _summary(disk)
+    except (_UnsureError, DamageError):
+        return False
+    return True
+
+
+def _between_chunks(disk: Disk, found: Contents, indices: list[ChunkIndex], end: int) -> None:
+    """Take in all that is not in a chunk that the summary lists."""
+    walk, at = Walk(disk, found, check=False), len(MAGIC)
+    for index in indices:
+        if index.message_start_time == index.message_end_time == 0:
+            continue  # its times may stand for that it has no messages, so it is looked into
+        walk.through(at, index.chunk_start_offset)
+        at = index.chunk_start_offset + index.chunk_length + index.message_index_length
+    indices[:] = [index for index in indices if index.message_start_time or index.message_end_time]
+    walk.through(at, end)
+
+
+def _place(index: ChunkIndex) -> Place:
+    channels = frozenset(index.message_index_offsets) or None
+    return Place(
+        index.chunk_start_offset, index.chunk_length, index.message_start_time, index.message_end_time, channels
+    )
 
 
 # --- from front to back ---------------------------------------------------------------------------
@@ -164,68 +144,30 @@ def _profile(disk: Disk) -> str:
 
 def scan(disk: Disk) -> Contents:
     """Read everything, and keep what is whole."""
-    found = Contents(ours=_profile(disk) == PROFILE)
-    at = len(MAGIC)
+    found = _begun(disk)
+    found.closed = _ends(disk)
+    walk, at = Walk(disk, found, check=True, sure=_summary_is_right(disk)), len(MAGIC)
     while at < disk.size:
         try:
-            at = _step(disk, at, found)
+            at = walk.step(at)
         except DamageError as damage:
-            after = _search(disk, at + 1)
-            if after == disk.size and isinstance(damage, CutOffError):
+            start = at if walk.suspect is None else walk.suspect
+            after = _search(disk, start + 1)
+            if after == disk.size and isinstance(damage, CutOffError) and not found.closed:
                 found.cut_bytes = disk.size - at
                 break
-            found.problems.append(f"bytes {at} to {after} are not readable: {damage}")
-            at = after
+            found.problems.append(f"bytes {start} to {after} are not readable: {damage}")
+            walk.suspect, at = None, after
+    walk.finish()
     return found
 
 
-def _step(disk: Disk, at: int, found: Contents) -> int:
-    """Take in one record. Where the next one is; the file's size at the end of the data. Raises DamageError."""
-    op, length = PREFIX.unpack(disk.read(at, PREFIX.size))
-    end: int = at + PREFIX.size + length
-    if end > disk.size:
-        raise CutOffError("a record is cut off")
-    if op == Op.CHUNK:
-        _add_chunk(disk, at, found)
-        return end
-    if length > LARGEST_RECORD:
-        raise DamageError("no record is so large")
-    content = disk.read(at + PREFIX.size, length)
-    if op == Op.DATA_END and length == 4:
-        return disk.size
-    if op == Op.SCHEMA:
-        _add_schema(found, content)
-    elif op == Op.CHANNEL:
-        _add_channel(found, content)
-    elif op == Op.METADATA:
-        _add_metadata(found, content)
-    elif op == Op.MESSAGE:
-        mcap.message(memoryview(content))
-        found.foreign = True
-    elif op == Op.MESSAGE_INDEX:
-        mcap.check_message_index(content)
-    elif op == Op.ATTACHMENT:
-        if struct.unpack("<I", content[-4:])[0] not in (0, zlib.crc32(content[:-4])):
-            raise DamageError("an attachment's checksum is wrong")
-    elif op != Op.HEADER or at != len(MAGIC):
-        raise DamageError(f"a record of kind {op} has no place there")
-    return end
-
-
-def _add_chunk(disk: Disk, at: int, found: Contents) -> None:
-    length, raw = read_chunk(disk, at)
-    channels, times = set(), []
-    for op, content, _ in mcap.records(raw):
-        if op == Op.SCHEMA:
-            _add_schema(found, content)
-        elif op == Op.CHANNEL:
-            _add_channel(found, content)
-        elif op == Op.MESSAGE:
-            message = mcap.message(content)
-            channels.add(message.channel_id)
-            times.append(message.log_ns)
-    if times:
-        found.chunks.append(ChunkPlace(at, length, min(times), max(times), frozenset(channels)))
+def _ends(disk: Disk) -> bool:
+    """Whether there is a footer where one without an extension would be."""
+    tail = disk.read(
+        max(disk.size - mcap.FOOTER_LENGTH - len(MAGIC), 0), min(disk.size, mcap.FOOTER_LENGTH + len(MAGIC))
+    )
+    return tail.endswith(MAGIC) and tail.startswith(PREFIX.pack(Opcode.FOOTER, mcap.FOOTER_LENGTH - PREFIX.size))
 
 
 def _search(disk: Disk, start: int) -> int:
@@ -236,7 +178,7 @@ def _search(disk: Disk, start: int) -> int:
         for candidate in _candidates(block):
             at = block_at + candidate
             try:
-                read_chunk(disk, at)
+                read_chunk(disk, at, exactly=True)
             except DamageError:
                 continue
             return at
@@ -250,44 +192,7 @@ def _candidates(block: bytes) -> Iterator[int]:
         at = block.find(mark)
         while at >= 0:
             start = at - _MARK_AT
-            if start >= 0 and block[start] == Op.CHUNK:
+            if start >= 0 and block[start] == Opcode.CHUNK:
                 places.add(start)
             at = block.find(mark, at + 1)
     return iter(sorted(places))
-
-
-def read_chunk(disk: Disk, at: int) -> tuple[int, bytes | memoryview]:
-    """The length of the chunk record at a place, and the records in it, as their checksum vouches for them."""
-    op, length = PREFIX.unpack(disk.read(at, PREFIX.size))
-    if op != Op.CHUNK or length > disk.size - at - PREFIX.size or length > LARGEST_CHUNK:
-        raise DamageError("it is damaged, or cut off")
-    record = memoryview(disk.read(at + PREFIX.size, length))
-    head, start = mcap.ChunkHead.unpack(record)
-    if start + head.packed_bytes != length:
-        raise DamageError("its length contradicts itself")
-    raw = unpack(head.compression, record[start:], head.raw_bytes)
-    if head.crc not in (0, zlib.crc32(raw)):  # 0: its writer gave none
-        raise DamageError("its checksum is wrong")
-    return PREFIX.size + length, raw
-
-
-# --- what is found --------------------------------------------------------------------------------
-
-
-def _add_schema(found: Contents, content: bytes | memoryview) -> None:
-    schema = mcap.Schema.unpack(content)
-    found.schemas[schema.id] = schema
-
-
-def _add_channel(found: Contents, content: bytes | memoryview) -> None:
-    channel = mcap.Channel.unpack(content)
-    found.channels[channel.id] = channel
-
-
-def _add_metadata(found: Contents, content: bytes | memoryview) -> None:
-    name, entries = mcap.Metadata.unpack(content)
-    told = dict(entries)
-    known = told.pop(CHECKSUM, None)
-    if known != checksum(entries) and (found.ours or known is not None):
-        raise DamageError(f"the metadata {name!r} is not what was written")
-    found.metadata.append(mcap.Metadata(name, told))

@@ -2,27 +2,32 @@
 
 from __future__ import annotations
 
-import json
 import os
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-import msgspec
+from mcap.records import Channel, Schema
 
-from cocoro.about import versions
 from cocoro.capture.compression import Packer
 from cocoro.capture.errors import CaptureError
 from cocoro.capture.file import CaptureFile
 from cocoro.capture.keys import KeyInfo
 from cocoro.capture.schema import TypeSchema
+from cocoro.capture.whereabouts import whereabouts
 from cocoro.clock import NS
+from cocoro.messages import DisturbedFile
 
-TALLY = "tally"
-"""The metadata record that a whole file ends with: what it has of each key, and what is missing."""
-LIBRARY = f"cocoro {versions().get('cocoro-mesh', '')}".strip()
 MB = 1_000_000
+LOOK_S = 1.0
+"""How often it is looked whether the file is still where it was made."""
+KEPT_DISTURBED = 20
+
+
+Name = str | tuple[str, int]
+"""A channel of a writer: the key, or the key and a number where the key may have several."""
 
 
 class Entry(NamedTuple):
@@ -35,6 +40,8 @@ class Entry(NamedTuple):
     payload: bytes
     info: KeyInfo | None = None
     """What to write of the key, where that is not to be seen from the payload."""
+    channel: int | None = None
+    """A number, where the key may have several channels; it is not the number in the file."""
 
 
 class Prepared(NamedTuple):
@@ -82,6 +89,7 @@ class Writer:
         missing: Callable[[], Missing] = lambda: Missing({}, {}),
         release: Callable[[int], None] = sync_and_close,
         prepare: Callable[[Entry], Prepared] | None = None,
+        monotonic_s: Callable[[], float] = time.monotonic,
     ) -> None:
         """`place(n)` is the nth file's path, from 1 on; `info(key, payload)` says what to write of a key; `release`
         gets the descriptor of a file that is whole; `prepare` may put something else in an entry's place."""
@@ -92,22 +100,36 @@ class Writer:
         self._missing = missing
         self._release = release
         self._prepare = prepare
+        self._monotonic_s = monotonic_s
+        self._look_at_s = 0.0
         self._metadata: dict[str, dict[str, str]] = {}
-        self._infos: dict[str, KeyInfo] = {}
+        self._infos: dict[Name, KeyInfo] = {}
+        self._channels: dict[Name, int] = {}
+        self._schemas: dict[TypeSchema, int] = {}
+        """The numbers of channels and schemas in this file."""
         self._number = 0
         self._first_ns: int | None = None
         self._closed_bytes = 0
         self._closed_raw_bytes = 0
+        self._ended: CaptureFile | None = None
+        """The last one that is closed."""
         self.messages = 0
+        """Written, but for those of files that were removed while they were being written."""
+        self.removed = 0
+        """Those of such files."""
+        self.disturbed: tuple[DisturbedFile, ...] = ()
+        """The newest of the files that were moved or removed while they were being written."""
         self.file = self._open()
+        self.where = str(self.file.path)
+        """Where the file is that is being written, or was written last; '' when it is not on the disk any more."""
 
     @property
     def size_bytes(self) -> int:
-        return self._closed_bytes + self.file.size_bytes
+        return self._closed_bytes + (0 if self._ended is self.file else self.file.size_bytes)
 
     @property
     def raw_bytes(self) -> int:
-        return self._closed_raw_bytes + self.file.raw_bytes
+        return self._closed_raw_bytes + (0 if self._ended is self.file else self.file.raw_bytes)
 
     def put(self, entry: Entry) -> None:
         if self._first_ns is None:
@@ -121,22 +143,34 @@ class Writer:
         if self._prepare is not None:
             entry, schema = self._prepare(entry)
         try:
-            if not self.file.has(entry.key):
-                info = self._infos.get(entry.key)
-                if info is None:
-                    info = entry.info or self._info(entry.key, entry.payload)
-                    info = self._infos[entry.key] = info if schema is None else info._replace(schema=schema)
-                self.file.channel(entry.key, *info)
-            self.file.add(entry.key, entry.sequence, entry.log_ns, entry.publish_ns, entry.payload)
+            name: Name = entry.key if entry.channel is None else (entry.key, entry.channel)
+            channel = self._channels.get(name) or self._channel(name, entry, schema)
+            self.file.add(channel, entry.sequence, entry.log_ns, entry.publish_ns, entry.payload)
         except OSError as error:
             raise self._failed(error) from error
         self.messages += 1
 
+    def _channel(self, name: Name, entry: Entry, schema: TypeSchema | None) -> int:
+        """Make a key known to the file."""
+        info = self._infos.get(name)
+        if info is None:
+            info = entry.info or self._info(entry.key, entry.payload)
+            info = self._infos[name] = info if schema is None else info._replace(schema=schema)
+        schema_id = 0
+        if info.schema is not None:
+            schema_id = self._schemas.setdefault(info.schema, len(self._schemas) + 1)
+            self.file.schema(Schema(schema_id, info.schema.data, info.schema.encoding, info.schema.name))
+        channel = self._channels[name] = len(self._channels) + 1
+        self.file.channel(Channel(channel, entry.key, info.encoding, info.metadata, schema_id))
+        return channel
+
     def flush(self) -> None:
-        """Give everything to the system; and see whether the disk has room for more."""
+        """Give everything to the system; and see whether the file is still where it was made, and whether the disk has
+        room for more."""
         try:
             self.file.flush()
-            room = os.statvfs(self.file.path.parent)
+            self._look()
+            room = os.fstatvfs(self.file.fileno())
         except OSError as error:
             raise self._failed(error) from error
         if room.f_bavail * room.f_frsize < self._limits.min_free_bytes:
@@ -161,8 +195,18 @@ class Writer:
         try:
             self._finish(self.file)
         except OSError as error:
-            self.file.abandon()
+            self._abandon(self.file)
             raise _told(error, self.file.path) from error
+
+    def _look(self) -> None:
+        """Go on in a new file when somebody has moved or removed this one."""
+        now_s = self._monotonic_s()
+        if now_s < self._look_at_s:
+            return
+        self._look_at_s = now_s + LOOK_S
+        if whereabouts(self.file.path, self.file.fileno()).state != "there":
+            self._rotate()
+            self._first_ns = None
 
     def _open(self) -> CaptureFile:
         self._number += 1
@@ -170,7 +214,7 @@ class Writer:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             try:
-                file = CaptureFile(path, self._packer, LIBRARY)
+                file = CaptureFile(path, self._packer)
             except FileExistsError:
                 if self._place(self._number + 1) == path:
                     raise
@@ -194,34 +238,49 @@ class Writer:
         except CaptureError:
             self.close()
             raise
-        self.file = after
+        self.file, self._channels, self._schemas = after, {}, {}
         try:
             self._finish(before)
         except OSError as error:
-            before.abandon()
+            self._abandon(before)
             raise self._failed(error) from error
-        self._closed_bytes += before.size_bytes
-        self._closed_raw_bytes += before.raw_bytes
+        self.where = str(after.path)
 
     def _finish(self, file: CaptureFile) -> None:
         file.flush()
-        missing = self._missing()
-        file.metadata(
-            TALLY,
-            {
-                "keys": json.dumps(msgspec.to_builtins(file.tallies)),
-                "dropped": json.dumps(missing.dropped),
-                "lost": json.dumps(missing.lost),
-            },
-        )
-        self._release(file.finish())
+        file.tally(*self._missing())
+        fd = file.finish()
+        self._account(file)
+        self._release(fd)
+
+    def _abandon(self, file: CaptureFile) -> None:
+        self._account(file)
+        file.abandon()
+
+    def _account(self, file: CaptureFile) -> None:
+        """See, once, what has become of a file that gets no more, before it is closed."""
+        if self._ended is file:
+            return
+        found = whereabouts(file.path, file.fileno())
+        self._ended, self.where = file, found.path
+        if found.state == "removed":
+            lost = sum(tally.messages for tally in file.tallies.values())
+            self.messages -= lost
+            self.removed += lost
+        else:
+            lost = 0
+            self._closed_bytes += file.size_bytes
+            self._closed_raw_bytes += file.raw_bytes
+        if found.state != "there":
+            told = DisturbedFile(file=str(file.path), became=found.state, now=found.path, lost=lost)
+            self.disturbed = (*self.disturbed, told)[-KEPT_DISTURBED:]
 
     def _failed(self, error: OSError) -> CaptureError:
         """Leave the file as good as it can be."""
         try:
             self._finish(self.file)
         except OSError:
-            self.file.abandon()
+            self._abandon(self.file)
         return _told(error, self.file.path)
 
 

@@ -80,7 +80,7 @@ def replay(
     """
     from cocoro.cli import capture_replay
 
-    options = {"start_s": start or 0.0, "end_s": end, "rate": rate, "loop": loop, "paused": paused}
+    options = {"start_s": 0.0 if start is None else start, "end_s": end, "rate": rate, "loop": loop, "paused": paused}
     sys.exit(asyncio.run(capture_replay.replay(file, only or [], hardware, options)))
 
 
@@ -97,11 +97,15 @@ def export(
     rrd: Annotated[
         Path | None, typer.Option("--rrd", metavar="OUT.rrd", help="For Rerun; needs cocoro-mesh[view].")
     ] = None,
+    attachments: Annotated[
+        Path | None, typer.Option("--attachments", metavar="DIR", help="The files that are attached to it.")
+    ] = None,
 ) -> None:
-    """Turn a capture into a film, tables, or a file for Foxglove or Rerun. Several at once, if wanted."""
+    """Turn a capture into a film, tables, or a file for Foxglove or Rerun; or get out what is attached to it. Several
+    at once, if wanted."""
     from cocoro.cli import capture_export
 
-    sys.exit(capture_export.export(file, video, rrd, foxglove, csv, parquet))
+    sys.exit(capture_export.export(file, video, rrd, foxglove, csv, parquet, attachments))
 
 
 def view(

@@ -23,10 +23,11 @@ def export(
     foxglove: Path | None = None,
     csv: Path | None = None,
     parquet: Path | None = None,
+    attachments: Path | None = None,
 ) -> int:
     """Raises CaptureError for what cannot be read or written, ConfigError when nothing is asked for."""
-    if not any((video, rrd, foxglove, csv, parquet)):
-        raise ConfigError("say what to make of it: --video, --foxglove, --csv, --parquet or --rrd")
+    if not any((video, rrd, foxglove, csv, parquet, attachments)):
+        raise ConfigError("say what to make of it: --video, --foxglove, --csv, --parquet, --rrd or --attachments")
     for out in (video, rrd, foxglove):
         if out is not None:
             refuse_existing(out)  # now, not after the first of them has been made
@@ -53,6 +54,10 @@ def export(
 
             messages = rerun_scene.export(capture, rrd, _progress(capture, rrd))
             _done(f"{rrd}: {messages} messages; open it with `rerun {rrd}`")
+        if attachments is not None:
+            from cocoro.capture.export import attachments as attached
+
+            _done(f"{attachments}: {attached.export(capture, attachments)} attachments")
         for problem in capture.problems:
             print(f"missing: {problem}", file=sys.stderr)
         if capture.ending:

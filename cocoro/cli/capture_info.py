@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
@@ -9,7 +10,8 @@ from typing import Any
 
 import msgspec
 
-from cocoro.capture.info import Report, report
+from cocoro.capture.info import AttachmentReport, Report, report
+from cocoro.capture.log_clock import WALL_CLOCK, Step, words
 from cocoro.capture.reader import Capture
 from cocoro.capture.rewrite import REPAIRED
 from cocoro.cli import exits
@@ -27,9 +29,11 @@ def info(file: Path, check: bool, as_json: bool) -> int:
 
 
 def text(found: Report) -> str:
+    several = Counter(key.key for key in found.keys)
+    names = {key.channel: key.key if several[key.key] == 1 else f"{key.key}#{key.channel}" for key in found.keys}
     rows = [
         (
-            key.key, key.type, str(key.messages), f"{key.rate_hz:.1f} Hz", f"{key.size_bytes / MB:.2f} MB",
+            names[key.channel], key.type, str(key.messages), f"{key.rate_hz:.1f} Hz", f"{key.size_bytes / MB:.2f} MB",
             f"{key.longest_gap_s:.3f} s at {key.longest_gap_from_s:.1f}" if key.longest_gap_s else "",
             str(key.lost or ""), str(key.dropped or ""),
         )
@@ -41,11 +45,18 @@ def text(found: Report) -> str:
             *_head(found),
             "",
             table(heads, rows).rstrip(),
-            *(f"{key.key}: {change}" for key in found.keys for change in key.changed),
+            *(f"{names[key.channel]}: {change}" for key in found.keys for change in key.changed),
+            *(f"attachment: {_attachment(each)}" for each in found.attachments),
+            *(f"note: {note}" for note in found.notes),
             *(f"damaged: {problem}" for problem in found.problems),
             "",
         ]
     )
+
+
+def _attachment(found: AttachmentReport) -> str:
+    media = f", {found.media_type}" if found.media_type else ""
+    return f"{found.name}{media}, {found.size_bytes} bytes"
 
 
 def _head(found: Report) -> list[str]:
@@ -60,6 +71,7 @@ def _head(found: Report) -> list[str]:
         ("robot", found.robot or "unknown"),
         ("started", start if found.messages else ""),
         ("lasts", f"{found.duration_s:.3f} s"),
+        ("clock", "; ".join(_steps(found))),
         ("messages", f"{found.messages}"),
         ("size", f"{found.size_bytes / MB:.1f} MB, of {found.raw_bytes / MB:.1f} MB of payloads"),
         ("state", _state(found)),
@@ -71,6 +83,20 @@ def _head(found: Report) -> list[str]:
         ("metadata", ", ".join(found.metadata)),
     ]
     return [f"{name:<9} {value}" for name, value in lines if value]
+
+
+def _steps(found: Report) -> list[str]:
+    """How somebody set the wall clock while it was recorded; times since the capture's start."""
+    try:
+        steps = msgspec.convert(found.metadata.get(WALL_CLOCK, {}).get("steps", ()), tuple[Step, ...])
+    except msgspec.ValidationError:  # somebody else's record of this name
+        return []
+    told = []
+    for step in steps:
+        at_s = (step.log_ns - found.start_ns) / NS
+        when = f"at {at_s:.3f} s" if at_s >= 0 else f"{-at_s:.3f} s before this file began"
+        told.append(f"{words(step)} {when}")
+    return told
 
 
 def _state(found: Report) -> str:

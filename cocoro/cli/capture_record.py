@@ -11,12 +11,13 @@ from typing import Any
 
 import msgspec
 
-from cocoro import processes
+from cocoro import processes, robot_time
+from cocoro.capture.whereabouts import told
 from cocoro.cli import exits
 from cocoro.cli.ending import told_to_end
 from cocoro.cli.link import Where, joined
 from cocoro.cli.output import going_on
-from cocoro.clock import FollowedClock, RealClock
+from cocoro.clock import FollowedClock
 from cocoro.errors import ConfigError
 from cocoro.messages import Recording
 from cocoro.node import Node
@@ -38,10 +39,10 @@ async def record(where: Where, settings: dict[str, Any], seconds: float | None) 
         config = msgspec.convert(settings, component.config)
     except msgspec.ValidationError as error:
         raise ConfigError(f"record: {error}") from error
-    async with joined(where) as link:
+    async with joined(where, frames=True) as link:
         resolved = link.run_dir.resolved()
         description, measured = (Path(file) if (file := resolved.get(name)) else None for name in _DESCRIPTIONS)
-        clock = FollowedClock() if resolved.get("clock") == "sim" else RealClock()
+        clock = FollowedClock() if resolved.get("clock") == "sim" else robot_time.clock(link.run_dir.path)
         robot = Robot.load(description, measured)
         name = f"record-{os.getpid()}"
         async with Node(name, link.bus, clock, robot, robot_name=link.robot, module=row.module, config=config) as node:
@@ -75,9 +76,15 @@ class _View:
         self.failed = asyncio.Event()
         self.ended = asyncio.Event()
         self._newest: Recording | None = None
+        self._files: set[str] = set()
 
     def show(self, recording: Recording) -> None:
         before, self._newest = self._newest, recording
+        new = [file for file in recording.disturbed if before is None or file not in before.disturbed]
+        if not recording.ended:
+            self._files.add(recording.file)
+            for file in new:
+                print(f"{CLEAR if sys.stdout.isatty() else ''}cocoro: {told(file)}", file=sys.stderr, flush=True)
         if recording.ended:
             self.ended.set()
         elif recording.fault:
@@ -88,16 +95,24 @@ class _View:
             print(recording.file, flush=True)
 
     def last_words(self) -> int:
-        if self._newest is None:
+        newest = self._newest
+        if newest is None:
             print("nothing was recorded")
             return exits.FAILED
-        print(f"{CLEAR if sys.stdout.isatty() else ''}{_line(self._newest)}")
-        if self._newest.fault:
-            print(f"cocoro: {self._newest.fault}", file=sys.stderr)
-        return exits.FAILED if self._newest.fault else exits.DONE
+        others = len(self._files - {newest.file, ""} - {file.file for file in newest.disturbed})
+        others += sum(file.became == "moved" and file.now != newest.file for file in newest.disturbed)
+        print(f"{CLEAR if sys.stdout.isatty() else ''}{_line(newest, others)}")
+        for file in newest.disturbed:
+            print(f"cocoro: {told(file)}", file=sys.stderr)
+        if newest.fault:
+            print(f"cocoro: {newest.fault}", file=sys.stderr)
+        return exits.FAILED if newest.fault or newest.removed else exits.DONE
 
 
-def _line(recording: Recording) -> str:
+def _line(recording: Recording, others: int = 0) -> str:
+    """`others`: how many files there are besides."""
     missing = sum(recording.dropped.values()), sum(recording.lost.values())
     told = "".join(f", {count} {word}" for count, word in zip(missing, ("dropped", "lost"), strict=True) if count)
-    return f"{recording.file}: {recording.messages} messages, {recording.size_bytes / 1e6:.1f} MB{told}"
+    more = f" and {others} before it" if others > 0 else ""
+    where = f"{recording.file}{more}" if recording.file else "no file is left" if others <= 0 else f"{others} files"
+    return f"{where}: {recording.messages} messages, {recording.size_bytes / 1e6:.1f} MB{told}"

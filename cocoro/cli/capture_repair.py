@@ -9,6 +9,7 @@ from cocoro.capture.keys import Choice
 from cocoro.capture.reader import Capture
 from cocoro.capture.rewrite import rewrite
 from cocoro.cli import exits
+from cocoro.cli.capture_span import check_span
 from cocoro.clock import NS
 from cocoro.errors import ConfigError
 
@@ -27,17 +28,21 @@ def repair(
     packer = Packer(_compression(compression), level)
     with Capture.open(file) as capture:
         choice = Choice(capture.robot, only, without)
+        check_span(capture, start_s, end_s)
         done = rewrite(
             capture,
             out or file.with_suffix(".repaired.mcap"),
             packer,
-            keep=lambda record: record.key in choice,
+            keep=(lambda record: record.key in choice) if only or without else None,
             start_ns=_at(capture, start_s),
             end_ns=_at(capture, end_s),
         )
-    print(f"{done.path}: {done.messages} messages, {done.size_bytes / 1e6:.1f} MB")
+    attachments = f", {done.attachments} attachments" if done.attachments else ""
+    print(f"{done.path}: {done.messages} messages{attachments}, {done.size_bytes / 1e6:.1f} MB")
     for problem in done.problems:
         print(f"missing: {problem}")
+    for note in done.notes:
+        print(f"left out: {note}")
     if capture.ending:
         print(f"note: {file} was {capture.ending}")
     return exits.DONE

@@ -19,6 +19,7 @@ from cocoro.capture.player import Player
 from cocoro.capture.reader import Capture
 from cocoro.capture.replay import SIMULATOR, Replay, played_keys, refuse_if_alive, services_of
 from cocoro.cli import exits
+from cocoro.cli.capture_span import check_span
 from cocoro.errors import ConfigError, RefusedError
 from cocoro.rundir import RunDir
 from cocoro.topics import HARDWARE
@@ -40,7 +41,7 @@ async def replay(file: Path, only: list[str], hardware: bool, options: dict[str,
     with Capture.open(file) as capture:
         if not capture.robot:
             raise CaptureError(f"{file}: it does not say whose it is, so it was not made by `cocoro record`")
-        _check_span(capture, options)
+        check_span(capture, options["start_s"], options["end_s"])
         keys = played_keys(capture, only, hardware)
         player = Player(capture, keys.__contains__, **options)
         services = services_of(keys) | (set(HARDWARE) if hardware else set())
@@ -48,7 +49,7 @@ async def replay(file: Path, only: list[str], hardware: bool, options: dict[str,
         run_dir.make()
         claims = run_dir.claim("replay", services)
         try:
-            async with await ZenohBus.open(run_dir.join_as("replay")) as bus:
+            async with await ZenohBus.open(run_dir.join_as("replay", frames=True)) as bus:
                 await refuse_if_alive(bus, capture.robot, services)
                 await _play(bus, capture, player, hardware, services)
         finally:
@@ -59,13 +60,6 @@ async def replay(file: Path, only: list[str], hardware: bool, options: dict[str,
         if capture.ending:
             print(f"note: {file} was {capture.ending}", file=sys.stderr)
         return exits.FAILED if capture.problems else exits.DONE
-
-
-def _check_span(capture: Capture, options: dict[str, Any]) -> None:
-    length_s = (capture.end_ns - capture.start_ns) / 1e9
-    start_s, end_s = options["start_s"], options["end_s"]
-    if not 0 <= start_s <= length_s or (end_s is not None and end_s <= start_s):
-        raise ConfigError(f"--from and --to: the capture lasts {length_s:.3f} s, so there is nothing between them")
 
 
 async def _play(bus: ZenohBus, capture: Capture, player: Player, hardware: bool, services: frozenset[str]) -> None:

@@ -40,7 +40,7 @@ def view_file(file: Path) -> int:
 async def view_mesh(where: Where) -> int:
     """Open Rerun on the mesh, until Ctrl-C. Raises CaptureError when Rerun is not installed, MeshError for no mesh."""
     rr = library()
-    async with joined(where) as link:
+    async with joined(where, frames=True) as link:
         resolved = link.run_dir.resolved()
         description, measured = (_path(resolved.get(name)) for name in ("description", "measured"))
         recording = opened(rr)

@@ -9,18 +9,19 @@ import os
 import shutil
 import socket
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from cocoro import profiles
+from cocoro.bus import shared
 from cocoro.checks import Check, bad, note, ok
 from cocoro.cli import doctor_stop, exits
 from cocoro.errors import ConfigError
-from cocoro.processes import Process, load
+from cocoro.processes import Process, load, shared_bytes
 from cocoro.profiles import Profile
 from cocoro.robot import Robot
-from cocoro.rundir import RunDir
+from cocoro.rundir import Holder, RunDir
 
 LIBRARIES = {
     "base": ("pyserial",),
@@ -61,7 +62,11 @@ def examine(profile: Profile) -> Iterator[Check]:
     if profile.clock == "real":
         yield _rules()
         yield from _priority()
-    claims = run_dir.claims()
+    claims: dict[str, Holder] = {}
+    try:
+        claims = run_dir.claims()
+    except ConfigError as error:
+        yield bad("robot's folder", str(error))
     for row in profile.rows():
         running = [service for service in row.services if service in claims]
         if running:
@@ -69,6 +74,7 @@ def examine(profile: Profile) -> Iterator[Check]:
         else:
             yield from _hardware(row, profile, robot)
     yield _clock(profile)
+    yield _shared_memory(profile, claims)
     yield from _disk(run_dir)
     yield from _mesh(profile, run_dir)
     yield from doctor_stop.check(profile.robot)
@@ -130,6 +136,17 @@ def _clock(profile: Profile) -> Check:
     if profile.mesh.connect and not SYNCHRONISED.exists():
         return note("clock", "whether it is synchronised is not known; machines of one robot must agree to 0.1 s")
     return ok("clock", time.strftime("%Y-%m-%d %H:%M:%S"))
+
+
+def _shared_memory(profile: Profile, claims: Mapping[str, Holder]) -> Check:
+    """Whether frames can be shared; they are copied when they cannot."""
+    rows = profile.rows()
+    wanted_bytes = shared_bytes(rows)
+    if any(row.frames == "publishes" and set(row.services) & set(claims) for row in rows):
+        return ok("shared memory", f"{sum(shared.segments().values()) / 1e6:.1f} MB in use")
+    if why := shared.obstacle(wanted_bytes):
+        return note("shared memory", f"{why}; until then {shared.COSTS}")
+    return ok("shared memory", f"room for the {wanted_bytes / 1e6:.1f} MB that the frames take")
 
 
 def _disk(run_dir: RunDir) -> Iterator[Check]:

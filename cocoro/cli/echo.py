@@ -23,7 +23,7 @@ async def echo(
 ) -> int:
     """Print until interrupted, or so many messages, or for so long. Exit code 1 when the time is over and there was
     nothing, or fewer than were wanted."""
-    async with joined(where) as link:
+    async with joined(where, frames=True) as link:
         ear = Ear(link, keyexpr_of(text, link.robot))
         with told_to_end() as end:
             printed = await _print(ear, link.robot, end, count, seconds, as_json, everything)

@@ -22,6 +22,7 @@ from cocoro.cli.ending import told_to_end
 from cocoro.cli.link import Where, joined
 from cocoro.cli.listening import Ear, keyexpr_of
 from cocoro.cli.table import table
+from cocoro.source import ANY_HZ, Source
 from cocoro.topics import topic_named
 
 SHOW_S = 1.0
@@ -78,19 +79,28 @@ class Meter:
         self._nominal_hz = nominal_hz
         self._window_s = window_s
         self._arrivals: deque[Arrival] = deque()
-        self._incarnation: int | None = None
-        self._seq = -1
-        self._lost = 0
+        self._source = Source()
 
     def hear(self, payload: Payload, at_s: float) -> None:
         try:
             head = msgspec.msgpack.decode(payload, type=Head)
         except (msgspec.MsgspecError, ValueError, RecursionError, OverflowError):
             head = Head()  # nothing of ours; it has a rate all the same
-        if head.incarnation == self._incarnation and head.seq > self._seq:
-            self._lost += head.seq - self._seq - 1
-        self._incarnation, self._seq = head.incarnation, head.seq
+        self._count(head)
         self._arrivals.append(Arrival(at_s, len(payload), head.stamp_ns))
+
+    def _count(self, head: Head) -> None:
+        """Losses, as a reader counts them: a number that cannot be traffic is none."""
+        source = self._source
+        if head.incarnation != source.incarnation:
+            source.begin(head.incarnation)
+        elif head.seq != source.seq + 1:
+            lost = source.jump(head.seq, head.stamp_ns, self._nominal_hz or ANY_HZ, None)
+            if lost is None:
+                return
+            source.gaps += lost
+        source.seq, source.stamp_ns = head.seq, head.stamp_ns
+        source.settle()
 
     def report(self, now_s: float) -> Report | None:
         """None before the first message."""
@@ -120,7 +130,7 @@ class Meter:
             bytes_per_s=rate_hz * size,
             size_bytes=size,
             messages=len(arrivals),
-            lost=self._lost,
+            lost=self._source.gaps,
             silent_s=silent_s,
         )
 
@@ -128,7 +138,7 @@ class Meter:
 async def hz(where: Where, text: str, window_s: float, once: bool, as_json: bool) -> int:
     """Measure until interrupted, or with `once` over one window. Exit code 1 when that heard nothing."""
     meters: dict[str, Meter] = {}
-    async with joined(where) as link:
+    async with joined(where, frames=True) as link:
         ear = Ear(link, keyexpr_of(text, link.robot))
         with told_to_end() as end, _view(as_json, once) as view:
             show_s = time.monotonic() + (window_s if once else SHOW_S)

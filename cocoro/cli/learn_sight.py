@@ -65,7 +65,7 @@ def of_picture(path: Path) -> Sight:
 
 async def of_robot(where: Where) -> Sight:
     """What a robot sees now. Raises MeshError when it is not there, or sends no frames."""
-    async with joined(where) as link:
+    async with joined(where, frames=True) as link:
         resolved = link.run_dir.resolved()
         named = resolved.get("objects") or resolved.get("service", {}).get(PERCEPTION, {}).get("objects")
         description, measured = (Path(file) if (file := resolved.get(name)) else None for name in DESCRIPTIONS)

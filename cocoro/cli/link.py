@@ -10,9 +10,9 @@ from typing import Generic, NamedTuple, TypeVar
 
 import msgspec
 
+from cocoro import robot_time
 from cocoro.bus.base import Bus, Handle, Reply
 from cocoro.bus.zenoh import ZenohBus
-from cocoro.clock import RealClock
 from cocoro.errors import CallTimeoutError, ConfigError, MeshError, RemoteError
 from cocoro.inbox import Inbox, Latest, Stream
 from cocoro.messages import Message
@@ -45,11 +45,13 @@ class Answer(NamedTuple, Generic[R]):
 class Link:
     """Make it with `joined`."""
 
-    def __init__(self, run_dir: RunDir, bus: Bus) -> None:
+    def __init__(self, run_dir: RunDir, bus: Bus, private: bool = True) -> None:
+        """`private`: all who can be in this mesh are processes of this machine."""
+        self._private = private
         self.run_dir = run_dir
         self.robot = run_dir.robot
         self.bus = bus
-        self._clock = RealClock()
+        self._clock = robot_time.clock(run_dir.path)
 
     async def call(self, request: Request[Q, R], question: Q, timeout_s: float | None = None) -> R:
         """Raises MeshError when nobody serves it or answers in time, RemoteError with the server's words."""
@@ -80,13 +82,18 @@ class Link:
 
     def inbox(self, topic: Topic[M]) -> Inbox[M]:
         """Everything that arrives on a topic from now on; `close` its subscription to end that."""
-        inbox = Inbox(topic, topic.key(self.robot), self._clock)
+        inbox = Inbox(topic, topic.key(self.robot), self._clock, onlooker=True)
         inbox.subscription = self.bus.subscribe(inbox.keyexpr, topic.qos, inbox.deliver, depth=64)
         return inbox
 
     async def alive(self) -> list[str]:
         """The services that live now."""
         return sorted(key.split("/")[1] for key in await self.bus.alive(f"{self.robot}/*/alive"))
+
+    def unheard(self, service: str) -> str:
+        """What is true of a service whose token is not there, as a state: `no contact` with it, which its process may
+        live without, or `not alive`, when no process of this machine is it."""
+        return "not alive" if self._private and self.run_dir.claimant(service) is None else "no contact"
 
     def watch_alive(self, service: str, handler: Callable[[bool], None]) -> Handle:
         return self.bus.watch_alive(f"{self.robot}/{service}/alive", lambda _key, alive: handler(alive))
@@ -115,8 +122,8 @@ def find(where: Where) -> RunDir:
 
 
 @asynccontextmanager
-async def joined(where: Where, patience_s: float | None = None) -> AsyncIterator[Link]:
-    """Join the mesh of a robot. Raises MeshError when it is not there."""
+async def joined(where: Where, patience_s: float | None = None, *, frames: bool = False) -> AsyncIterator[Link]:
+    """Join the mesh of a robot. Raises MeshError when it is not there. `frames`: it is to read them, or everything."""
     if where.profile is not None:
         from cocoro import profiles
 
@@ -128,10 +135,11 @@ async def joined(where: Where, patience_s: float | None = None) -> AsyncIterator
         config = run_dir.join_as("operator")
         if config.directory is not None and not run_dir.populated:
             raise MeshError(f"{run_dir.robot} is not up on this machine: {START}")
+    config = replace(config, shared_memory=frames)
     if patience_s is not None:
         config = replace(config, patience_s=patience_s)
     async with await ZenohBus.open(config, expect_mesh=True) as bus:
-        yield Link(run_dir, bus)
+        yield Link(run_dir, bus, private=config.directory is not None)
 
 
 async def within(timeout_s: float, condition: Callable[[], bool], changed: asyncio.Event) -> bool:

@@ -15,7 +15,7 @@ from cocoro.cli import exits
 from cocoro.cli.ending import passed, told_to_end
 from cocoro.errors import ConfigError
 from cocoro.processes import PROCESSES
-from cocoro.rundir import RunDir
+from cocoro.rundir import RunDir, folders
 
 LOOK_S = 0.2
 """How often it looks for more."""
@@ -42,14 +42,12 @@ def robot_of(robot: str | None) -> RunDir:
         if not run_dir.logs.is_dir():
             raise ConfigError(f"there are no logs of {robot} in {run_dir.logs}")
         return run_dir
-    root = default_run_dir()
-    folders = sorted(root.iterdir()) if root.is_dir() else []
-    found = [run_dir for folder in folders if (run_dir := RunDir(folder.name, root)).logs.is_dir()]
+    found = [run_dir for run_dir in folders() if run_dir.logs.is_dir()]
     up = [run_dir for run_dir in found if run_dir.populated]
     if len(up or found) == 1:
         return (up or found)[0]
     if not found:
-        raise ConfigError(f"there are no logs in {root}: no robot has been up here (`cocoro up sim`)")
+        raise ConfigError(f"there are no logs in {default_run_dir()}: no robot has been up here (`cocoro up sim`)")
     raise ConfigError(f"logs of several robots, say which: {', '.join(f'--robot {r.robot}' for r in up or found)}")
 
 

@@ -10,11 +10,12 @@ import subprocess
 import sys
 from contextlib import closing
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import msgspec
 
-from cocoro import launch, profiles
+from cocoro import launch, private, profiles
+from cocoro.bus import shared
 from cocoro.cli import exits
 from cocoro.cli.options import frames_of, latencies_of
 from cocoro.cli.output import going_on
@@ -24,6 +25,8 @@ from cocoro.rundir import RunDir, Target, robots, targets
 
 SUPERVISOR = "deploy.supervisor"
 """Loaded by name: the API knows nothing of the deployment."""
+ERRORS = "supervisor.err"
+ERRORS_BYTES = 64 * 1024
 STOP_S = 60.0
 """How long a supervisor may take to stop everything."""
 
@@ -95,9 +98,8 @@ def up_detached(profile: Profile, unattended: bool) -> int:
     run_dir = RunDir(profile.robot)
     run_dir.make()
     reader_fd, writer_fd = os.pipe()
-    errors = run_dir.logs / "supervisor.err"
     command = [sys.executable, "-P", "-m", SUPERVISOR, "--run-dir", str(run_dir.path), "--report-fd", str(writer_fd)]
-    with errors.open("wb") as stderr:
+    with _errors_file(run_dir) as stderr:
         process = subprocess.Popen(
             command + ["--unattended"] * unattended,
             stdin=subprocess.PIPE,
@@ -124,17 +126,34 @@ def up_detached(profile: Profile, unattended: bool) -> int:
             return exits.REFUSED
     if code is None:
         process.wait()
-        lines = errors.read_text(errors="replace").splitlines()
-        raise CocoroError(f"the supervisor died{f': {lines[-1]}' if lines else ''}; see {errors}")
+        raise CocoroError(f"the supervisor died{_last_error(run_dir)}")
     if code != exits.DONE:
         process.wait()
     return int(code)
+
+
+def _errors_file(run_dir: RunDir) -> IO[bytes]:
+    """Where a supervisor writes what it could not say otherwise; nowhere where nothing can be written."""
+    try:
+        return os.fdopen(private.open_file(run_dir.logs / ERRORS, os.O_CREAT | os.O_WRONLY | os.O_TRUNC), "wb")
+    except private.FullError:
+        return os.fdopen(os.open(os.devnull, os.O_WRONLY), "wb")
+
+
+def _last_error(run_dir: RunDir) -> str:
+    """What a supervisor wrote last, to be put after a sentence."""
+    try:
+        lines = private.read(run_dir.logs / ERRORS, ERRORS_BYTES).decode(errors="replace").splitlines()
+    except (FileNotFoundError, CocoroError):
+        return ""
+    return f"{f': {lines[-1]}' if lines else ''}; see {run_dir.logs / ERRORS}"
 
 
 def down(robot: str | None) -> int:
     """Stop one robot, or all that are up on this machine."""
     chosen = [RunDir(robot)] if robot is not None else [r for r in robots() if r.supervisor() or r.claims()]
     stopped = [_stop(run_dir) for run_dir in chosen]
+    shared.sweep()  # what killed processes left
     if not any(stopped):
         _say(f"{robot or 'nothing'} was not up" if robot else "nothing was up")
     return exits.DONE

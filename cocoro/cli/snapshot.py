@@ -23,7 +23,7 @@ DETECTIONS_S = 3.0
 
 async def snapshot(where: Where, out: Path) -> int:
     check(out)
-    async with joined(where) as link:
+    async with joined(where, frames=True) as link:
         camera = Snapshot(link)
         camera.open()
         print(await camera.write(out))

@@ -65,7 +65,7 @@ class Survey:
             "robot": self._link.robot,
             "profile": resolved.get("name", ""),
             "services": [
-                {"service": name, "alive": name in alive}
+                {"service": name, "alive": name in alive, "state": self._state(name, name in alive)}
                 | ({"health": msgspec.to_builtins(self._health[name])} if name in self._health else {})
                 for name in names
             ],
@@ -74,6 +74,11 @@ class Survey:
             "latch": self._told(LATCH.name),
             "base": self._told(BASE_STATE.name),
         }
+
+    def _state(self, service: str, alive: bool) -> str:
+        if not alive:
+            return self._link.unheard(service)
+        return self._health[service].state if service in self._health else "silent"
 
     def _told(self, topic: str) -> Any:
         return msgspec.to_builtins(self._newest[topic]) if topic in self._newest else None
@@ -92,16 +97,14 @@ def _print(report: dict[str, Any]) -> None:
     for service in report["services"]:
         health = service.get("health")
         if health is None:
-            state = "silent" if service["alive"] else "not alive"
-            rows.append((service["service"], state, "", "", "", "", ""))
+            rows.append((service["service"], service["state"], "", "", "", "", ""))
             continue
-        state = health["state"] if service["alive"] else "not alive"
         text = "; ".join(filter(None, (health["text"], *health["faults"])))
         loop = max(health["loops"], key=lambda loop: loop["rate_hz"], default=None)
         rows.append(
             (
                 service["service"],
-                state,
+                service["state"],
                 str(health["pid"]),
                 f"{100 * health['cpu_share']:.0f}%",
                 f"{health['rss_mb']:.0f} MB",

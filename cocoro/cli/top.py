@@ -125,7 +125,7 @@ class Watch:
             "service": name,
             "process": row.name if row is not None else name,
             "alive": alive,
-            "state": "not alive" if not alive else "silent" if hangs else health.state if health else "",
+            "state": self._link.unheard(name) if not alive else "silent" if hangs else health.state if health else "",
             "silent_s": silent_s,
             "cpu_budget": None if row is None else row.cpu_share,
             "rss_budget_mb": None if row is None else row.rss_mb,

@@ -79,6 +79,9 @@ def _headline(report: dict[str, Any]) -> Text:
 # --- services -------------------------------------------------------------------------------------
 
 
+BAD_STATES = ("not alive", "no contact", "silent")
+
+
 def _services(services: list[dict[str, Any]]) -> Table:
     table = Table(box=None, pad_edge=False, header_style=FAINT)
     for head, right in (
@@ -94,7 +97,7 @@ def _services(services: list[dict[str, Any]]) -> Table:
 
 def _service(service: dict[str, Any], shown: dict[int, str]) -> list[RenderableType]:
     health = service["health"]
-    style = BAD if service["state"] in ("not alive", "silent") else GOOD if service["state"] == "ready" else DOUBTFUL
+    style = BAD if service["state"] in BAD_STATES else GOOD if service["state"] == "ready" else DOUBTFUL
     state = Text(service["state"] or "?", style)
     if health is None:
         return [service["service"], state, *[""] * 9]
@@ -113,7 +116,7 @@ def _service(service: dict[str, Any], shown: dict[int, str]) -> list[RenderableT
             _cost(100 * health["cpu_share"], 100 * (service["cpu_budget"] or 0), "%"),
             _cost(health["rss_mb"], service["rss_budget_mb"] or 0, " MB"),
         ]
-    dead = not service["alive"]
+    dead = service["state"] == "not alive"
     row = [
         service["service"], state, *costs,
         "" if loop is None else f"{loop['rate_hz']:.1f} Hz",
@@ -122,7 +125,9 @@ def _service(service: dict[str, Any], shown: dict[int, str]) -> list[RenderableT
         "" if loop is None else str(loop["overruns"]),
         _duration(health["uptime_s"]), text,
     ]  # fmt: skip
-    return [row[0], row[1], *[""] * 8, Text(f"was {pid}", FAINT)] if dead else row
+    return (
+        [row[0], row[1], *[""] * 8, Text(f"{'was' if dead else 'pid'} {pid}", FAINT)] if not service["alive"] else row
+    )
 
 
 def _cost(value: float, budget: float, unit: str) -> Text:

@@ -61,7 +61,7 @@ class BaseDriver:
     # --- commands -----------------------------------------------------------------------------------
 
     def command(self, command: BaseCommand, now_ns: int) -> None:
-        """Take wheel speeds; they count from when they were said."""
+        """Take wheel speeds; they count from when they were said, the faster the shorter (`Base.patience_s`)."""
         if self.latch != "released" or not is_fresh(command.stamp_ns, now_ns, BASE_COMMAND.max_age_s):
             return
         limit_mmps = self._base.max_wheel_speed_mps * 1000.0
@@ -70,7 +70,8 @@ class BaseDriver:
             for speed_mps in (command.left_mps, command.right_mps)
         )
         self._wanted_mmps = left, right
-        self._until_ns = min(command.stamp_ns, now_ns) + self._timeout_ns
+        patience_s = self._base.patience_s(max(abs(left), abs(right)) / 1000.0)
+        self._until_ns = min(command.stamp_ns, now_ns) + round(patience_s * NS)
 
     def set_latch(self, state: LatchState) -> None:
         """Latched and unknown stop the wheels; a command from before counts no more after the release. From any

@@ -6,7 +6,6 @@ import asyncio
 import base64
 import json
 import platform
-import time
 from contextlib import suppress
 from datetime import UTC, datetime
 from typing import Any
@@ -16,15 +15,17 @@ import msgspec
 from cocoro.about import about, versions
 from cocoro.bus.base import Handle, Heard, Payload
 from cocoro.capture.keys import ALIVE_INFO, Alive, Choice, KeyInfo
+from cocoro.capture.log_clock import WALL_CLOCK, LogClock, words
+from cocoro.capture.whereabouts import told
 from cocoro.capture.writer import Entry, Missing
-from cocoro.clock import FollowedClock, VirtualClock
+from cocoro.clock import NS, FollowedClock
 from cocoro.errors import MeshError, RemoteError
-from cocoro.messages import AboutReply, AboutRequest, Clock, Recording
+from cocoro.messages import AboutReply, AboutRequest, Clock, DisturbedFile, Recording
 from cocoro.node import Node
 from cocoro.rundir import RunDir
 from cocoro.tokens import alive_key, recorder_key
 from cocoro.topics import ABOUT, CLOCK, RECORDING
-from services.capture.sink import Sink
+from services.capture.sink import Progress, Sink
 
 TELL_S = 1.0
 """How often the recorder tells how it is getting on."""
@@ -33,7 +34,7 @@ TRIES, ASK_AGAIN_S = 10, 1.0
 LISTEN_S = 0.02
 """How often what was heard is fetched; each message is stamped when it comes in."""
 LOOK_S = 0.1
-"""How often it looks whether a fault has come up."""
+"""How often it looks whether a fault has come up, and whether somebody has set the wall clock."""
 
 
 class Head(msgspec.Struct, gc=False):
@@ -84,12 +85,15 @@ class Ledger:
 
 
 class Recorder:
-    """`start` it, and `tell` for ever; `close` takes its ears off the mesh."""
+    """`start` it, and `tell` for ever; `close` takes its ears off the mesh, and `end` says how it went."""
 
-    def __init__(self, node: Node, ledger: Ledger, sink: Sink) -> None:
+    def __init__(self, node: Node, ledger: Ledger, sink: Sink, log_clock: LogClock | None) -> None:
+        """Without `log_clock`, log times are the node's (virtual) time."""
         self._node = node
         self._ledger = ledger
         self._sink = sink
+        self._log_clock = log_clock
+        self._disturbed: tuple[DisturbedFile, ...] = ()
         self._handles: list[Handle] = []
         self._head = msgspec.msgpack.Decoder(Head)
         self._clock: FollowedClock | None = None
@@ -97,7 +101,6 @@ class Recorder:
         self._time = msgspec.msgpack.Decoder(Clock)
         self._newest_ns = 0
         self._alive: dict[str, bool] = {}
-        self._virtual = isinstance(node.clock, VirtualClock)
 
     def start(self) -> None:
         robot, bus = self._node.robot_name, self._node.bus
@@ -119,15 +122,45 @@ class Recorder:
         loop = asyncio.get_running_loop()
         while True:
             progress = self._sink.progress()
-            if progress.fault != fault:
+            if progress.fault != fault or progress.disturbed != self._disturbed:
                 fault, told_s = progress.fault, -TELL_S
-                self._node.log.error("%s", fault)
-                self._node.faults = (fault,)
-                self._node.degraded("not recording")
+                self._complain(progress)
+            self._look_at_clock()
             if loop.time() - told_s >= TELL_S:
                 told_s = loop.time()
                 self.say(ended=False)
             await asyncio.sleep(LOOK_S)
+
+    def end(self) -> None:
+        """Say how it went, when the sink has been closed."""
+        progress = self._sink.progress()
+        if progress.disturbed != self._disturbed:
+            self._complain(progress)
+        self._node.log.info(
+            "%d messages are recorded, the last of them in %s", progress.messages, progress.file or "no file"
+        )
+        self.say(ended=True)
+
+    def _complain(self, progress: Progress) -> None:
+        """Have it known what is wrong, or has been."""
+        for file in progress.disturbed:
+            if file not in self._disturbed:
+                self._node.log.error("%s", told(file))
+        if progress.fault:
+            self._node.log.error("%s", progress.fault)
+        self._disturbed = progress.disturbed
+        self._node.faults = (*filter(None, (progress.fault,)), *map(told, progress.disturbed))
+        if progress.fault:
+            self._node.degraded("not recording")
+        elif progress.removed:
+            self._node.degraded("messages are lost")
+
+    def _look_at_clock(self) -> None:
+        """Note in the capture, and say, when somebody has set the wall clock."""
+        step = None if self._log_clock is None else self._log_clock.look()
+        if step is not None and self._log_clock is not None:
+            self._node.log.warning("the wall clock was %s: log times go on as if it had not been", words(step))
+            self._sink.remember(WALL_CLOCK, self._log_clock.metadata())
 
     def say(self, ended: bool) -> None:
         """Say once how it goes, or how it went."""
@@ -168,7 +201,7 @@ class Recorder:
             message = Alive(alive=alive, seq=source.heard, stamp_ns=self._node.now_ns())
             source.heard += 1
             data = msgspec.msgpack.encode(message)
-            self._put(source, key, message.seq, message.stamp_ns, data, ALIVE_INFO, time.time_ns())
+            self._put(source, key, message.seq, message.stamp_ns, data, ALIVE_INFO, None)
         _, _, rest = key.partition("/")
         service, _, what = rest.partition("/")
         if alive and what == "alive" and service != self._node.name:
@@ -182,13 +215,18 @@ class Recorder:
         stamp_ns: int,
         payload: Payload,
         info: KeyInfo | None,
-        heard_ns: int,
+        heard_ns: int | None,
     ) -> None:
-        # When it was heard; each later than the last, so that the order can be told by it.
-        log_ns = self._newest_ns = max(self._node.now_ns() if self._virtual else heard_ns, self._newest_ns + 1)
+        # When it was heard (None is now); each later than the last, so that the order can be told by it.
+        log_ns = self._newest_ns = max(self._log_ns(heard_ns), self._newest_ns + 1)
         data = payload if isinstance(payload, bytes) else bytes(payload)
         if not self._sink.offer(Entry(key, sequence, log_ns, stamp_ns or log_ns, data, info)):
             source.dropped += 1
+
+    def _log_ns(self, heard_ns: int | None) -> int:
+        if self._log_clock is None:
+            return self._node.now_ns()
+        return self._log_clock.now_ns() if heard_ns is None else self._log_clock.at(heard_ns)
 
     # --- what is known besides --------------------------------------------------------------------
 
@@ -211,19 +249,21 @@ class Recorder:
         self._node.log.warning("%s does not say what it was started with", service)
 
     def _remember_run(self) -> None:
-        node = self._node
-        started = {} if self._virtual else {"started": datetime.now(UTC).isoformat(), "host": platform.node()}
+        node, clock = self._node, self._log_clock
+        started = {}
+        if clock is not None:
+            started = {"started": datetime.fromtimestamp(clock.now_ns() / NS, UTC).isoformat(), "host": platform.node()}
         run = {
             "robot": node.robot_name,
             "recorder": node.name,
-            "log_clock": "robot" if self._virtual else "unix",
+            "log_clock": "robot" if clock is None else "unix",
             "versions": json.dumps(versions()),
             **started,
         }
         self._sink.remember("run", run)
         self._sink.remember("robot", {"description": json.dumps(node.robot.to_data())})
         self._sink.remember(f"service/{node.name}", _entries(about(node)))
-        profile = {} if self._virtual else RunDir(node.robot_name).resolved()
+        profile = {} if clock is None else RunDir(node.robot_name).resolved()
         if profile:
             self._sink.remember("profile", {"profile": json.dumps(profile)})
 

@@ -11,10 +11,11 @@ from pathlib import Path
 
 from cocoro.capture.compression import Packer
 from cocoro.capture.keys import Choice, info_of
+from cocoro.capture.log_clock import LogClock
 from cocoro.capture.pictures import lossy
 from cocoro.capture.retention import file_name, make_room
 from cocoro.capture.writer import MB, Limits, Writer, sync_and_close
-from cocoro.clock import VirtualClock
+from cocoro.clock import NS, VirtualClock
 from cocoro.node import Node
 from services.capture.config import Config, folder_of
 from services.capture.recorder import Ledger, Recorder
@@ -23,16 +24,23 @@ from services.capture.sink import DirectSink, ThreadedSink
 __all__ = ["Config", "run"]
 
 
-async def run(node: Node, config: Config) -> None:
-    """Record until cancelled. A disk that does not take it is a fault that the mesh hears of, not the end."""
+async def run(node: Node, config: Config, log_clock: LogClock | None = None) -> None:
+    """Record until cancelled. A disk that does not take it is a fault that the mesh hears of, not the end. `log_clock`
+    is of use in real time alone, and made when there is none."""
     ledger = Ledger(Choice(node.robot_name, config.only, config.without))
-    make = partial(_writer, node.robot_name, config, ledger)
+    virtual = isinstance(node.clock, VirtualClock)
+    if virtual:
+        log_clock = None
+    elif log_clock is None:
+        log_clock = LogClock()
+    started = datetime.now(UTC) if log_clock is None else datetime.fromtimestamp(log_clock.now_ns() / NS, UTC)
+    make = partial(_writer, node.robot_name, config, ledger, started)
     sink: ThreadedSink | DirectSink
-    if isinstance(node.clock, VirtualClock):
+    if virtual:
         sink = DirectSink(make, config.flush_s)
     else:
         sink = ThreadedSink(make, round(config.memory_mb * MB), config.flush_s, config.sync_s)
-    recorder = Recorder(node, ledger, sink)
+    recorder = Recorder(node, ledger, sink, log_clock)
     try:
         recorder.start()
         node.ready()
@@ -43,15 +51,17 @@ async def run(node: Node, config: Config) -> None:
             await asyncio.to_thread(sink.close)
         else:
             sink.close()
-        recorder.say(ended=True)
+        recorder.end()
 
 
-def _writer(robot: str, config: Config, ledger: Ledger, release: Callable[[int], None] | None) -> Writer:
+def _writer(
+    robot: str, config: Config, ledger: Ledger, started: datetime, release: Callable[[int], None] | None
+) -> Writer:
     limits = Limits(min_free_bytes=round(config.min_free_mb * MB))
     if config.file is None:
         limits = replace(limits, file_bytes=config.rotate_mb * MB, file_s=config.rotate_s)
     return Writer(
-        _place(robot, config),
+        _place(robot, config, started),
         Packer(config.compression, config.level),
         limits,
         lambda key, payload: info_of(key, robot, payload),
@@ -61,19 +71,18 @@ def _writer(robot: str, config: Config, ledger: Ledger, release: Callable[[int],
     )
 
 
-def _place(robot: str, config: Config) -> Callable[[int], Path]:
+def _place(robot: str, config: Config, started: datetime) -> Callable[[int], Path]:
     """Where the nth file goes."""
     if config.file is not None:
         path = Path(config.file)
         return lambda _: path
     folder = folder_of(config)
-    started = datetime.now(UTC)
     while (folder / file_name(robot, started, 1)).exists():
         started += timedelta(seconds=1)
 
     def place(number: int) -> Path:
         if config.keep_gb is not None:
-            make_room(folder, robot, round(config.keep_gb * 1000 * MB))
+            make_room(folder, robot, round(config.keep_gb * 1000 * MB), started)
         return folder / file_name(robot, started, number)
 
     return place

@@ -14,6 +14,7 @@ from typing import NamedTuple, Protocol
 from cocoro.capture.errors import CaptureError
 from cocoro.capture.file import LARGE_BYTES
 from cocoro.capture.writer import Entry, Writer
+from cocoro.messages import DisturbedFile
 
 log = logging.getLogger(__name__)
 
@@ -32,6 +33,8 @@ class Progress(NamedTuple):
     longest_sync_ms: float = 0.0
     fault: str = ""
     """Why nothing is written any more."""
+    disturbed: tuple[DisturbedFile, ...] = ()
+    removed: int = 0
 
 
 class Sink(Protocol):
@@ -263,11 +266,13 @@ def _progress(writer: Writer | None, waiting_bytes: int, longest_sync_ms: float,
     if writer is None:
         return Progress(waiting_bytes=waiting_bytes, fault=fault)
     return Progress(
-        file=str(writer.file.path),
+        file=writer.where,
         messages=writer.messages,
         size_bytes=writer.size_bytes,
         raw_bytes=writer.raw_bytes,
         waiting_bytes=waiting_bytes,
         longest_sync_ms=longest_sync_ms,
         fault=fault,
+        disturbed=writer.disturbed,
+        removed=writer.removed,
     )

@@ -11,6 +11,7 @@ from cocoro.clock import NS
 from cocoro.messages import (
     BaseState,
     CancelRequest,
+    Health,
     KnownObject,
     ObjectsReply,
     ObjectsRequest,
@@ -29,6 +30,8 @@ from services.executive.skills import PlannerSkills, Skills, TaskFailedError
 from services.executive.tasks import babble_arm, babble_wheels, fetch, follow, go_to, park, put_down, touch
 
 Task = Callable[[Skills, TaskRequest, Config], Awaitable[None]]
+Ending = tuple[Outcome, str | Awaitable[str]]
+"""A task's outcome and its reason, which may not be known yet when the outcome is."""
 _CLOCK_STANDS_S = 1.0
 """When 20 ms of the clock take longer than this, it stands still."""
 _VERY_LONG_S = 86_400.0
@@ -50,8 +53,10 @@ class Executive:
         self._config = config
         self._catalogue = catalogue
         self._alive: set[str] = set()
+        self._unreadable: dict[str, str] = {}
+        """By service, what it cannot read and why."""
         self._running: asyncio.Task[Any] | None = None
-        self._ended: asyncio.Future[tuple[Outcome, str]] | None = None
+        self._ended: asyncio.Future[Ending] | None = None
         """Of the running task: gets its outcome when something outside of it ends it."""
         self._count = 0
         self.state = TaskState()
@@ -60,6 +65,7 @@ class Executive:
         self._skills = PlannerSkills(node, self._enter_phase, config.intent_hz, config.planner_silence_s)
         self._estop = Estop(node, config.latch_hz, self._on_latch)
         node.watch_alive(self._on_alive)
+        node.on(topics.HEALTH, self._on_health, service="*")
         node.serve(topics.RUN, self._run)
         node.serve(topics.CANCEL, self._cancel)
         node.serve(topics.OBJECTS, self._objects)
@@ -102,7 +108,9 @@ class Executive:
             return "estop", f"the emergency stop is {self._estop.words}; release it first (cocoro reset)"
         missing = [service for service in self._config.needed if service not in self._alive]
         if missing:
-            return "not_alive", f"not alive: {', '.join(missing)}; see cocoro status"
+            return "not_alive", f"{self._what_of(missing)}; see cocoro status"
+        if self._unreadable:
+            return "not_alive", f"{next(iter(self._unreadable.values()))}; see cocoro status"
         if self._node.clock.stands:  # and what was heard last would seem fresh for as long as it does
             return "not_alive", "the clock stands still; see cocoro status"
         battery = self._base.value.battery_fraction if self._base.value is not None else 1.0
@@ -118,6 +126,13 @@ class Executive:
         if request.task == "put-down" and not status.holding:
             return "not_holding", "the hand holds nothing"
         return None
+
+    def _what_of(self, missing: list[str]) -> str:
+        """What can be said of services that are not heard."""
+        dead = [service for service in missing if self._node.contact.dead(service)]
+        unheard = [service for service in missing if service not in dead]
+        texts = ((f"not alive: {', '.join(dead)}", dead), (f"no contact with {', '.join(unheard)}", unheard))
+        return "; ".join(text for text, services in texts if services)
 
     def _radius_m(self, label: str) -> float:
         """From a known object's centre to its edge, over the floor."""
@@ -148,7 +163,7 @@ class Executive:
 
     # --- the running task -------------------------------------------------------------------------
 
-    async def _carry_out(self, request: TaskRequest, ended: asyncio.Future[tuple[Outcome, str]]) -> None:
+    async def _carry_out(self, request: TaskRequest, ended: asyncio.Future[Ending]) -> None:
         """From the request to the outcome. What ends it from outside says so by `ended` and never cancels this
         coroutine, so that every task comes to its end, whenever that happens."""
         timeout_s = request.timeout_s or self._config.task_timeout_s
@@ -160,6 +175,8 @@ class Executive:
         self._skills.want("idle", "", self.state.task_id)
         work = asyncio.ensure_future(TASKS[request.task](self._skills, request, self._config))
         timer = asyncio.ensure_future(self._node.sleep(timeout_s))
+        outcome: Outcome
+        reason: str | Awaitable[str]
         try:
             await asyncio.wait((ended, work, timer), return_when=asyncio.FIRST_COMPLETED)
             if ended.done():
@@ -177,7 +194,7 @@ class Executive:
             timer.cancel()
             self._skills.want("idle", "", self.state.task_id)
         await self._come_to_rest()
-        self._finish(outcome, reason)
+        self._finish(outcome, reason if isinstance(reason, str) else await reason)
 
     def _outcome_of(self, work: asyncio.Future[None]) -> tuple[Outcome, str]:
         """Of a task's function that has ended."""
@@ -217,10 +234,10 @@ class Executive:
         self._node.log.info("%s %s %s", self._what(), outcome, reason)
         self._publish()
 
-    def _end(self, outcome: Outcome, reason: str) -> None:
-        """End the running task from outside."""
+    def _end(self, outcome: Outcome, reason: str | Callable[[], Awaitable[str]]) -> None:
+        """End the running task from outside. Its reason may be found out while it ends."""
         if self._running is not None and self._ended is not None and not self._ended.done():
-            self._ended.set_result((outcome, reason))
+            self._ended.set_result((outcome, reason if isinstance(reason, str) else reason()))
 
     def _what(self) -> str:
         return " ".join(filter(None, (self.state.task, self.state.label)))
@@ -232,8 +249,23 @@ class Executive:
             self._alive.add(service)
             return
         self._alive.discard(service)
+        self._unreadable.pop(service, None)
         if service in self._config.needed:
-            self._end("failed", f"not_alive: {service} died")
+            self._end("failed", lambda: self._node.spawn(self._lost(service)))
+
+    async def _lost(self, service: str) -> str:
+        return f"not_alive: {await self._node.contact.lost(service)}"
+
+    def _on_health(self, health: Health) -> None:
+        """A service that can no longer read what it acts on is no better than a dead one; and it knows why."""
+        if health.service not in (*self._config.needed, self._node.name):
+            return
+        fault = next((topic.fault for topic in health.topics if topic.unreadable), None)
+        if fault is None:
+            self._unreadable.pop(health.service, None)
+            return
+        self._unreadable[health.service] = f"{health.service} cannot read {fault}"
+        self._end("failed", f"unreadable: {self._unreadable[health.service]}")
 
     def _on_latch(self, latched: bool, by: str) -> None:
         if latched:

@@ -166,12 +166,9 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     arm: Arm = Arm()
     hand: Hand = Hand()
     follow: Follow = Follow()
-    hesitate_s: Positive = 0.12
-    """An executive that is silent for longer may be dead: the wheels stand until it speaks again, or for good."""
-    blind_s: Positive = 0.12
-    """The same for perception, of which nothing is heard for longer than this and than `blind_periods`."""
     blind_periods: Positive = 2.0
-    """As many of its own periods perception may be silent: one that is slow may be silent for longer."""
+    """As many of its own periods perception may be silent where that is longer than `Base.command_timeout_s`: one that
+    is slow may be silent for longer."""
     blind_for_good_s: Positive = 5.0
     """What needs to see fails when perception has been silent for so much longer than that."""
     odometry_gap_s: Positive = 0.1

@@ -32,7 +32,7 @@ class PlanningCore:
 
     def __init__(self, robot: Robot, config: Config) -> None:
         self._config = config
-        self._senses = Senses(config, robot.joints)
+        self._senses = Senses(config, robot)
         self._limbs = Limbs(robot, config)
         self._intent = Intent()
         self._behaviour: Behaviour = Idle()
@@ -83,7 +83,11 @@ class PlanningCore:
         self._follow_intent(now_ns)
         missing, hand, body = self._senses.missing(now_ns), self._senses.hand, self._senses.body()
         if missing or hand is None or body is None:
-            return self._halt(missing or "no odometry yet", now_ns)
+            # Zero, and not silence, which the base would take for a word that is yet to come.
+            return [
+                Output(topics.BASE_COMMAND, BaseCommand(left_mps=0.0, right_mps=0.0)),
+                *self._halt(missing or "no odometry yet", now_ns),
+            ]
         self._limbs.grip.feel(hand, now_ns)
         latched = self._senses.latched()
         if latched:
@@ -146,11 +150,27 @@ class PlanningCore:
                 self._ended.distance_m,
             )
         plan = self._blind(scene) or self._behaviour.step(scene)
-        if self._senses.intent_age_s(scene.now_ns) > self._config.hesitate_s:
-            plan.base, plan.why = self._limbs.driver.halt(), "standing still: the executive is silent"
+        self._slow_down(plan, scene)
         if plan.state != "running" and not isinstance(self._behaviour, Idle):
             self._ended = plan
         return plan
+
+    def _slow_down(self, plan: Plan, scene: Scene) -> None:
+        """Drive no faster than from where the wheels stand in time if whoever was heard the longest ago is gone: one
+        that is late makes the robot slower, one that is silent makes it stand."""
+        if self._config.coordination == "lockstep":  # where everyone waits for everyone, and no deadman is either
+            return
+        driver, base = self._limbs.driver, self._limbs.robot.base
+        needs_sight = self._intent.behaviour in _NEED_SIGHT
+        who, age_s = self._senses.oldest(scene.now_ns, sight=needs_sight)
+        if self._senses.intent_age_s(scene.now_ns) > base.command_timeout_s:
+            plan.base, plan.why = driver.pause(scene.dt_s), "standing still: the executive is silent"
+            return
+        # What is commanded now is for the time until the next step.
+        limit_mps = base.speed_at_age_mps(age_s + 1.0 / self._config.rate_hz)
+        slower = driver.within(plan.base, limit_mps)
+        if slower is not plan.base:
+            plan.base, plan.why = slower, f"slower, for {who} is late; {plan.why}"
 
     def _blind(self, scene: Scene) -> Plan | None:
         """What is done while perception is silent by what needs to see: nothing, and that for so long only. What it
@@ -160,7 +180,7 @@ class PlanningCore:
         blind_s = self._senses.blind_s(scene.now_ns)
         if blind_s is None:
             return None
-        plan = Plan(scene.limbs.driver.halt(), scene.still(), "standing still: perception is silent")
+        plan = Plan(scene.limbs.driver.pause(scene.dt_s), scene.still(), "standing still: perception is silent")
         if blind_s > self._config.blind_for_good_s:
             plan.state, plan.reason = "failed", "stale"
         return plan

@@ -119,6 +119,27 @@ class Driver:
             left, right = left / excess, right / excess
         return BaseCommand(left_mps=left, right_mps=right)
 
+    def within(self, command: BaseCommand, limit_mps: float) -> BaseCommand:
+        """A command made slower, on the same arc, until no wheel is faster than a limit; it goes on from there."""
+        faster_mps = max(abs(command.left_mps), abs(command.right_mps))
+        if faster_mps <= limit_mps:
+            return command
+        share = limit_mps / faster_mps
+        self._speed_mps *= share
+        self._turn_radps *= share
+        return BaseCommand(left_mps=share * command.left_mps, right_mps=share * command.right_mps)
+
+    def pause(self, dt_s: float) -> BaseCommand:
+        """Zero, for as long as somebody is silent; then it goes on from what the base's own ramp has left of its speed
+        by then."""
+        half = self._turn_radps * self._separation_m / 2
+        faster_mps = max(abs(self._speed_mps - half), abs(self._speed_mps + half))
+        left_mps = max(faster_mps - self._base.wheel_acceleration_mps2 * dt_s, 0.0)
+        share = left_mps / faster_mps if faster_mps > 0.0 else 0.0
+        self._speed_mps *= share
+        self._turn_radps *= share
+        return BaseCommand(left_mps=0.0, right_mps=0.0)
+
     def halt(self) -> BaseCommand:
         """Zero at once: the base's own ramp is all that there is between this and standing."""
         self.reset()

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from itertools import compress
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -17,6 +17,7 @@ from cocoro.history import History
 from cocoro.kinematics import Array
 from cocoro.learning.eye import Eye
 from cocoro.messages import BaseState, Detection, Detections, Intent, Message, Obstacles, ServoState, Vec3
+from cocoro.robot import Robot
 from cocoro.topics import Topic
 from services.planning.config import Config
 from services.planning.memory import TargetMemory
@@ -32,9 +33,10 @@ for such an eye is likely to be rolled a little, too."""
 class Sight:
     """Whether perception lives, by when it is heard: also when it sees nothing, and however slow it is."""
 
-    def __init__(self, config: Config) -> None:
-        self._least_ns = round(config.blind_s * NS)
-        self._periods = config.blind_periods
+    def __init__(self, least_s: float, periods: float) -> None:
+        """It may be silent for `least_s`, and for as many of its own periods where that is longer."""
+        self._least_ns = round(least_s * NS)
+        self._periods = periods
         self._heard_ns: int | None = None
         self._gaps_ns: deque[int] = deque(maxlen=5)
         self._blind_since_ns: int | None = None
@@ -53,6 +55,12 @@ class Sight:
         if self._blind_since_ns is None or now_ns < self._blind_since_ns:
             self._blind_since_ns = now_ns
         return (now_ns - self._blind_since_ns) / NS
+
+    def age_s(self, now_ns: int) -> float:
+        """Since it was heard; of one that is slow, less by what it may be silent for longer than others."""
+        if self._heard_ns is None or now_ns < self._heard_ns:
+            return float("inf")
+        return max(now_ns - self._heard_ns - (self._patience_ns() - self._least_ns), 0) / NS
 
     def _patience_ns(self) -> int:
         # The median: neither one pause nor two messages at once say how fast it is.
@@ -74,8 +82,8 @@ class Sighting(NamedTuple):
 class Senses:
     """Takes every input of the planner; answers by time."""
 
-    def __init__(self, config: Config, joints: Iterable[str]) -> None:
-        self._joints = tuple(joints)
+    def __init__(self, config: Config, robot: Robot) -> None:
+        self._joints = tuple(robot.joints)
         self.memory = TargetMemory(config.memory)
         self.base: BaseState | None = None
         self.arm: ServoState | None = None
@@ -92,7 +100,9 @@ class Senses:
         self.sight_lag_s = 0.0
         """How old a sighting is when the next one comes, smoothed: a fast perception makes it small."""
         self._looked_ns: int | None = None
-        self._sight = Sight(config)
+        self._said_ns: dict[str, int] = {}
+        """Per topic, when its newest message was said."""
+        self._sight = Sight(robot.base.command_timeout_s, config.blind_periods)
         self.turning = Turning()
         self.eye: Eye | None = None
         """Where it is known to be tilted: what it sees standing on the floor may be the floor."""
@@ -100,6 +110,7 @@ class Senses:
         self._sightings: list[Sighting] = []
 
     def take(self, topic: Topic[Message], message: Message, now_ns: int) -> None:
+        self._said_ns[topic.name] = min(message.stamp_ns, now_ns)
         if isinstance(message, BaseState):
             self.base = message
             resets = self._odometry.resets
@@ -242,9 +253,26 @@ class Senses:
         """For how long perception has been silent for longer than it may be; None while it is not."""
         return self._sight.blind_s(now_ns)
 
+    def _age_s(self, topic: Topic[Any], now_ns: int) -> float:
+        """Since the newest of a topic was said: by its stamp, but where that is ahead of our clock by when it came."""
+        said_ns = self._said_ns.get(topic.name)
+        # What was said later than now was said before the clock began anew.
+        return (now_ns - said_ns) / NS if said_ns is not None and said_ns <= now_ns else float("inf")
+
     def intent_age_s(self, now_ns: int) -> float:
         """Since the executive last said what it wants."""
-        return (now_ns - self.intent.stamp_ns) / NS if self.intent is not None else float("inf")
+        return self._age_s(topics.INTENT, now_ns)
+
+    def oldest(self, now_ns: int, *, sight: bool) -> tuple[str, float]:
+        """Who of those whom driving depends on was heard the longest ago, and how long ago, seconds; perception is
+        among them with `sight`."""
+        ages = {"the executive": self.intent_age_s(now_ns)}
+        for topic in (topics.BASE_STATE, topics.ARM_STATE, topics.HAND_STATE):
+            ages[topic.publisher] = self._age_s(topic, now_ns)
+        if sight:
+            ages["perception"] = self._sight.age_s(now_ns)
+        who = max(ages, key=ages.__getitem__)
+        return who, ages[who]
 
     def fresh_intent(self, now_ns: int) -> Intent | None:
         if self.intent is None or not is_fresh(self.intent.stamp_ns, now_ns, topics.INTENT.max_age_s):

@@ -9,6 +9,8 @@ import tty
 from contextlib import suppress
 from pathlib import Path
 
+from cocoro import private
+
 BAUDS = {
     getattr(termios, f"B{baud}"): baud
     for baud in (300, 1200, 2400, 4800, 9600, 19200, 38400, 57600, 115200, 230400, 500000, 1000000, 2000000)
@@ -31,11 +33,12 @@ class Port:
         tty.setraw(theirs)
         os.set_blocking(ours, False)
         self._ends = ours, theirs  # theirs stays open, or the first reader's leaving would look like unplugging
-        self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        fresh = self.path.with_name(f".{self.path.name}.{os.getpid()}")
-        fresh.unlink(missing_ok=True)
-        fresh.symlink_to(os.ttyname(theirs))
-        fresh.replace(self.path)
+        fresh = f".{self.path.name}.{os.getpid()}"
+        with private.directory(self.path.parent, make=True) as folder:
+            with suppress(FileNotFoundError):
+                os.unlink(fresh, dir_fd=folder)
+            os.symlink(os.ttyname(theirs), fresh, dir_fd=folder)
+            os.replace(fresh, self.path.name, src_dir_fd=folder, dst_dir_fd=folder)
 
     def unplug(self) -> None:
         """Pull the adapter out: who has the port open sees it hang up."""

@@ -23,7 +23,7 @@ from cocoro.capture.export.outfile import making
 from cocoro.capture.export.story import catalogue_of, robot_of
 from cocoro.capture.keys import JSON, KeyInfo
 from cocoro.capture.reader import Capture, Record
-from cocoro.capture.schema import TypeSchema
+from cocoro.capture.rewrite import info_in
 from cocoro.capture.types import NotReadableError
 from cocoro.capture.writer import Entry, Limits, Writer
 from cocoro.clock import NS
@@ -54,10 +54,12 @@ TRUE = fg.Color(0.2, 0.9, 0.3, 0.45)
 
 
 class Said(NamedTuple):
-    """What is written of a message."""
+    """One message of the new file."""
 
     topic: str
     message: msgspec.Struct | dict[str, Any]
+    channel: int | None = None
+    """The recorded one; None where it is told in Foxglove's own terms."""
 
 
 def export(capture: Capture, out: Path, progress: Callable[[float], None] = lambda _: None) -> int:
@@ -68,12 +70,12 @@ def export(capture: Capture, out: Path, progress: Callable[[float], None] = lamb
 
 def _export(capture: Capture, out: Path, progress: Callable[[float], None]) -> int:
     translator = Translator(capture)
-    writer = Writer(lambda _: out, Packer("zstd"), Limits(), lambda key, _: translator.info(key))
+    writer = Writer(lambda _: out, Packer("zstd"), Limits(), lambda *_: KeyInfo(JSON, None, {}))
     newest_ns = 0
     for stamp_ns, said in _by_stamp(capture, translator, progress):
         newest_ns = max(newest_ns, stamp_ns)
         payload = msgspec.json.encode(said.message)
-        writer.put(Entry(said.topic, 0, newest_ns, newest_ns, payload, translator.info_of(said)))
+        writer.put(Entry(said.topic, 0, newest_ns, newest_ns, payload, translator.info_of(said), said.channel))
     writer.close()
     return writer.messages
 
@@ -131,17 +133,13 @@ class Translator:
         except DamageError:
             return
         if isinstance(plain, dict):
-            yield Said(record.key, _for_json(plain))
+            yield Said(record.key, _for_json(plain), record.channel)
 
     def info_of(self, said: Said) -> KeyInfo:
-        if isinstance(said.message, dict):
-            return self.info(said.topic)
+        """A recorded channel keeps its own schema; its bytes are given by their number."""
+        if said.channel is not None:
+            return info_in(self._capture, said.channel)._replace(encoding=JSON, metadata={})
         return KeyInfo(JSON, fg.schema_of(type(said.message)), {})
-
-    def info(self, key: str) -> KeyInfo:
-        """Of a recorded key: its own schema, bytes given by their number."""
-        schema = self._capture.schema(key) if key in self._capture.keys else None
-        return KeyInfo(JSON, None if schema is None else TypeSchema(schema.name, schema.encoding, schema.data), {})
 
     # --- what is shown ----------------------------------------------------------------------------
 

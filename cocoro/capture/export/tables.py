@@ -25,13 +25,17 @@ class Sink(Protocol):
 
 
 def export(capture: Capture, sink: Sink) -> list[str]:
-    """Write a table for each key that has any messages of maps, one for each list of maps in it, and `belief` where
-    the simulator's truth was recorded. Returns their names. Raises CaptureError when it cannot be written."""
+    """Write a table for each key that has any messages of maps (for each channel of it, where it has several), one for
+    each list of maps in it, and `belief` where the simulator's truth was recorded. Returns their names. Raises
+    CaptureError when it cannot be written."""
     written = []
-    for key in sorted(capture.keys):
-        tables = _tables(capture, key)
+    for channel in (id for _, ids in sorted(capture.keys.items()) for id in ids):
+        key = capture.channels[channel].topic
+        number = f"#{channel}" if len(capture.keys[key]) > 1 else ""
+        tables = _tables(capture, channel)
         for part, rows in tables.items():
-            name = ".".join(filter(None, (key.removeprefix(f"{capture.robot}/").replace("/", "_"), part)))
+            head = key.removeprefix(f"{capture.robot}/").strip("/").replace("/", "_")
+            name = ".".join(filter(None, (f"{head}{number}", part)))
             sink.write(name, rows)
             written.append(name)
     aligned = list(beliefs(capture))
@@ -41,10 +45,10 @@ def export(capture: Capture, sink: Sink) -> list[str]:
     return written
 
 
-def _tables(capture: Capture, key: str) -> dict[str, list[Row]]:
+def _tables(capture: Capture, channel: int) -> dict[str, list[Row]]:
     """By the name of the list that it is of; '' is the key's own."""
     tables: dict[str, list[Row]] = {}
-    for record in capture.messages(key):
+    for record in capture.messages(channels=[channel]):
         try:
             message = capture.decode(record)
         except DamageError:

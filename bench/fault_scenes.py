@@ -1,0 +1,61 @@
+"""Scenes in which a robot drives at full speed, drawn at random: to a thing far off, or behind one that moves."""
+
+from __future__ import annotations
+
+import random
+from math import cos, pi, sin
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+Drive = Literal["fetch", "go-to", "follow"]
+DRIVES: tuple[Drive, ...] = ("fetch", "go-to", "follow")
+CANS = ("red_can", "green_can", "blue_can")
+BALL = "blue_ball"
+
+
+class Errand(NamedTuple):
+    """A task, and the file of the scene that it is for."""
+
+    task: Drive
+    label: str
+    scene: Path
+
+
+def draw_errand(drive: Drive, rng: random.Random, folder: Path) -> Errand:
+    """Make a scene for a drive and write it into a folder."""
+    scene = folder / "scene.toml"
+    if drive == "follow":
+        scene.write_text(_walk(rng))
+        return Errand(drive, BALL, scene)
+    labels = rng.sample(CANS, k=3)
+    text = _can(labels[0], rng.uniform(1.7, 2.6), rng.uniform(-0.5, 0.5))
+    for number, label in enumerate(labels[1 : 1 + rng.randrange(3)]):
+        side = 1.0 if number else -1.0
+        text += _can(label, rng.uniform(1.2, 2.4), side * rng.uniform(0.75, 1.1))
+    scene.write_text(text)
+    return Errand(drive, labels[0], scene)
+
+
+def _can(label: str, distance_m: float, bearing_rad: float) -> str:
+    x, y = distance_m * cos(bearing_rad), distance_m * sin(bearing_rad)
+    return (
+        f'[[object]]\nlabel = "{label}"\nshape = "cylinder"\nradius_m = 0.033\nheight_m = 0.12\n'
+        f"position_m = [{x:.3f}, {y:.3f}]\n"
+    )
+
+
+def _walk(rng: random.Random) -> str:
+    """A ball that is carried away at about the speed that the robot can follow at, along a winding line."""
+    heading = rng.uniform(-0.5, 0.5)
+    x, y = 1.2 * cos(heading), 1.2 * sin(heading)
+    start = f"[{x:.3f}, {y:.3f}, 0.7]"
+    path = []
+    for _ in range(12):
+        heading += rng.uniform(-pi / 5, pi / 5)
+        length_m = rng.uniform(0.5, 1.0)
+        x, y = x + length_m * cos(heading), y + length_m * sin(heading)
+        path.append(f"[{x:.3f}, {y:.3f}]")
+    return (
+        f'[[object]]\nlabel = "{BALL}"\nshape = "sphere"\nradius_m = 0.040\nposition_m = {start}\n'
+        f"path_m = [{', '.join(path)}]\nspeed_mps = {rng.uniform(0.40, 0.46):.3f}\nfloating = true\n"
+    )

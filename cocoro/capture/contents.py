@@ -1,0 +1,170 @@
+"""The contents of an MCAP file: what it has, and at which byte."""
+
+from __future__ import annotations
+
+import os
+import zlib
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+from mcap.opcode import Opcode
+from mcap.records import AttachmentIndex, Channel, Header, Metadata, Schema, Statistics
+
+from cocoro.capture import mcap
+from cocoro.capture.compression import LARGEST_CHUNK, unpack
+from cocoro.capture.errors import CutOffError, DamageError
+from cocoro.capture.file import CHECKSUM, MAKER, PROFILE, checksum
+from cocoro.capture.mcap import MAGIC, PREFIX
+
+LARGEST_RECORD = 1 << 28
+"""Bytes of records other than chunks, messages and attachments; what claims to be larger is damaged."""
+NEAR_BYTES = 1 << 18
+
+
+class Place(NamedTuple):
+    """Where messages are: a chunk, or a run of messages that are in none."""
+
+    offset: int
+    length: int
+    """With the prefixes of its records."""
+    start_ns: int
+    end_ns: int
+    channels: frozenset[int] | None
+    """None: not known without looking."""
+    loose: bool = False
+    """It is no chunk."""
+
+
+@dataclass
+class Contents:
+    """A file's schemas, channels, metadata and attachments, and the places of its messages."""
+
+    profile: str = ""
+    library: str = ""
+    schemas: dict[int, Schema] = field(default_factory=dict)
+    channels: dict[int, Channel] = field(default_factory=dict)
+    places: list[Place] = field(default_factory=list)
+    metadata: list[Metadata] = field(default_factory=list)
+    """As they stand in the file."""
+    attachments: list[AttachmentIndex] = field(default_factory=list)
+    statistics: Statistics | None = None
+    raw_bytes: int = 0
+    """Size of all chunks before compression."""
+    closed: bool = False
+    """It has its end, whatever else is wrong with it."""
+    summarised: bool = False
+    """This was taken from the file's summary, so not all of the file has been read."""
+    data_end: int = 0
+    """Where the record of this name is; 0 where there is none."""
+    data_crc: int = 0
+    """Checksum of all bytes before it; 0: its writer gave none."""
+    cut_bytes: int = 0
+    """At the end, of a record that was never finished: what the death of a recorder leaves, so no damage."""
+    problems: list[str] = field(default_factory=list)
+    unknown: Counter[int] = field(default_factory=Counter)
+    """By opcode, records of kinds that are not MCAP's own."""
+
+    @property
+    def follows_page(self) -> bool:
+        """The conventions of docs/captures.md hold."""
+        return self.profile == PROFILE
+
+    @property
+    def ours(self) -> bool:
+        """It was written by a recorder, so messages are in chunks, and each metadata record has its checksum."""
+        return self.follows_page and self.library.startswith(MAKER)
+
+    def add_schema(self, content: mcap.Bytes) -> int:
+        schema, taken = mcap.parsed(Schema, content)
+        self.schemas[schema.id] = schema
+        return taken
+
+    def add_channel(self, content: mcap.Bytes) -> int:
+        channel, taken = mcap.parsed(Channel, content)
+        self.channels[channel.id] = channel
+        return taken
+
+    def add_metadata(self, content: mcap.Bytes) -> int:
+        """How many bytes of it the record takes. Raises DamageError where a recorder's checksum is wrong."""
+        found, taken = mcap.parsed(Metadata, content)
+        if self.ours and found.metadata.get(CHECKSUM) != checksum(found.metadata):
+            raise DamageError(f"the metadata {found.name!r} is not what was written")
+        self.metadata.append(found)
+        return taken
+
+
+class Disk:
+    """A file to read from at any place. Shorter than wanted is damage, not an error of the disk's."""
+
+    def __init__(self, fd: int) -> None:
+        self._fd = fd
+        self.size = os.fstat(fd).st_size
+        self._near_at, self._near = 0, b""
+
+    def read(self, offset: int, length: int) -> bytes:
+        if offset < 0 or offset + length > self.size:
+            raise CutOffError(f"{length} bytes at byte {offset} are beyond the file's end")
+        data = os.pread(self._fd, length, offset)
+        while len(data) < length:
+            more = os.pread(self._fd, length - len(data), offset + len(data))
+            if not more:
+                raise CutOffError(f"the file has become shorter than {offset + length} bytes")
+            data += more
+        return data
+
+    def near(self, offset: int, length: int) -> bytes:
+        """Read from a block that is kept: for many small pieces in order. Not for use by two threads at once."""
+        at = offset - self._near_at
+        if at < 0 or at + length > len(self._near):
+            if length > NEAR_BYTES or offset + length > self.size:
+                return self.read(offset, length)
+            self._near_at, at = offset, 0
+            self._near = self.read(offset, min(NEAR_BYTES, self.size - offset))
+        return self._near[at : at + length]
+
+    def checksum(self, start: int, end: int) -> int:
+        crc = 0
+        for at in range(start, end, 4 * NEAR_BYTES):
+            crc = zlib.crc32(self.read(at, min(4 * NEAR_BYTES, end - at)), crc)
+        return crc
+
+
+def header_of(disk: Disk) -> Header:
+    """Read the file's header; an empty one where it cannot be read."""
+    try:
+        op, length = PREFIX.unpack(disk.read(len(MAGIC), PREFIX.size))
+        if op == Opcode.HEADER and length <= LARGEST_RECORD:
+            return mcap.parsed(Header, disk.read(len(MAGIC) + PREFIX.size, length))[0]
+    except DamageError:
+        pass
+    return Header("", "")
+
+
+def read_chunk(disk: Disk, at: int, exactly: bool = False) -> tuple[int, bytes | memoryview]:
+    """The length of the chunk record at a place, and the records in it, as their checksum vouches for them. With
+    `exactly` one without a checksum must not be longer than its fields."""
+    op, length = PREFIX.unpack(disk.read(at, PREFIX.size))
+    if op != Opcode.CHUNK or length > disk.size - at - PREFIX.size or length > LARGEST_CHUNK:
+        raise DamageError("it is damaged, or cut off")
+    raw, taken = unpacked(content := disk.read(at + PREFIX.size, length))
+    if exactly and taken != length and mcap.ChunkHead.unpack(content)[0].crc == 0:
+        raise DamageError("its length contradicts itself")
+    return PREFIX.size + length, raw
+
+
+def unpacked(content: bytes) -> tuple[bytes | memoryview, int]:
+    """The records in a chunk, from its record's content, and how many bytes of that it takes."""
+    record = memoryview(content)
+    head, start = mcap.ChunkHead.unpack(record)
+    if start + head.packed_bytes > len(record):
+        raise DamageError("its length contradicts itself")
+    raw = unpack(head.compression, record[start : start + head.packed_bytes], head.raw_bytes)
+    if head.crc not in (0, zlib.crc32(raw)):  # 0: its writer gave none
+        raise DamageError("its checksum is wrong")
+    return raw, start + head.packed_bytes
+
+
+def read_place(disk: Disk, place: Place) -> bytes | memoryview:
+    """The records of a place."""
+    return disk.read(place.offset, place.length) if place.loose else read_chunk(disk, place.offset)[1]

@@ -1,0 +1,86 @@
+"""The clock of a recording: Unix time when it begins, and from then on a clock that nobody sets."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from typing import NamedTuple
+
+import msgspec
+
+from cocoro.boottime import boottime_ns
+from cocoro.clock import NS
+
+WALL_CLOCK = "wall_clock"
+"""The metadata record that tells how the wall clock was set while the recording went on."""
+STEP_NS = NS // 100
+"""A wall clock that is off by less than this has not been set: the two clocks are not read in one moment."""
+TOGETHER_NS = NS // 1000
+"""Two readings further apart than this were not taken in one moment."""
+TRIES = 3
+KEPT_STEPS = 100
+
+
+class Step(msgspec.Struct, frozen=True):
+    """Somebody set the wall clock."""
+
+    log_ns: int
+    """Log time at which it was noticed."""
+    by_s: float
+    """Positive: forward."""
+
+
+class _Reading(NamedTuple):
+    offset_ns: int
+    """Wall clock minus boot time."""
+    apart_ns: int
+    """How far off it may be."""
+
+
+class LogClock:
+    """`at` gives a message its log time. `look` from time to time, to notice that the wall clock has been set."""
+
+    def __init__(self, wall_ns: Callable[[], int] = time.time_ns, steady_ns: Callable[[], int] = boottime_ns) -> None:
+        self._wall_ns = wall_ns
+        self._steady_ns = steady_ns
+        self._start = self._newest = min((self._read() for _ in range(TRIES)), key=lambda reading: reading.apart_ns)
+        self._steps: list[Step] = []
+        self._count = 0
+
+    def at(self, steady_ns: int) -> int:
+        """The log time, in nanoseconds, of what came in at a time of `boottime_ns`."""
+        return steady_ns + self._start.offset_ns
+
+    def now_ns(self) -> int:
+        return self.at(self._steady_ns())
+
+    def look(self) -> Step | None:
+        """How the wall clock was set since the last look; None when it was not, or when that cannot be told now."""
+        reading = self._read()
+        by_ns = reading.offset_ns - self._newest.offset_ns
+        if reading.apart_ns > TOGETHER_NS or abs(by_ns) < STEP_NS:
+            return None
+        step = Step(self.now_ns(), by_ns / NS)
+        self._newest = reading
+        self._steps = [*self._steps, step][-KEPT_STEPS:]
+        self._count += 1
+        return step
+
+    def metadata(self) -> dict[str, str]:
+        """The record `WALL_CLOCK`, as it is to be written after each step."""
+        return {
+            "steps": json.dumps(msgspec.to_builtins(self._steps)),
+            "count": str(self._count),
+            "ahead_of_log_s": repr((self._newest.offset_ns - self._start.offset_ns) / NS),
+        }
+
+    def _read(self) -> _Reading:
+        before_ns = self._steady_ns()
+        wall_ns = self._wall_ns()
+        after_ns = self._steady_ns()
+        return _Reading(wall_ns - (before_ns + after_ns) // 2, after_ns - before_ns)
+
+
+def words(step: Step) -> str:
+    return f"set {'forward' if step.by_s > 0 else 'back'} by {abs(step.by_s):.3f} s"

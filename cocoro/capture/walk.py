@@ -1,0 +1,217 @@
+"""From record to record through a file, taking in what each is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+from mcap.opcode import Opcode
+from mcap.records import (
+    AttachmentIndex,
+    Channel,
+    ChunkIndex,
+    DataEnd,
+    Footer,
+    Header,
+    MetadataIndex,
+    Schema,
+    Statistics,
+    SummaryOffset,
+)
+
+from cocoro.capture import mcap
+from cocoro.capture.compression import KNOWN
+from cocoro.capture.contents import LARGEST_RECORD, Contents, Disk, Place, unpacked
+from cocoro.capture.errors import CutOffError, DamageError
+from cocoro.capture.mcap import MAGIC, PREFIX
+
+RUN_BYTES = 1 << 20
+"""A run of messages outside of chunks is closed at this size, so that a reader need not hold more at once."""
+HEAD_BYTES = 1 << 16
+"""An attachment's names and times are looked for in so much of it."""
+_SUMMARY = {
+    Opcode.CHUNK_INDEX: ChunkIndex,
+    Opcode.ATTACHMENT_INDEX: AttachmentIndex,
+    Opcode.METADATA_INDEX: MetadataIndex,
+    Opcode.SUMMARY_OFFSET: SummaryOffset,
+}
+"""Kinds that only say where others are."""
+
+
+class Walk:
+    """Takes records into `found`. Raises DamageError from `step` for one that cannot be; what is before it stays."""
+
+    def __init__(self, disk: Disk, found: Contents, check: bool, sure: bool = True) -> None:
+        """With `check` the checksums of attachments are looked at, which reads them. Unless it is `sure` that the
+        summary is as it was written, no channels and schemas are taken from there."""
+        self.suspect: int | None = None
+        """The first of the records just before this place that nothing vouches for: of unknown kinds, or longer than
+        what is known of them. A wrong length may be hidden there."""
+        self._disk = disk
+        self._found = found
+        self._check = check
+        self._sure = sure
+        self._run_at = 0
+        self._run_end = 0
+        self._run_times: list[int] = []
+        self._run_channels: set[int] = set()
+        self._kinds: dict[int, Callable[[bytes], int]] = {
+            Opcode.SCHEMA: self._schema,
+            Opcode.CHANNEL: self._channel,
+            Opcode.METADATA: found.add_metadata,
+            Opcode.STATISTICS: self._statistics,
+            Opcode.MESSAGE_INDEX: mcap.check_message_index,
+            **{op: partial(_taken, kind) for op, kind in _SUMMARY.items()},
+        }
+
+    def through(self, start: int, end: int) -> None:
+        """From record to record up to `end`, where one must begin. Raises DamageError."""
+        at = start
+        while at < end:
+            at = self.step(at)
+        if at > end:
+            raise DamageError("a record reaches into another")
+        self.finish()
+
+    def finish(self) -> None:
+        """Close the run of messages outside of chunks, if there is one."""
+        if self._run_times:
+            self._found.places.append(
+                Place(
+                    self._run_at, self._run_end - self._run_at, min(self._run_times), max(self._run_times),
+                    frozenset(self._run_channels), loose=True,
+                )
+            )  # fmt: skip
+            self._run_times, self._run_channels = [], set()
+
+    def step(self, at: int) -> int:
+        """Take in one record. Where the next one is; the file's size after the footer. Raises DamageError."""
+        op, length = PREFIX.unpack(self._disk.near(at, PREFIX.size))
+        end: int = at + PREFIX.size + length
+        if end > self._disk.size:
+            raise CutOffError("a record is cut off")
+        start, taken = at + PREFIX.size, length
+        if op == Opcode.MESSAGE:
+            self._message(at, start, end)
+        elif op == Opcode.CHUNK:
+            taken = self._chunk(at, start, end)
+        elif op == Opcode.ATTACHMENT:
+            taken = self._attachment(at, start, end)
+        elif op == Opcode.FOOTER:
+            end = self._footer(start, end)
+        elif op == Opcode.DATA_END:
+            taken = self._data_end(at, self._disk.near(start, min(length, HEAD_BYTES)))
+        elif op == Opcode.HEADER and at == len(MAGIC):
+            taken = mcap.parsed(Header, self._content(start, length))[1]
+        elif op in self._kinds:
+            taken = self._kinds[op](self._content(start, length))
+        elif op in (0, Opcode.HEADER):
+            raise DamageError(f"a record of kind {op} has no place there")
+        else:
+            taken = -1
+        if taken == length:
+            self.suspect = None
+            return end
+        if op != Opcode.CHUNK and _is_chunk(self._disk, start, length):
+            raise DamageError("by its content it is a chunk, by its kind it is none")
+        self.suspect = at if self.suspect is None else self.suspect
+        if taken < 0:
+            self._found.unknown[op] += 1
+        return end
+
+    def _content(self, start: int, length: int) -> bytes:
+        if length > LARGEST_RECORD:
+            raise DamageError("no record is so large")
+        return self._disk.near(start, length)
+
+    # --- each kind --------------------------------------------------------------------------------
+
+    def _message(self, at: int, start: int, end: int) -> None:
+        if self._found.ours:
+            raise DamageError("a message has no place there")
+        if end - start < mcap.MESSAGE_FIELDS.size:
+            raise DamageError("a message is shorter than its head")
+        channel_id, _, log_ns, _ = mcap.MESSAGE_FIELDS.unpack(self._disk.near(start, mcap.MESSAGE_FIELDS.size))
+        if at != self._run_end or self._run_end - self._run_at >= RUN_BYTES:
+            self.finish()
+        if not self._run_times:
+            self._run_at = at
+        self._run_end = end
+        self._run_times.append(log_ns)
+        self._run_channels.add(channel_id)
+
+    def _chunk(self, at: int, start: int, end: int) -> int:
+        raw, taken = unpacked(self._disk.read(start, end - start))
+        channels, times = set(), []
+        for op, content, _ in mcap.records(raw):
+            if op == Opcode.MESSAGE:
+                message = mcap.message(content)
+                channels.add(message.channel_id)
+                times.append(message.log_ns)
+            elif op == Opcode.SCHEMA:
+                self._found.add_schema(content)
+            elif op == Opcode.CHANNEL:
+                self._found.add_channel(content)
+        self._found.raw_bytes += len(raw)
+        if times:
+            self._found.places.append(Place(at, end - at, min(times), max(times), frozenset(channels)))
+        return taken
+
+    def _attachment(self, at: int, start: int, end: int) -> int:
+        head = self._disk.near(start, min(end - start, HEAD_BYTES))
+        index, data_at = mcap.attachment_index(head, at, end - at)
+        if self._check:
+            try:
+                mcap.attachment(self._disk.read(start, end - start))
+            except DamageError as damage:  # its record is as long as it says, so what follows can be read
+                self._found.problems.append(f"bytes {at} to {end} are not readable: {damage}")
+                return data_at + index.data_size + 4
+        self._found.attachments.append(index)
+        return data_at + index.data_size + 4
+
+    def _schema(self, content: bytes) -> int:
+        if self._found.data_end and not self._sure:
+            return mcap.parsed(Schema, content)[1]
+        return self._found.add_schema(content)
+
+    def _channel(self, content: bytes) -> int:
+        if self._found.data_end and not self._sure:
+            return mcap.parsed(Channel, content)[1]
+        return self._found.add_channel(content)
+
+    def _statistics(self, content: bytes) -> int:
+        self._found.statistics, taken = mcap.parsed(Statistics, content)
+        return taken
+
+    def _data_end(self, at: int, content: bytes) -> int:
+        found, taken = mcap.parsed(DataEnd, content)
+        self._found.data_end, self._found.data_crc = at, found.data_section_crc
+        return taken
+
+    def _footer(self, start: int, end: int) -> int:
+        """Nothing comes after it but the magic bytes."""
+        mcap.parsed(Footer, self._disk.near(start, min(end - start, HEAD_BYTES)))
+        if self._disk.read(end, len(MAGIC)) != MAGIC:
+            raise DamageError("the file does not end after its footer")
+        self._found.closed = True
+        after = end + len(MAGIC)
+        if after < self._disk.size:
+            self._found.problems.append(f"bytes {after} to {self._disk.size} come after the file's end")
+        return self._disk.size
+
+
+def _taken(kind: Any, content: bytes) -> int:
+    return mcap.parsed(kind, content)[1]
+
+
+def _is_chunk(disk: Disk, start: int, length: int) -> bool:
+    """Whether a record's content is that of a chunk, as its checksum says."""
+    try:
+        head, _ = mcap.ChunkHead.unpack(disk.near(start, min(length, mcap.LONGEST_CHUNK_HEAD)))
+        if head.crc == 0 or head.compression not in KNOWN or head.packed_bytes > length:
+            return False
+        unpacked(disk.read(start, length))
+    except DamageError:
+        return False
+    return True

@@ -1,0 +1,31 @@
+"""To a base on the mesh of a robot that is up: planner and executive, which release it and drive it straight on at
+0.2 m/s: `python drive_on_mesh.py ROBOT`."""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+
+from cocoro import robot_time, topics
+from cocoro.bus.zenoh import ZenohBus
+from cocoro.messages import BaseCommand, Latch
+from cocoro.node import Node
+from cocoro.robot import Robot
+from cocoro.rundir import RunDir
+
+
+async def main(name: str) -> None:
+    run_dir = RunDir(name)
+    clock = robot_time.clock(run_dir.path)
+    async with (
+        await ZenohBus.open(run_dir.join_as("planning"), expect_mesh=True) as bus,
+        Node("planning", bus, clock, Robot.load(), robot_name=name) as node,
+    ):
+        node.ready()
+        async for _ in node.every(50.0):
+            node.publish(topics.LATCH, Latch(state="released"))
+            node.publish(topics.BASE_COMMAND, BaseCommand(left_mps=0.2, right_mps=0.2))
+
+
+if __name__ == "__main__":
+    asyncio.run(main(sys.argv[1]))

@@ -1,0 +1,96 @@
+"""All processes of a robot are stopped at once, as by a laptop's lid, and go on: nobody is called dead who lives."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import sys
+from pathlib import Path
+
+import pytest
+from faults_live import PROCESSES, LiveRobot, live
+from operator_shell import Running
+from test_faults_live import FAR, fault, stands_in_time
+
+pytestmark = [pytest.mark.zenoh, pytest.mark.sim]
+
+LEASE_S = 1.0
+ASLEEP_S = 4.0
+MESH = f"[mesh]\nlease_s = {LEASE_S}\n"
+SAID = "this machine was asleep or starved for"
+
+
+@pytest.fixture
+def far(tmp_path: Path) -> Path:
+    scene = tmp_path / "far.toml"
+    scene.write_text(FAR)
+    return scene
+
+
+def everyone(robot: LiveRobot, *others: Running) -> set[int]:
+    """The processes of the robot, its supervisor, and an operator's."""
+    return {by.pid for by in robot.run_dir.claims().values()} | {each.process.pid for each in (robot.up, *others)}
+
+
+def said_by_all(robot: LiveRobot, *others: Running) -> str:
+    """What people have been told, on terminals and in logs; the supervisor's log has all that it says."""
+    logs = [robot.run_dir.log(process).read_text() for process in (*PROCESSES, "supervisor")]
+    return "\n".join([*logs, *(line for each in others for line in each.lines)])
+
+
+def test_when_all_sleep_for_longer_than_the_lease_the_robot_stands_and_nobody_is_called_dead(
+    tmp_path: Path, far: Path
+) -> None:
+    async def scenario() -> None:
+        async with live(tmp_path, scene=far, mesh=MESH) as robot:
+            fetch = Running([sys.executable, "-m", "cocoro.cli.main", "fetch", "red_can"], robot.env)
+            try:
+                await robot.drives()
+                processes = everyone(robot, fetch)
+                pids = {service: by.pid for service, by in robot.run_dir.claims().items()}
+                for pid in processes:
+                    os.kill(pid, signal.SIGSTOP)
+                await asyncio.sleep(ASLEEP_S)
+                for pid in processes:
+                    os.kill(pid, signal.SIGCONT)
+                awake = await robot.told(SAID)
+                assert float(awake.partition(SAID)[2].split()[0]) >= ASLEEP_S - 1.0
+                code = await asyncio.to_thread(fetch.end)
+                if code != 0:  # a connection broke: the task has ended, and the robot stands
+                    assert code == 1
+                    ended_s = robot.now_s
+                    await robot.passes(0.5)
+                    assert robot.stood_since(ended_s)
+                    assert SAID in fetch.lines[-1] or "planner is silent" in fetch.lines[-1], fetch.lines
+                said = said_by_all(robot, fetch)
+                assert " died" not in said
+                assert said.count("is silent") == said.count("is back") == 0, said
+                code, answer = await robot.command("park")
+                assert code == 0, answer
+                assert {service: by.pid for service, by in robot.run_dir.claims().items()} == pids
+            finally:
+                fetch.process.kill()
+                fetch.process.wait()
+
+    asyncio.run(scenario())
+
+
+def test_of_one_that_alone_is_stopped_for_longer_than_the_lease_contact_is_lost(tmp_path: Path, far: Path) -> None:
+    async def scenario() -> None:
+        async with live(tmp_path, scene=far, mesh=MESH) as robot:
+            task_id = await robot.driving()
+            stopped_s = await fault(robot, "planning", signal.SIGSTOP)
+            state = await robot.outcome(task_id)
+            assert state.reason in ("not_alive: lost contact with planning", "not_alive: the planner is silent")
+            await stands_in_time(robot, stopped_s)
+            await robot.told("planning is silent: no sign of planning")
+            code, said = await robot.command("status")
+            assert code == 1
+            assert "no contact" in next(line for line in said.splitlines() if line.startswith("planning "))
+            robot.signal("planning", signal.SIGCONT)
+            await robot.told("planning is back")
+            await robot.driving()
+            assert " died" not in said_by_all(robot)
+
+    asyncio.run(scenario())

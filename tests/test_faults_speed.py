@@ -1,0 +1,47 @@
+"""Faults at full speed, at random moments: the body stands within 0.3 s, by the truth at every step of the physics.
+
+Policies: docs/faults.md; two hundred of them: `python -m bench.faults`.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+from concurrent.futures import ProcessPoolExecutor
+
+import pytest
+
+from bench.fault_robot import full_speed_mps
+from bench.faults import HAPPENINGS, STAND_S, Trial, happening_of, run_trial
+from cocoro.topics import HARDWARE
+
+pytestmark = pytest.mark.sim
+
+SEED = 7
+
+
+def telling(number: int) -> bool:
+    """Whether a kind differs from the others enough to be tried at every change."""
+    happening, _ = happening_of(number)
+    dies_with_its_task = happening.way == "dies" and happening.service in HARDWARE and happening.service != "base"
+    return happening.way != "late" and not dies_with_its_task
+
+
+NUMBERS = [number for number in range(len(HAPPENINGS)) if telling(number)]
+
+
+@pytest.fixture(scope="module")
+def trials() -> dict[int, Trial]:
+    with ProcessPoolExecutor(2, multiprocessing.get_context("spawn")) as pool:
+        return dict(zip(NUMBERS, pool.map(run_trial, [SEED] * len(NUMBERS), NUMBERS), strict=True))
+
+
+@pytest.mark.parametrize("number", NUMBERS, ids=lambda number: happening_of(number)[0].name)
+def test_whatever_happens_at_full_speed_the_robot_stands_in_time(trials: dict[int, Trial], number: int) -> None:
+    trial = trials[number]
+    assert trial.speed_mps >= 0.97 * full_speed_mps(trial.drive)
+    assert trial.stand_s <= STAND_S, trial
+    assert trial.stand_s > 0.1, "it was driving, and has a ramp"
+
+
+def test_a_trial_is_the_same_again(trials: dict[int, Trial]) -> None:
+    assert run_trial(SEED, NUMBERS[0]) == trials[NUMBERS[0]]

@@ -1,0 +1,66 @@
+"""The robot's one offset to wall time: fixed once, read by whoever joins, and not believed after another boot."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from cocoro import robot_time
+from cocoro.clock import NS, wall_offset_ns
+from cocoro.robot_time import FILE, RobotTime
+
+
+def step_wall_clock(monkeypatch: pytest.MonkeyPatch, seconds: float) -> None:
+    wall_ns = time.time_ns
+    monkeypatch.setattr(time, "time_ns", lambda: wall_ns() + round(seconds * NS))
+
+
+def measured_here(offset_ns: int) -> bool:
+    """Whether it is the wall clock's offset as it is now."""
+    return abs(offset_ns - wall_offset_ns()) < NS // 10
+
+
+@pytest.mark.parametrize("step_s", [-36_000.0, -0.49, 0.3, 36_000.0])
+def test_who_joins_after_a_step_has_the_time_of_who_was_there_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step_s: float
+) -> None:
+    first = robot_time.fix(tmp_path)
+    assert measured_here(first.offset_ns)
+    step_wall_clock(monkeypatch, step_s)
+    assert robot_time.clock(tmp_path).offset_ns == first.offset_ns
+    assert [file.name for file in tmp_path.iterdir()] == [FILE]
+
+
+def test_the_next_start_of_the_robot_reads_the_wall_clock_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot_time.fix(tmp_path)
+    step_wall_clock(monkeypatch, 3600.0)
+    assert measured_here(robot_time.fix(tmp_path).offset_ns)
+    assert measured_here(robot_time.clock(tmp_path).offset_ns)
+
+
+@pytest.mark.parametrize("content", [None, b"", b"{", b"[]", b'{"boot": "x"}', b'{"boot": 1, "offset_ns": 2}'])
+def test_who_finds_nothing_that_can_be_read_measures_its_own_and_writes_nothing(
+    tmp_path: Path, content: bytes | None
+) -> None:
+    if content is not None:
+        (tmp_path / FILE).write_bytes(content)
+    assert measured_here(robot_time.clock(tmp_path).offset_ns)
+    assert [file.read_bytes() for file in tmp_path.iterdir()] == ([] if content is None else [content])
+
+
+def test_an_offset_from_another_boot_is_none(tmp_path: Path) -> None:
+    robot_time.fix(tmp_path)
+    there = msgspec.json.decode((tmp_path / FILE).read_bytes(), type=RobotTime)
+    for boot in ("", there.boot + "x"):
+        wrong = msgspec.structs.replace(there, boot=boot, offset_ns=there.offset_ns + 10 * NS)
+        (tmp_path / FILE).write_bytes(msgspec.json.encode(wrong))
+        assert measured_here(robot_time.clock(tmp_path).offset_ns)
+
+
+def test_a_robot_that_was_never_up_here_has_no_folder_and_still_a_clock(tmp_path: Path) -> None:
+    assert measured_here(robot_time.clock(tmp_path / "nobody").offset_ns)
