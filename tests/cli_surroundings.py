@@ -88,35 +88,46 @@ NOT_UTF8 = "caf\udce9"
 
 SURROUNDINGS: dict[str, Surroundings] = {
     "stdout closed": Surroundings({"stdout": "closed"}, lost=True, helps=True),
-    "stdin and stderr closed": Surroundings({"stdin": "closed", "stderr": "closed"}),
     "all closed": Surroundings({"stdin": "closed", "stdout": "closed", "stderr": "closed"}, lost=True),
+    "stdin and stderr closed, home and run directory read-only": Surroundings(
+        {
+            "stdin": "closed",
+            "stderr": "closed",
+            "env": {"HOME": "{root}/disk", "COCORO_RUN_DIR": "{root}/disk/run"},
+            "mounts": [("{root}/disk", "ro")],
+        }
+    ),
     "stdout on a full device": Surroundings({"stdout": "full"}, lost=True),
-    "both unbuffered on a full device": Surroundings(
-        {"stdout": "full", "stderr": "full", "unbuffered": True}, lost=True
+    "both unbuffered on a full device, no home, a width that is none": Surroundings(
+        {
+            "stdout": "full",
+            "stderr": "full",
+            "unbuffered": True,
+            "env": {"HOME": None, "XDG_RUNTIME_DIR": None, "COCORO_RUN_DIR": None, "COLUMNS": "wide", "LINES": "-1"},
+        },
+        lost=True,
     ),
     "a pipe that nobody reads": Surroundings({"stdout": "gone"}, lost=True),
-    "ASCII alone": Surroundings({"encoding": "ascii"}, odd="für", helps=True),
+    "ASCII alone, a run directory that is a broken link": Surroundings(
+        {"encoding": "ascii", "env": {"COCORO_RUN_DIR": "{root}/broken"}}, odd="für"
+    ),
     "names that are no UTF-8": Surroundings(
         {"env": {"COCORO_RUN_DIR": f"{{root}}/{NOT_UTF8}"}}, odd=NOT_UTF8, same=False
     ),
-    "names of several lines": Surroundings(odd="a\nb\x1b[2Jc"),
+    "names of several lines, a run directory too long for a socket": Surroundings(
+        {"env": {"COCORO_RUN_DIR": "{root}/" + "x" * 120}}, odd="a\nb\x1b[2Jc"
+    ),
     "a current directory that was removed": Surroundings({"no_folder": True}, same=False),
-    "no home, and a width that is none": Surroundings(
-        {"env": {"HOME": None, "XDG_RUNTIME_DIR": None, "COCORO_RUN_DIR": None, "COLUMNS": "wide", "LINES": "-1"}}
+    "no terminal to speak of, a run directory that is a file": Surroundings(
+        {"env": {"TERM": None, "COLUMNS": "1", "LINES": "1", "COCORO_RUN_DIR": str(GOLDEN)}, "stdout": "narrow"}
     ),
-    "a home and a run directory that are read-only": Surroundings(
-        {"env": {"HOME": "{root}/disk", "COCORO_RUN_DIR": "{root}/disk/run"}, "mounts": [("{root}/disk", "ro")]}
-    ),
-    "no terminal to speak of": Surroundings({"env": {"TERM": None, "COLUMNS": "1", "LINES": "1"}, "stdout": "narrow"}),
     "a dumb terminal": Surroundings(
         {"env": {"TERM": "dumb", "COLUMNS": None}, "stdout": "narrow", "stderr": "narrow"}, helps=True
     ),
-    "a run directory that is a file": Surroundings({"env": {"COCORO_RUN_DIR": str(GOLDEN)}}),
-    "a run directory that is a broken link": Surroundings({"env": {"COCORO_RUN_DIR": "{root}/broken"}}),
-    "a run directory too long for a socket": Surroundings({"env": {"COCORO_RUN_DIR": "{root}/" + "x" * 120}}),
     "a run directory too long for a file": Surroundings({"env": {"COCORO_RUN_DIR": "{root}/" + "x" * 300}}, same=False),
     "no /proc": Surroundings({"mounts": [("/proc", "size=64k")]}, lines=2),
 }
+"""What is independent of each other is tried at once."""
 
 NEVER_SAID = (
     "Traceback", "Exception ignored", "internal error", "excepthook", "WARN", "Fatal", "Error in", "Aborted",
