@@ -34,8 +34,19 @@ class Room(NamedTuple):
     """What statvfs says, as far as it is asked."""
 
     f_bavail: int
-    f_blocks: int
     f_frsize: int = 1
+
+
+def has_free(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
+    """So many bytes are free, and may be locked in memory."""
+    monkeypatch.setattr(os, "statvfs", lambda _: Room(count))
+    monkeypatch.setattr(shared, "lockable_bytes", lambda: None)
+
+
+@pytest.fixture
+def needs_pool() -> None:
+    if why := shared.obstacle(2 * (shared.POOL_BYTES + shared.PROCESS_BYTES)):
+        pytest.skip(why)
 
 
 @pytest.fixture
@@ -106,7 +117,7 @@ def test_what_is_needed_is_what_is_taken_and_given_back(
 
 
 def test_too_little_is_said_with_by_how_much(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(os, "statvfs", lambda _: Room(16_000_000, 64_000_000))
+    has_free(monkeypatch, 16_000_000)
     assert shared.obstacle(26_500_000) == (
         f"{place} has 16.0 MB free, 26.5 MB are needed (10.5 MB more): make room, or mount it larger"
     )
@@ -186,9 +197,8 @@ def test_the_doctor_says_what_the_profile_needs_and_whether_it_is_there(
     root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def told(profile: str, free_bytes: int) -> Check:
-        monkeypatch.setattr(os, "statvfs", lambda _: Room(free_bytes, 1 << 40))
+        has_free(monkeypatch, free_bytes)
         with monkeypatch.context() as patch:
-            patch.setattr(shared, "lockable_bytes", lambda: None)
             patch.setattr(doctor, "_disk", lambda _: iter(()))
             return next(check for check in doctor.examine(profiles.read(profile)) if check.name == "shared memory")
 
@@ -214,7 +224,7 @@ def test_the_doctor_names_a_run_directory_that_is_another_user_s(root: Path) -> 
 
 
 @scenario
-async def test_frames_reach_a_receiver_without_shared_memory(directory: Path) -> None:
+async def test_frames_reach_a_receiver_without_shared_memory(directory: Path, needs_pool: None) -> None:
     """Beside one with it, from a publisher with it, whole and in order."""
     async with (
         await ZenohBus.open(local(directory, "publisher")) as publisher,
@@ -245,7 +255,7 @@ async def test_frames_reach_a_receiver_without_shared_memory(directory: Path) ->
 
 @pytest.fixture
 def no_room(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(os, "statvfs", lambda _: Room(0, 64_000_000))
+    has_free(monkeypatch, 0)
 
 
 @scenario
@@ -268,7 +278,7 @@ async def test_without_room_a_session_opens_and_a_publisher_says_why_its_frames_
 async def test_room_for_a_session_but_not_for_frames_is_said_once(
     directory: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(os, "statvfs", lambda _: Room(16_000_000, 64_000_000))
+    has_free(monkeypatch, 16_000_000)
     with caplog.at_level(logging.WARNING):
         async with await ZenohBus.open(local(directory, "publisher")) as bus:
             publisher = bus.publisher("robot/frame", Qos.FRAME)
@@ -376,7 +386,7 @@ def held() -> list[Path]:
     return [Path(f"/proc/self/fd/{fd}").readlink() for fd in shared._held()]
 
 
-def test_a_pool_that_is_given_up_leaves_nothing() -> None:
+def test_a_pool_that_is_given_up_leaves_nothing(needs_pool: None) -> None:
     before = set(held())
     pool = SharedPool()
     assert not pool.trouble

@@ -18,7 +18,7 @@ from rich.console import Console
 from cocoro.cli import top_view
 from cocoro.cli.foreign import jsonable, lines, read
 from cocoro.cli.hz import Meter, rows, size_text
-from cocoro.cli.listening import keyexpr_of
+from cocoro.cli.listening import keyexpr_of, takes_frames
 from cocoro.cli.logs import Tail, entries, files_of, robot_of
 from cocoro.cli.main import main
 from cocoro.errors import ConfigError
@@ -30,6 +30,13 @@ from cocoro.rundir import RunDir
 def test_each_tool_has_help(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([command, "--help"]) == 0
     assert "Ctrl-C" in (out := capsys.readouterr().out) or "KEY" in out
+
+
+def test_frames_may_be_among_what_is_not_known_to_be_something_else() -> None:
+    for text in ("kinect/frame", "**", "kinect/*", "calliope/base/state", "parts/other"):
+        assert takes_frames(text)
+    for text in ("base/state", "planning/health", "sim/clock"):
+        assert not takes_frames(text)
 
 
 # --- keys and payloads ----------------------------------------------------------------------------

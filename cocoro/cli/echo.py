@@ -12,7 +12,7 @@ from cocoro.cli import exits
 from cocoro.cli.ending import told_to_end
 from cocoro.cli.foreign import HEAD, Reading, jsonable, lines, read
 from cocoro.cli.link import Where, joined
-from cocoro.cli.listening import Ear, Heard, keyexpr_of
+from cocoro.cli.listening import Ear, Heard, keyexpr_of, takes_frames
 
 HINT_S = 3.0
 """A person who has heard nothing for so long is told so, and where to look."""
@@ -23,7 +23,7 @@ async def echo(
 ) -> int:
     """Print until interrupted, or so many messages, or for so long. Exit code 1 when the time is over and there was
     nothing, or fewer than were wanted."""
-    async with joined(where, frames=True) as link:
+    async with joined(where, frames=takes_frames(text)) as link:
         ear = Ear(link, keyexpr_of(text, link.robot))
         with told_to_end() as end:
             printed = await _print(ear, link.robot, end, count, seconds, as_json, everything)

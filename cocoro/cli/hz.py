@@ -20,7 +20,7 @@ from cocoro.bus.base import Payload
 from cocoro.cli import exits
 from cocoro.cli.ending import told_to_end
 from cocoro.cli.link import Where, joined
-from cocoro.cli.listening import Ear, keyexpr_of
+from cocoro.cli.listening import Ear, keyexpr_of, takes_frames
 from cocoro.cli.table import table
 from cocoro.source import ANY_HZ, Source
 from cocoro.topics import topic_named
@@ -138,7 +138,7 @@ class Meter:
 async def hz(where: Where, text: str, window_s: float, once: bool, as_json: bool) -> int:
     """Measure until interrupted, or with `once` over one window. Exit code 1 when that heard nothing."""
     meters: dict[str, Meter] = {}
-    async with joined(where, frames=True) as link:
+    async with joined(where, frames=takes_frames(text)) as link:
         ear = Ear(link, keyexpr_of(text, link.robot))
         with told_to_end() as end, _view(as_json, once) as view:
             show_s = time.monotonic() + (window_s if once else SHOW_S)

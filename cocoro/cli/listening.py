@@ -11,7 +11,7 @@ from typing import NamedTuple
 from cocoro.bus.base import Payload
 from cocoro.cli.link import Link
 from cocoro.errors import ConfigError
-from cocoro.topics import Qos
+from cocoro.topics import Qos, topic_named
 
 DEPTH = 64
 """Samples of one key that may wait for this process's loop."""
@@ -35,6 +35,12 @@ def keyexpr_of(text: str, robot: str) -> str:
     if not text or any(not chunk or ("*" in chunk and chunk not in ("*", "**")) for chunk in chunks):
         raise ConfigError(f"{text!r} is no key; write it as base/state, */health or ** (`cocoro topics` lists them)")
     return text if chunks[0] == robot else f"{robot}/{text}"
+
+
+def takes_frames(text: str) -> bool:
+    """Whether frames may be among what an operator wants to hear."""
+    topic = topic_named(text)
+    return topic is None or topic.qos is Qos.FRAME
 
 
 class Ear:
