@@ -46,7 +46,7 @@ class Contact:
             by = self._run_dir.claimant(service)
         except OSError:
             return False
-        return by is None or by.pid != self._pids[service]
+        return by is None or by.pid not in (self._pids[service], 0)  # 0: somebody holds it, and has not said who
 
     async def lost(self, service: str) -> str:
         """Its token dropped: what is true of it, in words, at once or within `CLAIM_S`."""
