@@ -119,7 +119,8 @@ SURROUNDINGS: dict[str, Surroundings] = {
     ),
     "a current directory that was removed": Surroundings({"no_folder": True}, same=False),
     "no terminal to speak of, a run directory that is a file": Surroundings(
-        {"env": {"TERM": None, "COLUMNS": "1", "LINES": "1", "COCORO_RUN_DIR": str(GOLDEN)}, "stdout": "narrow"}
+        {"env": {"TERM": None, "COLUMNS": "1", "LINES": "1", "COCORO_RUN_DIR": str(GOLDEN)}, "stdout": "narrow"},
+        same=False,
     ),
     "a dumb terminal": Surroundings(
         {"env": {"TERM": "dumb", "COLUMNS": None}, "stdout": "narrow", "stderr": "narrow"}, helps=True

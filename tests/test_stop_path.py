@@ -92,7 +92,7 @@ def test_without_a_name_every_robot_is_told() -> None:
 def test_who_has_ended_is_not_waited_for(robot: str) -> None:
     with moving(robot, "base"):
         pass
-    assert not stop(robot).points
+    assert not stop(robot).waiting
 
 
 def test_a_latch_that_the_disk_did_not_take_is_told(robot: str) -> None:
