@@ -62,7 +62,7 @@ def _command(arguments: list[str]) -> int:
         get_command(app)(args=arguments, prog_name="cocoro")  # not app itself, which hooks itself into sys.excepthook
     except SystemExit as end:
         if _interrupted(end):  # the command line library has an exit code of its own for it
-            return exits.REFUSED
+            return _cancelled()
         return end.code if isinstance(end.code, int) else exits.DONE if end.code is None else exits.FAILED
     return exits.DONE
 
@@ -83,12 +83,22 @@ def failed(error: BaseException) -> int:
         output.complain(_of_system(error))
         return exits.FAILED
     if _interrupted(error):
-        return exits.REFUSED
+        return _cancelled()
     if isinstance(error, UnicodeEncodeError) and any("\udc80" <= c <= "\udcff" for c in error.object):
         output.complain(f"{error.object}: this is no UTF-8, which is needed here; choose another name")
         return exits.USAGE
     _say_bug(error)
     return exits.FAILED
+
+
+def _cancelled() -> int:
+    """End as cancelled. What was interrupted while it was made is taken apart now, and has nothing to say."""
+    if output.taken_over():
+        import warnings
+
+        sys.unraisablehook = lambda found: output.show_trace(found.exc_value) if found.exc_value else None
+        warnings.simplefilter("ignore")
+    return exits.REFUSED
 
 
 def _say_bug(error: BaseException) -> None:
