@@ -88,10 +88,10 @@ def test_a_configuration_that_cannot_be_is_refused(options: dict[str, Any], text
         ZenohConfig("x", **options)
 
 
-def test_the_default_mesh_is_a_directory_for_each_robot(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setenv("COCORO_RUN_DIR", str(tmp_path / "here"))
-    assert default("calliope", "base").directory == tmp_path / "here" / "calliope"
-    assert default("calliope", "base", tmp_path).directory == tmp_path / "calliope"
+def test_the_default_mesh_is_a_directory_for_each_robot(monkeypatch: pytest.MonkeyPatch, short_path: Path) -> None:
+    monkeypatch.setenv("COCORO_RUN_DIR", str(short_path / "here"))
+    assert default("calliope", "base").directory == short_path / "here" / "calliope"
+    assert default("calliope", "base", short_path).directory == short_path / "calliope"
     monkeypatch.delenv("COCORO_RUN_DIR")
     monkeypatch.setenv("XDG_RUNTIME_DIR", "/run/user/7")
     assert default_run_dir() == Path("/run/user/7/cocoro")

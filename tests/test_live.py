@@ -64,7 +64,7 @@ def test_a_robot_is_started_fetches_is_stopped_and_leaves_nothing_behind(shell: 
     assert (result["outcome"], result["task"], result["label"]) == ("done", "fetch", "red_can")
     assert [phase["name"] for phase in result["phases"]][-2:] == ["lift", "hold"]
 
-    estop = shell("estop", "--json")
+    estop = shell("estop", "--json", "--robot", "calliope")
     assert estop.returncode == exits.DONE, estop.stderr
     stopped = json.loads(estop.stdout)
     assert set(stopped["acknowledged"]) >= {*STOPPABLE, "executive"}
