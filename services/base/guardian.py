@@ -24,8 +24,8 @@ from services.base.driver import Report
 log = logging.getLogger("cocoro.base")
 
 LATE_S, HANGS_S = 0.12, 0.25
-"""A guard reports at least twenty times a second. One that is late has the wheels stopped past it, which it puts right
-at once when it was only slow; one that hangs is killed."""
+"""A guard reports at least twenty times a second. One that is late (sooner, where the wheels turn fast) has the wheels
+stopped past it, which it puts right at once when it was only slow; one that hangs is killed."""
 START_S = 5.0
 """So long a guard may take to report first, on a busy machine. Before that it has turned no wheels."""
 AGAIN_S = 1.0
@@ -52,6 +52,7 @@ class Guardian:
         self._started_s = 0.0
         self._reported_s = 0.0
         self._late = False
+        self._late_s = LATE_S
 
     async def __aenter__(self) -> Guardian:
         self._start()
@@ -69,9 +70,11 @@ class Guardian:
     def pid(self) -> int | None:
         return None if self._process is None else self._process.pid
 
-    def ask(self, left_mmps: int, right_mmps: int, for_ns: int, reset: int = 0) -> None:
+    def ask(self, left_mmps: int, right_mmps: int, for_ns: int, reset: int = 0, patience_s: float = LATE_S) -> None:
         """Ask for wheel speeds, for so long from now. To be called steadily: it is what keeps the wheels turning.
-        `reset`: how many of the emergency stops that the guard heard have been reset."""
+        `reset`: how many of the emergency stops that the guard heard have been reset. `patience_s`: how long the guard
+        may be silent at these speeds."""
+        self._late_s = min(patience_s, LATE_S)
         self._send({"left": left_mmps, "right": right_mmps, "until": time.monotonic_ns() + for_ns, "reset": reset})
 
     def halt(self) -> None:
@@ -95,7 +98,7 @@ class Guardian:
         silent_s = now_s - (self._reported_s or self._started_s + START_S)
         if silent_s > HANGS_S:
             self._lost("the guard of the port hangs")
-        elif silent_s > LATE_S and not self._late:
+        elif silent_s > self._late_s and not self._late:
             self._late = True
             _write(self._port, oi.drive_direct(0, 0))
 

@@ -68,7 +68,9 @@ class BaseService:
         if self._node.clock.epoch != self._epoch:
             self._epoch = self._node.clock.epoch
             self._driver.new_epoch()
-        self.guardian.ask(*self._driver.wheels(self._node.now_ns()), self._reset_stops)
+        left_mmps, right_mmps, for_ns = self._driver.wheels(self._node.now_ns())
+        patience_s = self._node.robot.base.patience_s(max(abs(left_mmps), abs(right_mmps)) / 1000.0)
+        self.guardian.ask(left_mmps, right_mmps, for_ns, self._reset_stops, patience_s)
 
     def _commanded(self, command: BaseCommand) -> None:
         self._driver.command(command, self._node.now_ns())
