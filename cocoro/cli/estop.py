@@ -9,10 +9,10 @@ from __future__ import annotations
 import os
 import sys
 import time
-from contextlib import suppress
 from typing import NamedTuple, TextIO
 
 from cocoro.cli import exits
+from cocoro.quit import UNSAID
 from cocoro.stop.asking import Asking, Point
 
 STOPPABLE = ("base", "arm", "hand")
@@ -105,8 +105,8 @@ def main(command: str, arguments: list[str]) -> int:
         troubles.append(f"the mesh could not be asked: {type(error).__name__}: {error}")
         code = exits.FAILED
     for stop in sorted(stops, key=lambda stop: stop.owner is None):  # the operator's own where he sees it: last
-        _say(stop, as_json)
-        code = code or stop.code
+        is_said = _say(stop, as_json)
+        code = code or stop.code or (exits.DONE if is_said else UNSAID)
     for trouble in troubles:
         _print(f"cocoro: {trouble}", sys.stderr)
     return code
@@ -212,23 +212,25 @@ def _merged(by_path: list[Stop], by_mesh: list[Stop]) -> list[Stop]:
     return [*merged, *found.values()]
 
 
-def _say(stop: Stop, as_json: bool) -> None:
+def _say(stop: Stop, as_json: bool) -> bool:
     if as_json:
         import json
 
         text = json.dumps(stop._asdict())
     else:
         text = str(stop)
-    _print(text, sys.stderr if stop.code and not as_json else sys.stdout)
+    return _print(text, sys.stderr if stop.code and not as_json else sys.stdout)
 
 
-def _print(text: str, file: TextIO | None) -> None:
-    """What cannot be printed changes nothing about what was stopped, and the exit code tells that."""
-    with suppress(OSError, ValueError):
-        try:
-            print(text, file=file, flush=True)
-        except UnicodeError:
-            print(ascii(text), file=file, flush=True)
+def _print(text: str, file: TextIO | None) -> bool:
+    """Whether it was taken: what cannot be told changes nothing about what was stopped."""
+    try:
+        print(text, file=file, flush=True)
+    except UnicodeError:
+        return _print(ascii(text), file)
+    except (OSError, ValueError):
+        return False
+    return True
 
 
 def _process_start_s() -> float:
