@@ -171,8 +171,9 @@ def test_what_others_robots_answer_says_nothing_about_ones_own(root: Path) -> No
 
 def test_what_neither_way_acknowledged_is_missing() -> None:
     path = Stop("robbie", ("arm",), (), ("base", "hand"), 0.1)
-    mesh = Stop("robbie", ("arm",), ("base",), ("hand",), 0.4)
+    mesh = Stop("robbie", ("arm",), ("base",), ("hand",), 0.4, ("the disk is full",))
     (both,) = _merged([path], [mesh])
+    assert both.not_kept == ("the disk is full",)
     assert (both.missing, both.absent, both.code) == (("base",), ("hand",), exits.FAILED)
 
 

@@ -207,6 +207,7 @@ def _merged(by_path: list[Stop], by_mesh: list[Stop]) -> list[Stop]:
                 missing=tuple(sorted(missing, key=_in_order)),
                 absent=absent,
                 seconds=max(one.seconds, other.seconds),
+                not_kept=(*one.not_kept, *other.not_kept),
             )
         merged.append(one)
     return [*merged, *found.values()]
