@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import threading
 from collections.abc import Callable
 from concurrent.futures import Future
 from contextlib import suppress
@@ -18,11 +19,13 @@ from cocoro import topics
 from cocoro.clock import NS, is_fresh
 from cocoro.messages import EstopReply, EstopRequest, Latch, LatchState
 from cocoro.node import Node
-from cocoro.stop.path import KEPT_S, StopPoint, listen
+from cocoro.stop.path import StopPoint, listen
 from cocoro.stop.record import LatchRecord
 
 IN_FLIGHT_NS = NS // 2
 """For so long after a reset a word from before it may still arrive; it is not listened to."""
+STOP_KEPT_S, RESET_KEPT_S = 0.15, 0.6
+"""How long the answer to a stop and to a reset waits for the disk: less than who asked waits for the answer."""
 
 
 class LatchKeeper:
@@ -48,6 +51,9 @@ class LatchKeeper:
         self._halt = halt
         self._loop = asyncio.get_running_loop()
         self._record: LatchRecord | None = None
+        self._lock = threading.Lock()
+        self._stopped_by: str | None = None
+        """Who used the stop path, while the loop does not know of it yet."""
         self._reset_ns: int | None = None
         if node.latches is not None:
             self._record = LatchRecord(node.latches / node.name)
@@ -79,14 +85,27 @@ class LatchKeeper:
 
     def _stopped(self, by: str) -> None:
         """In the stop path's thread. The loop latches afterwards in any case, so a reset that comes between the two
-        undoes nothing for longer than a moment."""
-        self._halt()
-        with suppress(RuntimeError):  # the loop has ended, and with it what could move anything
-            self._loop.call_soon_threadsafe(self._set, "latched", by)
-
-    def _keep_latched(self, by: str) -> Future[str]:
+        undoes nothing for longer than a moment. However many stops come, the loop has one to see to."""
         assert self._record is not None
-        return self._record.keep(True, by)
+        try:
+            self._halt()
+        finally:
+            self._record.keep(True, by)  # before the loop knows, so that no reset can come first
+            with self._lock:
+                is_first, self._stopped_by = self._stopped_by is None, self._stopped_by or by
+            if is_first:
+                with suppress(RuntimeError):  # the loop has ended, and with it what could move anything
+                    self._loop.call_soon_threadsafe(self._latch)
+
+    def _latch(self) -> None:
+        with self._lock:
+            by, self._stopped_by = self._stopped_by, None
+        self._set("latched", by or "")
+
+    def _keep_latched(self, _by: str) -> Future[str]:
+        """The write that `_stopped` began, or one after it."""
+        assert self._record is not None
+        return self._record.last
 
     # --- the mesh -------------------------------------------------------------------------------------
 
@@ -96,16 +115,17 @@ class LatchKeeper:
         else:
             self._reset_ns = self._node.now_ns()
             self._set("released", request.by)
-        return EstopReply(service=self._node.name, latch=self.state, text=await self._not_kept())
+        not_kept = await self._not_kept(STOP_KEPT_S if request.latched else RESET_KEPT_S)
+        return EstopReply(service=self._node.name, latch=self.state, text=not_kept)  # another may have come meanwhile
 
-    async def _not_kept(self) -> str:
+    async def _not_kept(self, within_s: float) -> str:
         """Why the disk has not what was set last, or ''."""
         if self._record is None:
             return ""
         try:
-            why = await asyncio.wait_for(asyncio.shield(asyncio.wrap_future(self._record.last)), KEPT_S)
+            why = await asyncio.wait_for(asyncio.shield(asyncio.wrap_future(self._record.last)), within_s)
         except TimeoutError:
-            why = f"{self._record.path}: the disk has not taken it within {KEPT_S:g} s"
+            why = f"{self._record.path}: the disk has not taken it within {within_s:g} s"
         return f"a restart will not remember this: {why}" if why else ""
 
     def _heard(self, latch: Latch) -> None:
@@ -115,10 +135,10 @@ class LatchKeeper:
     # --- both -----------------------------------------------------------------------------------------
 
     def _set(self, state: LatchState, by: str) -> None:
-        if state != self.state:
-            level = logging.WARNING if state == "latched" else logging.INFO
-            self._node.log.log(level, "emergency stop %s by %s", state, by or "?")
+        before, self.state = self.state, state
         if self._record is not None:
             self._record.keep(state == "latched", by)
-        self.state = state
         self._changed(state, by)
+        if state != before:  # last, since a log may hang
+            level = logging.WARNING if state == "latched" else logging.INFO
+            self._node.log.log(level, "emergency stop %s by %s", state, by or "?")

@@ -4,16 +4,21 @@ from __future__ import annotations
 
 import json
 import os
+import subprocess
+import sys
 from collections.abc import Iterator
 from concurrent.futures import Future
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 
 import pytest
 
 from cocoro.cli import estop, exits
-from cocoro.cli.estop import Stop, _merged
+from cocoro.cli.estop import Stop, _left_open, _merged
 from cocoro.cli.main import main
+from cocoro.quit import UNSAID
+from cocoro.rundir import RunDir
 from cocoro.stop.path import StopPoint, listen
 
 
@@ -25,12 +30,15 @@ class Services:
         self.halted: list[str] = []
         self._stack = stack
 
-    def __call__(self, *services: str, hears: bool = True, not_kept: str = "") -> None:
+    def __call__(self, *services: str, hears: bool = True, not_kept: str = "", disk: Future[str] | None = None) -> None:
         for service in services:
             point = StopPoint(self.robot, service)
             self._stack.callback(point.close)
             if hears:
-                listen(point, lambda _by, service=service: self.halted.append(service), lambda _: told(not_kept))  # type: ignore[misc]
+                listen(point, partial(self._halt, service), lambda _: disk or told(not_kept))
+
+    def _halt(self, service: str, _by: str) -> None:
+        self.halted.append(service)
 
 
 def told(text: str) -> Future[str]:
@@ -142,3 +150,87 @@ def test_what_either_way_acknowledged_is_stopped() -> None:
 def test_a_robot_of_which_nothing_that_moves_answered_is_none() -> None:
     assert Stop("robbie", ("executive",), (), ("base", "arm", "hand"), 0.1).code == exits.NO_MESH
     assert "(of user 1001)" in str(Stop("robbie", ("base",), (), (), 0.1, owner=1001))
+
+
+def test_what_others_robots_answer_says_nothing_about_ones_own(root: Path) -> None:
+    run_dir = RunDir("robbie", root)
+    run_dir.make()
+    foreign = Stop("robbie", ("base", "arm", "hand"), (), (), 0.1, owner=1001)
+    assert _left_open(None, [foreign]) == set()
+    run_dir.hold_supervisor("sim")
+    (claim,) = run_dir.claim("base", ("base",))
+    try:
+        assert _left_open(None, [foreign]) == {"robbie"}
+        assert _left_open("robbie", [foreign]) == {"robbie"}
+        assert _left_open("other", [foreign]) == set()
+        assert _left_open(None, [foreign._replace(owner=None)]) == set()
+        assert _left_open(None, [Stop("robbie", ("arm",), (), ("base",), 0.1)]) == {"robbie"}
+    finally:
+        claim.release()
+
+
+def test_what_neither_way_acknowledged_is_missing() -> None:
+    path = Stop("robbie", ("arm",), (), ("base", "hand"), 0.1)
+    mesh = Stop("robbie", ("arm",), ("base",), ("hand",), 0.4, ("the disk is full",))
+    (both,) = _merged([path], [mesh])
+    assert both.not_kept == ("the disk is full",)
+    assert (both.missing, both.absent, both.code) == (("base",), ("hand",), exits.FAILED)
+
+
+def test_it_does_not_exit_with_0_where_a_process_of_ones_own_is_there_and_cannot_be_asked(
+    services: Services, root: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    services("arm", "hand")
+    run_dir = RunDir(services.robot, root)
+    run_dir.make()
+    (claim,) = run_dir.claim("base", ("base",))
+    run_dir.hold_supervisor("sim")
+    try:
+        assert main(["stop", "--robot", services.robot]) == exits.FAILED
+    finally:
+        claim.release()
+    assert "stopped arm, hand in" in (said := capsys.readouterr()).out + said.err
+
+
+def test_a_mesh_that_fails_in_a_way_of_which_nobody_thought_leaves_told_what_was_stopped(
+    services: Services, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise RuntimeError("out of order")
+
+    monkeypatch.setattr(estop, "ACKNOWLEDGE_S", 0.1)
+    monkeypatch.setattr(estop, "_by_mesh_too", fail)
+    services("base", "hand")
+    services("arm", hears=False)
+    assert main(["stop", "--robot", services.robot]) == exits.FAILED
+    assert "stopped base, hand in" in (said := capsys.readouterr().err)
+    assert "the mesh could not be asked: RuntimeError: out of order" in said
+
+
+def test_a_disk_that_has_not_said_anything_yet_is_told(
+    services: Services, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(estop, "KEPT_S", 0.05)
+    services("base", disk=Future())
+    assert main(["stop", "--robot", services.robot]) == exits.DONE
+    assert "; not yet known to be on the disk: base\n" in capsys.readouterr().out
+
+
+def test_nothing_that_another_process_says_or_calls_itself_reaches_the_terminal_raw(
+    services: Services, capsys: pytest.CaptureFixture[str]
+) -> None:
+    services("base", "arm\x1b[2J", not_kept="\x1b[2Jgone\n")
+    main(["stop", "--robot", services.robot])
+    said = capsys.readouterr()
+    assert "[2Jgone" in said.out + said.err
+    assert "\x1b" not in said.out + said.err
+
+
+@pytest.mark.parametrize("streams", ["closed", "full"])
+def test_who_cannot_be_told_has_stopped_the_robot_all_the_same(services: Services, streams: str) -> None:
+    services("base", "arm", "hand")
+    to = ">&- 2>&-" if streams == "closed" else ">/dev/full 2>/dev/full"
+    command = f"exec {sys.executable} -m cocoro.cli.main stop --robot {services.robot} {to}"
+    code = subprocess.run(["sh", "-c", command], check=False).returncode
+    assert code == (exits.DONE if streams == "closed" else UNSAID)
+    assert sorted(services.halted) == ["arm", "base", "hand"]

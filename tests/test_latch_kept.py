@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import threading
 import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -13,6 +14,7 @@ import pytest
 
 from cocoro import topics
 from cocoro.bus.local import LocalMesh
+from cocoro.cli.estop_mesh import ROUND_S
 from cocoro.clock import RealClock
 from cocoro.latch import LatchKeeper
 from cocoro.messages import EstopReply, EstopRequest, Latch, LatchState
@@ -183,5 +185,65 @@ def test_who_has_ended_hears_no_stop(folder: Path) -> None:
             name = it.node.robot_name
         with Asking(name) as asking:
             assert not asking.waiting
+
+    asyncio.run(scenario())
+
+
+def test_however_many_stops_come_a_loop_that_hangs_has_one_to_see_to_and_it_tells_who_came_first(folder: Path) -> None:
+    async def scenario() -> None:
+        async with base(folder) as it:
+            await it.ask(latched=False)
+            it.changes.clear()
+            with Asking(it.node.robot_name, by="the first") as asking:
+                asking.go_on(time.monotonic() + PATIENCE_S)
+            for _ in range(20):  # in the loop itself, so it does nothing else
+                it.stop()
+            assert it.halts == 21
+            await it.latched()
+            await asyncio.sleep(0)
+            assert it.changes == [("latched", f"the first (user {os.getuid()}, pid {os.getpid()})")]
+
+    asyncio.run(scenario())
+
+
+def test_what_halts_may_fail_and_the_loop_latches_all_the_same(folder: Path) -> None:
+    async def scenario() -> None:
+        async with base(folder) as it:
+            await it.ask(latched=False)
+
+            def fail() -> None:
+                raise RuntimeError("out of order")
+
+            it.keeper._halt = fail
+            asking = await asyncio.to_thread(it.stop, 0.1)
+            assert [point.service for point in asking.waiting] == ["base"]
+            await it.latched()
+            await it.kept()
+            assert read(folder / "base").latched
+
+    asyncio.run(scenario())
+
+
+def test_a_disk_that_hangs_holds_up_no_answer_on_the_mesh(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    go_on = threading.Event()
+
+    def hang(*_: object) -> int:
+        go_on.wait(PATIENCE_S)
+        return 0
+
+    async def scenario() -> None:
+        async with base(folder) as it:
+            await it.ask(latched=False)
+            await it.kept()
+            monkeypatch.setattr(os, "pwrite", hang)
+            question = EstopRequest(latched=True, by="operator")
+            reply = await it.operator.call(topics.ESTOP.of("base"), question, ROUND_S)
+            assert reply.latch == "latched"
+            assert "the disk has not taken it within" in reply.text
+            question = EstopRequest(latched=False, by="operator")
+            reply = await it.operator.call(topics.ESTOP.of("base"), question)
+            assert reply.latch == "released"
+            assert "the disk has not taken it within" in reply.text
+            go_on.set()
 
     asyncio.run(scenario())

@@ -7,6 +7,7 @@ import threading
 from collections.abc import Callable, Mapping
 from types import TracebackType
 
+from services.servos.bus import SilentError
 from services.servos.line import ServoLine, Setting
 from services.servos.motion import HOLD_RADPS
 from services.servos.table import SPEED_RADPS, Reading
@@ -24,6 +25,8 @@ class Wire:
     def __init__(self) -> None:
         self.written: list[dict[int, tuple[int, int]]] = []
         self.position = 512
+        self.misses = 0
+        """So many readings from now on get no answer."""
         self._news = threading.Condition()
 
     def __enter__(self) -> Wire:
@@ -39,7 +42,10 @@ class Wire:
             self.written.append(dict(orders))
             self._news.notify_all()
 
-    def reading(self, _number: int) -> Reading:
+    def reading(self, number: int) -> Reading:
+        if self.misses:
+            self.misses -= 1
+            raise SilentError(number)
         self.position += 1
         return Reading(0, self.position, 0, 0, 12.0, 38, 0)
 
@@ -108,3 +114,15 @@ def test_a_hand_goes_on_holding_what_it_holds_and_takes_no_new_goals() -> None:
         assert {5: (100, 30)} not in wire.written
 
     scenario(True, test)
+
+
+def test_what_does_not_answer_just_then_holds_as_soon_as_it_does() -> None:
+    def test(line: ServoLine, wire: Wire) -> None:
+        line.order(FAR)
+        wire.until(lambda written: FAR in written)
+        wire.misses = 2
+        line.halt()
+        wire.until(lambda written: 5 in written[-1] and written[-1] != FAR)
+        assert wire.misses == 0
+
+    scenario(False, test)

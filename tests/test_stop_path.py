@@ -92,7 +92,7 @@ def test_without_a_name_every_robot_is_told() -> None:
 def test_who_has_ended_is_not_waited_for(robot: str) -> None:
     with moving(robot, "base"):
         pass
-    assert not stop(robot).waiting
+    assert all(point.gone for point in stop(robot).points.values())
 
 
 def test_a_latch_that_the_disk_did_not_take_is_told(robot: str) -> None:
@@ -169,11 +169,11 @@ def test_full_queues_are_tried_again(robot: str) -> None:
                 sender.sendto(b"", b"\0" + address[1:].encode())
         with Asking(robot) as asking:
             (point,) = asking.points.values()
-            assert not point.told
+            assert point.told_s is None
             halted: list[str] = []
             listen(slow, halted.append, kept)
             asking.go_on(time.monotonic() + PATIENCE_S)
-            assert point.told
+            assert point.told_s
             assert point.latched_ns
             assert halted[-1].startswith("operator")
     slow.close()
@@ -201,20 +201,92 @@ def test_rubbish_in_the_list_of_sockets_is_passed_over(robot: str) -> None:
         assert not asking.waiting
 
 
-def test_a_thread_that_fails_halts(robot: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    failed = threading.Event()
-    monkeypatch.setattr(threading, "excepthook", lambda _: failed.set())
+def test_what_fails_in_the_path_is_a_stop_that_nobody_is_told_was_heard_and_the_path_goes_on(
+    robot: str, caplog: pytest.LogCaptureFixture
+) -> None:
     halted: list[str] = []
+    out_of_order = True
 
-    def fail(_by: str) -> Future[str]:
-        raise RuntimeError("out of order")
+    def halt(by: str) -> None:
+        halted.append(by)
+        if out_of_order and by.startswith("operator"):
+            raise RuntimeError("out of order")
 
     point = StopPoint(robot, "base")
-    listen(point, halted.append, fail)
-    stop(robot, within_s=0.2)
-    assert failed.wait(PATIENCE_S)
-    assert halted[-1] == "the failure of its own path"
+    listen(point, halt, kept)
+    assert [one.service for one in stop(robot, within_s=0.1).waiting] == ["base"]
+    assert halted[1] == "the failure of its own path"
+    assert "the emergency stop's own path failed" in caplog.text
+    out_of_order = False
+    assert not stop(robot).waiting, "it still hears"
     point.close()
+
+
+def test_a_disk_that_hangs_holds_up_no_further_stop_and_is_told_later(robot: str) -> None:
+    disk: Future[str] = Future()
+    with moving(robot, "base", keep=lambda _: disk) as halted, ExitStack() as stack:
+        first = stack.enter_context(Asking(robot))
+        first.go_on(time.monotonic() + PATIENCE_S)
+        for _ in range(100):
+            with Asking(robot) as another:
+                another.go_on(time.monotonic() + PATIENCE_S)
+                assert not another.waiting
+        assert len(halted["base"]) > 100
+        (point,) = first.points.values()
+        assert point.kept is None
+        disk.set_result("too late")
+        first.hear_of_the_disk(time.monotonic() + PATIENCE_S)
+        assert (point.kept, point.why_not_kept) == (False, "too late")
+
+
+def test_who_floods_the_asker_with_answers_neither_keeps_him_nor_hides_the_others(robot: str) -> None:
+    ended = threading.Event()
+    liar = StopPoint(robot, "arm")
+
+    def flood() -> None:
+        asked = liar.take(wait=True)
+        while asked is not None and not ended.is_set():
+            liar._answer(asked, "rubbish")
+
+    flooding = threading.Thread(target=flood)
+    flooding.start()
+    try:
+        with moving(robot, "base", "hand"):
+            asking = stop(robot, within_s=0.5)
+        assert [point.service for point in asking.waiting] == ["arm"]
+    finally:
+        ended.set()
+        liar.close()
+        flooding.join()
+
+
+def test_nobody_else_reaches_the_line_on_which_a_point_answers(robot: str) -> None:
+    deaf = StopPoint(robot, "base")
+    with Asking(robot), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as stranger:
+        asked = deaf.take(wait=False)
+        assert asked is not None
+        with pytest.raises(PermissionError):
+            stranger.sendto(b"latched base 1", asked.answer_to)
+    deaf.close()
+
+
+@pytest.mark.parametrize("free", [1, 2, 3, 1500], ids=lambda free: f"{free}-files-left")
+def test_a_caller_that_has_nearly_all_its_files_open_stops_the_robot(robot: str, free: int) -> None:
+    """Also one whose next file has a number that select(2) cannot take."""
+    code = (
+        "import resource, time; hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1];"
+        "resource.setrlimit(resource.RLIMIT_NOFILE, (min(3000, hard), hard));"
+        "from cocoro.stop.asking import Asking\nopen_files = []\n"
+        "try:\n  while True: open_files.append(open('/dev/null'))\nexcept OSError: pass\n"
+        "del open_files[-int(sys.argv[2]):]\n"
+        "a = Asking(sys.argv[1]); a.go_on(time.monotonic() + 60)\n"
+        "print(sorted(p.service for p in a.points.values() if p.latched_ns))"
+    )
+    with moving(robot, "arm", "base", "hand") as halted:
+        command = [sys.executable, "-c", f"import sys; sys.path.insert(0, {str(ROOT)!r}); " + code, robot, str(free)]
+        said = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert said.stdout == "['arm', 'base', 'hand']\n", said.stderr
+        assert halted["base"]
 
 
 def test_names_that_make_no_address_are_refused() -> None:
@@ -234,7 +306,29 @@ def test_another_user_without_any_variable_can_stop_the_robot(robot: str) -> Non
 
 
 @needs_root
-def test_an_answer_from_another_user_than_the_robots_does_not_count(robot: str) -> None:
+def test_an_address_that_names_another_user_is_that_of_who_made_it(robot: str) -> None:
+    """So what he answers, or does not, is told of a robot of his."""
+    code = (
+        "s = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM);"
+        f"s.bind(b'\\0{PREFIX}0/' + sys.argv[1].encode() + b'/base/liar');"
+        "print('there', flush=True); _, who = s.recvfrom(100); s.sendto(b'latched base 1', who); s.recvfrom(100)"
+    )
+    with another_user(robot, code) as liar:
+        try:
+            assert liar.stdout is not None
+            assert liar.stdout.readline() == "there\n"
+            with moving(robot, "arm"):
+                asking = stop(robot)
+            assert {point.service: point.uid for point in asking.points.values()} == {"base": 65534, "arm": 0}
+        finally:
+            liar.kill()
+
+
+@needs_root
+def test_where_the_kernel_does_not_tell_whose_an_address_is_only_the_answers_of_the_named_user_count(
+    robot: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(asking_module, "owners", lambda _: {})
     code = (
         "s = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM);"
         f"s.bind(b'\\0{PREFIX}0/' + sys.argv[1].encode() + b'/base/liar');"

@@ -113,6 +113,33 @@ def test_where_it_cannot_be_written_it_says_so_and_tries_again_at_the_next_word(
     assert read(folder / "base").latched
 
 
+def test_what_could_not_be_read_is_not_said_to_be_on_the_disk_unless_it_is_written_anew(folder: Path) -> None:
+    folder.parent.mkdir(parents=True)
+    folder.touch()  # a file where a folder should be
+    kept = LatchRecord(folder / "base")
+    assert kept.said.latched
+    assert kept.keep(True, "operator").result(PATIENCE_S)
+    folder.unlink()
+    folder.mkdir()
+    assert kept.keep(True, "operator").result(PATIENCE_S) == ""
+    assert read(folder / "base") == kept.said._replace(when=read(folder / "base").when)
+
+
+def test_a_write_that_fails_in_a_way_of_which_nobody_thought_is_not_the_last(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    prepare(folder, ["base"], by_hand=True)
+    kept = LatchRecord(folder / "base")
+
+    def fail(*_: object) -> int:
+        raise ValueError("out of order")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "pwrite", fail)
+        assert kept.keep(True, "operator").result(PATIENCE_S) == f"{folder}/base: out of order"
+    assert kept.keep(True, "operator").result(PATIENCE_S) == ""
+
+
 def test_a_flood_of_stops_is_written_once(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     prepare(folder, ["base"], by_hand=True)
     kept = LatchRecord(folder / "base")

@@ -9,9 +9,10 @@ from __future__ import annotations
 import os
 import sys
 import time
-from typing import NamedTuple
+from typing import NamedTuple, TextIO
 
 from cocoro.cli import exits
+from cocoro.quit import UNSAID
 from cocoro.stop.asking import Asking, Point
 
 STOPPABLE = ("base", "arm", "hand")
@@ -37,6 +38,8 @@ class Stop(NamedTuple):
     """From Enter to the moment at which the last of them stopped what it moves."""
     not_kept: tuple[str, ...] = ()
     """Why latches will not outlive a restart."""
+    not_yet_kept: tuple[str, ...] = ()
+    """Who has not said whether its latch is on the disk."""
     owner: int | None = None
     """User id of a robot that is another's."""
     latched_ns: dict[str, int] = {}  # noqa: RUF012 # read only
@@ -57,6 +60,8 @@ class Stop(NamedTuple):
             text += f"; not there: {', '.join(self.absent)}"
         if self.not_kept:
             text += f"; A RESTART WILL FORGET IT: {', '.join(self.not_kept)}"
+        if self.not_yet_kept:
+            text += f"; not yet known to be on the disk: {', '.join(self.not_yet_kept)}"
         return text
 
 
@@ -91,15 +96,19 @@ def main(command: str, arguments: list[str]) -> int:
             return exits.USAGE
     stops, troubles = by_path(robot)
     started_s = _process_start_s()
-    if profile is not None or not stops or any(stop.missing for stop in stops):
-        stops, troubles, code = _by_mesh_too(robot, profile, started_s, stops, troubles)
-    else:
-        code = exits.DONE
-    for stop in stops:
-        _say(stop, as_json)
-        code = code or stop.code
+    code = exits.DONE
+    try:
+        left_open = None if profile is not None or not stops else _left_open(robot, stops)
+        if left_open is None or left_open:
+            stops, troubles, code = _by_mesh_too(robot, profile, left_open, started_s, stops, troubles)
+    except Exception as error:  # whatever it is, what has been stopped is told
+        troubles.append(f"the mesh could not be asked: {type(error).__name__}: {error}")
+        code = exits.FAILED
+    for stop in sorted(stops, key=lambda stop: stop.owner is None):  # the operator's own where he sees it: last
+        is_said = _say(stop, as_json)
+        code = code or stop.code or (exits.DONE if is_said else UNSAID)
     for trouble in troubles:
-        print(f"cocoro: {trouble}", file=sys.stderr)
+        _print(f"cocoro: {trouble}", sys.stderr)
     return code
 
 
@@ -119,6 +128,20 @@ def by_path(robot: str | None) -> tuple[list[Stop], list[str]]:
     return [_stop_of(uid, name, points, started_s) for (uid, name), points in groups.items()], []
 
 
+def _left_open(robot: str | None, stops: list[Stop]) -> set[str]:
+    """This user's own robots of which something runs that the path did not stop. What others' robots answered says
+    nothing about them."""
+    own = {stop.robot: stop for stop in stops if stop.owner is None}
+    left_open = {stop.robot for stop in own.values() if stop.missing}
+    from cocoro.rundir import RunDir, robots  # it takes its time, and by now everything has been told
+
+    for run_dir in robots() if robot is None else [RunDir(robot)]:
+        stopped = own[run_dir.robot].acknowledged if run_dir.robot in own else ()
+        if ({*STOPPABLE} & {*run_dir.claims()}) - {*stopped}:
+            left_open.add(run_dir.robot)
+    return left_open
+
+
 def _stop_of(uid: int, robot: str, points: list[Point], started_s: float) -> Stop:
     there = {point.service for point in points}
     silent = {point.service for point in points if point.latched_ns is None}
@@ -132,6 +155,7 @@ def _stop_of(uid: int, robot: str, points: list[Point], started_s: float) -> Sto
         tuple(service for service in STOPPABLE if service not in there),
         max(latched_s, default=time.monotonic()) - started_s,
         tuple(dict.fromkeys(point.why_not_kept for point in points if point.kept is False)),
+        tuple(point.service for point in points if point.latched_ns is not None and not point.settled),
         None if uid == os.getuid() else uid,
         {point.service: point.latched_ns for point in points if point.latched_ns is not None},
     )
@@ -143,24 +167,29 @@ def _in_order(service: str) -> tuple[int, str]:
 
 
 def _by_mesh_too(
-    robot: str | None, profile: str | None, started_s: float, stops: list[Stop], troubles: list[str]
+    robot: str | None,
+    profile: str | None,
+    only: set[str] | None,
+    started_s: float,
+    stops: list[Stop],
+    troubles: list[str],
 ) -> tuple[list[Stop], list[str], int]:
-    """Ask on the mesh what the stop path left open: what both know of each robot, what was in the way, exit code."""
+    """Ask on the mesh what the stop path left open (`only` these robots, or all): what both know of each robot, what
+    was in the way, exit code."""
     from cocoro.cli import estop_mesh
     from cocoro.errors import CocoroError, ConfigError
 
-    done = {stop.robot for stop in stops if not stop.missing and profile is None}
     try:
-        which = [(run_dir, config) for run_dir, config in estop_mesh.found(robot, profile) if run_dir.robot not in done]
+        which = [one for one in estop_mesh.found(robot, profile) if only is None or one[0].robot in only]
         if not which and not stops:
             name = "no robot" if robot is None else f"no {robot}"
             return [], [*troubles, f"{name} is up on this machine: start one with `cocoro up sim`"], exits.NO_MESH
         by_mesh, errors = estop_mesh.stop_all(which, started_s)
     except (CocoroError, OSError) as error:
-        code = exits.USAGE if isinstance(error, ConfigError) else exits.FAILED
-        return stops, [*troubles, str(error)], code if not stops else exits.DONE
+        code = exits.USAGE if isinstance(error, ConfigError) and not stops else exits.FAILED
+        return stops, [*troubles, str(error)], code
     troubles = [*troubles, *map(str, errors)]
-    code = exits.DONE if by_mesh or stops or not errors else exits.NO_MESH
+    code = exits.DONE if not errors else exits.FAILED if by_mesh or stops else exits.NO_MESH
     return [*_merged(stops, by_mesh)], troubles, code
 
 
@@ -170,23 +199,39 @@ def _merged(by_path: list[Stop], by_mesh: list[Stop]) -> list[Stop]:
     merged = []
     for one in by_path:
         if (other := found.pop(one.robot, None) if one.owner is None else None) is not None:
-            acknowledged = sorted({*one.acknowledged, *other.acknowledged}, key=_in_order)
-            missing = tuple(name for name in one.missing if name not in acknowledged)
-            absent = tuple(name for name in one.absent if name not in acknowledged)
-            seconds = max(one.seconds, other.seconds)
-            one = one._replace(acknowledged=tuple(acknowledged), missing=missing, absent=absent, seconds=seconds)
+            acknowledged = {*one.acknowledged, *other.acknowledged}
+            missing = {*one.missing, *other.missing} - acknowledged
+            absent = tuple(name for name in one.absent if name not in acknowledged | missing)
+            one = one._replace(
+                acknowledged=tuple(sorted(acknowledged, key=_in_order)),
+                missing=tuple(sorted(missing, key=_in_order)),
+                absent=absent,
+                seconds=max(one.seconds, other.seconds),
+                not_kept=(*one.not_kept, *other.not_kept),
+            )
         merged.append(one)
     return [*merged, *found.values()]
 
 
-def _say(stop: Stop, as_json: bool) -> None:
+def _say(stop: Stop, as_json: bool) -> bool:
     if as_json:
         import json
 
         text = json.dumps(stop._asdict())
     else:
         text = str(stop)
-    print(text, file=sys.stderr if stop.code and not as_json else sys.stdout, flush=True)
+    return _print(text, sys.stderr if stop.code and not as_json else sys.stdout)
+
+
+def _print(text: str, file: TextIO | None) -> bool:
+    """Whether it was taken: what cannot be told changes nothing about what was stopped."""
+    try:
+        print(text, file=file, flush=True)
+    except UnicodeError:
+        return _print(ascii(text), file)
+    except (OSError, ValueError):
+        return False
+    return True
 
 
 def _process_start_s() -> float:

@@ -63,13 +63,15 @@ async def stop(run_dir: RunDir, config: ZenohConfig, started_s: float) -> Stop:
     """
     async with await ZenohBus.open(replace(config, patience_s=PATIENCE_S), expect_mesh=True) as bus:
         acknowledged: dict[str, float] = {}
+        not_kept: dict[str, str] = {}
         asking_s = time.monotonic()
         waited = False
         while True:
             living, answers = await asyncio.gather(_living(run_dir, bus), _ask(run_dir.robot, bus))
             took_s = time.monotonic() - started_s
-            for service in answers:
+            for service, text in answers.items():
                 acknowledged.setdefault(service, took_s)
+                not_kept[service] = text
             waiting = [service for service in STOPPABLE if service not in acknowledged]
             missing = tuple(service for service in waiting if service in living)
             if not missing or time.monotonic() - asking_s > GIVE_UP_S:
@@ -80,22 +82,23 @@ async def stop(run_dir: RunDir, config: ZenohConfig, started_s: float) -> Stop:
             await asyncio.sleep(PAUSE_S)
         absent = tuple(service for service in waiting if service not in living)
         took_s = took_s if missing else max(acknowledged.values(), default=took_s)
-        return Stop(run_dir.robot, tuple(acknowledged), missing, absent, took_s)
+        why_not_kept = tuple(f"{service}: {text}" for service, text in not_kept.items() if text)
+        return Stop(run_dir.robot, tuple(acknowledged), missing, absent, took_s, why_not_kept)
 
 
-async def _ask(robot: str, bus: ZenohBus) -> list[str]:
-    """Ask everybody once; the services that say they are latched."""
+async def _ask(robot: str, bus: ZenohBus) -> dict[str, str]:
+    """Ask everybody once; the services that say they are latched, and why the disk has it not, or ''."""
     question = msgspec.msgpack.encode(EstopRequest(latched=True, by="operator"))
     try:
         replies = await bus.call(ESTOP.of("*").key(robot), question, ROUND_S)
     except CallTimeoutError:
-        return []
-    latched = []
+        return {}
+    latched = {}
     for reply in replies:
         with suppress(msgspec.MsgspecError):
             answer = msgspec.msgpack.decode(reply.payload, type=EstopReply) if reply.ok else None
             if answer is not None and answer.latch == "latched":
-                latched.append(answer.service)
+                latched[answer.service] = answer.text
     return latched
 
 

@@ -16,7 +16,6 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future
-from concurrent.futures import TimeoutError as LateError
 from contextlib import suppress
 from typing import NamedTuple
 
@@ -24,8 +23,10 @@ PREFIX = "cocoro-stop/"
 LONGEST_ADDRESS = 107
 """Bytes after the leading zero (unix(7))."""
 TEXT_BYTES = 256
-KEPT_S = 2.0
-"""How long the disk may take to keep a latch before the asker is told that it has not."""
+WAITING_FOR_THE_DISK = 32
+"""So many who asked are told when the latch is on the disk; more of them are a flood."""
+FAILURE_S = 0.1
+"""A path that goes on failing halts so often."""
 _CREDENTIALS = struct.Struct("3i")
 
 
@@ -107,31 +108,44 @@ def _who(text: bytes, ancillary: list[tuple[int, int, bytes]]) -> str:
     return said
 
 
-def listen(point: StopPoint, halt: Callable[[str], None], keep: Callable[[str], Future[str]] | None = None) -> None:
-    """Hear stops in a thread of their own until the point is closed, whatever the event loop does.
+def listen(point: StopPoint, halt: Callable[[str], None], keep: Callable[[str], Future[str]]) -> None:
+    """Hear stops in a thread of their own until the point is closed, whatever the event loop and the disk do.
 
     `halt(by)` stops what the service moves; it is called in that thread and must be brief. `keep(by)` begins to write
-    the latch to the disk; the future tells why it could not be kept, or ''. Should the thread fail, it halts.
+    the latch to the disk; the future tells why it could not be kept, or ''. Whatever fails here is a stop of its own
+    that nobody is told was heard, and the thread goes on: what cannot be stopped must not move.
     """
+    room = threading.BoundedSemaphore(WAITING_FOR_THE_DISK)
 
     def hear() -> None:
-        try:
-            while (asked := point.take(wait=True)) is not None:
-                halt(asked.by)
-                point.latched(asked, time.monotonic_ns())
-                point.kept(asked, _kept(keep, asked.by))
-        finally:
-            if not point.closed:
-                halt("the failure of its own path")
+        while not point.closed:
+            try:
+                if (asked := point.take(wait=True)) is not None:
+                    halt(asked.by)
+                    point.latched(asked, time.monotonic_ns())
+                    _tell_when_kept(point, asked, keep(asked.by), room)
+            except Exception:
+                with suppress(Exception):
+                    halt("the failure of its own path")
+                _log_failure(point.service)
+                time.sleep(FAILURE_S)
 
     threading.Thread(target=hear, name=f"stop {point.service}", daemon=True).start()
 
 
-def _kept(keep: Callable[[str], Future[str]] | None, by: str) -> str:
-    """Why the latch is not on the disk, or ''."""
-    if keep is None:
-        return "nothing is kept here"
-    try:
-        return keep(by).result(KEPT_S)
-    except LateError:
-        return f"the disk has not taken it within {KEPT_S:g} s"
+def _tell_when_kept(point: StopPoint, asked: Asked, kept: Future[str], room: threading.BoundedSemaphore) -> None:
+    """Answer once more when the disk is done, without waiting for it; where it hangs, not for all who ask meanwhile."""
+
+    def tell(kept: Future[str]) -> None:
+        room.release()
+        point.kept(asked, kept.result())
+
+    if room.acquire(blocking=False):
+        kept.add_done_callback(tell)
+
+
+def _log_failure(service: str) -> None:
+    import logging  # the guard, which has no use for it, is to start quickly
+
+    with suppress(Exception):
+        logging.getLogger(f"cocoro.{service}").exception("the emergency stop's own path failed; it halted")

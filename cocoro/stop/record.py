@@ -96,7 +96,7 @@ class LatchRecord:
         """What it says, or will when the disk has taken it."""
         self.last: Future[str] = Future()
         """The newest write: why it is not on the disk, or '' when it is."""
-        self.last.set_result("")
+        self.last.set_result("" if self.said.when else self.said.by)  # what cannot be read is not on the disk
         self._fd: int | None = None
         with suppress(OSError):
             self._fd = os.open(path, os.O_RDWR | _FLAGS)
@@ -128,8 +128,8 @@ class LatchRecord:
             if os.fstat(self._fd).st_size != RECORD_BYTES:  # it was damaged
                 os.ftruncate(self._fd, RECORD_BYTES)
             os.fsync(self._fd)
-        except OSError as error:
-            return f"{self.path}: {error.strerror or error}"
+        except Exception as error:  # whatever it is, the next write is tried
+            return f"{self.path}: {getattr(error, 'strerror', None) or error}"
         return ""
 
 

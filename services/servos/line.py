@@ -98,7 +98,7 @@ class ServoLine:
         self._tasks: SimpleQueue[Task] = SimpleQueue()
         self._orders: tuple[float, Mapping[int, tuple[int, int]]] = (0.0, {})
         self._halted = False
-        self._held: dict[int, tuple[int, int]] | None = None
+        self._held: dict[int, tuple[int, int]] = {}
         """Where the servos were when the line was halted, in counts, and with which speed they hold that."""
         self._misses = dict.fromkeys(settings, 0)
         self._probed_s = 0.0
@@ -157,7 +157,7 @@ class ServoLine:
             self._order(bus, started_s)
             for number in self._to_read(started_s):
                 self._read(bus, number, event)
-            if self._halted and self._held is None:
+            if self._halted:
                 self._hold(bus, event.readings)
             self._do_task(bus, event)
             self._check(bus, event)
@@ -169,20 +169,22 @@ class ServoLine:
     def _order(self, bus: Bus, now_s: float) -> None:
         """Write the newest orders; of a halted line, where its servos were when it was halted."""
         if not self._halted:
-            self._held = None
+            self._held = {}
             until_s, goals = self._orders
             if now_s < until_s:
                 bus.go(goals)
-        elif self._held is not None:
+        else:
             bus.go(self._held)
 
     def _hold(self, bus: Bus, readings: Mapping[int, Reading]) -> None:
-        """Have what is under orders hold where it has just been read; a line that keeps its goals only takes no new
-        ones."""
+        """Have what is under orders hold where it has just been read, which may take some cycles where one does not
+        answer; a line that keeps its goals only takes no new ones."""
         speed = round(HOLD_RADPS / table.SPEED_RADPS)
         ordered = () if self._keeps_goal else self._orders[1]
-        self._held = {number: (readings[number].position, speed) for number in ordered if number in readings}
-        bus.go(self._held)
+        fresh = [number for number in ordered if number in readings and number not in self._held]
+        if fresh:
+            self._held |= {number: (readings[number].position, speed) for number in fresh}
+            bus.go(self._held)
 
     def _to_read(self, now_s: float) -> Collection[int]:
         """All that answer; of those that do not, one at a time and not often."""
