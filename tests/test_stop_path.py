@@ -179,6 +179,27 @@ def test_full_queues_are_tried_again(robot: str) -> None:
     slow.close()
 
 
+def test_who_finds_no_room_in_a_flood_is_there_as_soon_as_there_is_some(
+    robot: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(asking_module, "LOOK_AGAIN_S", PATIENCE_S)  # it is not tried by and by
+    full = StopPoint(robot, "base")
+    (address,) = addresses(robot)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as sender:
+        with suppress(BlockingIOError):
+            while True:
+                sender.sendto(b"", b"\0" + address[1:].encode())
+        with Asking(robot) as asking:
+            (point,) = asking.points.values()
+            asking.go_on(time.monotonic() + 0.05)
+            assert point.told_s is None
+            while full.take(wait=False) is not None:
+                pass
+            asking.go_on(time.monotonic() + 0.05)
+            assert point.told_s
+    full.close()
+
+
 def test_one_who_appears_while_others_are_waited_for_is_told_too(robot: str) -> None:
     deaf = StopPoint(robot, "arm")
     with Asking(robot) as asking:

@@ -73,6 +73,8 @@ class Asking:
         self._poll = select.poll()
         self._poll.register(self._shared, select.POLLIN)
         self._lines = {self._shared.fileno(): self._shared}
+        self._on_line: dict[int, Point] = {}
+        """By the number of its line."""
         self._tell(found)
 
     def __enter__(self) -> Asking:
@@ -115,11 +117,17 @@ class Asking:
                     self.points[address] = Point(address, owner)
         for point in self.waiting:
             if point.told_s is None or time.monotonic() - point.told_s > TELL_AGAIN_S:
-                try:
-                    self._line_to(point).sendto(self._by, point.address)
-                    point.told_s = time.monotonic()
-                except OSError as error:  # else it has many waiting, or there is no memory just now: told again
-                    point.gone = error.errno in ENDED
+                self._tell_one(point)
+
+    def _tell_one(self, point: Point) -> None:
+        try:
+            self._line_to(point).sendto(self._by, point.address)
+            point.told_s = time.monotonic()
+        except OSError as error:  # else it has many waiting, or there is no memory just now: told again
+            point.gone = error.errno in ENDED
+        if point.line is not None:  # in a flood there is room for a moment only
+            awaits_room = point.told_s is None and not point.gone
+            self._poll.modify(point.line, select.POLLIN | (select.POLLOUT if awaits_room else 0))
 
     def _line_to(self, point: Point) -> socket.socket:
         """A line on which it alone can answer, so that nobody else fills the queue of its answers."""
@@ -129,6 +137,7 @@ class Asking:
             except OSError:
                 return self._shared
             self._lines[point.line.fileno()] = point.line
+            self._on_line[point.line.fileno()] = point
             self._poll.register(point.line, select.POLLIN)
             point.line.connect(point.address)
         return point.line
@@ -136,7 +145,9 @@ class Asking:
     def _hear(self, wait_s: float) -> None:
         """Wait so long at most for answers, and take some of each line: one who never ceases keeps nobody else from
         being heard."""
-        for fd, _ in self._poll.poll(max(wait_s * 1000.0, 0.0)):
+        for fd, events in self._poll.poll(max(wait_s * 1000.0, 0.0)):
+            if events & select.POLLOUT:
+                self._tell_one(self._on_line[fd])
             with suppress(OSError):
                 for _ in range(AT_ONCE):
                     ancillary_bytes = socket.CMSG_SPACE(_CREDENTIALS.size)
