@@ -12,6 +12,7 @@ from bus_rig import Local, Mesh, Zenoh
 from hypothesis import HealthCheck, settings
 from pictures import renderer_of
 
+from cocoro.bus import shared
 from cocoro.robot import Robot
 from sim.render import Renderer
 
@@ -79,3 +80,9 @@ def renderer(request: pytest.FixtureRequest) -> Renderer:
 @pytest.fixture
 def gl() -> Renderer:
     return renderer_of("moderngl")
+
+
+@pytest.fixture
+def needs_pool() -> None:
+    if why := shared.obstacle(2 * (shared.POOL_BYTES + shared.PROCESS_BYTES)):
+        pytest.skip(why)

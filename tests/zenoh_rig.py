@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 
+from cocoro.bus import shared
 from cocoro.bus.base import Payload
 from cocoro.bus.endpoints import ZenohConfig
 from cocoro.bus.zenoh import ZenohBus
@@ -54,6 +55,24 @@ async def main():
     bus.declare_alive(f"robot/{NAME}/alive")
     say("ready")
     await asyncio.get_running_loop().create_future()
+asyncio.run(main())
+"""
+)
+
+
+PUBLISHER = (
+    CHILD
+    + """
+from cocoro.bus import shared
+async def main():
+    async with await join(shared_memory=sys.argv[2] != "plain") as bus:
+        if sys.argv[2] == "publisher":
+            publisher = bus.publisher("robot/frame", Qos.FRAME)
+            publisher.put(bytes(1_500_000))
+            assert not publisher.trouble, publisher.trouble
+        say("took", sum(shared.segments().values()))
+        sys.stdin.readline()
+        await bus.call("robot/*/who", b"", 0.1)
 asyncio.run(main())
 """
 )
@@ -129,3 +148,8 @@ def left_in(directory: Path) -> list[str]:
 
 async def echo(key: str, payload: Payload) -> bytes:
     return bytes(payload)
+
+
+def held() -> list[Path]:
+    """The segments that this process holds; others of this user's may come and go."""
+    return [Path(f"/proc/self/fd/{fd}").readlink() for fd in shared._held()]
