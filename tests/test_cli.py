@@ -145,7 +145,7 @@ def test_the_emergency_stop_imports_next_to_nothing() -> None:
     modules = set(done.stdout.split())
     assert {name for name in modules if name.startswith("cocoro")} == {
         "cocoro", "cocoro.cli", "cocoro.cli.main", "cocoro.cli.exits", "cocoro.cli.output", "cocoro.cli.estop",
-        "cocoro.quit", "cocoro.stop", "cocoro.stop.asking",
+        "cocoro.quit", "cocoro.stop", "cocoro.stop.asking", "cocoro.stop.owners",
     }  # fmt: skip
     assert modules.isdisjoint({"asyncio", "argparse", "json", "pathlib", "typing_extensions", "msgspec", "zenoh"})
 

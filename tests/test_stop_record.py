@@ -178,15 +178,24 @@ def test_a_folder_that_others_can_write_to_is_refused(folder: Path) -> None:
         prepare(folder, ["base"], by_hand=True)
 
 
-def test_the_place_outlives_a_reboot(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in (record.STATE_DIR, "STATE_DIRECTORY", "XDG_STATE_HOME"):
+def test_the_place_outlives_a_reboot_and_is_the_same_for_the_unit_file_and_by_hand(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    for name in (record.STATE_DIR, "XDG_STATE_HOME"):
         monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(record, "MACHINES", tmp_path / "lib")
     monkeypatch.setenv("HOME", "/home/robbie")
     assert latch_dir("calliope") == Path("/home/robbie/.local/state/cocoro/calliope/latch")
     monkeypatch.setenv("XDG_STATE_HOME", "/home/robbie/state")
     assert latch_dir("calliope") == Path("/home/robbie/state/cocoro/calliope/latch")
-    monkeypatch.setenv("STATE_DIRECTORY", "/var/lib/cocoro:/var/lib/other")
-    assert latch_dir("calliope") == Path("/var/lib/cocoro/calliope/latch")
+    monkeypatch.setattr(record, "MACHINES", Path("/proc/1"))
+    monkeypatch.setattr(os, "geteuid", lambda: 4711)
+    assert latch_dir("calliope") == Path("/home/robbie/state/cocoro/calliope/latch"), "it is another's"
+    monkeypatch.undo()
+    monkeypatch.delenv(record.STATE_DIR, raising=False)
+    (tmp_path / "lib").mkdir()
+    monkeypatch.setattr(record, "MACHINES", tmp_path / "lib")
+    assert latch_dir("calliope") == tmp_path / "lib" / "calliope" / "latch"
     monkeypatch.setenv(record.STATE_DIR, "/somewhere")
     assert latch_dir("calliope") == Path("/somewhere/calliope/latch")
 

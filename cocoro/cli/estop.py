@@ -12,7 +12,6 @@ import time
 from typing import NamedTuple, TextIO
 
 from cocoro.cli import exits
-from cocoro.quit import UNSAID
 from cocoro.stop.asking import Asking, Point
 
 STOPPABLE = ("base", "arm", "hand")
@@ -106,7 +105,7 @@ def main(command: str, arguments: list[str]) -> int:
         code = exits.FAILED
     for stop in sorted(stops, key=lambda stop: stop.owner is None):  # the operator's own where he sees it: last
         is_said = _say(stop, as_json)
-        code = code or stop.code or (exits.DONE if is_said else UNSAID)
+        code = code or stop.code or (exits.DONE if is_said else exits.FAILED)
     for trouble in troubles:
         _print(f"cocoro: {trouble}", sys.stderr)
     return code

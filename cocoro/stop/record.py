@@ -2,8 +2,9 @@
 
 The file never grows, so a full disk does not matter; it is written in place and synced. Who cannot read its record
 counts as latched. The files of a robot lie in `<state>/<robot>/latch/`, where <state> is the first of
-$COCORO_STATE_DIR, $STATE_DIRECTORY (systemd), $XDG_STATE_HOME/cocoro and ~/.local/state/cocoro: a place that
-outlives a reboot, unlike the run directory.
+$COCORO_STATE_DIR, /var/lib/cocoro where it is this user's (the unit file makes it so), $XDG_STATE_HOME/cocoro and
+~/.local/state/cocoro: a place that outlives a reboot, unlike the run directory, and that does not change with who
+starts the robot, the unit file or the user by hand.
 """
 
 from __future__ import annotations
@@ -22,6 +23,8 @@ from typing import NamedTuple
 
 STATE_DIR = "COCORO_STATE_DIR"
 """Environment variable with the place of what must outlive a reboot."""
+MACHINES = Path("/var/lib/cocoro")
+"""The place of a robot that starts with its machine."""
 RECORD_BYTES = 512
 """One sector of a disk: it is written whole or not at all."""
 _BY_CHARACTERS = 60
@@ -41,8 +44,9 @@ def state_dir() -> Path:
     """Where a robot's state lives that must outlive a reboot."""
     if explicit := os.environ.get(STATE_DIR):
         return Path(explicit).absolute()
-    if service := os.environ.get("STATE_DIRECTORY", "").partition(":")[0]:
-        return Path(service)
+    with suppress(OSError):
+        if MACHINES.stat().st_uid == os.geteuid():
+            return MACHINES
     if state := os.environ.get("XDG_STATE_HOME"):
         return Path(state) / "cocoro"
     return Path(os.path.expanduser("~")) / ".local" / "state" / "cocoro"  # noqa: PTH111 # Path's raises without a home
