@@ -16,6 +16,8 @@ from cocoro.bus import shared
 from cocoro.robot import Robot
 from sim.render import Renderer
 
+pytest_plugins = ["clock_rig"]
+
 # The same examples at every run, and none that fails because the machine was busy.
 settings.register_profile(
     "repeatable", derandomize=True, database=None, deadline=None, suppress_health_check=[HealthCheck.too_slow]
