@@ -25,9 +25,9 @@ from cocoro.vloop import run_virtual
 pytestmark = pytest.mark.sim
 
 FAR = 2**62
-STANDS_S = 0.3
+STANDS_S = 0.45
 """For so long at most one bad message makes the robot less than half as fast: 0.25 s until the true stamps have passed
-the wrong one, three messages, and the ramps down and up, less the deadman."""
+the wrong one, three messages at 50 Hz, and the ramps down and up, less the patience that there is at full speed."""
 KEYS: tuple[Topic[Any], ...] = (topics.BASE_COMMAND, topics.BASE_STATE, topics.LATCH)
 
 

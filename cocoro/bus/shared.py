@@ -157,7 +157,11 @@ def _unlink(path: str, status: os.stat_result) -> bool:
 
 def _held() -> Iterable[int]:
     """The descriptors by which this process holds segments."""
-    for entry in list(os.scandir("/proc/self/fd")):
+    try:
+        entries = list(os.scandir("/proc/self/fd"))
+    except OSError:  # no /proc: then nobody can tell
+        return
+    for entry in entries:
         with suppress(OSError):
             target = Path(entry.path).readlink()
             if target.parent == PLACE and _SEGMENT.fullmatch(target.name):

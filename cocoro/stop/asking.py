@@ -66,7 +66,7 @@ class Asking:
         self.points: dict[str, Point] = {}
         """By address. It grows as long as new ones appear."""
         self._robot = robot
-        self._by = by.encode()
+        self._by = by.encode(errors="replace")
         found = addresses(robot)  # first, since a file and a socket at once may be more than this process may open
         self._shared = _socket()
         """For those that get no line of their own: this process may not open that many."""
@@ -182,7 +182,7 @@ def addresses(robot: str | None = None) -> dict[str, int | None]:
     with open(SOCKETS, "rb") as sockets:  # noqa: PTH123 # pathlib takes as long to import as all else here
         for line in sockets:
             name = line.rstrip(b"\n").partition(PREFIX.encode())[2]
-            if name and (robot is None or name.split(b"/")[1:2] == [robot.encode()]):
+            if name and (robot is None or name.split(b"/")[1:2] == [os.fsencode(robot)]):
                 with suppress(UnicodeDecodeError):
                     found.append(PREFIX + name.decode())
     users = owners(_raw(PREFIX)) if found else {}
