@@ -28,6 +28,10 @@ class _Publisher:
         elif way == "late":
             asyncio.get_running_loop().call_later(LATE_S, self._raw.put, bytes(payload))
 
+    @property
+    def trouble(self) -> str:
+        return self._raw.trouble
+
     def close(self) -> None:
         self._raw.close()
 
