@@ -1,5 +1,5 @@
 """Whether what a file says of itself agrees with what was read of it: its statistics, its index of metadata, the
-checksums of its metadata. What does not agree is told as damage."""
+checksums of its metadata. What does not agree is told as damage. A file without statistics has none to contradict."""
 
 from __future__ import annotations
 
@@ -67,6 +67,8 @@ def _keep_written(found: Contents) -> None:
     kept: list[tuple[int, Metadata]] = []
     if not sealed:
         return
+    if not found.header_right:
+        found.problems.append("the file's header is damaged")
     for at, each in zip(found.metadata_at, found.metadata, strict=True):
         needless = CHECKSUM not in each.metadata and not _recorders_name(each.name)
         right = needless or each.metadata.get(CHECKSUM) == checksum(each.metadata)

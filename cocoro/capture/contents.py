@@ -42,6 +42,8 @@ class Contents:
 
     profile: str = ""
     library: str = ""
+    header_right: bool = True
+    """False where the header has zeros in its texts, or is longer than its fields: by others it may be."""
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
     places: list[Place] = field(default_factory=list)
@@ -141,15 +143,17 @@ class Disk:
         return crc
 
 
-def header_of(disk: Disk) -> Header:
-    """Read the file's header; an empty one where it cannot be read."""
+def begun(disk: Disk) -> Contents:
+    """Contents with the file's header; an empty one where it cannot be read."""
     try:
         op, length = PREFIX.unpack(disk.read(len(MAGIC), PREFIX.size))
         if op == Opcode.HEADER and length <= LARGEST_RECORD:
-            return mcap.parsed(Header, disk.read(len(MAGIC) + PREFIX.size, length))[0]
+            header, taken = mcap.parsed(Header, disk.read(len(MAGIC) + PREFIX.size, length))
+            right = taken == length and "\0" not in header.profile + header.library
+            return Contents(header.profile, header.library, right)
     except DamageError:
         pass
-    return Header("", "")
+    return Contents()
 
 
 def read_chunk(disk: Disk, at: int, ours: bool, exactly: bool = False) -> tuple[int, bytes | memoryview]:

@@ -18,7 +18,7 @@ from mcap.records import ChunkIndex, Footer, MetadataIndex, Statistics
 
 from cocoro.capture import mcap
 from cocoro.capture.agreement import compare
-from cocoro.capture.contents import Contents, Disk, Place, header_of, read_chunk
+from cocoro.capture.contents import Contents, Disk, Place, begun, read_chunk
 from cocoro.capture.errors import CutOffError, DamageError
 from cocoro.capture.mcap import MAGIC, PREFIX
 from cocoro.capture.walk import Walk
@@ -53,17 +53,12 @@ def contents(disk: Disk) -> Contents:
     return found
 
 
-def _begun(disk: Disk) -> Contents:
-    header = header_of(disk)
-    return Contents(header.profile, header.library)
-
-
 # --- by the summary -------------------------------------------------------------------------------
 
 
 def _by_summary(disk: Disk) -> Contents:
     """Raises _UnsureError, or DamageError for what a reading from front to back will find, too."""
-    found, indices = _begun(disk), []
+    found, indices = begun(disk), []
     summary, summary_start = _summary(disk, found.ours)
     for op, content, _ in mcap.records(summary):
         if op == Opcode.SCHEMA:
@@ -160,7 +155,7 @@ def front_to_back(disk: Disk) -> Contents:
 
 
 def _scanned(disk: Disk) -> Contents:
-    found = _begun(disk)
+    found = begun(disk)
     found.closed = _ends(disk)
     walk, at = Walk(disk, found, check=True, sure=_summary_is_right(disk, found.ours)), len(MAGIC)
     while at < disk.size:
