@@ -11,7 +11,7 @@ import msgspec
 
 from cocoro import topics
 from cocoro.bus.local import LocalMesh
-from cocoro.capture.compression import Packer
+from cocoro.capture.compression import Compression, Packer
 from cocoro.capture.keys import KeyInfo, info_of
 from cocoro.capture.reader import Capture, Record
 from cocoro.capture.writer import Entry, Limits, Writer
@@ -80,13 +80,13 @@ def frame(number: int, width: int = 16, height: int = 12) -> Frame:
     return Frame(width=width, height=height, colour=memoryview(shade), depth=memoryview(shade[: 2 * width * height]))
 
 
-def writer(folder: Path, limits: Limits = FOR_EVER, **options: Any) -> Writer:
+def writer(folder: Path, limits: Limits = FOR_EVER, compression: Compression = "zstd", **options: Any) -> Writer:
     """Writes one-1.mcap, one-2.mcap and so on."""
 
     def info(key: str, payload: bytes) -> KeyInfo:
         return info_of(key, "calliope", payload)
 
-    return Writer(lambda number: folder / f"one-{number}.mcap", Packer("zstd"), limits, info, **options)
+    return Writer(lambda number: folder / f"one-{number}.mcap", Packer(compression), limits, info, **options)
 
 
 def entry(key: str, number: int, payload: bytes = b"", log_ns: int | None = None) -> Entry:

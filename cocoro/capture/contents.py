@@ -42,15 +42,25 @@ class Contents:
 
     profile: str = ""
     library: str = ""
+    header_right: bool = True
+    """False where the header has zeros in its texts, or is longer than its fields: by others it may be."""
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
     places: list[Place] = field(default_factory=list)
     metadata: list[Metadata] = field(default_factory=list)
     """As they stand in the file."""
+    metadata_at: list[int] = field(default_factory=list)
+    """The place of each of them."""
+    metadata_told: dict[int, str] = field(default_factory=dict)
+    """Place and name of each, as the summary's index of them has it."""
     attachments: list[AttachmentIndex] = field(default_factory=list)
     statistics: Statistics | None = None
     raw_bytes: int = 0
     """Size of all chunks before compression."""
+    chunks: int = 0
+    """With those that have no messages."""
+    messages: Counter[int] = field(default_factory=Counter)
+    """By channel, how many were counted; none where this was taken from the summary."""
     closed: bool = False
     """It has its end, whatever else is wrong with it."""
     summarised: bool = False
@@ -72,7 +82,9 @@ class Contents:
 
     @property
     def ours(self) -> bool:
-        """It was written by a recorder, so messages are in chunks, and each metadata record has its checksum."""
+        """It was written by a recorder. So messages are in chunks; every chunk, the summary and each metadata record
+        have their checksum; no record is longer than its fields; and a file that was closed has statistics and a
+        tally. What is missing of these, or 0, is damage."""
         return self.follows_page and self.library.startswith(MAKER)
 
     def add_schema(self, content: mcap.Bytes) -> int:
@@ -85,12 +97,13 @@ class Contents:
         self.channels[channel.id] = channel
         return taken
 
-    def add_metadata(self, content: mcap.Bytes) -> int:
-        """How many bytes of it the record takes. Raises DamageError where a recorder's checksum is wrong."""
+    def add_metadata(self, content: mcap.Bytes, at: int) -> int:
+        """How many bytes of it the record at a place takes. Raises DamageError where a recorder's checksum is wrong."""
         found, taken = mcap.parsed(Metadata, content)
         if self.ours and found.metadata.get(CHECKSUM) != checksum(found.metadata):
             raise DamageError(f"the metadata {found.name!r} is not what was written")
         self.metadata.append(found)
+        self.metadata_at.append(at)
         return taken
 
 
@@ -130,41 +143,48 @@ class Disk:
         return crc
 
 
-def header_of(disk: Disk) -> Header:
-    """Read the file's header; an empty one where it cannot be read."""
+def begun(disk: Disk) -> Contents:
+    """Contents with the file's header; an empty one where it cannot be read."""
     try:
         op, length = PREFIX.unpack(disk.read(len(MAGIC), PREFIX.size))
         if op == Opcode.HEADER and length <= LARGEST_RECORD:
-            return mcap.parsed(Header, disk.read(len(MAGIC) + PREFIX.size, length))[0]
+            header, taken = mcap.parsed(Header, disk.read(len(MAGIC) + PREFIX.size, length))
+            right = taken == length and "\0" not in header.profile + header.library
+            return Contents(header.profile, header.library, right)
     except DamageError:
         pass
-    return Header("", "")
+    return Contents()
 
 
-def read_chunk(disk: Disk, at: int, exactly: bool = False) -> tuple[int, bytes | memoryview]:
-    """The length of the chunk record at a place, and the records in it, as their checksum vouches for them. With
-    `exactly` one without a checksum must not be longer than its fields."""
+def read_chunk(disk: Disk, at: int, ours: bool, exactly: bool = False) -> tuple[int, bytes | memoryview]:
+    """The length of the chunk record at a place, and the records in it, as their checksum vouches for them; `ours` as
+    for `unpacked`. With `exactly` one without a checksum must not be longer than its fields. Raises DamageError."""
     op, length = PREFIX.unpack(disk.read(at, PREFIX.size))
     if op != Opcode.CHUNK or length > disk.size - at - PREFIX.size or length > LARGEST_CHUNK:
         raise DamageError("it is damaged, or cut off")
-    raw, taken = unpacked(content := disk.read(at + PREFIX.size, length))
+    raw, taken = unpacked(content := disk.read(at + PREFIX.size, length), ours)
     if exactly and taken != length and mcap.ChunkHead.unpack(content)[0].crc == 0:
         raise DamageError("its length contradicts itself")
     return PREFIX.size + length, raw
 
 
-def unpacked(content: bytes) -> tuple[bytes | memoryview, int]:
-    """The records in a chunk, from its record's content, and how many bytes of that it takes."""
+def unpacked(content: bytes, ours: bool) -> tuple[bytes | memoryview, int]:
+    """The records in a chunk, from its record's content, and how many bytes of that it takes. One of `ours`, a
+    recorder's, has records and their checksum, and nothing after them: zeros in its head would else make it a chunk
+    without records that has no checksum. Raises DamageError."""
     record = memoryview(content)
     head, start = mcap.ChunkHead.unpack(record)
     if start + head.packed_bytes > len(record):
         raise DamageError("its length contradicts itself")
     raw = unpack(head.compression, record[start : start + head.packed_bytes], head.raw_bytes)
-    if head.crc not in (0, zlib.crc32(raw)):  # 0: its writer gave none
+    taken = start + head.packed_bytes
+    if ours and (not raw or taken != len(record)):
+        raise DamageError("its length contradicts itself")
+    if head.crc != zlib.crc32(raw) and (ours or head.crc != 0):  # 0: its writer gave none, which recorders never do
         raise DamageError("its checksum is wrong")
-    return raw, start + head.packed_bytes
+    return raw, taken
 
 
-def read_place(disk: Disk, place: Place) -> bytes | memoryview:
-    """The records of a place."""
-    return disk.read(place.offset, place.length) if place.loose else read_chunk(disk, place.offset)[1]
+def read_place(disk: Disk, place: Place, ours: bool) -> bytes | memoryview:
+    """The records of a place; `ours` as for `unpacked`."""
+    return disk.read(place.offset, place.length) if place.loose else read_chunk(disk, place.offset, ours)[1]

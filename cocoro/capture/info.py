@@ -86,7 +86,7 @@ def report(capture: Capture, check: bool = False) -> Report:
     checked = check or tallies is not told
     if checked:
         capture.check()
-    notes = [*capture.notes, *_contradictions(capture, tallies)]
+    notes = [*capture.notes, *_contradictions(capture)]
     dropped, lost = missing_of(capture)
     names = sorted(capture.keys)
     keys = tuple(
@@ -159,14 +159,11 @@ def _counted(capture: Capture) -> dict[int, KeyTally]:
     return tallies
 
 
-def _contradictions(capture: Capture, tallies: Mapping[int, KeyTally]) -> list[str]:
+def _contradictions(capture: Capture) -> list[str]:
     """False statements of the file about itself, in words. MCAP readers do not look at them, so they are no damage."""
     if capture.problems:
         return []
-    found, counted = [], sum(tally.messages for tally in tallies.values())
-    statistics = capture.statistics
-    if statistics is not None and statistics.message_count != counted:
-        found.append(f"its statistics say {statistics.message_count} messages, and it has {counted}")
+    found = []
     if capture.follows_page and TALLY in capture.metadata and capture.summarised and _told_tallies(capture) is None:
         found.append(f"its metadata {TALLY!r} is not of this file, so its messages were counted")
     return found

@@ -102,12 +102,13 @@ def attachment_index(content: Bytes, offset: int, length: int) -> tuple[Attachme
     return AttachmentIndex(offset, length, log_time, create_time, size, name, media_type), stream.count
 
 
-def attachment(content: Bytes) -> Attachment:
-    """An attachment whose checksum is right, or that has none (0); the package never looks. Raises DamageError."""
+def attachment(content: Bytes, must: bool) -> Attachment:
+    """An attachment whose checksum is right, or, unless it `must` have one, 0 for none; the package never looks.
+    Raises DamageError."""
     found, taken = parsed(Attachment, content)
     view = memoryview(content)
     (crc,) = struct.unpack("<I", view[taken - 4 : taken])
-    if crc not in (0, zlib.crc32(view[: taken - 4])):
+    if crc != zlib.crc32(view[: taken - 4]) and (must or crc != 0):
         raise DamageError(f"the checksum of the attachment {found.name!r} is wrong")
     return found
 
@@ -117,9 +118,12 @@ def footer(summary: bytes, summary_start: int, offsets_start: int) -> bytes:
     return packed(Footer(summary_start, offsets_start, _footer_crc(summary, summary_start, offsets_start)))
 
 
-def vouches_for(footer: Footer, summary: bytes) -> bool:
-    """Whether the summary section is what it was when it was written; True when the writer gave no checksum (0)."""
-    return footer.summary_crc in (0, _footer_crc(summary, footer.summary_start, footer.summary_offset_start))
+def vouches_for(footer: Footer, summary: bytes, must: bool) -> bool:
+    """Whether the summary section is what it was when it was written; also True when the writer gave no checksum (0),
+    unless it `must` have one."""
+    if footer.summary_crc == 0 and not must:
+        return True
+    return footer.summary_crc == _footer_crc(summary, footer.summary_start, footer.summary_offset_start)
 
 
 def _footer_crc(summary: bytes, summary_start: int, offsets_start: int) -> int:
@@ -197,6 +201,12 @@ def check_message_index(content: Bytes) -> int:
     if length % 16 or 6 + length > len(content):
         raise DamageError("a message index has a wrong length")
     return 6 + int(length)
+
+
+def index_entries(content: Bytes) -> tuple[int, list[tuple[int, int]]]:
+    """The channel of a message index that was checked; log time and offset of each message."""
+    channel, length = struct.unpack_from("<HI", content)
+    return channel, list(struct.iter_unpack("<QQ", content[6 : 6 + length]))
 
 
 @dataclass(frozen=True)

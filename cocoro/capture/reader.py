@@ -17,7 +17,7 @@ import heapq
 import json
 import os
 import stat
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Collection, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cached_property
@@ -31,11 +31,12 @@ from mcap.records import Attachment, AttachmentIndex, Channel, Schema, Statistic
 
 from cocoro.bus.keys import matches
 from cocoro.capture import mcap
+from cocoro.capture.agreement import miscounted
 from cocoro.capture.contents import Contents, Disk, Place, read_place
 from cocoro.capture.errors import CaptureError, DamageError, NotAFileError
 from cocoro.capture.file import CHECKSUM, TALLY, checksum
 from cocoro.capture.keys import JSON, MSGPACK
-from cocoro.capture.scan import contents
+from cocoro.capture.scan import contents, front_to_back
 from cocoro.capture.types import NotReadableError, reader_of
 
 Raw = bytes | memoryview
@@ -130,7 +131,7 @@ class Capture:
 
     @property
     def problems(self) -> list[str]:
-        """Parts that could not be read, as far as it was tried, in words."""
+        """Parts that could not be read, and counts that are not so, as far as it was tried, in words."""
         more = [f"and {self._untold} more of the kind"] if self._untold else []
         return [*self._problems, *more]
 
@@ -209,7 +210,7 @@ class Capture:
     def attachment(self, index: AttachmentIndex) -> Attachment:
         """Read one attachment with its data. Raises DamageError where its checksum is wrong."""
         content = self._disk.read(index.offset, index.length)
-        return mcap.attachment(content[mcap.PREFIX.size :])
+        return mcap.attachment(content[mcap.PREFIX.size :], self._contents.ours)
 
     @cached_property
     def robot(self) -> str:
@@ -257,21 +258,29 @@ class Capture:
             and (place.channels is None or place.channels & wanted or not place.channels <= self.channels.keys())
         ]
         waiting: list[tuple[int, int, int, Record]] = []
+        counts: Counter[int] = Counter()
         for place, raw in self._read_ahead(places):
             while waiting and waiting[0][0] < place.start_ns:
                 yield heapq.heappop(waiting)[3]
             for order, message in enumerate(self._messages_in(place, raw, wanted)):
+                counts[message.channel_id] += 1
                 if (start_ns is None or message.log_ns >= start_ns) and (end_ns is None or message.log_ns < end_ns):
                     record = self._record(message)
                     heapq.heappush(waiting, (message.log_ns, place.offset, order, record))
+        if start_ns is None and end_ns is None and self.statistics is not None:
+            for text in miscounted(self.statistics, counts, wanted, of_all=wanted == self.channels.keys()):
+                self.add_problem(text)
         while waiting:
             yield heapq.heappop(waiting)[3]
 
     def check(self) -> None:
-        """Look at the checksums that reading messages does not look at: of all the data, and of attachments. What is
-        wrong is in `problems` then."""
+        """Look at what reading messages does not look at: the checksums of all the data and of attachments, and of a
+        recorder's file every record, from front to back. What is wrong is in `problems` then. Raises CaptureError."""
         found = self._contents
         try:
+            if found.ours and found.summarised:
+                for problem in front_to_back(self._disk).problems:
+                    self.add_problem(problem)
             if found.data_crc and self._disk.checksum(0, found.data_end) != found.data_crc:
                 self.add_problem("the checksum of all the data is wrong")
             for index in found.attachments:
@@ -297,7 +306,7 @@ class Capture:
             ahead: deque[tuple[Place, Future[Raw]]] = deque()
             try:
                 for place in places:
-                    ahead.append((place, pool.submit(read_place, self._disk, place)))
+                    ahead.append((place, pool.submit(read_place, self._disk, place, self._contents.ours)))
                     if len(ahead) > AHEAD:
                         yield ahead.popleft()
                 while ahead:

@@ -14,10 +14,11 @@ import struct
 from collections.abc import Iterator
 
 from mcap.opcode import Opcode
-from mcap.records import ChunkIndex, Footer, Statistics
+from mcap.records import ChunkIndex, Footer, MetadataIndex, Statistics
 
 from cocoro.capture import mcap
-from cocoro.capture.contents import Contents, Disk, Place, header_of, read_chunk
+from cocoro.capture.agreement import compare
+from cocoro.capture.contents import Contents, Disk, Place, begun, read_chunk
 from cocoro.capture.errors import CutOffError, DamageError
 from cocoro.capture.mcap import MAGIC, PREFIX
 from cocoro.capture.walk import Walk
@@ -28,6 +29,7 @@ _MARKS = (struct.pack("<I", 4) + b"zstd", struct.pack("<I", 3) + b"lz4", struct.
 """A chunk's compression, as it stands in its head."""
 _MARK_AT = PREFIX.size + 28
 _MCAPS = frozenset(Opcode)
+_FOOTER_DAMAGED = "the file's footer is damaged"
 
 
 class _UnsureError(Exception):
@@ -41,17 +43,14 @@ def contents(disk: Disk) -> Contents:
     if disk.size < len(MAGIC) or disk.read(0, len(MAGIC)) != MAGIC:
         raise DamageError("this is no MCAP file")
     try:
-        return _by_summary(disk)
+        found = _by_summary(disk)
     except (_UnsureError, DamageError) as reason:
-        found = scan(disk)
+        found = front_to_back(disk)
         if isinstance(reason, _UnsureError) and str(reason):
             found.problems.insert(0, str(reason))
         return found
-
-
-def _begun(disk: Disk) -> Contents:
-    header = header_of(disk)
-    return Contents(header.profile, header.library)
+    compare(found)
+    return found
 
 
 # --- by the summary -------------------------------------------------------------------------------
@@ -59,8 +58,8 @@ def _begun(disk: Disk) -> Contents:
 
 def _by_summary(disk: Disk) -> Contents:
     """Raises _UnsureError, or DamageError for what a reading from front to back will find, too."""
-    summary, summary_start = _summary(disk)
-    found, indices = _begun(disk), []
+    found, indices = begun(disk), []
+    summary, summary_start = _summary(disk, found.ours)
     for op, content, _ in mcap.records(summary):
         if op == Opcode.SCHEMA:
             found.add_schema(content)
@@ -70,51 +69,57 @@ def _by_summary(disk: Disk) -> Contents:
             found.statistics, _ = mcap.parsed(Statistics, content)
         elif op == Opcode.CHUNK_INDEX:
             indices.append(mcap.parsed(ChunkIndex, content)[0])
+        elif op == Opcode.METADATA_INDEX:
+            index, _ = mcap.parsed(MetadataIndex, content)
+            found.metadata_told[index.offset] = index.name
         elif op not in _MCAPS:
             found.unknown[op] += 1
     if found.statistics is None:
         raise _UnsureError
     indices.sort(key=lambda index: index.chunk_start_offset)
     _between_chunks(disk, found, indices, summary_start)
+    found.chunks += len(indices)
     found.places += map(_place, indices)
     found.places.sort()
     found.raw_bytes += sum(index.uncompressed_size for index in indices)
     told = found.statistics
     listed = (told.schema_count, told.channel_count, told.chunk_count, told.attachment_count, told.metadata_count)
-    chunks = sum(not place.loose for place in found.places)
-    if listed != (len(found.schemas), len(found.channels), chunks, len(found.attachments), len(found.metadata)):
+    if listed != (len(found.schemas), len(found.channels), found.chunks, len(found.attachments), len(found.metadata)):
         raise _UnsureError
+    found.messages.clear()
     if any(place.channels is not None and not place.channels <= found.channels.keys() for place in found.places):
         raise _UnsureError
     found.closed = found.summarised = True
     return found
 
 
-def _footer(disk: Disk) -> tuple[Footer, int]:
-    """Read the footer; also the offset of its record. Raises _UnsureError where there is none with a summary."""
+def _footer(disk: Disk, ours: bool) -> tuple[Footer, int]:
+    """Read the footer; also the offset of its record. Raises _UnsureError where there is none with a summary, which
+    is damage in a file of `ours`."""
     if not _ends(disk):
         raise _UnsureError  # it was never closed, which is no damage; or its footer is longer than what is known of it
     at = disk.size - mcap.FOOTER_LENGTH - len(MAGIC)
     footer, _ = mcap.parsed(Footer, disk.read(at + PREFIX.size, mcap.FOOTER_LENGTH - PREFIX.size))
     if footer.summary_start == 0:
-        raise _UnsureError
+        raise _UnsureError(_FOOTER_DAMAGED if ours else "")
     return footer, at
 
 
-def _summary(disk: Disk) -> tuple[bytes, int]:
-    """Read the summary section, which its checksum vouches for, and the offset at which it begins."""
-    footer, footer_at = _footer(disk)
+def _summary(disk: Disk, ours: bool) -> tuple[bytes, int]:
+    """Read the summary section, which its checksum vouches for, and the offset at which it begins. In a file of `ours`
+    it must have a checksum. Raises _UnsureError."""
+    footer, footer_at = _footer(disk, ours)
     if not len(MAGIC) <= footer.summary_start <= footer_at or footer_at - footer.summary_start > LARGEST_SUMMARY:
-        raise _UnsureError("the file's footer is damaged")
+        raise _UnsureError(_FOOTER_DAMAGED)
     summary = disk.read(footer.summary_start, footer_at - footer.summary_start)
-    if not mcap.vouches_for(footer, summary):
+    if not mcap.vouches_for(footer, summary, must=ours):
         raise _UnsureError("the file's summary is damaged")
     return summary, footer.summary_start
 
 
-def _summary_is_right(disk: Disk) -> bool:
+def _summary_is_right(disk: Disk, ours: bool) -> bool:
     try:
-        _summary(disk)
+        _summary(disk, ours)
     except (_UnsureError, DamageError):
         return False
     return True
@@ -142,22 +147,29 @@ def _place(index: ChunkIndex) -> Place:
 # --- from front to back ---------------------------------------------------------------------------
 
 
-def scan(disk: Disk) -> Contents:
+def front_to_back(disk: Disk) -> Contents:
     """Read everything, and keep what is whole."""
-    found = _begun(disk)
+    found = _scanned(disk)
+    compare(found)
+    return found
+
+
+def _scanned(disk: Disk) -> Contents:
+    found = begun(disk)
     found.closed = _ends(disk)
-    walk, at = Walk(disk, found, check=True, sure=_summary_is_right(disk)), len(MAGIC)
+    walk, at = Walk(disk, found, check=True, sure=_summary_is_right(disk, found.ours)), len(MAGIC)
     while at < disk.size:
         try:
             at = walk.step(at)
         except DamageError as damage:
             start = at if walk.suspect is None else walk.suspect
-            after = _search(disk, start + 1)
+            after = _search(disk, start + 1, found.ours)
             if after == disk.size and isinstance(damage, CutOffError) and not found.closed:
                 found.cut_bytes = disk.size - at
                 break
             found.problems.append(f"bytes {start} to {after} are not readable: {damage}")
-            walk.suspect, at = None, after
+            walk.jump()
+            at = after
     walk.finish()
     return found
 
@@ -170,7 +182,7 @@ def _ends(disk: Disk) -> bool:
     return tail.endswith(MAGIC) and tail.startswith(PREFIX.pack(Opcode.FOOTER, mcap.FOOTER_LENGTH - PREFIX.size))
 
 
-def _search(disk: Disk, start: int) -> int:
+def _search(disk: Disk, start: int, ours: bool) -> int:
     """Where the next chunk is that is right; the file's size when there is none."""
     overlap = mcap.LONGEST_CHUNK_HEAD + PREFIX.size
     for block_at in range(start, disk.size, _SEARCHED):
@@ -178,7 +190,7 @@ def _search(disk: Disk, start: int) -> int:
         for candidate in _candidates(block):
             at = block_at + candidate
             try:
-                read_chunk(disk, at, exactly=True)
+                read_chunk(disk, at, ours, exactly=True)
             except DamageError:
                 continue
             return at

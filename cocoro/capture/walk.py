@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -33,7 +34,6 @@ HEAD_BYTES = 1 << 16
 _SUMMARY = {
     Opcode.CHUNK_INDEX: ChunkIndex,
     Opcode.ATTACHMENT_INDEX: AttachmentIndex,
-    Opcode.METADATA_INDEX: MetadataIndex,
     Opcode.SUMMARY_OFFSET: SummaryOffset,
 }
 """Kinds that only say where others are."""
@@ -44,7 +44,7 @@ class Walk:
 
     def __init__(self, disk: Disk, found: Contents, check: bool, sure: bool = True) -> None:
         """With `check` the checksums of attachments are looked at, which reads them. Unless it is `sure` that the
-        summary is as it was written, no channels and schemas are taken from there."""
+        summary is as it was written, nothing is taken from there."""
         self.suspect: int | None = None
         """The first of the records just before this place that nothing vouches for: of unknown kinds, or longer than
         what is known of them. A wrong length may be hidden there."""
@@ -56,12 +56,14 @@ class Walk:
         self._run_end = 0
         self._run_times: list[int] = []
         self._run_channels: set[int] = set()
+        self._due: dict[int, list[tuple[int, int]]] = {}
+        """By channel, log time and offset of each message in the chunk that was read last, until its index is read."""
         self._kinds: dict[int, Callable[[bytes], int]] = {
             Opcode.SCHEMA: self._schema,
             Opcode.CHANNEL: self._channel,
-            Opcode.METADATA: found.add_metadata,
             Opcode.STATISTICS: self._statistics,
-            Opcode.MESSAGE_INDEX: mcap.check_message_index,
+            Opcode.MESSAGE_INDEX: self._message_index,
+            Opcode.METADATA_INDEX: self._metadata_index,
             **{op: partial(_taken, kind) for op, kind in _SUMMARY.items()},
         }
 
@@ -73,6 +75,10 @@ class Walk:
         if at > end:
             raise DamageError("a record reaches into another")
         self.finish()
+
+    def jump(self) -> None:
+        """Records were passed by, so what the next one is says nothing of those before."""
+        self.suspect, self._due = None, {}
 
     def finish(self) -> None:
         """Close the run of messages outside of chunks, if there is one."""
@@ -92,6 +98,9 @@ class Walk:
         if end > self._disk.size:
             raise CutOffError("a record is cut off")
         start, taken = at + PREFIX.size, length
+        if self._due and op != Opcode.MESSAGE_INDEX:
+            self._found.problems.append(f"before byte {at} an index of messages is missing")
+            self._due = {}
         if op == Opcode.MESSAGE:
             self._message(at, start, end)
         elif op == Opcode.CHUNK:
@@ -104,6 +113,8 @@ class Walk:
             taken = self._data_end(at, self._disk.near(start, min(length, HEAD_BYTES)))
         elif op == Opcode.HEADER and at == len(MAGIC):
             taken = mcap.parsed(Header, self._content(start, length))[1]
+        elif op == Opcode.METADATA:
+            taken = self._found.add_metadata(self._content(start, length), at)
         elif op in self._kinds:
             taken = self._kinds[op](self._content(start, length))
         elif op in (0, Opcode.HEADER):
@@ -115,6 +126,8 @@ class Walk:
             return end
         if op != Opcode.CHUNK and _is_chunk(self._disk, start, length):
             raise DamageError("by its content it is a chunk, by its kind it is none")
+        if self._found.ours:
+            self._found.problems.append(f"bytes {at} to {end} are no record of a recorder's")
         self.suspect = at if self.suspect is None else self.suspect
         if taken < 0:
             self._found.unknown[op] += 1
@@ -138,24 +151,43 @@ class Walk:
         if not self._run_times:
             self._run_at = at
         self._run_end = end
+        self._found.messages[channel_id] += 1
         self._run_times.append(log_ns)
         self._run_channels.add(channel_id)
 
     def _chunk(self, at: int, start: int, end: int) -> int:
-        raw, taken = unpacked(self._disk.read(start, end - start))
-        channels, times = set(), []
-        for op, content, _ in mcap.records(raw):
+        record = self._disk.read(start, end - start)
+        raw, taken = unpacked(record, self._found.ours)
+        index: dict[int, list[tuple[int, int]]] = defaultdict(list)
+        times = []
+        for op, content, offset in mcap.records(raw):
             if op == Opcode.MESSAGE:
                 message = mcap.message(content)
-                channels.add(message.channel_id)
+                index[message.channel_id].append((message.log_ns, offset))
                 times.append(message.log_ns)
             elif op == Opcode.SCHEMA:
                 self._found.add_schema(content)
             elif op == Opcode.CHANNEL:
                 self._found.add_channel(content)
         self._found.raw_bytes += len(raw)
+        self._found.chunks += 1
+        self._found.messages.update({channel: len(entries) for channel, entries in index.items()})
         if times:
-            self._found.places.append(Place(at, end - at, min(times), max(times), frozenset(channels)))
+            self._found.places.append(Place(at, end - at, min(times), max(times), frozenset(index)))
+        if self._found.ours:
+            self._due = index
+            head, _ = mcap.ChunkHead.unpack(record)
+            if times and (head.start_ns, head.end_ns) != (min(times), max(times)):
+                self._found.problems.append(f"the times of the chunk at byte {at} are not those of its messages")
+        return taken
+
+    def _message_index(self, content: bytes) -> int:
+        taken = mcap.check_message_index(content)
+        if self._found.ours:
+            channel, entries = mcap.index_entries(content)
+            if sorted(entries) != sorted(self._due.pop(channel, ())):
+                place = self._found.places[-1].offset if self._found.places else 0
+                self._found.problems.append(f"an index of the chunk at byte {place} is not that of its messages")
         return taken
 
     def _attachment(self, at: int, start: int, end: int) -> int:
@@ -163,7 +195,7 @@ class Walk:
         index, data_at = mcap.attachment_index(head, at, end - at)
         if self._check:
             try:
-                mcap.attachment(self._disk.read(start, end - start))
+                mcap.attachment(self._disk.read(start, end - start), self._found.ours)
             except DamageError as damage:  # its record is as long as it says, so what follows can be read
                 self._found.problems.append(f"bytes {at} to {end} are not readable: {damage}")
                 return data_at + index.data_size + 4
@@ -181,7 +213,15 @@ class Walk:
         return self._found.add_channel(content)
 
     def _statistics(self, content: bytes) -> int:
-        self._found.statistics, taken = mcap.parsed(Statistics, content)
+        told, taken = mcap.parsed(Statistics, content)
+        if self._sure:
+            self._found.statistics = told
+        return taken
+
+    def _metadata_index(self, content: bytes) -> int:
+        told, taken = mcap.parsed(MetadataIndex, content)
+        if self._sure:
+            self._found.metadata_told[told.offset] = told.name
         return taken
 
     def _data_end(self, at: int, content: bytes) -> int:
@@ -211,7 +251,7 @@ def _is_chunk(disk: Disk, start: int, length: int) -> bool:
         head, _ = mcap.ChunkHead.unpack(disk.near(start, min(length, mcap.LONGEST_CHUNK_HEAD)))
         if head.crc == 0 or head.compression not in KNOWN or head.packed_bytes > length:
             return False
-        unpacked(disk.read(start, length))
+        unpacked(disk.read(start, length), ours=False)
     except DamageError:
         return False
     return True
