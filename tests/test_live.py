@@ -112,7 +112,8 @@ def test_who_is_frozen_while_driving_leaves_a_robot_that_stands(
     shell: Shell, service: str, said: Topic[Any], reason: str | None
 ) -> None:
     """All times are the simulator's own: how busy the machine is plays no part but for messages under way."""
-    assert shell("up", "sim", "--detach", "--frames", "320x240@15").returncode == exits.DONE
+    patient = ("--set", "mesh.lease_s=60")  # on a busy machine two simulated seconds may be longer than the usual lease
+    assert shell("up", "sim", "--detach", "--frames", "320x240@15", *patient).returncode == exits.DONE
     fetch = shell.start("fetch", "red_can")
 
     async def scenario() -> None:
@@ -142,7 +143,7 @@ def test_who_is_frozen_while_driving_leaves_a_robot_that_stands(
         assert code == exits.FAILED
         assert reason in fetch.lines[-1]
     else:
-        assert code == exits.DONE, "it goes on where it was"
+        assert code == exits.DONE, fetch.lines  # it goes on where it was
 
 
 async def speeds(truths: Stream[Truth]) -> AsyncIterator[tuple[float, int]]:

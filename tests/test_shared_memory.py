@@ -236,7 +236,7 @@ async def test_without_room_a_session_opens_and_a_publisher_says_why_its_frames_
             publisher = bus.publisher("robot/frame", Qos.FRAME)
             for _ in range(3):
                 publisher.put(FRAME)
-            assert held() == before
+            assert set(held()) <= set(before)  # what earlier tests left may go meanwhile
     why = f"{shared.PLACE} has 0 kB free, 12 kB are needed (12 kB more): make room, or mount it larger"
     assert publisher.trouble == f"no shared memory: {why}; {shared.COSTS}"
     assert [record.message for record in caplog.records] == [f"no shared memory: {why}; {shared.COSTS}"]
