@@ -17,12 +17,12 @@ check mypy
 check lint-imports --no-logo
 [ ${#unclean[@]} = 0 ] || echo "NOT CLEAN: ${unclean[*]}"
 
-# Tests that start processes or simulate a world have the machine for themselves; the others share it.
+# Tests of real processes have the machine for themselves; the others, which go by virtual time, share it.
 if [ $# = 0 ]; then
-    echo "== pytest, what is pure, on two processors"
-    pytest -rs -n 2 -m "not zenoh and not sim"
+    echo "== pytest, what goes by virtual time, on two processors"
+    pytest -rs -n 2 -m "not zenoh"
     tests=$?
-    set -- -m "zenoh or sim"
+    set -- -m zenoh
 fi
 echo "== pytest $*"
 pytest -rs "$@" || tests=$?
