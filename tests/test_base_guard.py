@@ -13,6 +13,8 @@ from wire_base import DEADMAN_NS, MS, PATIENCE_NS, SAFE, Bench, FakeService, gua
 
 from services.base import oi
 
+pytestmark = pytest.mark.zenoh
+
 
 @pytest.fixture
 def bench(tmp_path: Path) -> Iterator[Bench]:

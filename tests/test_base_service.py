@@ -22,6 +22,8 @@ from cocoro.testing import ServiceUnderTest
 from services.base.service import BaseService, Config
 from sim.wire.faults import Fault
 
+pytestmark = pytest.mark.zenoh
+
 LONG_S = 30.0
 
 

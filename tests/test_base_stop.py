@@ -23,6 +23,8 @@ from cocoro.stop.asking import Asking
 from cocoro.stop.record import prepare, read
 from cocoro.testing import ServiceUnderTest
 
+pytestmark = pytest.mark.zenoh
+
 PATIENCE_S = 60.0
 
 

@@ -22,6 +22,8 @@ from services.servos.line import STATE
 from services.servos.motion import LEAD_S, REACH_RAD
 from sim.wire.faults import Fault
 
+pytestmark = pytest.mark.zenoh
+
 ELBOW = 5
 FOREVER_NS = 10**19
 
