@@ -117,7 +117,7 @@ def test_a_live_process_s_segments_survive_the_sweep_of_what_a_killed_one_left(d
                 assert len(left) == len(theirs) == 3
                 killed.kill()
                 killed.wait()
-                assert there() == left | theirs
+                assert theirs <= there() <= left | theirs  # zenoh removes what it shared with the dead one, and no more
                 sweep = "from cocoro.bus import shared; print(shared.sweep())"
                 while there() != theirs:  # the kernel lets go of a killed process's files a moment after its end
                     subprocess.run([*namespace.prefix, sys.executable, "-c", sweep], check=True, capture_output=True)

@@ -16,6 +16,9 @@ LOOSE_S = 0.5
 """A hand that feels nothing for so long has lost what it held. When the arm comes to rest the claws may feel nothing
 for a moment, and then want a quarter of a second until they trust their grip again."""
 
+LISTEN_S = 0.25
+"""At least so long nothing may come while this process runs, before the planner is said to be silent."""
+
 
 class TaskFailedError(Exception):
     """A step, and with it perhaps the task, did not succeed: a reason to decide on, a text for people."""
@@ -177,16 +180,20 @@ class PlannerSkills:
     async def _next_status(self) -> PlannerStatus:
         """The next status. Raises TaskFailedError when none comes for too long."""
         while True:
-            began_s = self.now_s()
             waiting = asyncio.ensure_future(self._plan.next())
-            timer = asyncio.ensure_future(self._node.sleep(self._silence_s))
             try:
-                await asyncio.wait((waiting, timer), return_when=asyncio.FIRST_COMPLETED)
-                if waiting.done():
-                    return waiting.result()
+                # The last part is listened to anew: who was stopped meanwhile takes what came only after it wakes.
+                for part_s in (max(self._silence_s - LISTEN_S, 0.0), LISTEN_S):
+                    began_s = self.now_s()
+                    timer = asyncio.ensure_future(self._node.sleep(part_s))
+                    try:
+                        await asyncio.wait((waiting, timer), return_when=asyncio.FIRST_COMPLETED)
+                    finally:
+                        timer.cancel()
+                    if waiting.done():
+                        return waiting.result()
             finally:
                 waiting.cancel()
-                timer.cancel()
-            if self.now_s() - began_s < 2 * self._silence_s:
+            if self.now_s() - began_s < 2 * LISTEN_S:
                 raise TaskFailedError("not_alive", "the planner is silent")
-            # This process was itself stopped for a while; what the planner said meanwhile is only now being read.
+            # This process was itself stopped in that last part.
