@@ -29,23 +29,23 @@ from pathlib import Path
 
 import psutil
 
+from apps.captures.info import report
+from apps.captures.reexecute import rerun, words
+from apps.rehearsal.rehearse import rehearse
+from apps.rehearsal.request import RehearsalRequest
 from cocoro import topics
 from cocoro.bus.endpoints import default
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.capture.compression import Packer
-from cocoro.capture.info import report
 from cocoro.capture.reader import Capture
-from cocoro.capture.rerun import rerun, words
 from cocoro.clock import RealClock
 from cocoro.messages import BaseState, Frame
 from cocoro.node import Node
-from cocoro.rehearsal import RehearsalRequest
 from cocoro.robot import Robot
-from cocoro.rundir import RunDir
 from cocoro.tokens import recorder_key
-from sim.rehearse import rehearse
+from deploy.rundir import RunDir
 
-COCORO = [sys.executable, "-m", "cocoro.cli.main"]
+COCORO = [sys.executable, "-m", "apps.cli.main"]
 HEARD_S, LOOK_S = 10.0, 0.2
 """How long the second recorder may take for the last of a replay, and how often that is looked for."""
 PROFILE = """

@@ -17,14 +17,14 @@ from collections import defaultdict
 from contextlib import redirect_stderr, redirect_stdout, suppress
 from pathlib import Path
 
+from apps.captures.rewrite import rewrite
+from apps.cli.main import main as cocoro
+from apps.rehearsal.rehearse import rehearse
+from apps.rehearsal.request import RehearsalRequest
 from cocoro.capture.compression import Packer
 from cocoro.capture.errors import CaptureError
 from cocoro.capture.reader import Capture, Record
-from cocoro.capture.rewrite import rewrite
-from cocoro.cli.main import main as cocoro
 from cocoro.clock import NS
-from cocoro.rehearsal import RehearsalRequest
-from sim.rehearse import rehearse
 
 
 def damage(folder: Path, times: int) -> None:

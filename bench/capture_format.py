@@ -31,15 +31,15 @@ from mcap.stream_reader import breakup_chunk
 from mcap.writer import CompressionType
 from mcap.writer import Writer as PackageWriter
 
+from apps.rehearsal.rehearse import rehearse
+from apps.rehearsal.request import RehearsalRequest
 from cocoro.capture import mcap
 from cocoro.capture.compression import QUICK, Packer
 from cocoro.capture.contents import unpacked
 from cocoro.capture.keys import info_of
 from cocoro.capture.reader import Capture
-from cocoro.capture.writer import Entry, Limits, Writer
 from cocoro.clock import NS
-from cocoro.rehearsal import RehearsalRequest
-from sim.rehearse import rehearse
+from services.capture.writer import Entry, Limits, Writer
 
 SMALL_BYTES = 64 * 1024
 MEMORY = Path("/dev/shm")

@@ -17,12 +17,13 @@ from cocoro import topics
 from cocoro.bus.base import Payload
 from cocoro.bus.local import LocalMesh
 from cocoro.clock import NS, VirtualClock
+from cocoro.component import load
 from cocoro.errors import CocoroError
 from cocoro.messages import CancelRequest, EstopRequest, TaskReply, TaskRequest
 from cocoro.node import Node
-from cocoro.processes import load, named
 from cocoro.robot import Robot
 from cocoro.topics import HARDWARE, Qos
+from deploy.processes import named
 from services.planning.config import Config as Planning
 from sim.motion import Motion, read_motion
 

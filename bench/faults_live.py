@@ -31,7 +31,7 @@ from cocoro.errors import CocoroError
 from cocoro.messages import PlannerStatus, TaskReply, TaskRequest, TaskState
 from cocoro.node import Node
 from cocoro.robot import Robot
-from cocoro.rundir import Target
+from deploy.rundir import Target
 from sim.motion import Motion, read_motion
 
 VICTIMS = {"sim": ("planning", "executive", "perception"), "sim-wire": ("base", "arm")}

@@ -19,11 +19,11 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
+from apps.learning.study import BEST, METHODS, Sightings, fit
 from cocoro.learning.drawing import Drawing
 from cocoro.learning.fitting import LeastSquares, learn_in_order
 from cocoro.learning.network import PAPER_RATE, HyperplaneRbf
 from cocoro.learning.reachability import ReachMesh
-from cocoro.learning.study import BEST, METHODS, Sightings, fit
 from cocoro.robot import Robot
 
 SAMPLES = 1000

@@ -31,7 +31,7 @@ from cocoro.bus.zenoh import ZenohBus
 from cocoro.clock import NS, FollowedClock
 from cocoro.node import Node
 from cocoro.robot import Robot
-from cocoro.rundir import RunDir
+from deploy.rundir import RunDir
 from sim.judge import HELD_S, Judge, Verdict
 from sim.random_scene import find_scene
 
@@ -47,7 +47,7 @@ class Operator:
         self._env |= {"COCORO_STATE_DIR": str(root / "state")}
 
     def start(self, *arguments: str) -> subprocess.Popen[str]:
-        command = [sys.executable, "-m", "cocoro.cli.main", *arguments]
+        command = [sys.executable, "-m", "apps.cli.main", *arguments]
         return subprocess.Popen(command, env=self._env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
 
     def __call__(self, *arguments: str) -> tuple[int, str, float]:

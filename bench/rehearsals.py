@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from typing import Any
 
-from cocoro.rehearsal import RehearsalRequest
+from apps.rehearsal.request import RehearsalRequest
 from sim.random_scene import random_scene
 
 Result = dict[str, Any]
@@ -76,8 +76,8 @@ SETS: dict[str, tuple[Callable[[int], Iterator[dict[str, Any]]], Callable[[Resul
 
 
 def _run(request: RehearsalRequest) -> Result:
+    from apps.rehearsal.rehearse import rehearse
     from cocoro.errors import CocoroError
-    from sim.rehearse import rehearse
 
     try:
         return rehearse(request)

@@ -37,7 +37,7 @@ from cocoro.clock import FollowedClock
 from cocoro.messages import TaskRequest
 from cocoro.node import Node
 from cocoro.robot import Robot
-from cocoro.rundir import Target
+from deploy.rundir import Target
 
 STANDING_MPS = 0.01
 BOUNDS_S = {"quiet": 0.3, "loaded": 1.0}

@@ -18,7 +18,7 @@ from cocoro.clock import FollowedClock
 from cocoro.messages import BaseCommand, BaseState, EstopRequest
 from cocoro.node import Node
 from cocoro.robot import Robot
-from cocoro.rundir import RunDir
+from deploy.rundir import RunDir
 
 NAME = "calliope"
 CIRCLE = (0.41, 0.29)

@@ -65,7 +65,7 @@ class RealClock:
     """The robot's clock where nobody simulates it: `steady_ns` plus an offset to wall time that is read once.
 
     So stamps read as wall time, and setting the wall clock later changes nothing. All processes of a robot on a machine
-    take the same offset: see `cocoro.robot_time`.
+    take the same offset: see `deploy.robot_time`.
     """
 
     epoch = 0

@@ -2,15 +2,15 @@
 
 A token drops when its process ends, and also when the mesh has not heard of that process for the lease: because it was
 stopped, because it hangs, because the way to it is broken, or because this process was itself asleep. A process of this
-machine that is dead holds its claim no more (see `cocoro.rundir`); of others it cannot be known.
+machine that is dead holds its claim no more (see `deploy.rundir`); of others it cannot be known.
 """
 
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Callable
 from contextlib import suppress
 
-from cocoro.rundir import RunDir
 from cocoro.vigil import Vigil
 
 CLAIM_S = 0.5
@@ -21,11 +21,13 @@ LOOK_S = 0.02
 class Contact:
     """Tell it of each token that comes (`met`); it then tells what became of those that dropped.
 
-    Without a run directory nothing is known of any process, and without a vigil this process never sleeps.
+    `claimant` gives the number of the process of this machine that is a service now: None when no process is, 0 when
+    one is whose number is not known yet. It may raise OSError. Without it nothing is known of any process, and without
+    a vigil this process never sleeps.
     """
 
-    def __init__(self, run_dir: RunDir | None = None, vigil: Vigil | None = None) -> None:
-        self._run_dir = run_dir
+    def __init__(self, claimant: Callable[[str], int | None] | None = None, vigil: Vigil | None = None) -> None:
+        self._claimant = claimant
         self.vigil = vigil
         self._pids: dict[str, int] = {}
         """Of services that processes of this machine are, or were when they were met."""
@@ -34,19 +36,19 @@ class Contact:
         """Its token is there."""
         self._pids.pop(service, None)
         with suppress(OSError):
-            by = None if self._run_dir is None else self._run_dir.claimant(service)
-            if by is not None:
-                self._pids[service] = by.pid
+            pid = None if self._claimant is None else self._claimant(service)
+            if pid is not None:
+                self._pids[service] = pid
 
     def dead(self, service: str) -> bool:
         """Whether it is known that the process that was this service has ended."""
-        if self._run_dir is None or service not in self._pids:
+        if self._claimant is None or service not in self._pids:
             return False
         try:
-            by = self._run_dir.claimant(service)
+            pid = self._claimant(service)
         except OSError:
             return False
-        return by is None or by.pid not in (self._pids[service], 0)  # 0: somebody holds it, and has not said who
+        return pid is None or pid not in (self._pids[service], 0)  # 0: somebody holds it, and has not said who
 
     async def lost(self, service: str) -> str:
         """Its token dropped: what is true of it, in words, at once or within `CLAIM_S`."""

@@ -13,7 +13,7 @@ import asyncio
 import logging
 import os
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -61,11 +61,13 @@ class Node:
         health_hz: float = 1.0,
         module: str = "",
         config: Any = None,
+        profile: Mapping[str, Any] | None = None,
         latches: Path | None = None,
         contact: Contact | None = None,
     ) -> None:
         """`latency_s` is added to every step of a driven core that gives outputs, as if computing them took longer.
         `module` and `config` are the component that runs here, for those who ask (see `cocoro.about`).
+        `profile` is the resolved profile that it was started with, as data.
         `latches` is the folder of the emergency stop's records; without it nothing is kept, and the stop path is not
         listened to (a service in a process of its own has it). `contact` knows what became of services that are not
         heard any more."""
@@ -78,6 +80,7 @@ class Node:
         self.record_steps = record_steps
         self.module = module
         self.config = config
+        self.profile = profile or {}
         self.latches = latches
         self.contact = contact or Contact()
         self.log = logging.getLogger(f"cocoro.{name}")
@@ -157,7 +160,7 @@ class Node:
         """Another service in this process, on the same bus and clock: the simulator stands in for four."""
         return Node(
             name, self.bus, self.clock, self.robot, robot_name=self.robot_name, health_hz=self._health_hz,
-            module=self.module, config=self.config, latches=self.latches,
+            module=self.module, config=self.config, profile=self.profile, latches=self.latches,
         )  # fmt: skip
 
     def keep(self, handle: Handle) -> None:

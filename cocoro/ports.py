@@ -7,8 +7,8 @@ from contextlib import suppress
 from pathlib import Path
 
 from cocoro import private
+from cocoro.bus.endpoints import default_run_dir
 from cocoro.checks import Check, bad, note, ok
-from cocoro.rundir import RunDir
 
 WIRE = "wire:"
 RULES = "deploy/udev/99-cocoro.rules"
@@ -18,7 +18,7 @@ LATENCY_MS = 1
 
 def wire_dir(robot: str) -> Path:
     """Where the simulator puts its emulated ports."""
-    return RunDir(robot).path / "wire"
+    return default_run_dir() / robot / "wire"
 
 
 def port_path(name: str, robot: str) -> str:

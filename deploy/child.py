@@ -12,11 +12,12 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import IO
 
+from cocoro.component import Process
 from cocoro.errors import ConfigError
-from cocoro.launch import CRASHED, MISCONFIGURED, REFUSED
-from cocoro.processes import BACKOFF_LIMIT_S, SETTLED_S, Process
-from cocoro.rundir import RunDir
 from cocoro.vigil import RECOVERY_S, Vigil
+from deploy.launch import CRASHED, MISCONFIGURED, REFUSED
+from deploy.processes import BACKOFF_LIMIT_S, SETTLED_S
+from deploy.rundir import RunDir
 
 SAID_WHY = (MISCONFIGURED, REFUSED)
 """Exit codes with which a process's last line says it all."""
@@ -165,7 +166,7 @@ class Child:
     # --- the process ------------------------------------------------------------------------------
 
     def _spawn(self) -> None:
-        command = [sys.executable, "-P", "-m", "cocoro.launch", self.row.name]
+        command = [sys.executable, "-P", "-m", "deploy.launch", self.row.name]
         command += ["--run-dir", str(self._run_dir.path), "--parent-fd", str(self._parent_fd)]
         loop = asyncio.get_running_loop()
         self._alive.clear()

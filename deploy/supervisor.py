@@ -21,20 +21,19 @@ from typing import IO
 
 import msgspec
 
-from cocoro import robot_time
 from cocoro.bus import shared
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.errors import CocoroError, ConfigError, RefusedError
-from cocoro.launch import CRASHED
-from cocoro.processes import shared_bytes
-from cocoro.profiles import Profile, from_data
-from cocoro.quit import quit_process
-from cocoro.rundir import RunDir
 from cocoro.stop.record import latch_dir, prepare
 from cocoro.topics import STOPPABLE
 from cocoro.vigil import Vigil
-from deploy import service_manager
+from deploy import robot_time, service_manager
 from deploy.child import Child, StartError
+from deploy.launch import CRASHED
+from deploy.processes import shared_bytes
+from deploy.profiles import Profile, from_data
+from deploy.quit import quit_process
+from deploy.rundir import RunDir
 
 STOPPED, MISCONFIGURED, REFUSED = 0, 2, 3
 """Exit codes, as of every command."""

@@ -14,13 +14,14 @@ from cocoro.bus.local import LocalMesh
 from cocoro.capture.compression import Compression, Packer
 from cocoro.capture.keys import KeyInfo, info_of
 from cocoro.capture.reader import Capture, Record
-from cocoro.capture.writer import Entry, Limits, Writer
 from cocoro.clock import NS, VirtualClock
+from cocoro.component import load
 from cocoro.messages import BaseState, Frame
 from cocoro.node import Node
-from cocoro.processes import load, named
 from cocoro.robot import Robot
 from cocoro.vloop import run_virtual
+from deploy.processes import named
+from services.capture.writer import Entry, Limits, Writer
 
 ROBOT = Robot.load()
 STILL = {"odometry_yaw_rad": 0.0, "speed_mps": 0.0, "turn_rate_radps": 0.0}

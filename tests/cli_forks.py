@@ -43,7 +43,7 @@ NO_MOUNTS = 77
 
 OFTEN = (
     "services.base.doctor", "services.capture.service", "services.kinect.doctor", "services.kinect.tools",
-    "services.servos.doctor", "services.servos.tools", "cocoro.capture.export.foxglove", "cocoro.capture.export.video",
+    "services.servos.doctor", "services.servos.tools", "apps.captures.export.foxglove", "apps.captures.export.video",
 )  # fmt: skip
 """What commands import when they are called."""
 
@@ -149,10 +149,10 @@ def preload() -> None:
     import typer.main
 
     typer.main.get_command = functools.cache(typer.main.get_command)  # to make them is most of what a command costs
-    from cocoro import cli
-    from cocoro.cli.main import main
+    from apps import cli
+    from apps.cli.main import main
 
-    for module in pkgutil.iter_modules(cli.__path__, "cocoro.cli."):
+    for module in pkgutil.iter_modules(cli.__path__, "apps.cli."):
         importlib.import_module(module.name)
     for name in OFTEN:
         importlib.import_module(name)
@@ -241,7 +241,7 @@ def live(case: Case, kept: dict[str, int], narrow: int, counted: int) -> None:
     if case.fresh:
         for name in [name for name in sys.modules if name.partition(".")[0] in ("cocoro", "services", "sim", "deploy")]:
             del sys.modules[name]
-    from cocoro.cli.main import run
+    from apps.cli.main import run
 
     if case.at_call is not None:
         signal_at(case, counted)

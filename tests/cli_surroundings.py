@@ -12,8 +12,8 @@ from typing import Any
 import typer.main
 from cli_forks import Case, Ending
 
-from cocoro.cli import exits
-from cocoro.cli.app import app
+from apps.cli import exits
+from apps.cli.app import app
 
 GOLDEN = Path(__file__).parent / "golden" / "fetch.mcap"
 CODES = (exits.DONE, exits.FAILED, exits.USAGE, exits.REFUSED, exits.NO_MESH)

@@ -6,12 +6,13 @@ from __future__ import annotations
 import asyncio
 import sys
 
-from cocoro import robot_time, topics
+from cocoro import topics
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.messages import BaseCommand, Latch
 from cocoro.node import Node
 from cocoro.robot import Robot
-from cocoro.rundir import RunDir
+from deploy import robot_time
+from deploy.rundir import RunDir
 
 
 async def main(name: str) -> None:

@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 
 from cocoro.errors import RefusedError
-from cocoro.rundir import RunDir
+from deploy.rundir import RunDir
 
 
 def main() -> None:

@@ -27,8 +27,8 @@ from cocoro.bus.base import Payload
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.clock import NS
 from cocoro.messages import AboutRequest, Exchange, Message, TaskReply, TaskRequest, TaskState, Truth
-from cocoro.rundir import RunDir, Target
 from cocoro.topics import Qos, Topic
+from deploy.rundir import RunDir, Target
 
 M = TypeVar("M", bound=Message)
 
@@ -62,7 +62,7 @@ class LiveRobot:
     # --- up and down ----------------------------------------------------------------------------------
 
     async def start(self) -> None:
-        self.up = Running([sys.executable, "-m", "cocoro.cli.main", "up", str(self.profile)], self.env)
+        self.up = Running([sys.executable, "-m", "apps.cli.main", "up", str(self.profile)], self.env)
         await self.told("is up")
         self._bus = await ZenohBus.open(self.run_dir.join_as("onlooker"))
         for topic in WATCHED:
@@ -89,7 +89,7 @@ class LiveRobot:
     async def command(self, *arguments: str) -> tuple[int, str]:
         """Run a `cocoro` command; its exit code and what it printed."""
         process = await asyncio.create_subprocess_exec(
-            sys.executable, "-m", "cocoro.cli.main", *arguments, "--robot", self.name,
+            sys.executable, "-m", "apps.cli.main", *arguments, "--robot", self.name,
             env=self.env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
         )  # fmt: skip
         out, _ = await asyncio.wait_for(process.communicate(), PATIENCE_S)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from apps.learning.study import Sightings
 from cocoro.kinematics import Array
 from cocoro.learning.drawing import Drawing
-from cocoro.learning.study import Sightings
 from cocoro.robot import Robot
 from sim.wear import body_of
 

@@ -12,7 +12,7 @@ import threading
 from pathlib import Path
 from types import TracebackType
 
-from cocoro.rundir import RunDir, Target
+from deploy.rundir import RunDir, Target
 
 PATIENCE_S = 300.0
 """Far more than anything here takes, on however busy a machine: a test that waits so long has failed."""
@@ -21,7 +21,7 @@ PARTS = """
 import asyncio, os, signal
 from pathlib import Path
 import msgspec
-from cocoro.processes import Process
+from cocoro.component import Process
 
 good = Process(name="good", module="parts.good", services=("good",), doc="Does nothing, well.", backoff_s=0.01)
 pair = Process(name="pair", module="parts.good", services=("left", "right"), doc="Two services in one process.")
@@ -80,7 +80,7 @@ def install_parts(folder: Path) -> None:
     about.mkdir()
     (about / "METADATA").write_text("Metadata-Version: 2.1\nName: parts\nVersion: 1.0\n")
     rows = "".join(f"{name} = parts:{name}\n" for name in ("good", "pair", "dies", "mute", "slow", "deaf", "once"))
-    (about / "entry_points.txt").write_text(f"[cocoro.processes]\n{rows}")
+    (about / "entry_points.txt").write_text(f"[deploy.processes]\n{rows}")
 
 
 class Shell:
@@ -119,11 +119,11 @@ class Shell:
         return str(path)
 
     def __call__(self, *arguments: str) -> subprocess.CompletedProcess[str]:
-        command = [*self.prefix, sys.executable, "-m", "cocoro.cli.main", *arguments]
+        command = [*self.prefix, sys.executable, "-m", "apps.cli.main", *arguments]
         return subprocess.run(command, env=self.env, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
 
     def start(self, *arguments: str) -> Running:
-        self._started.append(Running([*self.prefix, sys.executable, "-m", "cocoro.cli.main", *arguments], self.env))
+        self._started.append(Running([*self.prefix, sys.executable, "-m", "apps.cli.main", *arguments], self.env))
         return self._started[-1]
 
     def pid(self, service: str) -> int:

@@ -14,6 +14,7 @@ import msgspec
 from cocoro import topics
 from cocoro.bus.local import LocalBus, LocalMesh
 from cocoro.clock import NS, Clock, VirtualClock
+from cocoro.component import load
 from cocoro.frames import wrap_rad
 from cocoro.messages import (
     BaseState,
@@ -27,9 +28,9 @@ from cocoro.messages import (
     Truth,
 )
 from cocoro.node import Node
-from cocoro.processes import load, named
 from cocoro.robot import Robot
 from cocoro.testing import Tap, settle
+from deploy.processes import named
 
 SERVICES = ("sim", "perception", "planning", "executive")
 HALTED_MPS = 0.01

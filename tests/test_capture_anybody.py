@@ -15,13 +15,13 @@ from mcap.reader import make_reader
 from mcap.records import Attachment
 from mcap.writer import CompressionType, IndexType, Writer
 
-from cocoro.capture.export import foxglove
-from cocoro.capture.export.attachments import file_name
-from cocoro.capture.info import report
-from cocoro.capture.player import Player
+from apps.captures.export import foxglove
+from apps.captures.export.attachments import file_name
+from apps.captures.info import report
+from apps.captures.player import Player
+from apps.captures.replay import played_keys
+from apps.cli.main import main
 from cocoro.capture.reader import Capture
-from cocoro.capture.replay import played_keys
-from cocoro.cli.main import main
 
 
 @pytest.fixture(scope="module")

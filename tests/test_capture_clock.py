@@ -9,14 +9,14 @@ from pathlib import Path
 import pytest
 from capture_rig import all_of, entry, writer
 
+from apps.captures.info import report
+from apps.cli import capture_info
 from cocoro.boottime import boottime_ns
-from cocoro.capture.info import report
-from cocoro.capture.log_clock import KEPT_STEPS, TOGETHER_NS, WALL_CLOCK, LogClock
 from cocoro.capture.reader import Capture
-from cocoro.capture.retention import captures, file_name, make_room
-from cocoro.capture.writer import Limits
-from cocoro.cli import capture_info
 from cocoro.clock import NS
+from services.capture.log_clock import KEPT_STEPS, TOGETHER_NS, WALL_CLOCK, LogClock
+from services.capture.retention import captures, file_name, make_room
+from services.capture.writer import Limits
 
 START_NS = 1_750_000_000 * NS
 HOUR_NS = 3600 * NS

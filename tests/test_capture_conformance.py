@@ -16,12 +16,12 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, IndexType, Writer
 from mcap_conformance import CONTENTS, MAGIC, made, variants
 
+from apps.captures.info import report
+from apps.captures.rewrite import rewrite
+from apps.cli.main import main
 from cocoro.capture.compression import Packer
 from cocoro.capture.file import checksum
-from cocoro.capture.info import report
 from cocoro.capture.reader import Capture
-from cocoro.capture.rewrite import rewrite
-from cocoro.cli.main import main
 
 FILES = dict(variants())
 

@@ -10,12 +10,12 @@ from pathlib import Path
 import pytest
 from capture_rig import all_of, drive, record
 
+from apps.captures.info import report
+from apps.captures.rewrite import rewrite
+from apps.cli.main import main
 from cocoro.capture.compression import Packer
 from cocoro.capture.errors import CaptureError
-from cocoro.capture.info import report
 from cocoro.capture.reader import Capture, Record
-from cocoro.capture.rewrite import rewrite
-from cocoro.cli.main import main
 
 DAMAGES = 1000
 

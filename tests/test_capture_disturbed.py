@@ -13,10 +13,10 @@ from capture_rig import Room, all_of, drive, entry, writer
 from cocoro import topics
 from cocoro.capture.errors import CaptureError
 from cocoro.capture.reader import Capture
-from cocoro.capture.whereabouts import told, whereabouts
-from cocoro.capture.writer import KEPT_DISTURBED, LOOK_S, Limits, Writer
 from cocoro.messages import Recording
 from cocoro.vloop import run_virtual
+from services.capture.whereabouts import told, whereabouts
+from services.capture.writer import KEPT_DISTURBED, LOOK_S, Limits, Writer
 
 
 class Watch:
@@ -243,7 +243,7 @@ def test_it_is_looked_once_a_second(it: Disturbed, monkeypatch: pytest.MonkeyPat
         looks.append(it.watch.now_s)
         return whereabouts(path, fd)
 
-    monkeypatch.setattr("cocoro.capture.writer.whereabouts", look)
+    monkeypatch.setattr("services.capture.writer.whereabouts", look)
     for _ in range(100):
         it.watch.now_s += 0.1
         it.writer.flush()
@@ -272,7 +272,7 @@ def test_when_there_is_no_place_for_the_next_file_recording_stops_and_says_so(it
 
 
 def test_the_mesh_hears_of_a_removal_and_of_a_move(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("cocoro.capture.writer.LOOK_S", 0.0)
+    monkeypatch.setattr("services.capture.writer.LOOK_S", 0.0)
     said: list[Recording] = []
     health: list[Any] = []
 

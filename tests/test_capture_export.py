@@ -18,15 +18,15 @@ import pytest
 from capture_rig import ROBOT, Room, drive, record
 from mcap.reader import make_reader
 
+from apps.captures.export import foxglove, rerun_scene, tables, video
+from apps.captures.export.foxglove_types import SceneUpdate, schema_of
+from apps.captures.export.geometry import Posture, about_z, conjugate, points, quaternion, rotated
+from apps.captures.export.story import catalogue_of, robot_of
+from apps.cli.capture_view import watch
+from apps.cli.main import main
 from cocoro import topics
 from cocoro.capture.errors import CaptureError
-from cocoro.capture.export import foxglove, rerun_scene, tables, video
-from cocoro.capture.export.foxglove_types import SceneUpdate, schema_of
-from cocoro.capture.export.geometry import Posture, about_z, conjugate, points, quaternion, rotated
-from cocoro.capture.export.story import catalogue_of, robot_of
 from cocoro.capture.reader import Capture
-from cocoro.cli.capture_view import watch
-from cocoro.cli.main import main
 from cocoro.kinematics import turn_z
 from cocoro.messages import BaseCommand, Frame, PlannerStatus, ServoState, TargetEstimate, TrueObject, Truth
 from cocoro.objects import Catalogue

@@ -18,20 +18,21 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from message_samples import data_of
 
+from apps.captures.info import report
+from apps.captures.rewrite import rewrite
 from cocoro.capture.compression import COMPRESSIONS, Compression, Packer, unpack
 from cocoro.capture.errors import CaptureError
-from cocoro.capture.info import report
 from cocoro.capture.keys import Alive, Choice
-from cocoro.capture.pictures import LossyFrame, lossy
+from cocoro.capture.pictures import LossyFrame
 from cocoro.capture.reader import Capture
-from cocoro.capture.retention import captures, make_room
-from cocoro.capture.rewrite import rewrite
 from cocoro.capture.schema import changes, known_to, schema_of
 from cocoro.capture.types import NotReadableError
-from cocoro.capture.writer import Limits, Missing
 from cocoro.errors import ConfigError
 from cocoro.messages import BaseState, Detections, Frame, Message, PlannerStatus
 from cocoro.topics import TOPICS
+from services.capture.lossy import lossy
+from services.capture.retention import captures, make_room
+from services.capture.writer import Limits, Missing
 
 BIG = msgspec.msgpack.encode(frame(7, 320, 240))
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from cocoro.capture.export import foxglove
+from apps.captures.export import foxglove
 from cocoro.capture.reader import Capture
 
 HERE = Path(__file__).parent

@@ -16,21 +16,22 @@ from pathlib import Path
 import pytest
 from capture_rig import STILL, all_of, drive, record
 
+from apps.captures.info import report
+from apps.captures.rewrite import rewrite
+from apps.cli import capture_info
 from cocoro import topics
 from cocoro.bus.endpoints import default
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.capture.compression import Packer
-from cocoro.capture.info import report
-from cocoro.capture.log_clock import WALL_CLOCK, LogClock
 from cocoro.capture.reader import Capture
-from cocoro.capture.rewrite import rewrite
-from cocoro.cli import capture_info
 from cocoro.clock import NS, RealClock
+from cocoro.component import load
 from cocoro.messages import BaseState
 from cocoro.node import Node
-from cocoro.processes import load, named
 from cocoro.robot import Robot
 from cocoro.tokens import recorder_key
+from deploy.processes import named
+from services.capture.log_clock import WALL_CLOCK, LogClock
 
 pytestmark = pytest.mark.zenoh
 
@@ -73,7 +74,7 @@ async def robot(run_dir: Path) -> AsyncIterator[tuple[ZenohBus, Pulse]]:
 
 async def cocoro(run_dir: Path, *arguments: str) -> asyncio.subprocess.Process:
     return await asyncio.create_subprocess_exec(
-        sys.executable, "-m", "cocoro.cli.main", *arguments,
+        sys.executable, "-m", "apps.cli.main", *arguments,
         env=os.environ | {"COCORO_RUN_DIR": str(run_dir)},
         stdin=asyncio.subprocess.DEVNULL, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE,
     )  # fmt: skip
@@ -271,7 +272,7 @@ def test_replay_is_worked_by_the_keyboard(short_path: Path) -> None:
     path = record(short_path / "drive.mcap", drive)
     ours, theirs = os.openpty()
     replay = subprocess.Popen(
-        [sys.executable, "-m", "cocoro.cli.main", "replay", str(path), "--paused"],
+        [sys.executable, "-m", "apps.cli.main", "replay", str(path), "--paused"],
         env=os.environ | {"COCORO_RUN_DIR": str(short_path)}, stdin=theirs, stdout=theirs, stderr=theirs,
     )  # fmt: skip
     os.close(theirs)

@@ -13,23 +13,25 @@ import msgspec
 import pytest
 from capture_rig import ROBOT, STILL, Room, all_of, drive, entry, record, writer
 
-from cocoro import profiles, topics
+from cocoro import topics
 from cocoro.bus.base import Payload
 from cocoro.bus.local import LocalMesh
 from cocoro.capture.reader import Capture
-from cocoro.capture.writer import Writer
 from cocoro.clock import NS, FollowedClock
+from cocoro.component import load
 from cocoro.core import Sample, Schedule, Take
 from cocoro.errors import CocoroError, RemoteError
 from cocoro.messages import AboutReply, BaseState, CancelRequest, Clock, Recording, TaskReply
 from cocoro.node import Node
-from cocoro.processes import load, named
 from cocoro.stepper import RECORDER_S
 from cocoro.testing import settle
 from cocoro.topics import Qos
 from cocoro.vloop import run_virtual
+from deploy import profiles
+from deploy.processes import named
 from services.capture.config import Config, folder_of
 from services.capture.sink import LARGE_BYTES, RESERVE_BYTES, Syncer, ThreadedSink
+from services.capture.writer import Writer
 
 
 def test_every_message_of_every_key_is_there_with_its_stamp_and_number(tmp_path: Path) -> None:

@@ -12,11 +12,11 @@ import msgspec
 import pytest
 from capture_rig import ROBOT, Room, all_of, drive, entry, record, writer
 
+from apps.captures.player import AT_ONCE, FASTEST, Player
+from apps.captures.rebirth import reborn, with_rate
+from apps.captures.replay import Replay, played_keys, refuse_if_alive, services_of
 from cocoro import topics
-from cocoro.capture.player import AT_ONCE, FASTEST, Player
 from cocoro.capture.reader import Capture
-from cocoro.capture.rebirth import reborn, with_rate
-from cocoro.capture.replay import Replay, played_keys, refuse_if_alive, services_of
 from cocoro.clock import FollowedClock
 from cocoro.core import Output, Sample, Schedule, Take
 from cocoro.errors import ConfigError, RefusedError

@@ -12,19 +12,19 @@ import msgspec
 import pytest
 from capture_rig import Room, drive, record
 
+from apps.captures.compare import difference
+from apps.captures.reexecute import Result, rerun
+from apps.captures.rewrite import info_in, rewrite
+from apps.cli.main import main
 from cocoro import topics
-from cocoro.capture.compare import difference
 from cocoro.capture.compression import Packer
 from cocoro.capture.errors import CaptureError
-from cocoro.capture.pictures import lossy
 from cocoro.capture.reader import Capture, Record
-from cocoro.capture.rerun import Result, rerun
-from cocoro.capture.rewrite import info_in, rewrite
-from cocoro.capture.writer import Entry, Limits, Writer
-from cocoro.cli.main import main
 from cocoro.clock import NS
 from cocoro.core import Core, Output, Sample, Schedule, Take
 from cocoro.messages import Detections, PlannerStatus
+from services.capture.lossy import lossy
+from services.capture.writer import Entry, Limits, Writer
 from services.perception import service as perception
 from services.planning import service as planning
 

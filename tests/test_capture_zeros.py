@@ -16,13 +16,13 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel
 from mcap.writer import CompressionType, Writer
 
+from apps.captures.info import report
+from apps.captures.rewrite import rewrite
 from cocoro.capture.compression import Packer
 from cocoro.capture.file import CaptureFile
-from cocoro.capture.info import report
 from cocoro.capture.mcap import MAGIC, PREFIX
 from cocoro.capture.reader import Capture
-from cocoro.capture.rewrite import rewrite
-from cocoro.capture.writer import Limits, sync_and_close
+from services.capture.writer import Limits, sync_and_close
 
 CHUNK_CRC = PREFIX.size + 24
 """From a chunk record's beginning, of 4 bytes."""

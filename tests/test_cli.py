@@ -13,13 +13,13 @@ from typing import Any
 
 import pytest
 
-from cocoro.cli import estop, rehearse
-from cocoro.cli.main import main
-from cocoro.cli.options import frames_of, latencies_of
-from cocoro.cli.running import overrides
-from cocoro.cli.table import table
+from apps.cli import estop, rehearse
+from apps.cli.main import main
+from apps.cli.options import frames_of, latencies_of
+from apps.cli.running import overrides
+from apps.cli.table import table
+from apps.rehearsal.request import RehearsalRequest
 from cocoro.errors import CocoroError, ConfigError
-from cocoro.rehearsal import RehearsalRequest
 from cocoro.topics import STOPPABLE, TOPICS
 
 COMMANDS = (
@@ -140,12 +140,12 @@ def test_the_topics_page_of_the_documentation_is_up_to_date(capsys: pytest.Captu
 
 
 def test_the_emergency_stop_imports_next_to_nothing() -> None:
-    code = "import sys; from cocoro.cli import main, estop; estop.by_path('nobody'); print(*sys.modules)"
+    code = "import sys; from apps.cli import main, estop; estop.by_path('nobody'); print(*sys.modules)"
     done = subprocess.run([sys.executable, "-S", "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
     modules = set(done.stdout.split())
     assert {name for name in modules if name.startswith("cocoro")} == {
-        "cocoro", "cocoro.cli", "cocoro.cli.main", "cocoro.cli.exits", "cocoro.cli.output", "cocoro.cli.estop",
-        "cocoro.quit", "cocoro.stop", "cocoro.stop.asking", "cocoro.stop.owners",
+        "cocoro", "apps.cli", "apps.cli.main", "apps.cli.exits", "apps.cli.output", "apps.cli.estop",
+        "deploy.quit", "cocoro.stop", "cocoro.stop.asking", "cocoro.stop.owners",
     }  # fmt: skip
     assert modules.isdisjoint({"asyncio", "argparse", "json", "pathlib", "typing_extensions", "msgspec", "zenoh"})
 

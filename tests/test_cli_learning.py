@@ -9,14 +9,14 @@ from pathlib import Path
 import pytest
 from learning_arm import sightings
 
-from cocoro.cli.babble import BabbleView
-from cocoro.cli.main import main
-from cocoro.cli.progress import Silent
+from apps.cli.babble import BabbleView
+from apps.cli.main import main
+from apps.cli.progress import Silent
+from apps.learning.collector import Coverage, HandCollector, WheelCollector, collector
+from apps.learning.study import BEST
 from cocoro.learning import model
-from cocoro.learning.collector import Coverage, HandCollector, WheelCollector, collector
 from cocoro.learning.dataset import HandRow, WheelRow, Writer, hand_header, wheel_header
 from cocoro.learning.drawing import LEVEL_ROLL_RAD, Drawing
-from cocoro.learning.study import BEST
 from cocoro.messages import HandSample, TaskState, WheelTrial
 from cocoro.robot import Robot
 

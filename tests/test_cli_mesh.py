@@ -14,11 +14,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from apps.cli import estop_mesh, exits, objects, reset, snapshot, status
+from apps.cli.estop import Stop
+from apps.cli.link import Where
 from cocoro.bus.endpoints import default
 from cocoro.bus.zenoh import ZenohBus
-from cocoro.cli import estop_mesh, exits, objects, reset, snapshot, status
-from cocoro.cli.estop import Stop
-from cocoro.cli.link import Where
 from cocoro.clock import RealClock
 from cocoro.errors import ConfigError
 from cocoro.latch import LatchKeeper
@@ -41,8 +41,8 @@ from cocoro.messages import (
 )
 from cocoro.node import Node
 from cocoro.robot import Robot
-from cocoro.rundir import RunDir
 from cocoro.topics import BASE_STATE, CANCEL, DETECTIONS, ESTOP, FRAME, LATCH, OBJECTS, PLAN, RUN, STOPPABLE, TASK
+from deploy.rundir import RunDir
 
 pytestmark = pytest.mark.zenoh
 
@@ -291,7 +291,7 @@ def test_ctrl_c_on_a_running_fetch_cancels_the_task_on_the_robot(root: Path) -> 
             node.serve(RUN, run)
             node.serve(CANCEL, cancel)
             fetch = await asyncio.create_subprocess_exec(
-                sys.executable, "-m", "cocoro.cli.main", "fetch", "red_can", stdout=asyncio.subprocess.PIPE
+                sys.executable, "-m", "apps.cli.main", "fetch", "red_can", stdout=asyncio.subprocess.PIPE
             )
             assert fetch.stdout is not None
             assert b"approach" in await fetch.stdout.readline()

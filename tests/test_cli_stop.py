@@ -14,11 +14,11 @@ from pathlib import Path
 
 import pytest
 
-from cocoro.cli import estop, exits
-from cocoro.cli.estop import Stop, _left_open, _merged
-from cocoro.cli.main import main
-from cocoro.rundir import RunDir
+from apps.cli import estop, exits
+from apps.cli.estop import Stop, _left_open, _merged
+from apps.cli.main import main
 from cocoro.stop.path import StopPoint, listen
+from deploy.rundir import RunDir
 
 
 class Services:
@@ -229,7 +229,7 @@ def test_nothing_that_another_process_says_or_calls_itself_reaches_the_terminal_
 def test_who_cannot_be_told_has_stopped_the_robot_all_the_same(services: Services, streams: str) -> None:
     services("base", "arm", "hand")
     to = ">&- 2>&-" if streams == "closed" else ">/dev/full 2>/dev/full"
-    command = f"exec {sys.executable} -m cocoro.cli.main stop --robot {services.robot} {to}"
+    command = f"exec {sys.executable} -m apps.cli.main stop --robot {services.robot} {to}"
     code = subprocess.run(["sh", "-c", command], check=False).returncode
     assert code == exits.FAILED
     assert sorted(services.halted) == ["arm", "base", "hand"]

@@ -23,11 +23,11 @@ import pytest
 from cli_forks import FULL, NO_MOUNTS, TALKED, Forks
 from cli_surroundings import ARGUMENTS, COMMANDS, GOLDEN, NOT_UTF8, SURROUNDINGS, Surroundings, Table, wrong
 
+from apps.captures.rewrite import rewrite
+from apps.cli import exits
+from apps.cli.main import failed
 from cocoro.capture.compression import Packer
 from cocoro.capture.reader import Capture
-from cocoro.capture.rewrite import rewrite
-from cocoro.cli import exits
-from cocoro.cli.main import failed
 from cocoro.clock import NS
 
 
@@ -153,11 +153,11 @@ def test_being_told_to_end_does_so_where_ctrl_c_is_ignored(table: Table) -> None
 
 
 def test_a_bug_is_one_line_and_its_traceback_can_be_had(table: Table) -> None:
-    bug = {"instead": ("cocoro.cli.topics:table", "bug")}
+    bug = {"instead": ("apps.cli.topics:table", "bug")}
     ending = table.play("topics", Surroundings(bug))
     assert ending.code == exits.FAILED
     assert ending.err == (
-        "cocoro: internal error, please report it: ZeroDivisionError: a bug\\nof two lines (in cocoro.cli.app, line "
+        "cocoro: internal error, please report it: ZeroDivisionError: a bug\\nof two lines (in apps.cli.app, line "
         f"{line_of('listing.table()')}); COCORO_LOG=debug shows the traceback\n"
     )
     told = table.play("topics", Surroundings(bug | {"env": {"COCORO_LOG": "debug"}}))
@@ -167,7 +167,7 @@ def test_a_bug_is_one_line_and_its_traceback_can_be_had(table: Table) -> None:
 
 
 def test_what_is_logged_is_a_line_each(table: Table) -> None:
-    logs = {"instead": ("cocoro.cli.topics:table", "log")}
+    logs = {"instead": ("apps.cli.topics:table", "log")}
     ending = table.play("topics", Surroundings(logs))
     assert (ending.code, ending.err) == (exits.DONE, "cocoro: a callback failed: ValueError: of two\\nlines\n")
     assert (
@@ -187,11 +187,11 @@ def line_of(text: str) -> int:
 
 
 def test_an_emergency_stop_goes_on_though_nobody_hears_of_it(table: Table) -> None:
-    talking = {"instead": ("cocoro.cli.estop:main", "talk")}
+    talking = {"instead": ("apps.cli.estop:main", "talk")}
     for place in ("closed", "full", "gone"):
         ending = table.play("stop", Surroundings({"stdout": place, "stderr": place} | talking))
         assert ending.code == TALKED  # the first word that was lost has not ended it
-    ending = table.play("topics", Surroundings({"stdout": "full", "instead": ("cocoro.cli.topics:table", "talk")}))
+    ending = table.play("topics", Surroundings({"stdout": "full", "instead": ("apps.cli.topics:table", "talk")}))
     assert ending.code == exits.FAILED  # as it ends any other command
 
 
@@ -239,7 +239,7 @@ def test_a_run_directory_on_a_full_disk_is_named(command: str, table: Table, roo
 
 # --- the process itself ---------------------------------------------------------------------------
 
-COMMAND = f"{sys.executable} -m cocoro.cli.main"
+COMMAND = f"{sys.executable} -m apps.cli.main"
 
 
 @pytest.mark.parametrize(

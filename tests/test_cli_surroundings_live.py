@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from operator_shell import PATIENCE_S, Shell
 
-from cocoro.cli import exits
+from apps.cli import exits
 
 pytestmark = pytest.mark.zenoh
 
@@ -25,7 +25,7 @@ def shell(tmp_path: Path) -> Iterator[Shell]:
 
 
 def command(*arguments: str) -> list[str]:
-    return [sys.executable, "-m", "cocoro.cli.main", *arguments]
+    return [sys.executable, "-m", "apps.cli.main", *arguments]
 
 
 def test_without_proc_a_robot_comes_up_and_top_says_what_it_cannot_measure(shell: Shell) -> None:

@@ -12,12 +12,12 @@ from typing import Any
 
 import pytest
 
+from apps.cli import exits
+from apps.cli.babble import Keeper
+from apps.cli.link import Link
+from apps.cli.progress import Lines, Live, View
+from apps.cli.tasks import Follower
 from cocoro.bus.local import LocalMesh
-from cocoro.cli import exits
-from cocoro.cli.babble import Keeper
-from cocoro.cli.link import Link
-from cocoro.cli.progress import Lines, Live, View
-from cocoro.cli.tasks import Follower
 from cocoro.clock import VirtualClock
 from cocoro.errors import MeshError
 from cocoro.messages import (
@@ -32,9 +32,9 @@ from cocoro.messages import (
 )
 from cocoro.node import Node
 from cocoro.robot import Robot
-from cocoro.rundir import RunDir
 from cocoro.topics import CANCEL, LATCH, RUN, TASK
 from cocoro.vloop import run_virtual
+from deploy.rundir import RunDir
 
 REQUEST = TaskRequest(task="fetch", label="red_can")
 ID = "fetch-1"

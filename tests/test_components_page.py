@@ -41,7 +41,7 @@ def environment(tmp_path: Path) -> Iterator[dict[str, str]]:
     venv.create(home, with_pip=False, symlinks=True)
     (site,) = home.glob("lib/python*/site-packages")
     (site / "ours.pth").write_text(f"import site; site.addsitedir({sysconfig.get_paths()['purelib']!r})\n")
-    for command, module in (("pip", "pip"), ("pytest", "pytest -p no:cacheprovider"), ("cocoro", "cocoro.cli.main")):
+    for command, module in (("pip", "pip"), ("pytest", "pytest -p no:cacheprovider"), ("cocoro", "apps.cli.main")):
         script = home / "bin" / command
         script.write_text(f'#!/bin/sh\nexec "{home}/bin/python" -P -m {module} "$@"\n')
         script.chmod(0o755)

@@ -9,11 +9,11 @@ import pytest
 
 from cocoro.clock import NS
 from cocoro.contact import Contact
-from cocoro.processes import named
-from cocoro.rundir import RunDir
 from cocoro.testing import in_virtual_time
 from cocoro.vigil import BEAT_S, LATE_S, RECOVERY_S, Vigil
 from deploy.child import Child
+from deploy.processes import named
+from deploy.rundir import RunDir
 
 
 class Steady:

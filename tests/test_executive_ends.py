@@ -12,10 +12,10 @@ from cocoro import topics
 from cocoro.clock import NS
 from cocoro.contact import Contact
 from cocoro.messages import CancelRequest
-from cocoro.rundir import RunDir, hold
 from cocoro.testing import JumpingClock, in_virtual_time
 from cocoro.topics import HARDWARE
 from cocoro.vigil import Vigil
+from deploy.rundir import RunDir, hold
 from services.executive import executive
 
 

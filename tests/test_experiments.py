@@ -12,17 +12,17 @@ import numpy as np
 import pytest
 from learning_arm import sightings
 
-from cocoro.cli.experiment import Progress
-from cocoro.cli.main import main
-from cocoro.experiments import bodies, lessons, report
-from cocoro.experiments.every import EXPERIMENTS
-from cocoro.experiments.runs import Result, Run, perform
-from cocoro.experiments.settings import Settings
-from cocoro.experiments.stats import summarise
+from apps.cli.experiment import Progress
+from apps.cli.main import main
+from apps.experiments import bodies, lessons, report
+from apps.experiments.every import EXPERIMENTS
+from apps.experiments.runs import Result, Run, perform
+from apps.experiments.settings import Settings
+from apps.experiments.stats import summarise
+from apps.learning.study import BEST
+from apps.rehearsal.request import RehearsalRequest
 from cocoro.learning.dataset import HandRow, WheelRow, Writer, hand_header, wheel_header
 from cocoro.learning.drawing import LEVEL_ROLL_RAD, Drawing
-from cocoro.learning.study import BEST
-from cocoro.rehearsal import RehearsalRequest
 from cocoro.robot import Robot
 
 # --- statistics ---------------------------------------------------------------------------------------

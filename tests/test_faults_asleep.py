@@ -44,7 +44,7 @@ def test_when_all_sleep_for_longer_than_the_lease_the_robot_stands_and_nobody_is
 ) -> None:
     async def scenario() -> None:
         async with live(tmp_path, scene=far, mesh=MESH) as robot:
-            fetch = Running([sys.executable, "-m", "cocoro.cli.main", "fetch", "red_can"], robot.env)
+            fetch = Running([sys.executable, "-m", "apps.cli.main", "fetch", "red_can"], robot.env)
             try:
                 await robot.drives()
                 processes = everyone(robot, fetch)

@@ -14,8 +14,8 @@ import pytest
 from namespace_rig import Namespace, needs_root
 from operator_shell import Shell
 
+from apps.cli import exits
 from cocoro.bus import shared
-from cocoro.cli import exits
 
 pytestmark = [pytest.mark.zenoh, needs_root]
 

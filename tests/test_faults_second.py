@@ -14,8 +14,8 @@ import operator_shell
 import pytest
 from faults_live import profile_text
 
-from cocoro import launch, profiles
-from cocoro.rundir import RunDir
+from deploy import launch, profiles
+from deploy.rundir import RunDir
 
 SIM = "arm,base,hand,kinect"
 CONTENDER = Path(__file__).with_name("faults_claims.py")
@@ -114,7 +114,7 @@ def test_of_two_that_start_at_once_one_runs_and_one_is_refused_in_a_line(
     profile.write_text(profile_text("robbie", {"width": 64, "height": 48}))
     run_dir.make()
     run_dir.profile_file.write_bytes(msgspec.json.encode(profiles.read(str(profile))))
-    command = [sys.executable, "-m", "cocoro.launch", process, "--run-dir", str(run_dir.path)]
+    command = [sys.executable, "-m", "deploy.launch", process, "--run-dir", str(run_dir.path)]
     for _ in range(10):
         with ExitStack() as stack:
             both = []

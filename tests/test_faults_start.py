@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from operator_shell import Shell
 
-from cocoro.cli import exits
+from apps.cli import exits
 
 pytestmark = [pytest.mark.zenoh, pytest.mark.sim]
 
@@ -107,7 +107,7 @@ def test_a_run_directory_that_cannot_be_is_named_in_a_line(shell: Shell, tmp_pat
     place = tmp_path / "a file"
     place.touch()
     told = subprocess.run(
-        [sys.executable, "-m", "cocoro.cli.main", "up", profile],
+        [sys.executable, "-m", "apps.cli.main", "up", profile],
         env=shell.env | {"COCORO_RUN_DIR": str(place)}, capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert told.returncode == exits.USAGE

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from chessboard import Eyes, Painter, lying
 
-from cocoro.cli import kinect as command
+from apps.cli import kinect as command
+from apps.cli.robot_file import write_values
 from cocoro.errors import CocoroError, ConfigError
 from cocoro.robot import Robot
-from cocoro.robot_file import write_values
 from services.kinect import tools
 from services.kinect.calibration import Array, Board, Calibration, View, calibrate, find_corners
 from services.kinect.device import Shot

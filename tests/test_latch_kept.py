@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 
+from apps.cli.estop_mesh import ROUND_S
 from cocoro import topics
 from cocoro.bus.local import LocalMesh
-from cocoro.cli.estop_mesh import ROUND_S
 from cocoro.clock import RealClock
 from cocoro.latch import LatchKeeper
 from cocoro.messages import EstopReply, EstopRequest, Latch, LatchState

@@ -8,9 +8,9 @@ import pytest
 from perception_scenes import CATALOGUE, ROBOT, Canvas, Scene, Thing, facing, known
 from test_objects import colours_in_changing_light
 
-from cocoro.appearance.learn import Learnt, Look, Wanted, learn
-from cocoro.appearance.ranges import overlaps, range_of
-from cocoro.appearance.region import Picture, at_pixel, in_box, most_salient
+from apps.appearance.learn import Learnt, Look, Wanted, learn
+from apps.appearance.ranges import overlaps, range_of
+from apps.appearance.region import Picture, at_pixel, in_box, most_salient
 from cocoro.colour import in_boxes, lab_of
 from cocoro.errors import ConfigError
 from cocoro.messages import Frame

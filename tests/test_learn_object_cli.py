@@ -15,23 +15,24 @@ import numpy as np
 import pytest
 from perception_scenes import Canvas, Scene, Thing, facing
 
-from cocoro import profiles
+from apps.cli.learn_object import size_of
+from apps.cli.main import main
+from apps.cli.objects_file import as_toml, save, with_object
+from apps.rehearsal.rehearse import rehearse
+from apps.rehearsal.request import RehearsalRequest
 from cocoro.bus.endpoints import default
 from cocoro.bus.zenoh import ZenohBus
-from cocoro.cli.learn_object import size_of
-from cocoro.cli.main import main
 from cocoro.clock import RealClock
+from cocoro.component import load
 from cocoro.errors import ConfigError
 from cocoro.messages import ServoState
 from cocoro.node import Node
 from cocoro.objects import Catalogue, KnownObject, LabBox, own_text
-from cocoro.objects_file import as_toml, save, with_object
 from cocoro.picture import colour_of
-from cocoro.processes import load, named
-from cocoro.rehearsal import RehearsalRequest
 from cocoro.robot import Robot
 from cocoro.topics import ARM_STATE, FRAME
-from sim.rehearse import rehearse
+from deploy import profiles
+from deploy.processes import named
 from sim.scene import Light
 
 TEAL = (20, 150, 140)
@@ -196,7 +197,7 @@ def test_the_live_view_brings_depth_and_the_heads_angles(
         ):
             camera.spawn(see(camera, arm))
             command = await asyncio.create_subprocess_exec(
-                sys.executable, "-m", "cocoro.cli.main", "objects", "learn", "cup", "--yes",
+                sys.executable, "-m", "apps.cli.main", "objects", "learn", "cup", "--yes",
                 stdin=asyncio.subprocess.DEVNULL, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.STDOUT,
             )  # fmt: skip
             out, _ = await command.communicate()

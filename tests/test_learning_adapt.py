@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from learning_arm import sightings
 
-from cocoro.learning.adapt import Adapter
+from apps.learning.study import BEST, Sightings, errors_m, fit, rms, split
 from cocoro.learning.drawing import Drawing
-from cocoro.learning.study import BEST, Sightings, errors_m, fit, rms, split
 from cocoro.robot import Robot
+from services.planning.adapt import Adapter
 from sim.wear import BEND_RAD
 
 

@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 from learning_arm import sightings
 
+from apps.learning.study import BEST, METHODS, fit
 from cocoro.errors import ConfigError, RefusedError
 from cocoro.learning import dataset, model
 from cocoro.learning.dataset import HandRow, WheelRow, Writer, hand_header, wheel_header
 from cocoro.learning.drawing import Drawing
 from cocoro.learning.model import Training, WheelModel
-from cocoro.learning.study import BEST, METHODS, fit
 from cocoro.robot import Robot
 
 TRAINING = Training(data="0123456789abcdef", samples=600, method=BEST.name, scores={"held_out_rms_m": 0.0035})

@@ -6,11 +6,8 @@ import numpy as np
 import pytest
 from learning_arm import NOISE_M, sightings, slope_by_differences
 
-from cocoro.frames import to_spherical
-from cocoro.learning.drawing import Drawing
-from cocoro.learning.handmap import cartesian_of, spherical_of
-from cocoro.learning.outliers import inliers
-from cocoro.learning.study import (
+from apps.learning.outliers import inliers
+from apps.learning.study import (
     BEST,
     METHODS,
     Method,
@@ -28,6 +25,9 @@ from cocoro.learning.study import (
     score,
     split,
 )
+from cocoro.frames import to_spherical
+from cocoro.learning.drawing import Drawing
+from cocoro.learning.handmap import cartesian_of, spherical_of
 from cocoro.robot import Robot
 
 

@@ -16,16 +16,16 @@ import psutil
 import pytest
 from operator_shell import Shell
 
+from apps.cli import exits
 from cocoro import topics
 from cocoro.bus.zenoh import ZenohBus
-from cocoro.cli import exits
 from cocoro.clock import NS, FollowedClock
 from cocoro.inbox import Stream
 from cocoro.messages import Truth
 from cocoro.node import Node
 from cocoro.robot import Robot
-from cocoro.rundir import RunDir
 from cocoro.topics import HARDWARE, STOPPABLE, Topic
+from deploy.rundir import RunDir
 
 pytestmark = [pytest.mark.zenoh, pytest.mark.sim]
 

@@ -12,7 +12,6 @@ from cocoro.clock import NS
 from cocoro.core import Output, Sample
 from cocoro.kinematics import Array
 from cocoro.learning.drawing import Drawing
-from cocoro.learning.draws import sobol
 from cocoro.messages import (
     BaseCommand,
     BaseState,
@@ -30,6 +29,7 @@ from cocoro.robot import Robot
 from services.planning.arm import ROLL, ArmController
 from services.planning.config import Config
 from services.planning.core import PlanningCore
+from services.planning.draws import sobol
 from services.planning.postures import Postures
 from services.planning.reach import ARM, LEVEL_ROLL_RAD, HandPose, Reacher
 

@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 from learning_arm import sightings
 
+from apps.learning.study import BEST, fit
+from apps.rehearsal.rehearse import rehearse
+from apps.rehearsal.request import RehearsalRequest
 from cocoro.clock import NS
 from cocoro.kinematics import Array
 from cocoro.learning.drawing import Drawing
 from cocoro.learning.model import Training, arm_model, empty, encode
 from cocoro.learning.reachability import ReachMesh
-from cocoro.learning.study import BEST, fit
-from cocoro.rehearsal import RehearsalRequest
 from cocoro.robot import Robot
 from services.planning.behaviours.base import Limbs
 from services.planning.config import Config
@@ -22,7 +23,6 @@ from services.planning.learned import Learned
 from services.planning.reach import ARM, LEVEL_ROLL_RAD
 from services.planning.senses import Sighting
 from services.planning.teaching import LUMP, Teacher
-from sim.rehearse import rehearse
 
 QUICK = {"width": 160, "height": 120, "frame_rate_hz": 15.0}
 

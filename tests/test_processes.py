@@ -10,10 +10,12 @@ import msgspec
 import pytest
 from operator_shell import install_parts
 
-from cocoro import processes, profiles
+from cocoro.component import Process
+from cocoro.component import load as load_component
 from cocoro.errors import ConfigError
-from cocoro.processes import PROCESSES, Process
 from cocoro.topics import REQUESTS, TOPICS
+from deploy import processes, profiles
+from deploy.processes import PROCESSES
 
 
 @pytest.fixture
@@ -45,7 +47,7 @@ def test_every_publisher_and_server_on_the_mesh_has_a_process() -> None:
 
 @pytest.mark.parametrize("process", profiles.read("sim").rows(), ids=lambda process: process.name)
 def test_a_component_of_the_simulated_robot_starts_with_nothing_configured(process: Process) -> None:
-    component = processes.load(process)
+    component = load_component(process)
     config = component.config()
     assert msgspec.convert({}, component.config) == config
     with pytest.raises(msgspec.ValidationError, match="unknown field"):
@@ -59,7 +61,7 @@ def test_an_unknown_name_lists_the_known_ones() -> None:
 
 def test_third_parties_add_rows_by_entry_point(parts: Path) -> None:
     assert processes.named("good").services == ("good",)
-    assert processes.load(processes.named("good")).config().pace_hz == 1.0
+    assert load_component(processes.named("good")).config().pace_hz == 1.0
 
 
 @pytest.mark.parametrize(
@@ -71,7 +73,7 @@ def test_third_parties_add_rows_by_entry_point(parts: Path) -> None:
     ],
 )
 def test_a_bad_entry_point_is_named(parts: Path, entry: str, message: str) -> None:
-    (parts / "parts-1.0.dist-info" / "entry_points.txt").write_text(f"[cocoro.processes]\n{entry}\n")
+    (parts / "parts-1.0.dist-info" / "entry_points.txt").write_text(f"[deploy.processes]\n{entry}\n")
     with pytest.raises(ConfigError, match=message):
         processes.table()
 
@@ -92,7 +94,7 @@ def test_a_module_that_is_no_component_says_what_is_missing(
     if text is not None:
         (tmp_path / "component.py").write_text(text)
     with pytest.raises(ConfigError, match=message):
-        processes.load(row("component"))
+        load_component(row("component"))
 
 
 def test_a_missing_library_of_a_component_is_not_taken_for_a_missing_component(
@@ -101,4 +103,4 @@ def test_a_missing_library_of_a_component_is_not_taken_for_a_missing_component(
     monkeypatch.syspath_prepend(tmp_path)
     (tmp_path / "needy.py").write_text("import a_library_that_is_not_there")
     with pytest.raises(ModuleNotFoundError, match="a_library_that_is_not_there"):
-        processes.load(row("needy"))
+        load_component(row("needy"))

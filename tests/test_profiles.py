@@ -8,9 +8,9 @@ from typing import Annotated
 import msgspec
 import pytest
 
-from cocoro import profiles
 from cocoro.errors import ConfigError
-from cocoro.rundir import RunDir
+from deploy import profiles
+from deploy.rundir import RunDir
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from cocoro.quit import UNSAID
+from deploy.quit import UNSAID
 
 PATIENCE_S = 60.0
 
@@ -24,7 +24,7 @@ def test_it_ends_with_its_code_after_threads_exit_functions_and_what_was_printed
     script = """
 import atexit, threading
 from concurrent.futures import ThreadPoolExecutor
-from cocoro.quit import quit_process
+from deploy.quit import quit_process
 begun, last = threading.Event(), threading.Event()
 def work():
     begun.set()
@@ -41,12 +41,12 @@ quit_process(3)
 
 
 def test_nobody_to_read_its_last_words_changes_no_exit_code() -> None:
-    script = "import sys; from cocoro.quit import quit_process; print('words'); sys.stdout.close(); quit_process(0)"
+    script = "import sys; from deploy.quit import quit_process; print('words'); sys.stdout.close(); quit_process(0)"
     assert ended(script)[0] == 0
 
 
 def test_what_it_could_not_print_is_an_error() -> None:
-    script = "from cocoro.quit import quit_process; print('words'); quit_process(0)"
+    script = "from deploy.quit import quit_process; print('words'); quit_process(0)"
     buffered = os.environ | {"PYTHONUNBUFFERED": ""}
     with Path("/dev/full").open("w") as full:
         run = subprocess.run([sys.executable, "-c", script], stdout=full, env=buffered, timeout=PATIENCE_S)
@@ -56,7 +56,7 @@ def test_what_it_could_not_print_is_an_error() -> None:
 CAUGHT_IN_A_CALLBACK = """
 import json, sys, threading, time
 import zenoh
-from cocoro.quit import quit_process
+from deploy.quit import quit_process
 
 class Long:
     def __del__(self, sleep=time.sleep):

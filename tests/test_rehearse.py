@@ -8,18 +8,18 @@ from typing import Any
 import pytest
 from robot_rig import RobotRig
 
+from apps.rehearsal.rehearse import TaskRefusedError, rehearse
+from apps.rehearsal.request import RehearsalRequest
 from cocoro import topics
 from cocoro.core import Core
 from cocoro.errors import ConfigError
 from cocoro.objects import Catalogue
-from cocoro.rehearsal import RehearsalRequest
 from cocoro.robot import Robot
 from cocoro.testing import execute_again, in_virtual_time
 from services.perception.config import Config as PerceptionConfig
 from services.perception.core import PerceptionCore
 from services.planning.config import Config as PlanningConfig
 from services.planning.core import PlanningCore
-from sim.rehearse import TaskRefusedError, rehearse
 
 pytestmark = pytest.mark.sim
 

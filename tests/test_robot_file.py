@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from apps.cli.robot_file import with_values, write_values
 from cocoro.errors import ConfigError
 from cocoro.robot import Robot
-from cocoro.robot_file import with_values, write_values
 
 FILE = """# Robbie's own.
 name = "robbie"

@@ -8,9 +8,9 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from cocoro import robot_time
 from cocoro.clock import NS, wall_offset_ns
-from cocoro.robot_time import FILE, RobotTime
+from deploy import robot_time
+from deploy.robot_time import FILE, RobotTime
 
 
 def step_wall_clock(monkeypatch: pytest.MonkeyPatch, seconds: float) -> None:

@@ -15,9 +15,9 @@ import pytest
 from operator_shell import PATIENCE_S, Shell
 
 from cocoro.bus import shared
-from cocoro.launch import ORPHAN_S
 from cocoro.vloop import run_virtual
 from deploy import service_manager
+from deploy.launch import ORPHAN_S
 
 UNIT = Path(__file__).parents[1] / "deploy" / "systemd" / "cocoro@.service"
 EXPOSED = 40

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from wire_servos import REPLY_S, ServoBench
 
-from cocoro.cli.main import main
+from apps.cli.main import main
 from cocoro.errors import RefusedError
 from cocoro.robot import SERVO_COUNT_RAD, Robot
 from services.base.doctor import check as check_base

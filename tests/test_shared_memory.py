@@ -16,16 +16,17 @@ from bus_rig import known
 from namespace_rig import Namespace, needs_root
 from zenoh_rig import CHILD, FRAME, PATIENCE_S, PUBLISHER, held, local, scenario
 
-from cocoro import profiles
+from apps.cli import doctor
 from cocoro.bus import shared
 from cocoro.bus.base import Payload
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.checks import Check
-from cocoro.cli import doctor
-from cocoro.processes import PROCESSES, Process, shared_bytes
-from cocoro.rundir import RunDir
+from cocoro.component import Process
 from cocoro.topics import FRAME as FRAME_TOPIC
 from cocoro.topics import Qos
+from deploy import profiles
+from deploy.processes import PROCESSES, shared_bytes
+from deploy.rundir import RunDir
 
 
 class Room(NamedTuple):

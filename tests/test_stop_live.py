@@ -14,10 +14,10 @@ from pathlib import Path
 import pytest
 from operator_shell import Shell
 
+from apps.cli import exits
 from bench.stop import SITUATIONS
-from cocoro.cli import exits
-from cocoro.rundir import RunDir
 from cocoro.stop.record import latch_dir, read
+from deploy.rundir import RunDir
 
 pytestmark = [pytest.mark.zenoh, pytest.mark.sim]
 

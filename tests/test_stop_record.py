@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from cocoro.cli import doctor_stop
+from apps.cli import doctor_stop
 from cocoro.stop import asking, record
 from cocoro.stop.record import RECORD_BYTES, LatchRecord, latch_dir, prepare, read
 

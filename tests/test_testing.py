@@ -10,11 +10,11 @@ import msgspec
 import pytest
 
 from cocoro import topics
+from cocoro.component import Component
 from cocoro.core import Output, Sample, Schedule, Take
 from cocoro.errors import CocoroError
 from cocoro.messages import BaseCommand, CancelRequest, Intent, Message, PlannerStatus, TaskReply
 from cocoro.node import Node
-from cocoro.processes import Component
 from cocoro.testing import CoreUnderTest, JumpingClock, ServiceUnderTest, execute_again, in_virtual_time
 from cocoro.topics import STEPS, Topic
 

@@ -15,15 +15,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from cocoro.cli import top_view
-from cocoro.cli.foreign import jsonable, lines, read
-from cocoro.cli.hz import Meter, rows, size_text
-from cocoro.cli.listening import keyexpr_of, takes_frames
-from cocoro.cli.logs import Tail, entries, files_of, robot_of
-from cocoro.cli.main import main
+from apps.cli import top_view
+from apps.cli.foreign import jsonable, lines, read
+from apps.cli.hz import Meter, rows, size_text
+from apps.cli.listening import keyexpr_of, takes_frames
+from apps.cli.logs import Tail, entries, files_of, robot_of
+from apps.cli.main import main
 from cocoro.errors import ConfigError
 from cocoro.messages import BaseCommand
-from cocoro.rundir import RunDir
+from deploy.rundir import RunDir
 
 
 @pytest.mark.parametrize("command", ["top", "echo", "hz", "logs"])

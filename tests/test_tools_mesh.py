@@ -15,16 +15,16 @@ import msgpack
 import pytest
 from operator_shell import Shell
 
+from apps.cli import echo, exits, hz, top
+from apps.cli.link import Where
 from cocoro.bus.endpoints import default
 from cocoro.bus.zenoh import ZenohBus
-from cocoro.cli import echo, exits, hz, top
-from cocoro.cli.link import Where
 from cocoro.clock import RealClock
 from cocoro.messages import BaseCommand
 from cocoro.node import Node
 from cocoro.robot import Robot
-from cocoro.rundir import RunDir
 from cocoro.topics import BASE_COMMAND, Qos
+from deploy.rundir import RunDir
 
 pytestmark = pytest.mark.zenoh
 
@@ -157,7 +157,7 @@ def test_ctrl_c_ends_them_well(root: Path, command: list[str]) -> None:
     async def scenario() -> None:
         async with robot():
             running = await asyncio.create_subprocess_exec(
-                sys.executable, "-m", "cocoro.cli.main", *command, stdout=asyncio.subprocess.PIPE
+                sys.executable, "-m", "apps.cli.main", *command, stdout=asyncio.subprocess.PIPE
             )
             assert running.stdout is not None
             assert await running.stdout.readline()

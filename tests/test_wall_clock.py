@@ -25,10 +25,11 @@ from robot_rig import RobotRig
 from wall_clock import NoPreloadError, WallClock
 from wire_base import MS, Bench
 
-from cocoro import robot_time, topics
+from cocoro import topics
 from cocoro.clock import NS, RealClock
-from cocoro.rundir import RunDir, Target
 from cocoro.vloop import run_virtual
+from deploy import robot_time
+from deploy.rundir import RunDir, Target
 
 STEPS_S = (-0.01, 0.01, -0.3, 0.3, -0.49, 0.49, -10.0, 10.0, -3600.0, 3600.0, -36_000.0, 36_000.0)
 DEADMAN_S = 0.15
@@ -113,7 +114,7 @@ class Driven:
         self._planner: subprocess.Popen[bytes] | None = None
 
     def up(self) -> None:
-        self.supervisor = Running([sys.executable, "-m", "cocoro.cli.main", "up", str(self._profile)], self._env)
+        self.supervisor = Running([sys.executable, "-m", "apps.cli.main", "up", str(self._profile)], self._env)
         self.supervisor.until("is up")
 
     def down(self) -> None:
@@ -157,7 +158,7 @@ class Driven:
         return json.loads(out.stdout)
 
     def command(self, *arguments: str) -> tuple[int, str]:
-        command = [sys.executable, "-m", "cocoro.cli.main", *arguments, "--robot", "stepped"]
+        command = [sys.executable, "-m", "apps.cli.main", *arguments, "--robot", "stepped"]
         done = subprocess.run(command, env=self._env, capture_output=True, text=True, timeout=PATIENCE_S)
         return done.returncode, done.stdout
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from operator_shell import Shell
 
-from cocoro.rundir import RunDir
+from deploy.rundir import RunDir
 
 pytestmark = [pytest.mark.zenoh, pytest.mark.sim]
 

@@ -169,7 +169,7 @@ async def in_thread(work: Callable[[], T], undo: Callable[[T], None] | None = No
 
 
 class ExitGuard:
-    """Zenoh must not call back into an interpreter that is taken apart (`cocoro.quit` tells why): sessions that the
+    """Zenoh must not call back into an interpreter that is taken apart (`deploy.quit` tells why): sessions that the
     program forgot are closed before, and a thread of zenoh's that is about to call gets its turn. A program that
     would be sure ends by `quit_process`."""
 

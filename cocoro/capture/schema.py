@@ -7,8 +7,9 @@ The rules of reading, as of every reader on the mesh (msgspec applies them to ea
   as that type, only as the map that it is;
 - a field whose type or limits have changed is read where the recorded value fits today's, else as above.
 
-An output that is compared with a recorded one (`cocoro.capture.rerun`) is compared by the fields that both types have:
-of a field that has come since nothing was recorded, and one that is no more is not made. What has changed is told.
+An output that is compared with a recorded one (`apps.captures.reexecute`) is compared by the fields that both types
+have: of a field that has come since nothing was recorded, and one that is no more is not made. What has changed is
+told.
 """
 
 from __future__ import annotations

@@ -13,9 +13,9 @@ import msgspec
 from cocoro.bus.base import Handle
 from cocoro.bus.local import LocalMesh
 from cocoro.clock import NS, Clock, VirtualClock
+from cocoro.component import Component, Process, load
 from cocoro.messages import Message, TopicHealth
 from cocoro.node import Node
-from cocoro.processes import Component, Process, load
 from cocoro.robot import Robot
 from cocoro.testing.tap import Tap
 from cocoro.testing.virtual import settle

@@ -15,17 +15,16 @@ import msgspec
 from cocoro.about import about, versions
 from cocoro.bus.base import Handle, Heard, Payload
 from cocoro.capture.keys import ALIVE_INFO, Alive, Choice, KeyInfo
-from cocoro.capture.log_clock import WALL_CLOCK, LogClock, words
-from cocoro.capture.whereabouts import told
-from cocoro.capture.writer import Entry, Missing
 from cocoro.clock import NS, FollowedClock
 from cocoro.errors import MeshError, RemoteError
 from cocoro.messages import AboutReply, AboutRequest, Clock, DisturbedFile, Recording
 from cocoro.node import Node
-from cocoro.rundir import RunDir
 from cocoro.tokens import alive_key, recorder_key
 from cocoro.topics import ABOUT, CLOCK, RECORDING
+from services.capture.log_clock import WALL_CLOCK, LogClock, words
 from services.capture.sink import Progress, Sink
+from services.capture.whereabouts import told
+from services.capture.writer import Entry, Missing
 
 TELL_S = 1.0
 """How often the recorder tells how it is getting on."""
@@ -263,9 +262,8 @@ class Recorder:
         self._sink.remember("run", run)
         self._sink.remember("robot", {"description": json.dumps(node.robot.to_data())})
         self._sink.remember(f"service/{node.name}", _entries(about(node)))
-        profile = {} if clock is None else RunDir(node.robot_name).resolved()
-        if profile:
-            self._sink.remember("profile", {"profile": json.dumps(profile)})
+        if node.profile:
+            self._sink.remember("profile", {"profile": json.dumps(node.profile)})
 
 
 def _entries(about: AboutReply) -> dict[str, str]:

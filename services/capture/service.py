@@ -11,15 +11,15 @@ from pathlib import Path
 
 from cocoro.capture.compression import Packer
 from cocoro.capture.keys import Choice, info_of
-from cocoro.capture.log_clock import LogClock
-from cocoro.capture.pictures import lossy
-from cocoro.capture.retention import file_name, make_room
-from cocoro.capture.writer import MB, Limits, Writer, sync_and_close
 from cocoro.clock import NS, VirtualClock
 from cocoro.node import Node
 from services.capture.config import Config, folder_of
+from services.capture.log_clock import LogClock
+from services.capture.lossy import lossy
 from services.capture.recorder import Ledger, Recorder
+from services.capture.retention import file_name, make_room
 from services.capture.sink import DirectSink, ThreadedSink
+from services.capture.writer import MB, Limits, Writer, sync_and_close
 
 __all__ = ["Config", "run"]
 

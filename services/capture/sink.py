@@ -13,8 +13,8 @@ from typing import NamedTuple, Protocol
 
 from cocoro.capture.errors import CaptureError
 from cocoro.capture.file import LARGE_BYTES
-from cocoro.capture.writer import Entry, Writer
 from cocoro.messages import DisturbedFile
+from services.capture.writer import Entry, Writer
 
 log = logging.getLogger(__name__)
 

@@ -8,9 +8,9 @@ import numpy as np
 
 from cocoro.clock import NS
 from cocoro.kinematics import Array
-from cocoro.learning.adapt import WILD_M, Adapter
 from cocoro.learning.handmap import HandMap
 from cocoro.learning.reachability import ReachMesh
+from services.planning.adapt import WILD_M, Adapter
 from services.planning.reach import ARM, LEVEL_ROLL_RAD
 from services.planning.senses import Sighting
 

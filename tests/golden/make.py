@@ -9,14 +9,14 @@ from __future__ import annotations
 import tempfile
 from pathlib import Path
 
+from apps.captures.reexecute import rerun, words
+from apps.captures.rewrite import rewrite
+from apps.rehearsal.rehearse import rehearse
+from apps.rehearsal.request import RehearsalRequest
 from cocoro.capture.compression import Packer
 from cocoro.capture.keys import Choice
 from cocoro.capture.reader import Capture
-from cocoro.capture.rerun import rerun, words
-from cocoro.capture.rewrite import rewrite
 from cocoro.clock import NS
-from cocoro.rehearsal import RehearsalRequest
-from sim.rehearse import rehearse
 
 GOLDEN = Path(__file__).with_name("fetch.mcap")
 LENGTH_S = 6.0

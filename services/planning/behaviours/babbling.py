@@ -12,10 +12,10 @@ from cocoro.clock import NS
 from cocoro.core import Output
 from cocoro.frames import Pose2
 from cocoro.kinematics import Array
-from cocoro.learning.draws import sobol
 from cocoro.messages import BaseCommand, HandSample, Vec2, Vec3, WheelTrial
 from cocoro.topics import HAND_SAMPLES, WHEEL_TRIALS
 from services.planning.behaviours.base import Plan, Scene
+from services.planning.draws import sobol
 from services.planning.postures import Postures
 from services.planning.reach import ARM, LEVEL_ROLL_RAD, HandPose
 

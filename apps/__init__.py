@@ -1,0 +1,1 @@
+"""The applications: they stand on services, simulator and deployment, and nothing stands on them."""

@@ -1,0 +1,1 @@
+"""What is done with captures: replay, re-execution, export, rewriting, reports."""

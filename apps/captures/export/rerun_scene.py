@@ -1,0 +1,256 @@
+"""Rerun: pictures, depth as points, the robot, what it believes and what is true, curves and phases.
+
+One picture of the world, told message by message: from a capture (`--rrd`, `cocoro view FILE`) or from the mesh as it
+goes (`cocoro view`). Needs the package rerun-sdk, which is an extra.
+"""
+
+from __future__ import annotations
+
+import os
+import sysconfig
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from apps.captures.export.geometry import CAMERA, Posture, about_z, conjugate, points, quaternion, rotated
+from apps.captures.export.outfile import making
+from apps.captures.export.story import catalogue_of, robot_of
+from cocoro.capture.errors import CaptureError
+from cocoro.capture.reader import Capture
+from cocoro.capture.types import NotReadableError
+from cocoro.clock import NS
+from cocoro.messages import (
+    BaseCommand,
+    BaseState,
+    Detections,
+    Frame,
+    Message,
+    PlannerStatus,
+    ServoState,
+    TaskState,
+    Truth,
+)
+from cocoro.objects import Catalogue
+from cocoro.picture import describe
+from cocoro.robot import Robot
+
+APPLICATION = "cocoro"
+TIMELINE = "robot"
+"""The stamps' time line."""
+DEPTH_STEP = 5
+JPEG_QUALITY = 85
+BONE, UNKNOWN, TRUE = (217, 217, 230), (255, 255, 255), (50, 230, 80)
+
+
+def library() -> Any:
+    """The package. Raises CaptureError with the line that installs it."""
+    try:
+        import rerun
+    except ModuleNotFoundError as error:
+        raise CaptureError("this needs Rerun: pip install 'cocoro-mesh[view]'") from error
+    return rerun
+
+
+def export(capture: Capture, out: Path, progress: Callable[[float], None] = lambda _: None) -> int:
+    """Write a recording that Rerun opens; the number of messages in it. Raises CaptureError when that cannot be."""
+    rr = library()
+    with making(out):
+        recording = rr.RecordingStream(APPLICATION)
+        recording.save(str(out))
+        count = tell(capture, recording, progress)
+        recording.flush()
+        return count
+
+
+def opened(rr: Any) -> Any:
+    """A recording that a viewer shows, which is opened here. Raises CaptureError when it cannot be."""
+    beside_us = sysconfig.get_path("scripts")  # where the package has put it, whether or not that is in the PATH
+    os.environ["PATH"] = os.pathsep.join(filter(None, (beside_us, os.environ.get("PATH"))))
+    recording = rr.RecordingStream(APPLICATION)
+    with no_viewer():
+        recording.spawn()
+    return recording
+
+
+@contextmanager
+def no_viewer() -> Iterator[None]:
+    """Around what fails when the viewer does, as it does without a screen."""
+    try:
+        yield
+    except RuntimeError as error:
+        raise CaptureError(
+            "Rerun's viewer could not be opened, or has gone; it needs a screen. "
+            "`cocoro export FILE --rrd OUT.rrd` makes a file that it opens elsewhere"
+        ) from error
+
+
+def tell(capture: Capture, recording: Any, progress: Callable[[float], None] = lambda _: None) -> int:
+    """A capture to a recording, whatever that is connected to."""
+    teller = Teller(recording, robot_of(capture), catalogue_of(capture))
+    count = 0
+    for record in capture.messages():
+        try:
+            message = capture.read(record)
+        except NotReadableError:
+            continue
+        if isinstance(message, Message):
+            teller.tell(record.key.removeprefix(f"{capture.robot}/"), message)
+            count += 1
+        progress((record.log_ns - capture.start_ns) / NS)
+    return count
+
+
+class Teller:
+    """Tells a recording of each message, at the message's stamp."""
+
+    def __init__(self, recording: Any, robot: Robot, catalogue: Catalogue) -> None:
+        self._rr = library()
+        self._to = recording
+        self._robot = robot
+        self._catalogue = catalogue
+        self._posture = Posture(robot)
+        self._phase = ""
+        self._why = ""
+        self._log("world", self._rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+
+    def tell(self, topic: str, message: Message) -> None:
+        """`topic` is the key without the robot."""
+        self._to.set_time(TIMELINE, duration=message.stamp_ns / NS)
+        if isinstance(message, Frame):
+            self._frame(message)
+        elif isinstance(message, Detections):
+            self._seen(message)
+        elif isinstance(message, BaseState):
+            self._base(message)
+        elif isinstance(message, ServoState):
+            self._servos(message)
+        elif isinstance(message, BaseCommand):
+            self._curve("wheels/commanded_left", message.left_mps)
+            self._curve("wheels/commanded_right", message.right_mps)
+        elif isinstance(message, PlannerStatus):
+            self._plan(message)
+        elif isinstance(message, TaskState):
+            self._task(message)
+        elif isinstance(message, Truth):
+            self._truth(message)
+
+    # --- what it sees -----------------------------------------------------------------------------
+
+    def _frame(self, frame: Frame) -> None:
+        rr, camera = self._rr, self._robot.camera.scaled(frame.width, frame.height)
+        self._log(
+            "world/body/camera",
+            rr.Pinhole(
+                focal_length=(camera.fx, camera.fy), principal_point=(camera.cx, camera.cy),
+                width=frame.width, height=frame.height, image_plane_distance=0.2,
+            ),
+        )  # fmt: skip
+        pixels = np.frombuffer(frame.colour, dtype=np.uint8).reshape(frame.height, frame.width, 3)
+        self._log("world/body/camera/colour", rr.Image(pixels).compress(jpeg_quality=JPEG_QUALITY))
+        places, colours = points(frame, self._robot, DEPTH_STEP)
+        links = self._posture.links()
+        if links:  # the points are hung on the body, since what hangs on a camera is a picture
+            pose = links[CAMERA]
+            self._log(
+                "world/body/points", rr.Points3D(places @ pose[:3, :3].T + pose[:3, 3], colors=colours, radii=0.004)
+            )
+
+    def _seen(self, seen: Detections) -> None:
+        boxes = [detection.box_px for detection in seen.detections]
+        self._log(
+            "world/body/camera/colour/detections",
+            self._rr.Boxes2D(
+                array=np.array(boxes, dtype=np.float32).reshape(-1, 4), array_format=self._rr.Box2DFormat.XYXY,
+                labels=[describe(detection) for detection in seen.detections],
+                colors=[self._colour(detection.label) for detection in seen.detections],
+            ),
+        )  # fmt: skip
+
+    # --- where it is ------------------------------------------------------------------------------
+
+    def _base(self, base: BaseState) -> None:
+        self._posture.move(base)
+        body, rr = self._posture.body, self._rr
+        self._log(
+            "world/body",
+            rr.Transform3D(translation=(body.x_m, body.y_m, 0.0), rotation=rr.Quaternion(xyzw=about_z(body.yaw_rad))),
+        )
+        radius, height = self._robot.base.chassis_diameter_m / 2, self._robot.base.chassis_height_m
+        self._log(
+            "world/body/chassis",
+            rr.Cylinders3D(lengths=[height], radii=[radius], centers=[(0.0, 0.0, height / 2)], colors=[BONE]),
+        )
+        self._curve("base/speed", base.speed_mps)
+        self._curve("base/turn_rate", base.turn_rate_radps)
+
+    def _servos(self, servos: ServoState) -> None:
+        self._posture.bend(servos)
+        for joint, angle_rad in zip(servos.joints, servos.position_rad, strict=True):
+            self._curve(f"joints/{joint}", angle_rad)
+        links = self._posture.links()
+        if not links:
+            return
+        rr = self._rr
+        self._log("world/body/links", rr.LineStrips3D(self._posture.bones(links), radii=0.01, colors=[BONE]))
+        pose = links[CAMERA]
+        turn = rr.Quaternion(xyzw=quaternion(pose[:3, :3]))
+        self._log("world/body/camera", rr.Transform3D(translation=pose[:3, 3], rotation=turn))
+
+    # --- what it believes, and does ---------------------------------------------------------------
+
+    def _plan(self, plan: PlannerStatus) -> None:
+        known = plan.known
+        self._log(
+            "world/body/believed",
+            self._rr.Points3D(
+                np.array([item.position_m for item in known], dtype=np.float32).reshape(-1, 3),
+                labels=[item.label for item in known], radii=0.03,
+                colors=[self._colour(item.label) for item in known],
+            ),
+        )  # fmt: skip
+        if plan.hand_m is not None:
+            self._log("world/body/hand", self._rr.Points3D([plan.hand_m], radii=0.015, labels=["hand"]))
+        if plan.distance_m is not None:
+            self._curve("distance", plan.distance_m)
+        if plan.why != self._why:
+            self._why = plan.why
+            self._log("log", self._rr.TextLog(f"{plan.behaviour}: {plan.why}", level="DEBUG"))
+
+    def _task(self, task: TaskState) -> None:
+        phase = f"{task.task} {task.label}: {task.outcome or task.phase}".strip()
+        if task.task_id and phase != self._phase:
+            words = f"{phase} ({task.reason})" if task.reason else phase
+            self._log("log", self._rr.TextLog(words, level="ERROR" if task.outcome == "failed" else "INFO"))
+        self._phase = phase
+
+    def _truth(self, truth: Truth) -> None:
+        """In the body frame, where the belief is too."""
+        there = [item for item in truth.objects if item.kind == "object"]
+        back = conjugate(truth.body_orientation)
+        places = []
+        for item in there:
+            x, y, z = (one - other for one, other in zip(item.position_m, truth.body_m, strict=True))
+            places.append(rotated(back, (x, y, z)))
+        self._log(
+            "world/body/true",
+            self._rr.Points3D(
+                np.array(places, dtype=np.float32).reshape(-1, 3), radii=0.02, colors=[TRUE],
+                labels=[f"true {item.label}" for item in there],
+            ),
+        )  # fmt: skip
+
+    def _colour(self, label: str) -> tuple[int, int, int]:
+        known = self._catalogue.get(label)
+        if known is None:
+            return UNKNOWN
+        red, green, blue = (round(255 * share) for share in known.rgb)
+        return red, green, blue
+
+    def _curve(self, name: str, value: float) -> None:
+        self._log(f"curves/{name}", self._rr.Scalars(value))
+
+    def _log(self, path: str, what: Any, static: bool = False) -> None:
+        self._to.log(path, what, static=static)

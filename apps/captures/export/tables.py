@@ -1,0 +1,152 @@
+"""`--csv` and `--parquet`: each key as a table, and what the robot believed beside what was true."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, Protocol
+
+from apps.captures.export.truth import beliefs
+from cocoro.capture.errors import CaptureError, DamageError
+from cocoro.capture.reader import Capture
+from cocoro.clock import NS
+
+LONGEST_LIST = 16
+"""A list of more plain values than this is given by its length."""
+
+Row = dict[str, Any]
+
+
+class Sink(Protocol):
+    """Where a table goes."""
+
+    def write(self, name: str, rows: list[Row]) -> None: ...
+
+
+def export(capture: Capture, sink: Sink) -> list[str]:
+    """Write a table for each key that has any messages of maps (for each channel of it, where it has several), one for
+    each list of maps in it, and `belief` where the simulator's truth was recorded. Returns their names. Raises
+    CaptureError when it cannot be written."""
+    written = []
+    for channel in (id for _, ids in sorted(capture.keys.items()) for id in ids):
+        key = capture.channels[channel].topic
+        number = f"#{channel}" if len(capture.keys[key]) > 1 else ""
+        tables = _tables(capture, channel)
+        for part, rows in tables.items():
+            head = key.removeprefix(f"{capture.robot}/").strip("/").replace("/", "_")
+            name = ".".join(filter(None, (f"{head}{number}", part)))
+            sink.write(name, rows)
+            written.append(name)
+    aligned = list(beliefs(capture))
+    if aligned:
+        sink.write("belief", aligned)
+        written.append("belief")
+    return written
+
+
+def _tables(capture: Capture, channel: int) -> dict[str, list[Row]]:
+    """By the name of the list that it is of; '' is the key's own."""
+    tables: dict[str, list[Row]] = {}
+    for record in capture.messages(channels=[channel]):
+        try:
+            message = capture.decode(record)
+        except DamageError:
+            continue
+        if not isinstance(message, Mapping):
+            continue
+        head: Row = {
+            "time_s": (record.log_ns - capture.start_ns) / NS,
+            "log_ns": record.log_ns,
+            "stamp_ns": record.publish_ns,
+            "seq": record.sequence,
+        }
+        row = dict(head)
+        for name, value in message.items():
+            if name in head:
+                continue
+            if isinstance(value, list) and value and all(isinstance(item, Mapping) for item in value):
+                row[f"{name}.count"] = len(value)
+                parts = tables.setdefault(str(name), [])
+                parts += [{**head, "index": n, **_flat(item)} for n, item in enumerate(value)]
+            else:
+                row.update(_flat({name: value}))
+        tables.setdefault("", []).append(row)
+    return tables
+
+
+def _flat(value: Any, name: str = "") -> Row:
+    """Maps and short lists as columns: 'odometry_m.0'."""
+    if isinstance(value, Mapping):
+        return _joined(((str(part), item) for part, item in value.items()), name)
+    if isinstance(value, list):
+        if len(value) > LONGEST_LIST or any(isinstance(item, Mapping) for item in value):
+            return {f"{name}.count": len(value)}
+        return _joined(((str(n), item) for n, item in enumerate(value)), name)
+    if isinstance(value, bytes):
+        return {f"{name}.bytes": len(value)}
+    return {name: value}
+
+
+def _joined(parts: Iterator[tuple[str, Any]], name: str) -> Row:
+    found: Row = {}
+    for part, item in parts:
+        found.update(_flat(item, f"{name}.{part}" if name else part))
+    return found
+
+
+def columns(rows: list[Row]) -> list[str]:
+    """All that any row has, in the order in which they come up. What is nothing or a map or list ('target' or
+    'target.label') has the columns of its parts alone."""
+    names = dict.fromkeys(name for row in rows for name in row)
+    wholes = {name[:at] for name in names for at, letter in enumerate(name) if letter == "."}
+    return [name for name in names if name not in wholes or any(row.get(name) is not None for row in rows)]
+
+
+class CsvFolder:
+    """A file for each table."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    def write(self, name: str, rows: list[Row]) -> None:
+        path = self._folder / f"{name}.csv"
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            with path.open("w", newline="", encoding="utf-8") as file:
+                writer = csv.DictWriter(file, columns(rows), restval="", extrasaction="ignore")
+                writer.writeheader()
+                writer.writerows(rows)
+        except OSError as error:
+            raise CaptureError(f"{path}: {error.strerror}") from error
+
+
+class ParquetFolder:
+    """Likewise. Raises CaptureError when pyarrow is not installed."""
+
+    def __init__(self, folder: Path) -> None:
+        try:
+            import pyarrow
+            import pyarrow.parquet
+        except ModuleNotFoundError as error:
+            raise CaptureError(
+                "--parquet needs pyarrow: pip install 'cocoro-mesh[tables]'; --csv needs nothing"
+            ) from error
+        self._arrow = pyarrow
+        self._folder = folder
+
+    def write(self, name: str, rows: list[Row]) -> None:
+        path = self._folder / f"{name}.parquet"
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            table = self._arrow.table({column: self._column(rows, column) for column in columns(rows)})
+            self._arrow.parquet.write_table(table, path)
+        except OSError as error:
+            raise CaptureError(f"{path}: {error.strerror or error}") from error
+
+    def _column(self, rows: list[Row], name: str) -> Any:
+        values = [row.get(name) for row in rows]
+        try:
+            return self._arrow.array(values)
+        except (self._arrow.ArrowInvalid, self._arrow.ArrowTypeError):  # of several types: as texts
+            return self._arrow.array([None if value is None else str(value) for value in values])

@@ -1,0 +1,262 @@
+"""Exact re-execution: a service's pure core over the inputs that each recorded step consumed, its outputs compared
+with the recorded ones by meaning.
+
+A step whose inputs the capture lacks cannot be executed: it is counted as such, and never as equal. The core goes on
+with what there is; a difference in a later step is told with that in mind.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from apps.captures.compare import difference
+from apps.captures.info import changed_since
+from apps.captures.inputs import Found, Id, Step, steps_of, with_messages
+from apps.captures.origin import Origin, origins
+from cocoro.capture.reader import Capture
+from cocoro.capture.schema import known_to
+from cocoro.capture.types import NotReadableError
+from cocoro.clock import NS
+from cocoro.core import Core, Output, Sample
+from cocoro.messages import Message
+
+
+class FirstDifference(msgspec.Struct, kw_only=True):
+    step: int
+    """The recorded step's sequence number."""
+    at_s: float
+    """Seconds of the capture."""
+    now_ns: int
+    text: str
+    after_missing: bool
+    """A step before it could not be executed, which may be why."""
+
+
+class Result(msgspec.Struct, kw_only=True):
+    service: str
+    steps: int = 0
+    equal: int = 0
+    """Steps whose every output is the recorded one."""
+    differing: int = 0
+    not_executable: int = 0
+    outputs: int = 0
+    """Compared."""
+    reasons: dict[str, int] = {}
+    """Why steps could not be executed, and how often."""
+    first: FirstDifference | None = None
+    tolerance: float = 0.0
+    recorded_s: float = 0.0
+    """From the first step to the last."""
+    wall_s: float = 0.0
+    cpu_s: float = 0.0
+    """Of this process's processors; less than `wall_s` where others wanted them too."""
+    changed: tuple[str, ...] = ()
+    """What is different in the types of its messages since; outputs are compared by the fields that both have."""
+    problems: tuple[str, ...] = ()
+    """What of the captures could not be read."""
+
+    @property
+    def speed(self) -> float:
+        """Times real time."""
+        return self.recorded_s / self.wall_s if self.wall_s else 0.0
+
+
+def rerun(captures: Sequence[Capture], service: str, tolerance: float = 0.0, compare: bool = True) -> Result:
+    """Execute a service again over a run's captures, given in order; without `compare` just to see how fast it goes.
+
+    Raises CaptureError when they do not have what that takes: its steps, its configuration, a component with a core.
+    """
+    started, cpu_started = time.perf_counter(), time.process_time()
+    with origins(captures, service) as made:
+        steps = steps_of(captures, service)
+        run = _Rerun(service, made, captures[0], tolerance if compare else None)
+        for step in with_messages(captures, steps):
+            run.execute(step)
+    result = run.result
+    result.recorded_s = (steps[-1][0] - steps[0][0]) / NS
+    result.changed = tuple(run.changed)
+    result.problems = tuple(problem for capture in captures for problem in capture.problems)
+    result.wall_s, result.cpu_s = time.perf_counter() - started, time.process_time() - cpu_started
+    return result
+
+
+class _Rerun:
+    def __init__(self, service: str, made: Sequence[Origin], first: Capture, tolerance: float | None) -> None:
+        self.result = Result(service=service, tolerance=tolerance or 0.0)
+        self._made = made
+        self._tolerance = tolerance
+        self._start_ns = first.start_ns
+        self._incarnation: int | None = None
+        self._starts = 0
+        self._seq = -1
+        self._core: Core | None = None
+        self._latency_ns = 0
+        self._inputs_missed = False
+        self._looked_at: set[tuple[Path, int]] = set()
+        self.changed: dict[str, None] = {}
+        self._encoder = msgspec.msgpack.Encoder(enc_hook=_plain)
+
+    def execute(self, step: Step) -> None:
+        record = step.record
+        if record.incarnation != self._incarnation:
+            self._begin(record.incarnation)
+        if missed := record.seq - self._seq - 1:
+            self._cannot("its record is missing", missed)
+        self._seq = record.seq
+        self.result.steps += 1
+        core = self._core
+        assert core is not None
+        samples, missing = self._samples(core, step)
+        try:
+            outputs = core.step(samples, record.now_ns)
+        except Exception as error:  # whatever it is, it is the finding
+            outputs, failure = (), f"the core fails: {type(error).__name__}: {error}"
+        else:
+            failure = ""
+        if missing:
+            self._cannot(missing)
+            return
+        if self._tolerance is None:
+            return
+        reason, text = ("", failure) if failure else self._compare(step, outputs)
+        if reason:
+            self._cannot(reason, inputs=False)
+        elif text:
+            self._differs(step, text)
+        else:
+            self.result.equal += 1
+
+    def _begin(self, incarnation: int) -> None:
+        """The service was started: a new core, with what it was configured with then."""
+        origin = self._made[min(self._starts, len(self._made) - 1)]
+        self._core = origin.core()
+        self._latency_ns = round(origin.latency_s * NS)
+        self._starts += 1
+        self._incarnation, self._seq = incarnation, -1
+        self._inputs_missed = False
+
+    def _samples(self, core: Core, step: Step) -> tuple[list[Sample], str]:
+        """What the core is given, and why that is not all that it was given then ('' when it is)."""
+        topics = {topic.name: topic for topic in core.reads}
+        samples, missing = [], ""
+        for name in step.record.consumed:
+            topic, found = topics.get(name[0]), step.messages.get(name)
+            if topic is None:
+                missing = f"it consumed {name[0]}, which the core does not read today"
+            elif found is None:
+                missing = f"the capture lacks an input of {name[0]}"
+            else:
+                self._look_at(found)
+                try:
+                    message = found.capture.read(found.record)
+                    assert isinstance(message, Message)
+                    samples.append(Sample(topic, message))
+                except NotReadableError:
+                    missing = f"an input of {name[0]} cannot be read as today's type"
+        return samples, missing
+
+    def _compare(self, step: Step, outputs: Sequence[Output]) -> tuple[str, str]:
+        """Why the step's outputs cannot be compared, and what is different first; '' for nothing."""
+        produced = step.record.produced
+        given, now = [name[0] for name in produced], [output.topic.name for output in outputs]
+        if given != now:
+            return "", f"it gave {', '.join(given) or 'nothing'} and gives {', '.join(now) or 'nothing'}"
+        for name, output in zip(produced, outputs, strict=True):
+            found = step.messages.get(name)
+            if found is None:
+                return f"the capture lacks an output on {name[0]}", ""
+            self._look_at(found)
+            self.result.outputs += 1
+            payload = self._encoded(name, output, step.record.now_ns)
+            if payload == found.record.payload:
+                continue
+            try:
+                text = self._difference(found, payload)
+            except NotReadableError:
+                return f"an output on {name[0]} cannot be read as today's type", ""
+            if text:
+                return "", f"{name[0]}: {text}"
+        return "", ""
+
+    def _encoded(self, name: Id, output: Output, now_ns: int) -> bytes:
+        """As the node published it, or would have."""
+        message = output.message
+        if message.stamp_ns == 0:
+            message.stamp_ns = now_ns + self._latency_ns
+        _, message.incarnation, message.seq = name
+        return self._encoder.encode(message)
+
+    def _difference(self, found: Found, payload: bytes) -> str:
+        """By meaning, and by the fields that the type had then and has today."""
+        recorded = found.capture.read(found.record)
+        now = found.capture.read(found.record._replace(payload=memoryview(payload)))
+        plain = [msgspec.to_builtins(message, builtin_types=(bytes, memoryview)) for message in (recorded, now)]
+        schema = found.capture.schema(found.record.channel)
+        if schema is not None:
+            plain = [known_to(schema.data, message) for message in plain]
+        unlike = difference(plain[0], plain[1], self._tolerance or 0.0)
+        return "" if unlike is None else unlike.text
+
+    def _look_at(self, found: Found) -> None:
+        """Whether the type of its key has changed since."""
+        key, channel = found.record.key, found.record.channel
+        if (found.capture.path, channel) not in self._looked_at:
+            self._looked_at.add((found.capture.path, channel))
+            self.changed.update(dict.fromkeys(f"{key}: {text}" for text in changed_since(found.capture, channel)))
+
+    def _cannot(self, reason: str, count: int = 1, inputs: bool = True) -> None:
+        self._inputs_missed |= inputs
+        self.result.not_executable += count
+        self.result.reasons[reason] = self.result.reasons.get(reason, 0) + count
+        if reason == "its record is missing":
+            self.result.steps += count
+
+    def _differs(self, step: Step, text: str) -> None:
+        self.result.differing += 1
+        if self.result.first is None:
+            self.result.first = FirstDifference(
+                step=step.record.seq,
+                at_s=(step.log_ns - self._start_ns) / NS,
+                now_ns=step.record.now_ns,
+                text=text,
+                after_missing=self._inputs_missed,
+            )
+
+
+def _plain(value: object) -> Any:
+    """As the node's publisher does it."""
+    if isinstance(value, np.generic):
+        return value.item()
+    raise TypeError(f"a {type(value).__name__} cannot be sent")
+
+
+def words(result: Result) -> list[str]:
+    """What came of it, a fact a line."""
+    within = f" within {result.tolerance:g}" if result.tolerance else ""
+    compared = f"{result.service}: {result.steps} steps, {result.outputs} outputs compared{within}: "
+    verdict = "every one equal" if result.equal == result.steps else f"{result.equal} steps equal"
+    lines = [compared + verdict]
+    if result.differing:
+        lines.append(f"  {result.differing} steps differ")
+    if result.first is not None:
+        first = result.first
+        doubt = " (after a step that could not be executed, which may be why)" if first.after_missing else ""
+        lines.append(f"  first in step {first.step}, at {first.at_s:.3f} s: {first.text}{doubt}")
+    if result.not_executable:
+        lines.append(f"  {result.not_executable} steps not re-executable")
+        lines += [f"    {count}: {reason}" for reason, count in _by_count(result.reasons)]
+    lines += [f"  changed since, {change}" for change in result.changed]
+    lines += [f"  not read: {problem}" for problem in result.problems]
+    times = f"{result.wall_s:.1f} s ({result.cpu_s:.1f} s of processor)"
+    lines.append(f"  {result.recorded_s:.1f} s in {times}: {result.speed:.1f} times real time")
+    return lines
+
+
+def _by_count(reasons: Mapping[str, int]) -> list[tuple[str, int]]:
+    return sorted(reasons.items(), key=lambda item: -item[1])

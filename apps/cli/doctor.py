@@ -1,0 +1,185 @@
+"""`cocoro doctor`: a machine and its robot, looked over before a run."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import socket
+import time
+from collections.abc import Callable, Iterator, Mapping
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from apps.cli import doctor_stop, exits
+from cocoro.bus import shared
+from cocoro.checks import Check, bad, note, ok
+from cocoro.component import Process, load
+from cocoro.errors import ConfigError
+from cocoro.robot import Robot
+from deploy import profiles
+from deploy.processes import shared_bytes
+from deploy.profiles import Profile
+from deploy.rundir import Holder, RunDir
+from services.base import doctor as base_doctor
+from services.kinect import doctor as kinect_doctor
+from services.servos import doctor as servos_doctor
+
+LIBRARIES = {
+    "base": ("pyserial",),
+    "servos": ("pyserial", "dynamixel-sdk"),
+    "kinect": ("numpy", "opencv-python-headless"),
+    "perception": ("numpy", "opencv-python-headless"),
+    "sim": ("pybullet", "moderngl"),
+    "wire": ("pybullet", "moderngl"),
+}
+"""What a process needs beyond the mesh, by distribution."""
+DOCTORS: dict[str, Callable[[Any, Robot, str], list[Check]]] = {
+    "base": base_doctor.check,
+    "kinect": kinect_doctor.check,
+    "servos": servos_doctor.check,
+}
+"""The checks that a process's own package makes, by the process's name."""
+RULES = Path("/etc/udev/rules.d/99-cocoro.rules")
+ENOUGH_GB = 1.0
+MARKS = {"ok": "ok  ", "note": "note", "bad": "BAD "}
+SYNCHRONISED = Path("/run/systemd/timesync/synchronized")
+EARLIEST_S = 1_700_000_000
+
+
+def doctor(profile_name: str, as_json: bool) -> int:
+    """Exit code 1 when something is not well."""
+    profile = profiles.read(profile_name)
+    checks = list(examine(profile))
+    if as_json:
+        print(json.dumps([check._asdict() for check in checks]))
+    else:
+        width = max(len(check.name) for check in checks)
+        for check in checks:
+            print(f"{MARKS[check.state]}  {check.name:<{width}}  {check.text}")
+    return exits.FAILED if any(check.state == "bad" for check in checks) else exits.DONE
+
+
+def examine(profile: Profile) -> Iterator[Check]:
+    """All checks that a profile's robot gives reason for."""
+    run_dir = RunDir(profile.robot)
+    yield from _libraries(profile)
+    robot, own = _robot(profile)
+    if own is not None:
+        yield own
+    if profile.clock == "real":
+        yield _rules()
+        yield from _priority()
+    claims: dict[str, Holder] = {}
+    try:
+        claims = run_dir.claims()
+    except ConfigError as error:
+        yield bad("robot's folder", str(error))
+    for row in profile.rows():
+        running = [service for service in row.services if service in claims]
+        if running:
+            yield note(row.name, f"runs (pid {claims[running[0]].pid}): `cocoro status` tells how it is")
+        else:
+            yield from _hardware(row, profile, robot)
+    yield _clock(profile)
+    yield _shared_memory(profile, claims)
+    yield from _disk(run_dir)
+    yield from _mesh(profile, run_dir)
+    yield from doctor_stop.check(profile.robot)
+
+
+def _robot(profile: Profile) -> tuple[Robot, Check | None]:
+    """The description, and what there is to say of its files."""
+    files = [None if file is None else Path(file) for file in (profile.description, profile.measured)]
+    try:
+        robot = Robot.load(*files)
+    except ConfigError as error:
+        return Robot.load(), bad("robot's files", str(error))
+    if profile.measured is not None:
+        return robot, ok("robot's own file", profile.measured)
+    if profile.clock == "real":
+        what = "none: zeros and limits are the drawing's; `cocoro servos calibrate` measures them"
+        return robot, note("robot's own file", what)
+    return robot, None
+
+
+def _libraries(profile: Profile) -> Iterator[Check]:
+    for name in dict.fromkeys(library for row in profile.rows() for library in LIBRARIES.get(row.name, ())):
+        try:
+            yield ok(name, version(name))
+        except PackageNotFoundError:
+            yield bad(name, f"is not installed: pip install {name}")
+
+
+def _hardware(row: Process, profile: Profile, robot: Robot) -> Iterator[Check]:
+    """What the process's own package looks at."""
+    if row.name in DOCTORS:
+        config = profile.config(row.name, load(row).config)
+        yield from DOCTORS[row.name](config, robot, profile.robot)
+
+
+def _rules() -> Check:
+    if RULES.exists():
+        return ok("udev rules", str(RULES))
+    return bad("udev rules", f"not installed: sudo cp deploy/udev/{RULES.name} {RULES.parent}, then plug anew")
+
+
+def _priority() -> Iterator[Check]:
+    """Whether the base's guard may run before everything else."""
+    import resource
+
+    allowed = os.geteuid() == 0 or resource.getrlimit(resource.RLIMIT_RTPRIO)[0] > 0
+    if allowed:
+        yield ok("real-time priority", "allowed")
+    else:
+        yield note("real-time priority", "not allowed: the unit file's LimitRTPRIO and LimitNICE give it")
+
+
+def _clock(profile: Profile) -> Check:
+    if time.time() < EARLIEST_S:
+        return bad("clock", f"it is not {time.strftime('%Y')}: set it, or let timesyncd do so")
+    if profile.mesh.connect and not SYNCHRONISED.exists():
+        return note("clock", "whether it is synchronised is not known; machines of one robot must agree to 0.1 s")
+    return ok("clock", time.strftime("%Y-%m-%d %H:%M:%S"))
+
+
+def _shared_memory(profile: Profile, claims: Mapping[str, Holder]) -> Check:
+    """Whether frames can be shared; they are copied when they cannot."""
+    rows = profile.rows()
+    wanted_bytes = shared_bytes(rows)
+    if any(row.frames == "publishes" and set(row.services) & set(claims) for row in rows):
+        return ok("shared memory", f"{sum(shared.segments().values()) / 1e6:.1f} MB in use")
+    if why := shared.obstacle(wanted_bytes):
+        return note("shared memory", f"{why}; until then {shared.COSTS}")
+    return ok("shared memory", f"room for the {wanted_bytes / 1e6:.1f} MB that the frames take")
+
+
+def _disk(run_dir: RunDir) -> Iterator[Check]:
+    for what, path in (("run directory", run_dir.root), ("logs", run_dir.logs)):
+        there = next(folder for folder in (path, *path.parents) if folder.exists())
+        if not os.access(there, os.W_OK):
+            yield bad(what, f"{there} cannot be written; choose another by COCORO_RUN_DIR or COCORO_LOG_DIR")
+            continue
+        free_gb = shutil.disk_usage(there).free / 1e9
+        text = f"{path}, {free_gb:.1f} GB free"
+        yield ok(what, text) if free_gb >= ENOUGH_GB else bad(what, f"{text}: make room")
+
+
+def _mesh(profile: Profile, run_dir: RunDir) -> Iterator[Check]:
+    mesh = profile.mesh
+    if not mesh.listen and not mesh.connect:
+        yield ok("mesh", f"on this machine, in {run_dir.path}")
+    for endpoint in mesh.connect:
+        yield _reachable(endpoint)
+    for endpoint in mesh.listen:
+        yield ok("mesh", f"listens at {endpoint}")
+
+
+def _reachable(endpoint: str) -> Check:
+    host, _, port = endpoint.partition("/")[2].partition("#")[0].rpartition(":")
+    try:
+        with socket.create_connection((host.strip("[]"), int(port)), timeout=2.0):
+            return ok("mesh", f"{endpoint} answers")
+    except (OSError, ValueError) as error:
+        return bad("mesh", f"{endpoint} does not answer ({error}): is its router up, is the address right?")

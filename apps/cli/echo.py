@@ -1,0 +1,78 @@
+"""`cocoro echo KEY`: what travels on a key, decoded, of whatever type it is."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import sys
+import time
+from typing import Any
+
+from apps.cli import exits
+from apps.cli.ending import told_to_end
+from apps.cli.foreign import HEAD, Reading, jsonable, lines, read
+from apps.cli.link import Where, joined
+from apps.cli.listening import Ear, Heard, keyexpr_of, takes_frames
+
+HINT_S = 3.0
+"""A person who has heard nothing for so long is told so, and where to look."""
+
+
+async def echo(
+    where: Where, text: str, count: int | None, seconds: float | None, as_json: bool, everything: bool
+) -> int:
+    """Print until interrupted, or so many messages, or for so long. Exit code 1 when the time is over and there was
+    nothing, or fewer than were wanted."""
+    async with joined(where, frames=takes_frames(text)) as link:
+        ear = Ear(link, keyexpr_of(text, link.robot))
+        with told_to_end() as end:
+            printed = await _print(ear, link.robot, end, count, seconds, as_json, everything)
+            interrupted = end.is_set()
+        if ear.dropped:
+            print(f"cocoro: {ear.dropped} more came than could be printed", file=sys.stderr)
+    enough = printed >= (count or 1)
+    return exits.DONE if interrupted or enough else exits.FAILED
+
+
+async def _print(
+    ear: Ear, robot: str, end: asyncio.Event, count: int | None, seconds: float | None, as_json: bool, everything: bool
+) -> int:
+    """The number of messages that were printed."""
+    printed, hinted = 0, False
+    started_s = time.monotonic()
+    while not end.is_set() and (count is None or printed < count):
+        left_s = None if seconds is None else started_s + seconds - time.monotonic()
+        if left_s is not None and left_s <= 0:
+            break
+        wait_s = left_s if hinted or printed else min(HINT_S, left_s or HINT_S)
+        if not await ear.wait(end, wait_s):
+            if not (printed or hinted or end.is_set()) and (left_s is None or left_s > HINT_S):
+                hinted = True
+                print(f"nothing on {ear.keyexpr} yet; `cocoro topics` lists what there is, `cocoro top` what is sent",
+                      file=sys.stderr)  # fmt: skip
+            continue
+        for heard in ear.take()[: None if count is None else count - printed]:
+            reading = read(heard.payload, heard.key.removeprefix(f"{robot}/"))
+            print(_as_json(heard, reading) if as_json else _as_text(heard, reading, everything), flush=True)
+            printed += 1
+    return printed
+
+
+def _as_json(heard: Heard, reading: Reading) -> str:
+    entry = {"key": heard.key, "type": reading.type or None, "message": jsonable(reading.value)}
+    return json.dumps(entry | ({"problem": reading.problem} if reading.problem else {}))
+
+
+def _as_text(heard: Heard, reading: Reading, everything: bool) -> str:
+    value = reading.value
+    head: dict[Any, Any] = value if isinstance(value, dict) else {}
+    title = [heard.key, reading.type or "(unknown type)"]
+    if isinstance(seq := head.get("seq"), int):
+        title.append(f"#{seq}")
+    if isinstance(stamp_ns := head.get("stamp_ns"), int):
+        title.append(f"{stamp_ns / 1e9:.3f} s")
+    told = [f"! {reading.problem}"] if reading.problem else []
+    if isinstance(value, dict):
+        rest = {key: item for key, item in value.items() if key not in HEAD}
+        return "\n".join(["  ".join(title), *told, *lines(rest, everything)])
+    return "\n".join(["  ".join(title), *told, *([] if value is None else lines(value, everything))])

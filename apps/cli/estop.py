@@ -1,0 +1,244 @@
+"""`cocoro estop`, in short `stop`: first by the stop path, which nothing can deny, then by the mesh where that left
+something open.
+
+The stop path is used before anything else is imported or read, so it takes no longer than Python takes to start.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from typing import NamedTuple, TextIO
+
+from apps.cli import exits
+from cocoro.stop.asking import Asking, Point
+
+STOPPABLE = ("base", "arm", "hand")
+"""As `cocoro.topics` has it, which takes its time to import."""
+EXECUTIVE = "executive"
+"""It is told so that it ends its task. It moves nothing itself, so nobody waits for it to find its tongue."""
+ACKNOWLEDGE_S = 0.6
+"""How long the stop path waits for acknowledgements before the mesh is tried, too."""
+KEPT_S = 0.3
+"""How long it then waits to hear whether the latches are on the disk."""
+
+
+class Stop(NamedTuple):
+    """How stopping one robot went."""
+
+    robot: str
+    acknowledged: tuple[str, ...]
+    missing: tuple[str, ...]
+    """Known to run, and did not acknowledge."""
+    absent: tuple[str, ...]
+    """Nobody there to acknowledge."""
+    seconds: float
+    """From Enter to the moment at which the last of them stopped what it moves."""
+    not_kept: tuple[str, ...] = ()
+    """Why latches will not outlive a restart."""
+    not_yet_kept: tuple[str, ...] = ()
+    """Who has not said whether its latch is on the disk."""
+    owner: int | None = None
+    """User id of a robot that is another's."""
+    latched_ns: dict[str, int] = {}  # noqa: RUF012 # read only
+    """When each service stopped what it moves, CLOCK_MONOTONIC; by the stop path alone."""
+
+    @property
+    def code(self) -> int:
+        if self.missing:
+            return exits.FAILED
+        return exits.DONE if any(service in STOPPABLE for service in self.acknowledged) else exits.NO_MESH
+
+    def __str__(self) -> str:
+        whose = "" if self.owner is None else f" (of user {self.owner})"
+        text = f"{self.robot}{whose}: stopped {', '.join(self.acknowledged) or 'nothing'} in {self.seconds:.2f} s"
+        if self.missing:
+            text += f"; NOT ACKNOWLEDGED by {', '.join(self.missing)}"
+        if self.absent:
+            text += f"; not there: {', '.join(self.absent)}"
+        if self.not_kept:
+            text += f"; A RESTART WILL FORGET IT: {', '.join(self.not_kept)}"
+        if self.not_yet_kept:
+            text += f"; not yet known to be on the disk: {', '.join(self.not_yet_kept)}"
+        return text
+
+
+def main(command: str, arguments: list[str]) -> int:
+    robot, profile, as_json = None, None, False
+    if arguments:
+        import argparse
+
+        parser = argparse.ArgumentParser(
+            prog=f"cocoro {command}",
+            description="Latch the emergency stop: wheels, arm and hand hold still until `cocoro reset`. "
+            "Without --robot and --profile every robot on this machine is stopped, whoever's it is.",
+            epilog="Exit code 0 when every service that moves something has acknowledged, 1 when one has not "
+            "(it is named), 4 when no robot is there.",
+        )
+        parser.add_argument("--robot", metavar="NAME")
+        parser.add_argument("--profile", metavar="FILE", help="reach it as this profile says, on another machine")
+        parser.add_argument("--json", action="store_true", help="print one JSON object a robot")
+        try:
+            options = parser.parse_args(arguments)
+        except SystemExit as end:
+            return end.code if isinstance(end.code, int) else exits.USAGE
+        robot, profile, as_json = options.robot, options.profile, options.json
+    if profile is not None:
+        from cocoro.errors import ConfigError
+        from deploy import profiles
+
+        try:
+            robot = robot or profiles.read(profile).robot
+        except ConfigError as error:
+            print(f"cocoro: {error}", file=sys.stderr)
+            return exits.USAGE
+    stops, troubles = by_path(robot)
+    started_s = _process_start_s()
+    code = exits.DONE
+    try:
+        left_open = None if profile is not None or not stops else _left_open(robot, stops)
+        if left_open is None or left_open:
+            stops, troubles, code = _by_mesh_too(robot, profile, left_open, started_s, stops, troubles)
+    except Exception as error:  # whatever it is, what has been stopped is told
+        troubles.append(f"the mesh could not be asked: {type(error).__name__}: {error}")
+        code = exits.FAILED
+    for stop in sorted(stops, key=lambda stop: stop.owner is None):  # the operator's own where he sees it: last
+        is_said = _say(stop, as_json)
+        code = code or stop.code or (exits.DONE if is_said else exits.FAILED)
+    for trouble in troubles:
+        _print(f"cocoro: {trouble}", sys.stderr)
+    return code
+
+
+def by_path(robot: str | None) -> tuple[list[Stop], list[str]]:
+    """Stop by the stop path; how it went with each robot, and what was in the way."""
+    try:
+        with Asking(robot) as asking:
+            asking.go_on(time.monotonic() + ACKNOWLEDGE_S)
+            asking.hear_of_the_disk(time.monotonic() + KEPT_S)
+    except OSError as error:
+        return [], [f"the stop path cannot be used ({error}): the mesh alone was asked"]
+    started_s = _process_start_s()
+    groups: dict[tuple[int, str], list[Point]] = {}
+    for point in asking.points.values():
+        if not point.gone:
+            groups.setdefault((point.uid, point.robot), []).append(point)
+    return [_stop_of(uid, name, points, started_s) for (uid, name), points in groups.items()], []
+
+
+def _left_open(robot: str | None, stops: list[Stop]) -> set[str]:
+    """This user's own robots of which something runs that the path did not stop. What others' robots answered says
+    nothing about them."""
+    own = {stop.robot: stop for stop in stops if stop.owner is None}
+    left_open = {stop.robot for stop in own.values() if stop.missing}
+    from deploy.rundir import RunDir, robots  # it takes its time, and by now everything has been told
+
+    for run_dir in robots() if robot is None else [RunDir(robot)]:
+        stopped = own[run_dir.robot].acknowledged if run_dir.robot in own else ()
+        if ({*STOPPABLE} & {*run_dir.claims()}) - {*stopped}:
+            left_open.add(run_dir.robot)
+    return left_open
+
+
+def _stop_of(uid: int, robot: str, points: list[Point], started_s: float) -> Stop:
+    there = {point.service for point in points}
+    silent = {point.service for point in points if point.latched_ns is None}
+    acknowledged = sorted(there - silent, key=_in_order)
+    missing = silent - {EXECUTIVE}
+    latched_s = [point.latched_ns / 1e9 for point in points if point.latched_ns is not None]
+    return Stop(
+        robot,
+        tuple(acknowledged),
+        tuple(sorted(missing, key=_in_order)),
+        tuple(service for service in STOPPABLE if service not in there),
+        max(latched_s, default=time.monotonic()) - started_s,
+        tuple(dict.fromkeys(point.why_not_kept for point in points if point.kept is False)),
+        tuple(point.service for point in points if point.latched_ns is not None and not point.settled),
+        None if uid == os.getuid() else uid,
+        {point.service: point.latched_ns for point in points if point.latched_ns is not None},
+    )
+
+
+def _in_order(service: str) -> tuple[int, str]:
+    """What moves first, in the order in which people name it."""
+    return STOPPABLE.index(service) if service in STOPPABLE else len(STOPPABLE), service
+
+
+def _by_mesh_too(
+    robot: str | None,
+    profile: str | None,
+    only: set[str] | None,
+    started_s: float,
+    stops: list[Stop],
+    troubles: list[str],
+) -> tuple[list[Stop], list[str], int]:
+    """Ask on the mesh what the stop path left open (`only` these robots, or all): what both know of each robot, what
+    was in the way, exit code."""
+    from apps.cli import estop_mesh
+    from cocoro.errors import CocoroError, ConfigError
+
+    try:
+        which = [one for one in estop_mesh.found(robot, profile) if only is None or one[0].robot in only]
+        if not which and not stops:
+            name = "no robot" if robot is None else f"no {robot}"
+            return [], [*troubles, f"{name} is up on this machine: start one with `cocoro up sim`"], exits.NO_MESH
+        by_mesh, errors = estop_mesh.stop_all(which, started_s)
+    except (CocoroError, OSError) as error:
+        code = exits.USAGE if isinstance(error, ConfigError) and not stops else exits.FAILED
+        return stops, [*troubles, str(error)], code
+    troubles = [*troubles, *map(str, errors)]
+    code = exits.DONE if not errors else exits.FAILED if by_mesh or stops else exits.NO_MESH
+    return [*_merged(stops, by_mesh)], troubles, code
+
+
+def _merged(by_path: list[Stop], by_mesh: list[Stop]) -> list[Stop]:
+    """What either way acknowledged is stopped."""
+    found = {stop.robot: stop for stop in by_mesh}
+    merged = []
+    for one in by_path:
+        if (other := found.pop(one.robot, None) if one.owner is None else None) is not None:
+            acknowledged = {*one.acknowledged, *other.acknowledged}
+            missing = {*one.missing, *other.missing} - acknowledged
+            absent = tuple(name for name in one.absent if name not in acknowledged | missing)
+            one = one._replace(
+                acknowledged=tuple(sorted(acknowledged, key=_in_order)),
+                missing=tuple(sorted(missing, key=_in_order)),
+                absent=absent,
+                seconds=max(one.seconds, other.seconds),
+                not_kept=(*one.not_kept, *other.not_kept),
+            )
+        merged.append(one)
+    return [*merged, *found.values()]
+
+
+def _say(stop: Stop, as_json: bool) -> bool:
+    if as_json:
+        import json
+
+        text = json.dumps(stop._asdict())
+    else:
+        text = str(stop)
+    return _print(text, sys.stderr if stop.code and not as_json else sys.stdout)
+
+
+def _print(text: str, file: TextIO | None) -> bool:
+    """Whether it was taken: what cannot be told changes nothing about what was stopped."""
+    try:
+        print(text, file=file, flush=True)
+    except UnicodeError:
+        return _print(ascii(text), file)
+    except (OSError, ValueError):
+        return False
+    return True
+
+
+def _process_start_s() -> float:
+    """When this process was started, on the monotonic clock: the operator's Enter, to 10 ms (proc_pid_stat(5))."""
+    try:
+        with open("/proc/self/stat") as stat:  # noqa: PTH123 # pathlib takes as long to import as the stop itself
+            ticks = int(stat.read().rpartition(")")[2].split()[19])
+        age_s = time.clock_gettime(time.CLOCK_BOOTTIME) - ticks / os.sysconf("SC_CLK_TCK")
+    except (OSError, AttributeError):  # no /proc
+        age_s = 0.0
+    return time.monotonic() - age_s

@@ -1,0 +1,108 @@
+"""The mesh's own emergency stop: the second way, for robots on other machines and for what the stop path misses."""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+import time
+from contextlib import suppress
+from dataclasses import replace
+
+import msgspec
+
+from apps.cli.estop import Stop
+from cocoro.bus.endpoints import ZenohConfig
+from cocoro.bus.zenoh import ZenohBus
+from cocoro.errors import CallTimeoutError, CocoroError, MeshError
+from cocoro.messages import EstopReply, EstopRequest
+from cocoro.topics import ESTOP, STOPPABLE
+from deploy.rundir import RunDir, robots
+
+ROUND_S = 0.3
+"""How long one round of asking waits for those that do not answer."""
+PAUSE_S = 0.05
+GIVE_UP_S = 3.0
+PATIENCE_S = 0.15
+"""How long joining the mesh waits for members that do not answer (a stopped process, say)."""
+
+
+def found(robot: str | None, profile: str | None) -> list[tuple[RunDir, ZenohConfig]]:
+    """The robots to be stopped, and how to reach each. Raises ConfigError."""
+    if profile is not None:
+        from deploy import profiles
+
+        said = profiles.read(profile)
+        run_dir = RunDir(robot or said.robot)
+        return [(run_dir, run_dir.join_as("operator", said.mesh))]
+    here = robots() if robot is None else [run_dir for run_dir in (RunDir(robot),) if run_dir.populated]
+    return [(run_dir, run_dir.join_as("operator")) for run_dir in here]
+
+
+def stop_all(which: list[tuple[RunDir, ZenohConfig]], started_s: float) -> tuple[list[Stop], list[CocoroError]]:
+    """Latch them one beside the other; how each went, and what kept others from being asked."""
+
+    async def run() -> list[Stop | BaseException]:
+        stops = (stop(run_dir, config, started_s) for run_dir, config in which)
+        return await asyncio.gather(*stops, return_exceptions=True)
+
+    stops, errors = [], []
+    for (run_dir, _), result in zip(which, asyncio.run(run()), strict=True):
+        if isinstance(result, Stop):
+            stops.append(result)
+        elif isinstance(result, CocoroError):
+            errors.append(type(result)(f"{run_dir.robot}: {result}"))
+        else:
+            errors.append(MeshError(f"{run_dir.robot}: {type(result).__name__}: {result}"))
+    return stops, errors
+
+
+async def stop(run_dir: RunDir, config: ZenohConfig, started_s: float) -> Stop:
+    """Latch one robot's emergency stop: ask again and again until all who run and move have acknowledged.
+
+    Raises MeshError when the mesh is not there.
+    """
+    async with await ZenohBus.open(replace(config, patience_s=PATIENCE_S), expect_mesh=True) as bus:
+        acknowledged: dict[str, float] = {}
+        not_kept: dict[str, str] = {}
+        asking_s = time.monotonic()
+        waited = False
+        while True:
+            living, answers = await asyncio.gather(_living(run_dir, bus), _ask(run_dir.robot, bus))
+            took_s = time.monotonic() - started_s
+            for service, text in answers.items():
+                acknowledged.setdefault(service, took_s)
+                not_kept[service] = text
+            waiting = [service for service in STOPPABLE if service not in acknowledged]
+            missing = tuple(service for service in waiting if service in living)
+            if not missing or time.monotonic() - asking_s > GIVE_UP_S:
+                break
+            if not waited:
+                print(f"{run_dir.robot}: waiting for {', '.join(missing)}", file=sys.stderr, flush=True)
+            waited = True
+            await asyncio.sleep(PAUSE_S)
+        absent = tuple(service for service in waiting if service not in living)
+        took_s = took_s if missing else max(acknowledged.values(), default=took_s)
+        why_not_kept = tuple(f"{service}: {text}" for service, text in not_kept.items() if text)
+        return Stop(run_dir.robot, tuple(acknowledged), missing, absent, took_s, why_not_kept)
+
+
+async def _ask(robot: str, bus: ZenohBus) -> dict[str, str]:
+    """Ask everybody once; the services that say they are latched, and why the disk has it not, or ''."""
+    question = msgspec.msgpack.encode(EstopRequest(latched=True, by="operator"))
+    try:
+        replies = await bus.call(ESTOP.of("*").key(robot), question, ROUND_S)
+    except CallTimeoutError:
+        return {}
+    latched = {}
+    for reply in replies:
+        with suppress(msgspec.MsgspecError):
+            answer = msgspec.msgpack.decode(reply.payload, type=EstopReply) if reply.ok else None
+            if answer is not None and answer.latch == "latched":
+                latched[answer.service] = answer.text
+    return latched
+
+
+async def _living(run_dir: RunDir, bus: ZenohBus) -> set[str]:
+    """The services that are alive on the mesh, and those that a process here is, though it may have been stopped."""
+    tokens = await bus.alive(f"{run_dir.robot}/*/alive", ROUND_S)
+    return {token.split("/")[1] for token in tokens} | set(run_dir.claims())

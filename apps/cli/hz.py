@@ -1,0 +1,232 @@
+"""`cocoro hz KEY`: how often, how evenly and how much travels on a key."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+from itertools import pairwise
+from statistics import fmean, pstdev
+from typing import NamedTuple
+
+import msgspec
+from rich.live import Live
+from rich.text import Text
+
+from apps.cli import exits
+from apps.cli.ending import told_to_end
+from apps.cli.link import Where, joined
+from apps.cli.listening import Ear, keyexpr_of, takes_frames
+from apps.cli.table import table
+from cocoro.bus.base import Payload
+from cocoro.source import ANY_HZ, Source
+from cocoro.topics import topic_named
+
+SHOW_S = 1.0
+SILENT_PERIODS = 3.0
+"""A key that is silent for so many of its periods has stopped, as far as its rate goes."""
+
+
+class Head(msgspec.Struct, gc=False):
+    """What every message of ours says of itself; others may say none of it."""
+
+    stamp_ns: int = 0
+    seq: int = 0
+    incarnation: int = 0
+
+
+class Arrival(NamedTuple):
+    at_s: float
+    size: int
+    stamp_ns: int
+
+
+@dataclass(frozen=True)
+class Report:
+    """Of one key over the last window."""
+
+    key: str
+    nominal_hz: float | None
+    """As the table of topics has it, in the robot's time."""
+    rate_hz: float
+    """As it arrives here."""
+    stamped_hz: float | None
+    """By the messages' own stamps: in the robot's time, which a slow simulator makes another. None without stamps."""
+    period_ms: float | None
+    jitter_ms: float | None
+    """Standard deviation of the periods between arrivals."""
+    min_ms: float | None
+    max_ms: float | None
+    bytes_per_s: float
+    size_bytes: float
+    """Mean, of one message."""
+    messages: int
+    """In the window."""
+    lost: int
+    """Gaps in the sequence, since the start."""
+    silent_s: float
+    """Since the newest."""
+
+
+class Meter:
+    """One key, as it is heard. `window_s`: what the figures are of."""
+
+    def __init__(self, key: str, nominal_hz: float | None, window_s: float) -> None:
+        self.key = key
+        self._nominal_hz = nominal_hz
+        self._window_s = window_s
+        self._arrivals: deque[Arrival] = deque()
+        self._source = Source()
+
+    def hear(self, payload: Payload, at_s: float) -> None:
+        try:
+            head = msgspec.msgpack.decode(payload, type=Head)
+        except (msgspec.MsgspecError, ValueError, RecursionError, OverflowError):
+            head = Head()  # nothing of ours; it has a rate all the same
+        self._count(head)
+        self._arrivals.append(Arrival(at_s, len(payload), head.stamp_ns))
+
+    def _count(self, head: Head) -> None:
+        """Losses, as a reader counts them: a number that cannot be traffic is none."""
+        source = self._source
+        if head.incarnation != source.incarnation:
+            source.begin(head.incarnation)
+        elif head.seq != source.seq + 1:
+            lost = source.jump(head.seq, head.stamp_ns, self._nominal_hz or ANY_HZ, None)
+            if lost is None:
+                return
+            source.gaps += lost
+        source.seq, source.stamp_ns = head.seq, head.stamp_ns
+        source.settle()
+
+    def report(self, now_s: float) -> Report | None:
+        """None before the first message."""
+        if not self._arrivals:
+            return None
+        newest = self._arrivals[-1]
+        while len(self._arrivals) > 1 and self._arrivals[0].at_s < now_s - self._window_s:
+            self._arrivals.popleft()
+        arrivals = list(self._arrivals)
+        periods_s = [b.at_s - a.at_s for a, b in pairwise(arrivals)]
+        span_s = newest.at_s - arrivals[0].at_s
+        silent_s = now_s - newest.at_s
+        if periods_s and silent_s > max(SILENT_PERIODS * fmean(periods_s), max(periods_s)):
+            span_s += silent_s
+        stamped_s = (newest.stamp_ns - arrivals[0].stamp_ns) / 1e9
+        size = fmean(arrival.size for arrival in arrivals)
+        rate_hz = len(periods_s) / span_s if span_s > 0 else 0.0
+        return Report(
+            key=self.key,
+            nominal_hz=self._nominal_hz,
+            rate_hz=rate_hz,
+            stamped_hz=len(periods_s) / stamped_s if stamped_s > 0 else None,
+            period_ms=1e3 * fmean(periods_s) if periods_s else None,
+            jitter_ms=1e3 * pstdev(periods_s) if periods_s else None,
+            min_ms=1e3 * min(periods_s) if periods_s else None,
+            max_ms=1e3 * max(periods_s) if periods_s else None,
+            bytes_per_s=rate_hz * size,
+            size_bytes=size,
+            messages=len(arrivals),
+            lost=self._source.gaps,
+            silent_s=silent_s,
+        )
+
+
+async def hz(where: Where, text: str, window_s: float, once: bool, as_json: bool) -> int:
+    """Measure until interrupted, or with `once` over one window. Exit code 1 when that heard nothing."""
+    meters: dict[str, Meter] = {}
+    async with joined(where, frames=takes_frames(text)) as link:
+        ear = Ear(link, keyexpr_of(text, link.robot))
+        with told_to_end() as end, _view(as_json, once) as view:
+            show_s = time.monotonic() + (window_s if once else SHOW_S)
+            while not end.is_set():
+                await ear.wait(end, max(show_s - time.monotonic(), 0.0))
+                for heard in ear.take():
+                    if heard.key not in meters:
+                        meters[heard.key] = Meter(heard.key, _nominal_hz(heard.key, link.robot), window_s)
+                    meters[heard.key].hear(heard.payload, heard.at_s)
+                if time.monotonic() >= show_s:
+                    show_s = time.monotonic() + SHOW_S
+                    view.show(_reports(meters.values()), ear.keyexpr)
+                    if once:
+                        break
+        if ear.dropped:
+            print(f"cocoro: {ear.dropped} came faster than this command could count", file=sys.stderr)
+        if end.is_set() and not once:
+            return exits.DONE
+    return exits.DONE if meters else exits.FAILED
+
+
+def _reports(meters: Iterable[Meter]) -> list[Report]:
+    now_s = time.monotonic()
+    found = (meter.report(now_s) for meter in sorted(meters, key=lambda meter: meter.key))
+    return [report for report in found if report is not None]
+
+
+def _nominal_hz(key: str, robot: str) -> float | None:
+    topic = topic_named(key.removeprefix(f"{robot}/"))
+    return None if topic is None else topic.rate_hz
+
+
+class _View:
+    """Lines of JSON; a table that is written over, where somebody watches; tables one after the other elsewhere."""
+
+    def __init__(self, as_json: bool, live: Live | None) -> None:
+        self._as_json = as_json
+        self._live = live
+
+    def __enter__(self) -> _View:
+        if self._live is not None:
+            self._live.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._live is not None:
+            self._live.stop()
+
+    def show(self, reports: list[Report], keyexpr: str) -> None:
+        if self._as_json:
+            print(json.dumps([asdict(report) for report in reports]), flush=True)
+            return
+        text = rows(reports) if reports else f"nothing on {keyexpr} yet\n"
+        if self._live is not None:
+            self._live.update(Text(text.rstrip("\n"), no_wrap=True), refresh=True)
+        else:
+            print(text, end="", flush=True)
+
+
+def _view(as_json: bool, once: bool) -> _View:
+    watched = sys.stdout.isatty() and not as_json and not once
+    return _View(as_json, Live(auto_refresh=False, vertical_overflow="visible") if watched else None)
+
+
+def rows(reports: list[Report]) -> str:
+    heads = ("key", "rate", "nominal", "by stamp", "period", "jitter", "min", "max", "data", "message", "lost", "")
+    return table(heads, [_row(report) for report in reports])
+
+
+def _row(report: Report) -> tuple[str, ...]:
+    def ms(value: float | None) -> str:
+        return "-" if value is None else f"{value:.1f} ms"
+
+    def per_s(value: float | None) -> str:
+        return "-" if value is None else f"{value:.1f} Hz"
+
+    stopped = report.period_ms is not None and 1e3 * report.silent_s > SILENT_PERIODS * report.period_ms + 100
+    return (
+        report.key, per_s(report.rate_hz), per_s(report.nominal_hz), per_s(report.stamped_hz),
+        ms(report.period_ms), ms(report.jitter_ms), ms(report.min_ms), ms(report.max_ms),
+        f"{size_text(report.bytes_per_s)}/s", size_text(report.size_bytes), str(report.lost),
+        f"silent for {report.silent_s:.1f} s" if stopped else "",
+    )  # fmt: skip
+
+
+def size_text(size: float) -> str:
+    """Bytes for people, in powers of 1000."""
+    for unit, factor in (("MB", 1e6), ("kB", 1e3)):
+        if size >= factor:
+            return f"{size / factor:.1f} {unit}"
+    return f"{size:.0f} B"

@@ -1,0 +1,162 @@
+"""`cocoro babble`, `cocoro learn` and `cocoro experiment`, and their options; `app` takes them in."""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from cocoro import robot as robots
+    from cocoro.learning.model import Model
+    from cocoro.messages import TaskName
+
+PANEL = "Learning"
+
+babble = typer.Typer(no_args_is_help=True, help="Move to learn: the arm before the eyes, the wheels before a target.")
+learn = typer.Typer(no_args_is_help=True, help="Learn from what babbling saw: a model that the planner loads.")
+
+Robot = Annotated[str | None, typer.Option(help="Which robot; needed only when several are up here.")]
+Reach = Annotated[
+    str | None,
+    typer.Option("--profile", metavar="PROFILE", help="Reach the robot as this profile says, on another machine."),
+]
+Json = Annotated[bool, typer.Option("--json", help="Print JSON, for scripts.")]
+Into = Annotated[Path, typer.Option("--model", metavar="FILE", help="Where the model goes; what else is in it stays.")]
+Description = Annotated[
+    Path | None, typer.Option(metavar="FILE", help="The robot's description, where it is not the Calliope's own.")
+]
+Measured = Annotated[
+    Path | None, typer.Option(metavar="FILE", help="What was measured on this robot, over the description.")
+]
+Kept = Annotated[Path, typer.Option(metavar="FILE", help="Where they are kept; one that is there is gone on with.")]
+Send = Annotated[bool, typer.Option("--send", help="Have the robot that is up take it over, without a restart.")]
+
+
+def add_to(app: typer.Typer) -> None:
+    app.add_typer(babble, name="babble", rich_help_panel=PANEL)
+    app.add_typer(learn, name="learn", rich_help_panel=PANEL)
+    app.command(rich_help_panel=PANEL)(experiment)
+
+
+@babble.command("arm")
+def babble_arm(
+    samples: Annotated[int, typer.Option(min=1, max=1_000_000, metavar="N", help="How many, all in all.")] = 1000,
+    out: Kept = Path("arm.jsonl"),
+    robot: Robot = None,
+    profile: Reach = None,
+    json: Json = False,
+) -> None:
+    """Move the arm about and look at the hand. Ctrl-C stops it; the same command goes on, and nothing is lost."""
+    _babble("babble-arm", samples, out, "", robot, profile, json)
+
+
+@babble.command("wheels")
+def babble_wheels(
+    trials: Annotated[int, typer.Option(min=1, max=100_000, metavar="N", help="How many, all in all.")] = 40,
+    target: Annotated[
+        str, typer.Option(metavar="LABEL", help="A known object that stands 1.5 m before the robot.")
+    ] = "red_can",
+    out: Kept = Path("wheels.jsonl"),
+    robot: Robot = None,
+    profile: Reach = None,
+    json: Json = False,
+) -> None:
+    """Turn the wheels to and fro before a target. The robot needs half a metre around it. Ctrl-C stops it."""
+    _babble("babble-wheels", trials, out, target, robot, profile, json)
+
+
+def _babble(
+    task: TaskName, wanted: int, out: Path, target: str, robot: str | None, profile: str | None, as_json: bool
+) -> None:
+    from apps.cli import babble as babbling
+    from apps.cli.link import Where
+
+    sys.exit(asyncio.run(babbling.babble(Where(robot, profile), task, wanted, out, target, as_json)))
+
+
+@learn.command("arm")
+def learn_arm(
+    samples: Annotated[Path, typer.Argument(metavar="FILE", help="What `babble arm` kept.")] = Path("arm.jsonl"),
+    into: Into = Path("model.json"),
+    search: Annotated[bool, typer.Option("--search", help="A grid of bases, widths and rates too.")] = False,
+    method: Annotated[
+        str | None, typer.Option(metavar="NAME", help="This one, in place of the one that measures best.")
+    ] = None,
+    description: Description = None,
+    measured: Measured = None,
+    send: Send = False,
+    robot: Robot = None,
+    profile: Reach = None,
+    json: Json = False,
+) -> None:
+    """The hand-eye map: every way of learning it, measured on samples that it did not learn from; the best is kept."""
+    from apps.cli import learn as learning
+
+    made, text = learning.learn_arm(
+        samples, into, _robot(description, measured), search=search, method=method, as_json=json
+    )
+    print(text)
+    _send(send, made, robot, profile, json)
+
+
+@learn.command("wheels")
+def learn_wheels(
+    samples: Annotated[Path, typer.Argument(metavar="FILE", help="What `babble wheels` kept.")] = Path("wheels.jsonl"),
+    into: Into = Path("model.json"),
+    description: Description = None,
+    measured: Measured = None,
+    send: Send = False,
+    robot: Robot = None,
+    profile: Reach = None,
+    json: Json = False,
+) -> None:
+    """The distance between the wheels."""
+    from apps.cli import learn as learning
+
+    made, text = learning.learn_wheels(samples, into, _robot(description, measured), as_json=json)
+    print(text)
+    _send(send, made, robot, profile, json)
+
+
+def _robot(description: Path | None, measured: Path | None) -> robots.Robot:
+    from cocoro.robot import Robot
+
+    return Robot.load(description, measured)
+
+
+def _send(wanted: bool, made: Model, robot: str | None, profile: str | None, as_json: bool) -> None:
+    if wanted:
+        from apps.cli import learn as learning
+        from apps.cli.link import Where
+
+        text = asyncio.run(learning.send(Where(robot, profile), made))
+        print(text, file=sys.stderr if as_json else sys.stdout)
+
+
+def experiment(
+    which: Annotated[str, typer.Argument(metavar="E1|E2|E3|E4|E5|E6|all", help="Which of the paper's experiments.")],
+    seeds: Annotated[int, typer.Option(min=1, max=1000, metavar="N", help="So many, from 0 on: a body each.")] = 10,
+    out: Annotated[
+        Path, typer.Option(metavar="DIR", help="Report, plots, samples, models; what is there is not run again.")
+    ] = Path("experiments"),
+    sensors: Annotated[str, typer.Option(metavar="ideal|real", help="Perfect or real sensors.")] = "real",
+    body: Annotated[str, typer.Option(metavar="nominal|worn", help="A body as drawn, or not.")] = "worn",
+    frames: Annotated[str | None, typer.Option(metavar="WxH@HZ", help="The camera's frames: 320x240@15.")] = None,
+    samples: Annotated[
+        int, typer.Option(min=100, max=100_000, metavar="N", help="Of each body's babbling; a fifth is held out.")
+    ] = 2600,
+    jobs: Annotated[int | None, typer.Option(min=1, metavar="N", help="Runs at once; by default one a core.")] = None,
+    no_plots: Annotated[bool, typer.Option("--no-plots", help="Tables alone, without matplotlib.")] = False,
+) -> None:
+    """Run the paper's experiments in virtual time and report them beside the paper's text and baselines.
+
+    E1 hand-eye map, E2 reaching, E3 wheel distance, E4 navigation, E5 following, E6 fetching. Ctrl-C ends it; the same
+    command goes on.
+    """
+    from apps.cli import experiment as experimenting
+
+    sys.exit(experimenting.experiment(which, seeds, out, sensors, body, frames, samples, jobs, not no_plots))

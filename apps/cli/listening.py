@@ -1,0 +1,85 @@
+"""Hearing any key of a robot's mesh, those that this project does not know among them."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections import deque
+from contextlib import suppress
+from typing import NamedTuple
+
+from apps.cli.link import Link
+from cocoro.bus.base import Payload
+from cocoro.errors import ConfigError
+from cocoro.topics import Qos, topic_named
+
+DEPTH = 64
+"""Samples of one key that may wait for this process's loop."""
+WAITING = 2000
+"""Samples that may wait for a slow terminal."""
+
+
+class Heard(NamedTuple):
+    key: str
+    payload: Payload
+    at_s: float
+    """When it came, on this machine's monotonic clock."""
+
+
+def keyexpr_of(text: str, robot: str) -> str:
+    """What an operator writes, with or without the robot's name, as a key expression of the robot's keys.
+
+    Raises ConfigError for what is none.
+    """
+    chunks = text.split("/")
+    if not text or any(not chunk or ("*" in chunk and chunk not in ("*", "**")) for chunk in chunks):
+        raise ConfigError(f"{text!r} is no key; write it as base/state, */health or ** (`cocoro topics` lists them)")
+    return text if chunks[0] == robot else f"{robot}/{text}"
+
+
+def takes_frames(text: str) -> bool:
+    """Whether frames may be among what an operator wants to hear."""
+    topic = topic_named(text)
+    return topic is None or topic.qos is Qos.FRAME
+
+
+class Ear:
+    """Everything that arrives on a key expression from now on. What nobody takes in time is dropped and counted."""
+
+    def __init__(self, link: Link, keyexpr: str) -> None:
+        self.keyexpr = keyexpr
+        self._waiting: deque[Heard] = deque()
+        self._arrived = asyncio.Event()
+        self._overflowed = 0
+        self._subscription = link.bus.subscribe(keyexpr, Qos.STATE, self._take, depth=DEPTH)
+
+    def _take(self, key: str, payload: Payload) -> None:
+        if len(self._waiting) >= WAITING:
+            self._waiting.popleft()
+            self._overflowed += 1
+        self._waiting.append(Heard(key, payload, time.monotonic()))
+        self._arrived.set()
+
+    @property
+    def dropped(self) -> int:
+        return self._subscription.skipped + self._overflowed
+
+    def take(self) -> list[Heard]:
+        """All that waits."""
+        heard = list(self._waiting)
+        self._waiting.clear()
+        self._arrived.clear()
+        return heard
+
+    async def wait(self, end: asyncio.Event, timeout_s: float | None = None) -> bool:
+        """Until something waits; False when the end comes first, or the time is over."""
+        arrived, ended = asyncio.ensure_future(self._arrived.wait()), asyncio.ensure_future(end.wait())
+        await asyncio.wait((arrived, ended), timeout=timeout_s, return_when=asyncio.FIRST_COMPLETED)
+        for task in (arrived, ended):
+            task.cancel()
+            with suppress(asyncio.CancelledError):
+                await task
+        return bool(self._waiting) and not end.is_set()
+
+    def close(self) -> None:
+        self._subscription.close()

@@ -1,0 +1,81 @@
+"""`cocoro new service NAME`: a working component with its test, as a distribution of its own."""
+
+from __future__ import annotations
+
+import importlib.util
+import keyword
+import re
+import sys
+from collections.abc import Iterator
+from importlib import resources
+from importlib.resources.abc import Traversable
+from pathlib import Path, PurePosixPath
+
+from apps.cli import exits
+from cocoro.errors import ConfigError
+from deploy import processes
+
+TEMPLATE = "templates/service"
+SUFFIX = ".template"
+NAME = r"[a-z][a-z0-9_-]{0,31}"
+"""A chunk of a key, and with '_' for '-' a Python package."""
+
+
+def service(name: str, into: Path) -> int:
+    """Write the component into a folder of its name. Raises ConfigError for a name that cannot be, or is taken."""
+    folder = into / name
+    if folder.exists():
+        raise ConfigError(f"{folder} is there already; choose another name, or another place with --into")
+    package = package_of(name)
+    words = {"name": name, "package": package, "class": "".join(part.capitalize() for part in re.split("[-_]+", name))}
+    for path, text in files(words):
+        target = folder / path
+        try:
+            target.parent.mkdir(parents=True, exist_ok=True)
+            target.write_text(text, encoding="utf-8")
+        except OSError as error:
+            raise ConfigError(f"{target} cannot be written: {error.strerror}") from error
+        print(target)
+    hints = (
+        (f"pytest {folder}", "its tests"),
+        (f"pip install -e {folder}", "so that `cocoro` knows it"),
+        (f"cocoro run {name}", "beside a robot that is up"),
+        (f"cocoro echo {name}/travelled", "what it says"),
+    )
+    print(f"\nWhat it does is in {folder / package / 'core.py'}. Now:")
+    for command, what in hints:
+        print(f"  {command:<{max(len(command) for command, _ in hints)}}  # {what}")
+    return exits.DONE
+
+
+def package_of(name: str) -> str:
+    """The Python package of a component's name. Raises ConfigError when it cannot be, or is another's."""
+    if not re.fullmatch(NAME, name):
+        raise ConfigError(f"{name!r} is no name for a service: small letters, digits, '_' and '-', a letter first")
+    package = name.replace("-", "_")
+    for row in processes.table().values():
+        if name in (row.name, *row.services):
+            raise ConfigError(f"there is a service {name} already (process {row.name}); choose another name")
+    spec = None if keyword.iskeyword(package) else importlib.util.find_spec(package)
+    taken = spec is not None and spec.origin is not None  # a mere folder of that name is no module
+    if keyword.iskeyword(package) or package in sys.stdlib_module_names or taken:
+        raise ConfigError(f"there is a Python module {package} already; choose another name")
+    return package
+
+
+def files(words: dict[str, str]) -> Iterator[tuple[PurePosixPath, str]]:
+    """The template's files, filled in: where below the component's folder, and their text."""
+    for path, source in _walk(resources.files("apps").joinpath(TEMPLATE), PurePosixPath()):
+        text = source.read_text(encoding="utf-8")
+        for word, value in words.items():
+            text = text.replace(f"{{{{{word}}}}}", value)
+        parts = (part.removesuffix(SUFFIX).replace("package", words["package"]) for part in path.parts)
+        yield PurePosixPath(*parts), text
+
+
+def _walk(folder: Traversable, path: PurePosixPath) -> Iterator[tuple[PurePosixPath, Traversable]]:
+    for entry in sorted(folder.iterdir(), key=lambda entry: entry.name):
+        if entry.is_dir():
+            yield from _walk(entry, path / entry.name)
+        elif entry.name.endswith(SUFFIX):
+            yield path / entry.name, entry

@@ -1,0 +1,141 @@
+"""`cocoro status`: what should run and does, how it is, what the robot does and why."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from functools import partial
+from typing import Any
+
+import msgspec
+
+from apps.cli import exits
+from apps.cli.link import Link, Where, joined, within
+from apps.cli.table import print_table
+from cocoro.errors import ConfigError
+from cocoro.messages import Health, Message, TaskState
+from cocoro.topics import BASE_STATE, HEALTH, LATCH, PLAN, TASK, Topic
+from deploy import profiles
+
+NEWS: tuple[Topic[Any], ...] = (PLAN, TASK, LATCH, BASE_STATE)
+HEALTH_S = 2.5
+"""How long to wait for those that are alive to tell their health; they do so once a second of the robot's time."""
+
+
+async def status(where: Where, as_json: bool) -> int:
+    async with joined(where) as link:
+        report = await Survey(link).take()
+    if as_json:
+        print(json.dumps(report))
+    else:
+        _print(report)
+    return exits.DONE if all(service["alive"] for service in report["services"]) else exits.FAILED
+
+
+class Survey:
+    """Listens until everyone who lives has been heard."""
+
+    def __init__(self, link: Link) -> None:
+        self._link = link
+        self._health: dict[str, Health] = {}
+        self._newest: dict[str, Message] = {}
+        self._changed = asyncio.Event()
+
+    async def take(self) -> dict[str, Any]:
+        self._link.inbox(HEALTH.of("*")).add(lambda _key, health: self._on_health(health))
+        for topic in NEWS:
+            self._link.inbox(topic).add(partial(self._on_news, topic.name))
+        alive = set(await self._link.alive())
+        wanted_news = {topic.name for topic in NEWS if topic.publisher in alive}
+        await within(HEALTH_S, lambda: alive <= set(self._health) and wanted_news <= set(self._newest), self._changed)
+        return self._report(alive)
+
+    def _on_health(self, health: Health) -> None:
+        self._health[health.service] = health
+        self._changed.set()
+
+    def _on_news(self, topic: str, _key: str, message: Message) -> None:
+        self._newest[topic] = message
+        self._changed.set()
+
+    def _report(self, alive: set[str]) -> dict[str, Any]:
+        resolved = self._link.run_dir.resolved()
+        names = list(dict.fromkeys([*expected(resolved), *sorted(alive)]))
+        return {
+            "robot": self._link.robot,
+            "profile": resolved.get("name", ""),
+            "services": [
+                {"service": name, "alive": name in alive, "state": self._state(name, name in alive)}
+                | ({"health": msgspec.to_builtins(self._health[name])} if name in self._health else {})
+                for name in names
+            ],
+            "task": self._told(TASK.name),
+            "plan": self._told(PLAN.name),
+            "latch": self._told(LATCH.name),
+            "base": self._told(BASE_STATE.name),
+        }
+
+    def _state(self, service: str, alive: bool) -> str:
+        if not alive:
+            return self._link.unheard(service)
+        return self._health[service].state if service in self._health else "silent"
+
+    def _told(self, topic: str) -> Any:
+        return msgspec.to_builtins(self._newest[topic]) if topic in self._newest else None
+
+
+def expected(resolved: dict[str, Any]) -> tuple[str, ...]:
+    """What the last start's profile says should be alive."""
+    try:
+        return profiles.from_data(resolved, resolved.get("name", "")).services() if resolved else ()
+    except ConfigError:  # a component has been uninstalled since
+        return ()
+
+
+def _print(report: dict[str, Any]) -> None:
+    rows = []
+    for service in report["services"]:
+        health = service.get("health")
+        if health is None:
+            rows.append((service["service"], service["state"], "", "", "", "", ""))
+            continue
+        text = "; ".join(filter(None, (health["text"], *health["faults"])))
+        loop = max(health["loops"], key=lambda loop: loop["rate_hz"], default=None)
+        rows.append(
+            (
+                service["service"],
+                service["state"],
+                str(health["pid"]),
+                f"{100 * health['cpu_share']:.0f}%",
+                f"{health['rss_mb']:.0f} MB",
+                "" if loop is None else f"{loop['rate_hz']:.1f} Hz",
+                text,
+            )
+        )
+    print(f"{report['robot']}{f' (profile {name})' if (name := report['profile']) else ''}\n")
+    print_table(("service", "state", "pid", "cpu", "memory", "loop", ""), rows)
+    print()
+    if (latch := report["latch"]) is not None:
+        by = f" by {latch['by']}" if latch["by"] else ""
+        print(f"emergency stop  {latch['state']}{by}")
+    if (base := report["base"]) is not None:
+        print(f"battery         {100 * base['battery_fraction']:.0f}%{', charging' if base['charging'] else ''}")
+    if report["task"] is not None:
+        print(f"task            {_task(msgspec.convert(report['task'], TaskState))}")
+    if (plan := report["plan"]) is not None:
+        print(
+            f"planner         {plan['behaviour']}: {plan['why']}"
+            if plan["why"]
+            else f"planner         {plan['behaviour']}"
+        )
+        if plan["model"]:
+            print(f"reaches with    {plan['model']}")
+
+
+def _task(task: TaskState) -> str:
+    if not task.task_id:
+        return "none yet"
+    name = f"{task.task} {task.label}".strip()
+    if task.outcome is None:
+        return f"{name}, {task.phase}, {task.elapsed_s:.1f} s"
+    return f"{name}: {task.outcome} after {task.elapsed_s:.1f} s{f' ({task.reason})' if task.reason else ''}"

@@ -1,0 +1,206 @@
+"""`fetch`, `park`, `put-down` and `cancel`: ask the executive, follow the task to its outcome, say it."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import sys
+from contextlib import suppress
+from pathlib import Path
+
+import msgspec
+
+from apps.cli import exits
+from apps.cli.ending import on_end
+from apps.cli.link import Link, Where, joined
+from apps.cli.output import going_on
+from apps.cli.progress import View, view
+from apps.cli.snapshot import Snapshot, check
+from cocoro.contact import Contact
+from cocoro.errors import CallTimeoutError, CocoroError
+from cocoro.messages import CancelRequest, TaskReply, TaskRequest, TaskState
+from cocoro.topics import CANCEL, LATCH, RUN, TASK
+from cocoro.vigil import RECOVERY_S, Vigil
+
+USAGE_REFUSALS = ("unknown_label", "not_graspable", "bad_request")
+"""Refusals that are the operator's mistake, not the robot's state."""
+UNSETTLED = ("not_alive", "estop")
+"""Refusals that may be over in a moment: not everyone has been heard yet, or the emergency stop is not known yet."""
+SETTLE_S = 3.0
+ASK_AGAIN_S = 0.1
+SNAPSHOT_PHASE = "grasp"
+"""The picture is the last one of this phase: the claws have closed, the hand has not moved yet."""
+CANCEL_S = 10.0
+"""How long a cancelled task may take to say its outcome."""
+EXECUTIVE = "executive"
+LOOK_S = 0.2
+"""How often it is looked whether an executive that is not heard has died."""
+
+
+async def run(where: Where, request: TaskRequest, as_json: bool, picture: Path | None) -> int:
+    """Run a task to its outcome and return the exit code. `picture`: where to write what is seen at the grasp."""
+    if picture is not None:
+        check(picture)
+    async with joined(where, frames=picture is not None) as link:
+        follower = Follower(link, request, view(as_json), picture, Contact(link.run_dir.claimant_pid, Vigil()))
+        with on_end(follower.interrupt), going_on():
+            code, result = await follower.run()
+    if as_json:
+        print(json.dumps(result))
+    return code
+
+
+async def cancel(where: Where) -> int:
+    async with joined(where) as link:
+        reply = await link.call(CANCEL, CancelRequest())
+    if not reply.accepted:
+        print(f"cocoro: refused: {reply.text}", file=sys.stderr)
+        return exits.REFUSED
+    print(reply.text or "cancelled")
+    return exits.DONE
+
+
+class Follower:
+    """One task, from the request to the outcome. `interrupt` cancels it on the robot."""
+
+    def __init__(
+        self, link: Link, request: TaskRequest, view: View, picture: Path | None, contact: Contact | None = None
+    ) -> None:
+        """`contact` knows what became of an executive that is not heard any more."""
+        self._contact = contact or Contact(link.run_dir.claimant_pid)
+        self._link = link
+        self._request = request
+        self._view = view
+        self._picture = picture
+        self._name = f"{request.task} {request.label}".strip()
+        self._task_id = ""
+        self._news: asyncio.Queue[TaskState | bool] = asyncio.Queue()
+        """What the executive says; and whether its token is there, as that changes."""
+        self._interrupted = asyncio.Event()
+
+    def interrupt(self) -> None:
+        """The first one cancels the task on the robot, the second one leaves at once."""
+        if self._interrupted.is_set():
+            raise KeyboardInterrupt
+        self.cancel()
+
+    def cancel(self) -> None:
+        """Have the task cancelled on the robot, and wait for its outcome."""
+        self._interrupted.set()
+
+    async def run(self) -> tuple[int, dict[str, object]]:
+        """The exit code, and the result as data."""
+        news = self._link.inbox(TASK)  # before the call, so that nothing is missed
+        news.add(lambda _key, state: self._news.put_nowait(state))
+        alive = self._link.watch_alive(EXECUTIVE, self._on_alive)
+        reply = await self._ask()
+        if not reply.accepted:
+            return self._refused(reply)
+        self._task_id = reply.task_id
+        beside = [asyncio.create_task(self._cancel_when_interrupted())]
+        if self._contact.vigil is not None:
+            beside.append(asyncio.create_task(self._contact.vigil.keep()))
+        try:
+            state = await self._follow()
+        finally:
+            alive.close()
+            for task in beside:
+                task.cancel()
+        return self._outcome(state)
+
+    def _on_alive(self, alive: bool) -> None:
+        if alive:
+            self._contact.met(EXECUTIVE)
+        self._news.put_nowait(alive)
+
+    async def _ask(self) -> TaskReply:
+        """Ask for the task; a robot that has only just come up gets a little time to find itself able."""
+        latch = self._link.latest(LATCH)
+        for _ in range(round(SETTLE_S / ASK_AGAIN_S)):
+            reply = await self._link.call(RUN, self._request)
+            latched = latch.value is not None and latch.value.state == "latched"
+            if reply.accepted or reply.refusal not in UNSETTLED or (reply.refusal == "estop" and latched):
+                break
+            await asyncio.sleep(ASK_AGAIN_S)
+        return reply
+
+    async def _follow(self) -> TaskState:
+        """The task's last state, as the executive says it, or as it is when that is not heard any more."""
+        camera: Snapshot | None = None
+        while True:
+            news = await self._news.get()
+            state = await self._after_silence() if news is False else news
+            if isinstance(state, bool) or state.task_id != self._task_id:
+                continue
+            if self._picture is not None:
+                if state.phase == SNAPSHOT_PHASE and camera is None:
+                    camera = Snapshot(self._link)
+                    camera.open()
+                elif state.phase != SNAPSHOT_PHASE and camera is not None:
+                    await self._take(camera, self._picture)
+                    camera = None
+            if state.outcome is not None:
+                return state
+            self._view.show(state)
+
+    async def _after_silence(self) -> TaskState:
+        """The executive's token has dropped: the next that it says of the task, or the task's end when it is dead or
+        is not heard for long."""
+        lost = await self._contact.lost(EXECUTIVE)
+        if not self._contact.dead(EXECUTIVE):
+            self._view.say(f"{lost}: waiting for the executive to be heard again")
+        end_s = asyncio.get_running_loop().time() + RECOVERY_S
+        while (left_s := end_s - asyncio.get_running_loop().time()) > 0:
+            if self._contact.dead(EXECUTIVE):
+                return self._failed(f"{EXECUTIVE} died")
+            with suppress(TimeoutError):
+                news = await asyncio.wait_for(self._news.get(), min(left_s, LOOK_S))
+                if isinstance(news, bool):
+                    continue
+                if news.task_id == self._task_id:
+                    return news
+                # Before, it was the state of an earlier task; now it is all that an executive knows that began anew.
+                return self._failed("the executive knows nothing of the task any more")
+        return self._failed(f"{lost}; the task may still be running: see cocoro status")
+
+    def _failed(self, reason: str) -> TaskState:
+        """What is said when the executive does not say it."""
+        return TaskState(
+            task_id=self._task_id, task=self._request.task, label=self._request.label, outcome="failed", reason=reason
+        )
+
+    async def _take(self, camera: Snapshot, picture: Path) -> None:
+        try:
+            self._view.say(await camera.write(picture))
+        except CocoroError as error:
+            self._view.say(f"no picture: {error}")
+
+    async def _cancel_when_interrupted(self) -> None:
+        await self._interrupted.wait()
+        self._view.say(f"cancelling {self._name} (once more leaves without waiting)")
+        try:
+            reply = await self._link.call(CANCEL, CancelRequest(task_id=self._task_id))
+            if reply.accepted:
+                await asyncio.sleep(CANCEL_S)
+                self._view.say("the task does not end: `cocoro estop` stops the robot")
+            else:
+                self._view.say(f"not cancelled: {reply.text}")
+        except CallTimeoutError:
+            self._view.say("the executive does not answer: `cocoro estop` stops the robot")
+        except CocoroError as error:
+            self._view.say(f"not cancelled: {error}")
+
+    # --- the end ----------------------------------------------------------------------------------
+
+    def _refused(self, reply: TaskReply) -> tuple[int, dict[str, object]]:
+        result = {"task": self._request.task, "label": self._request.label, "outcome": "refused"}
+        print(f"cocoro: refused: {reply.text}", file=sys.stderr)
+        code = exits.USAGE if reply.refusal in USAGE_REFUSALS else exits.REFUSED
+        return code, result | {"reason": reply.refusal, "text": reply.text}
+
+    def _outcome(self, state: TaskState) -> tuple[int, dict[str, object]]:
+        code = {"done": exits.DONE, "failed": exits.FAILED, "cancelled": exits.REFUSED}[state.outcome or "failed"]
+        time = f" {'in' if state.outcome == 'done' else 'after'} {state.elapsed_s:.1f} s" if state.elapsed_s else ""
+        reason = f": {state.reason}" if state.reason and state.outcome != "done" else ""
+        self._view.result(f"{state.outcome}: {self._name}{time}{reason}")
+        return code, msgspec.to_builtins(state)

@@ -1,0 +1,220 @@
+"""`cocoro top`: what runs, what it costs, what travels, how fast and how well. Gathered here, shown by `top_view`."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import sys
+import time
+from functools import partial
+from typing import Any
+
+import msgspec
+import psutil
+
+from apps.cli import exits
+from apps.cli.ending import passed, told_to_end
+from apps.cli.link import Link, Where, joined, within
+from apps.cli.status import expected
+from cocoro.bus.keys import matches
+from cocoro.component import Process
+from cocoro.errors import ConfigError
+from cocoro.messages import Health, Message, TopicHealth
+from cocoro.topics import BASE_STATE, CLOCK, HEALTH, LATCH, PLAN, TASK, Topic, topic_named
+from deploy import processes
+
+FIRST_S = 2.5
+"""How long to wait for those that live to tell their health; they do so once a second of the robot's time."""
+SILENT_S = 3.0
+"""Who lives and tells no health for so long hangs, or the clock stands."""
+NEWS: dict[str, Topic[Any]] = {"clock": CLOCK, "task": TASK, "plan": PLAN, "latch": LATCH, "base": BASE_STATE}
+
+
+async def top(where: Where, once: bool, as_json: bool, every_s: float) -> int:
+    """Show until interrupted, or once. Exit code 1, with `once`, when something that should run does not."""
+    async with joined(where) as link:
+        watch = Watch(link)
+        await watch.first()
+        if once:
+            report = watch.report()
+            _print(report, as_json)
+            return exits.DONE if all(service["alive"] for service in report["services"]) else exits.FAILED
+        with told_to_end() as end:
+            if as_json or not sys.stdout.isatty():
+                while not end.is_set():
+                    _print(watch.report(), as_json)
+                    await passed(end, every_s)
+            else:
+                from apps.cli.top_view import Screen
+
+                with Screen() as screen:
+                    while not end.is_set():
+                        screen.show(watch.report())
+                        await passed(end, every_s)
+    return exits.DONE
+
+
+def _print(report: dict[str, Any], as_json: bool) -> None:
+    if as_json:
+        print(json.dumps(report), flush=True)
+    else:
+        from apps.cli.top_view import print_report
+
+        print_report(report)
+
+
+class Watch:
+    """Listens to everyone's health; `report` is what is known now, as data."""
+
+    def __init__(self, link: Link) -> None:
+        self._link = link
+        self._alive: set[str] = set()
+        self._health: dict[str, Health] = {}
+        self._heard_s: dict[str, float] = {}
+        self._news: dict[str, Message] = {}
+        self._before: dict[tuple[str, str, str], int] = {}
+        """Counts of the last report, by reader, key and what is counted."""
+        self._changed = asyncio.Event()
+        _machine()  # the first of these calls has nothing to compare with
+        link.inbox(HEALTH.of("*")).add(lambda _key, health: self._on_health(health))
+        for what, topic in NEWS.items():
+            link.inbox(topic).add(partial(self._on_news, what))
+        link.bus.watch_alive(f"{link.robot}/*/alive", self._on_alive)
+
+    async def first(self) -> None:
+        """Wait until everyone who lives has told its health, but not for long."""
+        self._alive |= set(await self._link.alive())
+        await within(FIRST_S, lambda: self._alive <= set(self._health), self._changed)
+
+    def _on_alive(self, key: str, alive: bool) -> None:
+        service = key.split("/")[1]
+        (self._alive.add if alive else self._alive.discard)(service)
+        self._changed.set()
+
+    def _on_health(self, health: Health) -> None:
+        self._health[health.service] = health
+        self._heard_s[health.service] = time.monotonic()
+        self._changed.set()
+
+    def _on_news(self, what: str, _key: str, message: Message) -> None:
+        self._news[what] = message
+
+    # --- the report -------------------------------------------------------------------------------
+
+    def report(self) -> dict[str, Any]:
+        resolved = self._link.run_dir.resolved()
+        rows = _rows(resolved)
+        names = dict.fromkeys([*expected(resolved), *sorted(self._alive | set(self._health))])
+        ordered = sorted(names, key=lambda name: _place(name, rows, list(names)))
+        return {
+            "robot": self._link.robot,
+            "profile": resolved.get("name", ""),
+            "machine": _machine(),
+            **{what: msgspec.to_builtins(self._news.get(what)) for what in NEWS},
+            "services": [self._service(name, rows.get(name)) for name in ordered],
+            "topics": self._topics(),
+        }
+
+    def _service(self, name: str, row: Process | None) -> dict[str, Any]:
+        health, heard_s = self._health.get(name), self._heard_s.get(name)
+        silent_s = None if heard_s is None else time.monotonic() - heard_s
+        alive = name in self._alive
+        hangs = alive and (silent_s is None or silent_s > SILENT_S)
+        return {
+            "service": name,
+            "process": row.name if row is not None else name,
+            "alive": alive,
+            "state": self._link.unheard(name) if not alive else "silent" if hangs else health.state if health else "",
+            "silent_s": silent_s,
+            "cpu_budget": None if row is None else row.cpu_share,
+            "rss_budget_mb": None if row is None else row.rss_mb,
+            "health": None if health is None else _without_topics(health),
+        }
+
+    def _topics(self) -> list[dict[str, Any]]:
+        """Every key that somebody publishes, and every one that somebody waits for in vain; with its readers."""
+        sent: dict[str, tuple[str, TopicHealth]] = {}
+        read: list[tuple[str, TopicHealth]] = []
+        for service, health in self._health.items():
+            if service in self._alive:
+                for topic in health.topics:
+                    if topic.direction == "out":
+                        sent[topic.key] = (service, topic)
+                    else:
+                        read.append((service, topic))
+        keys = list(sent)
+        keys += dict.fromkeys(topic.key for _, topic in read if not any(matches(topic.key, key) for key in sent))
+        now = {(service, topic.key, what): getattr(topic, what) for service, topic in read for what in COUNTS}
+        found = [self._topic(key, sent.get(key), read) for key in keys]
+        self._before = now
+        return sorted(found, key=lambda topic: topic["topic"])
+
+    def _topic(
+        self, key: str, sent: tuple[str, TopicHealth] | None, read: list[tuple[str, TopicHealth]]
+    ) -> dict[str, Any]:
+        name = key.removeprefix(f"{self._link.robot}/")
+        topic = topic_named(name)
+        readers = [
+            {
+                "service": service, "rate_hz": health.rate_hz, "age_s": health.age_s,
+                **{what: getattr(health, what) for what in COUNTS},
+                "growing": any(
+                    getattr(health, what) > self._before.get((service, health.key, what), getattr(health, what))
+                    for what in COUNTS
+                ),
+                "last_error": health.last_error,
+            }
+            for service, health in read if matches(health.key, key) or health.key == key
+        ]  # fmt: skip
+        publisher = sent[0] if sent is not None else topic.publisher if topic is not None else ""
+        return {
+            "topic": name,
+            "publisher": publisher,
+            "published": sent is not None,
+            "count": sent[1].count if sent is not None else 0,
+            "rate_hz": sent[1].rate_hz if sent is not None else 0.0,
+            "nominal_hz": None if topic is None else topic.rate_hz,
+            "age_s": sent[1].age_s if sent is not None else None,
+            "max_age_s": None if topic is None else topic.max_age_s,
+            "readers": readers,
+        }
+
+
+COUNTS = ("skipped", "lost", "rejected")
+
+
+def _machine() -> dict[str, Any]:
+    """Its cores, and the share of them that is used since the last call; None where /proc does not tell it."""
+    try:
+        used = psutil.cpu_percent() / 100
+    except (psutil.Error, OSError):
+        used = None
+    return {"cores": os.cpu_count() or 1, "cpu_share": used}
+
+
+def _place(name: str, rows: dict[str, Process], names: list[str]) -> tuple[int, bool, int]:
+    """Services of one process stand together, behind the one that has the process's own name."""
+    row = rows.get(name)
+    first = min((names.index(other) for other in names if row is not None and rows.get(other) is row), default=0)
+    return (names.index(name) if row is None else first), row is not None and row.name != name, names.index(name)
+
+
+def _without_topics(health: Health) -> dict[str, Any]:
+    data: dict[str, Any] = msgspec.to_builtins(health)
+    del data["topics"]
+    return data
+
+
+def _rows(resolved: dict[str, Any]) -> dict[str, Process]:
+    """The process of each service: of the profile's first, then of all others that are installed."""
+    try:
+        known = processes.table()
+    except ConfigError:  # somebody's entry point is broken, which must not blind this command
+        known = {row.name: row for row in processes.PROCESSES}
+    started = [known[name] for name in resolved.get("processes", ()) if name in known]
+    found: dict[str, Process] = {}
+    for row in (*started, *known.values()):
+        for service in (row.name, *row.services):  # a process may be a service beside those that it is started for
+            found.setdefault(service, row)
+    return found

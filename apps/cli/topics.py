@@ -1,0 +1,153 @@
+"""`cocoro topics`: the table of what travels, as a table, as data, and as the page of the documentation."""
+
+from __future__ import annotations
+
+import ast
+import json
+from collections.abc import Iterable
+from importlib import resources
+from typing import Any, NamedTuple
+
+from apps.cli.table import table as plain_table
+from cocoro.topics import REQUESTS, TOPICS, Qos, Request, Topic
+
+QOS = {
+    Qos.FRAME: "newest wins; shared memory, lowest priority",
+    Qos.STATE: "newest wins",
+    Qos.COMMAND: "newest wins; sent at once at real-time priority; expires",
+    Qos.EVENT: "reliable, in order",
+}
+
+
+def table() -> str:
+    heads = ("topic", "type", "rate", "max age", "qos", "publisher", "recorded")
+    topics = plain_table(heads, [_row(topic) for topic in TOPICS])
+    request_heads = ("request", "question", "answer", "server", "time-out")
+    return f"{topics}\n{plain_table(request_heads, [_request_row(request) for request in REQUESTS])}"
+
+
+def as_json() -> str:
+    rows: list[dict[str, Any]] = [
+        {
+            "topic": topic.name,
+            "type": topic.type.__name__,
+            "rate_hz": topic.rate_hz,
+            "max_age_s": topic.max_age_s,
+            "qos": topic.qos.value,
+            "publisher": topic.publisher,
+            "recorded": topic.recorded,
+            "max_bytes": topic.max_bytes,
+            "doc": topic.doc,
+        }
+        for topic in TOPICS
+    ]
+    return json.dumps(rows) + "\n"
+
+
+def _row(topic: Topic[Any]) -> tuple[str, ...]:
+    rate = "on change" if topic.rate_hz is None else f"{topic.rate_hz:g} Hz"
+    recorded = "yes" if topic.recorded else "no"
+    return topic.name, topic.type.__name__, rate, f"{topic.max_age_s:g} s", topic.qos.value, topic.publisher, recorded
+
+
+def _request_row(request: Request[Any, Any]) -> tuple[str, ...]:
+    question, answer = request.request.__name__, request.reply.__name__
+    return request.name, question, answer, request.server, f"{request.timeout_s:g} s"
+
+
+# --- the page of the documentation ----------------------------------------------------------------
+
+
+def markdown() -> str:
+    """docs/topics.md; a test holds it up to date."""
+    types = _types()
+    mentioned = [*(topic.type.__name__ for topic in TOPICS)]
+    mentioned += [name for request in REQUESTS for name in (request.request.__name__, request.reply.__name__)]
+    parts = [
+        "# Topics\n",
+        "Made by `cocoro topics --markdown` from `cocoro/topics.py` and `cocoro/messages.py`; change those.\n",
+        "A key is `<robot>/<topic>`. A payload is one MessagePack map, its fields named as below; a reader ignores\n"
+        "fields that it does not know. SI units, in the names. What arrives malformed, wrongly typed, oversized or\n"
+        "out of order is counted in the reader's health and dropped.\n",
+        "## What is published\n",
+        _markdown_table(("topic", "type", "rate", "max age", "QoS", "publisher", "recorded"), map(_row, TOPICS)),
+        *(f"- `{topic.name}`: {topic.doc}" for topic in TOPICS),
+        "\nQuality of service: "
+        + "; ".join(f"**{qos.value}**: {text.replace(';', ',')}" for qos, text in QOS.items())
+        + ".\n",
+        "## What can be asked\n",
+        _markdown_table(("request", "question", "answer", "server", "time-out"), map(_request_row, REQUESTS)),
+        *(f"- `{request.name}`: {request.doc}" for request in REQUESTS),
+        "\n## Types\n",
+        *(_type_section(types[name]) for name in _with_parts(dict.fromkeys(mentioned), types)),
+    ]
+    return "\n".join(parts).rstrip() + "\n"
+
+
+class _Field(NamedTuple):
+    name: str
+    type: str
+    default: str
+    doc: str
+
+
+class _Type(NamedTuple):
+    name: str
+    bases: tuple[str, ...]
+    doc: str
+    fields: tuple[_Field, ...]
+
+
+def _types() -> dict[str, _Type]:
+    """The classes of `messages.py` as they are written: a field's text is the string that follows it."""
+    module = ast.parse(resources.files("cocoro").joinpath("messages.py").read_text(encoding="utf-8"))
+    return {node.name: _type(node) for node in module.body if isinstance(node, ast.ClassDef)}
+
+
+def _type(node: ast.ClassDef) -> _Type:
+    fields: list[_Field] = []
+    for item in node.body:
+        if isinstance(item, ast.AnnAssign) and isinstance(item.target, ast.Name):
+            default = "" if item.value is None else ast.unparse(item.value)
+            fields.append(_Field(item.target.id, ast.unparse(item.annotation), default, ""))
+        elif isinstance(item, ast.Expr) and isinstance(item.value, ast.Constant) and fields:
+            fields[-1] = fields[-1]._replace(doc=" ".join(str(item.value.value).split()))
+    bases = tuple(base.id for base in node.bases if isinstance(base, ast.Name))
+    return _Type(node.name, bases, " ".join((ast.get_docstring(node) or "").split()), tuple(fields))
+
+
+def _with_parts(names: Iterable[str], types: dict[str, _Type]) -> list[str]:
+    """The named types, and behind each those that its fields are made of; what all messages share comes first."""
+    found = ["Message"]
+
+    def add(name: str) -> None:
+        if name in found:
+            return
+        found.append(name)
+        for field in types[name].fields:
+            for word in ast.walk(ast.parse(field.type, mode="eval")):
+                if isinstance(word, ast.Name) and word.id in types:
+                    add(word.id)
+
+    for name in names:
+        add(name)
+    return found
+
+
+def _type_section(kind: _Type) -> str:
+    also = " With the fields of `Message`." if "Message" in kind.bases else ""
+    rows = [(f"`{field.name}`", f"`{field.type}`", _code(field.default), field.doc) for field in kind.fields]
+    table = _markdown_table(("field", "type", "default", ""), rows) if rows else ""
+    parts = (f"### {kind.name}", f"{kind.doc}{also}".strip(), table.rstrip("\n"))
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def _code(text: str) -> str:
+    return f"`{text}`" if text else ""
+
+
+def _markdown_table(heads: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
+    lines = [tuple(heads)]
+    lines.append(("---",) * len(lines[0]))
+    lines += [tuple(cell.replace("|", "\\|") for cell in row) for row in rows]
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)

@@ -1,0 +1,43 @@
+"""The experiments by their names, and how to run them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Protocol
+
+from apps.experiments import arm_map, fetching, figures, following, going, reaching, report, wheel_distance
+from apps.experiments.runs import Display, Result, Run, perform
+from apps.experiments.section import Section
+from apps.experiments.settings import Settings
+
+
+class Experiment(Protocol):
+    KEY: str
+    TITLE: str
+
+    def runs(self, settings: Settings) -> list[Run]: ...
+
+    def section(self, settings: Settings, results: dict[str, Result]) -> Section: ...
+
+
+EXPERIMENTS: dict[str, Experiment] = {
+    module.KEY: module for module in (arm_map, reaching, wheel_distance, going, following, fetching)
+}
+
+
+def run(keys: Sequence[str], settings: Settings, display: Display, *, plots: bool) -> tuple[list[Section], Path]:
+    """Run them and write the report. Raises ConfigError; what was run before an end of any kind is kept."""
+    if plots:
+        figures.available()
+    runs: dict[str, Run] = {}
+    for key in keys:
+        runs |= {run.name: run for run in EXPERIMENTS[key].runs(settings)}
+    results = perform(runs.values(), settings.out / "runs", settings.jobs, display)
+    sections = []
+    for key in keys:
+        section = EXPERIMENTS[key].section(settings, results)
+        mine = EXPERIMENTS[key].runs(settings)
+        section.errors = [f"{run.name}: {results[run.name]['error']}" for run in mine if "error" in results[run.name]]
+        sections.append(section)
+    return sections, report.write(sections, settings, plots=plots)

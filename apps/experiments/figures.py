@@ -1,0 +1,185 @@
+"""The plots. matplotlib is loaded here alone, and when something is drawn: it is an extra."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from apps.learning import study
+from apps.learning.lesson import sightings
+from cocoro.errors import ConfigError
+from cocoro.learning import dataset, model
+from cocoro.learning.dataset import HandRow
+from cocoro.learning.drawing import Drawing
+from cocoro.robot import Robot
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+OURS, OTHER, TRUE, FAINT = "#1b6ca8", "#c8553d", "#2f2f2f", "#b9b9b9"
+COLOURS = (OURS, OTHER, "#6a994e")
+SMOOTHED = 15
+"""Sightings over which the bent arm's errors are averaged."""
+
+
+def available() -> None:
+    """Raises ConfigError where matplotlib is not installed."""
+    try:
+        import matplotlib  # noqa: F401
+    except ImportError as error:
+        raise ConfigError(
+            "the experiments' plots need matplotlib: pip install 'cocoro-mesh[experiments]'; or give --no-plots"
+        ) from error
+
+
+def sheet(columns: int = 1, rows: int = 1, *, width: float = 5.0, height: float = 3.8) -> tuple[Figure, list[Axes]]:
+    """A figure and its axes, row by row; nothing of it is global."""
+    from matplotlib.figure import Figure as Sheet
+
+    figure = Sheet(figsize=(width * columns, height * rows), layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False)
+    found: list[Axes] = list(axes.flat)
+    for axis in found:
+        axis.spines[["top", "right"]].set_visible(False)
+        axis.grid(color="#e6e6e6", linewidth=0.6)
+    return figure, found
+
+
+def hand_places(samples: Path, learned: Path) -> Figure:
+    """Seen, drawn and learned places of the held-out sightings, from above and from the side."""
+    robot = Robot.load()
+    drawing = Drawing(robot)
+    _, held = study.split(study.clean(sightings(dataset.read(samples, HandRow, robot).rows), drawing))
+    arm = model.load(learned, robot).arm
+    assert arm is not None
+    held = held.pick(slice(None, None, max(len(held) // 150, 1)))
+    drawn, mapped = drawing.predict(held.angles_rad), model.hand_map(arm, robot).predict(held.angles_rad)
+    figure, axes = sheet(2, width=4.6, height=4.6)
+    for axis, (one, other, said) in zip(axes, ((0, 1, "left, m"), (0, 2, "up, m")), strict=True):
+        for start, end in zip(held.places_m, drawn, strict=True):
+            axis.plot([start[one], end[one]], [start[other], end[other]], color=FAINT, linewidth=0.7, zorder=1)
+        axis.scatter(drawn[:, one], drawn[:, other], s=9, color=OTHER, label="the drawing", zorder=2)
+        axis.scatter(mapped[:, one], mapped[:, other], s=9, color=OURS, label="the learned map", zorder=3)
+        axis.scatter(held.places_m[:, one], held.places_m[:, other], s=26, facecolors="none", edgecolors=TRUE,
+                     linewidths=0.7, label="seen", zorder=4)  # fmt: skip
+        axis.set(xlabel="ahead, m", ylabel=said, aspect="equal")
+    figure.legend(*axes[0].get_legend_handles_labels(), frameon=False, fontsize=8, ncols=3, loc="outside lower center")
+    return figure
+
+
+def curves(seeds: Sequence[Mapping[str, Mapping[str, float]]]) -> Figure:
+    figure, (axis,) = sheet(width=6.0)
+    names = {"default": "ours: 81 bases over the drawing", "paper over drawing": "the paper's rule over the drawing",
+             "paper": "the paper's rule, primed"}  # fmt: skip
+    for (key, said), colour in zip(names.items(), COLOURS, strict=True):
+        sizes = sorted({int(size) for seed in seeds for size in seed[key]})
+        lines = np.array([[100 * seed[key].get(str(size), np.nan) for size in sizes] for seed in seeds])
+        axis.plot(sizes, lines.T, color=colour, linewidth=0.5, alpha=0.4)
+        axis.plot(sizes, np.nanmean(lines, axis=0), color=colour, marker="o", markersize=4, label=said)
+    axis.set(xscale="log", yscale="log", xlabel="samples", ylabel="held-out error, RMS, cm")
+    axis.legend(frameon=False, fontsize=8)
+    return figure
+
+
+def bend(seeds: Sequence[Mapping[str, Any]]) -> Figure:
+    figure, (axis,) = sheet(width=6.0)
+    before = min(seed["bent_at"] for seed in seeds)
+    after = min(len(seed["fixed_m"]) - seed["bent_at"] for seed in seeds)
+    for key, said, colour in (("fixed_m", "the map as it was", OTHER), ("adapted_m", "taught on", OURS)):
+        lines = np.array([seed[key][seed["bent_at"] - before : seed["bent_at"] + after] for seed in seeds])
+        middle = np.median(100 * lines, axis=0)
+        smooth = np.convolve(middle, np.ones(SMOOTHED) / SMOOTHED, mode="valid")
+        axis.plot(np.arange(len(smooth)) - before + SMOOTHED // 2, smooth, color=colour, label=said)
+    axis.axvline(0, color=TRUE, linewidth=0.8, linestyle=":")
+    axis.set(xlabel="sightings since the bend", ylabel="error, cm", ylim=(0, None))
+    axis.legend(frameon=False, fontsize=8)
+    return figure
+
+
+def reaches(traces: Mapping[tuple[str, str], Mapping[str, list[Any]]], said: Sequence[str]) -> Figure:
+    """A column a way of reaching, rows: from above and from the side."""
+    figure, axes = sheet(2, 2, width=4.2, height=3.6)
+    ways = list(dict.fromkeys(way for way, _ in traces))
+    for column, way in enumerate(ways):
+        for (its, scene), trace in traces.items():
+            if its != way:
+                continue
+            hidden = scene.endswith("hidden")
+            # Not how the arm unfolds before the first of them.
+            first = trace["target"][0]
+            later = next(number for number, target in enumerate(trace["target"]) if target != first)
+            hand = np.array(trace["hand_m"][later:])
+            targets = np.array([t for t in trace["target_m"] if t is not None])
+            label, colour, line = ("marker hidden", OTHER, "--") if hidden else ("marker in view", OURS, "-")
+            for axis, other in ((axes[column], 1), (axes[2 + column], 2)):
+                axis.plot(hand[:, 0], hand[:, other], color=colour, linestyle=line, linewidth=0.8, label=label)
+                axis.scatter(targets[:, 0], targets[:, other], s=60, facecolors="none", edgecolors=TRUE, zorder=3)
+                axis.set(xlabel="ahead, m", ylabel="left, m" if other == 1 else "up, m", aspect="equal")
+        axes[column].set_title(said[column], fontsize=9)
+    figure.legend(*axes[0].get_legend_handles_labels(), frameon=False, fontsize=8, ncols=2, loc="outside lower center")
+    return figure
+
+
+def wheel_trials(seeds: Sequence[tuple[Mapping[str, Any], float]]) -> Figure:
+    figure, (left, right) = sheet(2, width=5.2)
+    for fit, true_m in seeds:
+        after = [np.nan if value is None else 1000 * (value - true_m) for value in fit["after_m"]]
+        left.plot(2 * np.arange(1, len(after) + 1), after, color=OURS, linewidth=0.8, alpha=0.7)
+        errors = 1000 * (np.array(fit["estimates_m"]) - true_m)
+        right.scatter(np.arange(1, len(errors) + 1), errors, s=5, color=OURS, alpha=0.5)
+    for axis in (left, right):
+        axis.axhline(0, color=TRUE, linewidth=0.8)
+    left.axhspan(-8, 8, color=FAINT, alpha=0.25, linewidth=0)
+    left.set(xlabel="trials", ylabel="fit to all so far, less the truth, mm", ylim=(-10, 10))
+    right.set(xlabel="trial", ylabel="its own estimate, less the truth, mm", ylim=(-25, 25))
+    return figure
+
+
+def paths(traces: Sequence[Mapping[str, list[Any]]], asked_m: float) -> Figure:
+    from matplotlib.patches import Circle
+
+    figure, (axis,) = sheet(width=5.6, height=5.0)
+    for trace in traces:
+        way = np.array(trace["body"])
+        ball = next(place for place in trace["target_m"] if place is not None)
+        axis.plot(way[:, 0], way[:, 1], color=OURS, linewidth=0.7, alpha=0.6)
+        axis.plot(*way[-1, :2], marker="o", markersize=3, color=OTHER)
+        axis.add_patch(Circle((ball[0], ball[1]), asked_m + 0.03, fill=False, color=FAINT, linewidth=0.5))
+        axis.plot(ball[0], ball[1], marker="o", color="#e0b400", markersize=7)
+    axis.set(xlabel="ahead, m", ylabel="left, m", aspect="equal")
+    return figure
+
+
+def square(traces: Mapping[str, Mapping[str, list[Any]]]) -> Figure:
+    figure, (axis,) = sheet(width=5.6, height=5.0)
+    for (said, trace), colour in zip(traces.items(), COLOURS, strict=False):
+        following = np.array([phase == "follow" for phase in trace["phase"]])
+        way = np.array(trace["body"])[following]
+        axis.plot(way[:, 0], way[:, 1], color=colour, linewidth=1.0, label=said)
+    ball = np.array([place for place in next(iter(traces.values()))["target_m"] if place is not None])
+    axis.plot(ball[:, 0], ball[:, 1], color=TRUE, linewidth=0.8, linestyle=":", label="the ball")
+    axis.set(xlabel="ahead, m", ylabel="left, m", aspect="equal")
+    axis.legend(frameon=False, fontsize=8)
+    return figure
+
+
+def phases(ways: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
+    figure, (axis,) = sheet(width=7.0, height=2.6)
+    names = list(dict.fromkeys(p["name"] for runs in ways.values() for run in runs for p in run["phases"]))
+    palette = ("#8ecae6", "#219ebc", "#126782", "#ffb703", "#fb8500", "#6a994e", "#bc4749", "#a7a7a7")
+    begun = np.zeros(len(ways))
+    for number, name in enumerate(names):
+        spent = [
+            sum(p["sim_s"] for run in runs for p in run["phases"] if p["name"] == name) / max(len(runs), 1)
+            for runs in ways.values()
+        ]
+        axis.barh(list(ways), spent, left=begun, color=palette[number % len(palette)], label=name, height=0.6)
+        begun += spent
+    axis.invert_yaxis()
+    axis.set(xlabel="simulated seconds")
+    axis.legend(frameon=False, fontsize=8, ncols=min(len(names), 4), loc="upper center", bbox_to_anchor=(0.5, -0.25))
+    return figure

@@ -1,0 +1,64 @@
+"""E5: a ball is carried round a square, and followed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from typing import Any
+
+from apps.experiments import bodies, figures
+from apps.experiments.runs import Result, Run
+from apps.experiments.section import Plot, Section, row
+from apps.experiments.settings import Settings
+
+KEY, TITLE = "E5", "Following"
+FOR_S = 33.0
+"""Once round: 8 m at 0.25 m/s, and a little."""
+LOST_S = 1.0
+WAYS: dict[str, tuple[str, dict[str, Any]]] = {
+    "learned": ("ours", {}),
+    "lockstep": ("baseline: lock-step", {"lockstep": True}),
+}
+
+
+def runs(settings: Settings) -> list[Run]:
+    found = []
+    for seed in settings.seeds:
+        found += bodies.learned(settings, seed)
+        for way, (_, fields) in WAYS.items():
+            request = {
+                "task": "follow", "label": "blue_ball", "scene": "follow", "for_s": FOR_S,
+                "trace": seed == settings.seeds[0],
+            }  # fmt: skip
+            found.append(bodies.with_model(settings, seed, f"follow-{way}-{seed}", **{**request, **fields}))
+    return found
+
+
+def section(settings: Settings, results: Mapping[str, Result]) -> Section:
+    made = Section(
+        KEY,
+        TITLE,
+        "A ball, 0.7 m high, starts 1 m ahead and is carried round a square of 8 m at 0.25 m/s. Gaps are from the"
+        " robot's centre to the ball's nearest edge; lost is the longest time without the ball in the picture."
+        " All by the truth.",
+    )
+    for way, (who, _) in WAYS.items():
+        truths = [r["truth"] for s in settings.seeds if (r := results[f"follow-{way}-{s}"]).get("outcome") == "done"]
+        lost = [truth["lost_s"] for truth in truths]
+        ours = way == "learned"
+        paper = "pursuit kept all round, overshoot at the turns" if ours else ""
+        held = len(truths) == len(settings.seeds) and max(lost, default=0.0) <= LOST_S if ours else None
+        made.rows += [
+            row("mean gap", who, [truth["mean_gap_m"] for truth in truths], "m", digits=2, paper=paper),
+            row("widest gap", who, [truth["max_gap_m"] for truth in truths], "m", digits=2),
+            row("lost for", who, lost, "s", digits=2, wanted="never over 1" if ours else "", held=held),
+            row("followed to the end, of " + str(len(settings.seeds)), who, [], "", said=str(len(truths))),
+        ]
+    seed = settings.seeds[0]
+    traces = {WAYS[way][0]: result["trace"] for way in WAYS if "trace" in (result := results[f"follow-{way}-{seed}"])}
+    if traces:
+        made.plots.append(
+            Plot("e5-square", f"The ball's square and the robot's way after it, from above, seed {seed}.",
+                 partial(figures.square, traces))
+        )  # fmt: skip
+    return made

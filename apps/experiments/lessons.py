@@ -1,0 +1,82 @@
+"""What is learned between the runs of the experiments: a model of each seed's body, and what a bent arm does to it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from apps.learning import study
+from apps.learning.lesson import learn_arm, learn_wheels, sightings
+from apps.learning.wheels import fit_wheels
+from cocoro.clock import NS
+from cocoro.learning import dataset, model
+from cocoro.learning.dataset import HandRow, WheelRow
+from cocoro.learning.drawing import Drawing
+from cocoro.robot import Robot
+from services.planning.adapt import Adapter
+
+SIZES = (100, 300, 1000, 2000)
+
+
+def learn(arm: str, wheels: str, into: str, method: str | None = None) -> dict[str, Any]:
+    """A model of arm and wheels, with every method's score (or only of the one that is asked for) and how the error
+    falls with the samples."""
+    robot, file = Robot.load(), Path(into)
+    file.unlink(missing_ok=True)
+    _, report = learn_arm(Path(arm), file, robot, method=method)
+    _, fit = learn_wheels(Path(wheels), file, robot)
+    drawing = Drawing(robot)
+    rows = dataset.read(Path(arm), HandRow, robot).rows
+    learn, held = study.split(study.clean(sightings(rows), drawing))
+    methods = {"default": study.BEST, "paper": study.METHODS[0], "paper over drawing": study.METHODS[2]}
+    sizes = [size for size in SIZES if size <= len(learn)]
+    draws = np.unique([row.draw for row in rows])
+    trials = dataset.read(Path(wheels), WheelRow, robot).rows
+    after = [fit_wheels(trials[:count]) for count in range(2, len(trials) + 1, 2)]
+    return {
+        "arm": report.data(),
+        "learn": len(learn),
+        "held": len(held),
+        "curves": {
+            name: {str(s): e for s, e in zip(sizes, study.curve(m, drawing, learn, held, sizes), strict=True)}
+            for name, m in methods.items()
+        },
+        "draws_used": len(draws),
+        "draws_looked_at": int(draws.max() - draws.min() + 1),
+        "babbled_s": _babbled_s(rows),
+        "wheels": {
+            "separation_m": fit.separation_m, "sigma_m": fit.sigma_m, "median_m": fit.median_m,
+            "estimates_m": list(fit.estimates_m), "left_scale": fit.left_scale, "right_scale": fit.right_scale,
+            "after_m": [one.separation_m if one is not None else None for one in after],
+        },
+    }  # fmt: skip
+
+
+def _babbled_s(rows: Sequence[HandRow]) -> float:
+    """How long it took to see them; a babbling that was gone on with began its clock anew."""
+    steps = np.diff([row.stamp_ns for row in rows])
+    return float(steps[steps > 0].sum()) / NS
+
+
+def bend(into: str, bent: str, bend_s: float) -> dict[str, Any]:
+    """The learned map's error at each sighting of an arm that is bent meanwhile: left as it was, and taught on."""
+    robot = Robot.load()
+    arm = model.load(Path(into), robot).arm
+    if arm is None:
+        raise msgspec.ValidationError(f"{into} has no arm in it")
+    fixed = model.hand_map(arm, robot)
+    adapter = Adapter(model.hand_map(arm, robot), arm.training.scores["held_out_rms_m"])
+    rows = dataset.read(Path(bent), HandRow, robot).rows
+    seen = sightings(rows)
+    return {
+        "bent_at": int(np.searchsorted([row.stamp_ns for row in rows], bend_s * NS)),
+        "fixed_m": study.errors_m(fixed, seen).round(5).tolist(),
+        "adapted_m": [
+            round(adapter.add(angles, place), 5) for angles, place in zip(seen.angles_rad, seen.places_m, strict=True)
+        ],
+        "changes": adapter.changes,
+    }

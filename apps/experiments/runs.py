@@ -1,0 +1,163 @@
+"""The runs that experiments are made of: each in a process of its own, as many at once as there are cores, each result
+kept on disk, so that the same command goes on where an earlier one was ended."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import multiprocessing
+import os
+from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, Protocol
+
+import msgspec
+
+from apps.experiments import lessons
+from apps.rehearsal.rehearse import rehearse
+from apps.rehearsal.request import RehearsalRequest
+from cocoro.errors import CocoroError, naming
+
+TASKS_A_PROCESS = 25
+"""A new one now and then, lest something grows; to begin costs each as long as a short run."""
+LESSONS: dict[str, Callable[..., dict[str, Any]]] = {"learn": lessons.learn, "bend": lessons.bend}
+Result = dict[str, Any]
+"""JSON; with 'error' in it where the run could not be."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """One piece of work. Equal names, equal runs."""
+
+    name: str
+    """Its file's, under `runs`."""
+    kind: Literal["rehearse", "learn", "bend"]
+    fields: dict[str, Any] = field(hash=False)
+    """Rehearse: of the request; else the arguments of the lesson of that name."""
+    needs: tuple[str, ...] = ()
+    """Names of the runs that must be done before."""
+
+
+class Display(Protocol):
+    def begin(self, total: int, had: int) -> None: ...
+
+    def started(self, name: str) -> None: ...
+
+    def ended(self, name: str, result: Result) -> None: ...
+
+
+def carry_out(kind: str, fields: dict[str, Any]) -> Result:
+    """In a process of its own."""
+    try:
+        if kind == "rehearse":
+            request = msgspec.convert(fields, RehearsalRequest)
+            if request.samples is not None and request.bend_s is not None:
+                Path(request.samples).unlink(missing_ok=True)  # half a babbling has no bend at that time
+            return dict(rehearse(request))
+        return dict(LESSONS[kind](**fields))
+    except (CocoroError, msgspec.ValidationError) as error:
+        return {"error": str(error)}
+    except Exception as error:  # one run that breaks must not end the others, of which there are hundreds
+        return {"error": f"{type(error).__name__}: {error}"}
+
+
+def perform(runs: Iterable[Run], folder: Path, jobs: int, display: Display) -> dict[str, Result]:
+    """All runs, by name, each given after what it needs. What the folder holds of them already is not done again,
+    unless something that it needs was; a run whose needs failed fails."""
+    results: dict[str, Result] = {}
+    waiting: dict[str, Run] = {}
+    for run in runs:
+        kept = _kept(run, folder, results) if all(name in results for name in run.needs) else None
+        if kept is not None:
+            results[run.name] = kept
+        else:
+            waiting[run.name] = run
+    for run in waiting.values():
+        lacking = [name for name in run.needs if name not in waiting and name not in results]
+        assert not lacking, f"{run.name} needs {lacking}, which nobody does"
+    display.begin(len(waiting) + len(results), len(results))
+    # One thread of linear algebra a process: more of them only get in one another's way.
+    os.environ |= {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(jobs, context, initializer=_quiet, max_tasks_per_child=TASKS_A_PROCESS) as pool:
+        running: dict[Future[Result], Run] = {}
+        try:
+            while waiting or running:
+                _start(waiting, running, results, jobs, pool.submit, display)
+                done, _ = wait(running, return_when=FIRST_COMPLETED) if running else (set(), set())
+                for future in done:
+                    run = running.pop(future)
+                    results[run.name] = result = future.result()
+                    _keep(run, folder, results)
+                    display.ended(run.name, result)
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+    return results
+
+
+def _start(
+    waiting: dict[str, Run],
+    running: dict[Future[Result], Run],
+    results: dict[str, Result],
+    jobs: int,
+    submit: Callable[..., Future[Result]],
+    display: Display,
+) -> None:
+    for run in list(waiting.values()):
+        failed = next((name for name in run.needs if "error" in results.get(name, {})), None)
+        if failed is not None:
+            del waiting[run.name]
+            results[run.name] = {"error": f"{failed} failed: {results[failed]['error']}"}
+            display.ended(run.name, results[run.name])
+        elif len(running) < jobs and all(name in results for name in run.needs):
+            del waiting[run.name]
+            display.started(run.name)
+            running[submit(carry_out, run.kind, run.fields)] = run
+
+
+def _quiet() -> None:
+    """What a worker prints is nobody's: the display has the terminal."""
+    null = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(null, 1)
+    os.dup2(null, 2)
+
+
+def _path(run: Run, folder: Path) -> Path:
+    return folder / f"{run.name}.json"
+
+
+def _kept(run: Run, folder: Path, results: Mapping[str, Result]) -> Result | None:
+    """The result of an earlier time, if it was of the same run, after the same, and no error."""
+    try:
+        data = json.loads(_path(run, folder).read_text())
+        same = data["fields"] == _plain(run.fields) and data["after"] == _after(run, results)
+        return dict(data["result"]) if same else None
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def _keep(run: Run, folder: Path, results: Mapping[str, Result]) -> None:
+    result = results[run.name]
+    if "error" in result:
+        return
+    path = _path(run, folder)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    beside = path.with_suffix(".part")
+    data = {"kind": run.kind, "fields": _plain(run.fields), "after": _after(run, results), "result": result}
+    with naming(beside):
+        beside.write_text(json.dumps(data))
+    beside.replace(path)
+
+
+def _after(run: Run, results: Mapping[str, Result]) -> dict[str, str]:
+    """Fingerprints of what the run stood on."""
+    return {
+        name: hashlib.sha256(json.dumps(results[name], sort_keys=True).encode()).hexdigest()[:16] for name in run.needs
+    }
+
+
+def _plain(fields: dict[str, Any]) -> Any:
+    return json.loads(json.dumps(fields))

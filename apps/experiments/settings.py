@@ -1,0 +1,45 @@
+"""What an experiment is run with."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from apps.rehearsal.request import Body, Sensors
+
+
+class Settings(msgspec.Struct, frozen=True, kw_only=True):
+    seeds: tuple[int, ...]
+    out: Path
+    sensors: Sensors = "real"
+    body: Body = "worn"
+    width: int = 640
+    height: int = 480
+    frame_rate_hz: float = 30.0
+    samples: int = 2600
+    """Of the arm's babbling: four fifths of them are learned from, so that there are 2,000 and a few."""
+    trials: int = 40
+    """Of the wheels' babbling."""
+    jobs: int = 1
+    """Runs at once."""
+
+    def common(self, seed: int) -> dict[str, Any]:
+        """Of every rehearsal's request."""
+        return {
+            "seed": seed, "sensors": self.sensors, "body": self.body, "width": self.width, "height": self.height,
+            "frame_rate_hz": self.frame_rate_hz,
+        }  # fmt: skip
+
+    def arm_file(self, seed: int) -> Path:
+        return self.out / "data" / f"seed-{seed}" / "arm.jsonl"
+
+    def bent_file(self, seed: int) -> Path:
+        return self.out / "data" / f"seed-{seed}" / "bent.jsonl"
+
+    def wheels_file(self, seed: int) -> Path:
+        return self.out / "data" / f"seed-{seed}" / "wheels.jsonl"
+
+    def model_file(self, seed: int) -> Path:
+        return self.out / "models" / f"seed-{seed}.json"

@@ -1,0 +1,1 @@
+"""Learning from samples: collecting them, fitting models, judging what was fitted."""

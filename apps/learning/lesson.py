@@ -1,0 +1,137 @@
+"""From samples to a model: every way of learning measured on samples that it has not seen, the best one kept."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from math import isnan
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from apps.learning import study
+from apps.learning.study import METHODS, Method, Score, Sightings
+from apps.learning.wheels import WheelFit, fit_wheels
+from cocoro.errors import ConfigError
+from cocoro.learning import dataset, model
+from cocoro.learning.dataset import HandRow, WheelRow
+from cocoro.learning.drawing import Drawing
+from cocoro.learning.eye import eye_tilt
+from cocoro.learning.model import Model, Training, WheelModel
+from cocoro.robot import Robot
+
+LEAST_SAMPLES = 50
+CURVE = (100, 300, 1000, 2000)
+
+
+@dataclass(frozen=True)
+class Report:
+    """What came of the arm's samples."""
+
+    samples: int
+    outliers: int
+    draws: int
+    scores: list[Score]
+    """Of the baselines first."""
+    chosen: Method
+    curve: dict[int, float]
+    """Held-out error of the chosen method, metres, after so many samples."""
+
+    def data(self) -> dict[str, Any]:
+        return {
+            "samples": self.samples, "outliers": self.outliers, "draws": self.draws, "chosen": self.chosen.name,
+            "scores": [{k: None if v != v else v for k, v in score._asdict().items()} for score in self.scores],
+            "curve": {str(size): error for size, error in self.curve.items()},
+        }  # fmt: skip
+
+
+def sightings(rows: Sequence[HandRow]) -> Sightings:
+    return Sightings(
+        np.array([row.angles_rad for row in rows]),
+        np.array([row.seen_m for row in rows]),
+        np.array([row.draw for row in rows]),
+    )
+
+
+def learn_arm(
+    samples: Path,
+    into: Path,
+    robot: Robot,
+    *,
+    search: bool = False,
+    method: str | None = None,
+    tell: Callable[[str], None] = lambda text: None,
+) -> tuple[Model, Report]:
+    """Fit every method, choose, write the model. `tell` hears what is being done. Raises ConfigError."""
+    recorded = dataset.read(samples, HandRow, robot)
+    rows = recorded.rows
+    if len(rows) < LEAST_SAMPLES:
+        raise ConfigError(f"samples {samples}: {len(rows)} are too few to learn from; {LEAST_SAMPLES} are the least")
+    drawing = Drawing(robot, recorded.header.roll_rad)
+    seen = sightings(rows)
+    kept = study.clean(seen, drawing)
+    learn, held = study.split(kept)
+    if not len(held):
+        raise ConfigError(f"samples {samples}: {study.HELD_OUT} draws at least are needed to hold one out")
+    methods = _methods(search, method)
+    scores = []
+    for number, one in enumerate(methods, 1):
+        tell(f"{number} of {len(methods)}: {one.name}")
+        scores.append(study.score(one, drawing, learn, held))
+    chosen = study.best(scores, methods)
+    sizes = [*[size for size in CURVE if size < len(learn)], len(learn)]
+    curve_m = study.curve(chosen, drawing, learn, held, sizes)
+    report = Report(
+        samples=len(kept), outliers=len(seen) - len(kept), draws=len(np.unique(kept.draws)),
+        scores=[*study.baselines(drawing, learn, held), *scores], chosen=chosen,
+        curve=dict(zip(sizes, curve_m, strict=True)),
+    )  # fmt: skip
+    own = next(score for score in scores if score.name == chosen.name)
+    training = Training(
+        data=recorded.fingerprint, samples=len(kept), method=chosen.name,
+        scores={
+            "held_out_rms_m": own.held_out_m, "held_out_95_m": own.held_out_95_m,
+            "drawing_offset_rms_m": report.scores[1].held_out_m,
+        },
+    )  # fmt: skip
+    learned = study.fit(chosen, drawing, kept)  # what is used learns from the held-out draws too
+    arm = model.arm_model(learned, recorded.header.roll_rad, kept.places_m, training)
+    made = msgspec.structs.replace(_before(into, robot), arm=arm)
+    model.save(made, into)
+    return made, report
+
+
+def learn_wheels(samples: Path, into: Path, robot: Robot) -> tuple[Model, WheelFit]:
+    """Fit the distance of the wheels, write the model. Raises ConfigError."""
+    recorded = dataset.read(samples, WheelRow, robot)
+    fit = fit_wheels(recorded.rows)
+    if fit is None:
+        raise ConfigError(f"samples {samples}: no trial in it turned far enough to tell the wheels' distance")
+    scores = {"sigma_m": fit.sigma_m, "median_m": fit.median_m}
+    training = Training(
+        data=recorded.fingerprint, samples=len(recorded.rows), method="all trials at once",
+        scores={name: value for name, value in scores.items() if not isnan(value)},
+    )  # fmt: skip
+    tilt_rad = eye_tilt(recorded.rows, recorded.header.target_height_m, robot)
+    wheels = WheelModel(separation_m=fit.separation_m, eye_tilt_rad=tilt_rad or 0.0, training=training)
+    made = msgspec.structs.replace(_before(into, robot), wheels=wheels)
+    model.save(made, into)
+    return made, fit
+
+
+def _before(into: Path, robot: Robot) -> Model:
+    """What the file holds already, so that arm and wheels can be learned one after the other."""
+    return model.load(into, robot) if into.is_file() else model.empty(robot)
+
+
+def _methods(search: bool, method: str | None) -> Sequence[Method]:
+    methods = [*METHODS, *study.grid("in order"), *study.grid("least squares")] if search else list(METHODS)
+    if method is None:
+        return methods
+    found = [one for one in methods if one.name == method]
+    if not found:
+        names = "\n  ".join(one.name for one in methods)
+        raise ConfigError(f"there is no method {method!r}; known are\n  {names}")
+    return found

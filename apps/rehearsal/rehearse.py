@@ -1,0 +1,330 @@
+"""`cocoro rehearse`: the whole robot in one process, in virtual time, judged by the simulator's truth.
+
+The services are the real ones, found by the process table and run on the local bus; only time and the bus differ
+from a live run.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from contextlib import AsyncExitStack
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from apps.learning.collector import TOPICS, Collector, collector
+from apps.rehearsal.request import RehearsalRequest
+from cocoro import topics
+from cocoro.bus.local import LocalMesh
+from cocoro.clock import NS, VirtualClock
+from cocoro.component import load
+from cocoro.core import Core
+from cocoro.errors import CocoroError, ConfigError
+from cocoro.inbox import Stream
+from cocoro.messages import Detections, Frame, Recording, TaskReply, TaskRequest, TaskState
+from cocoro.node import Node
+from cocoro.objects import Catalogue
+from cocoro.picture import draw, save_png
+from cocoro.robot import Robot
+from cocoro.stepper import Stepper
+from cocoro.vloop import run_virtual
+from deploy.processes import named
+from sim.judge import Judge
+from sim.pursuit import PursuitJudge
+from sim.random_scene import find_scene
+from sim.realism import REALISM, wheel_scales
+from sim.trace import Trace
+from sim.wear import body_of
+
+RECORDER = "capture"
+PROCESSES = ("sim", "perception", "planning", "executive")
+START_S = 5.0
+"""So long the robot may take until it accepts a task."""
+_LONG_S = 60.0
+
+
+def rehearse(request: RehearsalRequest) -> dict[str, Any]:
+    """Run one task and return the result, as the JSON has it. Raises CocoroError when the robot refuses the task,
+    ConfigError for a wrong scene or service name."""
+    started = time.perf_counter()
+    unknown = sorted(set(request.latency) - set(PROCESSES))
+    if unknown:
+        raise ConfigError(f"--latency {unknown[0]}: no such service; known are {', '.join(PROCESSES)}")
+    if request.record is not None and Path(request.record).exists():
+        raise ConfigError(f"--record {request.record}: there is such a file already")
+    result = run_virtual(_Rehearsal(request).run())
+    result["wall_s"] = round(time.perf_counter() - started, 3)
+    return result
+
+
+class TaskRefusedError(CocoroError):
+    """The executive would not start the task."""
+
+    def __init__(self, reply: TaskReply) -> None:
+        super().__init__(reply.text)
+        self.code = reply.refusal
+
+
+class LockstepCycle:
+    """The paper's one serial cycle: sense, perceive, plan, act; the next begins when the last has ended, and
+    commands hold meanwhile. The services' own cores, latencies included, in turn."""
+
+    ORDER = ("perception", "planning")
+
+    def __init__(self) -> None:
+        self._steps: dict[str, tuple[Node, Stepper]] = {}
+
+    async def join(self, node: Node, core: Core) -> None:
+        """In place of `Node.drive`: the core is stepped when its turn comes."""
+        self._steps[node.name] = (node, node.stepper(core))
+        node.ready()
+        if set(self._steps) == set(self.ORDER):
+            await self._run()
+        else:
+            await asyncio.get_running_loop().create_future()
+
+    async def _run(self) -> None:
+        perceiver, perceive = self._steps["perception"]
+        planner, plan = self._steps["planning"]
+        while True:
+            await perceive.wake.wait()
+            perceive.wake.clear()
+            if await perceive(perceiver.now_ns()):
+                # Lets what was published arrive; no time passes.
+                await asyncio.sleep(0)
+                await plan(planner.now_ns())
+
+
+class LockstepNode(Node):
+    """A node whose core is driven by the cycle."""
+
+    cycle: LockstepCycle
+
+    async def drive(self, core: Core, name: str | None = None) -> None:
+        await self.cycle.join(self, core)
+
+
+class _Rehearsal:
+    def __init__(self, request: RehearsalRequest) -> None:
+        self._request = request
+        scene = find_scene(request.scene, request.seed, request.label)
+        labels = [item.label for item in scene.objects]
+        present = request.label if request.label in labels else ""
+        self._judge: Judge | PursuitJudge = (
+            PursuitJudge(Robot.load(), scene, present)
+            if request.task == "follow" and present
+            else Judge(scene, present)
+        )
+        self._scene = scene
+        self._body = body_of(Robot.load(), request.body, request.seed).robot
+        self._trace = Trace(self._body, present)
+        self._steps: list[dict[str, Any]] = []
+        """One by one, the tasks that came to an end."""
+        self._frame: Frame | None = None
+        self._seen: Detections | None = None
+        self._recording: Recording | None = None
+        self._collector: Collector[Any] | None = None
+
+    async def run(self) -> dict[str, Any]:
+        request = self._request
+        mesh, clock, robot = LocalMesh(), VirtualClock(), Robot.load()
+        cycle = LockstepCycle()
+        async with AsyncExitStack() as stack:
+            services = []
+            for name in (*((RECORDER,) if request.record else ()), *PROCESSES):
+                row = named(name)
+                component = load(row)
+                settings = self._settings(name)
+                if request.objects is not None and "objects" in component.config.__struct_fields__:
+                    settings["objects"] = request.objects
+                config = msgspec.convert(settings, component.config)
+                lockstep = request.lockstep and name in LockstepCycle.ORDER
+                kind = LockstepNode if lockstep else Node
+                node = kind(
+                    name, mesh.join(), clock, robot, latency_s=request.latency.get(name, 0.0),
+                    record_steps=request.record is not None, module=row.module, config=config,
+                )  # fmt: skip
+                if isinstance(node, LockstepNode):
+                    node.cycle = cycle
+                await stack.enter_async_context(node)
+                services.append(asyncio.ensure_future(component.run(node, config)))
+            operator = await stack.enter_async_context(Node("operator", mesh.join(), clock, robot))
+            operator.on(topics.TRUTH, self._judge.feed)
+            operator.on(topics.TRUTH, self._trace.feed)
+            operator.on(topics.PLAN, self._trace.said)
+            operator.on(topics.TASK, self._trace.state)
+            operator.on(topics.RECORDING.of(RECORDER), self._keep_recording)
+            if request.samples is not None and request.task in TOPICS:
+                self._collector = collector(request.task, Path(request.samples), robot, self._standing_height_m())
+                stack.enter_context(self._collector)
+            task = asyncio.ensure_future(self._operate(operator))
+            try:
+                await asyncio.wait((task, *services), return_when=asyncio.FIRST_COMPLETED)
+                for service in services:
+                    if service.done():
+                        service.result()
+                        raise CocoroError("a service of the rehearsal ended by itself")
+                state = task.result()
+            finally:
+                for future in (task, *services):
+                    future.cancel()
+                await asyncio.gather(task, *services, return_exceptions=True)
+        if self._recording is not None and self._recording.fault:
+            raise CocoroError(self._recording.fault)
+        return self._result(state)
+
+    def _settings(self, name: str) -> dict[str, Any]:
+        request = self._request
+        if name == RECORDER:
+            return {"file": request.record}
+        if name == "sim":
+            world: dict[str, Any] = {
+                field: getattr(request, field)
+                for field in ("scene", "seed", "sensors", "body", "width", "height", "frame_rate_hz")
+            }
+            world |= {"target": request.label, "bend_at_s": request.bend_s}
+            return world | ({"command_timeout_s": _LONG_S} if request.lockstep else {})
+        settings: dict[str, Any] = {}
+        if name == "planning":
+            settings = {
+                "model": request.model or "", "reach": request.reach, "see_hand": request.see_hand,
+                "adapt": request.adapt,
+            }  # fmt: skip
+        if request.lockstep:
+            # The baseline's planner speaks once a cycle, however long that is: no penalty for it.
+            baseline: dict[str, dict[str, Any]] = {
+                "planning": {"coordination": "lockstep"},
+                "executive": {"planner_silence_s": _LONG_S},
+            }
+            settings |= baseline.get(name, {})
+        return settings
+
+    async def _operate(self, operator: Node) -> TaskState:
+        """What the operator does: give the task, watch it to its end, and again with each other label."""
+        request = self._request
+        states = operator.stream(topics.TASK)
+        if request.picture is not None:
+            operator.on(topics.FRAME, self._keep_frame)
+            operator.on(topics.DETECTIONS, self._keep_seen)
+        for number, label in enumerate((request.label, *request.then)):
+            question = TaskRequest(
+                task=request.task,
+                label=label,
+                timeout_s=request.timeout_s,
+                bring=request.bring,
+                for_s=request.for_s,
+                distance_m=request.distance_m,
+                first=request.first,
+                count=request.count,
+            )
+            if self._collector is not None and number == 0:
+                operator.on(TOPICS[request.task], self._collector.take)
+            if self._collector is not None:
+                question.first, question.count = self._collector.next, max(request.count - len(self._collector), 1)
+            self._trace.begin(label)
+            reply = await self._ask(operator, question)
+            while reply.refusal in ("not_alive", "estop") and operator.now_ns() < START_S * NS:
+                await operator.sleep(0.1)
+                reply = await self._ask(operator, question)
+            if not reply.accepted:
+                raise TaskRefusedError(reply)
+            state = await self._watch(states, reply.task_id)
+            self._keep_step(state)
+            if state.outcome != "done":
+                break
+        return state
+
+    async def _watch(self, states: Stream[TaskState], task_id: str) -> TaskState:
+        pictured = self._request.picture is None
+        async for state in states:
+            if state.task_id != task_id:
+                continue
+            if isinstance(self._judge, PursuitJudge) and state.phase == "follow":
+                self._judge.begin()
+            if not pictured and state.phase == "lift":
+                self._take_picture()
+                pictured = True
+            if state.outcome is not None:
+                return state
+        raise AssertionError("a stream has no end")
+
+    def _keep_step(self, state: TaskState) -> None:
+        """What came of one task, by the truth at its end."""
+        labels = {item.label: item for item in self._scene.objects}
+        known = labels.get(state.label)
+        edge_m = self._trace.edge_m(known.half_width_m) if known is not None else None
+        self._steps.append(
+            {
+                "label": state.label,
+                "outcome": state.outcome,
+                "reason": state.reason,
+                "sim_s": round(state.elapsed_s, 3),
+                "hand_to_target": self._trace.hand_gap(),
+                "target_edge_m": edge_m,
+                "longest_stall_s": round(self._trace.longest_stall_s(), 3),
+            }
+        )
+
+    @staticmethod
+    async def _ask(operator: Node, question: TaskRequest) -> TaskReply:
+        try:
+            return await operator.call(topics.RUN, question)
+        except CocoroError as error:
+            return TaskReply(accepted=False, refusal="not_alive", text=str(error))
+
+    def _standing_height_m(self) -> float | None:
+        """Of the target's centre, as the robot knows the object."""
+        catalogue = Catalogue.load(Path(self._request.objects) if self._request.objects else None)
+        known = catalogue.get(self._request.label)
+        return known.size_m[2] / 2 if known is not None else None
+
+    def _keep_recording(self, recording: Recording) -> None:
+        self._recording = recording
+
+    def _keep_frame(self, frame: Frame) -> None:
+        self._frame = frame
+
+    def _keep_seen(self, seen: Detections) -> None:
+        self._seen = seen
+
+    def _take_picture(self) -> None:
+        if self._frame is not None and self._request.picture is not None:
+            catalogue = Catalogue.load(Path(self._request.objects) if self._request.objects else None)
+            save_png(draw(self._frame, self._seen, catalogue), Path(self._request.picture))
+
+    def _true_body(self) -> dict[str, Any]:
+        request, separation_m = self._request, self._body.base.wheel_separation_m
+        scales = wheel_scales(request.seed, REALISM[request.sensors])
+        return {
+            "kind": request.body,
+            "wheel_separation_m": separation_m,
+            # Wheels that roll further than they are told to turn it as if they stood nearer together.
+            "turning_separation_m": separation_m / float(scales.mean()),
+        }
+
+    def _result(self, state: TaskState) -> dict[str, Any]:
+        request = self._request
+        return {
+            "task": request.task,
+            "label": request.label,
+            "scene": request.scene,
+            "seed": request.seed,
+            "sensors": request.sensors,
+            "lockstep": request.lockstep,
+            "model": self._trace.model,
+            **({} if self._collector is None else {"samples": len(self._collector), "said": self._collector.said}),
+            "outcome": state.outcome,
+            "reason": state.reason,
+            "sim_s": round(state.elapsed_s, 3),
+            "wall_s": 0.0,
+            "phases": [
+                {"name": phase.name, "sim_s": round(((phase.end_ns or state.stamp_ns) - phase.start_ns) / NS, 3)}
+                for phase in state.phases
+            ],
+            "truth": msgspec.to_builtins(self._judge.result()),
+            "tasks": self._steps,
+            "body": self._true_body(),
+            **({"trace": self._trace.data()} if request.trace else {}),
+        }

@@ -1,0 +1,200 @@
+"""Runs one process of the table: `python -m deploy.launch PROCESS --run-dir DIR`, or `run` from one's own terminal.
+
+Exits with 0 when it was asked to end, 1 for a crash (its traceback in the log), 2 for an error that its user can
+mend and 3 when what is there already does not let it start (one line in the log).
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import faulthandler
+import logging
+import os
+import signal
+import threading
+import time
+from collections.abc import Awaitable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from cocoro import private
+from cocoro.errors import CocoroError, RefusedError
+from deploy.quit import quit_process
+from deploy.rundir import RunDir
+
+OK, CRASHED, MISCONFIGURED, REFUSED = 0, 1, 2, 3
+ORPHAN_S = 5.0
+"""How long a process may take to end once its supervisor is gone."""
+LEVEL = "COCORO_LOG"
+"""Environment variable with the log level; info when it is not set."""
+
+
+class _Line(logging.Formatter):
+    """One line a record: time, level, who, what."""
+
+    def __init__(self, process: str) -> None:
+        super().__init__(f"%(asctime)s.%(msecs)03d %(levelname)-7s {process}: %(message)s", "%Y-%m-%dT%H:%M:%S")
+
+    def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802 # the library's name
+        return super().formatMessage(record).replace("\n", " | ")
+
+
+def set_up_logging(process: str) -> logging.Logger:
+    handler = logging.StreamHandler()
+    handler.setFormatter(_Line(process))
+    logging.basicConfig(handlers=[handler], level=os.environ.get(LEVEL, "info").upper(), force=True)
+    logging.captureWarnings(True)
+    return logging.getLogger(f"cocoro.{process}")
+
+
+def watch_parent(fd: int) -> None:
+    """End this process when the other end of a pipe is closed, which is when the supervisor has died.
+
+    In a thread of its own, so that it works while modules are imported and when the loop hangs.
+    """
+
+    def watch() -> None:
+        while os.read(fd, 1):
+            pass
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(ORPHAN_S)
+        os._exit(CRASHED)
+
+    threading.Thread(target=watch, name="parent", daemon=True).start()
+
+
+def run(
+    process: str, run_dir: RunDir, profile: dict[str, Any], profile_name: str, *, raise_crashes: bool = False
+) -> int:
+    """Run a process until it is told to end; returns the exit code. Logging is set up already. A crash is logged with
+    its traceback, or raised for a caller who shows it to a person."""
+    log = logging.getLogger(f"cocoro.{process}")
+    try:
+        with asyncio.Runner() as runner:
+            return runner.run(_main(process, run_dir, profile, profile_name))
+    except CocoroError as error:
+        log.error("%s", error)
+        return REFUSED if isinstance(error, RefusedError) else MISCONFIGURED
+    except KeyboardInterrupt:
+        return OK
+    except OSError as error:
+        if not private.full(error):
+            log.exception("crashed")
+            return CRASHED
+        log.error("%s: %s; make room there", error.filename or run_dir.path, error.strerror)
+        return MISCONFIGURED
+    except Exception:
+        if raise_crashes:
+            raise
+        log.exception("crashed")
+        return CRASHED
+
+
+async def _main(process: str, run_dir: RunDir, data: dict[str, Any], profile_name: str) -> int:
+    from cocoro.bus.zenoh import ZenohBus
+    from cocoro.clock import FollowedClock
+    from cocoro.component import load as load_component
+    from cocoro.contact import Contact
+    from cocoro.node import Node
+    from cocoro.robot import Robot
+    from cocoro.stop.record import latch_dir
+    from cocoro.vigil import Vigil
+    from deploy import processes, profiles, robot_time
+
+    profile = profiles.from_data(data, profile_name)
+    row = processes.named(process)
+    claims = run_dir.claim(process, row.services)
+    try:
+        with suppress(PermissionError):  # to be preferred is a privilege
+            os.nice(row.nice)
+        component = load_component(row)
+        config = profile.config(process, component.config)
+        launch = profile.launch(process)
+        robot = Robot.load(_path(profile.description), _path(profile.measured))
+        log = logging.getLogger(f"cocoro.{process}")
+        log.info("%s with %s", row.module, config)
+        stop = _stop_signal()
+        # Whoever comes first, without a supervisor, fixes the robot's time for those who come later.
+        real_clock = robot_time.clock if run_dir.populated else robot_time.fix
+        async with (
+            await ZenohBus.open(run_dir.join_as(process, profile.mesh, frames=bool(row.frames))) as bus,
+            Node(
+                process,
+                bus,
+                FollowedClock() if profile.clock == "sim" else real_clock(run_dir.path),
+                robot,
+                robot_name=profile.robot,
+                latency_s=launch.latency_s,
+                record_steps=launch.record_steps,
+                module=row.module,
+                config=config,
+                profile=data,
+                latches=latch_dir(profile.robot),
+                contact=Contact(run_dir.claimant_pid, Vigil(log.warning)),
+            ) as node,
+        ):
+            log.info("joined the mesh at %s", bus.where)
+            if await _until(stop, component.run(node, config)):
+                log.info("told to end")
+                return OK
+        log.error("ended by itself, though a component runs for ever")
+        return CRASHED
+    finally:
+        for claim in claims:
+            claim.release()
+
+
+def _path(file: str | None) -> Path | None:
+    return None if file is None else Path(file)
+
+
+def _stop_signal() -> asyncio.Event:
+    """Set by the first SIGTERM or SIGINT; a second one ends the process at once."""
+    loop, stop = asyncio.get_running_loop(), asyncio.Event()
+    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
+
+    def told() -> None:
+        stop.set()
+        for number, handler in before.items():
+            loop.remove_signal_handler(number)
+            signal.signal(number, handler)
+
+    for number in before:
+        loop.add_signal_handler(number, told)
+    return stop
+
+
+async def _until(stop: asyncio.Event, work: Awaitable[None]) -> bool:
+    """Whether `stop` came before the work's end; the work is cancelled then, and its errors while ending are raised."""
+    working, stopping = asyncio.ensure_future(work), asyncio.ensure_future(stop.wait())
+    await asyncio.wait((working, stopping), return_when=asyncio.FIRST_COMPLETED)
+    stopping.cancel()
+    if working.done():
+        working.result()
+        return False
+    working.cancel()
+    with suppress(asyncio.CancelledError):
+        await working
+    return True
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="python -m deploy.launch", description="Run one process of a robot.")
+    parser.add_argument("process")
+    parser.add_argument("--run-dir", type=Path, required=True, help="the robot's folder, with its profile.json")
+    parser.add_argument("--parent-fd", type=int, help="a pipe that closes when the supervisor dies")
+    options = parser.parse_args(arguments)
+    faulthandler.enable()
+    set_up_logging(options.process)
+    if options.parent_fd is not None:
+        watch_parent(options.parent_fd)
+    folder: Path = options.run_dir
+    run_dir = RunDir(folder.name, folder.parent)
+    profile = run_dir.resolved()
+    return run(options.process, run_dir, profile, profile.get("name", ""))
+
+
+if __name__ == "__main__":
+    quit_process(main())

@@ -1,0 +1,185 @@
+"""Profiles: which robot, which processes, how they are configured and where they meet. One TOML file each.
+
+robot = "calliope"
+clock = "sim"                     # or "real"
+processes = ["sim", "perception", "planning", "executive"]
+objects = "objects.toml"          # known objects instead of the project's own; beside this file
+
+[mesh]                            # see deploy.rundir.Mesh; on one machine nothing need be said
+[service.sim]                     # that process's own Config; and for each of them
+latency_s = 0.0                   #   added to every step, as if computing took that much longer
+record_steps = false              #   publish what each step consumed
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterable
+from importlib import resources
+from importlib.resources.abc import Traversable
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+import msgspec
+from msgspec import Meta
+
+from cocoro.component import Process
+from cocoro.errors import ConfigError
+from deploy.processes import named
+from deploy.rundir import Mesh
+
+C = TypeVar("C")
+Name = Annotated[str, Meta(pattern=r"\A[a-z0-9][a-z0-9_-]{0,31}\Z")]
+"""A chunk of a key, and a directory."""
+
+PACKAGE = "deploy"
+"""Where the profiles that come with the project are; a resource, not an import."""
+
+
+class Launch(msgspec.Struct, frozen=True, kw_only=True):
+    """What a `[service.NAME]` table may say of any process, beside what its own Config says."""
+
+    latency_s: Annotated[float, Meta(ge=0, le=60)] = 0.0
+    record_steps: bool = False
+
+
+class Profile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A profile, resolved: overrides applied, paths absolute, names checked. Make it with `read`."""
+
+    name: str = ""
+    """Where it came from, for messages; not written in the file."""
+    robot: Name
+    clock: Literal["sim", "real"] = "real"
+    processes: Annotated[tuple[Name, ...], Meta(min_length=1)]
+    """In the order in which they are started; they are stopped in reverse."""
+    description: str | None = None
+    """A robot description file instead of the Calliope's."""
+    measured: str | None = None
+    """A robot's own file with the values that were measured on that robot; it overrides the description."""
+    objects: str | None = None
+    """A file of known objects instead of the project's own, for every process whose Config has a field of that name."""
+    mesh: Mesh = Mesh()
+    service: dict[Name, dict[str, Any]] = {}
+
+    def rows(self) -> tuple[Process, ...]:
+        return tuple(named(name) for name in self.processes)
+
+    def services(self) -> tuple[str, ...]:
+        """All services that are alive when the profile is up."""
+        return tuple(service for row in self.rows() for service in row.services)
+
+    def launch(self, process: str) -> Launch:
+        return self._convert(process, self._table(process), Launch)
+
+    def config(self, process: str, kind: type[C]) -> C:
+        """A process's table as its Config. Raises ConfigError that names profile, table and field."""
+        table = {k: v for k, v in self._table(process).items() if k not in Launch.__struct_fields__}
+        if self.objects is not None and "objects" in getattr(kind, "__struct_fields__", ()):
+            table = {"objects": self.objects} | table
+        return self._convert(process, table, kind)
+
+    def _table(self, process: str) -> dict[str, Any]:
+        return self.service.get(named(process).settings or process, {})
+
+    def _convert(self, process: str, table: dict[str, Any], kind: type[C]) -> C:
+        try:
+            return msgspec.convert(table, kind)
+        except msgspec.ValidationError as error:
+            raise ConfigError(f"profile {self.name}, [service.{process}]: {_plain(error)}") from error
+
+
+def names() -> list[str]:
+    """The profiles that come with the project."""
+    folder = resources.files(PACKAGE).joinpath("profiles")
+    return sorted(entry.name.removesuffix(".toml") for entry in folder.iterdir() if entry.name.endswith(".toml"))
+
+
+def read(which: str, overrides: Iterable[str] = ()) -> Profile:
+    """Read the profile of that name, or of that path, and apply overrides such as `service.sim.seed=3`.
+
+    Raises ConfigError that names file, table and field.
+    """
+    source = _find(which)
+    try:
+        data = tomllib.loads(source.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"profile {which} cannot be read: {error}") from error
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"profile {source}: {error}") from error
+    for override in overrides:
+        _override(data, override)
+    profile = from_data(data, which)
+    home = source.parent if isinstance(source, Path) else None
+    return msgspec.structs.replace(
+        profile,
+        description=_absolute(profile.description, home),
+        measured=_absolute(profile.measured, home),
+        objects=_absolute(profile.objects, home),
+    )
+
+
+def from_data(data: dict[str, Any], name: str) -> Profile:
+    try:
+        profile = msgspec.structs.replace(msgspec.convert(data, Profile), name=name)
+    except msgspec.ValidationError as error:
+        raise ConfigError(f"profile {name}: {_plain(error)}") from error
+    if len(set(profile.processes)) < len(profile.processes):
+        raise ConfigError(f"profile {name}: processes names one twice")
+    try:
+        rows = profile.rows()
+    except ConfigError as error:
+        raise ConfigError(f"profile {name}, processes: {error}") from error
+    owner: dict[str, str] = {}
+    for row in rows:
+        for service in row.services:
+            if service in owner:
+                raise ConfigError(f"profile {name}, processes: {owner[service]} and {row.name} are both {service}")
+            owner[service] = row.name
+    for table in profile.service:
+        named(table)
+        profile.launch(table)
+    return profile
+
+
+def _find(which: str) -> Path | Traversable:
+    if "/" in which or which.endswith(".toml"):
+        path = Path(which).resolve()
+        if not path.is_file():
+            raise ConfigError(f"there is no profile file {which}")
+        return path
+    known = names()
+    if which not in known:
+        raise ConfigError(
+            f"there is no profile {which!r}; known are {', '.join(known)}, or give the path of a .toml file"
+        )
+    return resources.files(PACKAGE).joinpath("profiles", f"{which}.toml")
+
+
+def _override(data: dict[str, Any], override: str) -> None:
+    """Apply `a.b.c=value`; the value as in TOML, or, where that is none, as it stands."""
+    path, equals, text = override.partition("=")
+    keys = path.strip().split(".")
+    if not equals or not all(keys):
+        raise ConfigError(f"{override!r} is no setting; write it as service.sim.seed=3")
+    try:
+        value = tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        value = text
+    table = data
+    for key in keys[:-1]:
+        table = table.setdefault(key, {})
+        if not isinstance(table, dict):
+            raise ConfigError(f"{override!r}: {key} is a value, not a table")
+    table[keys[-1]] = value
+
+
+def _absolute(file: str | None, home: Path | None) -> str | None:
+    if file is None or home is None:
+        return file
+    return str((home / file).resolve())
+
+
+def _plain(error: msgspec.ValidationError) -> str:
+    """msgspec's words, with the field in place of its path: 'seed: Expected `int`, got `str`'."""
+    text, at, path = str(error).partition(" - at `$.")
+    return f"{path.rstrip('`')}: {text}" if at else text
