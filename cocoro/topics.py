@@ -1,5 +1,5 @@
 """What travels on the mesh: one table. Recorder, health, access control and the documentation are derived
-from it; adding a message type means a class in `messages.py` and a row here.
+from it; adding a message type means a class in `cocoro/messages/` and a row here.
 
 A key is `<robot>/<service>/<topic>`. Rows with `{service}` in their name stand for one topic per service.
 """

@@ -6,18 +6,18 @@ import json
 import subprocess
 import sys
 import tempfile
-import types
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from apps.cli import estop, rehearse
-from apps.cli.main import main
+from apps.cli import estop
+from apps.cli.main import PACKAGES, main
 from apps.cli.options import frames_of, latencies_of
 from apps.cli.running import overrides
 from apps.cli.table import table
+from apps.rehearsal import rehearse as rehearsing
 from apps.rehearsal.request import RehearsalRequest
 from cocoro.errors import CocoroError, ConfigError
 from cocoro.topics import STOPPABLE, TOPICS
@@ -143,8 +143,8 @@ def test_the_emergency_stop_imports_next_to_nothing() -> None:
     code = "import sys; from apps.cli import main, estop; estop.by_path('nobody'); print(*sys.modules)"
     done = subprocess.run([sys.executable, "-S", "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
     modules = set(done.stdout.split())
-    assert {name for name in modules if name.startswith("cocoro")} == {
-        "cocoro", "apps.cli", "apps.cli.main", "apps.cli.exits", "apps.cli.output", "apps.cli.estop",
+    assert {name for name in modules if name.partition(".")[0] in PACKAGES} == {
+        "apps", "cocoro", "deploy", "apps.cli", "apps.cli.main", "apps.cli.exits", "apps.cli.output", "apps.cli.estop",
         "deploy.quit", "cocoro.stop", "cocoro.stop.asking", "cocoro.stop.owners",
     }  # fmt: skip
     assert modules.isdisjoint({"asyncio", "argparse", "json", "pathlib", "typing_extensions", "msgspec", "zenoh"})
@@ -173,10 +173,7 @@ def simulator(monkeypatch: pytest.MonkeyPatch) -> list[RehearsalRequest]:
         print("pybullet build time: today", flush=True)
         return RESULT | {"outcome": "failed" if request.label == "blue_can" else "done"}
 
-    module = types.ModuleType("fake_simulator")
-    module.rehearse = run  # type: ignore[attr-defined]
-    monkeypatch.setitem(sys.modules, module.__name__, module)
-    monkeypatch.setattr(rehearse, "SIMULATOR", module.__name__)
+    monkeypatch.setattr(rehearsing, "rehearse", run)
     return asked
 
 
@@ -223,7 +220,7 @@ def test_a_refused_rehearsal_exits_as_the_refused_task_would(
         error.code = refusal  # type: ignore[attr-defined]
         raise error
 
-    monkeypatch.setattr(sys.modules[rehearse.SIMULATOR], "rehearse", refuse)
+    monkeypatch.setattr(rehearsing, "rehearse", refuse)
     assert main(["rehearse", "fetch", "grey_can"]) == code
 
 

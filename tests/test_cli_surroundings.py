@@ -182,7 +182,7 @@ def test_the_error_of_one_task_of_several_is_told_as_its_own(capsys: pytest.Capt
 
 
 def line_of(text: str) -> int:
-    lines = (Path(__file__).parent.parent / "cocoro" / "cli" / "app.py").read_text(encoding="utf-8").splitlines()
+    lines = (Path(__file__).parent.parent / "apps" / "cli" / "app.py").read_text(encoding="utf-8").splitlines()
     return next(number for number, line in enumerate(lines, 1) if text in line)
 
 

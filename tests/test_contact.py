@@ -79,7 +79,7 @@ def test_one_of_another_machine_is_never_known_to_be_dead(tmp_path: Path) -> Non
 
     @in_virtual_time
     async def scenario() -> None:
-        contact = Contact(run_dir)
+        contact = Contact(run_dir.claimant_pid)
         contact.met("base")
         assert not contact.dead("base")
         assert await contact.lost("base") == "lost contact with base"
@@ -89,7 +89,7 @@ def test_one_of_another_machine_is_never_known_to_be_dead(tmp_path: Path) -> Non
 
 def test_one_that_is_met_again_lives_again(tmp_path: Path) -> None:
     run_dir = RunDir("calliope", tmp_path)
-    contact = Contact(run_dir)
+    contact = Contact(run_dir.claimant_pid)
     (first,) = run_dir.claim("base", ["base"])
     contact.met("base")
     first.release()
@@ -102,7 +102,7 @@ def test_one_that_is_met_again_lives_again(tmp_path: Path) -> None:
 
 def test_a_run_directory_that_cannot_be_read_says_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run_dir = RunDir("calliope", tmp_path)
-    contact = Contact(run_dir)
+    contact = Contact(run_dir.claimant_pid)
     (claim,) = run_dir.claim("base", ["base"])
     contact.met("base")
 

@@ -14,7 +14,7 @@ from apps.cli import new
 from apps.cli.main import main
 
 ROOT = Path(__file__).parent.parent
-TEMPLATES = ROOT / "cocoro" / "templates"
+TEMPLATES = ROOT / "apps" / "templates"
 
 
 @pytest.fixture
@@ -90,8 +90,8 @@ def test_a_place_that_cannot_be_written_to_is_named(tmp_path: Path, capsys: pyte
 
 
 def test_the_templates_are_part_of_the_package() -> None:
-    patterns = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]["cocoro"]
-    packed = {path for pattern in patterns for path in (ROOT / "cocoro").glob(pattern)}
+    patterns = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]["apps"]
+    packed = {path for pattern in patterns for path in (ROOT / "apps").glob(pattern)}
     files = {path for path in TEMPLATES.rglob("*") if path.is_file()}
     assert files <= packed
     assert len(files) == len(list(new.files({"name": "a", "package": "a", "class": "A"})))

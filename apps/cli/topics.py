@@ -65,7 +65,7 @@ def markdown() -> str:
     mentioned += [name for request in REQUESTS for name in (request.request.__name__, request.reply.__name__)]
     parts = [
         "# Topics\n",
-        "Made by `cocoro topics --markdown` from `cocoro/topics.py` and `cocoro/messages.py`; change those.\n",
+        "Made by `cocoro topics --markdown` from `cocoro/topics.py` and `cocoro/messages/`; change those.\n",
         "A key is `<robot>/<topic>`. A payload is one MessagePack map, its fields named as below; a reader ignores\n"
         "fields that it does not know. SI units, in the names. What arrives malformed, wrongly typed, oversized or\n"
         "out of order is counted in the reader's health and dropped.\n",
@@ -99,9 +99,10 @@ class _Type(NamedTuple):
 
 
 def _types() -> dict[str, _Type]:
-    """The classes of `messages.py` as they are written: a field's text is the string that follows it."""
-    module = ast.parse(resources.files("cocoro").joinpath("messages.py").read_text(encoding="utf-8"))
-    return {node.name: _type(node) for node in module.body if isinstance(node, ast.ClassDef)}
+    """The classes of `cocoro.messages` as they are written: a field's text is the string that follows it."""
+    files = [file for file in resources.files("cocoro.messages").iterdir() if file.name.endswith(".py")]
+    modules = [ast.parse(file.read_text(encoding="utf-8")) for file in files]
+    return {node.name: _type(node) for module in modules for node in module.body if isinstance(node, ast.ClassDef)}
 
 
 def _type(node: ast.ClassDef) -> _Type:

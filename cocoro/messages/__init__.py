@@ -1,0 +1,144 @@
+"""The typed messages of the mesh: SI units, named in the field (`_m`, `_rad`, `_mps`, `_ns`).
+
+Every message is a MessagePack map on the wire, validated when it is decoded. Positions are in the body
+frame unless the field says otherwise: x forward, y left, z up, origin on the floor between the drive
+wheels. A reader ignores fields that it does not know, so a field with a default may be added at any time.
+"""
+
+from __future__ import annotations
+
+from cocoro.messages.capture import (
+    DisturbedFile,
+    Recording,
+)
+from cocoro.messages.common import (
+    LARGEST,
+    Count,
+    Finite,
+    LatchState,
+    Message,
+    NonNegative,
+    Quaternion,
+    Vec2,
+    Vec3,
+)
+from cocoro.messages.executive import (
+    CancelRequest,
+    KnownObject,
+    ObjectsReply,
+    ObjectsRequest,
+    Outcome,
+    Phase,
+    RefusalCode,
+    TaskName,
+    TaskReply,
+    TaskRequest,
+    TaskState,
+)
+from cocoro.messages.hardware import (
+    BaseCommand,
+    BaseState,
+    Frame,
+    RecoverReply,
+    RecoverRequest,
+    ServoCommand,
+    ServoReply,
+    ServoRequest,
+    ServoState,
+)
+from cocoro.messages.node import (
+    AboutFile,
+    AboutReply,
+    AboutRequest,
+    Exchange,
+    Health,
+    LoopHealth,
+    StepRecord,
+    TopicHealth,
+)
+from cocoro.messages.perception import (
+    Detection,
+    Detections,
+    Obstacles,
+)
+from cocoro.messages.planning import (
+    Behaviour,
+    HandSample,
+    Intent,
+    LearnedModel,
+    ModelReply,
+    ModelRequest,
+    PlannerStatus,
+    TargetEstimate,
+    WheelTrial,
+)
+from cocoro.messages.sim import (
+    Clock,
+    TrueObject,
+    Truth,
+)
+from cocoro.messages.stop import (
+    EstopReply,
+    EstopRequest,
+    Latch,
+)
+
+__all__ = [
+    "LARGEST",
+    "AboutFile",
+    "AboutReply",
+    "AboutRequest",
+    "BaseCommand",
+    "BaseState",
+    "Behaviour",
+    "CancelRequest",
+    "Clock",
+    "Count",
+    "Detection",
+    "Detections",
+    "DisturbedFile",
+    "EstopReply",
+    "EstopRequest",
+    "Exchange",
+    "Finite",
+    "Frame",
+    "HandSample",
+    "Health",
+    "Intent",
+    "KnownObject",
+    "Latch",
+    "LatchState",
+    "LearnedModel",
+    "LoopHealth",
+    "Message",
+    "ModelReply",
+    "ModelRequest",
+    "NonNegative",
+    "ObjectsReply",
+    "ObjectsRequest",
+    "Obstacles",
+    "Outcome",
+    "Phase",
+    "PlannerStatus",
+    "Quaternion",
+    "Recording",
+    "RecoverReply",
+    "RecoverRequest",
+    "RefusalCode",
+    "ServoCommand",
+    "ServoReply",
+    "ServoRequest",
+    "ServoState",
+    "StepRecord",
+    "TargetEstimate",
+    "TaskName",
+    "TaskReply",
+    "TaskRequest",
+    "TaskState",
+    "TopicHealth",
+    "TrueObject",
+    "Truth",
+    "Vec2",
+    "Vec3",
+    "WheelTrial",
+]

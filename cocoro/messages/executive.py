@@ -1,0 +1,90 @@
+"""Tasks: how they are asked for, refused, followed and ended; and the known objects."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import Meta
+
+from cocoro.messages.common import Count, Finite, Message, Vec3
+from cocoro.messages.planning import TargetEstimate
+
+TaskName = Literal["fetch", "follow", "touch", "go-to", "park", "put-down", "babble-arm", "babble-wheels"]
+Outcome = Literal["done", "failed", "cancelled"]
+
+
+class Phase(msgspec.Struct, kw_only=True):
+    name: str
+    start_ns: int
+    end_ns: int | None = None
+
+
+class TaskState(Message):
+    """The task that runs, or the one that ran last."""
+
+    task_id: str = ""
+    task: str = ""
+    label: str = ""
+    phase: str = "idle"
+    text: str = ""
+    """What it does now, in words, with the planner's reason."""
+    distance_m: Finite | None = None
+    started_ns: int = 0
+    phases: tuple[Phase, ...] = ()
+    outcome: Outcome | None = None
+    reason: str = ""
+    """For failed and cancelled: not_found, lost, slipped, unreachable, timed_out, ... and words after a colon."""
+    elapsed_s: Finite = 0.0
+
+
+class TaskRequest(msgspec.Struct, kw_only=True):
+    task: TaskName
+    label: str = ""
+    timeout_s: Annotated[float, Meta(gt=0, le=3600)] | None = None
+    bring: bool = False
+    """Fetch: carry it to where the task began and put it down there."""
+    for_s: Annotated[float, Meta(gt=0, le=3600)] | None = None
+    """Follow: for so long; None is until cancelled."""
+    distance_m: Annotated[float, Meta(ge=0, le=5)] = 0.2
+    """Go-to: from the robot's centre to the target's nearest edge, over the floor."""
+    first: Count = 0
+    """Babbling: the number of its first draw, to go on where an earlier one ended."""
+    count: Annotated[int, Meta(ge=1, le=1_000_000)] = 1000
+    """Babbling: how many samples or trials make an end of it."""
+
+
+RefusalCode = Literal[
+    "unknown_label", "not_graspable", "busy", "estop", "not_alive", "battery", "holding", "not_holding", "bad_request",
+    "no_task",
+]  # fmt: skip
+
+
+class TaskReply(msgspec.Struct, kw_only=True):
+    """Accepted with a task's id, or refused with a code and a sentence that says what to do."""
+
+    accepted: bool
+    task_id: str = ""
+    refusal: RefusalCode | None = None
+    text: str = ""
+
+
+class CancelRequest(msgspec.Struct, kw_only=True):
+    task_id: str = ""
+    """Empty cancels whatever runs."""
+
+
+class ObjectsRequest(msgspec.Struct, kw_only=True):
+    pass
+
+
+class KnownObject(msgspec.Struct, kw_only=True):
+    label: str
+    shape: Literal["cylinder", "sphere", "box"]
+    size_m: Vec3
+    graspable: bool
+    seen: TargetEstimate | None = None
+
+
+class ObjectsReply(msgspec.Struct, kw_only=True):
+    objects: tuple[KnownObject, ...]
