@@ -20,9 +20,9 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from apps.learning.study import BEST, METHODS, Sightings, fit
-from cocoro.learning.drawing import Drawing
 from cocoro.learning.fitting import LeastSquares, learn_in_order
 from cocoro.learning.network import PAPER_RATE, HyperplaneRbf
+from cocoro.learning.nominal_model import NominalModel
 from cocoro.learning.reachability import ReachMesh
 from cocoro.robot import Robot
 
@@ -35,7 +35,7 @@ def best_s(call: Callable[[], object], number: int = 1, repeat: int = 5) -> floa
 
 
 def main() -> None:
-    drawing = Drawing(Robot.load())
+    drawing = NominalModel(Robot.load())
     rng = np.random.default_rng(0)
     low, high = drawing.limits_rad.T
     angles = rng.uniform(low, high, (SAMPLES, 4))

@@ -6,7 +6,7 @@ import numpy as np
 
 from apps.learning.study import Sightings
 from cocoro.kinematics import Array
-from cocoro.learning.drawing import Drawing
+from cocoro.learning.nominal_model import NominalModel
 from cocoro.robot import Robot
 from sim.wear import body_of
 
@@ -16,7 +16,7 @@ NOISE_M = 0.002
 def sightings(robot: Robot, *, seed: int = 0, draws: int = 150, each: int = 4, noise_m: float = NOISE_M) -> Sightings:
     """So many moves through the arm's range, so many frames of each."""
     rng = np.random.default_rng(seed)
-    true = Drawing(body_of(robot, "worn", seed).robot)
+    true = NominalModel(body_of(robot, "worn", seed).robot)
     low, high = true.limits_rad.T
     # A part of the range, as much as a camera sees of it.
     low, high = low + 0.3 * (high - low), high - 0.3 * (high - low)

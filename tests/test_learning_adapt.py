@@ -7,7 +7,7 @@ import pytest
 from learning_arm import sightings
 
 from apps.learning.study import BEST, Sightings, errors_m, fit, rms, split
-from cocoro.learning.drawing import Drawing
+from cocoro.learning.nominal_model import NominalModel
 from cocoro.robot import Robot
 from services.planning.adapt import Adapter
 from sim.wear import BEND_RAD
@@ -22,7 +22,7 @@ def parts(robot: Robot) -> tuple[Sightings, Sightings, Sightings]:
 
 
 def bent(robot: Robot, seen: Sightings) -> Sightings:
-    drawing = Drawing(robot)
+    drawing = NominalModel(robot)
     beyond = seen.angles_rad + np.array([0.0, 0.0, BEND_RAD, 0.0])
     shift = drawing.predict(beyond) - drawing.predict(seen.angles_rad)
     return Sightings(seen.angles_rad, seen.places_m + shift, seen.draws)
@@ -30,7 +30,7 @@ def bent(robot: Robot, seen: Sightings) -> Sightings:
 
 def test_nothing_is_lost_while_nothing_changes(robot: Robot, parts: tuple[Sightings, Sightings, Sightings]) -> None:
     learn, work, held = parts
-    learned = fit(BEST, Drawing(robot), learn)
+    learned = fit(BEST, NominalModel(robot), learn)
     before = rms(errors_m(learned, held))
     adapter = Adapter(learned, before)
     for angles, place in zip(work.angles_rad, work.places_m, strict=True):
@@ -42,7 +42,7 @@ def test_nothing_is_lost_while_nothing_changes(robot: Robot, parts: tuple[Sighti
 
 def test_a_bent_arm_is_noticed_and_learned(robot: Robot, parts: tuple[Sightings, Sightings, Sightings]) -> None:
     learn, work, held = parts
-    learned = fit(BEST, Drawing(robot), learn)
+    learned = fit(BEST, NominalModel(robot), learn)
     usual_m = rms(errors_m(learned, held))
     work, held = bent(robot, work), bent(robot, held)
     adapter = Adapter(learned, usual_m)
@@ -59,7 +59,7 @@ def test_a_bent_arm_is_noticed_and_learned(robot: Robot, parts: tuple[Sightings,
 
 def test_what_is_not_the_hand_teaches_nothing(robot: Robot, parts: tuple[Sightings, Sightings, Sightings]) -> None:
     learn, work, _held = parts
-    adapter = Adapter(fit(BEST, Drawing(robot), learn), 0.003)
+    adapter = Adapter(fit(BEST, NominalModel(robot), learn), 0.003)
     weights = adapter.map.network.weights.copy()
     adapter.add(work.angles_rad[0], work.places_m[0] + 1.0)
     assert adapter.samples == 0

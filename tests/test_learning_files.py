@@ -17,8 +17,8 @@ from apps.learning.study import BEST, METHODS, fit
 from cocoro.errors import ConfigError, RefusedError
 from cocoro.learning import dataset, model
 from cocoro.learning.dataset import HandRow, WheelRow, Writer, hand_header, wheel_header
-from cocoro.learning.drawing import Drawing
 from cocoro.learning.model import Training, WheelModel
+from cocoro.learning.nominal_model import NominalModel
 from cocoro.robot import Robot
 
 TRAINING = Training(data="0123456789abcdef", samples=600, method=BEST.name, scores={"held_out_rms_m": 0.0035})
@@ -32,7 +32,7 @@ def row(draw: int) -> HandRow:
 
 
 def opened(path: Path, robot: Robot) -> Writer[HandRow]:
-    return Writer(path, HandRow, robot, hand_header(robot, Drawing(robot).joints, np.pi / 2))
+    return Writer(path, HandRow, robot, hand_header(robot, NominalModel(robot).joints, np.pi / 2))
 
 
 # --- samples ----------------------------------------------------------------------------------------
@@ -64,7 +64,7 @@ KILLED = """
 import sys
 from pathlib import Path
 from cocoro.learning.dataset import HandRow, Writer, hand_header
-from cocoro.learning.drawing import Drawing
+from cocoro.learning.nominal_model import Drawing
 from cocoro.robot import Robot
 
 robot = Robot.load()
@@ -86,7 +86,7 @@ def test_killed_in_the_middle_nothing_that_was_appended_is_lost(tmp_path: Path, 
                 process.send_signal(signal.SIGKILL)
                 break
         said = [200, *map(int, process.stdout.read().split())]
-    writer = Writer(path, HandRow, robot, hand_header(robot, Drawing(robot).joints, 1.57))
+    writer = Writer(path, HandRow, robot, hand_header(robot, NominalModel(robot).joints, 1.57))
     with writer:
         draws = [sample.draw for sample in writer.rows]
         assert draws[: said[-1] + 1] == list(range(said[-1] + 1))
@@ -169,7 +169,7 @@ def test_a_damaged_line_is_named(tmp_path: Path, robot: Robot) -> None:
 @pytest.fixture(scope="module")
 def learned(robot: Robot) -> model.Model:
     seen = sightings(robot, draws=60)
-    arm = model.arm_model(fit(BEST, Drawing(robot), seen), np.pi / 2, seen.places_m, TRAINING)
+    arm = model.arm_model(fit(BEST, NominalModel(robot), seen), np.pi / 2, seen.places_m, TRAINING)
     return msgspec.structs.replace(
         model.empty(robot), arm=arm, wheels=WheelModel(separation_m=0.2575, training=TRAINING)
     )
@@ -180,7 +180,7 @@ def test_a_map_computes_the_same_after_it_was_saved(
     tmp_path: Path, robot: Robot, method: object, learned: model.Model
 ) -> None:
     seen = sightings(robot, draws=60)
-    before = fit(method, Drawing(robot), seen)  # type: ignore[arg-type]
+    before = fit(method, NominalModel(robot), seen)  # type: ignore[arg-type]
     arm = model.arm_model(before, np.pi / 2, seen.places_m, TRAINING)
     model.save(msgspec.structs.replace(learned, arm=arm), tmp_path / "model.json")
     loaded = model.load(tmp_path / "model.json", robot)

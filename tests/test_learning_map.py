@@ -26,14 +26,14 @@ from apps.learning.study import (
     split,
 )
 from cocoro.frames import to_spherical
-from cocoro.learning.drawing import Drawing
 from cocoro.learning.handmap import cartesian_of, spherical_of
+from cocoro.learning.nominal_model import NominalModel
 from cocoro.robot import Robot
 
 
 @pytest.fixture(scope="module")
-def drawing(robot: Robot) -> Drawing:
-    return Drawing(robot)
+def drawing(robot: Robot) -> NominalModel:
+    return NominalModel(robot)
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +41,7 @@ def seen(robot: Robot) -> Sightings:
     return sightings(robot)
 
 
-def test_the_drawing_is_the_robots_own_kinematics(robot: Robot, drawing: Drawing) -> None:
+def test_the_drawing_is_the_robots_own_kinematics(robot: Robot, drawing: NominalModel) -> None:
     assert drawing.joints == ("arm_base", "shoulder", "elbow", "wrist_pitch")
     chain = robot.chain(robot.marker.link)
     angles = np.random.default_rng(0).uniform(-1.5, 1.5, (20, 4))
@@ -51,7 +51,7 @@ def test_the_drawing_is_the_robots_own_kinematics(robot: Robot, drawing: Drawing
         assert np.allclose(drawing.jacobian(row), slope_by_differences(drawing, row), atol=1e-7)
 
 
-def test_priming_is_10_000_distinct_postures(drawing: Drawing) -> None:
+def test_priming_is_10_000_distinct_postures(drawing: NominalModel) -> None:
     angles, places = drawing.priming()
     assert angles.shape == (10_000, 4)
     assert places.shape == (10_000, 3)
@@ -66,7 +66,9 @@ def test_spherical_coordinates_are_those_of_the_common_frame() -> None:
 
 
 @pytest.mark.parametrize("method", [*METHODS[:4], BEST, METHODS[6]], ids=lambda method: method.name)
-def test_every_maps_jacobian_is_that_of_finite_differences(method: Method, drawing: Drawing, seen: Sightings) -> None:
+def test_every_maps_jacobian_is_that_of_finite_differences(
+    method: Method, drawing: NominalModel, seen: Sightings
+) -> None:
     learned = fit(method, drawing, seen)
     for angles in seen.angles_rad[::60]:
         assert np.allclose(learned.jacobian(angles), slope_by_differences(learned, angles), atol=1e-6)
@@ -74,7 +76,7 @@ def test_every_maps_jacobian_is_that_of_finite_differences(method: Method, drawi
 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_over_the_drawing_the_map_comes_near_to_the_noise_of_what_was_seen(robot: Robot, seed: int) -> None:
-    drawing = Drawing(robot)
+    drawing = NominalModel(robot)
     learn, held = split(sightings(robot, seed=seed, draws=200))
     plain, shifted = baselines(drawing, learn, held)
     reached = score(BEST, drawing, learn, held)
@@ -83,7 +85,9 @@ def test_over_the_drawing_the_map_comes_near_to_the_noise_of_what_was_seen(robot
     assert reached.cross_validated_m == pytest.approx(reached.held_out_m, rel=0.4)
 
 
-def test_the_papers_rule_learns_and_least_squares_learns_more_of_the_same(drawing: Drawing, seen: Sightings) -> None:
+def test_the_papers_rule_learns_and_least_squares_learns_more_of_the_same(
+    drawing: NominalModel, seen: Sightings
+) -> None:
     learn, held = split(seen)
     by_name = {method.name: method for method in METHODS}
     rule, squares = by_name["the paper's rule, 81 bases"], by_name["81 bases, least squares"]
@@ -93,7 +97,7 @@ def test_the_papers_rule_learns_and_least_squares_learns_more_of_the_same(drawin
     assert rms(errors_m(fit(squares, drawing, learn), held)) < 0.3 * taught
 
 
-def test_more_sightings_make_the_map_better(drawing: Drawing, seen: Sightings) -> None:
+def test_more_sightings_make_the_map_better(drawing: NominalModel, seen: Sightings) -> None:
     learn, held = split(seen)
     errors = curve(BEST, drawing, learn, held, (30, 100, 400, 100_000))
     assert len(errors) == 3
@@ -107,11 +111,11 @@ def test_whole_draws_are_held_out(seen: Sightings) -> None:
     assert len(held) == pytest.approx(len(seen) / 5, rel=0.02)
 
 
-def test_too_few_draws_cannot_be_cross_validated(drawing: Drawing, seen: Sightings) -> None:
+def test_too_few_draws_cannot_be_cross_validated(drawing: NominalModel, seen: Sightings) -> None:
     assert np.isnan(cross_validate(BEST, drawing, seen.pick(seen.draws < 3)))
 
 
-def test_the_best_is_the_one_of_the_smallest_cross_validated_error(drawing: Drawing, seen: Sightings) -> None:
+def test_the_best_is_the_one_of_the_smallest_cross_validated_error(drawing: NominalModel, seen: Sightings) -> None:
     learn, held = split(seen)
     methods = (METHODS[2], BEST)
     scores = [score(method, drawing, learn, held) for method in methods]
@@ -127,7 +131,7 @@ def test_the_grid_varies_bases_width_and_rate() -> None:
     assert len({method.doubt for method in grid("least squares")}) == 3
 
 
-def test_a_sighting_that_no_other_is_near_to_is_an_outlier(drawing: Drawing, seen: Sightings) -> None:
+def test_a_sighting_that_no_other_is_near_to_is_an_outlier(drawing: NominalModel, seen: Sightings) -> None:
     places = seen.places_m.copy()
     places[7] += [0.0, 0.0, 1.0]
     mask = inliers(places)
@@ -141,7 +145,7 @@ def test_sparse_sightings_are_not_all_outliers() -> None:
     assert inliers(sparse[:1]).all()
 
 
-def test_a_wrong_sighting_amidst_good_ones_is_found_by_its_error(drawing: Drawing, seen: Sightings) -> None:
+def test_a_wrong_sighting_amidst_good_ones_is_found_by_its_error(drawing: NominalModel, seen: Sightings) -> None:
     places = seen.places_m.copy()
     places[[3, 90]] = places[[90, 3]]  # each where another truly was
     kept = clean(Sightings(seen.angles_rad, places, seen.draws), drawing)

@@ -11,7 +11,7 @@ from cocoro import topics
 from cocoro.clock import NS
 from cocoro.core import Output, Sample
 from cocoro.kinematics import Array
-from cocoro.learning.drawing import Drawing
+from cocoro.learning.nominal_model import NominalModel
 from cocoro.messages import (
     BaseCommand,
     BaseState,
@@ -131,7 +131,7 @@ class Body:
         self.reports: list[Output] = []
         self.status = PlannerStatus()
         self._separation_m = separation_m
-        self._drawing = Drawing(robot)
+        self._drawing = NominalModel(robot)
         self._wheels = (0.0, 0.0)
 
     def run(self, intent: Intent, *, ticks: int) -> PlannerStatus:
@@ -211,7 +211,7 @@ def test_the_arm_babbles_until_there_are_samples_enough_and_comes_home(robot: Ro
     assert (status.state, status.why) == ("done", "90 samples")
     samples = [output.message for output in body.reports]
     assert len(samples) == 90
-    drawing = Drawing(robot)
+    drawing = NominalModel(robot)
     for sample in samples:
         assert isinstance(sample, HandSample)
         angles = np.array([sample.angles_rad[name] for name in ARM])

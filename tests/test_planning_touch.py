@@ -13,15 +13,15 @@ from apps.rehearsal.rehearse import rehearse
 from apps.rehearsal.request import RehearsalRequest
 from cocoro.clock import NS
 from cocoro.kinematics import Array
-from cocoro.learning.drawing import Drawing
 from cocoro.learning.model import Training, arm_model, empty, encode
+from cocoro.learning.nominal_model import NominalModel
 from cocoro.learning.reachability import ReachMesh
 from cocoro.robot import Robot
-from services.planning.behaviours.base import Limbs
+from services.planning.behaviours.base import Actuators
 from services.planning.config import Config
 from services.planning.learned import Learned
 from services.planning.reach import ARM, LEVEL_ROLL_RAD
-from services.planning.senses import Sighting
+from services.planning.state_estimator import Sighting
 from services.planning.teaching import LUMP, Teacher
 
 QUICK = {"width": 160, "height": 120, "frame_rate_hz": 15.0}
@@ -61,7 +61,7 @@ def sighting(number: int, angles: np.ndarray, place: np.ndarray, roll_rad: float
 
 def test_sightings_at_work_teach_a_copy_of_the_map_and_the_mesh(robot: Robot) -> None:
     seen = sightings(robot, draws=60)
-    learned = fit(BEST, Drawing(robot), seen)
+    learned = fit(BEST, NominalModel(robot), seen)
     mesh = ReachMesh(seen.places_m)
     had = len(mesh.places_m)
     teacher = Teacher(learned, 0.003, mesh)
@@ -81,7 +81,7 @@ def test_sightings_at_work_teach_a_copy_of_the_map_and_the_mesh(robot: Robot) ->
 
 def test_a_turned_wrist_and_frames_in_quick_succession_teach_nothing(robot: Robot) -> None:
     seen = sightings(robot, draws=60)
-    teacher = Teacher(fit(BEST, Drawing(robot), seen), 0.003, ReachMesh(seen.places_m))
+    teacher = Teacher(fit(BEST, NominalModel(robot), seen), 0.003, ReachMesh(seen.places_m))
     angles, place = seen.angles_rad[0], seen.places_m[0]
     teacher.step([sighting(1, angles, place, roll_rad=0.0)])
     assert "taught by 0 " in teacher.text
@@ -91,7 +91,7 @@ def test_a_turned_wrist_and_frames_in_quick_succession_teach_nothing(robot: Robo
 
 def test_only_a_planner_that_is_told_to_goes_on_learning_and_it_says_so(robot: Robot) -> None:
     seen = sightings(robot, draws=60)
-    drawing = Drawing(robot)
+    drawing = NominalModel(robot)
     training = Training(data="d", samples=len(seen), method=BEST.name, scores={"held_out_rms_m": 0.003})
     arm = arm_model(fit(BEST, drawing, seen), LEVEL_ROLL_RAD, seen.places_m, training)
     base = empty(robot)
@@ -124,10 +124,10 @@ class LongerHand:
 
 
 def test_a_hand_that_is_learned_to_be_further_out_waits_where_the_arm_still_folds(robot: Robot) -> None:
-    limbs = Limbs(robot, Config())
-    drawn_m = limbs.reachability.retreat_m
+    actuators = Actuators(robot, Config())
+    drawn_m = actuators.reachability.retreat_m
     assert drawn_m == Config().arm.retreat_radius_m
-    limbs.reacher.use(LongerHand(robot, 0.03))
-    limbs.reachability.use(None, None)
-    assert drawn_m + 0.005 < limbs.reachability.retreat_m < drawn_m + 0.04
-    assert limbs.reachability.grasp((0.58, -0.1, 0.06)).behind.radius_m == limbs.reachability.retreat_m
+    actuators.reacher.use(LongerHand(robot, 0.03))
+    actuators.reachability.use(None, None)
+    assert drawn_m + 0.005 < actuators.reachability.retreat_m < drawn_m + 0.04
+    assert actuators.reachability.grasp((0.58, -0.1, 0.06)).behind.radius_m == actuators.reachability.retreat_m

@@ -13,7 +13,7 @@ from apps.learning.lesson import sightings
 from cocoro.errors import ConfigError
 from cocoro.learning import dataset, model
 from cocoro.learning.dataset import HandRow
-from cocoro.learning.drawing import Drawing
+from cocoro.learning.nominal_model import NominalModel
 from cocoro.robot import Robot
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ def sheet(columns: int = 1, rows: int = 1, *, width: float = 5.0, height: float 
 def hand_places(samples: Path, learned: Path) -> Figure:
     """Seen, drawn and learned places of the held-out sightings, from above and from the side."""
     robot = Robot.load()
-    drawing = Drawing(robot)
+    drawing = NominalModel(robot)
     _, held = study.split(study.clean(sightings(dataset.read(samples, HandRow, robot).rows), drawing))
     arm = model.load(learned, robot).arm
     assert arm is not None

@@ -15,7 +15,7 @@ from apps.learning.wheels import fit_wheels
 from cocoro.clock import NS
 from cocoro.learning import dataset, model
 from cocoro.learning.dataset import HandRow, WheelRow
-from cocoro.learning.drawing import Drawing
+from cocoro.learning.nominal_model import NominalModel
 from cocoro.robot import Robot
 from services.planning.adapt import Adapter
 
@@ -29,7 +29,7 @@ def learn(arm: str, wheels: str, into: str, method: str | None = None) -> dict[s
     file.unlink(missing_ok=True)
     _, report = learn_arm(Path(arm), file, robot, method=method)
     _, fit = learn_wheels(Path(wheels), file, robot)
-    drawing = Drawing(robot)
+    drawing = NominalModel(robot)
     rows = dataset.read(Path(arm), HandRow, robot).rows
     learn, held = study.split(study.clean(sightings(rows), drawing))
     methods = {"default": study.BEST, "paper": study.METHODS[0], "paper over drawing": study.METHODS[2]}

@@ -10,7 +10,7 @@ from types import TracebackType
 from typing import Any, Generic, Self
 
 from cocoro.learning.dataset import HandRow, Row, WheelRow, Writer, hand_header, wheel_header
-from cocoro.learning.drawing import LEVEL_ROLL_RAD, arm_joints
+from cocoro.learning.nominal_model import LEVEL_ROLL_RAD, arm_joints
 from cocoro.messages import HandSample, Message, Vec3, WheelTrial
 from cocoro.robot import Robot
 from cocoro.topics import HAND_SAMPLES, WHEEL_TRIALS, Topic

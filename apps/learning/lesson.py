@@ -16,10 +16,10 @@ from apps.learning.study import METHODS, Method, Score, Sightings
 from apps.learning.wheels import WheelFit, fit_wheels
 from cocoro.errors import ConfigError
 from cocoro.learning import dataset, model
+from cocoro.learning.camera_tilt import eye_tilt
 from cocoro.learning.dataset import HandRow, WheelRow
-from cocoro.learning.drawing import Drawing
-from cocoro.learning.eye import eye_tilt
 from cocoro.learning.model import Model, Training, WheelModel
+from cocoro.learning.nominal_model import NominalModel
 from cocoro.robot import Robot
 
 LEAST_SAMPLES = 50
@@ -69,7 +69,7 @@ def learn_arm(
     rows = recorded.rows
     if len(rows) < LEAST_SAMPLES:
         raise ConfigError(f"samples {samples}: {len(rows)} are too few to learn from; {LEAST_SAMPLES} are the least")
-    drawing = Drawing(robot, recorded.header.roll_rad)
+    drawing = NominalModel(robot, recorded.header.roll_rad)
     seen = sightings(rows)
     kept = study.clean(seen, drawing)
     learn, held = study.split(kept)

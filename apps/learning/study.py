@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apps.learning.outliers import inliers, plausible
-from cocoro.learning.drawing import Drawing
 from cocoro.learning.fitting import LeastSquares, folds, learn_in_order
 from cocoro.learning.handmap import Coordinates, HandMap
 from cocoro.learning.network import PAPER_BASES, PAPER_RANGE_RAD, PAPER_RATE, PAPER_WIDTH_RAD, Array, HyperplaneRbf
+from cocoro.learning.nominal_model import NominalModel
 
 PRIMING_SHARE = 0.1
 """Priming points count a tenth of a sighting, in rate or in weight."""
@@ -91,7 +91,7 @@ class Score(NamedTuple):
     fit_s: float
 
 
-def clean(sightings: Sightings, drawing: Drawing) -> Sightings:
+def clean(sightings: Sightings, drawing: NominalModel) -> Sightings:
     """Without the outliers: sightings that no other is near to, and those that disagree with all others."""
     near = sightings.pick(inliers(sightings.places_m))
     if len(near) < 20:
@@ -107,7 +107,7 @@ def split(sightings: Sightings, every: int = HELD_OUT) -> tuple[Sightings, Sight
     return sightings.pick(~held), sightings.pick(held)
 
 
-def fit(method: Method, drawing: Drawing, sightings: Sightings) -> HandMap:
+def fit(method: Method, drawing: NominalModel, sightings: Sightings) -> HandMap:
     """Learn a map."""
     learned, learner = begin(method, drawing)
     targets = learned.targets(sightings.angles_rad, sightings.places_m)
@@ -118,7 +118,7 @@ def fit(method: Method, drawing: Drawing, sightings: Sightings) -> HandMap:
     return learned
 
 
-def begin(method: Method, drawing: Drawing) -> tuple[HandMap, LeastSquares | None]:
+def begin(method: Method, drawing: NominalModel) -> tuple[HandMap, LeastSquares | None]:
     """A map before anything was seen, primed where it does not stand on the drawing; and its learner (None: the
     paper's rule has no state but the weights)."""
     learned, learner = _primed(method, drawing)
@@ -129,7 +129,7 @@ def begin(method: Method, drawing: Drawing) -> tuple[HandMap, LeastSquares | Non
 
 
 @lru_cache(maxsize=16)
-def _primed(method: Method, drawing: Drawing) -> tuple[HandMap, LeastSquares | None]:
+def _primed(method: Method, drawing: NominalModel) -> tuple[HandMap, LeastSquares | None]:
     count = len(drawing.joints)
     ranges = np.tile([-PAPER_RANGE_RAD, PAPER_RANGE_RAD], (count, 1))
     network = HyperplaneRbf.spread([method.bases] * count, [method.width_rad] * count, ranges)
@@ -145,7 +145,7 @@ def _primed(method: Method, drawing: Drawing) -> tuple[HandMap, LeastSquares | N
     return learned, learner
 
 
-def errors_m(learned: HandMap | Drawing, sightings: Sightings) -> Array:
+def errors_m(learned: HandMap | NominalModel, sightings: Sightings) -> Array:
     """Distances (b,) between where the hand was seen and where a map has it."""
     return np.asarray(np.linalg.norm(learned.predict(sightings.angles_rad) - sightings.places_m, axis=1))
 
@@ -154,7 +154,7 @@ def rms(errors: Array) -> float:
     return float(np.sqrt(np.mean(errors**2))) if len(errors) else float("nan")
 
 
-def score(method: Method, drawing: Drawing, learn: Sightings, held: Sightings, *, validate: bool = True) -> Score:
+def score(method: Method, drawing: NominalModel, learn: Sightings, held: Sightings, *, validate: bool = True) -> Score:
     started = time.process_time()
     learned = fit(method, drawing, learn)
     took_s = time.process_time() - started
@@ -163,7 +163,7 @@ def score(method: Method, drawing: Drawing, learn: Sightings, held: Sightings, *
     return Score(method.name, checked, rms(errors), float(np.quantile(errors, 0.95)), took_s)
 
 
-def cross_validate(method: Method, drawing: Drawing, learn: Sightings) -> float:
+def cross_validate(method: Method, drawing: NominalModel, learn: Sightings) -> float:
     """Root mean square error over folds of whole draws; NaN with fewer draws than folds."""
     if len(np.unique(learn.draws)) < FOLDS:
         return float("nan")
@@ -171,7 +171,7 @@ def cross_validate(method: Method, drawing: Drawing, learn: Sightings) -> float:
     return rms(np.concatenate(found))
 
 
-def baselines(drawing: Drawing, learn: Sightings, held: Sightings) -> list[Score]:
+def baselines(drawing: NominalModel, learn: Sightings, held: Sightings) -> list[Score]:
     """The drawing as it stands, and with the constant hand offset that goes best with what may be learned from."""
     offset = (learn.places_m - drawing.predict(learn.angles_rad)).mean(axis=0)
     moved = replace(held, places_m=held.places_m - offset)
@@ -211,6 +211,8 @@ def best(scores: Sequence[Score], methods: Sequence[Method]) -> Method:
     return BEST if BEST in checked and checked[BEST] * (1 - CHANCE) <= checked[least] else least
 
 
-def curve(method: Method, drawing: Drawing, learn: Sightings, held: Sightings, sizes: Sequence[int]) -> list[float]:
+def curve(
+    method: Method, drawing: NominalModel, learn: Sightings, held: Sightings, sizes: Sequence[int]
+) -> list[float]:
     """Held-out error (RMS, m) after so many sightings, taken in the order in which they came."""
     return [rms(errors_m(fit(method, drawing, learn.pick(slice(size))), held)) for size in sizes if size <= len(learn)]

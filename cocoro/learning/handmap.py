@@ -13,8 +13,8 @@ from typing import Literal
 import numpy as np
 
 from cocoro.frames import Spherical, to_cartesian
-from cocoro.learning.drawing import Drawing
 from cocoro.learning.network import Array, HyperplaneRbf
+from cocoro.learning.nominal_model import NominalModel
 
 Coordinates = Literal["cartesian", "spherical"]
 
@@ -24,7 +24,7 @@ class HandMap:
 
     def __init__(
         self,
-        drawing: Drawing,
+        drawing: NominalModel,
         network: HyperplaneRbf,
         *,
         over_drawing: bool = True,

@@ -17,9 +17,9 @@ from msgspec import Meta
 
 from cocoro.errors import ConfigError
 from cocoro.learning.dataset import fingerprint_of
-from cocoro.learning.drawing import Drawing
 from cocoro.learning.handmap import Coordinates, HandMap
 from cocoro.learning.network import Array, HyperplaneRbf
+from cocoro.learning.nominal_model import NominalModel
 from cocoro.messages import Vec3
 from cocoro.robot import Robot
 
@@ -162,7 +162,7 @@ def arm_model(learned: HandMap, roll_rad: float, seen_m: Array, training: Traini
 
 def hand_map(arm: ArmModel, robot: Robot, where: str = "arm") -> HandMap:
     """The map, ready to compute with. Raises ConfigError where its parts do not fit together."""
-    drawing = Drawing(robot, arm.roll_rad)
+    drawing = NominalModel(robot, arm.roll_rad)
     try:
         centres, weights = np.array(arm.centres), np.array(arm.weights)
         network = HyperplaneRbf(centres, np.array(arm.widths), 3)

@@ -14,12 +14,12 @@ from cocoro.messages import BaseCommand, Intent, LearnedModel, PlannerStatus, Se
 from cocoro.robot import Robot
 from cocoro.topics import Topic
 from services.planning.arm import Step
-from services.planning.behaviours import BEHAVIOURS, Behaviour, Idle, Limbs, Plan, Scene
+from services.planning.behaviours import BEHAVIOURS, Actuators, Behaviour, Idle, Plan, Snapshot
 from services.planning.config import Config
 from services.planning.head import PAN, TILT
 from services.planning.learned import Learned
 from services.planning.reach import ARM
-from services.planning.senses import Senses
+from services.planning.state_estimator import StateEstimator
 
 _NEED_SIGHT = ("search", "explore", "approach", "carry", "follow", "go-to", "babble-arm", "babble-wheels")
 """What drives, or looks for something: none of it without perception."""
@@ -32,8 +32,8 @@ class PlanningCore:
 
     def __init__(self, robot: Robot, config: Config) -> None:
         self._config = config
-        self._senses = Senses(config, robot)
-        self._limbs = Limbs(robot, config)
+        self._estimator = StateEstimator(config, robot)
+        self._actuators = Actuators(robot, config)
         self._intent = Intent()
         self._behaviour: Behaviour = Idle()
         self._ended: Plan | None = None
@@ -48,12 +48,12 @@ class PlanningCore:
 
     def _use_learned(self) -> None:
         learned = self.learned
-        self._limbs.reacher.use(learned.hand)
-        self._limbs.reachability.use(learned.map, learned.mesh)
-        self._limbs.eye = self._senses.eye = learned.eye
-        self._limbs.driver.turn_with(learned.separation_m)
-        drawn_m = self._limbs.robot.base.wheel_separation_m
-        self._senses.turning.ratio = drawn_m / learned.separation_m if learned.separation_m is not None else 1.0
+        self._actuators.reacher.use(learned.hand)
+        self._actuators.reachability.use(learned.map, learned.mesh)
+        self._actuators.camera_tilt = self._estimator.camera_tilt = learned.camera_tilt
+        self._actuators.driver.turn_with(learned.separation_m)
+        drawn_m = self._actuators.robot.base.wheel_separation_m
+        self._estimator.turning.ratio = drawn_m / learned.separation_m if learned.separation_m is not None else 1.0
 
     reads: Mapping[Topic, Take] = {  # type: ignore[type-arg]
         topics.BASE_STATE: "all",
@@ -76,40 +76,40 @@ class PlanningCore:
             if isinstance(sample.message, LearnedModel):
                 self.learned.take(bytes(sample.message.content))
                 self._use_learned()
-            self._senses.take(sample.topic, sample.message, now_ns)
-        self._senses.localise(now_ns)
-        self.learned.step(self._senses.sightings_of(self._config.marker), now_ns)
+            self._estimator.take(sample.topic, sample.message, now_ns)
+        self._estimator.localise(now_ns)
+        self.learned.step(self._estimator.sightings_of(self._config.marker), now_ns)
         dt_s = self._elapsed(now_ns)
         self._follow_intent(now_ns)
-        missing, hand, body = self._senses.missing(now_ns), self._senses.hand, self._senses.body()
+        missing, hand, body = self._estimator.missing(now_ns), self._estimator.hand, self._estimator.body()
         if missing or hand is None or body is None:
             # Zero, and not silence, which the base would take for a word that is yet to come.
             return [
                 Output(topics.BASE_COMMAND, BaseCommand(left_mps=0.0, right_mps=0.0)),
                 *self._halt(missing or "no odometry yet", now_ns),
             ]
-        self._limbs.grip.feel(hand, now_ns)
-        latched = self._senses.latched()
+        self._actuators.grip.feel(hand, now_ns)
+        latched = self._estimator.latched()
         if latched:
             return self._halt(latched, now_ns)
         self._missing_since_ns = None
-        self._senses.look_around(now_ns, self._own_hull)
-        scene = Scene(now_ns, dt_s, self._senses, body, self._senses.angles(), self._limbs)
-        plan = self._plan(scene)
+        self._estimator.look_around(now_ns, self._own_hull)
+        snapshot = Snapshot(now_ns, dt_s, self._estimator, body, self._estimator.angles(), self._actuators)
+        plan = self._plan(snapshot)
         if isinstance(self._behaviour, Idle):
             self.learned.rest()
-        status = self._status(plan, scene)
-        return [*self._commands(plan, scene), *plan.reports, Output(topics.PLAN, status)]
+        status = self._status(plan, snapshot)
+        return [*self._commands(plan, snapshot), *plan.reports, Output(topics.PLAN, status)]
 
     def _own_hull(self, angles: Mapping[str, float]) -> tuple[Array, Array]:
         """Where the robot itself, and what it holds, is in its own view in a posture."""
-        centres, radii = self._limbs.arm.clearance.hull(angles)
+        centres, radii = self._actuators.arm.clearance.hull(angles)
         off = self.learned.offset_m(angles)
         if off is not None:  # the arm is seen there, and nearer to its shoulder in between
             centres, radii = np.vstack([centres, centres + off / 2, centres + off]), np.tile(radii, 3)
-        held = self._limbs.reacher.position(angles)
+        held = self._actuators.reacher.position(angles)
         chassis = np.array([0.0, 0.0, 0.0])
-        own_m = self._limbs.robot.base.chassis_diameter_m / 2 + 0.03
+        own_m = self._actuators.robot.base.chassis_diameter_m / 2 + 0.03
         return np.vstack([centres, held, chassis]), np.append(radii + 0.03, [0.09, own_m])
 
     def _elapsed(self, now_ns: int) -> float:
@@ -124,7 +124,7 @@ class PlanningCore:
         return 1.0 if self._config.coordination == "lockstep" else 0.05
 
     def _follow_intent(self, now_ns: int) -> None:
-        fresh = self._senses.fresh_intent(now_ns)
+        fresh = self._estimator.fresh_intent(now_ns)
         intent = fresh or Intent(task_id=self._intent.task_id, step=self._intent.step)
         wanted = (intent.task_id, intent.step, intent.behaviour, intent.label)
         current = (self._intent.task_id, self._intent.step, self._intent.behaviour, self._intent.label)
@@ -137,34 +137,34 @@ class PlanningCore:
         else:
             self._behaviour = BEHAVIOURS[intent.behaviour](intent)
 
-    def _plan(self, scene: Scene) -> Plan:
+    def _plan(self, snapshot: Snapshot) -> Plan:
         """Step the behaviour; once it has ended, hold still with its result."""
         if self._ended is not None:
             return Plan(
-                scene.stand(),
-                scene.still(),
+                snapshot.stand(),
+                snapshot.still(),
                 self._ended.why,
                 None,
                 self._ended.state,
                 self._ended.reason,
                 self._ended.distance_m,
             )
-        plan = self._blind(scene) or self._behaviour.step(scene)
-        self._slow_down(plan, scene)
+        plan = self._blind(snapshot) or self._behaviour.step(snapshot)
+        self._slow_down(plan, snapshot)
         if plan.state != "running" and not isinstance(self._behaviour, Idle):
             self._ended = plan
         return plan
 
-    def _slow_down(self, plan: Plan, scene: Scene) -> None:
+    def _slow_down(self, plan: Plan, snapshot: Snapshot) -> None:
         """Drive no faster than from where the wheels stand in time if whoever was heard the longest ago is gone: one
         that is late makes the robot slower, one that is silent makes it stand."""
         if self._config.coordination == "lockstep":  # where everyone waits for everyone, and no deadman is either
             return
-        driver, base = self._limbs.driver, self._limbs.robot.base
+        driver, base = self._actuators.driver, self._actuators.robot.base
         needs_sight = self._intent.behaviour in _NEED_SIGHT
-        who, age_s = self._senses.oldest(scene.now_ns, sight=needs_sight)
-        if self._senses.intent_age_s(scene.now_ns) > base.command_timeout_s:
-            plan.base, plan.why = driver.pause(scene.dt_s), "standing still: the executive is silent"
+        who, age_s = self._estimator.oldest(snapshot.now_ns, sight=needs_sight)
+        if self._estimator.intent_age_s(snapshot.now_ns) > base.command_timeout_s:
+            plan.base, plan.why = driver.pause(snapshot.dt_s), "standing still: the executive is silent"
             return
         # What is commanded now is for the time until the next step.
         limit_mps = base.speed_at_age_mps(age_s + 1.0 / self._config.rate_hz)
@@ -172,29 +172,31 @@ class PlanningCore:
         if slower is not plan.base:
             plan.base, plan.why = slower, f"slower, for {who} is late; {plan.why}"
 
-    def _blind(self, scene: Scene) -> Plan | None:
+    def _blind(self, snapshot: Snapshot) -> Plan | None:
         """What is done while perception is silent by what needs to see: nothing, and that for so long only. What it
         had begun goes on when perception speaks again."""
         if self._intent.behaviour not in _NEED_SIGHT:
             return None
-        blind_s = self._senses.blind_s(scene.now_ns)
+        blind_s = self._estimator.blind_s(snapshot.now_ns)
         if blind_s is None:
             return None
-        plan = Plan(scene.limbs.driver.pause(scene.dt_s), scene.still(), "standing still: perception is silent")
+        plan = Plan(
+            snapshot.actuators.driver.pause(snapshot.dt_s), snapshot.still(), "standing still: perception is silent"
+        )
         if blind_s > self._config.blind_for_good_s:
             plan.state, plan.reason = "failed", "stale"
         return plan
 
     def _halt(self, why: str, now_ns: int) -> Sequence[Output]:
         """Command nothing, so that everything stops by itself, and start afresh from what is measured later."""
-        self._limbs.arm.resync()
-        self._limbs.driver.reset()
-        self._limbs.grip.keep()
+        self._actuators.arm.resync()
+        self._actuators.driver.reset()
+        self._actuators.grip.keep()
         self._head_goal = None
         if self._missing_since_ns is None or now_ns < self._missing_since_ns:
             self._missing_since_ns = now_ns
         failed = self._intent.behaviour != "idle" and now_ns - self._missing_since_ns > _STALE_NS
-        body = self._senses.body()
+        body = self._estimator.body()
         status = PlannerStatus(
             task_id=self._intent.task_id,
             step=self._intent.step,
@@ -202,14 +204,14 @@ class PlanningCore:
             state="failed" if failed else "running",
             reason="stale" if failed else "",
             why=f"standing still: {why}",
-            holding=self._limbs.grip.holding(now_ns),
+            holding=self._actuators.grip.holding(now_ns),
             body_m=(body.x_m, body.y_m) if body is not None else None,
             body_yaw_rad=body.yaw_rad if body is not None else 0.0,
         )
         return [Output(topics.PLAN, status)]
 
-    def _status(self, plan: Plan, scene: Scene) -> PlannerStatus:
-        x, y, z = self._limbs.reacher.position(scene.angles)
+    def _status(self, plan: Plan, snapshot: Snapshot) -> PlannerStatus:
+        x, y, z = self._actuators.reacher.position(snapshot.angles)
         return PlannerStatus(
             task_id=self._intent.task_id,
             step=self._intent.step,
@@ -217,30 +219,30 @@ class PlanningCore:
             state=plan.state,
             reason=plan.reason,
             why=plan.why,
-            target=scene.target(self._intent.label) if self._intent.label else None,
+            target=snapshot.target(self._intent.label) if self._intent.label else None,
             distance_m=plan.distance_m,
             hand_m=(float(x), float(y), float(z)),
-            holding=scene.holding,
-            body_m=(scene.body.x_m, scene.body.y_m),
-            body_yaw_rad=scene.body.yaw_rad,
-            known=self._senses.memory.all(scene.body, scene.now_ns),
+            holding=snapshot.holding,
+            body_m=(snapshot.body.x_m, snapshot.body.y_m),
+            body_yaw_rad=snapshot.body.yaw_rad,
+            known=self._estimator.memory.all(snapshot.body, snapshot.now_ns),
             model=self.learned.text,
         )
 
-    def _commands(self, plan: Plan, scene: Scene) -> list[Output]:
+    def _commands(self, plan: Plan, snapshot: Snapshot) -> list[Output]:
         base: BaseCommand = plan.base
         step: Step = plan.arm
         if plan.head is not None:
             self._head_goal = plan.head[:2]
         if self._head_goal is None:
-            self._head_goal = (scene.angles[PAN], scene.angles[TILT])
+            self._head_goal = (snapshot.angles[PAN], snapshot.angles[TILT])
         head_speed = plan.head[2] if plan.head is not None else 1.0
         arm = ServoCommand(
             joints=(PAN, TILT, *ARM),
             goal_rad=(*self._head_goal, *(float(angle) for angle in step.goal_rad)),
             speed_radps=(head_speed, head_speed, *(float(speed) for speed in step.speed_radps)),
         )
-        hand = self._limbs.grip.command(step.roll_rad)
+        hand = self._actuators.grip.command(step.roll_rad)
         return [
             Output(topics.BASE_COMMAND, base),
             Output(topics.ARM_COMMAND, arm),

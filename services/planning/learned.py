@@ -12,15 +12,15 @@ from cocoro.clock import NS
 from cocoro.errors import ConfigError
 from cocoro.kinematics import Array
 from cocoro.learning import model as models
-from cocoro.learning.drawing import Drawing
-from cocoro.learning.eye import Eye
+from cocoro.learning.camera_tilt import CameraTilt
 from cocoro.learning.handmap import HandMap
 from cocoro.learning.model import Model
+from cocoro.learning.nominal_model import NominalModel
 from cocoro.learning.reachability import ReachMesh
 from cocoro.robot import Robot
 from services.planning.config import Config, HandSight
 from services.planning.reach import LEVEL_ROLL_RAD, HandModel
-from services.planning.senses import Sighting
+from services.planning.state_estimator import Sighting
 from services.planning.teaching import Teacher
 from services.planning.teaching import arm_angles as _arm
 
@@ -71,7 +71,7 @@ class SeenHand:
     comes into view or is hidden, however far the two are apart; a correction that is not renewed fades.
     """
 
-    def __init__(self, felt: HandModel, marker: HandMap | Drawing, config: HandSight) -> None:
+    def __init__(self, felt: HandModel, marker: HandMap | NominalModel, config: HandSight) -> None:
         self._felt = felt
         self._marker = marker
         self._config = config
@@ -128,7 +128,7 @@ class Learned:
         self._text = NOTHING_LEARNED
         self._refusal = ""
         self.separation_m: float | None = None
-        self.eye = Eye(robot)
+        self.camera_tilt = CameraTilt(robot)
         self.hand: SeenHand | None = None
         """None: the rigid body, unseen."""
         self.map: HandMap | None = None
@@ -179,7 +179,7 @@ class Learned:
     def _take(self, model: Model) -> None:
         self._refusal = ""
         self.separation_m = model.wheels.separation_m if model.wheels is not None else None
-        self.eye = Eye(self._robot, model.wheels.eye_tilt_rad if model.wheels is not None else 0.0)
+        self.camera_tilt = CameraTilt(self._robot, model.wheels.eye_tilt_rad if model.wheels is not None else 0.0)
         arm = model.arm if self._config.reach == "learned" else None
         self._teacher, self.mesh = None, None
         learned = models.hand_map(arm, self._robot) if arm is not None else None
@@ -202,6 +202,6 @@ class Learned:
         if learned is not None:
             self.hand = SeenHand(LearnedHand(self._robot, learned), learned, self._config.sight)
         elif self._config.see_hand:
-            self.hand = SeenHand(self._robot.chain("pad_centre"), Drawing(self._robot), self._config.sight)
+            self.hand = SeenHand(self._robot.chain("pad_centre"), NominalModel(self._robot), self._config.sight)
         else:
             self.hand = None

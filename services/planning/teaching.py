@@ -12,7 +12,7 @@ from cocoro.learning.handmap import HandMap
 from cocoro.learning.reachability import ReachMesh
 from services.planning.adapt import WILD_M, Adapter
 from services.planning.reach import ARM, LEVEL_ROLL_RAD
-from services.planning.senses import Sighting
+from services.planning.state_estimator import Sighting
 
 EVERY_NS = NS // 10
 """Sightings nearer in time than this are nearly the same; babbling takes no more of them either."""

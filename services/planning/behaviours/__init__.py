@@ -7,14 +7,14 @@ from collections.abc import Callable, Mapping
 
 from cocoro.messages import Intent
 from services.planning.behaviours.babbling import BabbleArm, BabbleWheels
-from services.planning.behaviours.base import Behaviour, Limbs, Plan, Scene
+from services.planning.behaviours.base import Actuators, Behaviour, Plan, Snapshot
 from services.planning.behaviours.driving import Approach, Carry, Follow
 from services.planning.behaviours.going import GoTo
 from services.planning.behaviours.handling import Close, Lift, Place, Reach
 from services.planning.behaviours.looking import Explore, Idle, Park, Search
 from services.planning.behaviours.touching import Touch
 
-__all__ = ["BEHAVIOURS", "Behaviour", "Idle", "Limbs", "Plan", "Scene"]
+__all__ = ["BEHAVIOURS", "Actuators", "Behaviour", "Idle", "Plan", "Snapshot"]
 
 BEHAVIOURS: Mapping[str, Callable[[Intent], Behaviour]] = {
     "idle": lambda _intent: Idle(),

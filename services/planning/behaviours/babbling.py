@@ -14,7 +14,7 @@ from cocoro.frames import Pose2
 from cocoro.kinematics import Array
 from cocoro.messages import BaseCommand, HandSample, Vec2, Vec3, WheelTrial
 from cocoro.topics import HAND_SAMPLES, WHEEL_TRIALS
-from services.planning.behaviours.base import Plan, Scene
+from services.planning.behaviours.base import Plan, Snapshot
 from services.planning.draws import sobol
 from services.planning.postures import Postures
 from services.planning.reach import ARM, LEVEL_ROLL_RAD, HandPose
@@ -50,45 +50,45 @@ class BabbleArm:
         self._last_ns: int | None = None
         self._hitches = 0
 
-    def step(self, scene: Scene) -> Plan:
+    def step(self, snapshot: Snapshot) -> Plan:
         if self._postures is None:
-            self._postures = Postures(scene.limbs.robot)
+            self._postures = Postures(snapshot.actuators.robot)
             self._draws = sobol(self._first, self._postures.ranges)
         if not self._trail:
-            return self._unfold(scene)
-        reports = self._report(scene)
-        arm = scene.limbs.arm
+            return self._unfold(snapshot)
+        reports = self._report(snapshot)
+        arm = snapshot.actuators.arm
         if self._goal is None:
-            self._choose(scene)
+            self._choose(snapshot)
         if self._goal is None:
-            step = scene.still()
+            step = snapshot.still()
         else:
-            step = arm.towards(dict(zip(ARM, self._goal.tolist(), strict=True)), self.SPEED_RADPS, scene.angles,
-                               scene.dt_s)  # fmt: skip
-        head = scene.look_at(self._postures.marker_m(scene.angles))
+            step = arm.towards(dict(zip(ARM, self._goal.tolist(), strict=True)), self.SPEED_RADPS, snapshot.angles,
+                               snapshot.dt_s)  # fmt: skip
+        head = snapshot.look_at(self._postures.marker_m(snapshot.angles))
         why = f"{self._samples} of {self._count} samples, draw {self._draw}"
-        plan = Plan(scene.stand(), step, why, head, reports=reports)
+        plan = Plan(snapshot.stand(), step, why, head, reports=reports)
         if step.blocked or arm.stalled:
-            self._hitch(plan, scene)
+            self._hitch(plan, snapshot)
         elif self._goal is not None and step.arrived:
             self._arrive(plan)
         if self._samples >= self._count:
             self._returning = True
         return plan
 
-    def _unfold(self, scene: Scene) -> Plan:
+    def _unfold(self, snapshot: Snapshot) -> Plan:
         """To the posture that everything starts from; from a posture of an earlier babbling straight there."""
-        limbs, travel = scene.limbs, scene.limbs.config.arm
+        actuators, travel = snapshot.actuators, snapshot.actuators.config.arm
         home = HandPose(travel.travel_radius_m, 0.0, travel.travel_height_m, travel.pitch_rad)
-        step = limbs.arm.reach(home, travel.hand_speed_mps, scene.angles, scene.dt_s)
-        plan = Plan(scene.stand(), step, "unfolding the arm")
-        if step.blocked or limbs.arm.stalled:
+        step = actuators.arm.reach(home, travel.hand_speed_mps, snapshot.angles, snapshot.dt_s)
+        plan = Plan(snapshot.stand(), step, "unfolding the arm")
+        if step.blocked or actuators.arm.stalled:
             plan.state, plan.reason, plan.why = "failed", "blocked", "something is in the arm's way"
         elif step.arrived:
             self._trail = [step.goal_rad]
         return plan
 
-    def _choose(self, scene: Scene) -> None:
+    def _choose(self, snapshot: Snapshot) -> None:
         """Where to next; nowhere yet when none of the draws of this step would do."""
         assert self._draws is not None
         assert self._postures is not None
@@ -125,18 +125,18 @@ class BabbleArm:
         self._trail.append(self._goal)
         self._goal = None
 
-    def _hitch(self, plan: Plan, scene: Scene) -> None:
+    def _hitch(self, plan: Plan, snapshot: Snapshot) -> None:
         """The way is not as clear as the drawing has it: back to where it came from."""
         self._hitches += 1
-        scene.limbs.arm.resync()
+        snapshot.actuators.arm.resync()
         self._goal = self._trail[-1]
         if self._hitches > 20:
             plan.state, plan.reason, plan.why = "failed", "blocked", "the arm is held up again and again"
 
-    def _report(self, scene: Scene) -> list[Output]:
+    def _report(self, snapshot: Snapshot) -> list[Output]:
         """The hand's sightings since the last step, as far as they tell something new."""
         found: list[Output] = []
-        for sight in scene.senses.sightings_of(scene.limbs.config.marker):
+        for sight in snapshot.estimator.sightings_of(snapshot.actuators.config.marker):
             new = self._last_ns is None or sight.stamp_ns - self._last_ns >= self.EVERY_NS
             level = abs(sight.angles_rad["wrist_roll"] - LEVEL_ROLL_RAD) < 0.03
             if new and level and self._samples < self._count:
@@ -188,45 +188,45 @@ class BabbleWheels:
         self._before: tuple[Vec2, Pose2] | None = None
         self._begun: Pose2 | None = None
 
-    def step(self, scene: Scene) -> Plan:
-        self._begun = self._begun or scene.body
-        scene.senses.watch(self._label)
-        sightings = scene.senses.sightings_of(self._label)
+    def step(self, snapshot: Snapshot) -> Plan:
+        self._begun = self._begun or snapshot.body
+        snapshot.estimator.watch(self._label)
+        sightings = snapshot.estimator.sightings_of(self._label)
         if self._phase_ns is None:
-            self._phase_ns = scene.now_ns
-        spent_s = (scene.now_ns - self._phase_ns) / NS
+            self._phase_ns = snapshot.now_ns
+        spent_s = (snapshot.now_ns - self._phase_ns) / NS
         why = f"{self._done} of {self._count} trials"
         if self._driving:
-            plan = Plan(self._drive(scene, spent_s), scene.still(), why, self._look_there(scene))
+            plan = Plan(self._drive(snapshot, spent_s), snapshot.still(), why, self._look_there(snapshot))
         else:
-            plan = self._look(scene, spent_s, why, [s.position_m for s in sightings])
-        base = scene.senses.base
+            plan = self._look(snapshot, spent_s, why, [s.position_m for s in sightings])
+        base = snapshot.estimator.base
         if base is not None and (base.bump_left or base.bump_right):
-            plan.base = scene.stand()
+            plan.base = snapshot.stand()
             plan.state, plan.reason, plan.why = "failed", "blocked", "the bumper touches something"
-        elif self._begun.inverse().compose(scene.body).x_m ** 2 > self.MOVED_M**2:
-            plan.base = scene.stand()
+        elif self._begun.inverse().compose(snapshot.body).x_m ** 2 > self.MOVED_M**2:
+            plan.base = snapshot.stand()
             plan.state, plan.reason, plan.why = "failed", "blocked", "it has gone too far from where it began"
         return plan
 
-    def _drive(self, scene: Scene, spent_s: float) -> BaseCommand:
+    def _drive(self, snapshot: Snapshot, spent_s: float) -> BaseCommand:
         if spent_s < self.TURN_S:
             left, right = self._speeds
             return BaseCommand(left_mps=left, right_mps=right)
-        scene.limbs.driver.reset()
-        if scene.standing:
+        snapshot.actuators.driver.reset()
+        if snapshot.standing:
             self._driving, self._phase_ns = False, None
         return BaseCommand(left_mps=0.0, right_mps=0.0)
 
-    def _look_there(self, scene: Scene) -> tuple[float, float, float] | None:
-        target = scene.target(self._label)
-        return None if target is None else scene.look_at(target.position_m)
+    def _look_there(self, snapshot: Snapshot) -> tuple[float, float, float] | None:
+        target = snapshot.target(self._label)
+        return None if target is None else snapshot.look_at(target.position_m)
 
-    def _look(self, scene: Scene, spent_s: float, why: str, places: list[tuple[float, float, float]]) -> Plan:
+    def _look(self, snapshot: Snapshot, spent_s: float, why: str, places: list[tuple[float, float, float]]) -> Plan:
         """Away, back to the target, wait, take the frames."""
-        plan = Plan(scene.stand(), scene.still(), why)
+        plan = Plan(snapshot.stand(), snapshot.still(), why)
         if spent_s < self.AWAY_S or self._gaze is None:
-            gaze = self._look_there(scene)
+            gaze = self._look_there(snapshot)
             if gaze is None:
                 plan.state, plan.reason, plan.why = "failed", "lost", f"{self._label} is out of sight"
                 return plan
@@ -239,18 +239,18 @@ class BabbleWheels:
             return plan
         self._seen.extend(places)
         if len(self._seen) == self.LOOKS:
-            self._looked(scene, plan)
-        elif spent_s > self.LOST_S + self.LOOKS * scene.senses.sight_lag_s:
+            self._looked(snapshot, plan)
+        elif spent_s > self.LOST_S + self.LOOKS * snapshot.estimator.sight_lag_s:
             plan.state, plan.reason, plan.why = "failed", "lost", f"{self._label} is out of sight"
         return plan
 
-    def _looked(self, scene: Scene, plan: Plan) -> None:
+    def _looked(self, snapshot: Snapshot, plan: Plan) -> None:
         """A look is complete: it ends one trial and begins the next."""
         x, y, height_m = np.median(np.array(self._seen), axis=0).tolist()
         after = (x, y)
         if self._before is not None:
             before, start = self._before
-            moved = start.inverse().compose(scene.body)
+            moved = start.inverse().compose(snapshot.body)
             half = moved.yaw_rad / 2
             # The way along the arc, from its chord; backwards where the chord points backwards.
             arc_per_chord = half / sin(half) if abs(half) > 1e-6 else 1.0
@@ -273,16 +273,16 @@ class BabbleWheels:
                 return
         left, right = -self._speeds[0], -self._speeds[1]
         if self._trial % 2 == 0:
-            left, right = self._draw(scene)
+            left, right = self._draw(snapshot)
         self._speeds = (left, right)
-        self._before = (after, scene.body)
-        self._gaze, self._phase_ns, self._driving = None, scene.now_ns, True
+        self._before = (after, snapshot.body)
+        self._gaze, self._phase_ns, self._driving = None, snapshot.now_ns, True
 
-    def _draw(self, scene: Scene) -> tuple[float, float]:
+    def _draw(self, snapshot: Snapshot) -> tuple[float, float]:
         """The next pair's speeds: of the draws the next that turns the robot far enough to say something."""
         for number, speeds in self._draws:
             left, right = speeds.tolist()
-            if abs(right - left) * self.TURN_S > self.LEAST_TURN_RAD * scene.limbs.robot.base.wheel_separation_m:
+            if abs(right - left) * self.TURN_S > self.LEAST_TURN_RAD * snapshot.actuators.robot.base.wheel_separation_m:
                 self._trial = 2 * number
                 return left, right
         raise AssertionError("draws have no end")

@@ -1,4 +1,4 @@
-"""What every behaviour works with: the scene of one step, the limbs to command, the plan to give."""
+"""What every behaviour works with: the snapshot of one step, the actuators to command, the plan to give."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from cocoro.core import Output
 from cocoro.frames import Pose2
 from cocoro.kinematics import Array
-from cocoro.learning.eye import Eye
+from cocoro.learning.camera_tilt import CameraTilt
 from cocoro.messages import BaseCommand, TargetEstimate
 from cocoro.robot import Robot
 from services.planning.arm import ArmController, Step
@@ -22,14 +22,14 @@ from services.planning.head import Gaze
 from services.planning.navigation import Driver
 from services.planning.reach import ARM, HandPose, Reacher
 from services.planning.reachability import Reachability
-from services.planning.senses import Senses
+from services.planning.state_estimator import StateEstimator
 from services.planning.surroundings import Fields, placed, swept_by
 
 State = Literal["running", "done", "failed"]
 
 
 @dataclass
-class Limbs:
+class Actuators:
     """What a behaviour commands with; one set for the planner's life, so that motion goes on smoothly from one
     behaviour to the next."""
 
@@ -43,7 +43,7 @@ class Limbs:
     reachability: Reachability = field(init=False)
     unfolding: Array = field(init=False)
     """The floor places (n, 2), body frame, over which the arm swings when it unfolds."""
-    eye: Eye = field(init=False)
+    camera_tilt: CameraTilt = field(init=False)
     grasp_height_m: float = 0.065
     """At which height what is in the hand was grasped: there it is put down."""
 
@@ -56,7 +56,7 @@ class Limbs:
         self.gaze = Gaze(robot, config.head)
         self.reachability = Reachability(config.arm, self.reacher)
         self.unfolding = self._unfolding()
-        self.eye = Eye(robot)
+        self.camera_tilt = CameraTilt(robot)
 
     def _unfolding(self) -> Array:
         arm = ArmController(self.robot, self.config.arm, self.reacher)
@@ -75,33 +75,33 @@ class Limbs:
 
 
 @dataclass(frozen=True)
-class Scene:
+class Snapshot:
     """One step's view: everything fresh, everything now."""
 
     now_ns: int
     dt_s: float
-    senses: Senses
+    estimator: StateEstimator
     body: Pose2
     angles: Mapping[str, float]
-    limbs: Limbs
+    actuators: Actuators
 
     def target(self, label: str) -> TargetEstimate | None:
-        return self.senses.memory.estimate(label, self.body, self.now_ns)
+        return self.estimator.memory.estimate(label, self.body, self.now_ns)
 
     def fields(self, label: str, ignore: tuple[tuple[float, float, float], ...] = ()) -> Fields:
         """What body and arm must keep clear of on the way to a label."""
-        known = [item for item in self.senses.memory.all(self.body, self.now_ns, sure=True) if item.label != label]
+        known = [item for item in self.estimator.memory.all(self.body, self.now_ns, sure=True) if item.label != label]
         target = self.target(label)
         if target is not None:
             known.append(target)
-        return self.senses.around.fields(label, known, self.now_ns, ignore)
+        return self.estimator.around.fields(label, known, self.now_ns, ignore)
 
     def unseen_under_swing(self) -> tuple[float, float] | None:
         """The middle of the floor under the arm's swing that nobody has looked at, odometry frame; None when all was
         seen. What is under the robot itself cannot be seen, nor need it be."""
-        places = placed(self.limbs.unfolding, self.body)
+        places = placed(self.actuators.unfolding, self.body)
         away = places[np.hypot(places[:, 0] - self.body.x_m, places[:, 1] - self.body.y_m) > 0.33]
-        hidden = away[self.senses.around.unseen(away)]
+        hidden = away[self.estimator.around.unseen(away)]
         if len(hidden) < 4:
             return None
         x, y = hidden.mean(axis=0).tolist()
@@ -109,22 +109,22 @@ class Scene:
 
     @property
     def holding(self) -> bool:
-        return self.limbs.grip.holding(self.now_ns)
+        return self.actuators.grip.holding(self.now_ns)
 
     @property
     def standing(self) -> bool:
-        base = self.senses.base
+        base = self.estimator.base
         return base is not None and abs(base.speed_mps) < 0.01 and abs(base.turn_rate_radps) < 0.03
 
     def stand(self) -> BaseCommand:
-        return self.limbs.driver.brake(self.dt_s)
+        return self.actuators.driver.brake(self.dt_s)
 
     def still(self) -> Step:
-        return self.limbs.arm.hold(self.angles, self.dt_s)
+        return self.actuators.arm.hold(self.angles, self.dt_s)
 
     def look_at(self, point_m: tuple[float, float, float]) -> tuple[float, float, float]:
-        pan, tilt = self.limbs.gaze.at(point_m, self.angles)
-        return pan, tilt, self.limbs.config.head.fixate_speed_radps
+        pan, tilt = self.actuators.gaze.at(point_m, self.angles)
+        return pan, tilt, self.actuators.config.head.fixate_speed_radps
 
 
 @dataclass
@@ -144,7 +144,7 @@ class Plan:
 
 
 class Behaviour(Protocol):
-    def step(self, scene: Scene) -> Plan: ...
+    def step(self, snapshot: Snapshot) -> Plan: ...
 
 
 def planar_m(target: TargetEstimate) -> float:
@@ -152,7 +152,7 @@ def planar_m(target: TargetEstimate) -> float:
     return hypot(target.position_m[0], target.position_m[1])
 
 
-def hand_place(scene: Scene) -> tuple[float, float, float]:
+def hand_place(snapshot: Snapshot) -> tuple[float, float, float]:
     """Where the pads' centre is, body frame."""
-    x, y, z = scene.limbs.reacher.position(scene.angles).tolist()
+    x, y, z = snapshot.actuators.reacher.position(snapshot.angles).tolist()
     return x, y, z

@@ -9,16 +9,16 @@ from cocoro.clock import NS
 from cocoro.frames import Pose2
 from cocoro.messages import BaseState, TargetEstimate, Vec2
 from services.planning.arm import Step
-from services.planning.behaviours.base import Limbs, Plan, Scene, hand_place, planar_m
+from services.planning.behaviours.base import Actuators, Plan, Snapshot, hand_place, planar_m
 from services.planning.course import Course, Move
 from services.planning.head import PAN, TILT, Sweep
 from services.planning.reach import HandPose
 from services.planning.surroundings import Fields
 
 
-def grasp_aim(limbs: Limbs) -> tuple[float, float]:
+def grasp_aim(actuators: Actuators) -> tuple[float, float]:
     """Where in the body frame a target stands best for the arm."""
-    x, y, _ = limbs.reacher.point(HandPose(limbs.config.arm.grasp_radius_m, 0.0, 0.0, 0.0)).tolist()
+    x, y, _ = actuators.reacher.point(HandPose(actuators.config.arm.grasp_radius_m, 0.0, 0.0, 0.0)).tolist()
     return x, y
 
 
@@ -32,31 +32,31 @@ class BackOff:
         self._from: Pose2 | None = None
         self._bumps = 0
 
-    def step(self, scene: Scene, head: tuple[float, float, float]) -> Plan | None:
+    def step(self, snapshot: Snapshot, head: tuple[float, float, float]) -> Plan | None:
         """What to do about a bump; None when there is nothing to back off from."""
-        base = scene.senses.base
+        base = snapshot.estimator.base
         if base is not None and (base.bump_left or base.bump_right) and self._from is None:
-            self._from = scene.body
+            self._from = snapshot.body
             self._bumps += 1
-            scene.senses.around.floor.bump(self._touched(scene, base))
+            snapshot.estimator.around.floor.bump(self._touched(snapshot, base))
         if self._from is None:
             return None
         if self._bumps > self.MAX_BUMPS:
             why = "the bumper touches something again and again"
-            return Plan(scene.stand(), scene.still(), why, head, "failed", "blocked")
-        if self._from.inverse().compose(scene.body).x_m <= -self.BACK_M:
+            return Plan(snapshot.stand(), snapshot.still(), why, head, "failed", "blocked")
+        if self._from.inverse().compose(snapshot.body).x_m <= -self.BACK_M:
             self._from = None
             return None
-        command = scene.limbs.driver.command(-0.08, 0.0, scene.dt_s)
-        return Plan(command, scene.still(), "the bumper touched something: backing off", head)
+        command = snapshot.actuators.driver.command(-0.08, 0.0, snapshot.dt_s)
+        return Plan(command, snapshot.still(), "the bumper touched something: backing off", head)
 
     @staticmethod
-    def _touched(scene: Scene, base: BaseState) -> list[tuple[float, float]]:
-        radius = scene.limbs.robot.base.chassis_diameter_m / 2 + 0.02
+    def _touched(snapshot: Snapshot, base: BaseState) -> list[tuple[float, float]]:
+        radius = snapshot.actuators.robot.base.chassis_diameter_m / 2 + 0.02
         bearings = [b for b, hit in ((0.6, base.bump_left), (-0.6, base.bump_right)) if hit]
         if base.bump_left and base.bump_right:
             bearings.append(0.0)
-        places = [scene.body.apply((radius * cos(b), radius * sin(b), 0.0)) for b in bearings]
+        places = [snapshot.body.apply((radius * cos(b), radius * sin(b), 0.0)) for b in bearings]
         return [(x, y) for x, y, _ in places]
 
 
@@ -71,108 +71,115 @@ class Approach:
         self._stalls = 0
         self._glance_since_ns: int | None = None
 
-    def step(self, scene: Scene) -> Plan:
-        limbs, config = scene.limbs, scene.limbs.config
-        target = scene.target(self._label)
+    def step(self, snapshot: Snapshot) -> Plan:
+        actuators, config = snapshot.actuators, snapshot.actuators.config
+        target = snapshot.target(self._label)
         if self._course is None:
-            self._course = Course(limbs.robot, config, grasp_aim(limbs), arm="last", swing_m=limbs.unfolding)
+            self._course = Course(
+                actuators.robot, config, grasp_aim(actuators), arm="last", swing_m=actuators.unfolding
+            )
         if target is None:
-            return Plan(scene.stand(), scene.still(), f"{self._label} is unknown", None, "failed", "lost")
-        fields = scene.fields(self._label)
-        head = scene.look_at(target.position_m)
-        backing = self._back_off.step(scene, head)
+            return Plan(snapshot.stand(), snapshot.still(), f"{self._label} is unknown", None, "failed", "lost")
+        fields = snapshot.fields(self._label)
+        head = snapshot.look_at(target.position_m)
+        backing = self._back_off.step(snapshot, head)
         if backing is not None:
             return backing
         place = target.odometry_position_m[:2]
-        folded = limbs.arm.folded(limbs.arm.reference or scene.angles)
+        folded = actuators.arm.folded(actuators.arm.reference or snapshot.angles)
         move = self._course.step(
-            place, scene.body, scene.senses.around, fields, limbs.driver, scene.now_ns, folded=folded
+            place, snapshot.body, snapshot.estimator.around, fields, actuators.driver, snapshot.now_ns, folded=folded
         )
         patience_s = config.stale_target_s if move.direct else config.stale_on_way_s
-        if target.age_s > patience_s + scene.senses.sight_lag_s:
+        if target.age_s > patience_s + snapshot.estimator.sight_lag_s:
             why = f"{self._label} has not been seen for {target.age_s:.1f} s"
-            return Plan(scene.stand(), scene.still(), why, None, "failed", "lost")
-        if limbs.arm.stalled:
-            self._touched(scene)
+            return Plan(snapshot.stand(), snapshot.still(), why, None, "failed", "lost")
+        if actuators.arm.stalled:
+            self._touched(snapshot)
         if self._stalls > self.MAX_STALLS:
             why = "the arm is held up again and again"
-            return Plan(scene.stand(), scene.still(), why, head, "failed", "blocked")
-        arm, move = self._ready_hand(scene, target, move, fields)
+            return Plan(snapshot.stand(), snapshot.still(), why, head, "failed", "blocked")
+        arm, move = self._ready_hand(snapshot, target, move, fields)
         if move.look_at is not None:
-            head = scene.look_at(scene.body.inverse().apply((*move.look_at, 0.0)))
+            head = snapshot.look_at(snapshot.body.inverse().apply((*move.look_at, 0.0)))
         if move.blocked:
-            return Plan(scene.stand(), arm, move.why, head, "failed", "blocked")
+            return Plan(snapshot.stand(), arm, move.why, head, "failed", "blocked")
         if arm.blocked:
-            return Plan(scene.stand(), arm, "the hand cannot get ready: its way is blocked", head, "failed", "blocked")
-        base = limbs.driver.command(move.speed_mps, move.turn_radps, scene.dt_s)
-        if move.arrived and scene.standing and arm.arrived:
+            return Plan(
+                snapshot.stand(), arm, "the hand cannot get ready: its way is blocked", head, "failed", "blocked"
+            )
+        base = actuators.driver.command(move.speed_mps, move.turn_radps, snapshot.dt_s)
+        if move.arrived and snapshot.standing and arm.arrived:
             return Plan(base, arm, f"{self._label} is in reach", head, "done", distance_m=move.left_m)
         why = "there; waiting for base and hand to come to rest" if move.arrived else move.why
         return Plan(base, arm, why, head, distance_m=move.left_m)
 
     MAX_STALLS = 2
 
-    def _touched(self, scene: Scene) -> None:
+    def _touched(self, snapshot: Snapshot) -> None:
         """The arm meets something that was not seen: remember it where the hand is, and fold the arm."""
         self._stalls += 1
-        x, y, _ = scene.body.apply(hand_place(scene))
-        scene.senses.around.floor.bump([(x, y)])
-        scene.limbs.arm.resync()
+        x, y, _ = snapshot.body.apply(hand_place(snapshot))
+        snapshot.estimator.around.floor.bump([(x, y)])
+        snapshot.actuators.arm.resync()
 
-    def _room_here(self, scene: Scene, fields: Fields) -> bool:
+    def _room_here(self, snapshot: Snapshot, fields: Fields) -> bool:
         assert self._course is not None
-        return self._course.roomy(scene.body, fields)
+        return self._course.roomy(snapshot.body, fields)
 
-    def _room_ahead(self, scene: Scene, fields: Fields) -> bool:
+    def _room_ahead(self, snapshot: Snapshot, fields: Fields) -> bool:
         """Whether the arm can go on unfolding while the robot drives."""
         assert self._course is not None
-        return all(self._course.roomy(scene.body.compose(Pose2(ahead)), fields) for ahead in (0.25, 0.5))
+        return all(self._course.roomy(snapshot.body.compose(Pose2(ahead)), fields) for ahead in (0.25, 0.5))
 
-    def _unseen_swing(self, scene: Scene) -> tuple[float, float] | None:
+    def _unseen_swing(self, snapshot: Snapshot) -> tuple[float, float] | None:
         """A place to look at before the arm unfolds; looked for once, for as long as a glance takes."""
         if self._glance_since_ns is None:
-            self._glance_since_ns = scene.now_ns
-        glance_s = scene.limbs.config.navigation.glance_s + scene.senses.sight_lag_s
-        if scene.now_ns - self._glance_since_ns > glance_s * NS:
+            self._glance_since_ns = snapshot.now_ns
+        glance_s = snapshot.actuators.config.navigation.glance_s + snapshot.estimator.sight_lag_s
+        if snapshot.now_ns - self._glance_since_ns > glance_s * NS:
             return None
-        return scene.unseen_under_swing()
+        return snapshot.unseen_under_swing()
 
-    def _ready_hand(self, scene: Scene, target: TargetEstimate, move: Move, fields: Fields) -> tuple[Step, Move]:
-        limbs, config = scene.limbs, scene.limbs.config.arm
-        arm, angles, dt_s = limbs.arm, scene.angles, scene.dt_s
+    def _ready_hand(self, snapshot: Snapshot, target: TargetEstimate, move: Move, fields: Fields) -> tuple[Step, Move]:
+        actuators, config = snapshot.actuators, snapshot.actuators.config.arm
+        arm, angles, dt_s = actuators.arm, snapshot.angles, snapshot.dt_s
         reference = arm.reference or angles
-        if limbs.config.coordination == "lockstep":
+        if actuators.config.coordination == "lockstep":
             return arm.park(angles, dt_s), move
         if not arm.folded(reference):
-            have = limbs.reacher.pose({**angles, **reference})
-            if have.height_m < config.travel_height_m - 0.05 and have.radius_m > limbs.reachability.retreat_m + 0.02:
+            have = actuators.reacher.pose({**angles, **reference})
+            if (
+                have.height_m < config.travel_height_m - 0.05
+                and have.radius_m > actuators.reachability.retreat_m + 0.02
+            ):
                 # Low and stretched out, perhaps around something: back out before anything else.
-                limbs.grip.open()
-                back = have._replace(radius_m=limbs.reachability.retreat_m, pitch_rad=config.pitch_rad)
+                actuators.grip.open()
+                back = have._replace(radius_m=actuators.reachability.retreat_m, pitch_rad=config.pitch_rad)
                 step = arm.reach(back, config.insert_speed_mps, angles, dt_s)
                 return step._replace(arrived=False), _waiting(move, "backing the hand out first")
             if not move.direct:
                 return arm.park(angles, dt_s), _waiting(move, "folding the arm to go around")
         elif not move.direct:
             return arm.park(angles, dt_s), move
-        elif not self._room_here(scene, fields):
+        elif not self._room_here(snapshot, fields):
             step = arm.park(angles, dt_s)._replace(arrived=False)
             if move.arrived:
                 return step, move._replace(arrived=False, blocked=True, why="no room to unfold the arm")
             return step, move._replace(why=f"no room yet to unfold the arm; {move.why}")
-        elif arm.parked(reference) and (place := self._unseen_swing(scene)) is not None:
+        elif arm.parked(reference) and (place := self._unseen_swing(snapshot)) is not None:
             why = "looking where to unfold the arm"
             # It goes on driving meanwhile, but not up to the target.
             held = _waiting(move, why) if move.left_m < 0.35 else move._replace(why=f"{why}; {move.why}")
             return arm.park(angles, dt_s)._replace(arrived=False), held._replace(look_at=place)
-        if arm.folded(reference) and not self._room_ahead(scene, fields):
+        if arm.folded(reference) and not self._room_ahead(snapshot, fields):
             move = _waiting(move, "unfolding the arm here, where there is room")
-        limbs.grip.open()
+        actuators.grip.open()
         if move.left_m < config.descend_at_m and abs(move.turn_radps) < 0.4:
-            goal = limbs.reachability.grasp(target.position_m).behind
+            goal = actuators.reachability.grasp(target.position_m).behind
             low, high = config.grasp_azimuth_range_rad
             goal = goal._replace(azimuth_rad=min(max(goal.azimuth_rad, low), high))
-            have = limbs.reacher.pose({**angles, **reference})
+            have = actuators.reacher.pose({**angles, **reference})
             if abs(have.azimuth_rad - goal.azimuth_rad) > 0.12 and have.height_m > config.travel_height_m - 0.03:
                 # What stands beside the target is passed over first: the hand comes down where it is to be.
                 goal = goal._replace(radius_m=config.travel_radius_m, height_m=config.travel_height_m)
@@ -194,30 +201,34 @@ class Carry:
         self._back_off = BackOff()
         self._loose_since_ns: int | None = None
 
-    def step(self, scene: Scene) -> Plan:
-        limbs = scene.limbs
+    def step(self, snapshot: Snapshot) -> Plan:
+        actuators = snapshot.actuators
         if self._course is None:
-            self._course = Course(limbs.robot, limbs.config, grasp_aim(limbs), arm="out")
-        x, y, _ = scene.body.inverse().apply((*self._place_m, 0.0))
-        head = scene.look_at((x, y, 0.0))
-        if scene.holding:
+            self._course = Course(actuators.robot, actuators.config, grasp_aim(actuators), arm="out")
+        x, y, _ = snapshot.body.inverse().apply((*self._place_m, 0.0))
+        head = snapshot.look_at((x, y, 0.0))
+        if snapshot.holding:
             self._loose_since_ns = None
         elif self._loose_since_ns is None:
-            self._loose_since_ns = scene.now_ns
-        elif scene.now_ns - self._loose_since_ns > 0.3 * NS:
-            return Plan(scene.stand(), scene.still(), "the claws hold nothing any more", head, "failed", "slipped")
-        backing = self._back_off.step(scene, head)
+            self._loose_since_ns = snapshot.now_ns
+        elif snapshot.now_ns - self._loose_since_ns > 0.3 * NS:
+            return Plan(
+                snapshot.stand(), snapshot.still(), "the claws hold nothing any more", head, "failed", "slipped"
+            )
+        backing = self._back_off.step(snapshot, head)
         if backing is not None:
             return backing
-        fields = scene.fields(self._label)
-        move = self._course.step(self._place_m, scene.body, scene.senses.around, fields, limbs.driver, scene.now_ns)
+        fields = snapshot.fields(self._label)
+        move = self._course.step(
+            self._place_m, snapshot.body, snapshot.estimator.around, fields, actuators.driver, snapshot.now_ns
+        )
         if move.blocked:
-            return Plan(scene.stand(), scene.still(), move.why, head, "failed", "blocked")
+            return Plan(snapshot.stand(), snapshot.still(), move.why, head, "failed", "blocked")
         if move.look_at is not None:
-            head = scene.look_at(scene.body.inverse().apply((*move.look_at, 0.0)))
-        base = limbs.driver.command(move.speed_mps, move.turn_radps, scene.dt_s)
-        plan = Plan(base, scene.still(), f"carrying: {move.why}", head, distance_m=move.left_m)
-        if move.arrived and scene.standing:
+            head = snapshot.look_at(snapshot.body.inverse().apply((*move.look_at, 0.0)))
+        base = actuators.driver.command(move.speed_mps, move.turn_radps, snapshot.dt_s)
+        plan = Plan(base, snapshot.still(), f"carrying: {move.why}", head, distance_m=move.left_m)
+        if move.arrived and snapshot.standing:
             plan.state, plan.why = "done", "at the place to put it down"
         return plan
 
@@ -231,22 +242,22 @@ class Follow:
         self._trail: deque[tuple[int, tuple[float, float]]] = deque(maxlen=400)
         self._sweep: Sweep | None = None
 
-    def step(self, scene: Scene) -> Plan:
-        limbs, config = scene.limbs, scene.limbs.config.follow
-        target = scene.target(self._label)
+    def step(self, snapshot: Snapshot) -> Plan:
+        actuators, config = snapshot.actuators, snapshot.actuators.config.follow
+        target = snapshot.target(self._label)
         if target is None:
-            return Plan(scene.stand(), scene.still(), f"{self._label} is unknown", None, "failed", "lost")
+            return Plan(snapshot.stand(), snapshot.still(), f"{self._label} is unknown", None, "failed", "lost")
         if target.age_s > config.give_up_s:
             why = f"{self._label} has not been seen for {target.age_s:.0f} s"
-            return Plan(scene.stand(), scene.still(), why, None, "failed", "lost")
-        arm = limbs.arm.park(scene.angles, scene.dt_s)
-        if target.age_s > config.lost_s + scene.senses.sight_lag_s:
-            return self._look_for(scene, target, arm)
+            return Plan(snapshot.stand(), snapshot.still(), why, None, "failed", "lost")
+        arm = actuators.arm.park(snapshot.angles, snapshot.dt_s)
+        if target.age_s > config.lost_s + snapshot.estimator.sight_lag_s:
+            return self._look_for(snapshot, target, arm)
         self._sweep = None
-        self._trail.append((scene.now_ns, target.odometry_position_m[:2]))
+        self._trail.append((snapshot.now_ns, target.odometry_position_m[:2]))
         x, y, _ = target.position_m
         distance, bearing = hypot(x, y), atan2(y, x)
-        vx, vy, _ = scene.body.inverse().rotate(target.velocity_mps)
+        vx, vy, _ = snapshot.body.inverse().rotate(target.velocity_mps)
         # Along and across the line of sight.
         along = (vx * x + vy * y) / max(distance, 0.2)
         across = (x * vy - y * vx) / max(distance, 0.2)
@@ -255,24 +266,24 @@ class Follow:
         speed = min(max(speed, -0.25), config.max_speed_mps)
         turn = config.turn_gain_per_s * bearing + across / max(distance, 0.3)
         move = Move(speed, turn, abs(gap), f"{distance:.2f} m behind it, {gap:+.2f} m to make up", False)
-        fields = scene.fields(self._label, self._ignored(scene.now_ns))
-        watcher = Course(limbs.robot, limbs.config, (0.0, 0.0), arm="folded")
-        if watcher.guarded(move, scene.body, fields, limbs.driver):
+        fields = snapshot.fields(self._label, self._ignored(snapshot.now_ns))
+        watcher = Course(actuators.robot, actuators.config, (0.0, 0.0), arm="folded")
+        if watcher.guarded(move, snapshot.body, fields, actuators.driver):
             move = move._replace(speed_mps=0.0, why="something is between us")
-        base = limbs.driver.command(move.speed_mps, move.turn_radps, scene.dt_s, brisk=True)
-        return Plan(base, arm, move.why, scene.look_at(target.position_m), distance_m=distance)
+        base = actuators.driver.command(move.speed_mps, move.turn_radps, snapshot.dt_s, brisk=True)
+        return Plan(base, arm, move.why, snapshot.look_at(target.position_m), distance_m=distance)
 
-    def _look_for(self, scene: Scene, target: TargetEstimate, arm: Step) -> Plan:
-        pan, tilt = scene.angles[PAN], scene.angles[TILT]
+    def _look_for(self, snapshot: Snapshot, target: TargetEstimate, arm: Step) -> Plan:
+        pan, tilt = snapshot.angles[PAN], snapshot.angles[TILT]
         if target.age_s < 3.0:
-            head = scene.look_at(target.position_m)
+            head = snapshot.look_at(target.position_m)
             turn = 1.5 * atan2(target.position_m[1], target.position_m[0])
-            base = scene.limbs.driver.command(0.0, turn, scene.dt_s)
+            base = snapshot.actuators.driver.command(0.0, turn, snapshot.dt_s)
             return Plan(base, arm, "lost it: looking where it was going", head, distance_m=planar_m(target))
         if self._sweep is None or self._sweep.done:
-            self._sweep = Sweep(scene.limbs.config.head, pan)
-        head = (*self._sweep.next(pan, tilt), scene.limbs.config.head.sweep_speed_radps)
-        return Plan(scene.stand(), arm, "lost it: searching", head, distance_m=planar_m(target))
+            self._sweep = Sweep(snapshot.actuators.config.head, pan)
+        head = (*self._sweep.next(pan, tilt), snapshot.actuators.config.head.sweep_speed_radps)
+        return Plan(snapshot.stand(), arm, "lost it: searching", head, distance_m=planar_m(target))
 
     def _ignored(self, now_ns: int) -> tuple[tuple[float, float, float], ...]:
         """Where the target has just been nothing stands, whatever the map still shows."""

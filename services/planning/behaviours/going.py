@@ -5,7 +5,7 @@ from __future__ import annotations
 from math import hypot
 
 from cocoro.messages import Vec2
-from services.planning.behaviours.base import Plan, Scene
+from services.planning.behaviours.base import Plan, Snapshot
 from services.planning.behaviours.driving import BackOff
 from services.planning.course import Course
 from services.planning.navigation import offset_to
@@ -25,46 +25,51 @@ class GoTo:
         self._back_off = BackOff()
         self._creeping = False
 
-    def step(self, scene: Scene) -> Plan:
-        limbs, config = scene.limbs, scene.limbs.config
-        target = scene.target(self._label)
+    def step(self, snapshot: Snapshot) -> Plan:
+        actuators, config = snapshot.actuators, snapshot.actuators.config
+        target = snapshot.target(self._label)
         if target is None:
-            return Plan(scene.stand(), scene.still(), f"{self._label} is unknown", None, "failed", "lost")
+            return Plan(snapshot.stand(), snapshot.still(), f"{self._label} is unknown", None, "failed", "lost")
         if self._course is None:
-            self._course = Course(limbs.robot, config, (self._distance_m, 0.0), arm="folded")
-        head = scene.look_at(target.position_m)
-        backing = self._back_off.step(scene, head)
+            self._course = Course(actuators.robot, config, (self._distance_m, 0.0), arm="folded")
+        head = snapshot.look_at(target.position_m)
+        backing = self._back_off.step(snapshot, head)
         if backing is not None:
             return backing
-        arm = limbs.arm.park(scene.angles, scene.dt_s)
+        arm = actuators.arm.park(snapshot.angles, snapshot.dt_s)
         # The arm works where things are seen; the wheels have to go to where they are.
-        x, y, _ = straight = limbs.eye.straight(target.position_m)
-        place = scene.body.apply(straight)[:2]
+        x, y, _ = straight = actuators.camera_tilt.straight(target.position_m)
+        place = snapshot.body.apply(straight)[:2]
         move = self._course.step(
-            place, scene.body, scene.senses.around, scene.fields(self._label), limbs.driver, scene.now_ns
+            place,
+            snapshot.body,
+            snapshot.estimator.around,
+            snapshot.fields(self._label),
+            actuators.driver,
+            snapshot.now_ns,
         )
         # The camera is blind near by, so on the last stretch the target may be remembered for a while.
         patience_s = config.stale_target_s if move.direct else config.stale_on_way_s
-        if target.age_s > patience_s + scene.senses.sight_lag_s:
+        if target.age_s > patience_s + snapshot.estimator.sight_lag_s:
             why = f"{self._label} has not been seen for {target.age_s:.1f} s"
-            return Plan(scene.stand(), scene.still(), why, None, "failed", "lost")
+            return Plan(snapshot.stand(), snapshot.still(), why, None, "failed", "lost")
         self._creeping |= move.arrived
         if self._creeping:
-            return self._creep(scene, Plan(scene.stand(), arm, "", head), (x, y))
+            return self._creep(snapshot, Plan(snapshot.stand(), arm, "", head), (x, y))
         if move.look_at is not None:
-            head = scene.look_at(scene.body.inverse().apply((*move.look_at, 0.0)))
-        base = limbs.driver.command(move.speed_mps, move.turn_radps, scene.dt_s)
+            head = snapshot.look_at(snapshot.body.inverse().apply((*move.look_at, 0.0)))
+        base = actuators.driver.command(move.speed_mps, move.turn_radps, snapshot.dt_s)
         plan = Plan(base, arm, move.why, head, distance_m=move.left_m)
         if move.blocked:
-            plan.base, plan.state, plan.reason = scene.stand(), "failed", "blocked"
+            plan.base, plan.state, plan.reason = snapshot.stand(), "failed", "blocked"
         return plan
 
-    def _creep(self, scene: Scene, plan: Plan, place_m: Vec2) -> Plan:
+    def _creep(self, snapshot: Snapshot, plan: Plan, place_m: Vec2) -> Plan:
         left_m = offset_to(place_m, (self._distance_m, 0.0)).ahead_m
         plan.distance_m, plan.why = abs(left_m), f"{left_m:+.3f} m to creep"
         if abs(left_m) > self.NEAR_ENOUGH_M:
             speed = min(max(2.0 * left_m, -self.CREEP_MPS), self.CREEP_MPS)
-            plan.base = scene.limbs.driver.command(speed, 0.0, scene.dt_s)
-        elif scene.standing:
+            plan.base = snapshot.actuators.driver.command(speed, 0.0, snapshot.dt_s)
+        elif snapshot.standing:
             plan.state, plan.why = "done", f"{self._label} is {hypot(*place_m):.3f} m away"
         return plan

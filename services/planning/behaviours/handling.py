@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from services.planning.behaviours.base import Plan, Scene, hand_place
+from services.planning.behaviours.base import Plan, Snapshot, hand_place
 from services.planning.reach import HandPose
 from services.planning.reachability import Grasp
 
@@ -26,38 +26,40 @@ class Reach:
         """Where the hand comes to at last, once that is settled."""
         return self._frozen.around if self._frozen is not None else None
 
-    def step(self, scene: Scene) -> Plan:
-        limbs, config = scene.limbs, scene.limbs.config
-        target = scene.target(self._label)
-        if self._frozen is None and (target is None or target.age_s > config.stale_target_s + scene.senses.sight_lag_s):
-            return Plan(scene.stand(), scene.still(), f"{self._label} is out of sight", None, "failed", "lost")
+    def step(self, snapshot: Snapshot) -> Plan:
+        actuators, config = snapshot.actuators, snapshot.actuators.config
+        target = snapshot.target(self._label)
+        if self._frozen is None and (
+            target is None or target.age_s > config.stale_target_s + snapshot.estimator.sight_lag_s
+        ):
+            return Plan(snapshot.stand(), snapshot.still(), f"{self._label} is out of sight", None, "failed", "lost")
         if target is not None and not self._inserting:
-            why_not = limbs.reachability.why_not(target.position_m, touching=self._touching)
+            why_not = actuators.reachability.why_not(target.position_m, touching=self._touching)
             if why_not:
-                return Plan(scene.stand(), scene.still(), why_not, None, "failed", "unreachable")
-        limbs.grip.open()
+                return Plan(snapshot.stand(), snapshot.still(), why_not, None, "failed", "unreachable")
+        actuators.grip.open()
         grasp = self._frozen
         if grasp is None:
             assert target is not None
-            grasp = limbs.reachability.grasp(target.position_m)
-        head = scene.look_at(target.position_m) if target is not None else None
+            grasp = actuators.reachability.grasp(target.position_m)
+        head = snapshot.look_at(target.position_m) if target is not None else None
         closing_in = self._inserting
         if not closing_in:
-            arm = limbs.arm.reach(grasp.behind, config.arm.hand_speed_mps, scene.angles, scene.dt_s)
-            ready = arm.left < self.CLOSE_IN_M and scene.senses.hand is not None
-            if ready and scene.senses.hand is not None and limbs.grip.opened(scene.senses.hand):
+            arm = actuators.arm.reach(grasp.behind, config.arm.hand_speed_mps, snapshot.angles, snapshot.dt_s)
+            ready = arm.left < self.CLOSE_IN_M and snapshot.estimator.hand is not None
+            if ready and snapshot.estimator.hand is not None and actuators.grip.opened(snapshot.estimator.hand):
                 self._inserting = True
             why = "bringing the open hand behind the target"
         else:
-            arm = limbs.arm.reach(grasp.around, config.arm.insert_speed_mps, scene.angles, scene.dt_s)
+            arm = actuators.arm.reach(grasp.around, config.arm.insert_speed_mps, snapshot.angles, snapshot.dt_s)
             if arm.left < self.FREEZE_M:
                 self._frozen = grasp
             why = "closing in on the target"
-        plan = Plan(scene.stand(), arm, why, head, distance_m=arm.left)
+        plan = Plan(snapshot.stand(), arm, why, head, distance_m=arm.left)
         if arm.blocked:
             plan.state, plan.reason, plan.why = "failed", "blocked", "the hand's way is blocked"
         elif closing_in and arm.arrived:
-            limbs.grasp_height_m = grasp.around.height_m
+            actuators.grasp_height_m = grasp.around.height_m
             plan.state, plan.why = "done", "the target is between the claws"
         return plan
 
@@ -68,16 +70,16 @@ class Close:
     def __init__(self) -> None:
         self._since_ns: int | None = None
 
-    def step(self, scene: Scene) -> Plan:
-        hand = scene.senses.hand
+    def step(self, snapshot: Snapshot) -> Plan:
+        hand = snapshot.estimator.hand
         if self._since_ns is None:
-            self._since_ns = scene.now_ns
-            scene.limbs.grip.close()
-        plan = Plan(scene.stand(), scene.still(), "closing the claws")
-        if scene.holding and hand is not None:
-            scene.limbs.grip.clamp(hand)
+            self._since_ns = snapshot.now_ns
+            snapshot.actuators.grip.close()
+        plan = Plan(snapshot.stand(), snapshot.still(), "closing the claws")
+        if snapshot.holding and hand is not None:
+            snapshot.actuators.grip.clamp(hand)
             plan.state, plan.why = "done", "the claws hold something"
-        elif (scene.now_ns - self._since_ns) / 1e9 > scene.limbs.config.hand.give_up_s:
+        elif (snapshot.now_ns - self._since_ns) / 1e9 > snapshot.actuators.config.hand.give_up_s:
             plan.state, plan.reason, plan.why = "failed", "no_grip", "the claws closed on nothing"
         return plan
 
@@ -93,22 +95,22 @@ class Lift:
         self._up = False
         self._loose_since_ns: int | None = None
 
-    def step(self, scene: Scene) -> Plan:
-        limbs, config = scene.limbs, scene.limbs.config.arm
+    def step(self, snapshot: Snapshot) -> Plan:
+        actuators, config = snapshot.actuators, snapshot.actuators.config.arm
         if self._start is None:
-            self._start = limbs.reacher.pose(scene.angles)
-        top_m = limbs.grasp_height_m + config.carry_rise_m
+            self._start = actuators.reacher.pose(snapshot.angles)
+        top_m = actuators.grasp_height_m + config.carry_rise_m
         if not self._up:
             goal = self._start._replace(height_m=self._start.height_m + self.STRAIGHT_M)
         else:
             goal = HandPose(config.carry_radius_m, self._start.azimuth_rad, top_m, self._start.pitch_rad)
-        arm = limbs.arm.reach(goal, config.lift_speed_mps, scene.angles, scene.dt_s)
-        plan = Plan(scene.stand(), arm, "lifting", scene.look_at(hand_place(scene)), distance_m=arm.left)
-        if scene.holding:
+        arm = actuators.arm.reach(goal, config.lift_speed_mps, snapshot.angles, snapshot.dt_s)
+        plan = Plan(snapshot.stand(), arm, "lifting", snapshot.look_at(hand_place(snapshot)), distance_m=arm.left)
+        if snapshot.holding:
             self._loose_since_ns = None
         elif self._loose_since_ns is None:
-            self._loose_since_ns = scene.now_ns
-        elif (scene.now_ns - self._loose_since_ns) / 1e9 > self.SLIP_S:
+            self._loose_since_ns = snapshot.now_ns
+        elif (snapshot.now_ns - self._loose_since_ns) / 1e9 > self.SLIP_S:
             plan.state, plan.reason, plan.why = "failed", "slipped", "the claws hold nothing any more"
             return plan
         if arm.blocked:
@@ -127,17 +129,17 @@ class Place:
         self._phase = 0
         self._start: HandPose | None = None
 
-    def step(self, scene: Scene) -> Plan:
-        limbs, config = scene.limbs, scene.limbs.config.arm
+    def step(self, snapshot: Snapshot) -> Plan:
+        actuators, config = snapshot.actuators, snapshot.actuators.config.arm
         if self._start is None:
-            self._start = limbs.reacher.pose(scene.angles)
+            self._start = actuators.reacher.pose(snapshot.angles)
         azimuth, pitch = self._start.azimuth_rad, config.pitch_rad
-        low = HandPose(config.grasp_radius_m, azimuth, limbs.grasp_height_m + 0.003, pitch)
+        low = HandPose(config.grasp_radius_m, azimuth, actuators.grasp_height_m + 0.003, pitch)
         phases: tuple[tuple[str, HandPose, float], ...] = (
             ("stretching out", low._replace(height_m=low.height_m + 0.05), config.lift_speed_mps),
             ("setting it down", low, config.lift_speed_mps / 2),
             ("letting go", low, config.lift_speed_mps),
-            ("backing out", low._replace(radius_m=limbs.reachability.retreat_m), config.insert_speed_mps),
+            ("backing out", low._replace(radius_m=actuators.reachability.retreat_m), config.insert_speed_mps),
             (
                 "raising the hand",
                 HandPose(config.travel_radius_m, azimuth, config.travel_height_m, pitch),
@@ -145,14 +147,14 @@ class Place:
             ),
         )
         why, goal, speed = phases[self._phase]
-        arm = limbs.arm.reach(goal, speed, scene.angles, scene.dt_s)
+        arm = actuators.arm.reach(goal, speed, snapshot.angles, snapshot.dt_s)
         done = arm.arrived
         if self._phase >= 2:
-            limbs.grip.open()
+            actuators.grip.open()
         if self._phase == 2:
-            hand = scene.senses.hand
-            done = hand is not None and limbs.grip.opened(hand)
-        plan = Plan(scene.stand(), arm, why, scene.look_at(hand_place(scene)), distance_m=arm.left)
+            hand = snapshot.estimator.hand
+            done = hand is not None and actuators.grip.opened(hand)
+        plan = Plan(snapshot.stand(), arm, why, snapshot.look_at(hand_place(snapshot)), distance_m=arm.left)
         if arm.blocked:
             plan.state, plan.reason, plan.why = "failed", "blocked", f"{why}: the arm's way is blocked"
         elif done and self._phase == len(phases) - 1:

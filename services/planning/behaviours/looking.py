@@ -6,7 +6,7 @@ from math import atan2
 
 from cocoro.clock import NS
 from cocoro.frames import Pose2
-from services.planning.behaviours.base import Plan, Scene, planar_m
+from services.planning.behaviours.base import Plan, Snapshot, planar_m
 from services.planning.course import Course
 from services.planning.floor_map import CELL_M, SIZE
 from services.planning.head import PAN, TILT, Sweep
@@ -18,19 +18,19 @@ class Idle:
     def __init__(self, why: str = "nothing is asked") -> None:
         self._why = why
 
-    def step(self, scene: Scene) -> Plan:
-        return Plan(scene.limbs.driver.halt(), scene.still(), self._why, state="done")
+    def step(self, snapshot: Snapshot) -> Plan:
+        return Plan(snapshot.actuators.driver.halt(), snapshot.still(), self._why, state="done")
 
 
 class Park:
     """Fold the arm up and look ahead."""
 
-    def step(self, scene: Scene) -> Plan:
-        arm = scene.limbs.arm.park(scene.angles, scene.dt_s)
+    def step(self, snapshot: Snapshot) -> Plan:
+        arm = snapshot.actuators.arm.park(snapshot.angles, snapshot.dt_s)
         if arm.blocked:
-            return Plan(scene.stand(), arm, "the way to the park pose is blocked", None, "failed", "blocked")
-        done = arm.arrived and scene.limbs.arm.parked(scene.angles)
-        plan = Plan(scene.stand(), arm, "folding the arm up", (0.0, 0.0, 1.5), distance_m=arm.left)
+            return Plan(snapshot.stand(), arm, "the way to the park pose is blocked", None, "failed", "blocked")
+        done = arm.arrived and snapshot.actuators.arm.parked(snapshot.angles)
+        plan = Plan(snapshot.stand(), arm, "folding the arm up", (0.0, 0.0, 1.5), distance_m=arm.left)
         if done:
             plan.state, plan.why = "done", "parked"
         return plan
@@ -54,52 +54,52 @@ class Search:
         self._looked_from = 0
         """Sightings there were when looking at the remembered place began."""
 
-    def step(self, scene: Scene) -> Plan:
-        config = scene.limbs.config.head
-        target = scene.target(self._label)
-        base, arm = scene.stand(), scene.still()
+    def step(self, snapshot: Snapshot) -> Plan:
+        config = snapshot.actuators.config.head
+        target = snapshot.target(self._label)
+        base, arm = snapshot.stand(), snapshot.still()
         if target is not None:
-            head = scene.look_at(target.position_m)
-            sightings = scene.senses.memory.sightings(self._label)
-            lag_s = scene.senses.sight_lag_s
+            head = snapshot.look_at(target.position_m)
+            sightings = snapshot.estimator.memory.sightings(self._label)
+            lag_s = snapshot.estimator.sight_lag_s
             if sightings >= self.CONFIRMED and target.age_s < self.IN_VIEW_S + lag_s:
                 return Plan(base, arm, f"{self._label} is in view", head, "done", distance_m=planar_m(target))
             if self._looked_at_ns is None or sightings > self._looked_from:
-                self._looked_at_ns, self._looked_from = scene.now_ns, sightings
-            if scene.now_ns - self._looked_at_ns < (config.look_where_it_was_s + 2 * lag_s) * 1e9:
+                self._looked_at_ns, self._looked_from = snapshot.now_ns, sightings
+            if snapshot.now_ns - self._looked_at_ns < (config.look_where_it_was_s + 2 * lag_s) * 1e9:
                 why = f"{self._label} was seen {target.age_s:.1f} s ago: looking there"
                 return Plan(base, arm, why, head, distance_m=planar_m(target))
-        too_near = self._back_away(scene)
+        too_near = self._back_away(snapshot)
         if too_near is not None:
             return too_near
-        pan, tilt = scene.angles[PAN], scene.angles[TILT]
+        pan, tilt = snapshot.angles[PAN], snapshot.angles[TILT]
         if self._sweep is None:
             self._sweep = Sweep(config, pan)
         goal = self._sweep.next(pan, tilt)
         # Slow perception must still see every direction twice as the view passes over it.
-        speed = min(config.sweep_speed_radps, 0.4 / max(scene.senses.sight_lag_s, 1e-3))
+        speed = min(config.sweep_speed_radps, 0.4 / max(snapshot.estimator.sight_lag_s, 1e-3))
         head = (*goal, speed)
         if self._sweep.done:
             why = f"the whole surroundings were searched, {self._label} is not there"
             return Plan(base, arm, why, head, "failed", "not_found")
         return Plan(base, arm, f"sweeping for {self._label}: {self._sweep.share:.0%} done", head)
 
-    def _back_away(self, scene: Scene) -> Plan | None:
+    def _back_away(self, snapshot: Snapshot) -> Plan | None:
         """From a target that is seen, but too near for the depth camera: until it has depth."""
-        stamp_ns, note = scene.senses.unlocalised.get(self._label, (0, ""))
-        fresh = scene.now_ns - stamp_ns < (0.5 + scene.senses.sight_lag_s) * NS
-        if not fresh or note != "no depth" or scene.target(self._label) is not None:
+        stamp_ns, note = snapshot.estimator.unlocalised.get(self._label, (0, ""))
+        fresh = snapshot.now_ns - stamp_ns < (0.5 + snapshot.estimator.sight_lag_s) * NS
+        if not fresh or note != "no depth" or snapshot.target(self._label) is not None:
             return None
         if self._start is None:
-            self._start = scene.body
-        gone = self._start.inverse().compose(scene.body)
+            self._start = snapshot.body
+        gone = self._start.inverse().compose(snapshot.body)
         if gone.x_m < -self.BACK_M:
             return None
-        pan = scene.angles[PAN]
+        pan = snapshot.angles[PAN]
         speed = -0.10 if abs(pan) < 0.5 else 0.0
-        base = scene.limbs.driver.command(speed, 1.2 * pan, scene.dt_s)
+        base = snapshot.actuators.driver.command(speed, 1.2 * pan, snapshot.dt_s)
         why = f"{self._label} is too near to be seen in depth: backing away"
-        return Plan(base, scene.still(), why)
+        return Plan(base, snapshot.still(), why)
 
 
 class Explore:
@@ -113,38 +113,44 @@ class Explore:
         self._course: Course | None = None
         self._goal: tuple[float, float] | None = None
 
-    def step(self, scene: Scene) -> Plan:
-        limbs = scene.limbs
-        fields = scene.fields("")
+    def step(self, snapshot: Snapshot) -> Plan:
+        actuators = snapshot.actuators
+        fields = snapshot.fields("")
         if self._goal is None:
-            self._goal = self._viewpoint(scene)
+            self._goal = self._viewpoint(snapshot)
             if self._goal is None:
-                return Plan(scene.stand(), scene.still(), "there is nowhere else to look from", state="done")
+                return Plan(snapshot.stand(), snapshot.still(), "there is nowhere else to look from", state="done")
         if self._course is None:
-            self._course = Course(limbs.robot, limbs.config, (0.0, 0.0), arm="folded", arrive_m=0.12)
-        target = scene.target(self._label)
-        if target is not None and target.age_s < 0.3 and scene.senses.memory.sightings(self._label) >= Search.CONFIRMED:
-            return Plan(scene.stand(), scene.still(), f"{self._label} came into view", state="done")
-        arm = limbs.arm.park(scene.angles, scene.dt_s)
-        move = self._course.step(self._goal, scene.body, scene.senses.around, fields, limbs.driver, scene.now_ns)
-        if not limbs.arm.parked(scene.angles):
+            self._course = Course(actuators.robot, actuators.config, (0.0, 0.0), arm="folded", arrive_m=0.12)
+        target = snapshot.target(self._label)
+        if (
+            target is not None
+            and target.age_s < 0.3
+            and snapshot.estimator.memory.sightings(self._label) >= Search.CONFIRMED
+        ):
+            return Plan(snapshot.stand(), snapshot.still(), f"{self._label} came into view", state="done")
+        arm = actuators.arm.park(snapshot.angles, snapshot.dt_s)
+        move = self._course.step(
+            self._goal, snapshot.body, snapshot.estimator.around, fields, actuators.driver, snapshot.now_ns
+        )
+        if not actuators.arm.parked(snapshot.angles):
             move = move._replace(speed_mps=0.0, turn_radps=0.0)
-        base = limbs.driver.command(move.speed_mps, move.turn_radps, scene.dt_s)
+        base = actuators.driver.command(move.speed_mps, move.turn_radps, snapshot.dt_s)
         place = move.look_at or self._goal
-        head = scene.look_at(scene.body.inverse().apply((*place, 0.0)))
+        head = snapshot.look_at(snapshot.body.inverse().apply((*place, 0.0)))
         plan = Plan(base, arm, f"going to look from elsewhere: {move.why}", head, distance_m=move.left_m)
-        if move.blocked or (move.arrived and scene.standing):
+        if move.blocked or (move.arrived and snapshot.standing):
             # Wherever it has got to, it can look from there.
             plan.state = "done"
         return plan
 
-    def _viewpoint(self, scene: Scene) -> tuple[float, float] | None:
+    def _viewpoint(self, snapshot: Snapshot) -> tuple[float, float] | None:
         """The place within reach that is nearest to the most unseen floor."""
-        around, limbs = scene.senses.around, scene.limbs
-        navigation = limbs.config.navigation
-        fields = scene.fields("")
-        radius = limbs.robot.base.chassis_diameter_m / 2 + navigation.clearance_m
-        routes = around.routes(fields.body, scene.body, radius, navigation.comfort_m)
+        around, actuators = snapshot.estimator.around, snapshot.actuators
+        navigation = actuators.config.navigation
+        fields = snapshot.fields("")
+        radius = actuators.robot.base.chassis_diameter_m / 2 + navigation.clearance_m
+        routes = around.routes(fields.body, snapshot.body, radius, navigation.comfort_m)
         unseen = ~around.floor.looked_at()
         best: tuple[float, tuple[float, float]] | None = None
         for row in range(0, SIZE, 4):
@@ -155,7 +161,7 @@ class Explore:
                     continue
                 reach = round(self.SIGHT_M / CELL_M)
                 hidden = unseen[max(row - reach, 0) : row + reach, max(column - reach, 0) : column + reach].sum()
-                turn = abs(atan2(y - scene.body.y_m, x - scene.body.x_m))
+                turn = abs(atan2(y - snapshot.body.y_m, x - snapshot.body.x_m))
                 gain = float(hidden) * CELL_M**2 - cost - 0.05 * turn
                 if best is None or gain > best[0]:
                     best = gain, (x, y)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from cocoro.clock import NS
 from cocoro.frames import Spherical, to_spherical, wrap_rad
-from services.planning.behaviours.base import Plan, Scene, hand_place
+from services.planning.behaviours.base import Plan, Snapshot, hand_place
 from services.planning.behaviours.handling import Reach
 from services.planning.reach import HandPose
 
@@ -27,53 +27,55 @@ class Touch:
         self._seen = False
         self._looking_since_ns: int | None = None
 
-    def step(self, scene: Scene) -> Plan:
-        limbs, config = scene.limbs, scene.limbs.config.arm
-        reference = limbs.arm.reference or scene.angles
+    def step(self, snapshot: Snapshot) -> Plan:
+        actuators, config = snapshot.actuators, snapshot.actuators.config.arm
+        reference = actuators.arm.reference or snapshot.angles
         if not self._begun:
             self._begun = True
-            have = limbs.reacher.pose({**scene.angles, **reference})
-            if not limbs.arm.folded(reference) and have.radius_m > limbs.reachability.retreat_m + 0.02:
-                self._back = have._replace(radius_m=limbs.reachability.retreat_m, pitch_rad=config.pitch_rad)
+            have = actuators.reacher.pose({**snapshot.angles, **reference})
+            if not actuators.arm.folded(reference) and have.radius_m > actuators.reachability.retreat_m + 0.02:
+                self._back = have._replace(radius_m=actuators.reachability.retreat_m, pitch_rad=config.pitch_rad)
         if self._back is not None:
-            return self._back_out(scene, self._back)
-        plan = self._look(scene) or self._reach.step(scene)
+            return self._back_out(snapshot, self._back)
+        plan = self._look(snapshot) or self._reach.step(snapshot)
         if plan.state == "done":
-            self._judge(scene, plan)
+            self._judge(snapshot, plan)
         return plan
 
-    def _back_out(self, scene: Scene, goal: HandPose) -> Plan:
+    def _back_out(self, snapshot: Snapshot, goal: HandPose) -> Plan:
         """Out of what it was around before, along the hand's own axis."""
-        limbs, config = scene.limbs, scene.limbs.config.arm
-        limbs.grip.open()
-        step = limbs.arm.reach(goal, config.hand_speed_mps, scene.angles, scene.dt_s)
-        target = scene.target(self._label)
-        head = scene.look_at(target.position_m) if target is not None else None
-        plan = Plan(scene.stand(), step, "backing the hand out first", head, distance_m=step.left)
+        actuators, config = snapshot.actuators, snapshot.actuators.config.arm
+        actuators.grip.open()
+        step = actuators.arm.reach(goal, config.hand_speed_mps, snapshot.angles, snapshot.dt_s)
+        target = snapshot.target(self._label)
+        head = snapshot.look_at(target.position_m) if target is not None else None
+        plan = Plan(snapshot.stand(), step, "backing the hand out first", head, distance_m=step.left)
         if step.left < Reach.CLOSE_IN_M:
             self._back = None
         elif step.blocked:
             plan.state, plan.reason, plan.why = "failed", "blocked", "the hand's way out is blocked"
         return plan
 
-    def _look(self, scene: Scene) -> Plan | None:
+    def _look(self, snapshot: Snapshot) -> Plan | None:
         """Wait, for so long, for a target that the hand has hidden; None once it is in view."""
-        target, lag_s = scene.target(self._label), scene.senses.sight_lag_s
+        target, lag_s = snapshot.target(self._label), snapshot.estimator.sight_lag_s
         if target is None or self._seen or target.age_s < self.IN_VIEW_S + lag_s:
             self._seen = True
             return None
         if self._looking_since_ns is None:
-            self._looking_since_ns = scene.now_ns
-        if scene.now_ns - self._looking_since_ns > (self.LOOK_S + lag_s) * NS:
+            self._looking_since_ns = snapshot.now_ns
+        if snapshot.now_ns - self._looking_since_ns > (self.LOOK_S + lag_s) * NS:
             return None
-        return Plan(scene.stand(), scene.still(), f"looking at {self._label}", scene.look_at(target.position_m))
+        return Plan(
+            snapshot.stand(), snapshot.still(), f"looking at {self._label}", snapshot.look_at(target.position_m)
+        )
 
-    def _judge(self, scene: Scene, plan: Plan) -> None:
+    def _judge(self, snapshot: Snapshot, plan: Plan) -> None:
         """The goal's posture is commanded; done is it when the hand has come there."""
         goal = self._reach.goal
         assert goal is not None
-        x, y, z = scene.limbs.reacher.point(goal).tolist()
-        want, have = to_spherical((x, y, z)), to_spherical(hand_place(scene))
+        x, y, z = snapshot.actuators.reacher.point(goal).tolist()
+        want, have = to_spherical((x, y, z)), to_spherical(hand_place(snapshot))
         turn_rad, rise_rad = wrap_rad(have.azimuth_rad - want.azimuth_rad), have.elevation_rad - want.elevation_rad
         gap = Spherical(have.rho_m - want.rho_m, turn_rad, rise_rad)
         if all(abs(value) <= limit for value, limit in zip(gap, REACHED, strict=True)):

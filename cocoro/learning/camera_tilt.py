@@ -20,7 +20,7 @@ from cocoro.robot import Robot
 LEAST_TRIALS = 4
 
 
-class Eye:
+class CameraTilt:
     """Sees with the drawing of the neck, and knows by how much that is wrong."""
 
     def __init__(self, robot: Robot, tilt_rad: float = 0.0) -> None:
@@ -60,6 +60,6 @@ def eye_tilt(trials: Sequence[WheelRow], height_m: float | None, robot: Robot) -
     or too few trials tell how high it was seen."""
     if height_m is None:
         return None
-    eye = Eye(robot)
+    eye = CameraTilt(robot)
     found = [eye.tilt_of((*row.after_m, row.height_m), height_m) for row in trials if row.height_m is not None]
     return float(np.median(found)) if len(found) >= LEAST_TRIALS else None

@@ -15,7 +15,7 @@ from cocoro.clock import NS, is_fresh
 from cocoro.frames import Pose2
 from cocoro.history import History
 from cocoro.kinematics import Array
-from cocoro.learning.eye import Eye
+from cocoro.learning.camera_tilt import CameraTilt
 from cocoro.messages import BaseState, Detection, Detections, Intent, Message, Obstacles, ServoState, Vec3
 from cocoro.robot import Robot
 from cocoro.topics import Topic
@@ -49,7 +49,7 @@ class Sight:
         self._blind_since_ns = None
 
     def blind_s(self, now_ns: int) -> float | None:
-        """As `Senses.blind_s`; from when this was first asked where nothing was ever heard."""
+        """As `StateEstimator.blind_s`; from when this was first asked where nothing was ever heard."""
         if self._heard_ns is not None and 0 <= now_ns - self._heard_ns <= self._patience_ns():
             return None
         if self._blind_since_ns is None or now_ns < self._blind_since_ns:
@@ -79,7 +79,7 @@ class Sighting(NamedTuple):
     """Of every joint."""
 
 
-class Senses:
+class StateEstimator:
     """Takes every input of the planner; answers by time."""
 
     def __init__(self, config: Config, robot: Robot) -> None:
@@ -104,7 +104,7 @@ class Senses:
         """Per topic, when its newest message was said."""
         self._sight = Sight(robot.base.command_timeout_s, config.blind_periods)
         self.turning = Turning()
-        self.eye: Eye | None = None
+        self.camera_tilt: CameraTilt | None = None
         """Where it is known to be tilted: what it sees standing on the floor may be the floor."""
         self._watched = {config.marker}
         self._sightings: list[Sighting] = []
@@ -180,11 +180,11 @@ class Senses:
 
     def _standing(self, seen: Obstacles) -> Obstacles:
         """Without what only a tilted eye lifts off the floor."""
-        if self.eye is None or self.eye.tilt_rad <= 0.0 or not seen.points_m:
+        if self.camera_tilt is None or self.camera_tilt.tilt_rad <= 0.0 or not seen.points_m:
             return seen
         points = np.array(seen.points_m)
         distance = np.hypot(points[:, 0] - seen.origin_m[0], points[:, 1] - seen.origin_m[1])
-        stands = self.eye.heights(points) > FLOOR_M + FLOOR_PER_M * distance
+        stands = self.camera_tilt.heights(points) > FLOOR_M + FLOOR_PER_M * distance
         return msgspec.structs.replace(seen, points_m=tuple(compress(seen.points_m, stands.tolist())))
 
     def _remember(self, detections: Detections, body: Pose2) -> None:

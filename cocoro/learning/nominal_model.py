@@ -24,7 +24,7 @@ def arm_joints(robot: Robot) -> tuple[str, ...]:
 _NEXT, _LAST = [1, 2, 0], [2, 0, 1]
 
 
-class Drawing:
+class NominalModel:
     """Rigid-body forward kinematics of the marker; angles are in the order of `joints`."""
 
     def __init__(self, robot: Robot, roll_rad: float = LEVEL_ROLL_RAD) -> None:

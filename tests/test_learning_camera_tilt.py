@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from cocoro.learning.camera_tilt import LEAST_TRIALS, CameraTilt, eye_tilt
 from cocoro.learning.dataset import WheelRow
-from cocoro.learning.eye import LEAST_TRIALS, Eye, eye_tilt
 from cocoro.messages import Obstacles, Vec3
 from cocoro.robot import Robot
 from services.planning.config import Config
-from services.planning.senses import Senses
+from services.planning.state_estimator import StateEstimator
 
 
 def seen(robot: Robot, true_m: Vec3, tilt_rad: float) -> Vec3:
@@ -31,7 +31,7 @@ def row(after_m: Vec3) -> WheelRow:
 
 @pytest.mark.parametrize("tilt_rad", [-0.04, 0.0, 0.03])
 def test_what_a_tilted_eye_sees_is_put_straight(robot: Robot, tilt_rad: float) -> None:
-    eye = Eye(robot, tilt_rad)
+    eye = CameraTilt(robot, tilt_rad)
     for place in ((1.5, 0.0, 0.06), (0.4, -0.2, 0.3), (0.9, 0.8, 0.0)):
         assert eye.straight(seen(robot, place, tilt_rad)) == pytest.approx(place, abs=1e-6)
 
@@ -49,14 +49,14 @@ def test_without_the_targets_height_or_with_few_trials_nothing_is_said_of_the_ey
 
 
 def test_an_eye_that_is_as_drawn_changes_nothing(robot: Robot) -> None:
-    assert Eye(robot).straight((1.0, 0.3, 0.2)) == (1.0, 0.3, 0.2)
+    assert CameraTilt(robot).straight((1.0, 0.3, 0.2)) == (1.0, 0.3, 0.2)
 
 
 def test_the_floor_that_a_tilted_eye_lifts_is_no_obstacle(robot: Robot) -> None:
     floor, box = seen(robot, (1.9, 0.2, 0.0), 0.03), seen(robot, (1.9, -0.2, 0.2), 0.03)
     assert floor[2] > 0.05  # higher than what counts as floor so far off
-    senses = Senses(Config(), robot)
+    estimator = StateEstimator(Config(), robot)
     obstacles = Obstacles(points_m=(floor, box), origin_m=(0.06, 0.0))
-    assert senses._standing(obstacles).points_m == (floor, box)
-    senses.eye = Eye(robot, 0.03)
-    assert senses._standing(obstacles).points_m == (box,)
+    assert estimator._standing(obstacles).points_m == (floor, box)
+    estimator.camera_tilt = CameraTilt(robot, 0.03)
+    assert estimator._standing(obstacles).points_m == (box,)
