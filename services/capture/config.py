@@ -9,7 +9,7 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from cocoro.capture.compression import Compression
+from services.capture.file import Compression
 
 Positive = Annotated[float, Meta(gt=0)]
 FOLDER = "COCORO_CAPTURE_DIR"

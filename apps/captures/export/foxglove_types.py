@@ -9,7 +9,7 @@ from typing import Any
 
 import msgspec
 
-from cocoro.capture.schema import ENCODING, TypeSchema
+from cocoro.capture.types import ENCODING, TypeSchema
 from cocoro.clock import NS
 from cocoro.messages import Quaternion as Turn
 from cocoro.messages import Vec3
