@@ -25,12 +25,12 @@ from apps.captures.export.story import catalogue_of, robot_of
 from apps.cli.capture_view import watch
 from apps.cli.main import main
 from cocoro import topics
+from cocoro.bus.base import Qos
 from cocoro.capture.errors import CaptureError
 from cocoro.capture.reader import Capture
 from cocoro.kinematics import turn_z
 from cocoro.messages import BaseCommand, Frame, PlannerStatus, ServoState, TargetEstimate, TrueObject, Truth
 from cocoro.objects import Catalogue
-from cocoro.topics import Qos
 from cocoro.vloop import run_virtual
 
 GOLDEN = Path(__file__).parent / "golden" / "fetch.mcap"

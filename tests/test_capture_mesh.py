@@ -20,6 +20,7 @@ from apps.captures.info import report
 from apps.captures.rewrite import rewrite
 from apps.cli import capture_info
 from cocoro import topics
+from cocoro.bus.base import Qos
 from cocoro.bus.endpoints import default
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.capture.compression import Packer
@@ -255,9 +256,7 @@ def test_replay_refuses_a_mesh_with_a_robot_and_plays_where_there_is_none(short_
     async def played() -> None:
         async with await ZenohBus.open(default(ROBOT, "test", short_path)) as bus:
             found: list[bytes] = []
-            bus.subscribe(
-                "calliope/base/state", topics.Qos.EVENT, lambda _, payload: found.append(bytes(payload)), depth=0
-            )
+            bus.subscribe("calliope/base/state", Qos.EVENT, lambda _, payload: found.append(bytes(payload)), depth=0)
             replay = await cocoro(short_path, "replay", str(path), "--rate", "4")
             out, err = await asyncio.wait_for(replay.communicate(), PATIENCE_S)
             assert (replay.returncode, err) == (0, b"")

@@ -14,7 +14,7 @@ import pytest
 from capture_rig import ROBOT, STILL, Room, all_of, drive, entry, record, writer
 
 from cocoro import topics
-from cocoro.bus.base import Payload
+from cocoro.bus.base import Payload, Qos
 from cocoro.bus.local import LocalMesh
 from cocoro.capture.reader import Capture
 from cocoro.clock import NS, FollowedClock
@@ -25,7 +25,6 @@ from cocoro.messages import AboutReply, BaseState, CancelRequest, Clock, Recordi
 from cocoro.node import Node
 from cocoro.stepper import RECORDER_S
 from cocoro.testing import settle
-from cocoro.topics import Qos
 from cocoro.vloop import run_virtual
 from deploy import profiles
 from deploy.processes import named

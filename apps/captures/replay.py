@@ -10,7 +10,7 @@ import msgspec
 
 from apps.captures.player import Player
 from apps.captures.rebirth import reborn, with_rate
-from cocoro.bus.base import Bus, Handle, RawPublisher
+from cocoro.bus.base import Bus, Handle, Qos, RawPublisher
 from cocoro.capture.keys import MADE_HERE, Choice
 from cocoro.capture.pictures import LossyFrame
 from cocoro.capture.reader import Capture, Record
@@ -18,7 +18,7 @@ from cocoro.capture.types import NotReadableError
 from cocoro.errors import ConfigError, RefusedError
 from cocoro.messages import Clock
 from cocoro.tokens import alive_key
-from cocoro.topics import ARM_STATE, BASE_STATE, CLOCK, FRAME, HAND_STATE, HARDWARE, RECORDING, Qos
+from cocoro.topics import ARM_STATE, BASE_STATE, CLOCK, FRAME, HAND_STATE, HARDWARE, RECORDING
 
 SIMULATOR = "sim"
 HARDWARE_TOPICS = (FRAME, BASE_STATE, ARM_STATE, HAND_STATE)

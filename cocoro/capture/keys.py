@@ -8,11 +8,12 @@ from typing import NamedTuple
 
 import msgspec
 
+from cocoro.bus.base import Qos
 from cocoro.bus.keys import matches
 from cocoro.capture.schema import TypeSchema, schema_of
 from cocoro.errors import ConfigError
 from cocoro.messages import Message
-from cocoro.topics import TOPICS, Qos, topic_named
+from cocoro.topics import TOPICS, topic_named
 
 MSGPACK, JSON, OTHER = "msgpack", "json", "application/octet-stream"
 MADE_HERE = "recorder"

@@ -10,8 +10,8 @@ import msgspec
 from msgspec import Meta
 
 from cocoro.capture.compression import Compression
+from cocoro.units import Positive
 
-Positive = Annotated[float, Meta(gt=0)]
 FOLDER = "COCORO_CAPTURE_DIR"
 """Environment variable: where captures go when the configuration does not say."""
 

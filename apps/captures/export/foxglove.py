@@ -36,10 +36,10 @@ from cocoro.messages import (
     TargetEstimate,
     TaskState,
     Truth,
-    Vec3,
 )
 from cocoro.objects import KnownObject
 from cocoro.picture import describe
+from cocoro.units import Vec3
 from services.capture.writer import Entry, Limits, Writer
 
 ODOMETRY, BODY = "odometry", "body"

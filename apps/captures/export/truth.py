@@ -11,8 +11,9 @@ from apps.captures.export.geometry import conjugate, rotated
 from apps.captures.export.story import read
 from cocoro.capture.reader import Capture
 from cocoro.clock import NS
-from cocoro.messages import TrueObject, Truth, Vec3
+from cocoro.messages import TrueObject, Truth
 from cocoro.topics import PLAN, TRUTH
+from cocoro.units import Vec3
 
 FARTHEST_NS = NS // 10
 """Truth that is further from the belief's stamp is not of its time."""
