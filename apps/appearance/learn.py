@@ -7,14 +7,13 @@ from math import pi
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from apps.appearance.ranges import NEARLY_GREY, Overlap, Range, overlaps, range_of
 from apps.appearance.region import Box, Picture, Region, at_pixel, in_box, most_salient
 from apps.appearance.size import Shape, Size, guessed_shape, size_of, surface_depth_m
-from cocoro.colour import Bools, Pixels, in_boxes, lab_of, matches
+from cocoro.arrays import BoolArray, CodeArray, FloatArray, ImageArray
+from cocoro.colour import in_boxes, lab_of, matches
 from cocoro.errors import ConfigError
-from cocoro.kinematics import Array
 from cocoro.objects import Catalogue, KnownObject
 from cocoro.robot import Robot
 
@@ -35,12 +34,12 @@ MAX_OBJECTS = 32
 class Look:
     """One look at the object."""
 
-    colour: Pixels
+    colour: ImageArray
     """RGB, (height, width, 3)."""
     robot: Robot
-    raw_depth: NDArray[np.uint16] | None = None
+    raw_depth: CodeArray | None = None
     """The depth camera's own view, (height, width); None for a mere picture."""
-    camera_pose: Array | None = None
+    camera_pose: FloatArray | None = None
     """4 x 4, camera frame to body frame; None when nobody knows how the head stood."""
 
 
@@ -70,7 +69,7 @@ class Learnt:
     measured: Size | None
     """None when the person gave the size."""
     overlaps: tuple[Overlap, ...]
-    matched: Bools
+    matched: BoolArray
     """(height, width): pixels of the picture that have one of its colours, as the detector smooths them."""
     elsewhere: int
     """Blobs of them that are not the object."""
@@ -178,7 +177,7 @@ def _row(wanted: Wanted, shape: Shape, measured: Size | None, found: Range) -> K
 # --- what is to be said ---------------------------------------------------------------------------
 
 
-def _blobs_beside(matched: Bools, region: Region, scale: float) -> int:
+def _blobs_beside(matched: BoolArray, region: Region, scale: float) -> int:
     near = np.asarray(cv2.dilate(region.mask, np.ones((7, 7), dtype=np.uint8)))
     beside = (matched & (near == 0)).astype(np.uint8)
     opened = cv2.morphologyEx(beside, cv2.MORPH_OPEN, np.ones((3, 3), dtype=np.uint8))

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apps.appearance.region import Region
-from cocoro.kinematics import Array
+from cocoro.arrays import CodeArray, FloatArray
 from cocoro.robot import Camera, Robot
 
 Shape = Literal["cylinder", "sphere", "box"]
@@ -31,7 +31,7 @@ class Size(NamedTuple):
     """From the camera to the object's middle."""
 
 
-def surface_depth_m(raw_depth: NDArray[np.uint16], region: Region, robot: Robot) -> float | None:
+def surface_depth_m(raw_depth: CodeArray, region: Region, robot: Robot) -> float | None:
     """Depth of the visible surface along the optical axis, of the colour camera; None when too little of it has any.
 
     The depth camera stands beside the colour camera, so each of its pixels is carried to the colour picture, where the
@@ -64,7 +64,7 @@ def guessed_shape(region: Region, camera: Camera) -> Shape:
     return "sphere" if fills < ROUND and min(across, down) / max(across, down) > ROUND_ASPECT else "cylinder"
 
 
-def size_of(region: Region, camera: Camera, depth_m: float, shape: Shape, pose: Array | None = None) -> Size:
+def size_of(region: Region, camera: Camera, depth_m: float, shape: Shape, pose: FloatArray | None = None) -> Size:
     """Width and height of the upright object whose visible surface is that far along the optical axis.
 
     The outline is that of its middle, a radius behind the surface. Seen from above at an angle e, a cylinder of height
@@ -101,7 +101,7 @@ def _width_px(region: Region, shape: Shape) -> float:
     return float(np.median(widths)) if shape != "sphere" and len(widths) else float(right - left)
 
 
-def _angle(a: Array, b: Array) -> float:
+def _angle(a: FloatArray, b: FloatArray) -> float:
     return acos(min(max(float(a @ b / np.linalg.norm(a) / np.linalg.norm(b)), -1.0), 1.0))
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from apps.appearance.learn import Learnt, Look
 from apps.appearance.size import outline_of
 from apps.cli.link import Link, Where, joined, within
-from cocoro.colour import Pixels
+from cocoro.arrays import ImageArray
 from cocoro.component import load as load_component
 from cocoro.core import Sample
 from cocoro.errors import ConfigError, MeshError
@@ -131,7 +131,7 @@ def _with_head(
 # --- what was learnt ------------------------------------------------------------------------------
 
 
-def preview(sight: Sight, learnt: Learnt, catalogue: Path) -> tuple[Pixels, list[str]]:
+def preview(sight: Sight, learnt: Learnt, catalogue: Path) -> tuple[ImageArray, list[str]]:
     """The picture with the region outlined, every pixel of its colour tinted (green: the object's, red: others), and
     what perception itself would see in it with that catalogue; and that in words."""
     image = sight.look.colour.copy()
@@ -146,7 +146,7 @@ def preview(sight: Sight, learnt: Learnt, catalogue: Path) -> tuple[Pixels, list
     return drawn, [describe(one) for one in seen.detections]
 
 
-def _put_close_up(image: Pixels, colour: Pixels, learnt: Learnt) -> None:
+def _put_close_up(image: ImageArray, colour: ImageArray, learnt: Learnt) -> None:
     """The object as it is, with its outline, large, in the corner of the picture that is furthest from it."""
     left, top, right, bottom = learnt.region.box
     height, width = image.shape[:2]

@@ -34,10 +34,10 @@ from cocoro.messages import (
     TargetEstimate,
     TaskState,
     Truth,
-    Vec3,
 )
 from cocoro.objects import KnownObject
 from cocoro.picture import describe
+from cocoro.units import Vec3
 from services.capture.file import Packer
 from services.capture.keys import Entry, KeyInfo
 from services.capture.writer import Limits, Writer

@@ -14,10 +14,11 @@ from apps.captures.recorded import recorded_file
 from cocoro.capture.reader import Capture, Record
 from cocoro.capture.types import NotReadableError
 from cocoro.clock import NS
-from cocoro.messages import Detections, Message, PlannerStatus, TaskState, TrueObject, Truth, Vec3
+from cocoro.messages import Detections, Message, PlannerStatus, TaskState, TrueObject, Truth
 from cocoro.objects import Catalogue
 from cocoro.robot import Robot
 from cocoro.topics import DETECTIONS, PLAN, TASK, TRUTH, Topic
+from cocoro.units import Vec3
 
 M = TypeVar("M", bound=Message)
 

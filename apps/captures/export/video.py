@@ -13,11 +13,12 @@ import cv2
 
 from apps.captures.export.files import making
 from apps.captures.export.story import Story, catalogue_of, read
+from cocoro.arrays import ImageArray
 from cocoro.capture.conventions import CaptureError
 from cocoro.capture.reader import Capture
 from cocoro.clock import NS
 from cocoro.messages import Frame
-from cocoro.picture import Pixels, draw
+from cocoro.picture import draw
 from cocoro.topics import FRAME
 
 RATE_HZ = 30.0
@@ -58,14 +59,14 @@ class _Film:
         self._size = first.width, first.height
         self._start_s = start_s
         self._count = 0
-        self._picture: Pixels | None = None
+        self._picture: ImageArray | None = None
         with complaints:
             self._writer = cv2.VideoWriter(name, cv2.VideoWriter.fourcc(*CODEC), RATE_HZ, self._size)
         if not self._writer.isOpened():
             raise CaptureError(f"{out}: OpenCV cannot write a film there; choose another place")
         complaints.are_new()  # of opening it: it is open
 
-    def show(self, at_s: float, picture: Pixels) -> None:
+    def show(self, at_s: float, picture: ImageArray) -> None:
         self._hold_until(at_s)
         if (picture.shape[1], picture.shape[0]) != self._size:
             picture = cv2.resize(picture, self._size).astype(picture.dtype)
@@ -93,7 +94,7 @@ class _Film:
         while self._picture is not None and self._start_s + (self._count + 0.5) / RATE_HZ < at_s:
             self._write(self._picture)
 
-    def _write(self, picture: Pixels) -> None:
+    def _write(self, picture: ImageArray) -> None:
         with self._complaints:
             self._writer.write(cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
         self._count += 1
