@@ -11,6 +11,7 @@ import msgspec
 from apps.captures.compare import changes
 from cocoro.capture import mcap
 from cocoro.capture.conventions import TALLY, KeyTally, tally_names
+from cocoro.capture.former import todays_name
 from cocoro.capture.mcap import DamageError
 from cocoro.capture.reader import Capture
 from cocoro.capture.types import MADE_HERE, LossyFrame, schema_of
@@ -217,7 +218,7 @@ def changed_since(capture: Capture, channel: int) -> list[str]:
         return []
     if schema.name == LossyFrame.__name__:
         return []
-    if schema.name != topic.type.__name__:
+    if todays_name(schema.name) != topic.type.__name__:
         return [f"it carries {topic.type.__name__} today"]
     kind: type[Message] = topic.type
     return [change.text for change in changes(schema.data, schema_of(kind).data)]

@@ -22,7 +22,8 @@ from apps.captures.replay import SIMULATOR, Replay, played_keys, refuse_if_alive
 from apps.cli import exits
 from apps.cli.capture_files import check_span
 from apps.cli.ending import told_to_end
-from apps.cli.link import Where, joined
+from apps.cli.link import joined
+from apps.cli.options import RobotChoice
 from apps.cli.output import going_on
 from cocoro.bus.base import Bus, Payload
 from cocoro.bus.zenoh import ZenohBus
@@ -46,7 +47,7 @@ LAST_WORDS_S = 1.0
 """How long the recorder's last word takes at most, after it has ended."""
 
 
-async def record(where: Where, settings: dict[str, Any], seconds: float | None) -> int:
+async def record(where: RobotChoice, settings: dict[str, Any], seconds: float | None) -> int:
     """Record until interrupted, or for so long. Raises MeshError when there is no mesh."""
     row = processes.named(RECORDER)
     component = load_component(row)
@@ -61,7 +62,7 @@ async def record(where: Where, settings: dict[str, Any], seconds: float | None) 
         robot = Robot.load(description, measured)
         name = f"record-{os.getpid()}"
         async with Node(name, link.bus, clock, robot, robot_name=link.robot, module=row.module, config=config) as node:
-            view = _RecordingView()
+            view = _RecordingDisplay()
             node.on(RECORDING.of(name), view.show)
             with told_to_end() as end, going_on():
                 await _run_until(component.run(node, config), end, view.failed, seconds)
@@ -84,7 +85,7 @@ async def _run_until(work: Any, end: asyncio.Event, failed: asyncio.Event, secon
         await working
 
 
-class _RecordingView:
+class _RecordingDisplay:
     """A line that is written over, on a terminal; elsewhere each file's name."""
 
     def __init__(self) -> None:
@@ -273,7 +274,7 @@ def view_file(file: Path) -> int:
         return exits.FAILED if capture.problems else exits.DONE
 
 
-async def view_mesh(where: Where) -> int:
+async def view_mesh(where: RobotChoice) -> int:
     """Open Rerun on the mesh, until Ctrl-C. Raises CaptureError when Rerun is not installed, MeshError for no mesh."""
     rr = library()
     async with joined(where, frames=True) as link:

@@ -12,6 +12,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
+from cocoro.capture.former import todays_name
 from cocoro.capture.mcap import DamageError
 from cocoro.messages import Frame, Message
 from cocoro.topics import topic_named
@@ -33,7 +34,7 @@ def reader_of(name: str, schema: str | None) -> Read | None:
         decoder = msgspec.msgpack.Decoder(LossyFrame)
         return lambda payload: expand(decoder.decode(payload))
     topic = topic_named(name)
-    if topic is None or (schema is not None and schema != topic.type.__name__):
+    if topic is None or (schema is not None and todays_name(schema) != topic.type.__name__):
         return None
     kind: type[Message] = topic.type
     return msgspec.msgpack.Decoder(kind).decode
