@@ -41,7 +41,7 @@ from cocoro.clock import RealClock
 from cocoro.messages import BaseState, Frame
 from cocoro.node import Node
 from cocoro.robot import Robot
-from cocoro.tokens import recorder_key
+from cocoro.keys import recorder_key
 from deploy.rundir import RunDir
 from services.capture.file import Packer
 

@@ -14,7 +14,7 @@ from typing import IO
 
 from cocoro.component import Process
 from cocoro.errors import ConfigError
-from cocoro.vigil import RECOVERY_S, Vigil
+from cocoro.contact import RECOVERY_S, SleepDetector
 from deploy.launch import CRASHED, MISCONFIGURED, REFUSED
 from deploy.processes import BACKOFF_LIMIT_S, SETTLED_S
 from deploy.rundir import RunDir
@@ -43,7 +43,7 @@ class Child:
     """`start`, then `keep` for ever, then `stop`. `tell` gets what people should know, a line at a time."""
 
     def __init__(
-        self, row: Process, run_dir: RunDir, parent_fd: int, tell: Callable[[str], None], vigil: Vigil
+        self, row: Process, run_dir: RunDir, parent_fd: int, tell: Callable[[str], None], vigil: SleepDetector
     ) -> None:
         """`vigil` knows whether this process was itself asleep."""
         self.row = row

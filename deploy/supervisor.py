@@ -26,7 +26,7 @@ from cocoro.bus.zenoh import ZenohBus
 from cocoro.errors import CocoroError, ConfigError, RefusedError
 from cocoro.stop.record import latch_dir, prepare
 from cocoro.topics import STOPPABLE
-from cocoro.vigil import Vigil
+from cocoro.contact import SleepDetector
 from deploy import robot_time, service_manager
 from deploy.child import Child, StartError
 from deploy.launch import CRASHED
@@ -66,7 +66,7 @@ class Supervisor:
         self._stop = asyncio.Event()
         self._unshared = ""
         """Why frames cannot all be shared, as it was before the processes were started."""
-        self._vigil = Vigil(self._tell)
+        self._vigil = SleepDetector(self._tell)
 
     async def run(self) -> int:
         """Start everything, stay until SIGINT or SIGTERM, stop everything. Returns the exit code.

@@ -19,7 +19,7 @@ from cocoro import topics
 from cocoro.clock import RealClock
 from cocoro.messages import EstopRequest
 from cocoro.robot import Robot
-from cocoro.stop.asking import Asking
+from apps.cli.stop_asking import Asking
 from cocoro.stop.record import prepare, read
 from cocoro.testing import ServiceUnderTest
 

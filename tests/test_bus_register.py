@@ -18,7 +18,7 @@ from zenoh_rig import PATIENCE_S, child, left_in, local, scenario, who
 
 from cocoro import private
 from cocoro.bus.endpoints import ZenohConfig
-from cocoro.bus.members import Membership, members, new_identity
+from cocoro.bus.register import Membership, members, new_identity
 from cocoro.bus.session import ACCEPT_PENDING
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.errors import ConfigError

@@ -8,7 +8,7 @@ import os
 import pytest
 from bus_rig import Inbox, Listener, Local, Mesh, joined, known, scenario
 
-from cocoro.bus.base import Heard, Payload, Qos
+from cocoro.bus.base import Received, Payload, Qos
 
 
 @scenario
@@ -237,7 +237,7 @@ async def test_who_fails_at_a_lot_gets_the_next_one(mesh: Mesh, caplog: pytest.L
     async with joined(mesh, 1) as (a,):
         listener = Listener()
 
-        def fail_once(lot: list[Heard]) -> None:
+        def fail_once(lot: list[Received]) -> None:
             listener(lot)
             if len(listener.heard) == 1:
                 raise RuntimeError("once")

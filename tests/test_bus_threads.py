@@ -8,9 +8,10 @@ from typing import Any
 
 from zenoh_rig import FRAME, PATIENCE_S
 
-from cocoro.bus.outbox import CAPACITY_BYTES, Outbox
-from cocoro.bus.pool import POOL_BYTES, SharedPool, read
-from cocoro.bus.ring import Ring
+from cocoro.bus.queues import OUTBOX_BYTES, Outbox
+from cocoro.bus.shared import POOL_BYTES
+from cocoro.bus.declared import SharedPool, read
+from cocoro.bus.queues import Ring
 
 
 def test_a_ring_keeps_the_newest_counts_the_rest_and_wakes_the_loop_once() -> None:
@@ -98,7 +99,7 @@ def test_an_outbox_never_keeps_the_sender_waiting_and_counts_what_it_cannot_take
     outbox = Outbox("test")
     go_on, sent = threading.Event(), []
     outbox.put(lambda: (go_on.wait(), sent.append("first"))[0], 1)  # type: ignore[func-returns-value]
-    outbox.put(lambda: sent.append("second"), CAPACITY_BYTES - 1)
+    outbox.put(lambda: sent.append("second"), OUTBOX_BYTES - 1)
     outbox.put(lambda: sent.append("too much"), 1)
     assert outbox.lost == 1
     go_on.set()

@@ -29,7 +29,7 @@ from cocoro.component import load
 from cocoro.messages import BaseState
 from cocoro.node import Node
 from cocoro.robot import Robot
-from cocoro.tokens import recorder_key
+from cocoro.keys import recorder_key
 from deploy.processes import named
 from services.capture.file import Packer
 from services.capture.log_clock import WALL_CLOCK, LogClock

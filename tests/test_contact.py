@@ -10,7 +10,7 @@ import pytest
 from cocoro.clock import NS
 from cocoro.contact import Contact
 from cocoro.testing import in_virtual_time
-from cocoro.vigil import BEAT_S, LATE_S, RECOVERY_S, Vigil
+from cocoro.contact import BEAT_S, LATE_S, RECOVERY_S, SleepDetector
 from deploy.child import Child
 from deploy.processes import named
 from deploy.rundir import RunDir
@@ -32,7 +32,7 @@ class Kept:
     def __init__(self) -> None:
         self.steady = Steady()
         self.told: list[str] = []
-        self.vigil = Vigil(self.told.append, self.steady)
+        self.vigil = SleepDetector(self.told.append, self.steady)
         self.keeping = asyncio.ensure_future(self.vigil.keep())
 
 

@@ -14,8 +14,9 @@ from cocoro.contact import Contact
 from cocoro.messages import CancelRequest
 from cocoro.testing import JumpingClock, in_virtual_time
 from cocoro.topics import HARDWARE
-from cocoro.vigil import Vigil
-from deploy.rundir import RunDir, hold
+from cocoro.contact import SleepDetector
+from deploy.rundir import RunDir
+from cocoro.held_file import hold
 from services.executive import executive
 
 
@@ -138,7 +139,7 @@ def test_only_of_one_that_is_known_to_be_dead_it_is_said_that_it_died(
     @in_virtual_time
     async def scenario() -> None:
         clock, said = Sleepy(), []
-        async with robot(contact=Contact(run_dir.claimant_pid, Vigil(said.append, clock))) as it:
+        async with robot(contact=Contact(run_dir.claimant_pid, SleepDetector(said.append, clock))) as it:
             it.script = {"search": ["never"]}
             await it.begin()
             await it.phase("search")

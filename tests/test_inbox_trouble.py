@@ -9,7 +9,7 @@ from inbox_rig import KEY, inbox_of, payload
 
 from cocoro import topics
 from cocoro.testing import in_virtual_time
-from cocoro.trouble import TOLD_S, UNREADABLE_S
+from cocoro.stream_checks import REPORTED_S, UNREADABLE_S
 
 
 @in_virtual_time
@@ -29,7 +29,7 @@ async def test_a_topic_of_which_everything_is_rejected_is_unreadable_and_says_wh
     inbox.deliver("calliope/base/command", payload(topics.BASE_COMMAND, seq=1))
     assert (inbox.health(0).fault, inbox.health(0).unreadable) == (why, False)
     assert told == [True, False]
-    await asyncio.sleep(TOLD_S + 0.1)
+    await asyncio.sleep(REPORTED_S + 0.1)
     assert inbox.health(0).fault == ""
 
 

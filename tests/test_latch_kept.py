@@ -20,7 +20,7 @@ from cocoro.latch import LatchKeeper
 from cocoro.messages import EstopReply, EstopRequest, Latch, LatchState
 from cocoro.node import Node
 from cocoro.robot import Robot
-from cocoro.stop.asking import Asking
+from apps.cli.stop_asking import Asking
 from cocoro.stop.record import prepare, read
 
 ROBOT = Robot.load()

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from cocoro import private
-from cocoro.bus.members import Membership, members
+from cocoro.bus.register import Membership, members
 from cocoro.errors import CocoroError, ConfigError
 from deploy.rundir import RunDir, robots
 from sim.wire.pty import Port

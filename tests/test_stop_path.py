@@ -15,8 +15,8 @@ from pathlib import Path
 
 import pytest
 
-from cocoro.stop import asking as asking_module
-from cocoro.stop.asking import Asking, addresses
+from apps.cli import stop_asking as asking_module
+from apps.cli.stop_asking import Asking, addresses
 from cocoro.stop.path import PREFIX, StopPoint, listen
 
 PATIENCE_S = 60.0

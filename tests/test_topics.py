@@ -9,7 +9,7 @@ import pytest
 
 from cocoro import topics
 from cocoro.bus.base import Qos
-from cocoro.bus.keys import matches
+from cocoro.keys import matches
 from cocoro.messages import Message
 from cocoro.topics import HARDWARE, REQUESTS, STOPPABLE, TOPICS, topic_named
 

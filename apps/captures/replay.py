@@ -15,7 +15,7 @@ from cocoro.capture.reader import Capture, Record
 from cocoro.capture.types import MADE_HERE, LossyFrame, NotReadableError
 from cocoro.errors import ConfigError, RefusedError
 from cocoro.messages import ClockTick
-from cocoro.tokens import alive_key
+from cocoro.keys import alive_key
 from cocoro.topics import ARM_STATE, BASE_STATE, CLOCK, FRAME, HAND_STATE, HARDWARE, RECORDING
 from services.capture.keys import Choice
 

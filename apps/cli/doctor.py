@@ -21,7 +21,8 @@ from cocoro.robot import Robot
 from deploy import profiles
 from deploy.processes import shared_bytes
 from deploy.profiles import Profile
-from deploy.rundir import Holder, RunDir
+from cocoro.held_file import Holder
+from deploy.rundir import RunDir
 from services.base import doctor as base_doctor
 from services.kinect import doctor as kinect_doctor
 from services.servos import doctor as servos_doctor

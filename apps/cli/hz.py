@@ -23,7 +23,7 @@ from apps.cli.listening import Ear, keyexpr_of, takes_frames
 from apps.cli.options import RobotChoice
 from apps.cli.table import table
 from cocoro.bus.base import Payload
-from cocoro.source import ANY_HZ, Source
+from cocoro.stream_checks import ANY_HZ, SequenceTracker
 from cocoro.topics import topic_named
 
 SHOW_S = 1.0
@@ -80,7 +80,7 @@ class RateMeter:
         self._nominal_hz = nominal_hz
         self._window_s = window_s
         self._arrivals: deque[Arrival] = deque()
-        self._source = Source()
+        self._source = SequenceTracker()
 
     def hear(self, payload: Payload, at_s: float) -> None:
         try:

@@ -21,7 +21,7 @@ from cocoro.contact import Contact
 from cocoro.errors import CallTimeoutError, CocoroError
 from cocoro.messages import CancelRequest, TaskReply, TaskRequest, TaskState
 from cocoro.topics import CANCEL, LATCH, RUN, TASK
-from cocoro.vigil import RECOVERY_S, Vigil
+from cocoro.contact import RECOVERY_S, SleepDetector
 
 USAGE_REFUSALS = ("unknown_label", "not_graspable", "bad_request")
 """Refusals that are the operator's mistake, not the robot's state."""
@@ -43,7 +43,7 @@ async def run(where: RobotChoice, request: TaskRequest, as_json: bool, picture: 
     if picture is not None:
         check(picture)
     async with joined(where, frames=picture is not None) as link:
-        follower = Follower(link, request, view(as_json), picture, Contact(link.run_dir.claimant_pid, Vigil()))
+        follower = Follower(link, request, view(as_json), picture, Contact(link.run_dir.claimant_pid, SleepDetector()))
         with on_end(follower.interrupt), going_on():
             code, result = await follower.run()
     if as_json:

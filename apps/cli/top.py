@@ -18,7 +18,7 @@ from apps.cli.ending import passed, told_to_end
 from apps.cli.link import Link, joined, within
 from apps.cli.options import RobotChoice
 from apps.cli.status import expected
-from cocoro.bus.keys import matches
+from cocoro.keys import matches
 from cocoro.component import Process
 from cocoro.errors import ConfigError
 from cocoro.messages import Health, Message, TopicHealth

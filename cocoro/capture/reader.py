@@ -29,7 +29,7 @@ import msgspec
 from mcap.opcode import Opcode
 from mcap.records import Attachment, AttachmentIndex, Channel, Schema, Statistics
 
-from cocoro.bus.keys import matches
+from cocoro.keys import matches
 from cocoro.capture import mcap
 from cocoro.capture.contents import Contents, Disk, Place, miscounted, read_place
 from cocoro.capture.conventions import CHECKSUM, TALLY, CaptureError, NotAFileError, checksum

@@ -19,7 +19,7 @@ from cocoro.node import Node
 from cocoro.robot import Robot
 from cocoro.testing.tap import Tap
 from cocoro.testing.virtual import settle
-from cocoro.tokens import alive_key
+from cocoro.keys import alive_key
 from cocoro.topics import Request, Topic
 
 M = TypeVar("M", bound=Message)

@@ -7,7 +7,7 @@ import msgspec
 from cocoro.clock import NS, is_fresh
 from cocoro.messages import BaseCommand, BaseState, LatchState
 from cocoro.odometry import Odometry, WheelRamp
-from cocoro.recent import WINDOW_S, Recent
+from cocoro.health import WINDOW_S, Recent
 from cocoro.robot import Base
 from cocoro.topics import BASE_COMMAND
 from services.base import oi

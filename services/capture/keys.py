@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 
 from cocoro.bus.base import Qos
-from cocoro.bus.keys import matches
+from cocoro.keys import matches
 from cocoro.capture.types import JSON, MADE_HERE, MSGPACK, OTHER, Alive, LossyFrame, TypeSchema, schema_of
 from cocoro.errors import ConfigError
 from cocoro.messages import Frame, Message

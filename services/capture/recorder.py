@@ -13,13 +13,13 @@ from typing import Any
 import msgspec
 
 from cocoro.about import about, versions
-from cocoro.bus.base import Handle, Heard, Payload
+from cocoro.bus.base import Handle, Received, Payload
 from cocoro.capture.types import Alive
 from cocoro.clock import NS, FollowedClock
 from cocoro.errors import MeshError, RemoteError
 from cocoro.messages import AboutReply, AboutRequest, ClockTick, DisturbedFile, Recording
 from cocoro.node import Node
-from cocoro.tokens import alive_key, recorder_key
+from cocoro.keys import alive_key, recorder_key
 from cocoro.topics import ABOUT, CLOCK, RECORDING
 from services.capture.keys import ALIVE_INFO, Choice, Entry, KeyInfo
 from services.capture.log_clock import WALL_CLOCK, LogClock, words
@@ -171,7 +171,7 @@ class Recorder:
 
     # --- what is heard ----------------------------------------------------------------------------
 
-    def _on_lot(self, lot: list[Heard]) -> None:
+    def _on_lot(self, lot: list[Received]) -> None:
         for key, payload, heard_ns in lot:
             if key == self._clock_key:
                 self._tick(payload)

@@ -12,7 +12,7 @@ from typing import Literal
 
 from cocoro.clock import NS, is_fresh
 from cocoro.messages import LatchState, ServoCommand, ServoState
-from cocoro.recent import WINDOW_S, Recent
+from cocoro.health import WINDOW_S, Recent
 from cocoro.robot import Joint
 from cocoro.topics import ARM_COMMAND
 from services.servos import table
