@@ -63,12 +63,12 @@ def test_any_tool_reads_them_line_by_line(tmp_path: Path, robot: Robot) -> None:
 KILLED = """
 import sys
 from pathlib import Path
-from cocoro.learning.dataset import HandRow, Writer, hand_header
+from cocoro.learning.dataset import HandRow, SampleWriter, hand_header
 from cocoro.learning.nominal_model import Drawing
 from cocoro.robot import Robot
 
 robot = Robot.load()
-with Writer(Path(sys.argv[1]), HandRow, robot, hand_header(robot, Drawing(robot).joints, 1.57)) as writer:
+with SampleWriter(Path(sys.argv[1]), HandRow, robot, hand_header(robot, Drawing(robot).joints, 1.57)) as writer:
     for draw in range(1_000_000):
         writer.append([HandRow(stamp_ns=draw, draw=draw, angles_rad=(0.0,) * 4, head_rad=(0.0, 0.0),
                                seen_m=(0.1, 0.2, 0.3), area_px=1)])
