@@ -15,6 +15,7 @@ from apps.cli.options import (
     JsonOption,
     MeshOption,
     OnlyOption,
+    RobotChoice,
     RobotOption,
     ToOption,
     WithoutOption,
@@ -47,13 +48,12 @@ def record(
 ) -> None:
     """Record what travels on the mesh into MCAP files, until Ctrl-C, beside what the robot's own recorder does."""
     from apps.cli import capture_record
-    from apps.cli.link import Where
 
     settings = {
         "folder": str(out.resolve()), "only": only or (), "without": without or (),
         "compression": compression, "jpeg_quality": jpeg,
     }  # fmt: skip
-    sys.exit(asyncio.run(capture_record.record(Where(robot, profile), settings, seconds)))
+    sys.exit(asyncio.run(capture_record.record(RobotChoice(robot, profile), settings, seconds)))
 
 
 def replay(
@@ -109,11 +109,10 @@ def view(
 ) -> None:
     """Open Rerun on a capture, or live on the mesh. Needs the extra `view`."""
     from apps.cli import capture_view
-    from apps.cli.link import Where
 
     if file is not None:
         sys.exit(capture_view.view_file(file))
-    sys.exit(asyncio.run(capture_view.view_mesh(Where(robot, profile))))
+    sys.exit(asyncio.run(capture_view.view_mesh(RobotChoice(robot, profile))))
 
 
 @capture.command()

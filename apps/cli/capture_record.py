@@ -13,7 +13,8 @@ import msgspec
 
 from apps.cli import exits
 from apps.cli.ending import told_to_end
-from apps.cli.link import Where, joined
+from apps.cli.link import joined
+from apps.cli.options import RobotChoice
 from apps.cli.output import going_on
 from cocoro.clock import FollowedClock
 from cocoro.component import load as load_component
@@ -32,7 +33,7 @@ LAST_WORDS_S = 1.0
 CLEAR = "\r\x1b[K"
 
 
-async def record(where: Where, settings: dict[str, Any], seconds: float | None) -> int:
+async def record(where: RobotChoice, settings: dict[str, Any], seconds: float | None) -> int:
     """Record until interrupted, or for so long. Raises MeshError when there is no mesh."""
     row = processes.named(RECORDER)
     component = load_component(row)
@@ -47,7 +48,7 @@ async def record(where: Where, settings: dict[str, Any], seconds: float | None) 
         robot = Robot.load(description, measured)
         name = f"record-{os.getpid()}"
         async with Node(name, link.bus, clock, robot, robot_name=link.robot, module=row.module, config=config) as node:
-            view = _View()
+            view = _RecordingDisplay()
             node.on(RECORDING.of(name), view.show)
             with told_to_end() as end, going_on():
                 await _work(component.run(node, config), end, view.failed, seconds)
@@ -70,7 +71,7 @@ async def _work(work: Any, end: asyncio.Event, failed: asyncio.Event, seconds: f
         await working
 
 
-class _View:
+class _RecordingDisplay:
     """A line that is written over, on a terminal; elsewhere each file's name."""
 
     def __init__(self) -> None:

@@ -12,7 +12,8 @@ import msgspec
 from apps.captures.export.rerun_scene import Teller, library, no_viewer, opened, tell
 from apps.cli import exits
 from apps.cli.ending import told_to_end
-from apps.cli.link import Where, joined
+from apps.cli.link import joined
+from apps.cli.options import RobotChoice
 from cocoro.bus.base import Bus, Payload
 from cocoro.capture.reader import Capture
 from cocoro.messages import Message
@@ -37,7 +38,7 @@ def view_file(file: Path) -> int:
         return exits.FAILED if capture.problems else exits.DONE
 
 
-async def view_mesh(where: Where) -> int:
+async def view_mesh(where: RobotChoice) -> int:
     """Open Rerun on the mesh, until Ctrl-C. Raises CaptureError when Rerun is not installed, MeshError for no mesh."""
     rr = library()
     async with joined(where, frames=True) as link:
