@@ -9,7 +9,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Generic, Self
 
-from cocoro.learning.dataset import HandRow, SampleRow, SampleWriter, WheelRow, hand_header, wheel_header
+from cocoro.learning.dataset import HandRow, SampleFile, SampleRow, WheelRow, hand_header, wheel_header
 from cocoro.learning.nominal_model import LEVEL_ROLL_RAD, arm_joints
 from cocoro.messages import HandSample, Message, WheelTrial
 from cocoro.robot import Robot
@@ -42,9 +42,9 @@ class Coverage:
 
 
 class SampleCollector(ABC, Generic[SampleRow]):
-    """Rows of one task's babbling. Use it with `with`; raises as `SampleWriter` does."""
+    """Rows of one task's babbling. Use it with `with`; raises as `SampleFile` does."""
 
-    def __init__(self, writer: SampleWriter[SampleRow]) -> None:
+    def __init__(self, writer: SampleFile[SampleRow]) -> None:
         self._writer = writer
 
     def __enter__(self) -> Self:
@@ -78,7 +78,7 @@ class HandCollector(SampleCollector[HandRow]):
 
     def __init__(self, path: Path, robot: Robot) -> None:
         self._joints = arm_joints(robot)
-        super().__init__(SampleWriter(path, HandRow, robot, hand_header(robot, self._joints, LEVEL_ROLL_RAD)))
+        super().__init__(SampleFile(path, HandRow, robot, hand_header(robot, self._joints, LEVEL_ROLL_RAD)))
         self._coverage = Coverage()
         for row in self._writer.rows:
             self._coverage.add(row.seen_m)
@@ -113,7 +113,7 @@ class WheelCollector(SampleCollector[WheelRow]):
     def __init__(self, path: Path, robot: Robot, target_height_m: float | None = None) -> None:
         """`target_height_m`: of the target's centre above the floor, where that is known."""
         self._separation_m = robot.base.wheel_separation_m
-        super().__init__(SampleWriter(path, WheelRow, robot, wheel_header(robot, target_height_m)))
+        super().__init__(SampleFile(path, WheelRow, robot, wheel_header(robot, target_height_m)))
 
     @property
     def next(self) -> int:

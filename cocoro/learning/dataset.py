@@ -160,7 +160,7 @@ def _header(path: Path, line: bytes, kind: type[SampleRow]) -> Header:
     return header
 
 
-class SampleWriter(Generic[SampleRow]):
+class SampleFile(Generic[SampleRow]):
     """Appends to a file, or begins it. Use it with `with`.
 
     Raises ConfigError when the file cannot be written or holds something else (another robot's samples, say), and
@@ -182,7 +182,7 @@ class SampleWriter(Generic[SampleRow]):
             self._file.close()
             raise
 
-    def __enter__(self) -> SampleWriter[SampleRow]:
+    def __enter__(self) -> SampleFile[SampleRow]:
         return self
 
     def __exit__(
