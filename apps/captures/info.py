@@ -11,6 +11,7 @@ import msgspec
 from cocoro.capture import mcap
 from cocoro.capture.errors import DamageError
 from cocoro.capture.file import TALLY, KeyTally, tally_names
+from cocoro.capture.former import todays_name
 from cocoro.capture.keys import MADE_HERE
 from cocoro.capture.pictures import LossyFrame
 from cocoro.capture.reader import Capture
@@ -217,7 +218,7 @@ def changed_since(capture: Capture, channel: int) -> list[str]:
         return []
     if schema.name == LossyFrame.__name__:
         return []
-    if schema.name != topic.type.__name__:
+    if todays_name(schema.name) != topic.type.__name__:
         return [f"it carries {topic.type.__name__} today"]
     kind: type[Message] = topic.type
     return [change.text for change in changes(schema.data, schema_of(kind).data)]

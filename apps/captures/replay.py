@@ -16,7 +16,7 @@ from cocoro.capture.pictures import LossyFrame
 from cocoro.capture.reader import Capture, Record
 from cocoro.capture.types import NotReadableError
 from cocoro.errors import ConfigError, RefusedError
-from cocoro.messages import Clock
+from cocoro.messages import ClockTick
 from cocoro.tokens import alive_key
 from cocoro.topics import ARM_STATE, BASE_STATE, CLOCK, FRAME, HAND_STATE, HARDWARE, RECORDING
 
@@ -161,7 +161,7 @@ class Replay:
 
     def _tick(self) -> None:
         """A real robot's capture has no clock: its stamps are of the system's, as the log times are."""
-        clock = Clock(
+        clock = ClockTick(
             stamp_ns=self._player.position_ns(asyncio.get_running_loop().time()),
             seq=self._ticks,
             incarnation=self._incarnation + (self._player.passes << 48),

@@ -8,6 +8,7 @@ from functools import cache
 import msgspec
 
 from cocoro.capture.errors import DamageError
+from cocoro.capture.former import todays_name
 from cocoro.capture.keys import Alive
 from cocoro.capture.pictures import LossyFrame, expand
 from cocoro.messages import Message
@@ -30,7 +31,7 @@ def reader_of(name: str, schema: str | None) -> Read | None:
         decoder = msgspec.msgpack.Decoder(LossyFrame)
         return lambda payload: expand(decoder.decode(payload))
     topic = topic_named(name)
-    if topic is None or (schema is not None and schema != topic.type.__name__):
+    if topic is None or (schema is not None and todays_name(schema) != topic.type.__name__):
         return None
     kind: type[Message] = topic.type
     return msgspec.msgpack.Decoder(kind).decode

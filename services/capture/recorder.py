@@ -17,7 +17,7 @@ from cocoro.bus.base import Handle, Heard, Payload
 from cocoro.capture.keys import ALIVE_INFO, Alive, Choice, KeyInfo
 from cocoro.clock import NS, FollowedClock
 from cocoro.errors import MeshError, RemoteError
-from cocoro.messages import AboutReply, AboutRequest, Clock, DisturbedFile, Recording
+from cocoro.messages import AboutReply, AboutRequest, ClockTick, DisturbedFile, Recording
 from cocoro.node import Node
 from cocoro.tokens import alive_key, recorder_key
 from cocoro.topics import ABOUT, CLOCK, RECORDING
@@ -97,7 +97,7 @@ class Recorder:
         self._head = msgspec.msgpack.Decoder(Head)
         self._clock: FollowedClock | None = None
         self._clock_key = CLOCK.key(node.robot_name)
-        self._time = msgspec.msgpack.Decoder(Clock)
+        self._time = msgspec.msgpack.Decoder(ClockTick)
         self._newest_ns = 0
         self._alive: dict[str, bool] = {}
 
