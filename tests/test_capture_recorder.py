@@ -212,7 +212,7 @@ def test_a_full_disk_in_the_middle_of_a_run_is_told_too(tmp_path: Path, monkeypa
         async with room.node("operator") as operator:
             operator.on(topics.RECORDING.of("capture"), told.append)
             await drive(room, 1.0)
-            monkeypatch.setattr("cocoro.capture.file.os.writev", _refuse)
+            monkeypatch.setattr("services.capture.file.os.writev", _refuse)
             await drive(room, 1.0)
 
     run_virtual(Room().recorded({"file": str(tmp_path / "full.mcap")}, scenario))

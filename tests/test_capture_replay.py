@@ -13,8 +13,7 @@ import pytest
 from capture_rig import ROBOT, Room, all_of, drive, entry, record, writer
 
 from apps.captures.player import AT_ONCE, FASTEST, Player
-from apps.captures.rebirth import reborn, with_rate
-from apps.captures.replay import Replay, played_keys, refuse_if_alive, services_of
+from apps.captures.replay import Replay, played_keys, reborn, refuse_if_alive, services_of, with_rate
 from cocoro import topics
 from cocoro.capture.reader import Capture
 from cocoro.clock import FollowedClock
