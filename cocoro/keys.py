@@ -36,4 +36,3 @@ def _matches(pattern: list[str], chunks: list[str]) -> bool:
     if pattern[0] == "**":
         return any(_matches(pattern[1:], chunks[i:]) for i in range(len(chunks) + 1))
     return bool(chunks) and pattern[0] in ("*", chunks[0]) and _matches(pattern[1:], chunks[1:])
-

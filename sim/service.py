@@ -14,7 +14,7 @@ import msgspec
 from msgspec import Meta
 
 from cocoro import topics
-from cocoro.clock import NS, Clock, FollowedClock
+from cocoro.clock import NS, Clock
 from cocoro.latch import LatchKeeper
 from cocoro.messages import BaseCommand, BaseState, ClockTick, LatchState, Message, ServoCommand
 from cocoro.node import Node
@@ -117,8 +117,7 @@ class Simulator:
         self._states: tuple[tuple[Publisher[Any], Callable[[], Message]], ...] = ()
         self.rate = 1.0
         self._motion: MotionWriter | None = None
-        if isinstance(self._clock, FollowedClock):
-            node.drive_clock()
+        node.drive_clock()
 
     def connect_camera(self, kinect: Node) -> None:
         """Stand in for the camera alone."""
@@ -187,8 +186,7 @@ class Simulator:
 
     def tell_time(self) -> None:
         sent = self._ticks.put(ClockTick(rate=self.rate), self._world.time_ns)
-        if isinstance(self._clock, FollowedClock):
-            self._clock.tick(sent.stamp_ns, sent.incarnation, self.rate)
+        self._clock.tick(sent.stamp_ns, sent.incarnation, self.rate)
 
 
 async def run(node: Node, config: Config) -> None:
@@ -232,10 +230,10 @@ async def keep_going(node: Node, config: Config, simulator: Simulator) -> None:
     with ExitStack() as stack:
         if config.motion:
             stack.enter_context(simulator.write_motion(Path(config.motion)))
-        if isinstance(node.clock, FollowedClock):
-            await _in_real_time(simulator, config.pace)
-        else:
+        if node.clock.virtual:
             await _in_virtual_time(simulator, node.clock)
+        else:
+            await _in_real_time(simulator, config.pace)
 
 
 async def _in_virtual_time(simulator: Simulator, clock: Clock) -> None:

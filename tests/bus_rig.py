@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol
 
-from cocoro.bus.base import Bus, Received, Payload
+from cocoro.bus.base import Bus, Payload, Received
 from cocoro.bus.endpoints import default
 from cocoro.bus.local import LocalBus, LocalMesh
 from cocoro.bus.zenoh import ZenohBus

@@ -172,8 +172,9 @@ class RobotRig:
     async def estop(self, latched: bool) -> set[str]:
         """Press or reset the emergency stop; who acknowledged that it is so."""
         question = EstopRequest(latched=latched, by="test")
-        replies = await self.operator.call_all(topics.ESTOP.of("*"), question)
-        return {reply.service for reply in replies if reply.latch == ("latched" if latched else "released")}
+        answers = await self.operator.call_all(topics.ESTOP.of("*"), question)
+        wanted = "latched" if latched else "released"
+        return {answer.service for answer in answers if answer.reply is not None and answer.reply.latch == wanted}
 
     async def driving(self, speed_mps: float = 0.25) -> str:
         """Fetch the red can, and be on the way to it at some speed; the task's id."""

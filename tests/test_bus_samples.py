@@ -8,7 +8,7 @@ import os
 import pytest
 from bus_rig import Inbox, Listener, Local, Mesh, joined, known, scenario
 
-from cocoro.bus.base import Received, Payload, Qos
+from cocoro.bus.base import Payload, Qos, Received
 
 
 @scenario
@@ -224,7 +224,7 @@ async def test_who_listens_hears_all_in_order_in_few_lots_and_what_has_come_when
         heard = listener.heard
         assert [bytes(each.payload) for each in heard] == [b"%d" % number for number in range(300)]
         assert [each.key for each in heard] == ["robot/x", "robot/y/z"] * 150
-        times = [each.heard_ns for each in heard]
+        times = [each.received_ns for each in heard]
         assert times == sorted(times)
         publishers[0].put(b"more")
         a.publisher("last", Qos.EVENT).put(b"again")

@@ -8,10 +8,9 @@ from typing import Any
 
 from zenoh_rig import FRAME, PATIENCE_S
 
-from cocoro.bus.queues import OUTBOX_BYTES, Outbox
-from cocoro.bus.shared import POOL_BYTES
 from cocoro.bus.declared import SharedPool, read
-from cocoro.bus.queues import Ring
+from cocoro.bus.queues import OUTBOX_BYTES, Outbox, Ring
+from cocoro.bus.shared import POOL_BYTES
 
 
 def test_a_ring_keeps_the_newest_counts_the_rest_and_wakes_the_loop_once() -> None:

@@ -11,9 +11,8 @@ from capture_rig import all_of, entry, writer
 
 from apps.captures.info import report
 from apps.cli import capture_files
-from cocoro.clock import steady_ns
 from cocoro.capture.reader import Capture
-from cocoro.clock import NS
+from cocoro.clock import NS, steady_ns
 from services.capture.log_clock import KEPT_STEPS, TOGETHER_NS, WALL_CLOCK, LogClock
 from services.capture.service import captures, file_name, make_room
 from services.capture.writer import Limits

@@ -26,10 +26,10 @@ from cocoro.bus.zenoh import ZenohBus
 from cocoro.capture.reader import Capture
 from cocoro.clock import NS, RealClock
 from cocoro.component import load
+from cocoro.keys import recorder_key
 from cocoro.messages import BaseState
 from cocoro.node import Node
 from cocoro.robot import Robot
-from cocoro.keys import recorder_key
 from deploy.processes import named
 from services.capture.file import Packer
 from services.capture.log_clock import WALL_CLOCK, LogClock

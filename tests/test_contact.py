@@ -8,9 +8,8 @@ from pathlib import Path
 import pytest
 
 from cocoro.clock import NS
-from cocoro.contact import Contact
+from cocoro.contact import BEAT_S, LATE_S, RECOVERY_S, Contact, SleepDetector
 from cocoro.testing import in_virtual_time
-from cocoro.contact import BEAT_S, LATE_S, RECOVERY_S, SleepDetector
 from deploy.child import Child
 from deploy.processes import named
 from deploy.rundir import RunDir

@@ -10,13 +10,12 @@ from executive_rig import idle_again, robot
 
 from cocoro import topics
 from cocoro.clock import NS
-from cocoro.contact import Contact
+from cocoro.contact import Contact, SleepDetector
+from cocoro.held_file import hold
 from cocoro.messages import CancelRequest
 from cocoro.testing import JumpingClock, in_virtual_time
 from cocoro.topics import HARDWARE
-from cocoro.contact import SleepDetector
 from deploy.rundir import RunDir
-from cocoro.held_file import hold
 from services.executive import executive
 
 

@@ -8,8 +8,8 @@ import pytest
 from inbox_rig import KEY, inbox_of, payload
 
 from cocoro import topics
-from cocoro.testing import in_virtual_time
 from cocoro.stream_checks import REPORTED_S, UNREADABLE_S
+from cocoro.testing import in_virtual_time
 
 
 @in_virtual_time

@@ -8,8 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from apps.cli import doctor_stop
-from apps.cli import stop_asking
+from apps.cli import doctor_stop, stop_asking
 from cocoro.stop import record
 from cocoro.stop.record import RECORD_BYTES, LatchRecord, latch_dir, prepare, read
 

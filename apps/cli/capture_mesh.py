@@ -25,6 +25,7 @@ from apps.cli.ending import told_to_end
 from apps.cli.link import joined
 from apps.cli.options import RobotChoice
 from apps.cli.output import going_on
+from cocoro.keys import alive_key, service_of
 from cocoro.bus.base import Bus, Payload
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.capture.conventions import CaptureError
@@ -179,12 +180,12 @@ async def _play(bus: ZenohBus, capture: Capture, player: Player, hardware: bool,
     intruder: list[str] = []
 
     def on_alive(key: str, alive: bool) -> None:
-        service = key.split("/")[1]
+        service = service_of(key)
         if alive and service in ({SIMULATOR} if hardware else services | {*HARDWARE, SIMULATOR}):
             intruder.append(service)
             end.set()
 
-    watch = bus.watch_alive(f"{capture.robot}/*/alive", on_alive)
+    watch = bus.watch_alive(alive_key(capture.robot), on_alive)
     work = asyncio.ensure_future(replaying.run())
     with _keyboard(lambda text: _handle_key(text, player, replaying, end)) as has_keys:
         showing = asyncio.ensure_future(_show_replay(player, replaying, has_keys))

@@ -17,11 +17,11 @@ from cocoro.bus import shared
 from cocoro.checks import Check, bad, note, ok
 from cocoro.component import Process, load
 from cocoro.errors import ConfigError
+from cocoro.held_file import Holder
 from cocoro.robot import Robot
 from deploy import profiles
 from deploy.processes import shared_bytes
 from deploy.profiles import Profile
-from cocoro.held_file import Holder
 from deploy.rundir import RunDir
 from services.base import doctor as base_doctor
 from services.kinect import doctor as kinect_doctor

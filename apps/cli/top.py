@@ -18,9 +18,9 @@ from apps.cli.ending import passed, told_to_end
 from apps.cli.link import Link, joined, within
 from apps.cli.options import RobotChoice
 from apps.cli.status import expected
-from cocoro.keys import matches
 from cocoro.component import Process
 from cocoro.errors import ConfigError
+from cocoro.keys import matches
 from cocoro.messages import Health, Message, TopicHealth
 from cocoro.topics import BASE_STATE, CLOCK, HEALTH, LATCH, PLAN, TASK, Topic, topic_named
 from deploy import processes
@@ -81,15 +81,14 @@ class MeshWatch:
         link.inbox(HEALTH.of("*")).add(lambda _key, health: self._on_health(health))
         for what, topic in NEWS.items():
             link.inbox(topic).add(partial(self._on_news, what))
-        link.bus.watch_alive(f"{link.robot}/*/alive", self._on_alive)
+        link.watch_alive(self._on_alive)
 
     async def first(self) -> None:
         """Wait until everyone who lives has told its health, but not for long."""
         self._alive |= set(await self._link.alive())
         await within(FIRST_S, lambda: self._alive <= set(self._health), self._changed)
 
-    def _on_alive(self, key: str, alive: bool) -> None:
-        service = key.split("/")[1]
+    def _on_alive(self, service: str, alive: bool) -> None:
         (self._alive.add if alive else self._alive.discard)(service)
         self._changed.set()
 

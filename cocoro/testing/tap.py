@@ -8,8 +8,8 @@ import msgspec
 
 from cocoro.bus.base import Payload, Qos
 from cocoro.bus.local import LocalBus
-from cocoro.messages import Message
 from cocoro.keys import recorder_key
+from cocoro.messages import Message
 from cocoro.topics import Topic, topic_named
 
 M = TypeVar("M", bound=Message)

@@ -11,9 +11,9 @@ import msgspec
 import numpy as np
 
 from cocoro.bus.base import Qos
-from cocoro.keys import matches
 from cocoro.capture.types import JSON, MADE_HERE, MSGPACK, OTHER, Alive, LossyFrame, TypeSchema, schema_of
 from cocoro.errors import ConfigError
+from cocoro.keys import matches
 from cocoro.messages import Frame, Message
 from cocoro.topics import FRAME, TOPICS, topic_named
 

@@ -9,8 +9,7 @@ from typing import NamedTuple
 
 import msgspec
 
-from cocoro.clock import steady_ns
-from cocoro.clock import NS
+from cocoro.clock import NS, steady_ns
 
 WALL_CLOCK = "wall_clock"
 """The metadata record that tells how the wall clock was set while the recording went on."""

@@ -12,14 +12,14 @@ from typing import Any
 
 import msgspec
 
-from cocoro.about import about, versions
-from cocoro.bus.base import Handle, Received, Payload
+from cocoro.about import versions
+from cocoro.bus.base import Handle, Payload, Received
 from cocoro.capture.types import Alive
-from cocoro.clock import NS, FollowedClock
+from cocoro.clock import NS, Clock
 from cocoro.errors import MeshError, RemoteError
+from cocoro.keys import alive_key, recorder_key
 from cocoro.messages import AboutReply, AboutRequest, ClockTick, DisturbedFile, Recording
 from cocoro.node import Node
-from cocoro.keys import alive_key, recorder_key
 from cocoro.topics import ABOUT, CLOCK, RECORDING
 from services.capture.keys import ALIVE_INFO, Choice, Entry, KeyInfo
 from services.capture.log_clock import WALL_CLOCK, LogClock, words
@@ -95,7 +95,7 @@ class Recorder:
         self._disturbed: tuple[DisturbedFile, ...] = ()
         self._handles: list[Handle] = []
         self._head = msgspec.msgpack.Decoder(Head)
-        self._clock: FollowedClock | None = None
+        self._clock: Clock | None = None
         self._clock_key = CLOCK.key(node.robot_name)
         self._time = msgspec.msgpack.Decoder(ClockTick)
         self._newest_ns = 0
@@ -103,7 +103,7 @@ class Recorder:
 
     def start(self) -> None:
         robot, bus = self._node.robot_name, self._node.bus
-        if isinstance(self._node.clock, FollowedClock):
+        if self._node.clock.needs_ticks:
             self._clock = self._node.drive_clock()
         self._remember_run()
         # Nothing is dropped before this loop has seen it; the sink bounds what may wait.
@@ -261,7 +261,7 @@ class Recorder:
         }
         self._sink.remember("run", run)
         self._sink.remember("robot", {"description": json.dumps(node.robot.to_data())})
-        self._sink.remember(f"service/{node.name}", _entries(about(node)))
+        self._sink.remember(f"service/{node.name}", _entries(node.about()))
         if node.profile:
             self._sink.remember("profile", {"profile": json.dumps(node.profile)})
 

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 from cocoro.clock import NS, is_fresh
-from cocoro.messages import LatchState, ServoCommand, ServoState
 from cocoro.health import WINDOW_S, Recent
+from cocoro.messages import LatchState, ServoCommand, ServoState
 from cocoro.robot import Joint
 from cocoro.topics import ARM_COMMAND
 from services.servos import table
