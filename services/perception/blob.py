@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from cocoro.arrays import MaskArray
-from cocoro.objects import Catalogue, KnownObject
+from cocoro.objects import Catalogue, ObjectSpec
 from services.perception.colours import ColourTable
 from services.perception.config import Config
 from services.perception.image import PixelBox, RgbdImage
@@ -50,7 +50,7 @@ class BlobDetector:
         return sightings
 
     def _find(
-        self, known: KnownObject, mask: MaskArray, origin: tuple[int, int], image: RgbdImage
+        self, known: ObjectSpec, mask: MaskArray, origin: tuple[int, int], image: RgbdImage
     ) -> ImageSighting | None:
         """The object in the part of the image whose first pixel is `origin` and whose matching pixels are `mask`."""
         parts = _clean_components(mask, origin, image, self._config.min_area_px * image.scale**2)
@@ -88,7 +88,7 @@ class BlobDetector:
 class _Fit:
     """How well a region's size goes with one known object at the region's own distance."""
 
-    def __init__(self, known: KnownObject, image: RgbdImage, config: Config) -> None:
+    def __init__(self, known: ObjectSpec, image: RgbdImage, config: Config) -> None:
         camera = image.camera
         self._config = config
         self._focal2 = camera.fx * camera.fy

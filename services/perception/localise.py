@@ -15,7 +15,7 @@ import numpy as np
 
 from cocoro.arrays import FloatArray
 from cocoro.messages import Detection
-from cocoro.objects import Catalogue, KnownObject
+from cocoro.objects import Catalogue, ObjectSpec
 from cocoro.robot import Camera, Robot
 from cocoro.units import Vec3
 from services.perception.image import PixelBox
@@ -149,7 +149,7 @@ def _overlap(a: PixelBox, b: PixelBox) -> float:
     return common / ((a[2] - a[0]) * (a[3] - a[1]) + (b[2] - b[0]) * (b[3] - b[1]) - common)
 
 
-def first_guess(known: KnownObject, surface_m: FloatArray, pose: FloatArray) -> FloatArray:
+def first_guess(known: ObjectSpec, surface_m: FloatArray, pose: FloatArray) -> FloatArray:
     """The object's centre, body frame, from one point of its visible surface (camera frame), shape (3,).
 
     The point is pushed inwards by the radius: along the ray for a sphere, horizontally for what stands upright.
@@ -161,7 +161,7 @@ def first_guess(known: KnownObject, surface_m: FloatArray, pose: FloatArray) -> 
     return point + inwards * (known.planar_radius_m / max(float(np.linalg.norm(inwards)), 1e-9))
 
 
-def fit_centre(known: KnownObject, evidence: Evidence, pose: FloatArray, start: FloatArray) -> tuple[FloatArray, float]:
+def fit_centre(known: ObjectSpec, evidence: Evidence, pose: FloatArray, start: FloatArray) -> tuple[FloatArray, float]:
     """The centre, body frame, of the upright shape that goes best with the evidence, shape (3,), and its misfit.
 
     Gauss-Newton on signed distances, with Huber weights: surface points want distance 0, each against its
@@ -203,7 +203,7 @@ class _Rays:
     that was nearest before, which follows the centre as it moves.
     """
 
-    def __init__(self, known: KnownObject, evidence: Evidence, rotation: FloatArray, guess: FloatArray) -> None:
+    def __init__(self, known: ObjectSpec, evidence: Evidence, rotation: FloatArray, guess: FloatArray) -> None:
         self._known = known
         self.directions: FloatArray = np.concatenate([evidence.outline, evidence.beside]) @ rotation.T
         self._free_to = np.concatenate([np.full(len(evidence.outline), np.inf), evidence.free_to_m])[:, None]
@@ -225,7 +225,7 @@ class _Rays:
         return nearest
 
 
-def expected_area_px(known: KnownObject, centre: FloatArray, camera: Camera, pose: FloatArray) -> float:
+def expected_area_px(known: ObjectSpec, centre: FloatArray, camera: Camera, pose: FloatArray) -> float:
     """Pixels that the whole object covers from here: its silhouette's solid angle, over that of a pixel."""
     to_camera = pose[:3, 3] - centre
     distance = float(np.linalg.norm(to_camera))

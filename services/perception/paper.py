@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from cocoro.arrays import ImageArray
-from cocoro.objects import Catalogue, KnownObject
+from cocoro.objects import Catalogue, ObjectSpec
 from services.perception.config import Config
 from services.perception.image import RgbdImage
 from services.perception.sighting import ImageSighting
@@ -29,7 +29,7 @@ class PaperDetector:
         found = (self._find(known, lab, image) for known in self._catalogue)
         return [sighting for sighting in found if sighting is not None]
 
-    def _find(self, known: KnownObject, lab: ImageArray, image: RgbdImage) -> ImageSighting | None:
+    def _find(self, known: ObjectSpec, lab: ImageArray, image: RgbdImage) -> ImageSighting | None:
         mask = np.zeros(lab.shape[:2], dtype=np.uint8)
         for box in known.lab:
             mask |= np.asarray(cv2.inRange(lab, _eight_bit(box.low), _eight_bit(box.high)), dtype=np.uint8)

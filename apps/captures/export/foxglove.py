@@ -35,7 +35,7 @@ from cocoro.messages import (
     TaskState,
     Truth,
 )
-from cocoro.objects import KnownObject
+from cocoro.objects import ObjectSpec
 from cocoro.picture import describe
 from cocoro.units import Vec3
 from services.capture.file import Packer
@@ -271,7 +271,7 @@ class Translator:
         return fg.Color(*known.rgb) if known is not None else WHITE
 
 
-def _add_shape(entity: fg.SceneEntity, known: KnownObject | None, place: Vec3, colour: fg.Color) -> None:
+def _add_shape(entity: fg.SceneEntity, known: ObjectSpec | None, place: Vec3, colour: fg.Color) -> None:
     pose = fg.pose_of(place)
     size = fg.Vector3(*(known.size_m if known is not None else (0.06, 0.06, 0.06)))
     if known is not None and known.shape == "cylinder":
