@@ -11,7 +11,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
-from functools import partial
 from typing import NamedTuple, Protocol
 
 NS = 1_000_000_000
@@ -19,12 +18,14 @@ CLOCKS_APART_NS = NS // 4
 """Greatest difference between the clocks of two machines of one robot. `cocoro.inbox` rejects a stamp that is further
 ahead of the reader's clock."""
 
-steady_ns = partial(time.clock_gettime_ns, time.CLOCK_BOOTTIME)
-"""Nanoseconds since this machine was started, on the one clock that nobody can set (CLOCK_BOOTTIME).
 
-It counts the time during which the machine was suspended, which CLOCK_MONOTONIC does not: a command from before a
-suspension must not seem fresh after it.
-"""
+def steady_ns() -> int:
+    """Nanoseconds since this machine was started, on the one clock that nobody can set (CLOCK_BOOTTIME).
+
+    It counts the time during which the machine was suspended, which CLOCK_MONOTONIC does not: a command from before a
+    suspension must not seem fresh after it.
+    """
+    return time.clock_gettime_ns(time.CLOCK_BOOTTIME)
 
 
 def wall_offset_ns() -> int:
@@ -194,7 +195,8 @@ class FollowedClock:
         self._pace = 1.0
         self._doubted: Ticks | None = None
         self._sleeping: dict[asyncio.Future[None], int] = {}
-        """Wake-up time of each sleeper. A tick wakes only those that it concerns: there are a hundred ticks a second."""
+        """Wake-up time of each sleeper. A tick wakes only those that it concerns: there are a hundred ticks a
+        second."""
 
     @property
     def epoch(self) -> int:

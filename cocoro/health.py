@@ -97,9 +97,7 @@ class ProcessMeter:
             self._process = psutil.Process()
             self._process.memory_info()
         except (psutil.Error, OSError) as error:
-            log.warning(
-                "/proc cannot be read (%s): health reports the peak memory of this process", error
-            )
+            log.warning("/proc cannot be read (%s): health reports the peak memory of this process", error)
             self._process = None
 
     def take(self) -> tuple[float, float]:

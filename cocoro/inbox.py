@@ -194,8 +194,8 @@ class Latest(Generic[M]):
 class Stream(Generic[M]):
     """Every message of a topic, in order: `async for message in stream`.
 
-    At most `limit` messages wait; beyond it the oldest are dropped and counted in `overflowed`, which only a reader that
-    no longer reads can reach."""
+    At most `limit` messages wait; beyond it the oldest are dropped and counted in `overflowed`, which only a reader
+    that no longer reads can reach."""
 
     def __init__(self, inbox: Inbox[M], limit: int = 100_000) -> None:
         self._inbox = inbox

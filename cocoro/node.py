@@ -3,8 +3,9 @@
     async with Node("planning", bus, clock, robot) as node:
         await node.drive(PlanningCore(...))
 
-A node reads, calls and watches as every participant does. It also publishes, with stamp, sequence number and incarnation
-filled in; serves typed requests; publishes its health once a second; and holds the service's liveliness token.
+A node reads, calls and watches as every participant does. It also publishes, with stamp, sequence number and
+incarnation filled in; serves typed requests; publishes its health once a second; and holds the service's liveliness
+token.
 """
 
 from __future__ import annotations

@@ -29,8 +29,8 @@ class Publisher(Generic[M]):
         self._clock = clock
 
     def put(self, message: M, stamp_ns: int | None = None) -> M:
-        """Publishes the message and returns it, completed in place. `stamp_ns` defaults to the message's own stamp, or to
-        now when that is 0. Raises TypeError when the topic carries another type."""
+        """Publishes the message and returns it, completed in place. `stamp_ns` defaults to the message's own stamp, or
+        to now when that is 0. Raises TypeError when the topic carries another type."""
         if not isinstance(message, self.topic.type):
             raise TypeError(f"{self.topic.name} carries {self.topic.type.__name__}, not {type(message).__name__}")
         if stamp_ns is not None:

@@ -8,10 +8,10 @@ A message is judged by its incarnation and sequence number against those of the 
   between the two stamps. Such a message alone is rejected; the stream goes on where it was.
 - The same number or a lower one was repeated, replayed or overtaken: it is rejected.
 
-After `FOLLOWED_AFTER` such rejections in a row that agree with one another (each number higher than the one before by at
-most `FREE_JUMP`, each stamp not older), the stream continues at those messages: it was restarted there, or the number
-before them was the wrong one. Messages with lower numbers must also be stamped later than the last accepted one, so a
-burst of old messages is never followed. Losses that a wrong number caused are taken back.
+After `FOLLOWED_AFTER` such rejections in a row that agree with one another (each number higher than the one before by
+at most `FREE_JUMP`, each stamp not older), the stream continues at those messages: it was restarted there, or the
+number before them was the wrong one. Messages with lower numbers must also be stamped later than the last accepted one,
+so a burst of old messages is never followed. Losses that a wrong number caused are taken back.
 """
 
 from __future__ import annotations

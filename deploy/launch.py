@@ -1,7 +1,7 @@
 """Runs one process of the table: `python -m deploy.launch PROCESS --run-dir DIR`, or `run` from one's own terminal.
 
-Exit codes: 0 it was asked to end, 1 it crashed (traceback in the log), 2 an error that its user can correct, 3 something
-that runs already keeps it from starting (for both one line in the log).
+Exit codes: 0 it was asked to end, 1 it crashed (traceback in the log), 2 an error that its user can correct, 3
+something that runs already keeps it from starting (for both one line in the log).
 """
 
 from __future__ import annotations

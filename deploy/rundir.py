@@ -90,7 +90,8 @@ class RunDir:
         return holder(self.path / "supervisor")
 
     def claim(self, process: str, services: Iterable[str]) -> list[HeldFile]:
-        """Makes this process these services on this machine. Raises RefusedError when another process is one of them."""
+        """Makes this process these services on this machine. Raises RefusedError when another process is one of
+        them."""
         held: list[HeldFile] = []
         for service in sorted(services):  # in a fixed order, so that of two processes that start together one gets all
             claim = hold(self.path / "claims" / service, process)
@@ -129,8 +130,8 @@ class RunDir:
     # --- the mesh ---------------------------------------------------------------------------------
 
     def join_as(self, name: str, mesh: Mesh | None = None, *, frames: bool = False) -> ZenohConfig:
-        """How a process called `name` joins the mesh of a profile (by default the last start's). `frames`: it publishes or
-        reads frames, so it asks for shared memory."""
+        """How a process called `name` joins the mesh of a profile (by default the last start's). `frames`: it publishes
+        or reads frames, so it asks for shared memory."""
         if mesh is None:
             mesh = msgspec.convert(self.resolved().get("mesh", {}), Mesh)
         if not mesh.listen and not mesh.connect:
@@ -165,8 +166,8 @@ class RunDir:
         return self.logs / f"{process}.log"
 
     def new_log(self, process: str) -> IO[bytes]:
-        """A new log file for a process; earlier logs are rotated, and the oldest is removed. Raises ConfigError, FullError;
-        a process can run without a log."""
+        """A new log file for a process; earlier logs are rotated, and the oldest is removed. Raises ConfigError,
+        FullError; a process can run without a log."""
         log = self.log(process)
         files = [log, *(self.logs / f"{process}.log.{n}" for n in range(1, KEPT_LOGS + 1))]
         with self._log_folder(make=True) as fd:

@@ -24,8 +24,8 @@ import msgspec
 from cocoro.bus import shared
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.contact import SleepDetector
-from cocoro.keys import alive_key, service_of
 from cocoro.errors import CocoroError, ConfigError, RefusedError
+from cocoro.keys import alive_key, service_of
 from cocoro.stop.record import latch_dir, prepare
 from cocoro.topics import STOPPABLE
 from deploy import robot_time, service_manager
@@ -96,7 +96,8 @@ class Supervisor:
         try:
             async with await ZenohBus.open(self._run_dir.join_as("supervisor", self._profile.mesh)) as bus:
                 self._children = [
-                    Child(row, self._run_dir, reader_fd, self._tell, self._sleep_detector) for row in self._profile.rows()
+                    Child(row, self._run_dir, reader_fd, self._tell, self._sleep_detector)
+                    for row in self._profile.rows()
                 ]
                 by_service = {service: child for child in self._children for service in child.row.services}
 

@@ -30,6 +30,7 @@ from cocoro.messages import (
 from cocoro.node import Node
 from cocoro.robot import Robot
 from cocoro.testing import Tap, settle
+from deploy.delayed import DelayedNode
 from deploy.processes import named
 
 SERVICES = ("sim", "perception", "planning", "executive")
@@ -96,7 +97,7 @@ class RobotRig:
         component = load(named(name))
         config = msgspec.convert(self._settings.get(name, {}), component.config)
         bus = self.mesh.join()
-        node = Node(
+        node = DelayedNode(
             name, bus, self._clock_of(name), self._robot,
             latency_s=self._latency_s.get(name, 0.0), record_steps=self._record_steps,
         )  # fmt: skip

@@ -114,7 +114,7 @@ async def main():
         atexit._run_exitfuncs()
         os._exit(0)
     os.wait()
-    from cocoro.bus.members import members
+    from cocoro.bus.register import members
     say(*(member.name for member in members(Path(sys.argv[1]))))
     assert len(await bus.alive("@cocoro/member/*")) == 1
     await bus.close()

@@ -196,7 +196,7 @@ def test_an_entry_that_has_no_room_for_its_name_is_one(directory: Path, monkeypa
         def write(*_: object) -> int:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-        patch.setattr(os, "write", write)
+        patch.setattr(os, "pwrite", write)
         one = Membership.register(directory, "one")
     assert [(member.identity, member.name, member.pid) for member in members(directory)] == [
         (one.member.identity, "?", 0)

@@ -171,11 +171,11 @@ def test_full_queues_are_tried_again(robot: str) -> None:
                 sender.sendto(b"", b"\0" + address[1:].encode())
         with Asking(robot) as asking:
             (point,) = asking.points.values()
-            assert point.told_s is None
+            assert point.sent_s is None
             halted: list[str] = []
             listen(slow, halted.append, kept)
             asking.go_on(time.monotonic() + PATIENCE_S)
-            assert point.told_s
+            assert point.sent_s
             assert point.latched_ns
             assert halted[-1].startswith("operator")
     slow.close()
@@ -194,11 +194,11 @@ def test_who_finds_no_room_in_a_flood_is_there_as_soon_as_there_is_some(
         with Asking(robot) as asking:
             (point,) = asking.points.values()
             asking.go_on(time.monotonic() + 0.05)
-            assert point.told_s is None
+            assert point.sent_s is None
             while full.take(wait=False) is not None:
                 pass
             asking.go_on(time.monotonic() + 0.05)
-            assert point.told_s
+            assert point.sent_s
     full.close()
 
 

@@ -61,7 +61,8 @@ def find(where: RobotChoice) -> RunDir:
 
 @asynccontextmanager
 async def joined(where: RobotChoice, patience_s: float | None = None, *, frames: bool = False) -> AsyncIterator[Link]:
-    """Joins the mesh of a robot. Raises MeshError when there is none. `frames`: the command reads frames, or all keys."""
+    """Joins the mesh of a robot. Raises MeshError when there is none. `frames`: the command reads frames, or all
+    keys."""
     if where.profile is not None:
         from deploy import profiles
 

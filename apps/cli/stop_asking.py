@@ -46,7 +46,8 @@ class Point:
     """One address of the stop path. Raises ValueError for an address of another form."""
 
     def __init__(self, address: str, owner: int | None) -> None:
-        """`owner`: the user whose socket it is; None where the kernel does not say, then the address's own claim counts."""
+        """`owner`: the user whose socket it is; None where the kernel does not say, then the address's own claim
+        counts."""
         uid, self.robot, self.service, _ = address.removeprefix(PREFIX).split("/")
         self.uid = int(uid)
         if owner is not None:
@@ -97,8 +98,8 @@ class Asking:
             line.close()
 
     def go_on(self, until_s: float) -> None:
-        """Receives answers, and sends again to addresses that had no room or do not answer, until `until_s` (monotonic) or
-        until all have answered."""
+        """Receives answers, and sends again to addresses that had no room or do not answer, until `until_s` (monotonic)
+        or until all have answered."""
         look_s = time.monotonic() + LOOK_AGAIN_S
         while (now_s := time.monotonic()) < until_s:
             all_answered = not self.waiting
@@ -155,8 +156,8 @@ class Asking:
         return point.line
 
     def _hear(self, wait_s: float) -> None:
-        """Waits for answers, for at most `wait_s`, and reads up to `AT_ONCE` from each socket, so that a sender that never
-        ceases does not keep the others from being heard."""
+        """Waits for answers, for at most `wait_s`, and reads up to `AT_ONCE` from each socket, so that a sender that
+        never ceases does not keep the others from being heard."""
         for fd, events in self._poll.poll(max(wait_s * 1000.0, 0.0)):
             if events & select.POLLOUT:
                 self._send(self._on_line[fd])
@@ -185,8 +186,8 @@ class Asking:
 
 
 def addresses(robot: str | None = None) -> dict[str, int | None]:
-    """The addresses of the stop path on this machine, of all robots or of one name, each with the user who owns it (None
-    where the kernel does not say). This user's come first.
+    """The addresses of the stop path on this machine, of all robots or of one name, each with the user who owns it
+    (None where the kernel does not say). This user's come first.
 
     Raises OSError where the kernel does not list its sockets (no /proc).
     """
@@ -227,8 +228,8 @@ def _uid(ancillary: list[tuple[int, int, bytes]]) -> int | None:
 
 
 def owners(prefix: bytes) -> dict[bytes, int]:
-    """The user ids of the Unix sockets whose address begins with `prefix`, by address, from the kernel (sock_diag(7)): the
-    address itself says only what its maker chose. Empty where the kernel does not say."""
+    """The user ids of the Unix sockets whose address begins with `prefix`, by address, from the kernel (sock_diag(7)):
+    the address itself says only what its maker chose. Empty where the kernel does not say."""
     found: dict[bytes, int] = {}
     with suppress(OSError, struct.error), socket.socket(socket.AF_NETLINK, socket.SOCK_RAW, _SOCK_DIAG) as kernel:
         kernel.settimeout(_PATIENCE_S)

@@ -30,6 +30,7 @@ from cocoro.picture import draw, save_png
 from cocoro.robot import Robot
 from cocoro.stepper import Stepper
 from cocoro.vloop import run_virtual
+from deploy.delayed import DelayedNode
 from deploy.processes import named
 from sim.judge import Judge
 from sim.pursuit import PursuitJudge
@@ -97,7 +98,7 @@ class LockstepCycle:
                 await plan(planner.now_ns())
 
 
-class LockstepNode(Node):
+class LockstepNode(DelayedNode):
     """A node whose core is driven by the cycle."""
 
     cycle: LockstepCycle
@@ -141,7 +142,7 @@ class _Rehearsal:
                     settings["objects"] = request.objects
                 config = msgspec.convert(settings, component.config)
                 lockstep = request.lockstep and name in LockstepCycle.ORDER
-                kind = LockstepNode if lockstep else Node
+                kind = LockstepNode if lockstep else DelayedNode
                 node = kind(
                     name, mesh.join(), clock, robot, latency_s=request.latency.get(name, 0.0),
                     record_steps=request.record is not None, module=row.module, config=config,

@@ -18,10 +18,10 @@ from cocoro.messages import Detection
 from cocoro.objects import Catalogue, ObjectSpec
 from cocoro.robot import Camera, Robot
 from cocoro.units import Vec3
-from services.perception.image import Box
+from services.perception.image import PixelBox
 from services.perception.region import depth_doubt_m
 from services.perception.shapes import counted_px, distance_from, reach_m, seen_area_m2, signed_distance
-from services.perception.sighting import Evidence, Sighting
+from services.perception.sighting import Evidence, ImageSighting
 
 ITERATIONS = 12
 SETTLED_M = 1e-4
@@ -53,7 +53,9 @@ class Localiser:
         """4 x 4, camera frame (x right, y down, z forward) to body frame."""
         return self._chain.pose(dict(zip(self.joints, angles_rad, strict=True)))
 
-    def locate(self, sightings: Sequence[Sighting], camera: Camera, angles_rad: FloatArray | None) -> list[Detection]:
+    def locate(
+        self, sightings: Sequence[ImageSighting], camera: Camera, angles_rad: FloatArray | None
+    ) -> list[Detection]:
         """The detections as they are published: with the centre's position, or with a note of why there is none.
 
         Where two objects share a colour, both may have been sighted in one place: the one stays whose shape and size
@@ -75,7 +77,7 @@ class Localiser:
         bottom_m = z - self._catalogue[detection.label].size_m[2] / 2
         return bottom_m < -UNDER_FLOOR_M - UNDER_FLOOR_PER_M * hypot(x, y)
 
-    def _place(self, sighting: Sighting, camera: Camera, pose: FloatArray | None) -> _Placed:
+    def _place(self, sighting: ImageSighting, camera: Camera, pose: FloatArray | None) -> _Placed:
         position: Vec3 | None = None
         fit: _Fit | None = None
         note = ""
@@ -140,7 +142,7 @@ def _size_misfit(area_px: float, least_px: float, most_px: float) -> float:
     return 0.5 * (log(area_px / min(max(area_px, least_px), most_px)) / SIZE_DOUBT) ** 2
 
 
-def _overlap(a: Box, b: Box) -> float:
+def _overlap(a: PixelBox, b: PixelBox) -> float:
     """What two boxes have in common, as a share of what they cover together."""
     across, down = min(a[2], b[2]) - max(a[0], b[0]), min(a[3], b[3]) - max(a[1], b[1])
     common = max(across, 0) * max(down, 0)
