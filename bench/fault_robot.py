@@ -24,7 +24,7 @@ from cocoro.node import Node
 from cocoro.robot import Robot
 from cocoro.topics import HARDWARE
 from deploy.processes import named
-from services.planning.config import Config as Planning
+from services.planning.config import PlanningConfig
 from sim.motion import Motion, read_motion
 
 SERVICES = ("sim", "perception", "planning", "executive")
@@ -38,7 +38,7 @@ FRAMES = {"width": 320, "height": 240, "frame_rate_hz": 30.0, "sensors": "real"}
 
 def full_speed_mps(drive: Drive) -> float:
     """The highest speed that the planner drives at, of itself, on an errand."""
-    planning = Planning()
+    planning = PlanningConfig()
     return planning.follow.max_speed_mps if drive == "follow" else planning.navigation.max_speed_mps
 
 

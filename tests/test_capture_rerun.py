@@ -304,7 +304,7 @@ class Adder:
 def test_each_start_of_a_service_is_a_new_core(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     async def twice(room: Room) -> None:
         for _ in range(2):
-            node = room.node("planning", record_steps=True, module=planning.__name__, config=planning.Config())
+            node = room.node("planning", record_steps=True, module=planning.__name__, config=planning.PlanningConfig())
             async with node:
                 driving = asyncio.ensure_future(node.drive(Adder()))
                 await drive(room, 1.0, frames=False)
@@ -322,7 +322,7 @@ def test_each_start_of_a_service_is_a_new_core(tmp_path: Path, monkeypatch: pyte
 def test_the_latency_of_a_service_is_in_the_stamps_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     async def slow(room: Room) -> None:
         node = room.node(
-            "planning", record_steps=True, module=planning.__name__, config=planning.Config(), latency_s=0.05
+            "planning", record_steps=True, module=planning.__name__, config=planning.PlanningConfig(), latency_s=0.05
         )
         async with node:
             driving = asyncio.ensure_future(node.drive(Adder()))

@@ -18,7 +18,7 @@ from cocoro.vloop import run_virtual
 from services.kinect import device
 from services.kinect.device import Shot, Tell
 from services.kinect.freenect import LED
-from services.kinect.service import Config, run
+from services.kinect.service import KinectConfig, run
 
 
 class _Two:
@@ -47,7 +47,7 @@ class _Two:
 def test_every_pair_is_published_with_its_own_stamp_and_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
     cameras: list[_Two] = []
 
-    def open_two(config: Config, clock: Clock, tell: Tell) -> _Two:
+    def open_two(config: KinectConfig, clock: Clock, tell: Tell) -> _Two:
         cameras.append(_Two(clock))
         return cameras[-1]
 
@@ -60,7 +60,7 @@ def test_every_pair_is_published_with_its_own_stamp_and_pixels(monkeypatch: pyte
             Node("viewer", mesh.join(), clock, robot) as viewer,
         ):
             stream = viewer.stream(topics.FRAME)
-            work = kinect.spawn(run(kinect, Config(device="two")))
+            work = kinect.spawn(run(kinect, KinectConfig(device="two")))
             frames = [await stream.next(), await stream.next()]
             work.cancel()
             await asyncio.wait([work])
@@ -74,4 +74,4 @@ def test_every_pair_is_published_with_its_own_stamp_and_pixels(monkeypatch: pyte
 
 def test_a_driver_that_is_not_there_is_said_with_what_to_do() -> None:
     with pytest.raises(ConfigError, match=r"no driver 'nonesuch' \(known: .*freenect"):
-        device.open_device(Config(device="nonesuch"), VirtualClock(), print)
+        device.open_device(KinectConfig(device="nonesuch"), VirtualClock(), print)

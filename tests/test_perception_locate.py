@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from perception_scenes import CATALOGUE, MS, ROBOT, STAMP_NS, Scene, Thing, block, error_mm, facing, known, seen, the
 
-from services.perception.config import Config
+from services.perception.config import PerceptionConfig
 from services.perception.localise import Localiser
 from services.perception.shapes import distance_from, signed_distance
 from services.perception.sighting import Sighting
@@ -101,7 +101,7 @@ def test_a_turning_heads_motion_blur_leaves_a_near_can_in_place(speed_radps):
 @pytest.mark.parametrize(("area_px", "is_told"), [(300, False), (2500, True)], ids=["a part", "whole"])
 def test_what_seems_to_be_a_part_of_something_that_reaches_into_the_floor_is_no_such_thing(area_px, is_told):
     """Of a can that the arm hides in part, what is left may be as round as a ball."""
-    localiser = Localiser(ROBOT, CATALOGUE, Config().occluded_share)
+    localiser = Localiser(ROBOT, CATALOGUE, PerceptionConfig().occluded_share)
     camera = ROBOT.camera
     head_rad = np.array([0.3, -0.6])
     into_floor = np.linalg.inv(localiser.camera_pose(head_rad)) @ [1.05, 0.35, -0.07, 1.0]

@@ -14,11 +14,11 @@ from apps.cli.main import main
 from cocoro.errors import RefusedError
 from cocoro.robot import SERVO_COUNT_RAD, Robot
 from services.base.doctor import check as check_base
-from services.base.service import Config as BaseConfig
+from services.base.service import BaseConfig
 from services.servos import tools
 from services.servos.bus import Bus
 from services.servos.doctor import check as check_servos
-from services.servos.service import Config as ServoConfig
+from services.servos.service import ServosConfig
 from sim.wire.create import Create
 from sim.wire.emulator import Emulator
 
@@ -178,7 +178,7 @@ def test_mistakes_get_one_line(
 
 
 def test_the_doctor_looks_at_every_servo(bench: ServoBench) -> None:
-    config = ServoConfig(arm_port=bench.port("arm"), hand_port=bench.port("hand"), reply_s=REPLY_S)
+    config = ServosConfig(arm_port=bench.port("arm"), hand_port=bench.port("hand"), reply_s=REPLY_S)
     assert {check.state for check in check_servos(config, ROBOT, "robbie")} == {"ok"}
     bench.call(lambda: setattr(bench.servo(9), "mute", True))
     bench.call(lambda: (bench.servo(5).put(5, 250), bench.servo(4).put(43, 75), bench.servo(3).put(42, 70)))

@@ -10,6 +10,7 @@ import msgspec
 from msgspec import Meta
 
 from cocoro import topics
+from cocoro.component import Implementation
 from cocoro.latch import LatchKeeper
 from cocoro.messages import BaseCommand, LatchState, RecoverReply, RecoverRequest
 from cocoro.node import Node
@@ -17,14 +18,12 @@ from cocoro.ports import port_path
 from services.base.driver import BaseDriver, Report
 from services.base.guardian import Guardian
 
-__all__ = ["Config", "run"]
-
 BEAT_S = 0.02
 """How often the guard is asked anew; a tenth of the time after which it stops the wheels."""
 RECOVERY_S = 2.0
 
 
-class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class BaseConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     port: str = "/dev/cocoro-create"
     """The serial port: a device, or wire:NAME for an emulated one."""
     mode: Literal["safe", "full"] = "safe"
@@ -34,7 +33,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class BaseService:
-    def __init__(self, node: Node, config: Config) -> None:
+    def __init__(self, node: Node, config: BaseConfig) -> None:
         self._node = node
         self._driver = BaseDriver(node.robot.base)
         port = port_path(config.port, node.robot_name)
@@ -131,6 +130,9 @@ class BaseService:
             node.degraded({"waking": "waking the Create", "fallen": "not obeying"}.get(self._driver.link, "no Create"))
 
 
-async def run(node: Node, config: Config) -> None:
+async def run(node: Node, config: BaseConfig) -> None:
     """Serve for ever."""
     await BaseService(node, config).run()
+
+
+implementation = Implementation(BaseConfig, run)

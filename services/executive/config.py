@@ -10,7 +10,7 @@ from msgspec import Meta
 from cocoro.units import Positive
 
 
-class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class ExecutiveConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     objects: str = ""
     """A catalogue of known objects; empty is the project's own."""
     needed: tuple[str, ...] = ("kinect", "base", "arm", "hand", "perception", "planning")

@@ -23,7 +23,7 @@ from cocoro.arrays import ImageArray
 from cocoro.clock import NS, Clock
 from cocoro.errors import ConfigError
 from services.kinect import freenect, grabber
-from services.kinect.config import Config
+from services.kinect.config import KinectConfig
 from services.kinect.device import Shot, Tell
 from services.kinect.freenect import HEIGHT, LED, WIDTH, Kind
 
@@ -42,7 +42,7 @@ _PACKAGE = str(Path(__file__).parents[2])
 class FreenectCamera:
     """Needs a running event loop. `tell(fault)` is called in it, whenever what is wrong has changed."""
 
-    def __init__(self, config: Config, clock: Clock, tell: Tell) -> None:
+    def __init__(self, config: KinectConfig, clock: Clock, tell: Tell) -> None:
         try:
             freenect.load(freenect.find(config.library, bool(config.recording)))
         except freenect.MissingLibraryError as error:

@@ -8,7 +8,7 @@ from typing import NamedTuple, Protocol
 from cocoro.arrays import CodeArray, ImageArray
 from cocoro.clock import Clock
 from cocoro.errors import ConfigError
-from services.kinect.config import Config
+from services.kinect.config import KinectConfig
 from services.kinect.freenect import LED
 
 Tell = Callable[[str], None]
@@ -40,13 +40,13 @@ class DepthCamera(Protocol):
     def close(self) -> None: ...
 
 
-Open = Callable[[Config, Clock, Tell], DepthCamera]
+Open = Callable[[KinectConfig, Clock, Tell], DepthCamera]
 
 DEVICES: dict[str, Open] = {}
 """Drivers by name. Raise ConfigError, naming the package to install, when their library is missing."""
 
 
-def open_device(config: Config, clock: Clock, tell: Tell) -> DepthCamera:
+def open_device(config: KinectConfig, clock: Clock, tell: Tell) -> DepthCamera:
     """Raises ConfigError for a driver that is not there."""
     from services.kinect import camera  # enters the real one
 

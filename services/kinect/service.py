@@ -8,16 +8,15 @@ from contextlib import closing
 import numpy as np
 
 from cocoro import topics
+from cocoro.component import Implementation
 from cocoro.messages import Frame
 from cocoro.node import Node
-from services.kinect.config import Config
+from services.kinect.config import KinectConfig
 from services.kinect.device import Shot, open_device
 from services.kinect.lens import Straightener
 
-__all__ = ["Config", "run"]
 
-
-async def run(node: Node, config: Config) -> None:
+async def run(node: Node, config: KinectConfig) -> None:
     """Publish every pair for ever. Raises ConfigError when the driver or its library is missing."""
     straighten = Straightener(node.robot)
 
@@ -34,6 +33,10 @@ async def run(node: Node, config: Config) -> None:
             # A few milliseconds of arithmetic, which the loop does not wait for.
             straight = shot if straighten.idle else await asyncio.to_thread(straighten, shot)
             node.publish(topics.FRAME, as_frame(straight))
+
+
+implementation = Implementation(KinectConfig, run)
+
 
 
 def as_frame(shot: Shot) -> Frame:

@@ -20,7 +20,7 @@ from cocoro.errors import CocoroError, ConfigError
 from cocoro.picture import load as load_picture
 from cocoro.picture import save as save_picture
 from services.kinect.calibration import Board, View, find_corners
-from services.kinect.config import Config
+from services.kinect.config import KinectConfig
 from services.kinect.device import DepthCamera, Shot, open_device
 from services.kinect.lens import NO_DATA
 
@@ -84,14 +84,14 @@ def mean_depth(depths: list[CodeArray]) -> CodeArray:
     return np.where((stack >= NO_DATA).any(axis=0), np.uint16(NO_DATA), middle)
 
 
-def capture(config: Config, board: Board, wanted: int, folder: Path | None, tell: Tell) -> list[View]:
+def capture(config: KinectConfig, board: Board, wanted: int, folder: Path | None, tell: Tell) -> list[View]:
     """Views from the device. Raises ConfigError where its library is missing, CocoroError where nothing comes of it."""
     if folder is not None:
         _prepare(folder)
     return asyncio.run(_capture(config, Collector(board, folder), wanted, tell))
 
 
-async def _capture(config: Config, collector: Collector, wanted: int, tell: Tell) -> list[View]:
+async def _capture(config: KinectConfig, collector: Collector, wanted: int, tell: Tell) -> list[View]:
     told = ""
 
     def say(text: str) -> None:
@@ -137,12 +137,12 @@ async def _shots(camera: DepthCamera) -> AsyncGenerator[Shot | None, None]:
             coming.cancel()
 
 
-def tilt(config: Config, angle_rad: float) -> None:
+def tilt(config: KinectConfig, angle_rad: float) -> None:
     """Move the device's own tilt motor. Raises CocoroError where there is no device."""
     asyncio.run(_tilt(config, angle_rad))
 
 
-async def _tilt(config: Config, angle_rad: float) -> None:
+async def _tilt(config: KinectConfig, angle_rad: float) -> None:
     faults: list[str] = []
     with closing(open_device(config, RealClock(), faults.append)) as camera:
         camera.tilt(angle_rad)

@@ -14,13 +14,13 @@ import numpy as np
 
 from cocoro.arrays import ImageArray
 from cocoro.objects import Catalogue, KnownObject
-from services.perception.config import Config
+from services.perception.config import PerceptionConfig
 from services.perception.image import RgbdImage
 from services.perception.sighting import Sighting
 
 
 class PaperDetector:
-    def __init__(self, catalogue: Catalogue, config: Config) -> None:
+    def __init__(self, catalogue: Catalogue, config: PerceptionConfig) -> None:
         self._catalogue = catalogue
         self._config = config
 

@@ -18,7 +18,7 @@ from cocoro.learning.model import Model
 from cocoro.learning.nominal_model import NominalModel
 from cocoro.learning.reachability import ReachMesh
 from cocoro.robot import Robot
-from services.planning.config import Config, HandSight
+from services.planning.config import HandSight, PlanningConfig
 from services.planning.reach import LEVEL_ROLL_RAD, HandModel
 from services.planning.state_estimator import Sighting
 from services.planning.teaching import Teacher
@@ -122,7 +122,7 @@ class SeenHand:
 class Learned:
     """What is known beyond the drawing, and the sentence that says so."""
 
-    def __init__(self, robot: Robot, config: Config) -> None:
+    def __init__(self, robot: Robot, config: PlanningConfig) -> None:
         self._robot = robot
         self._config = config
         self._text = NOTHING_LEARNED

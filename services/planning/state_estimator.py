@@ -20,7 +20,7 @@ from cocoro.messages import BaseState, Detection, Detections, Intent, Message, O
 from cocoro.robot import Robot
 from cocoro.topics import Topic
 from cocoro.units import Vec3
-from services.planning.config import Config
+from services.planning.config import PlanningConfig
 from services.planning.memory import TargetMemory
 from services.planning.surroundings import Surroundings
 from services.planning.turning import Turning
@@ -83,7 +83,7 @@ class Sighting(NamedTuple):
 class StateEstimator:
     """Takes every input of the planner; answers by time."""
 
-    def __init__(self, config: Config, robot: Robot) -> None:
+    def __init__(self, config: PlanningConfig, robot: Robot) -> None:
         self._joints = tuple(robot.joints)
         self.memory = TargetMemory(config.memory)
         self.base: BaseState | None = None

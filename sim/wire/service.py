@@ -15,18 +15,17 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from cocoro.component import Implementation
 from cocoro.errors import CocoroError
 from cocoro.node import Node
 from cocoro.ports import wire_dir
 from cocoro.robot import Robot
 from sim.camera import Kinect
-from sim.service import Config, Simulator, keep_going, make_kinect, make_world
+from sim.service import SimConfig, Simulator, keep_going, make_kinect, make_world
 from sim.wire.dynamixel import Motor
 from sim.wire.link import Channel, Orders, Senses, ServoSetup, Setup
 from sim.wire.motors import WireMotors
 from sim.world import World
-
-__all__ = ["Config", "run"]
 
 MODELS = {"arm": 28, "hand": 12}
 START_S, END_S = 30.0, 3.0
@@ -36,7 +35,7 @@ class WireSimulator(Simulator):
     """A simulator whose motors are driven by firmware in another process."""
 
     def __init__(
-        self, node: Node, config: Config, world: World, kinect: Kinect, motors: WireMotors, channel: Channel
+        self, node: Node, config: SimConfig, world: World, kinect: Kinect, motors: WireMotors, channel: Channel
     ) -> None:
         super().__init__(node, config, world, kinect)
         self._motors = motors
@@ -105,7 +104,7 @@ def firmware_process(folder: Path, setup: Setup) -> Iterator[Channel]:
             process.wait()
 
 
-async def run(node: Node, config: Config) -> None:
+async def run(node: Node, config: SimConfig) -> None:
     """Simulate for ever."""
     motors = WireMotors()
     folder = wire_dir(node.robot_name)
@@ -120,3 +119,6 @@ async def run(node: Node, config: Config) -> None:
                 for part in (node, camera):
                     part.ready(f"simulated behind wires, scene {world.scene.name}, {config.sensors} sensors")
                 await keep_going(node, config, simulator)
+
+
+implementation = Implementation(SimConfig, run)
