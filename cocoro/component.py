@@ -105,7 +105,7 @@ class Component:
             raise ConfigError(f"component {self.name}: it moves {unknown[0]}, which is none of its services")
         served = {request.name for request in self.all_serves()}
         if unstoppable := [service for service in self.moves if ESTOP.of(service).name not in served]:
-            raise ConfigError(f"component {self.name}: {unstoppable[0]} moves something, so it must serve the request ESTOP")
+            raise ConfigError(f"component {self.name}: {unstoppable[0]} moves something, so it must serve ESTOP")
 
     def all_publishes(self) -> Iterator[Topic[Any]]:
         """The published topics, those with `{service}` resolved for each service."""
@@ -135,7 +135,7 @@ def load(component: Component) -> Implementation[Any]:
     return found
 
 
-def examine(component: Component, config: Any, robot: Robot, robot_name: str) -> Iterable[Check]:
+def machine_checks(component: Component, config: Any, robot: Robot, robot_name: str) -> Iterable[Check]:
     """Run a component's own checks of the machine; none for a component without any. Raises ConfigError when its
     module of checks is missing."""
     if not component.checks:

@@ -1,8 +1,8 @@
 """The project's own topics and requests: the messages on the mesh, with their rates, ages and quality of service.
 
 What exists on a robot is the union of these rows and those of installed third parties (`cocoro.installed`). To add a
-message: a class in `cocoro/messages/`, a row here, and the row's name in the declaration of the component that publishes
-it (`services/<name>/component.py`).
+message: a class in `cocoro/messages/`, a row here, and the row's name in the declarations of the components that
+publish and read it (`services/<name>/component.py`).
 
 A key is `<robot>/<service>/<topic>`. Rows with `{service}` in their name stand for one topic per service.
 """

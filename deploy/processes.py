@@ -38,9 +38,11 @@ def table() -> dict[str, Component]:
     """All components by name. Raises ConfigError for a third party's that is faulty or takes a taken name."""
     third_parties().check()
     known = {component.name: component for component in COMPONENTS}
-    if taken := sorted(set(known) & set(third_parties().components)):
-        raise ConfigError(f"entry point {taken[0]!r}: there is a component of that name already")
-    return known | third_parties().components
+    for name, component in third_parties().components.items():
+        if name in known:
+            raise ConfigError(f"{component.module} of a third party: there is a component named {name!r} already")
+        known[name] = component
+    return known
 
 
 def components() -> tuple[Component, ...]:
@@ -77,12 +79,17 @@ def stoppable() -> tuple[str, ...]:
     return _distinct(service for component in components() for service in component.moves)
 
 
-def publishers(topic: Topic[Any]) -> tuple[str, ...]:
-    """The services that publish a topic, by any component; `ANY` for a per-service row."""
+def publishers(topic: Topic[Any], among: Iterable[Component] | None = None) -> tuple[str, ...]:
+    """The services that publish a topic, by all components or `among` some; `ANY` for a per-service row."""
     if topic.per_service:
         return (ANY,)
-    found = ((component, one) for component in components() for one in component.all_publishes())
-    return _distinct(component.speaker(topic) for component, one in found if one.name == topic.name)
+    found = ((one, declared) for one in among or components() for declared in one.all_publishes())
+    return _distinct(one.speaker(topic) for one, declared in found if declared.name == topic.name)
+
+
+def readers(topic: Topic[Any], among: Iterable[Component] | None = None) -> tuple[str, ...]:
+    """The components that read a topic, by name; a recorder reads everything, and is not among them."""
+    return _distinct(one.name for one in among or components() if topic.name in {read.name for read in one.reads})
 
 
 def needs(name: str, started: Iterable[Component] = ()) -> tuple[str, ...]:

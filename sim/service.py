@@ -15,6 +15,7 @@ from msgspec import Meta
 
 from cocoro import topics
 from cocoro.clock import NS, Clock, FollowedClock
+from cocoro.component import Implementation
 from cocoro.latch import LatchKeeper
 from cocoro.messages import BaseCommand, BaseState, LatchState, Message, ServoCommand
 from cocoro.messages import Clock as ClockMessage
@@ -22,6 +23,7 @@ from cocoro.node import Node
 from cocoro.publisher import Publisher
 from cocoro.robot import Robot
 from sim.camera import Kinect
+from sim.component import SIM
 from sim.motion import MotionWriter
 from sim.random_scene import find_scene
 from sim.realism import BodyRealism
@@ -195,7 +197,7 @@ async def run(node: Node, config: SimConfig) -> None:
     with make_world(node.robot, config) as world:
         simulator = Simulator(node, config, world, make_kinect(node.robot, config, world))
         async with AsyncExitStack() as stack:
-            hardware = [await stack.enter_async_context(node.sibling(name)) for name in topics.HARDWARE]
+            hardware = [await stack.enter_async_context(node.sibling(name)) for name in SIM.services]
             simulator.connect(*hardware)
             simulator.tell_time()  # before anybody is ready, so that nobody begins anything in a time that is over
             for part in (node, *hardware):
@@ -204,7 +206,6 @@ async def run(node: Node, config: SimConfig) -> None:
 
 
 implementation = Implementation(SimConfig, run)
-
 
 
 def make_world(

@@ -41,7 +41,8 @@ from cocoro.messages import (
 )
 from cocoro.node import Node
 from cocoro.robot import Robot
-from cocoro.topics import BASE_STATE, CANCEL, DETECTIONS, ESTOP, FRAME, LATCH, OBJECTS, PLAN, RUN, STOPPABLE, TASK
+from cocoro.topics import BASE_STATE, CANCEL, DETECTIONS, ESTOP, FRAME, LATCH, OBJECTS, PLAN, RUN, TASK
+from deploy.processes import stoppable
 from deploy.rundir import RunDir
 
 pytestmark = pytest.mark.zenoh
@@ -69,7 +70,7 @@ async def robot(*services: str, without_latch: tuple[str, ...] = ()) -> AsyncIte
         nodes = {name: Node(name, bus, clock, description, health_hz=20.0) for name in services}
         for node in nodes.values():
             await stack.enter_async_context(node)
-        keeping = [name for name in STOPPABLE if name in nodes and name not in without_latch]
+        keeping = [name for name in stoppable() if name in nodes and name not in without_latch]
         keepers = {name: LatchKeeper(nodes[name], lambda *_: None) for name in keeping}
         for node in nodes.values():
             node.ready("all is well")

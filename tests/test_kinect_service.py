@@ -16,9 +16,10 @@ from cocoro.node import Node
 from cocoro.robot import Robot
 from cocoro.vloop import run_virtual
 from services.kinect import device
+from services.kinect.config import KinectConfig
 from services.kinect.device import Shot, Tell
 from services.kinect.freenect import LED
-from services.kinect.service import KinectConfig, run
+from services.kinect.service import run
 
 
 class _Two:

@@ -16,8 +16,9 @@ from cocoro.capture.pictures import LossyFrame
 from cocoro.capture.reader import Capture
 from cocoro.capture.schema import changes, schema_of
 from cocoro.clock import NS
+from cocoro.installed import topic_named
 from cocoro.messages import Message
-from cocoro.topics import RECORDING, topic_named
+from cocoro.topics import RECORDING
 
 MESSAGE_HEAD_BYTES = mcap.MESSAGE_HEAD.size
 

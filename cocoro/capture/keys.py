@@ -12,8 +12,9 @@ from cocoro.bus.base import Qos
 from cocoro.bus.keys import matches
 from cocoro.capture.schema import TypeSchema, schema_of
 from cocoro.errors import ConfigError
+from cocoro.installed import topic_named
 from cocoro.messages import Message
-from cocoro.topics import TOPICS, topic_named
+from cocoro.topics import TOPICS
 
 MSGPACK, JSON, OTHER = "msgpack", "json", "application/octet-stream"
 MADE_HERE = "recorder"

@@ -10,8 +10,8 @@ import msgspec
 from cocoro.capture.errors import DamageError
 from cocoro.capture.keys import Alive
 from cocoro.capture.pictures import LossyFrame, expand
+from cocoro.installed import topic_named
 from cocoro.messages import Message
-from cocoro.topics import topic_named
 
 Read = Callable[[bytes | memoryview], msgspec.Struct]
 

@@ -56,7 +56,6 @@ async def run(node: Node, config: CaptureConfig, log_clock: LogClock | None = No
 implementation = Implementation(CaptureConfig, run)
 
 
-
 def _writer(
     robot: str, config: CaptureConfig, ledger: Ledger, started: datetime, release: Callable[[int], None] | None
 ) -> Writer:

@@ -38,7 +38,6 @@ async def run(node: Node, config: KinectConfig) -> None:
 implementation = Implementation(KinectConfig, run)
 
 
-
 def as_frame(shot: Shot) -> Frame:
     """The message of a pair; the pixels are not copied where they lie in order."""
     height, width = shot.depth.shape

@@ -269,7 +269,7 @@ class StateEstimator:
         among them with `sight`."""
         ages = {"the executive": self.intent_age_s(now_ns)}
         for topic in (topics.BASE_STATE, topics.ARM_STATE, topics.HAND_STATE):
-            ages[topic.publisher] = self._age_s(topic, now_ns)
+            ages[topic.service] = self._age_s(topic, now_ns)
         if sight:
             ages["perception"] = self._sight.age_s(now_ns)
         who = max(ages, key=ages.__getitem__)
