@@ -209,7 +209,7 @@ def _frames(name: str, frames: list[bytes], times: int) -> None:
 
     def read() -> None:
         for content in contents:
-            unpacked(content)
+            unpacked(content, ours=True)
 
     def read_by_package() -> None:
         for content in contents:

@@ -24,7 +24,7 @@ from deploy.processes import named
 from services.capture.writer import Entry, Limits, Writer
 
 ROBOT = Robot.load()
-STILL = {"odometry_yaw_rad": 0.0, "speed_mps": 0.0, "turn_rate_radps": 0.0}
+STILL: dict[str, Any] = {"odometry_yaw_rad": 0.0, "speed_mps": 0.0, "turn_rate_radps": 0.0}
 
 FOR_EVER = Limits()
 

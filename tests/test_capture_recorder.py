@@ -16,6 +16,7 @@ from capture_rig import ROBOT, STILL, Room, all_of, drive, entry, record, writer
 from cocoro import topics
 from cocoro.bus.base import Payload
 from cocoro.bus.local import LocalMesh
+from cocoro.capture.file import LARGE_BYTES
 from cocoro.capture.reader import Capture
 from cocoro.clock import NS, FollowedClock
 from cocoro.component import load
@@ -30,7 +31,7 @@ from cocoro.vloop import run_virtual
 from deploy import profiles
 from deploy.processes import named
 from services.capture.config import Config, folder_of
-from services.capture.sink import LARGE_BYTES, RESERVE_BYTES, Syncer, ThreadedSink
+from services.capture.sink import RESERVE_BYTES, Syncer, ThreadedSink
 from services.capture.writer import Writer
 
 
