@@ -64,11 +64,11 @@ KILLED = """
 import sys
 from pathlib import Path
 from cocoro.learning.dataset import HandRow, Writer, hand_header
-from cocoro.learning.nominal_model import Drawing
+from cocoro.learning.nominal_model import NominalModel
 from cocoro.robot import Robot
 
 robot = Robot.load()
-with Writer(Path(sys.argv[1]), HandRow, robot, hand_header(robot, Drawing(robot).joints, 1.57)) as writer:
+with Writer(Path(sys.argv[1]), HandRow, robot, hand_header(robot, NominalModel(robot).joints, 1.57)) as writer:
     for draw in range(1_000_000):
         writer.append([HandRow(stamp_ns=draw, draw=draw, angles_rad=(0.0,) * 4, head_rad=(0.0, 0.0),
                                seen_m=(0.1, 0.2, 0.3), area_px=1)])
