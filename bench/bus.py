@@ -22,10 +22,9 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from cocoro.bus.base import Payload
+from cocoro.bus.base import Payload, Qos
 from cocoro.bus.endpoints import ZenohConfig
 from cocoro.bus.zenoh import ZenohBus
-from cocoro.topics import Qos
 
 PING = bytes(1024)
 FRAME = os.urandom(640 * 480 * 5)

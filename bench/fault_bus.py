@@ -5,9 +5,9 @@ from __future__ import annotations
 import asyncio
 from typing import Literal
 
-from cocoro.bus.base import Handle, OnAlive, OnLot, OnSample, Payload, Reply, Server, Subscription
+from cocoro.bus.base import Handle, OnAlive, OnLot, OnSample, Payload, Qos, Reply, Server, Subscription
 from cocoro.bus.local import LocalBus
-from cocoro.topics import HARDWARE, Qos
+from cocoro.topics import HARDWARE
 
 Way = Literal["dies", "silent", "hangs", "late"]
 """dies: says and hears nothing, and its token is gone. silent: says nothing. hangs: says and hears nothing, and its

@@ -14,7 +14,7 @@ import msgspec
 from bench.fault_bus import LATE_S, FaultyBus, Way
 from bench.fault_scenes import Drive, Errand
 from cocoro import topics
-from cocoro.bus.base import Payload
+from cocoro.bus.base import Payload, Qos
 from cocoro.bus.local import LocalMesh
 from cocoro.clock import NS, VirtualClock
 from cocoro.component import load
@@ -22,7 +22,7 @@ from cocoro.errors import CocoroError
 from cocoro.messages import CancelRequest, EstopRequest, TaskReply, TaskRequest
 from cocoro.node import Node
 from cocoro.robot import Robot
-from cocoro.topics import HARDWARE, Qos
+from cocoro.topics import HARDWARE
 from deploy.processes import named
 from services.planning.config import Config as Planning
 from sim.motion import Motion, read_motion

@@ -10,11 +10,11 @@ from typing import Any, Generic, TypeVar
 
 import msgspec
 
-from cocoro.bus.base import Payload, Subscription
+from cocoro.bus.base import Payload, Qos, Subscription
 from cocoro.clock import CLOCKS_APART_NS, NS, Clock, is_fresh, latest_ns
 from cocoro.messages import Message, TopicHealth
 from cocoro.source import ANY_HZ, Source
-from cocoro.topics import CLOCK, Qos, Topic
+from cocoro.topics import CLOCK, Topic
 from cocoro.trouble import Trouble
 
 M = TypeVar("M", bound=Message)

@@ -21,7 +21,7 @@ import msgspec
 
 from cocoro import topics
 from cocoro.about import about
-from cocoro.bus.base import Bus, Handle, Payload, Reply
+from cocoro.bus.base import Bus, Handle, Payload, Qos, Reply
 from cocoro.clock import NS, Clock, FollowedClock, VirtualClock
 from cocoro.clock import sleep as clock_sleep
 from cocoro.contact import Contact
@@ -35,7 +35,7 @@ from cocoro.publisher import Publisher
 from cocoro.robot import Robot
 from cocoro.stepper import Stepper, drive
 from cocoro.tokens import alive_key
-from cocoro.topics import EXCHANGES, HEALTH, Qos, Request, Topic
+from cocoro.topics import EXCHANGES, HEALTH, Request, Topic
 
 M = TypeVar("M", bound=Message)
 Q = TypeVar("Q", bound=msgspec.Struct)

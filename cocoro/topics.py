@@ -7,29 +7,16 @@ A key is `<robot>/<service>/<topic>`. Rows with `{service}` in their name stand 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import Enum
 from typing import Any, Generic, TypeVar
 
 import msgspec
 
 from cocoro import messages as m
+from cocoro.bus.base import Qos
 
 M = TypeVar("M", bound=m.Message)
 Q = TypeVar("Q", bound=msgspec.Struct)
 R = TypeVar("R", bound=msgspec.Struct)
-
-
-class Qos(Enum):
-    """How a key travels. State: the newest wins. Events: reliable, in order."""
-
-    FRAME = "frame"
-    """Large, newest wins, shared memory, lowest priority: never in the way of a command."""
-    STATE = "state"
-    """Small, newest wins."""
-    COMMAND = "command"
-    """Small, newest wins, sent at once at real-time priority; expires."""
-    EVENT = "event"
-    """Reliable and ordered; nothing is dropped silently."""
 
 
 @dataclass(frozen=True)
@@ -144,7 +131,7 @@ LATCH = Topic(
     "The emergency stop's state, for hardware services that have just started.",
 )  # fmt: skip
 CLOCK = Topic(
-    "sim/clock", m.Clock, Qos.COMMAND, "sim", 120.0, 1.0,
+    "sim/clock", m.ClockTick, Qos.COMMAND, "sim", 120.0, 1.0,
     "Simulated time. When it stands, time stands.",
 )  # fmt: skip
 TRUTH = Topic(

@@ -6,7 +6,8 @@ from math import acos, degrees, hypot, sqrt
 
 import msgspec
 
-from cocoro.messages import TrueObject, Truth, Vec3
+from cocoro.messages import TrueObject, Truth
+from cocoro.units import Vec3
 from sim.scene import Scene, SceneObject
 from sim.stage import FLOOR
 

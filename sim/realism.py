@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 
-from cocoro.kinematics import Array
+from cocoro.arrays import FloatArray
 from sim.seeds import stream
 
 Sensors = Literal["ideal", "real"]
@@ -44,7 +44,7 @@ REALISM: dict[Sensors, BodyRealism] = {
 }
 
 
-def wheel_scales(seed: int, realism: BodyRealism) -> Array:
+def wheel_scales(seed: int, realism: BodyRealism) -> FloatArray:
     """How far the left and the right wheel of a run roll for a metre that they are told to; shape (2,)."""
     return np.asarray(1.0 + stream(seed, "wheel scale").uniform(-1.0, 1.0, 2) * realism.wheel_scale_error)
 
@@ -59,9 +59,9 @@ class Wander:
         self._draws = draws
         self._keep = exp(-dt_s / time_s)
         self._add = sigma * sqrt(1.0 - self._keep**2)
-        self.values: Array = sigma * draws.standard_normal(channels)
+        self.values: FloatArray = sigma * draws.standard_normal(channels)
 
-    def step(self) -> Array:
+    def step(self) -> FloatArray:
         """The next values, shape (channels,), `dt_s` later."""
         self.values = self._keep * self.values + self._add * self._draws.standard_normal(self.values.size)
         return self.values

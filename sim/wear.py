@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from cocoro.kinematics import Array
+from cocoro.arrays import FloatArray
 from cocoro.robot import Robot
 from sim.seeds import stream
 
@@ -89,13 +89,13 @@ def _worn(robot: Robot, rng: np.random.Generator) -> Robot:
     return Robot.from_data(data, "worn body")
 
 
-def _direction(rng: np.random.Generator) -> Array:
+def _direction(rng: np.random.Generator) -> FloatArray:
     """A direction in space, all alike; shape (3,)."""
-    vector: Array = rng.standard_normal(3)
+    vector: FloatArray = rng.standard_normal(3)
     return vector / float(np.linalg.norm(vector))
 
 
-def _displacement(name: str, parent: str, shift_m: Array, turn_rad: Array) -> Iterator[dict[str, Any]]:
+def _displacement(name: str, parent: str, shift_m: FloatArray, turn_rad: FloatArray) -> Iterator[dict[str, Any]]:
     """Fixed links that shift and turn what hangs on them, along and about x, y and z in turn. A row of the kinematic
     table moves along its x and z alone, so y is the x of a row that is turned by a quarter, and then back."""
     (x, y, z), (rx, ry, rz) = shift_m.tolist(), np.degrees(turn_rad).tolist()

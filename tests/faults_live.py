@@ -23,11 +23,11 @@ import msgspec
 from operator_shell import PATIENCE_S, Running
 
 from cocoro import topics
-from cocoro.bus.base import Payload
+from cocoro.bus.base import Payload, Qos
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.clock import NS
 from cocoro.messages import AboutRequest, Exchange, Message, TaskReply, TaskRequest, TaskState, Truth
-from cocoro.topics import Qos, Topic
+from cocoro.topics import Topic
 from deploy.rundir import RunDir, Target
 
 M = TypeVar("M", bound=Message)

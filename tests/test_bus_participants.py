@@ -6,8 +6,8 @@ import asyncio
 
 from bus_rig import PATIENCE_S, Inbox, Mesh, echo, joined, known, scenario
 
+from cocoro.bus.base import Qos
 from cocoro.bus.local import LocalMesh
-from cocoro.topics import Qos
 
 
 @scenario

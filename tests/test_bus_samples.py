@@ -8,8 +8,7 @@ import os
 import pytest
 from bus_rig import Inbox, Listener, Local, Mesh, joined, known, scenario
 
-from cocoro.bus.base import Heard, Payload
-from cocoro.topics import Qos
+from cocoro.bus.base import Heard, Payload, Qos
 
 
 @scenario

@@ -22,15 +22,15 @@ from apps.captures.export import foxglove, rerun_scene, tables, video
 from apps.captures.export.foxglove_types import SceneUpdate, schema_of
 from apps.captures.export.geometry import Posture, about_z, conjugate, points, quaternion, rotated
 from apps.captures.export.story import catalogue_of, robot_of
-from apps.cli.capture_view import watch
+from apps.cli.capture_mesh import watch
 from apps.cli.main import main
 from cocoro import topics
-from cocoro.capture.errors import CaptureError
+from cocoro.bus.base import Qos
+from cocoro.capture.conventions import CaptureError
 from cocoro.capture.reader import Capture
 from cocoro.kinematics import turn_z
 from cocoro.messages import BaseCommand, Frame, PlannerStatus, ServoState, TargetEstimate, TrueObject, Truth
 from cocoro.objects import Catalogue
-from cocoro.topics import Qos
 from cocoro.vloop import run_virtual
 
 GOLDEN = Path(__file__).parent / "golden" / "fetch.mcap"
@@ -307,7 +307,7 @@ def test_rerun_is_told_of_the_mesh_as_it_goes(monkeypatch: pytest.MonkeyPatch) -
     async def look() -> None:
         room = Room()
         bus = room.mesh.join()
-        watch(bus, "calliope", rerun_scene.Teller(Stream("cocoro"), ROBOT, Catalogue.load()))
+        watch(bus, "calliope", rerun_scene.RerunScene(Stream("cocoro"), ROBOT, Catalogue.load()))
         bus.publisher("calliope/base/state", Qos.STATE).put(b"no message")
         async with room.node("planning") as planning:
             await room.clock.sleep_until(10**9)

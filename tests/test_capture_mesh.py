@@ -18,11 +18,11 @@ from capture_rig import STILL, all_of, drive, record
 
 from apps.captures.info import report
 from apps.captures.rewrite import rewrite
-from apps.cli import capture_info
+from apps.cli import capture_files
 from cocoro import topics
+from cocoro.bus.base import Qos
 from cocoro.bus.endpoints import default
 from cocoro.bus.zenoh import ZenohBus
-from cocoro.capture.compression import Packer
 from cocoro.capture.reader import Capture
 from cocoro.clock import NS, RealClock
 from cocoro.messages import BaseState
@@ -30,6 +30,7 @@ from cocoro.node import Node
 from cocoro.robot import Robot
 from cocoro.tokens import recorder_key
 from services.capture.config import Config
+from services.capture.file import Packer
 from services.capture.log_clock import WALL_CLOCK, LogClock
 from services.capture.service import run
 
@@ -224,7 +225,9 @@ def test_a_recorder_whose_wall_clock_is_set_goes_on_as_if_it_had_not_been_and_no
         found = report(capture)
     (step,) = found.metadata[WALL_CLOCK]["steps"]
     assert step["by_s"] == pytest.approx(by_s, abs=0.01)
-    assert f"clock     set {'forward' if by_s > 0 else 'back'} by {abs(step['by_s']):.3f} s" in capture_info.text(found)
+    assert f"clock     set {'forward' if by_s > 0 else 'back'} by {abs(step['by_s']):.3f} s" in capture_files.text(
+        found
+    )
 
 
 def test_a_recorder_without_a_place_to_write_says_so_and_exits_with_1(short_path: Path) -> None:
@@ -254,9 +257,7 @@ def test_replay_refuses_a_mesh_with_a_robot_and_plays_where_there_is_none(short_
     async def played() -> None:
         async with await ZenohBus.open(default(ROBOT, "test", short_path)) as bus:
             found: list[bytes] = []
-            bus.subscribe(
-                "calliope/base/state", topics.Qos.EVENT, lambda _, payload: found.append(bytes(payload)), depth=0
-            )
+            bus.subscribe("calliope/base/state", Qos.EVENT, lambda _, payload: found.append(bytes(payload)), depth=0)
             replay = await cocoro(short_path, "replay", str(path), "--rate", "4")
             out, err = await asyncio.wait_for(replay.communicate(), PATIENCE_S)
             assert (replay.returncode, err) == (0, b"")

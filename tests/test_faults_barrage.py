@@ -17,9 +17,10 @@ from message_samples import data_of, leaves_in, replaced
 from robot_rig import RobotRig
 
 from cocoro import topics
+from cocoro.bus.base import Qos
 from cocoro.messages import TaskState
 from cocoro.testing import in_virtual_time
-from cocoro.topics import CLOCK, TOPICS, Qos, Topic
+from cocoro.topics import CLOCK, TOPICS, Topic
 from cocoro.vloop import run_virtual
 
 pytestmark = pytest.mark.sim

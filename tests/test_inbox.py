@@ -14,11 +14,12 @@ from inbox_rig import FAR, KEY, StillClock, inbox_of, payload
 from message_samples import data_of
 
 from cocoro import topics
+from cocoro.bus.base import Qos
 from cocoro.bus.local import LocalMesh
 from cocoro.clock import NS, FollowedClock
 from cocoro.inbox import Inbox, Intake, Latest, Stream
 from cocoro.testing import in_virtual_time
-from cocoro.topics import TOPICS, Qos, Topic
+from cocoro.topics import TOPICS, Topic
 
 MS = NS // 1000
 every_topic = pytest.mark.parametrize("topic", TOPICS, ids=lambda topic: topic.name)

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from cocoro.errors import ConfigError
-from cocoro.objects import Catalogue, KnownObject
+from cocoro.objects import Catalogue, ObjectSpec
 from cocoro.robot import Robot
 from services.perception.colours import ColourTable, lab_of, matches
 from sim.render.views import lamp_tint
@@ -127,7 +127,7 @@ def colours_in_changing_light(rgb: tuple[float, float, float], count: int = 4000
 
 
 @pytest.mark.parametrize("known", Catalogue.load(), ids=lambda known: known.label)
-def test_a_colour_range_holds_in_changing_light_and_takes_no_other_objects_colour(known: KnownObject) -> None:
+def test_a_colour_range_holds_in_changing_light_and_takes_no_other_objects_colour(known: ObjectSpec) -> None:
     own = lab_of(colours_in_changing_light(known.rgb))
     assert matches(known, own).mean() > 0.99
     for other in Catalogue.load():

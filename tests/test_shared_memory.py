@@ -18,12 +18,11 @@ from zenoh_rig import CHILD, FRAME, PATIENCE_S, PUBLISHER, held, local, scenario
 
 from apps.cli import doctor
 from cocoro.bus import shared
-from cocoro.bus.base import Payload
+from cocoro.bus.base import Payload, Qos
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.checks import Check
 from cocoro.component import Process
 from cocoro.topics import FRAME as FRAME_TOPIC
-from cocoro.topics import Qos
 from deploy import profiles
 from deploy.processes import PROCESSES, shared_bytes
 from deploy.rundir import RunDir

@@ -16,19 +16,20 @@ import pytest
 from operator_shell import Shell
 
 from apps.cli import echo, exits, hz, top
-from apps.cli.link import Where
+from apps.cli.options import RobotChoice
+from cocoro.bus.base import Qos
 from cocoro.bus.endpoints import default
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.clock import RealClock
 from cocoro.messages import BaseCommand
 from cocoro.node import Node
 from cocoro.robot import Robot
-from cocoro.topics import BASE_COMMAND, Qos
+from cocoro.topics import BASE_COMMAND
 from deploy.rundir import RunDir
 
 pytestmark = pytest.mark.zenoh
 
-ANY = Where()
+ANY = RobotChoice()
 
 
 @asynccontextmanager

@@ -8,9 +8,10 @@ import msgspec
 import pytest
 
 from cocoro import topics
+from cocoro.bus.base import Qos
 from cocoro.bus.keys import matches
 from cocoro.messages import Message
-from cocoro.topics import HARDWARE, REQUESTS, STOPPABLE, TOPICS, Qos, topic_named
+from cocoro.topics import HARDWARE, REQUESTS, STOPPABLE, TOPICS, topic_named
 
 
 def test_no_name_is_taken_twice() -> None:

@@ -26,7 +26,7 @@ import asyncio, sys
 from pathlib import Path
 from cocoro.bus.endpoints import ZenohConfig
 from cocoro.bus.zenoh import ZenohBus
-from cocoro.topics import Qos
+from cocoro.bus.base import Qos
 
 async def echo(key, payload):
     return NAME.encode()

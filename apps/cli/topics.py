@@ -9,7 +9,8 @@ from importlib import resources
 from typing import Any, NamedTuple
 
 from apps.cli.table import table as plain_table
-from cocoro.topics import REQUESTS, TOPICS, Qos, Request, Topic
+from cocoro.bus.base import Qos
+from cocoro.topics import REQUESTS, TOPICS, Request, Topic
 
 QOS = {
     Qos.FRAME: "newest wins; shared memory, lowest priority",

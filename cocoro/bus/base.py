@@ -8,9 +8,8 @@ numbers) is the node's. `<robot>/*/health`: in a key expression `*` stands for o
 from __future__ import annotations
 
 from collections.abc import Awaitable, Callable
+from enum import Enum
 from typing import NamedTuple, Protocol
-
-from cocoro.topics import Qos
 
 Payload = bytes | memoryview
 OnSample = Callable[[str, Payload], None]
@@ -19,6 +18,19 @@ OnAlive = Callable[[str, bool], None]
 """Gets the key of a liveliness token and whether it lives. Called at once for tokens that live already."""
 Server = Callable[[str, Payload], Awaitable[bytes]]
 """Answers a request. Raising cocoro.errors.CocoroError answers with an error whose text the caller gets."""
+
+
+class Qos(Enum):
+    """Quality of service of a key."""
+
+    FRAME = "frame"
+    """Large, newest wins, shared memory, lowest priority: it never delays a command."""
+    STATE = "state"
+    """Small, newest wins."""
+    COMMAND = "command"
+    """Small, newest wins, sent at once at real-time priority; expires."""
+    EVENT = "event"
+    """Reliable and ordered; nothing is dropped silently."""
 
 
 class Heard(NamedTuple):

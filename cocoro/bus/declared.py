@@ -9,12 +9,11 @@ from typing import Any
 
 import zenoh
 
-from cocoro.bus.base import Payload
+from cocoro.bus.base import Payload, Qos
 from cocoro.bus.lots import Lots
 from cocoro.bus.outbox import Outbox
 from cocoro.bus.pool import SharedPool
 from cocoro.bus.ring import Ring
-from cocoro.topics import Qos
 
 _DROP, _BLOCK = zenoh.CongestionControl.DROP, zenoh.CongestionControl.BLOCK
 QOS: dict[Qos, dict[str, Any]] = {

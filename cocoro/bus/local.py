@@ -11,11 +11,10 @@ from collections import defaultdict, deque
 from typing import TypeVar
 
 from cocoro.bus.answer import answer
-from cocoro.bus.base import Handle, Heard, OnAlive, OnLot, OnSample, Payload, Reply, Server
+from cocoro.bus.base import Handle, Heard, OnAlive, OnLot, OnSample, Payload, Qos, Reply, Server
 from cocoro.bus.keys import matches
 from cocoro.clock import NS
 from cocoro.errors import CallTimeoutError
-from cocoro.topics import Qos
 
 D = TypeVar("D", bound=Handle)
 

@@ -21,7 +21,7 @@ from zenoh.handlers import Callback
 
 from cocoro.boottime import boottime_ns
 from cocoro.bus.answer import answer
-from cocoro.bus.base import Heard, OnAlive, OnLot, OnSample, Reply, Server
+from cocoro.bus.base import Heard, OnAlive, OnLot, OnSample, Qos, Reply, Server
 from cocoro.bus.declared import QOS, Declared, ZenohListening, ZenohPublisher, ZenohSubscription
 from cocoro.bus.endpoints import ZenohConfig
 from cocoro.bus.lots import Lots
@@ -33,7 +33,6 @@ from cocoro.bus.session import LEAVE_S, Opened, close_session, exit_guard, in_th
 from cocoro.bus.shared import COSTS
 from cocoro.errors import CallTimeoutError, MeshError
 from cocoro.private import FullError
-from cocoro.topics import Qos
 
 log = logging.getLogger(__name__)
 D = TypeVar("D", bound=Declared)

@@ -6,11 +6,11 @@ from typing import Any, TypeVar, cast
 
 import msgspec
 
-from cocoro.bus.base import Payload
+from cocoro.bus.base import Payload, Qos
 from cocoro.bus.local import LocalBus
 from cocoro.messages import Message
 from cocoro.tokens import recorder_key
-from cocoro.topics import Qos, Topic, topic_named
+from cocoro.topics import Topic, topic_named
 
 M = TypeVar("M", bound=Message)
 

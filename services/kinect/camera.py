@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cocoro.arrays import ImageArray
 from cocoro.clock import NS, Clock
 from cocoro.errors import ConfigError
 from services.kinect import freenect, grabber
@@ -109,7 +109,7 @@ class FreenectCamera:
         age_ns = time.monotonic_ns() - pair["t"] + round(self._config.latency_s * NS)
         return Shot(self._clock.now_ns() - age_ns, colour, depth)
 
-    def _view(self, kind: Kind, buffer: int) -> NDArray[np.uint8]:
+    def _view(self, kind: Kind, buffer: int) -> ImageArray:
         return np.frombuffer(self._memory, np.uint8, grabber.size(kind), grabber.offset(kind, buffer))
 
     def _take(self, message: dict[str, Any]) -> None:

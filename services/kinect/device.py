@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import AsyncIterator, Callable
 from typing import NamedTuple, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
+from cocoro.arrays import CodeArray, ImageArray
 from cocoro.clock import Clock
 from cocoro.errors import ConfigError
 from services.kinect.config import Config
@@ -22,9 +20,9 @@ class Shot(NamedTuple):
 
     stamp_ns: int
     """Of the middle of the exposure, by the robot's clock."""
-    colour: NDArray[np.uint8]
+    colour: ImageArray
     """RGB, (height, width, 3)."""
-    depth: NDArray[np.uint16]
+    depth: CodeArray
     """Raw 11-bit codes as the depth camera sees them, (height, width); 2047 is no data."""
 
 

@@ -7,13 +7,13 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from cocoro import topics
+from cocoro.arrays import FloatArray
 from cocoro.clock import NS
 from cocoro.core import Output, Sample, Schedule, Take
-from cocoro.kinematics import Array
 from cocoro.messages import BaseCommand, Intent, LearnedModel, PlannerStatus, ServoCommand
 from cocoro.robot import Robot
 from cocoro.topics import Topic
-from services.planning.arm import Step
+from services.planning.arm import ArmStep
 from services.planning.behaviours import BEHAVIOURS, Actuators, Behaviour, Idle, Plan, Snapshot
 from services.planning.config import Config
 from services.planning.head import PAN, TILT
@@ -101,7 +101,7 @@ class PlanningCore:
         status = self._status(plan, snapshot)
         return [*self._commands(plan, snapshot), *plan.reports, Output(topics.PLAN, status)]
 
-    def _own_hull(self, angles: Mapping[str, float]) -> tuple[Array, Array]:
+    def _own_hull(self, angles: Mapping[str, float]) -> tuple[FloatArray, FloatArray]:
         """Where the robot itself, and what it holds, is in its own view in a posture."""
         centres, radii = self._actuators.arm.clearance.hull(angles)
         off = self.learned.offset_m(angles)
@@ -231,7 +231,7 @@ class PlanningCore:
 
     def _commands(self, plan: Plan, snapshot: Snapshot) -> list[Output]:
         base: BaseCommand = plan.base
-        step: Step = plan.arm
+        step: ArmStep = plan.arm
         if plan.head is not None:
             self._head_goal = plan.head[:2]
         if self._head_goal is None:

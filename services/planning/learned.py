@@ -8,19 +8,19 @@ from pathlib import Path
 
 import numpy as np
 
+from cocoro.arrays import FloatArray
 from cocoro.clock import NS
 from cocoro.errors import ConfigError
-from cocoro.kinematics import Array
 from cocoro.learning import model as models
 from cocoro.learning.camera_tilt import CameraTilt
 from cocoro.learning.handmap import HandMap
-from cocoro.learning.model import Model
+from cocoro.learning.model import BodyModel
 from cocoro.learning.nominal_model import NominalModel
-from cocoro.learning.reachability import ReachMesh
 from cocoro.robot import Robot
-from services.planning.config import Config, HandSight
+from services.planning.config import Config, HandSightConfig
 from services.planning.reach import LEVEL_ROLL_RAD, HandModel
-from services.planning.state_estimator import Sighting
+from services.planning.reachability import ReachMesh
+from services.planning.state_estimator import PostureSighting
 from services.planning.teaching import Teacher
 from services.planning.teaching import arm_angles as _arm
 
@@ -39,15 +39,15 @@ class LearnedHand:
         self._drawn = robot.chain("pad_centre")
         self._map = learned
 
-    def pose(self, angles: Mapping[str, float]) -> Array:
+    def pose(self, angles: Mapping[str, float]) -> FloatArray:
         pose = self._drawn.pose(angles)
         pose[:3, 3] += self._offset(angles)
         return pose
 
-    def position(self, angles: Mapping[str, float]) -> Array:
+    def position(self, angles: Mapping[str, float]) -> FloatArray:
         return np.asarray(self._drawn.position(angles) + self._offset(angles))
 
-    def jacobian(self, angles: Mapping[str, float], joints: Iterable[str]) -> Array:
+    def jacobian(self, angles: Mapping[str, float], joints: Iterable[str]) -> FloatArray:
         """As `Chain.jacobian`, for the joints of ARM in their order."""
         jac = self._drawn.jacobian(angles, joints)
         at = _arm(angles)
@@ -57,7 +57,7 @@ class LearnedHand:
             jac[:3] += self._map.jacobian(at) - self._map.drawing.jacobian(at)
         return jac
 
-    def _offset(self, angles: Mapping[str, float]) -> Array:
+    def _offset(self, angles: Mapping[str, float]) -> FloatArray:
         at = _arm(angles)
         if self._map.over_drawing and self._map.coordinates == "cartesian":
             return self._map.network.at(at)
@@ -71,7 +71,7 @@ class SeenHand:
     comes into view or is hidden, however far the two are apart; a correction that is not renewed fades.
     """
 
-    def __init__(self, felt: HandModel, marker: HandMap | NominalModel, config: HandSight) -> None:
+    def __init__(self, felt: HandModel, marker: HandMap | NominalModel, config: HandSightConfig) -> None:
         self._felt = felt
         self._marker = marker
         self._config = config
@@ -81,26 +81,26 @@ class SeenHand:
         self._seen_ns: int | None = None
 
     @property
-    def correction_m(self) -> Array:
+    def correction_m(self) -> FloatArray:
         """Added to where the hand is felt, shape (3,)."""
         return self._correction
 
-    def pose(self, angles: Mapping[str, float]) -> Array:
+    def pose(self, angles: Mapping[str, float]) -> FloatArray:
         pose = self._felt.pose(angles)
         pose[:3, 3] += self._correction
         return pose
 
-    def position(self, angles: Mapping[str, float]) -> Array:
+    def position(self, angles: Mapping[str, float]) -> FloatArray:
         return np.asarray(self._felt.position(angles) + self._correction)
 
-    def jacobian(self, angles: Mapping[str, float], joints: Iterable[str]) -> Array:
+    def jacobian(self, angles: Mapping[str, float], joints: Iterable[str]) -> FloatArray:
         return self._felt.jacobian(angles, joints)
 
     def seen(self, now_ns: int) -> bool:
         """Whether the hand was seen lately."""
         return self._seen_ns is not None and now_ns - self._seen_ns < self._config.lately_s * NS
 
-    def step(self, sightings: Iterable[Sighting], now_ns: int) -> None:
+    def step(self, sightings: Iterable[PostureSighting], now_ns: int) -> None:
         """Take the marker's sightings of this step of the planner, and let the correction follow."""
         config = self._config
         dt_s = 0.0 if self._now_ns is None else min(max((now_ns - self._now_ns) / NS, 0.0), 0.1)
@@ -143,14 +143,14 @@ class Learned:
         text = f"{self._text}; {self._teacher.text}" if self._teacher is not None else self._text
         return f"{text} ({self._refusal})" if self._refusal else text
 
-    def step(self, sightings: Sequence[Sighting], now_ns: int) -> None:
+    def step(self, sightings: Sequence[PostureSighting], now_ns: int) -> None:
         """Take the marker's sightings of this step of the planner."""
         if self._teacher is not None:
             self._teacher.step(sightings)
         if self.hand is not None:
             self.hand.step(sightings, now_ns)
 
-    def offset_m(self, angles: Mapping[str, float]) -> Array | None:
+    def offset_m(self, angles: Mapping[str, float]) -> FloatArray | None:
         """By how much the hand is seen beside where the drawing has it, shape (3,); None where nothing was learned."""
         if self.map is None:
             return None
@@ -176,7 +176,7 @@ class Learned:
         except ConfigError as error:
             self._refusal = str(error)
 
-    def _take(self, model: Model) -> None:
+    def _take(self, model: BodyModel) -> None:
         self._refusal = ""
         self.separation_m = model.wheels.separation_m if model.wheels is not None else None
         self.camera_tilt = CameraTilt(self._robot, model.wheels.eye_tilt_rad if model.wheels is not None else 0.0)

@@ -6,13 +6,12 @@ from collections.abc import Sequence
 
 import moderngl
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from cocoro.arrays import Float32Array
 from sim.render.meshes import Mesh, mesh, scale_of, square
 from sim.render.room import HALF_WIDTH_M, walls
 from sim.visual import Shape, Visual
-
-Floats = NDArray[np.float32]
 
 
 class Batch:
@@ -37,7 +36,7 @@ class Batch:
         self._poses = ctx.buffer(reserve=64 * len(self._rows))
         self._arrays: dict[moderngl.Program, moderngl.VertexArray] = {}
 
-    def place(self, poses: Floats) -> None:
+    def place(self, poses: Float32Array) -> None:
         """Where everything stands in this frame: (m, 4, 4), of which this batch takes its rows."""
         self._poses.write(poses[self._rows].tobytes())
 

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
-from cocoro.kinematics import Array
+from cocoro.arrays import Float32Array, FloatArray, ImageArray
 from cocoro.robot import Camera
 
 
@@ -34,9 +31,9 @@ class Light(Protocol):
 class Images(NamedTuple):
     """One look at the world. The arrays are the renderer's own: they hold until its next `render`."""
 
-    colour: NDArray[np.uint8]
+    colour: ImageArray
     """height x width x 3, RGB, the colour camera's view."""
-    depth_m: NDArray[np.float32]
+    depth_m: Float32Array
     """height x width, metres along the depth camera's optical axis, from that camera's own pose; infinite where
     there is nothing. NEGATIVE (the same metres) where the projector's light does not reach, if a projector
     was given."""
@@ -57,11 +54,11 @@ class Renderer(Protocol):
 
     def render(
         self,
-        poses: Array,
-        camera_pose: Array,
-        depth_camera_pose: Array,
+        poses: FloatArray,
+        camera_pose: FloatArray,
+        depth_camera_pose: FloatArray,
         light: Light,
-        projector_pose: Array | None = None,
+        projector_pose: FloatArray | None = None,
     ) -> Images:
         """One frame. `poses` is (n, 4, 4) in the order of the visuals."""
 

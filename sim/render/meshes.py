@@ -9,11 +9,11 @@ from itertools import pairwise
 from math import pi
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cocoro.arrays import Float32Array, FloatArray
 from sim.visual import Shape, Visual
 
-Mesh = NDArray[np.float32]
+Mesh = Float32Array
 
 CYLINDER_SLICES = 32
 """At a can's 33 mm radius the flat sides are at most 0.16 mm inside of the round."""
@@ -76,7 +76,7 @@ def cylinder() -> Mesh:
 def sphere() -> Mesh:
     """Radius 1."""
 
-    def corner(stack: int, slice_: int) -> NDArray[np.float64]:
+    def corner(stack: int, slice_: int) -> FloatArray:
         down, round_ = stack * pi / SPHERE_STACKS, slice_ * 2 * pi / SPHERE_SLICES
         return np.array([np.sin(down) * np.cos(round_), np.sin(down) * np.sin(round_), np.cos(down)])
 
@@ -93,14 +93,14 @@ def sphere() -> Mesh:
     return _stack(parts)
 
 
-def _triangle(corners: list[NDArray[np.float64]], normals: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+def _triangle(corners: list[FloatArray], normals: list[FloatArray]) -> FloatArray:
     return np.hstack([np.array(corners), np.array(normals)])
 
 
-def _quad(corners: list[NDArray[np.float64]], normals: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+def _quad(corners: list[FloatArray], normals: list[FloatArray]) -> FloatArray:
     rows = _triangle(corners, normals)
     return rows[[0, 1, 2, 0, 2, 3]]
 
 
-def _stack(parts: list[NDArray[np.float64]]) -> Mesh:
+def _stack(parts: list[FloatArray]) -> Mesh:
     return np.vstack(parts).astype(np.float32)
