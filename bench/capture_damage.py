@@ -21,10 +21,10 @@ from apps.captures.rewrite import rewrite
 from apps.cli.main import main as cocoro
 from apps.rehearsal.rehearse import rehearse
 from apps.rehearsal.request import RehearsalRequest
-from cocoro.capture.compression import Packer
-from cocoro.capture.errors import CaptureError
+from cocoro.capture.conventions import CaptureError
 from cocoro.capture.reader import Capture, Record
 from cocoro.clock import NS
+from services.capture.file import Packer
 
 
 def damage(folder: Path, times: int) -> None:
@@ -46,8 +46,8 @@ def damage(folder: Path, times: int) -> None:
         commands = [
             ["capture", "info", str(spoilt), "--check"],
             ["capture", "repair", str(spoilt), "--out", str(folder / f"{number}.mcap")],
-            ["capture", "rerun", str(spoilt), "--service", "perception"],
-            ["capture", "rerun", str(spoilt), "--service", "planning"],
+            ["capture", "reexecute", str(spoilt), "--service", "perception"],
+            ["capture", "reexecute", str(spoilt), "--service", "planning"],
             ["export", str(spoilt), "--csv", str(folder / "csv"), "--foxglove", str(folder / f"{number}-fox.mcap")],
             ["export", str(spoilt), "--video", str(folder / f"{number}.mp4")],
         ]

@@ -34,33 +34,36 @@ from mcap.writer import Writer as PackageWriter
 from apps.rehearsal.rehearse import rehearse
 from apps.rehearsal.request import RehearsalRequest
 from cocoro.capture import mcap
-from cocoro.capture.compression import QUICK, Packer
 from cocoro.capture.contents import unpacked
-from cocoro.capture.keys import info_of
 from cocoro.capture.reader import Capture
 from cocoro.clock import NS
-from services.capture.writer import Entry, Limits, Writer
+from services.capture import file
+from services.capture.file import QUICK, Packer
+from services.capture.keys import QueuedMessage, info_of
+from services.capture.writer import CaptureWriter, Limits
 
 SMALL_BYTES = 64 * 1024
 MEMORY = Path("/dev/shm")
 
 
-def recorded(folder: Path, sensors: Literal["ideal", "real"], seconds: float) -> list[Entry]:
+def recorded(folder: Path, sensors: Literal["ideal", "real"], seconds: float) -> list[QueuedMessage]:
     """The first messages of a rehearsed fetch, in order."""
     path = folder / f"{sensors}.mcap"
     rehearse(RehearsalRequest(task="fetch", label="red_can", sensors=sensors, record=str(path)))
     with Capture.open(path) as capture:
         end_ns = capture.start_ns + round(seconds * NS)
         made = [
-            Entry(one.key, one.sequence, one.log_ns, one.publish_ns, bytes(one.payload))
+            QueuedMessage(one.key, one.sequence, one.log_ns, one.publish_ns, bytes(one.payload))
             for one in capture.messages(end_ns=end_ns)
         ]
     path.unlink()
     return made
 
 
-def write_here(made: list[Entry], out: Path) -> None:
-    writer = Writer(lambda _: out, Packer("zstd"), Limits(), lambda key, payload: info_of(key, "calliope", payload))
+def write_here(made: list[QueuedMessage], out: Path) -> None:
+    writer = CaptureWriter(
+        lambda _: out, Packer("zstd"), Limits(), lambda key, payload: info_of(key, "calliope", payload)
+    )
     due_ns = made[0].log_ns
     for one in made:
         if one.log_ns >= due_ns:  # as the recorder does it
@@ -70,7 +73,7 @@ def write_here(made: list[Entry], out: Path) -> None:
     writer.close()
 
 
-def write_by_package(made: list[Entry], out: Path) -> None:
+def write_by_package(made: list[QueuedMessage], out: Path) -> None:
     with out.open("wb") as file:
         writer = PackageWriter(file, compression=CompressionType.ZSTD)
         writer.start(profile="cocoro")
@@ -105,9 +108,9 @@ def in_turn(times: int, **ways: Callable[[], object]) -> dict[str, float]:
     return {name: statistics.median(all_s) for name, all_s in spent.items()}
 
 
-def peak_of_a_frame(folder: Path, frame: Entry) -> float:
+def peak_of_a_frame(folder: Path, frame: QueuedMessage) -> float:
     """MB that writing one frame takes at the peak, beside the frame itself."""
-    writer = Writer(lambda _: folder / "peak.mcap", Packer("zstd"), Limits(), lambda *_: info_of(*_of(frame)))
+    writer = CaptureWriter(lambda _: folder / "peak.mcap", Packer("zstd"), Limits(), lambda *_: info_of(*_of(frame)))
     writer.put(frame)
     tracemalloc.start()
     writer.put(frame._replace(log_ns=frame.log_ns + 1))
@@ -117,7 +120,7 @@ def peak_of_a_frame(folder: Path, frame: Entry) -> float:
     return peak / 1e6
 
 
-def _of(frame: Entry) -> tuple[str, str, bytes]:
+def _of(frame: QueuedMessage) -> tuple[str, str, bytes]:
     return frame.key, "calliope", frame.payload
 
 
@@ -132,10 +135,10 @@ def compare(folder: Path, seconds: float, times: int) -> None:
         (folder / "peak.mcap").unlink()
 
 
-def _compare(folder: Path, name: str, made: list[Entry], times: int) -> None:
+def _compare(folder: Path, name: str, made: list[QueuedMessage], times: int) -> None:
     out, paths = folder / "out.mcap", [folder / "here.mcap", folder / "package.mcap"]
 
-    def anew(write: Callable[[list[Entry], Path], None]) -> Callable[[], None]:
+    def anew(write: Callable[[list[QueuedMessage], Path], None]) -> Callable[[], None]:
         def way() -> None:
             write(made, out)
             out.unlink()
@@ -164,16 +167,16 @@ def records(folder: Path, times: int) -> None:
     payload, count, places = bytes(220), 1000, list(range(40))
 
     def write_messages() -> bytes:
-        return b"".join(part for n in range(count) for part in (mcap.message_head(3, n, n, n, len(payload)), payload))
+        return b"".join(part for n in range(count) for part in (file.message_head(3, n, n, n, len(payload)), payload))
 
     def write_messages_by_package() -> bytes:
-        return mcap.packed(*(Message(3, n, payload, n, n) for n in range(count)))
+        return file.packed(*(Message(3, n, payload, n, n) for n in range(count)))
 
     raw = write_messages()
     assert raw == write_messages_by_package()
     small = Chunk("", raw, 0, 0, 0, len(raw))
     some = list(zip(places[::2], places[1::2], strict=True))
-    assert mcap.message_index(3, places) == mcap.packed(MessageIndex(3, some))
+    assert file.message_index(3, places) == file.packed(MessageIndex(3, some))
     _tell(f"{count} messages of {len(payload)} bytes, written", times, write_messages, write_messages_by_package)
     _tell(
         "the same, read", times,
@@ -182,8 +185,8 @@ def records(folder: Path, times: int) -> None:
     )  # fmt: skip
     _tell(
         f"{count} indices of {len(some)} messages, written", times,
-        lambda: [mcap.message_index(3, places) for _ in range(count)],
-        lambda: [mcap.packed(MessageIndex(3, some)) for _ in range(count)],
+        lambda: [file.message_index(3, places) for _ in range(count)],
+        lambda: [file.packed(MessageIndex(3, some)) for _ in range(count)],
     )  # fmt: skip
     for sensors in ("ideal", "real"):
         frames = [one.payload for one in recorded(folder, sensors, 3.0) if one.key.endswith("kinect/frame")][::4]
@@ -195,21 +198,21 @@ def _frames(name: str, frames: list[bytes], times: int) -> None:
     raws = [head + frame for frame in frames]
     packer = zstandard.ZstdCompressor(compression_params=QUICK)
     packed = [(packer.compress(raw), len(raw), zlib.crc32(raw)) for raw in raws]
-    contents = [mcap.packed(Chunk("zstd", data, 0, 0, crc, size))[9:] for data, size, crc in packed]
+    contents = [file.packed(Chunk("zstd", data, 0, 0, crc, size))[9:] for data, size, crc in packed]
 
     def write() -> None:
         for data, size, crc in packed:  # the head, and the packed records as they are
-            mcap.ChunkHead(0, 0, size, crc, "zstd", len(data)).pack()
+            file.chunk_head(mcap.ChunkHead(0, 0, size, crc, "zstd", len(data)))
 
     def write_by_package() -> None:
         for data, size, crc in packed:
-            mcap.packed(Chunk("zstd", data, 0, 0, crc, size))
+            file.packed(Chunk("zstd", data, 0, 0, crc, size))
 
     _tell(f"{name}, packed: chunk records made", times, write, write_by_package)
 
     def read() -> None:
         for content in contents:
-            unpacked(content)
+            unpacked(content, ours=True)
 
     def read_by_package() -> None:
         for content in contents:

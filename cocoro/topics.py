@@ -182,7 +182,7 @@ LATCH = Topic(
     "The emergency stop's state, for hardware services that have just started.",
 )  # fmt: skip
 CLOCK = Topic(
-    "sim/clock", m.Clock, Qos.COMMAND, 120.0, 1.0,
+    "sim/clock", m.ClockTick, Qos.COMMAND, 120.0, 1.0,
     "Simulated time. When it stands, time stands.",
 )  # fmt: skip
 TRUTH = Topic(

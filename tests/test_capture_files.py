@@ -18,20 +18,19 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from message_samples import data_of
 
+from apps.captures.compare import changes, known_to
 from apps.captures.info import report
 from apps.captures.rewrite import rewrite
-from cocoro.capture.compression import COMPRESSIONS, Compression, Packer, unpack
-from cocoro.capture.errors import CaptureError
-from cocoro.capture.keys import Alive, Choice
-from cocoro.capture.pictures import LossyFrame
+from cocoro.capture.conventions import CaptureError
+from cocoro.capture.mcap import unpack
 from cocoro.capture.reader import Capture
-from cocoro.capture.schema import changes, known_to, schema_of
-from cocoro.capture.types import NotReadableError
+from cocoro.capture.types import Alive, LossyFrame, NotReadableError, schema_of
 from cocoro.errors import ConfigError
 from cocoro.messages import BaseState, Detections, Frame, Message, PlannerStatus
 from cocoro.topics import TOPICS
-from services.capture.lossy import lossy
-from services.capture.retention import captures, make_room
+from services.capture.file import COMPRESSIONS, Compression, Packer
+from services.capture.keys import KeyFilter, lossy
+from services.capture.service import captures, make_room
 from services.capture.writer import Limits, Missing
 
 BIG = msgspec.msgpack.encode(frame(7, 320, 240))
@@ -80,9 +79,12 @@ def test_the_mcap_library_reads_it_as_a_whole_indexed_file(tmp_path: Path) -> No
         assert {channel.topic: channel.message_encoding for channel in summary.channels.values()} == {
             "calliope/base/state": "msgpack", "calliope/kinect/frame": "msgpack",
         }  # fmt: skip
-        told = [(schema.name, channel.topic, message.log_time) for schema, channel, message in reader.iter_messages()]
-        assert told[0][:2] == ("BaseState", "calliope/base/state")
-        assert [time for _, _, time in told] == sorted(time for _, _, time in told)
+        records = list(reader.iter_messages())
+        schema, channel, _ = records[0]
+        assert schema is not None
+        assert (schema.name, channel.topic) == ("BaseState", "calliope/base/state")
+        times = [message.log_time for _, _, message in records]
+        assert times == sorted(times)
         assert {record.name for record in reader.iter_metadata()} == {"run", "tally"}
         tally = next(record.metadata for record in reader.iter_metadata() if record.name == "tally")
         assert json.loads(tally["dropped"]) == {"calliope/kinect/frame": 3}
@@ -90,7 +92,8 @@ def test_the_mcap_library_reads_it_as_a_whole_indexed_file(tmp_path: Path) -> No
 
 def test_each_type_of_the_mesh_has_a_schema_that_is_an_object_with_binary_pixels() -> None:
     for topic in TOPICS:
-        schema = json.loads(schema_of(topic.type).data)
+        kind: type[Message] = topic.type
+        schema = json.loads(schema_of(kind).data)
         assert schema["type"] == "object"
         assert "stamp_ns" in schema["properties"]
     pixels = json.loads(schema_of(Frame).data)["properties"]["colour"]
@@ -197,7 +200,7 @@ class Disk:
 
 def test_a_full_disk_ends_the_recording_with_a_readable_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     disk = Disk(40_000)
-    monkeypatch.setattr("cocoro.capture.file.os.writev", disk.writev)
+    monkeypatch.setattr("services.capture.file.os.writev", disk.writev)
     written = writer(tmp_path)
     flushed = -1
 
@@ -350,11 +353,11 @@ def test_lossy_frames_look_like_the_frames_and_keep_their_depth(tmp_path: Path) 
     ],
 )
 def test_an_operator_chooses_keys_by_expressions(only: list[str], without: list[str], chosen: set[str]) -> None:
-    choice = Choice("calliope", only, without)
+    choice = KeyFilter("calliope", only, without)
     assert {key for key in ("base/state", "kinect/frame", "base/health") if f"calliope/{key}" in choice} == chosen
 
 
 @pytest.mark.parametrize("text", ["", "a//b", "base/st*"])
 def test_what_is_no_key_expression_is_told_of(text: str) -> None:
     with pytest.raises(ConfigError, match="no key expression"):
-        Choice("calliope", [text])
+        KeyFilter("calliope", [text])

@@ -21,7 +21,7 @@ from cocoro.clock import NS, FollowedClock
 from cocoro.component import load
 from cocoro.core import Sample, Schedule, Take
 from cocoro.errors import CocoroError, RemoteError
-from cocoro.messages import AboutReply, BaseState, CancelRequest, Clock, Recording, TaskReply
+from cocoro.messages import AboutReply, BaseState, CancelRequest, ClockTick, Recording, TaskReply
 from cocoro.node import Node
 from cocoro.stepper import RECORDER_S
 from cocoro.testing import settle
@@ -29,8 +29,9 @@ from cocoro.vloop import run_virtual
 from deploy import profiles
 from deploy.processes import named
 from services.capture.config import CaptureConfig, folder_of
-from services.capture.sink import LARGE_BYTES, RESERVE_BYTES, Syncer, ThreadedSink
-from services.capture.writer import Writer
+from services.capture.file import LARGE_BYTES
+from services.capture.sink import RESERVE_BYTES, Syncer, ThreadedSink
+from services.capture.writer import CaptureWriter
 
 
 def test_every_message_of_every_key_is_there_with_its_stamp_and_number(tmp_path: Path) -> None:
@@ -140,7 +141,7 @@ def test_it_tells_simulated_time_by_what_it_hears_and_is_not_woken_for_it_beside
             recording = asyncio.ensure_future(component.run(node, config))
             ticks = mesh.join().publisher(key, Qos.STATE)
             await settle()
-            ticks.put(msgspec.msgpack.encode(Clock(stamp_ns=70 * NS, incarnation=1)))
+            ticks.put(msgspec.msgpack.encode(ClockTick(stamp_ns=70 * NS, incarnation=1)))
             ticks.put(b"\xc1 no clock")
             await settle()
             assert 70 * NS <= node.now_ns() < 71 * NS
@@ -188,6 +189,19 @@ def test_what_never_arrived_is_counted_by_key(tmp_path: Path) -> None:
         assert newest.lost == {"calliope/base/state": 5}
 
 
+def test_a_sequence_number_that_cannot_be_right_is_no_loss(tmp_path: Path) -> None:
+    async def leaping(room: Room) -> None:
+        put = room.mesh.join().publisher("calliope/base/state", Qos.STATE).put
+        for seq in (0, 1, 1 << 62, 2, 3, 5):
+            put(msgspec.msgpack.encode(BaseState(seq=seq, incarnation=7, odometry_m=(0.0, 0.0), **STILL)))
+        await asyncio.sleep(0.1)
+
+    path = record(tmp_path / "leaping.mcap", leaping)
+    assert len(all_of(path, "base/state")) == 6
+    with Capture.open(path) as capture:
+        assert json.loads(capture.metadata["tally"]["lost"]) == {"calliope/base/state": 1}
+
+
 def test_a_fault_of_the_disk_is_told_on_the_mesh_and_the_robot_goes_on(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("no folder")
     told: list[Recording] = []
@@ -214,7 +228,7 @@ def test_a_full_disk_in_the_middle_of_a_run_is_told_too(tmp_path: Path, monkeypa
         async with room.node("operator") as operator:
             operator.on(topics.RECORDING.of("capture"), told.append)
             await drive(room, 1.0)
-            monkeypatch.setattr("cocoro.capture.file.os.writev", _refuse)
+            monkeypatch.setattr("services.capture.file.os.writev", _refuse)
             await drive(room, 1.0)
 
     run_virtual(Room().recorded({"file": str(tmp_path / "full.mcap")}, scenario))
@@ -239,7 +253,7 @@ class Stalled:
         self.go = threading.Event()
         self._folder = folder
 
-    def make(self, release: Callable[[int], None] | None) -> Writer:
+    def make(self, release: Callable[[int], None] | None) -> CaptureWriter:
         self.go.wait()
         return writer(self._folder)
 
@@ -263,7 +277,7 @@ def test_while_the_disk_stalls_memory_is_bounded_and_large_messages_are_dropped_
 
 
 def test_what_is_given_after_a_fault_is_forgotten(tmp_path: Path) -> None:
-    def fail(_: object) -> Writer:
+    def fail(_: object) -> CaptureWriter:
         raise ZeroDivisionError("a bug")
 
     sink = ThreadedSink(fail, capacity_bytes=10, flush_s=0.1, sync_s=0.5)

@@ -10,13 +10,14 @@ import time
 from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
 
 from apps.cli import estop_mesh, exits, objects, reset, snapshot, status
-from apps.cli.estop import Stop
-from apps.cli.link import Where
+from apps.cli.estop import StopResult
+from apps.cli.options import RobotChoice
 from cocoro.bus.endpoints import default
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.clock import RealClock
@@ -47,7 +48,7 @@ from deploy.rundir import RunDir
 
 pytestmark = pytest.mark.zenoh
 
-ANY = Where()
+ANY = RobotChoice()
 
 
 class FakeRobot:
@@ -86,7 +87,7 @@ def answering(node: Node, latch: str, text: str = "") -> None:
     node.serve(ESTOP.of(node.name), answer)
 
 
-async def stop() -> Stop:
+async def stop() -> StopResult:
     run_dir = RunDir("calliope")
     return await estop_mesh.stop(run_dir, run_dir.join_as("operator"), time.monotonic())
 
@@ -282,7 +283,7 @@ def test_ctrl_c_on_a_running_fetch_cancels_the_task_on_the_robot(root: Path) -> 
 
             async def tell() -> None:
                 async for _ in node.every(20.0):
-                    outcome = "cancelled" if cancelled else None
+                    outcome: Literal["cancelled"] | None = "cancelled" if cancelled else None
                     node.publish(TASK, TaskState(task_id="fetch-1", phase="approach", outcome=outcome, elapsed_s=1.0))
 
             async def cancel(request: CancelRequest) -> TaskReply:

@@ -11,7 +11,7 @@ import numpy as np
 from cocoro.arrays import Float32Array, ImageArray
 from cocoro.colour import Lab, in_boxes, lab_of
 from cocoro.errors import ConfigError
-from cocoro.objects import KnownObject, LabBox
+from cocoro.objects import LabBox, ObjectSpec
 
 EDGES_L = (8.0, 12.0, 20.0, 30.0, 40.0, 50.0, 60.0, 75.0, 99.0)
 """One box between each two: chroma falls with lightness, so one box for all would hold many other colours too."""
@@ -33,10 +33,10 @@ SHARED = 0.01
 NEARLY_GREY = 8.0
 """Chromaticity below which a colour is that of walls, floors and the robot itself."""
 
-Samples = ImageArray
+ColourSamples = ImageArray
 
 
-class Range(NamedTuple):
+class ColourRange(NamedTuple):
     """The colours of a new object, as a row of the catalogue has them."""
 
     lab: tuple[LabBox, ...]
@@ -51,7 +51,7 @@ class Range(NamedTuple):
         return self.lab + self.lab_by_shape
 
 
-class Overlap(NamedTuple):
+class ColourOverlap(NamedTuple):
     """What a new object and a known one have in common."""
 
     label: str
@@ -61,7 +61,7 @@ class Overlap(NamedTuple):
     """Share of the known one's that would pass for the new object's."""
 
 
-def range_of(pixels: ImageArray, known: Iterable[KnownObject] = ()) -> Range:
+def range_of(pixels: ImageArray, known: Iterable[ObjectSpec] = ()) -> ColourRange:
     """The range that an object has whose pixels (n, 3), RGB, are these. Raises ConfigError when they are too dark."""
     own = _typical(pixels)
     samples = lab_of(in_other_light(own))
@@ -73,7 +73,7 @@ def range_of(pixels: ImageArray, known: Iterable[KnownObject] = ()) -> Range:
     if all(shared):  # nothing is its alone: then at least the boxes are told, and the overlap is
         shared = [False] * len(boxes)
     lab = lab_of(own[None])[0]
-    return Range(
+    return ColourRange(
         lab=tuple(box for box, is_shared in zip(boxes, shared, strict=True) if not is_shared),
         lab_by_shape=tuple(box for box, is_shared in zip(boxes, shared, strict=True) if is_shared),
         rgb=_full_light(own),
@@ -82,7 +82,7 @@ def range_of(pixels: ImageArray, known: Iterable[KnownObject] = ()) -> Range:
     )
 
 
-def in_other_light(pixels: ImageArray) -> Samples:
+def in_other_light(pixels: ImageArray) -> ColourSamples:
     """The pixels (n, 3) as they would be in darker, brighter, warmer and colder light; (m, 3), nothing saturated
     that would not be, as a sensor clips."""
     gains = np.array([[k * (1 + tint), k, k * (1 - tint)] for k in BRIGHTNESS for tint in TINTS])
@@ -90,7 +90,7 @@ def in_other_light(pixels: ImageArray) -> Samples:
     return np.asarray(np.clip(np.rint(values), 0, 255), dtype=np.uint8).reshape(-1, 3)
 
 
-def overlaps(found: Range, known: Iterable[KnownObject]) -> list[Overlap]:
+def overlaps(found: ColourRange, known: Iterable[ObjectSpec]) -> list[ColourOverlap]:
     """With each known object that has any colours in common with it, the most first."""
     common = []
     for other in known:
@@ -100,7 +100,7 @@ def overlaps(found: Range, known: Iterable[KnownObject]) -> list[Overlap]:
         of_new = float(in_boxes(boxes, found.samples).mean())
         of_known = float(in_boxes(found.boxes, theirs).mean()) if len(theirs) else 0.0
         if max(of_new, of_known) > SHARED:
-            common.append(Overlap(other.label, of_new, of_known))
+            common.append(ColourOverlap(other.label, of_new, of_known))
     return sorted(common, key=lambda overlap: -max(overlap.of_new, overlap.of_known))
 
 
@@ -129,7 +129,7 @@ def _box(samples: Lab, low_l: float, high_l: float) -> LabBox | None:
     return LabBox(low=(bottom, a[0], b[0]), high=(top, a[1], b[1]))
 
 
-def _is_shared(box: LabBox, samples: Lab, known: Iterable[KnownObject]) -> bool:
+def _is_shared(box: LabBox, samples: Lab, known: Iterable[ObjectSpec]) -> bool:
     inside = samples[in_boxes([box], samples)]
     return any(in_boxes(other.lab, inside).mean() > SHARED for other in known)
 

@@ -8,17 +8,18 @@ from typing import Any
 
 import msgspec
 
+from apps.captures.compare import changes
 from cocoro.capture import mcap
-from cocoro.capture.errors import DamageError
-from cocoro.capture.file import TALLY, KeyTally, tally_names
-from cocoro.capture.keys import MADE_HERE
-from cocoro.capture.pictures import LossyFrame
+from cocoro.capture.conventions import TALLY, KeyTally, tally_names
+from cocoro.capture.former import todays_name
+from cocoro.capture.mcap import DamageError
 from cocoro.capture.reader import Capture
-from cocoro.capture.schema import changes, schema_of
+from cocoro.capture.types import MADE_HERE, LossyFrame, schema_of
 from cocoro.clock import NS
 from cocoro.installed import topic_named
 from cocoro.messages import Message
 from cocoro.topics import RECORDING
+from services.capture.file import packed
 
 MESSAGE_HEAD_BYTES = mcap.MESSAGE_HEAD.size
 
@@ -56,7 +57,7 @@ class AttachmentReport(msgspec.Struct, kw_only=True):
     """0: unknown."""
 
 
-class Report(msgspec.Struct, kw_only=True):
+class CaptureReport(msgspec.Struct, kw_only=True):
     path: str
     size_bytes: int
     raw_bytes: int
@@ -79,7 +80,7 @@ class Report(msgspec.Struct, kw_only=True):
     metadata: dict[str, dict[str, Any]]
 
 
-def report(capture: Capture, check: bool = False) -> Report:
+def report(capture: Capture, check: bool = False) -> CaptureReport:
     """Report on a capture. The counts of a whole capture are those of its own tally (checksums vouch for it), where
     that agrees with its statistics and chunks. Of any other capture, and with `check`, all is read and counted."""
     told = _told_tallies(capture) if capture.whole and capture.summarised else None
@@ -93,7 +94,7 @@ def report(capture: Capture, check: bool = False) -> Report:
     keys = tuple(
         _key_report(capture, channel, tallies[channel], dropped, lost) for key in names for channel in capture.keys[key]
     )
-    return Report(
+    return CaptureReport(
         path=str(capture.path),
         size_bytes=capture.size_bytes,
         raw_bytes=sum(tally.size_bytes for tally in tallies.values()),
@@ -148,7 +149,7 @@ def _told_tallies(capture: Capture) -> dict[int, KeyTally] | None:
         return None
     if (first_ns, last_ns) != (statistics.message_start_time, statistics.message_end_time):
         return None
-    declared = len(mcap.packed(*capture.schemas.values(), *capture.channels.values()))
+    declared = len(packed(*capture.schemas.values(), *capture.channels.values()))
     messages = sum(tally.size_bytes + MESSAGE_HEAD_BYTES * tally.messages for tally in busy)
     return tallies if messages + declared == capture.chunk_bytes else None
 
@@ -218,7 +219,7 @@ def changed_since(capture: Capture, channel: int) -> list[str]:
         return []
     if schema.name == LossyFrame.__name__:
         return []
-    if schema.name != topic.type.__name__:
+    if todays_name(schema.name) != topic.type.__name__:
         return [f"it carries {topic.type.__name__} today"]
     kind: type[Message] = topic.type
     return [change.text for change in changes(schema.data, schema_of(kind).data)]

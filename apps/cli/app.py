@@ -22,6 +22,7 @@ from apps.cli.options import (
     ObjectsOption,
     ProfileArgument,
     ReachOption,
+    RobotChoice,
     RobotOption,
     SetOption,
     TimeoutOption,
@@ -49,10 +50,9 @@ BodyOption = Annotated[str, typer.Option(metavar="nominal|worn", help="A body as
 def _task(where: tuple[str | None, str | None], as_json: bool, snapshot: Path | None = None, **request: Any) -> None:
     """`request`: the fields of a TaskRequest."""
     from apps.cli import tasks
-    from apps.cli.link import Where
     from cocoro.messages import TaskRequest
 
-    sys.exit(asyncio.run(tasks.run(Where(*where), TaskRequest(**request), as_json, snapshot)))
+    sys.exit(asyncio.run(tasks.run(RobotChoice(*where), TaskRequest(**request), as_json, snapshot)))
 
 
 @app.command(rich_help_panel=TASKS)
@@ -128,9 +128,8 @@ def put_down(
 def cancel(robot: RobotOption = None, profile: MeshOption = None) -> None:
     """End the running task; the robot stands still."""
     from apps.cli import tasks
-    from apps.cli.link import Where
 
-    sys.exit(asyncio.run(tasks.cancel(Where(robot, profile))))
+    sys.exit(asyncio.run(tasks.cancel(RobotChoice(robot, profile))))
 
 
 @app.command(rich_help_panel=TASKS)
@@ -188,9 +187,8 @@ def rehearse(
 def status(robot: RobotOption = None, profile: MeshOption = None, json: JsonOption = False) -> None:
     """What runs, how it is, what it does and why. Exit code 1 when something that should run does not."""
     from apps.cli import status as telling
-    from apps.cli.link import Where
 
-    sys.exit(asyncio.run(telling.status(Where(robot, profile), json)))
+    sys.exit(asyncio.run(telling.status(RobotChoice(robot, profile), json)))
 
 
 objects_app.add_to(app, WATCH)
@@ -204,9 +202,8 @@ def snapshot(
 ) -> None:
     """What the robot sees now, with its detections drawn in."""
     from apps.cli import snapshot as taking
-    from apps.cli.link import Where
 
-    sys.exit(asyncio.run(taking.snapshot(Where(robot, profile), out)))
+    sys.exit(asyncio.run(taking.snapshot(RobotChoice(robot, profile), out)))
 
 
 @app.command(rich_help_panel=WATCH)
@@ -315,6 +312,5 @@ def stop(context: typer.Context) -> None:
 def reset(robot: RobotOption = None, profile: MeshOption = None) -> None:
     """Release the emergency stop. The executive may refuse, and says why."""
     from apps.cli import reset as releasing
-    from apps.cli.link import Where
 
-    sys.exit(asyncio.run(releasing.reset(Where(robot, profile))))
+    sys.exit(asyncio.run(releasing.reset(RobotChoice(robot, profile))))

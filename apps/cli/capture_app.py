@@ -15,6 +15,7 @@ from apps.cli.options import (
     JsonOption,
     MeshOption,
     OnlyOption,
+    RobotChoice,
     RobotOption,
     ToOption,
     WithoutOption,
@@ -46,14 +47,13 @@ def record(
     profile: MeshOption = None,
 ) -> None:
     """Record what travels on the mesh into MCAP files, until Ctrl-C, beside what the robot's own recorder does."""
-    from apps.cli import capture_record
-    from apps.cli.link import Where
+    from apps.cli import capture_mesh
 
     settings = {
         "folder": str(out.resolve()), "only": only or (), "without": without or (),
         "compression": compression, "jpeg_quality": jpeg,
     }  # fmt: skip
-    sys.exit(asyncio.run(capture_record.record(Where(robot, profile), settings, seconds)))
+    sys.exit(asyncio.run(capture_mesh.record(RobotChoice(robot, profile), settings, seconds)))
 
 
 def replay(
@@ -72,10 +72,10 @@ def replay(
 
     Keys: space pauses, . goes to the next picture, left and right 5 s, + and - change the rate, q ends.
     """
-    from apps.cli import capture_replay
+    from apps.cli import capture_mesh
 
     options = {"start_s": 0.0 if start is None else start, "end_s": end, "rate": rate, "loop": loop, "paused": paused}
-    sys.exit(asyncio.run(capture_replay.replay(file, only or [], hardware, options)))
+    sys.exit(asyncio.run(capture_mesh.replay(file, only or [], hardware, options)))
 
 
 def export(
@@ -108,12 +108,11 @@ def view(
     profile: MeshOption = None,
 ) -> None:
     """Open Rerun on a capture, or live on the mesh. Needs the extra `view`."""
-    from apps.cli import capture_view
-    from apps.cli.link import Where
+    from apps.cli import capture_mesh
 
     if file is not None:
-        sys.exit(capture_view.view_file(file))
-    sys.exit(asyncio.run(capture_view.view_mesh(Where(robot, profile))))
+        sys.exit(capture_mesh.view_file(file))
+    sys.exit(asyncio.run(capture_mesh.view_mesh(RobotChoice(robot, profile))))
 
 
 @capture.command()
@@ -123,9 +122,9 @@ def info(
     json: JsonOption = False,
 ) -> None:
     """What a capture has: keys, counts, rates, gaps, losses and where it is from. Exit code 1 when it is damaged."""
-    from apps.cli import capture_info
+    from apps.cli import capture_files
 
-    sys.exit(capture_info.info(file, check, json))
+    sys.exit(capture_files.info(file, check, json))
 
 
 @capture.command()
@@ -140,13 +139,14 @@ def repair(
     end: ToOption = None,
 ) -> None:
     """Write a whole capture with all that can be read of a damaged or unfinished one; the old file stays."""
-    from apps.cli import capture_repair
+    from apps.cli import capture_files
 
-    sys.exit(capture_repair.repair(file, out, compression, level, only or [], without or [], start, end))
+    sys.exit(capture_files.repair(file, out, compression, level, only or [], without or [], start, end))
 
 
+@capture.command("rerun", hidden=True)
 @capture.command()
-def rerun(
+def reexecute(
     files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="The captures of one run, in order.")],
     service: Annotated[str, typer.Option("--service", help="perception, planning, or another with a pure core.")],
     against: Annotated[
@@ -158,6 +158,6 @@ def rerun(
     json: JsonOption = False,
 ) -> None:
     """Execute a service again over what it was given then, and compare what it gives. Exit code 1 when it differs."""
-    from apps.cli import capture_rerun
+    from apps.cli import capture_files
 
-    sys.exit(capture_rerun.rerun(files, service, against, tolerance, json))
+    sys.exit(capture_files.reexecute(files, service, against, tolerance, json))

@@ -14,6 +14,7 @@ from apps.cli.options import (
     MeshOption,
     ProfileArgument,
     ProfileOption,
+    RobotChoice,
     RobotOption,
 )
 
@@ -55,18 +56,16 @@ def show_base(
     """What the base is like: mode, battery, bumpers, odometry; `recover` puts it back into its mode."""
     if context.invoked_subcommand is None:
         from apps.cli import base as showing
-        from apps.cli.link import Where
 
-        sys.exit(asyncio.run(showing.show(Where(robot, profile), json)))
+        sys.exit(asyncio.run(showing.show(RobotChoice(robot, profile), json)))
 
 
 @base.command()
 def recover(robot: RobotOption = None, profile: MeshOption = None) -> None:
     """Put a Create that left its mode (a cliff, a wheel drop, the charger) back into it."""
     from apps.cli import base as showing
-    from apps.cli.link import Where
 
-    sys.exit(asyncio.run(showing.recover(Where(robot, profile))))
+    sys.exit(asyncio.run(showing.recover(RobotChoice(robot, profile))))
 
 
 # --- servos, while the robot is up ------------------------------------------------------------------
@@ -74,9 +73,8 @@ def recover(robot: RobotOption = None, profile: MeshOption = None) -> None:
 
 def _ask(action: str, joints: list[str] | None, robot: str | None, profile: str | None) -> None:
     from apps.cli import servos as asking
-    from apps.cli.link import Where
 
-    sys.exit(asyncio.run(asking.ask(Where(robot, profile), action, joints or [])))
+    sys.exit(asyncio.run(asking.ask(RobotChoice(robot, profile), action, joints or [])))
 
 
 @servos.command()

@@ -16,6 +16,7 @@ from apps.cli.options import (
     MeasuredOption,
     MeshOption,
     ModelOutOption,
+    RobotChoice,
     RobotOption,
     SamplesOutOption,
     SendOption,
@@ -23,7 +24,7 @@ from apps.cli.options import (
 
 if TYPE_CHECKING:
     from cocoro import robot as robots
-    from cocoro.learning.model import Model
+    from cocoro.learning.model import BodyModel
     from cocoro.messages import TaskName
 
 PANEL = "Learning"
@@ -69,9 +70,8 @@ def _babble(
     task: TaskName, wanted: int, out: Path, target: str, robot: str | None, profile: str | None, as_json: bool
 ) -> None:
     from apps.cli import babble as babbling
-    from apps.cli.link import Where
 
-    sys.exit(asyncio.run(babbling.babble(Where(robot, profile), task, wanted, out, target, as_json)))
+    sys.exit(asyncio.run(babbling.babble(RobotChoice(robot, profile), task, wanted, out, target, as_json)))
 
 
 @learn.command("arm")
@@ -124,12 +124,11 @@ def _robot(description: Path | None, measured: Path | None) -> robots.Robot:
     return Robot.load(description, measured)
 
 
-def _send(wanted: bool, made: Model, robot: str | None, profile: str | None, as_json: bool) -> None:
+def _send(wanted: bool, made: BodyModel, robot: str | None, profile: str | None, as_json: bool) -> None:
     if wanted:
         from apps.cli import learn as learning
-        from apps.cli.link import Where
 
-        text = asyncio.run(learning.send(Where(robot, profile), made))
+        text = asyncio.run(learning.send(RobotChoice(robot, profile), made))
         print(text, file=sys.stderr if as_json else sys.stdout)
 
 

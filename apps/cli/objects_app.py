@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from apps.cli.options import JsonOption, MeshOption, RobotOption
+from apps.cli.options import JsonOption, MeshOption, RobotChoice, RobotOption
 
 objects = typer.Typer(invoke_without_command=True)
 
@@ -25,9 +25,8 @@ def list_them(
     """The objects that the robot knows, and where it saw each last; `learn` adds one."""
     if context.invoked_subcommand is None:
         from apps.cli import objects as listing
-        from apps.cli.link import Where
 
-        sys.exit(asyncio.run(listing.objects(Where(robot, profile), json)))
+        sys.exit(asyncio.run(listing.objects(RobotChoice(robot, profile), json)))
 
 
 @objects.command()
@@ -71,7 +70,6 @@ def learn(
     Says and draws what it would match before it saves anything, and warns of what else looks like it.
     """
     from apps.cli import learn_object as learning
-    from apps.cli.link import Where
     from apps.cli.snapshot import check
 
     wanted = learning.wanted_of(
@@ -80,5 +78,5 @@ def learn(
     )  # fmt: skip
     if picture is not None:
         check(picture)
-    keeping = learning.Keeping(catalogue, picture, yes, replace, add, json)
-    sys.exit(asyncio.run(learning.learn_object(Where(robot, profile), source, wanted, keeping)))
+    keeping = learning.SaveOptions(catalogue, picture, yes, replace, add, json)
+    sys.exit(asyncio.run(learning.learn_object(RobotChoice(robot, profile), source, wanted, keeping)))

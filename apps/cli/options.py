@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -25,6 +26,17 @@ MeshOption = Annotated[
         "--profile", metavar="PROFILE", help="Reach a robot on another machine through the mesh of this profile."
     ),
 ]
+
+
+@dataclass(frozen=True)
+class RobotChoice:
+    """Which robot a command is for, from `--robot` and `--profile`; neither is needed when one robot is up here."""
+
+    robot: str | None = None
+    profile: str | None = None
+    """Reach it through the mesh of this profile, on another machine."""
+
+
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON, for scripts.")]
 
 # --- profiles and the simulator -------------------------------------------------------------------

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from apps.cli.options import JsonOption, KeyArgument, MeshOption, RobotOption
+from apps.cli.options import JsonOption, KeyArgument, MeshOption, RobotChoice, RobotOption
 
 PANEL = "Tools"
 
@@ -34,9 +34,8 @@ def top(
     Ctrl-C ends it. Counts are since the start; what is wrong now, or grows and should not, is red.
     """
     from apps.cli import top as showing
-    from apps.cli.link import Where
 
-    sys.exit(asyncio.run(showing.top(Where(robot, profile), once, json, every)))
+    sys.exit(asyncio.run(showing.top(RobotChoice(robot, profile), once, json, every)))
 
 
 def echo(
@@ -50,9 +49,8 @@ def echo(
 ) -> None:
     """What travels on a key, decoded, of whatever type it is; what a reader would reject is marked with its reason."""
     from apps.cli import echo as echoing
-    from apps.cli.link import Where
 
-    sys.exit(asyncio.run(echoing.echo(Where(robot, profile), key, count, seconds, json, full)))
+    sys.exit(asyncio.run(echoing.echo(RobotChoice(robot, profile), key, count, seconds, json, full)))
 
 
 def hz(
@@ -65,9 +63,8 @@ def hz(
 ) -> None:
     """How often, how evenly and how much travels on a key, as it arrives here, over the last seconds."""
     from apps.cli import hz as measuring
-    from apps.cli.link import Where
 
-    sys.exit(asyncio.run(measuring.hz(Where(robot, profile), key, window, once, json)))
+    sys.exit(asyncio.run(measuring.hz(RobotChoice(robot, profile), key, window, once, json)))
 
 
 def logs(

@@ -74,8 +74,8 @@ def markdown() -> str:
     mentioned += [name for request in REQUESTS for name in (request.request.__name__, request.reply.__name__)]
     parts = [
         "# Topics\n",
-        "Made by `cocoro topics --markdown` from `cocoro/topics.py`, `cocoro/messages/` and the components' declarations\n"
-        "(`services/*/component.py`, `sim/`); change those. A recorder reads everything that is recorded.\n",
+        "Made by `cocoro topics --markdown` from `cocoro/topics.py`, `cocoro/messages/` and the declarations of the\n"
+        "components (`services/*/component.py`, `sim/`); change those. A recorder reads everything that is recorded.\n",
         "A key is `<robot>/<topic>`. A payload is one MessagePack map, its fields named as below; a reader ignores\n"
         "fields that it does not know. SI units, in the names. What arrives malformed, wrongly typed, oversized or\n"
         "out of order is counted in the reader's health and dropped.\n",

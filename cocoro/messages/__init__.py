@@ -73,7 +73,7 @@ from cocoro.messages.planning import (
     WheelTrial,
 )
 from cocoro.messages.sim import (
-    Clock,
+    ClockTick,
     TrueObject,
     Truth,
 )
@@ -92,7 +92,7 @@ __all__ = [
     "BaseState",
     "Behaviour",
     "CancelRequest",
-    "Clock",
+    "ClockTick",
     "Count",
     "Detection",
     "Detections",

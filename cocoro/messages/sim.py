@@ -10,7 +10,7 @@ from msgspec import Meta
 from cocoro.messages.common import Finite, FiniteQuaternion, FiniteVec3, Message
 
 
-class Clock(Message):
+class ClockTick(Message):
     """Simulated time is `stamp_ns`; a new incarnation is a new epoch."""
 
     rate: Annotated[float, Meta(gt=0, le=1e3)] = 1.0

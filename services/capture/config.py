@@ -9,8 +9,8 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from cocoro.capture.compression import Compression
 from cocoro.units import Positive
+from services.capture.file import Compression
 
 FOLDER = "COCORO_CAPTURE_DIR"
 """Environment variable: where captures go when the configuration does not say."""

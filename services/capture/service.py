@@ -3,30 +3,30 @@
 from __future__ import annotations
 
 import asyncio
+import re
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from functools import partial
 from pathlib import Path
 
-from cocoro.capture.compression import Packer
-from cocoro.capture.keys import Choice, info_of
 from cocoro.clock import NS, VirtualClock
 from cocoro.component import Implementation
 from cocoro.node import Node
 from services.capture.config import CaptureConfig, folder_of
+from services.capture.file import Packer
+from services.capture.keys import KeyFilter, info_of, lossy
 from services.capture.log_clock import LogClock
-from services.capture.lossy import lossy
 from services.capture.recorder import Ledger, Recorder
-from services.capture.retention import file_name, make_room
 from services.capture.sink import DirectSink, ThreadedSink
-from services.capture.writer import MB, Limits, Writer, sync_and_close
+from services.capture.writer import MB, CaptureWriter, Limits, sync_and_close
 
 
 async def run(node: Node, config: CaptureConfig, log_clock: LogClock | None = None) -> None:
     """Record until cancelled. A disk that does not take it is a fault that the mesh hears of, not the end. `log_clock`
     is of use in real time alone, and made when there is none."""
-    ledger = Ledger(Choice(node.robot_name, config.only, config.without))
+    ledger = Ledger(node.robot_name, KeyFilter(node.robot_name, config.only, config.without))
     virtual = isinstance(node.clock, VirtualClock)
     if virtual:
         log_clock = None
@@ -58,11 +58,11 @@ implementation = Implementation(CaptureConfig, run)
 
 def _writer(
     robot: str, config: CaptureConfig, ledger: Ledger, started: datetime, release: Callable[[int], None] | None
-) -> Writer:
+) -> CaptureWriter:
     limits = Limits(min_free_bytes=round(config.min_free_mb * MB))
     if config.file is None:
         limits = replace(limits, file_bytes=config.rotate_mb * MB, file_s=config.rotate_s)
-    return Writer(
+    return CaptureWriter(
         _place(robot, config, started),
         Packer(config.compression, config.level),
         limits,
@@ -88,3 +88,46 @@ def _place(robot: str, config: CaptureConfig, started: datetime) -> Callable[[in
         return folder / file_name(robot, started, number)
 
     return place
+
+
+def file_name(robot: str, started: datetime, number: int) -> str:
+    """Of a run's nth file; names sort by time, as the wall clock told it when the run began."""
+    return f"{_run(robot, started)}-{number:03}.mcap"
+
+
+def _run(robot: str, started: datetime) -> str:
+    return f"{robot}-{started:%Y%m%dT%H%M%SZ}"
+
+
+def captures(folder: Path, robot: str) -> list[Path]:
+    """The files of these names, oldest first."""
+    pattern = re.compile(rf"{re.escape(robot)}-\d{{8}}T\d{{6}}Z-\d{{3,}}\.mcap")
+    return sorted(path for path in folder.glob("*.mcap") if pattern.fullmatch(path.name))
+
+
+def make_room(folder: Path, robot: str, keep_bytes: int, started: datetime | None = None) -> list[Path]:
+    """Delete the oldest captures until the others take no more than this; never the newest. Returns those deleted.
+
+    The files of the run that goes on, begun at `started`, are the newest, in the order of their numbers, whatever the
+    wall clock said when the others were begun.
+    """
+    own = "" if started is None else f"{_run(robot, started)}-"
+    files = sorted(captures(folder, robot), key=lambda path: _age(path, own))
+    sizes = {path: path.stat().st_size for path in files}
+    left = sum(sizes.values())
+    gone = []
+    for path in files[:-1]:
+        if left <= keep_bytes:
+            break
+        with suppress(OSError):
+            path.unlink()
+            left -= sizes[path]
+            gone.append(path)
+    return gone
+
+
+def _age(path: Path, own: str) -> tuple[bool, int, str]:
+    """Sorts the oldest first."""
+    if own and path.name.startswith(own):
+        return True, int(path.stem.rpartition("-")[2]), path.name
+    return False, 0, path.name

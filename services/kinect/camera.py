@@ -11,7 +11,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncGenerator
 from contextlib import suppress
 from math import degrees
 from pathlib import Path
@@ -69,7 +69,7 @@ class FreenectCamera:
         self._again = self._loop.call_soon(self._start)
         tell(self._fault)
 
-    async def shots(self) -> AsyncIterator[Shot]:
+    async def shots(self) -> AsyncGenerator[Shot, None]:
         while True:
             limit_s = FIRST_S if self._fault else HANGS_S
             try:

@@ -9,7 +9,7 @@ from typing import Any
 
 import msgspec
 
-from cocoro.capture.schema import ENCODING, TypeSchema
+from cocoro.capture.types import ENCODING, TypeSchema
 from cocoro.clock import NS
 from cocoro.units import Quaternion as Turn
 from cocoro.units import Vec3
