@@ -15,7 +15,7 @@ from cocoro.kinematics import Array
 from cocoro.messages import Frame
 from cocoro.robot import Robot
 from sim.realism import Sensors
-from sim.render import Light, Renderer
+from sim.render import Lighting, Renderer
 from sim.seeds import stream
 from sim.sensor_effects import (
     ByteNoise,
@@ -46,7 +46,7 @@ DRIFT_S = 5.0
 """From one extreme to the other."""
 
 
-class Kinect:
+class SimKinect:
     """Takes frames of the world that a renderer draws.
 
     Args:
@@ -90,7 +90,7 @@ class Kinect:
             self._exposure = Drift(rng, EXPOSURE_DRIFT, DRIFT_S)
             self._white_balance = Drift(rng, WHITE_BALANCE_DRIFT, DRIFT_S)
 
-    def capture(self, poses: Array, camera_pose: Array, stamp_ns: int, light: Light) -> Frame:
+    def capture(self, poses: Array, camera_pose: Array, stamp_ns: int, light: Lighting) -> Frame:
         """The frame whose exposure has its middle at `stamp_ns`.
 
         Args:

@@ -9,9 +9,9 @@ import numpy as np
 
 from cocoro.kinematics import Array
 from sim.bullet import Bullet
+from sim.render.interface import Visual
 from sim.rigid import rotations
 from sim.scene import Obstacle, Scene, SceneObject, Vec3
-from sim.visual import Visual
 
 FLOOR = "floor"
 CAN_FRICTION = 0.9

@@ -15,10 +15,9 @@ from pathlib import Path
 from typing import Any
 
 from services.base import oi
-from services.base.guardian import _PACKAGES
-from sim.wire.body import SimpleBody
-from sim.wire.create import Create
-from sim.wire.emulator import Emulator
+from services.base.guard_supervisor import _PACKAGES
+from sim.wire.create import EmulatedCreate
+from sim.wire.emulator import Emulator, SimplePlant
 
 MS = 1_000_000
 SAFE = 2
@@ -41,8 +40,8 @@ class Bench:
     """An emulated Create, its line and its body; `with` it."""
 
     def __init__(self, folder: Path, seed: int = 0) -> None:
-        self.create = Create()
-        self.body = SimpleBody(self.create)
+        self.create = EmulatedCreate()
+        self.body = SimplePlant(self.create)
         self.emulator = Emulator(folder, {"create": self.create}, self.body, seed)
         self.line = self.emulator.lines["create"]
         self.port = str(folder / "create")

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cocoro.robot import Camera, Robot
-from services.kinect.device import Shot
+from services.kinect.device import RawFrame
 
 Array = NDArray[np.float64]
 Maps = tuple[cv2.typing.MatLike, cv2.typing.MatLike]
@@ -77,7 +77,7 @@ class Straightener:
         """Nothing was measured."""
         return self._colour is None and self._depth is None
 
-    def __call__(self, shot: Shot) -> Shot:
+    def __call__(self, shot: RawFrame) -> RawFrame:
         """Colour smoothly, depth from the nearest pixel: two depths have no mean."""
         colour, depth = shot.colour, shot.depth
         if self._colour is not None:
@@ -90,7 +90,7 @@ class Straightener:
                 gain, shift = self._move
                 moved = (depth * gain + shift).astype(np.uint16)
                 depth = np.where(depth >= NO_DATA, np.uint16(NO_DATA), moved)
-        return Shot(shot.stamp_ns, colour, depth)
+        return RawFrame(shot.stamp_ns, colour, depth)
 
 
 def _maps(

@@ -6,7 +6,7 @@ stand out of the depth camera's range of anything near the middle of the room.
 
 from __future__ import annotations
 
-from sim.visual import Visual
+from sim.render.interface import Visual
 
 Vec3 = tuple[float, float, float]
 
