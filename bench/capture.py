@@ -36,7 +36,6 @@ from apps.rehearsal.request import RehearsalRequest
 from cocoro import topics
 from cocoro.bus.endpoints import default
 from cocoro.bus.zenoh import ZenohBus
-from cocoro.capture.compression import Packer
 from cocoro.capture.reader import Capture
 from cocoro.clock import RealClock
 from cocoro.messages import BaseState, Frame
@@ -44,6 +43,7 @@ from cocoro.node import Node
 from cocoro.robot import Robot
 from cocoro.tokens import recorder_key
 from deploy.rundir import RunDir
+from services.capture.file import Packer
 
 COCORO = [sys.executable, "-m", "apps.cli.main"]
 HEARD_S, LOOK_S = 10.0, 0.2

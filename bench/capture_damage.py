@@ -21,10 +21,10 @@ from apps.captures.rewrite import rewrite
 from apps.cli.main import main as cocoro
 from apps.rehearsal.rehearse import rehearse
 from apps.rehearsal.request import RehearsalRequest
-from cocoro.capture.compression import Packer
-from cocoro.capture.errors import CaptureError
+from cocoro.capture.conventions import CaptureError
 from cocoro.capture.reader import Capture, Record
 from cocoro.clock import NS
+from services.capture.file import Packer
 
 
 def damage(folder: Path, times: int) -> None:

@@ -34,12 +34,13 @@ from mcap.writer import Writer as PackageWriter
 from apps.rehearsal.rehearse import rehearse
 from apps.rehearsal.request import RehearsalRequest
 from cocoro.capture import mcap
-from cocoro.capture.compression import QUICK, Packer
 from cocoro.capture.contents import unpacked
-from cocoro.capture.keys import info_of
 from cocoro.capture.reader import Capture
 from cocoro.clock import NS
-from services.capture.writer import Entry, Limits, Writer
+from services.capture import file
+from services.capture.file import QUICK, Packer
+from services.capture.keys import Entry, info_of
+from services.capture.writer import Limits, Writer
 
 SMALL_BYTES = 64 * 1024
 MEMORY = Path("/dev/shm")
@@ -164,16 +165,16 @@ def records(folder: Path, times: int) -> None:
     payload, count, places = bytes(220), 1000, list(range(40))
 
     def write_messages() -> bytes:
-        return b"".join(part for n in range(count) for part in (mcap.message_head(3, n, n, n, len(payload)), payload))
+        return b"".join(part for n in range(count) for part in (file.message_head(3, n, n, n, len(payload)), payload))
 
     def write_messages_by_package() -> bytes:
-        return mcap.packed(*(Message(3, n, payload, n, n) for n in range(count)))
+        return file.packed(*(Message(3, n, payload, n, n) for n in range(count)))
 
     raw = write_messages()
     assert raw == write_messages_by_package()
     small = Chunk("", raw, 0, 0, 0, len(raw))
     some = list(zip(places[::2], places[1::2], strict=True))
-    assert mcap.message_index(3, places) == mcap.packed(MessageIndex(3, some))
+    assert file.message_index(3, places) == file.packed(MessageIndex(3, some))
     _tell(f"{count} messages of {len(payload)} bytes, written", times, write_messages, write_messages_by_package)
     _tell(
         "the same, read", times,
@@ -182,8 +183,8 @@ def records(folder: Path, times: int) -> None:
     )  # fmt: skip
     _tell(
         f"{count} indices of {len(some)} messages, written", times,
-        lambda: [mcap.message_index(3, places) for _ in range(count)],
-        lambda: [mcap.packed(MessageIndex(3, some)) for _ in range(count)],
+        lambda: [file.message_index(3, places) for _ in range(count)],
+        lambda: [file.packed(MessageIndex(3, some)) for _ in range(count)],
     )  # fmt: skip
     for sensors in ("ideal", "real"):
         frames = [one.payload for one in recorded(folder, sensors, 3.0) if one.key.endswith("kinect/frame")][::4]
@@ -195,15 +196,15 @@ def _frames(name: str, frames: list[bytes], times: int) -> None:
     raws = [head + frame for frame in frames]
     packer = zstandard.ZstdCompressor(compression_params=QUICK)
     packed = [(packer.compress(raw), len(raw), zlib.crc32(raw)) for raw in raws]
-    contents = [mcap.packed(Chunk("zstd", data, 0, 0, crc, size))[9:] for data, size, crc in packed]
+    contents = [file.packed(Chunk("zstd", data, 0, 0, crc, size))[9:] for data, size, crc in packed]
 
     def write() -> None:
         for data, size, crc in packed:  # the head, and the packed records as they are
-            mcap.ChunkHead(0, 0, size, crc, "zstd", len(data)).pack()
+            file.chunk_head(mcap.ChunkHead(0, 0, size, crc, "zstd", len(data)))
 
     def write_by_package() -> None:
         for data, size, crc in packed:
-            mcap.packed(Chunk("zstd", data, 0, 0, crc, size))
+            file.packed(Chunk("zstd", data, 0, 0, crc, size))
 
     _tell(f"{name}, packed: chunk records made", times, write, write_by_package)
 

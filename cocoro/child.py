@@ -39,7 +39,8 @@ def wait_or_kill(process: subprocess.Popen[bytes], patience_s: float) -> None:
 
 
 class ChildProcess:
-    """A child that holds one end of a socket pair (SOCK_SEQPACKET: each datagram is a message), given to it as `--fd N`.
+    """A child that holds one end of a socket pair (SOCK_SEQPACKET: each datagram is a message), given to it as `--fd
+    N`.
 
     The child must end when the other end closes: `close` asks it to end, and so does the death of this process.
     """
@@ -70,8 +71,8 @@ class ChildProcess:
         self._on_closed: Callable[[], None] = lambda: None
 
     def watch(self, on_message: Callable[[bytes], None], on_closed: Callable[[], None]) -> None:
-        """Call `on_message` with each message, and `on_closed` once when the child has closed its end, as it does when it
-        ends. Both are called in the event loop that is running now; this end is closed before `on_closed`."""
+        """Call `on_message` with each message, and `on_closed` once when the child has closed its end, as it does when
+        it ends. Both are called in the event loop that is running now; this end is closed before `on_closed`."""
         self._on_message, self._on_closed = on_message, on_closed
         self._loop = asyncio.get_running_loop()
         self._loop.add_reader(self.channel, self.read)

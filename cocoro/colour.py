@@ -6,22 +6,20 @@ from collections.abc import Iterable
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from cocoro.arrays import BoolArray, Float32Array, ImageArray
 from cocoro.objects import KnownObject, LabBox
 
-Pixels = NDArray[np.uint8]
-Lab = NDArray[np.float32]
-Bools = NDArray[np.bool_]
+Lab = Float32Array
 
 
-def lab_of(colour: Pixels) -> Lab:
+def lab_of(colour: ImageArray) -> Lab:
     """8-bit sRGB (..., 3) to true CIELAB, D65: L 0 to 100, a and b about -128 to 127."""
     flat = np.ascontiguousarray(colour).reshape(1, -1, 3).astype(np.float32) / np.float32(255)
     return np.asarray(cv2.cvtColor(flat, cv2.COLOR_RGB2Lab), dtype=np.float32).reshape(colour.shape)
 
 
-def in_boxes(boxes: Iterable[LabBox], lab: Lab) -> Bools:
+def in_boxes(boxes: Iterable[LabBox], lab: Lab) -> BoolArray:
     """Whether each colour (..., 3) lies in any of the boxes."""
     found = np.zeros(lab.shape[:-1], dtype=np.bool_)
     channels = [np.ascontiguousarray(lab[..., number]) for number in range(3)]
@@ -33,6 +31,6 @@ def in_boxes(boxes: Iterable[LabBox], lab: Lab) -> Bools:
     return found
 
 
-def matches(known: KnownObject, lab: Lab, *, by_shape: bool = False) -> Bools:
+def matches(known: KnownObject, lab: Lab, *, by_shape: bool = False) -> BoolArray:
     """Whether each colour (..., 3) is the object's; with `by_shape` also when it is one that it shares."""
     return in_boxes(known.lab + known.lab_by_shape if by_shape else known.lab, lab)

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from math import atan2, cos, hypot, pi, sin, sqrt
 from typing import NamedTuple
 
-Vec3 = tuple[float, float, float]
+from cocoro.units import Vec3
 
 
 def wrap_rad(angle_rad: float) -> float:

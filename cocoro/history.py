@@ -7,9 +7,8 @@ from collections.abc import Sequence
 from math import pi
 
 import numpy as np
-from numpy.typing import NDArray
 
-Vector = NDArray[np.float64]
+from cocoro.arrays import FloatArray
 
 DEFAULT_CAPACITY = 256
 """About five seconds of a 50 Hz state."""
@@ -42,7 +41,7 @@ class History:
         self._jump_back_ns = jump_back_ns
         self._incarnation: int | None = None
         self._stamps_ns: list[int] = []
-        self._values: list[Vector] = []
+        self._values: list[FloatArray] = []
         self.resets = 0
         """Times that a restart or a jump back of the clock emptied it."""
         self.refused = 0
@@ -51,7 +50,7 @@ class History:
     def __len__(self) -> int:
         return len(self._stamps_ns)
 
-    def add(self, stamp_ns: int, values: Sequence[float] | Vector, incarnation: int = 0) -> bool:
+    def add(self, stamp_ns: int, values: Sequence[float] | FloatArray, incarnation: int = 0) -> bool:
         """Append one sample; False when it is late or repeated and was refused. ValueError on a wrong width."""
         vector = np.array(values, dtype=np.float64)
         if vector.shape != (self._width,):
@@ -74,7 +73,7 @@ class History:
             del self._stamps_ns[0], self._values[0]
         return True
 
-    def at(self, stamp_ns: int, max_gap_ns: int) -> Vector | None:
+    def at(self, stamp_ns: int, max_gap_ns: int) -> FloatArray | None:
         """The vector at a time, linearly interpolated between the two samples around it; shape (width,).
 
         None when the time is outside of what is held (nothing is extrapolated) or when the two samples lie
@@ -94,7 +93,7 @@ class History:
         return (1.0 - share) * self._values[after - 1] + share * self._values[after]
 
     @property
-    def newest(self) -> tuple[int, Vector] | None:
+    def newest(self) -> tuple[int, FloatArray] | None:
         """The last sample, (stamp_ns, vector); None when there is none."""
         return (self._stamps_ns[-1], self._values[-1].copy()) if self._stamps_ns else None
 

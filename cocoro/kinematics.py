@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from math import cos, sin
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from cocoro.arrays import FloatArray
 
 _HERE = np.eye(4)
 _HERE.setflags(write=False)
@@ -28,7 +27,7 @@ class Link:
     r_m: float
     offset_rad: float
 
-    def fixed(self) -> Array:
+    def fixed(self) -> FloatArray:
         """4 x 4 transform from the link's frame to its parent's at joint angle minus offset, i.e. before the
         joint's own turn."""
         ct, st = cos(self.theta_rad), sin(self.theta_rad)
@@ -43,13 +42,13 @@ class Link:
         )
 
 
-def turn_z(angle_rad: float) -> Array:
+def turn_z(angle_rad: float) -> FloatArray:
     """4 x 4 rotation about z."""
     c, s = cos(angle_rad), sin(angle_rad)
     return np.array((c, -s, 0.0, 0.0, s, c, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0)).reshape(4, 4)
 
 
-def cross(a: Array, b: Array) -> Array:
+def cross(a: FloatArray, b: FloatArray) -> FloatArray:
     """Vector product of two of shape (3,); `np.cross` takes ten times as long to find out that they are two."""
     (ax, ay, az), (bx, by, bz) = a.tolist(), b.tolist()
     return np.array((ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx))
@@ -74,7 +73,7 @@ class Chain:
         self.joints = tuple(row.joint for row in rows if row.joint is not None)
         self._steps = [(row.fixed(), row.joint, row.offset_rad) for row in rows]
 
-    def pose(self, angles_rad: Mapping[str, float]) -> Array:
+    def pose(self, angles_rad: Mapping[str, float]) -> FloatArray:
         """4 x 4 transform from the tip's frame to the root's. `angles_rad` has every joint of the chain."""
         total = _HERE
         for fixed, joint, offset in self._steps:
@@ -83,16 +82,16 @@ class Chain:
                 total = total @ turn_z(angles_rad[joint] + offset)
         return total if total is not _HERE else total.copy()
 
-    def position(self, angles_rad: Mapping[str, float]) -> Array:
+    def position(self, angles_rad: Mapping[str, float]) -> FloatArray:
         """The tip's origin in the root's frame, shape (3,)."""
         return self.pose(angles_rad)[:3, 3]
 
-    def jacobian(self, angles_rad: Mapping[str, float], joints: Iterable[str] | None = None) -> Array:
+    def jacobian(self, angles_rad: Mapping[str, float], joints: Iterable[str] | None = None) -> FloatArray:
         """Geometric Jacobian of the tip, shape (6, n): rows 0-2 linear (m/rad), 3-5 angular, root's frame.
 
         Columns follow `joints` (those of the chain by default); a joint outside the chain has a zero column.
         """
-        columns: dict[str, tuple[Array, Array]] = {}
+        columns: dict[str, tuple[FloatArray, FloatArray]] = {}
         total = _HERE
         for fixed, joint, offset in self._steps:
             total = total @ fixed
@@ -130,9 +129,9 @@ class Tree:
         self._root = root
         self._steps = [(row.name, row.parent, row.fixed(), row.joint, row.offset_rad) for row in rows.values()]
 
-    def poses(self, angles_rad: Mapping[str, float]) -> dict[str, Array]:
+    def poses(self, angles_rad: Mapping[str, float]) -> dict[str, FloatArray]:
         """4 x 4 transforms from each link's frame on the way to the tips to the root's, by the link's name."""
-        poses: dict[str, Array] = {self._root: _HERE.copy()}
+        poses: dict[str, FloatArray] = {self._root: _HERE.copy()}
         for name, parent, fixed, joint, offset in self._steps:
             pose = poses[parent] @ fixed
             poses[name] = pose if joint is None else pose @ turn_z(angles_rad[joint] + offset)

@@ -14,10 +14,8 @@ import msgspec
 from msgspec import Meta
 
 from cocoro.errors import ConfigError
+from cocoro.units import Positive, Share, Vec3
 
-Positive = Annotated[float, Meta(gt=0)]
-Share = Annotated[float, Meta(ge=0, le=1)]
-Vec3 = tuple[float, float, float]
 Label = Annotated[str, Meta(pattern=r"\A[a-z][a-z0-9_-]{0,63}\Z")]
 
 DEFAULT_FILE = "objects.toml"

@@ -9,12 +9,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from cocoro.arrays import ImageArray
 from cocoro.errors import CocoroError
 from cocoro.messages import Detection, Detections, Frame
 from cocoro.objects import Catalogue
-
-Pixels = NDArray[np.uint8]
-Rgb = tuple[int, int, int]
+from cocoro.units import Rgb
 
 LOCALISED: Rgb = (255, 255, 255)
 UNLOCALISED: Rgb = (255, 160, 0)
@@ -22,14 +21,14 @@ TEXT_BACK: Rgb = (20, 20, 20)
 FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
-def colour_of(frame: Frame) -> Pixels:
+def colour_of(frame: Frame) -> ImageArray:
     """The frame's colour pixels, RGB, (height, width, 3); a view, not to be written to."""
     return np.frombuffer(frame.colour, dtype=np.uint8).reshape(frame.height, frame.width, 3)
 
 
 def draw(
     frame: Frame, detections: Detections | None = None, catalogue: Catalogue | None = None, caption: str = ""
-) -> Pixels:
+) -> ImageArray:
     """A copy of the colour image with each detection's box, centroid, label, distance and note; RGB.
 
     The distance is from the body frame's origin, level. With a catalogue each box has its object's colour. A frame
@@ -48,7 +47,7 @@ def draw(
     return image
 
 
-def save_png(image: Pixels, path: Path) -> None:
+def save_png(image: ImageArray, path: Path) -> None:
     """Write an RGB image as PNG, making the folder. Raises CocoroError when it cannot be written."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -90,7 +89,7 @@ def describe(detection: Detection) -> str:
     return " ".join(words)
 
 
-def _draw_detection(image: Pixels, detection: Detection, colour: Rgb, scale: tuple[float, float]) -> None:
+def _draw_detection(image: ImageArray, detection: Detection, colour: Rgb, scale: tuple[float, float]) -> None:
     left, top, right, bottom = (round(edge * factor) for edge, factor in zip(detection.box_px, scale * 2, strict=True))
     cv2.rectangle(image, (left - 2, top - 2), (right + 1, bottom + 1), TEXT_BACK, 3)
     cv2.rectangle(image, (left - 2, top - 2), (right + 1, bottom + 1), colour, 1)
@@ -101,7 +100,7 @@ def _draw_detection(image: Pixels, detection: Detection, colour: Rgb, scale: tup
     _text(image, describe(detection), left - 2, above if above > 14 else bottom + 16, colour)
 
 
-def _text(image: Pixels, text: str, left: int, baseline: int, colour: Rgb) -> None:
+def _text(image: ImageArray, text: str, left: int, baseline: int, colour: Rgb) -> None:
     size = max(0.35, 0.45 * image.shape[1] / 640)
     (width, height), below = cv2.getTextSize(text, FONT, size, 1)
     left = max(0, min(left, image.shape[1] - width))

@@ -14,13 +14,12 @@ from typing import Annotated, Any, Literal
 import msgspec
 import numpy as np
 from msgspec import Meta
-from numpy.typing import NDArray
 
+from cocoro.arrays import CodeArray, Float32Array, FloatArray
 from cocoro.errors import ConfigError
-from cocoro.kinematics import Array, Chain, Link, Tree
+from cocoro.kinematics import Chain, Link, Tree
+from cocoro.units import Positive, Vec3
 
-Positive = Annotated[float, Meta(gt=0)]
-Vec3 = tuple[float, float, float]
 LensValues = tuple[float, float, float, float, float, float, float, float, float]
 """fx, fy, cx, cy in pixels, then k1, k2, p1, p2, k3 as OpenCV has them."""
 
@@ -190,7 +189,7 @@ class Camera:
     cx: float
     cy: float
 
-    def ray(self, u_px: float, v_px: float) -> Array:
+    def ray(self, u_px: float, v_px: float) -> FloatArray:
         """Direction of a pixel, camera frame, with z = 1; shape (3,)."""
         return np.array([(u_px - self.cx) / self.fx, (v_px - self.cy) / self.fy, 1.0])
 
@@ -289,11 +288,11 @@ class Robot:
             (k.height - 1) / 2,
         )
 
-    def depth_m(self, raw: NDArray[np.uint16]) -> NDArray[np.float32]:
+    def depth_m(self, raw: CodeArray) -> Float32Array:
         """Raw 11-bit depth codes to metres along the optical axis; no data (2047 and beyond) becomes NaN."""
         return self._depth_table[np.minimum(raw, 2047)]
 
-    def depth_code(self, depth_m: Array) -> NDArray[np.uint16]:
+    def depth_code(self, depth_m: FloatArray) -> CodeArray:
         """Metres to raw codes, 2047 outside of the range; the inverse of `depth_m` up to quantisation."""
         a, b, c = self.kinect.depth_curve
         inside = (depth_m >= self.kinect.min_range_m) & (depth_m <= self.kinect.max_range_m)
@@ -301,7 +300,7 @@ class Robot:
         return np.where(inside, codes, 2047).astype(np.uint16)
 
     @cached_property
-    def _depth_table(self) -> NDArray[np.float32]:
+    def _depth_table(self) -> Float32Array:
         a, b, c = self.kinect.depth_curve
         angle = np.arange(2048) / b + c
         table = np.where(angle < pi / 2, a * np.tan(angle), np.nan)

@@ -131,7 +131,7 @@ LATCH = Topic(
     "The emergency stop's state, for hardware services that have just started.",
 )  # fmt: skip
 CLOCK = Topic(
-    "sim/clock", m.Clock, Qos.COMMAND, "sim", 120.0, 1.0,
+    "sim/clock", m.ClockTick, Qos.COMMAND, "sim", 120.0, 1.0,
     "Simulated time. When it stands, time stands.",
 )  # fmt: skip
 TRUTH = Topic(

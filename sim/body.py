@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from cocoro.kinematics import Array
+from cocoro.arrays import FloatArray
 from cocoro.robot import Robot
 from sim.render.interface import Shape
 
@@ -58,7 +58,7 @@ class Part:
     seen: bool = True
     """False for what is only touched, or only weighs."""
 
-    def pose(self) -> Array:
+    def pose(self) -> FloatArray:
         """4 x 4 transform from the part's frame to its link's."""
         total = np.eye(4)
         if self.axis == "x":
@@ -68,7 +68,7 @@ class Part:
         total[:3, 3] = self.position_m
         return total
 
-    def inertia(self) -> Array:
+    def inertia(self) -> FloatArray:
         """Of the part's mass, evenly filled, about its own centre in the link's axes; 3 x 3, kg m2."""
         if self.shape == "box":
             x, y, z = self.size_m

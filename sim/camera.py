@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from cocoro.arrays import CodeArray, Float32Array, FloatArray, ImageArray
 from cocoro.errors import ConfigError
-from cocoro.kinematics import Array
 from cocoro.messages import Frame
 from cocoro.robot import Robot
 from sim.realism import Sensors
@@ -19,12 +19,9 @@ from sim.render import Lighting, Renderer
 from sim.seeds import stream
 from sim.sensor_effects import (
     ByteNoise,
-    Codes,
     DepthCoder,
     DepthNoise,
     Drift,
-    Metres,
-    Rgb,
     blur_along_motion,
     drop_edges,
     motion_between,
@@ -81,7 +78,7 @@ class SimKinect:
         self._depth_offset_m = np.array(robot.kinect.depth_offset_m)
         self._projector_offset_m = np.array(robot.kinect.projector_offset_m)
         self._coder = DepthCoder(robot)
-        self._before: tuple[int, Array] | None = None
+        self._before: tuple[int, FloatArray] | None = None
         _keep_freed_memory()
         if self._real:
             rng = stream(seed, "kinect")
@@ -90,7 +87,7 @@ class SimKinect:
             self._exposure = Drift(rng, EXPOSURE_DRIFT, DRIFT_S)
             self._white_balance = Drift(rng, WHITE_BALANCE_DRIFT, DRIFT_S)
 
-    def capture(self, poses: Array, camera_pose: Array, stamp_ns: int, light: Lighting) -> Frame:
+    def capture(self, poses: FloatArray, camera_pose: FloatArray, stamp_ns: int, light: Lighting) -> Frame:
         """The frame whose exposure has its middle at `stamp_ns`.
 
         Args:
@@ -120,7 +117,14 @@ class SimKinect:
             depth=depth.astype("<u2", copy=False).reshape(-1).view(np.uint8).data,
         )
 
-    def _expose(self, colour: Rgb, depth_m: Metres, camera_pose: Array, stamp_ns: int, rng: np.random.Generator) -> Rgb:
+    def _expose(
+        self,
+        colour: ImageArray,
+        depth_m: Float32Array,
+        camera_pose: FloatArray,
+        stamp_ns: int,
+        rng: np.random.Generator,
+    ) -> ImageArray:
         """What the colour sensor makes of the light: smeared by the motion, scaled by exposure and white
         balance, with noise."""
         if self._before is not None:
@@ -133,13 +137,13 @@ class SimKinect:
         gains = np.array([exposure * (1 + balance), exposure, exposure * (1 - balance)])
         return self._colour_noise.add(scale_channels(colour, gains), rng)
 
-    def _measure(self, depth_m: Metres, rng: np.random.Generator) -> Codes:
+    def _measure(self, depth_m: Float32Array, rng: np.random.Generator) -> CodeArray:
         """What the depth camera reports: noise before quantising; nothing out of range, in the projector's
         shadow (negative metres) and here and there on edges."""
         return drop_edges(self._coder.codes(self._depth_noise.add(depth_m, rng)), rng)
 
 
-def moved(camera_pose: Array, offset_m: Array) -> Array:
+def moved(camera_pose: FloatArray, offset_m: FloatArray) -> FloatArray:
     """The pose of something that looks the same way as the camera from `offset_m` (3,) in its frame."""
     pose = camera_pose.copy()
     pose[:3, 3] += camera_pose[:3, :3] @ offset_m

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from cocoro.kinematics import Array
+from cocoro.arrays import FloatArray
 from sim.base import Bumper
 from sim.body import CHASSIS
 from sim.stage import FLOOR
@@ -46,7 +46,7 @@ def touching_pairs(
     return frozenset(pairs), on_chassis
 
 
-def bumper(points_m: Iterable[tuple[float, float, float]], body_pose: Array) -> Bumper:
+def bumper(points_m: Iterable[tuple[float, float, float]], body_pose: FloatArray) -> Bumper:
     """Which of the bumper's switches the contact points on the chassis close."""
     left = right = False
     for point in points_m:

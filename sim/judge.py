@@ -7,9 +7,10 @@ from math import acos, degrees, hypot, sqrt
 import msgspec
 import numpy as np
 
-from cocoro.kinematics import Array
-from cocoro.messages import TrueObject, Truth, Vec3
+from cocoro.arrays import FloatArray
+from cocoro.messages import TrueObject, Truth
 from cocoro.robot import Robot
+from cocoro.units import Vec3
 from sim.rigid import rotation
 from sim.scene import Scene, SceneObject
 from sim.stage import FLOOR
@@ -194,7 +195,7 @@ class PursuitJudge:
         body = np.eye(4)
         body[:3, :3] = rotation(truth.body_orientation)
         body[:3, 3] = truth.body_m
-        pose: Array = body @ self._chain.pose(truth.joints_rad)
+        pose: FloatArray = body @ self._chain.pose(truth.joints_rad)
         x, y, z = pose[:3, :3].T @ (np.array(target.position_m) - pose[:3, 3])
         if z <= 0:
             return False

@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cocoro.kinematics import Array
-from cocoro.messages import Quaternion, Vec3
+from cocoro.arrays import FloatArray
 from cocoro.robot import Robot
+from cocoro.units import Quaternion, Vec3
 from sim.body import CHASSIS
 from sim.bullet import Bullet
 from sim.model import WHEELS, RobotModel, write_urdf
@@ -114,7 +114,7 @@ class Mechanism:
         x, y, z = (float(value) for value in pose[:3, 3])
         return (x, y, z), self._bullet.getBasePositionAndOrientation(self.body)[1]
 
-    def root_pose(self) -> Array:
+    def root_pose(self) -> FloatArray:
         """4 x 4 transform from the body frame to the world."""
         position, orientation = self._bullet.getBasePositionAndOrientation(self.body)
         pose = np.eye(4)
@@ -122,7 +122,7 @@ class Mechanism:
         pose[:3, 3] = np.array(position) - pose[:3, :3] @ self._root_offset
         return pose
 
-    def link_poses(self) -> Array:
+    def link_poses(self) -> FloatArray:
         """Of every link in the world, shape (links + 1, 4, 4): row i is PyBullet's link i, the last the root."""
         states = self._bullet.getLinkStates(self.body, self._link_indices, computeForwardKinematics=1)
         poses = np.zeros((len(states) + 1, 4, 4))

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from cocoro.kinematics import Array, Link, turn_z
+from cocoro.arrays import FloatArray
+from cocoro.kinematics import Link, turn_z
 from cocoro.robot import Robot
 from sim.body import CHASSIS, Extra, Part, SimBody, calliope_body
 from sim.render.interface import Visual
@@ -47,7 +48,7 @@ class RobotModel:
     links: tuple[str, ...]
     """The root first. PyBullet numbers them in its own way: ask it for the names."""
     body: SimBody
-    carried: dict[str, tuple[str, Array]]
+    carried: dict[str, tuple[str, FloatArray]]
     """For every link of the description: the URDF link that carries it and the fixed transform between."""
 
     def collision_pairs(self) -> Iterator[tuple[str, str]]:
@@ -57,7 +58,7 @@ class RobotModel:
                 if frozenset((one, other)) not in _NEIGHBOURS and not {one, other} <= _FIXED:
                     yield one, other
 
-    def visuals(self) -> list[tuple[str, Array, Visual]]:
+    def visuals(self) -> list[tuple[str, FloatArray, Visual]]:
         """Every part: the URDF link that carries it, its 4 x 4 pose there, and how it looks."""
         found = []
         for link, parts in self.body.parts.items():
@@ -89,7 +90,7 @@ def build_model(robot: Robot) -> RobotModel:
             carried[name] = (name, np.eye(4))
             joints.append(_servo_joint(robot, link, carrier, place @ turn_z(link.offset_rad)))
             links.append(name)
-    solid: dict[str, list[tuple[Array, Part]]] = {name: [] for name in links}
+    solid: dict[str, list[tuple[FloatArray, Part]]] = {name: [] for name in links}
     for name, parts in body.parts.items():
         carrier, offset = carried.get(name, (name, np.eye(4)))
         solid[carrier] += [(offset, part) for part in parts]
@@ -123,7 +124,7 @@ def _parents_first(links: dict[str, Link]) -> Iterator[tuple[str, Link]]:
 # One element a line: PyBullet reads a URDF that is one long line wrongly, by chance.
 
 
-def _link_xml(name: str, placed: list[tuple[Array, Part]]) -> str:
+def _link_xml(name: str, placed: list[tuple[FloatArray, Part]]) -> str:
     lines = [f'  <link name="{name}">', *_inertial_xml(placed)]
     for offset, part in placed:
         if part.solid:
@@ -132,7 +133,7 @@ def _link_xml(name: str, placed: list[tuple[Array, Part]]) -> str:
     return "\n".join([*lines, "  </link>"])
 
 
-def _inertial_xml(placed: list[tuple[Array, Part]]) -> list[str]:
+def _inertial_xml(placed: list[tuple[FloatArray, Part]]) -> list[str]:
     mass = sum(part.mass_kg for _, part in placed)
     centres = [(offset @ part.pose())[:3, 3] for offset, part in placed]
     centre = sum((part.mass_kg * c for c, (_, part) in zip(centres, placed, strict=True)), np.zeros(3)) / mass
@@ -168,7 +169,7 @@ def _extra_joint(extra: Extra) -> str:
     return _joint_xml(extra.name, CHASSIS, place, "continuous" if extra.wheel else "fixed", axis="0 1 0")
 
 
-def _servo_joint(robot: Robot, link: Link, parent: str, place: Array) -> str:
+def _servo_joint(robot: Robot, link: Link, parent: str, place: FloatArray) -> str:
     assert link.joint is not None
     joint = robot.joints[link.joint]
     low, high = joint.limits_rad
@@ -183,7 +184,7 @@ def _servo_joint(robot: Robot, link: Link, parent: str, place: Array) -> str:
     )
 
 
-def _joint_xml(child: str, parent: str, place: Array, kind: str, axis: str, more: list[str] | None = None) -> str:
+def _joint_xml(child: str, parent: str, place: FloatArray, kind: str, axis: str, more: list[str] | None = None) -> str:
     return "\n".join(
         [
             f'  <joint name="{child}" type="{kind}">',
@@ -197,7 +198,7 @@ def _joint_xml(child: str, parent: str, place: Array, kind: str, axis: str, more
     )
 
 
-def _origin_xml(place: Array) -> str:
+def _origin_xml(place: FloatArray) -> str:
     turn = place[:3, :3]
     pitch = asin(max(-1.0, min(1.0, -turn[2, 0])))
     if abs(turn[2, 0]) < 1.0 - 1e-12:

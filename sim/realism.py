@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from cocoro.kinematics import Array
+from cocoro.arrays import FloatArray
 from cocoro.robot import Robot
 from sim.seeds import stream
 
@@ -46,7 +46,7 @@ REALISM: dict[Sensors, BodyRealism] = {
 }
 
 
-def wheel_scales(seed: int, realism: BodyRealism) -> Array:
+def wheel_scales(seed: int, realism: BodyRealism) -> FloatArray:
     """How far the left and the right wheel of a run roll for a metre that they are told to; shape (2,)."""
     return np.asarray(1.0 + stream(seed, "wheel scale").uniform(-1.0, 1.0, 2) * realism.wheel_scale_error)
 
@@ -61,9 +61,9 @@ class Wander:
         self._draws = draws
         self._keep = exp(-dt_s / time_s)
         self._add = sigma * sqrt(1.0 - self._keep**2)
-        self.values: Array = sigma * draws.standard_normal(channels)
+        self.values: FloatArray = sigma * draws.standard_normal(channels)
 
-    def step(self) -> Array:
+    def step(self) -> FloatArray:
         """The next values, shape (channels,), `dt_s` later."""
         self.values = self._keep * self.values + self._add * self._draws.standard_normal(self.values.size)
         return self.values
@@ -141,13 +141,13 @@ def _worn(robot: Robot, rng: np.random.Generator) -> Robot:
     return Robot.from_data(data, "worn body")
 
 
-def _direction(rng: np.random.Generator) -> Array:
+def _direction(rng: np.random.Generator) -> FloatArray:
     """A direction in space, all alike; shape (3,)."""
-    vector: Array = rng.standard_normal(3)
+    vector: FloatArray = rng.standard_normal(3)
     return vector / float(np.linalg.norm(vector))
 
 
-def _displacement(name: str, parent: str, shift_m: Array, turn_rad: Array) -> Iterator[dict[str, Any]]:
+def _displacement(name: str, parent: str, shift_m: FloatArray, turn_rad: FloatArray) -> Iterator[dict[str, Any]]:
     """Fixed links that shift and turn what hangs on them, along and about x, y and z in turn. A row of the kinematic
     table moves along its x and z alone, so y is the x of a row that is turned by a quarter, and then back."""
     (x, y, z), (rx, ry, rz) = shift_m.tolist(), np.degrees(turn_rad).tolist()

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from cocoro.kinematics import Array
+from cocoro.arrays import FloatArray
 
 
-def rotation(quaternion: Sequence[float]) -> Array:
+def rotation(quaternion: Sequence[float]) -> FloatArray:
     """Rotation matrix (3, 3) of one unit quaternion (x, y, z, w)."""
     x, y, z, w = quaternion
     return np.array(
@@ -21,7 +21,7 @@ def rotation(quaternion: Sequence[float]) -> Array:
     )
 
 
-def rotations(quaternions: Array) -> Array:
+def rotations(quaternions: FloatArray) -> FloatArray:
     """Rotation matrices of unit quaternions (x, y, z, w); shape (n, 4) to (n, 3, 3)."""
     x, y, z, w = quaternions.T
     rows = np.empty((len(quaternions), 3, 3))

@@ -14,9 +14,9 @@ from msgspec import Meta
 
 from cocoro.errors import ConfigError
 from cocoro.objects import Catalogue
+from cocoro.units import Vec3
 from sim.seeds import stream
 
-Vec3 = tuple[float, float, float]
 ScenePoint = Annotated[tuple[float, ...], Meta(min_length=2, max_length=3)]
 Shape = Literal["cylinder", "sphere", "box"]
 

@@ -9,12 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cocoro.kinematics import Array
+from cocoro.arrays import CodeArray, Float32Array, FloatArray, ImageArray
 from cocoro.robot import Camera, Robot
-
-Rgb = NDArray[np.uint8]
-Metres = NDArray[np.float32]
-Codes = NDArray[np.uint16]
 
 NO_DATA = 2047
 STEPS_PER_M = 16_000
@@ -36,7 +32,7 @@ class DepthCoder:
         self._table = robot.depth_code(np.arange(last + 1) / STEPS_PER_M)
         self._top_m = np.float32(last / STEPS_PER_M)
 
-    def codes(self, depth_m: Metres) -> Codes:
+    def codes(self, depth_m: Float32Array) -> CodeArray:
         """Codes of the same shape; 2047 out of range, for infinity and for negative metres."""
         steps = np.clip(depth_m, np.float32(0), self._top_m)
         steps *= np.float32(STEPS_PER_M)
@@ -57,7 +53,7 @@ class DepthNoise:
         self._size = shape[0] * shape[1]
         self._bank = np.float32(sigma_per_m) * rng.standard_normal(self._size + NOISE_OFFSETS, dtype=np.float32)
 
-    def add(self, depth_m: Metres, rng: np.random.Generator) -> Metres:
+    def add(self, depth_m: Float32Array, rng: np.random.Generator) -> Float32Array:
         """z + sigma z^2 times a normal draw a pixel; negative metres (no light there) become 0."""
         start = int(rng.integers(NOISE_OFFSETS))
         noise = self._bank[start : start + self._size].reshape(self._shape)
@@ -75,7 +71,7 @@ class ByteNoise:
         self._more = np.maximum(bank, 0).astype(np.uint8)
         self._less = np.maximum(-bank, 0).astype(np.uint8)
 
-    def add(self, image: Rgb, rng: np.random.Generator) -> Rgb:
+    def add(self, image: ImageArray, rng: np.random.Generator) -> ImageArray:
         start = int(rng.integers(NOISE_OFFSETS))
         more = self._more[start : start + self._size].reshape(image.shape)
         less = self._less[start : start + self._size].reshape(image.shape)
@@ -100,21 +96,21 @@ class Drift:
 class CameraMotion(NamedTuple):
     """How the camera moves while the shutter is open, in its own frame."""
 
-    rotation_rad: Array
+    rotation_rad: FloatArray
     """Rotation vector, (3,)."""
-    translation_m: Array
+    translation_m: FloatArray
 
-    def homography(self, share: float, plane_m: float, camera: Camera) -> Array:
+    def homography(self, share: float, plane_m: float, camera: Camera) -> FloatArray:
         """Where in the picture at mid-exposure the pixels are that the camera sees `share` of the exposure later
         (-0.5 to 0.5): 3 x 3, on pixel coordinates. Exact for a plane that faces the camera at `plane_m`."""
         move = _rodrigues(share * self.rotation_rad)
         move[:, 2] += share * self.translation_m / plane_m
         k = np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
-        pixels: Array = k @ move @ np.linalg.inv(k)
+        pixels: FloatArray = k @ move @ np.linalg.inv(k)
         return pixels
 
 
-def motion_between(before: Array, now: Array, exposures: float) -> CameraMotion:
+def motion_between(before: FloatArray, now: FloatArray, exposures: float) -> CameraMotion:
     """The motion of one exposure, from the camera's poses at the previous frame and at this one.
 
     `exposures` is the exposure's length as a share of the time between the two.
@@ -124,7 +120,7 @@ def motion_between(before: Array, now: Array, exposures: float) -> CameraMotion:
     return CameraMotion(exposures * _rodrigues(step).reshape(3), exposures * shift)
 
 
-def blur_along_motion(image: Rgb, motion: CameraMotion, depth_m: Metres, camera: Camera) -> Rgb:
+def blur_along_motion(image: ImageArray, motion: CameraMotion, depth_m: Float32Array, camera: Camera) -> ImageArray:
     """The mean of the picture over the exposure, each pixel smeared along its own path.
 
     The path is that of a plane facing the camera at the picture's median depth: exact for the camera's
@@ -136,7 +132,7 @@ def blur_along_motion(image: Rgb, motion: CameraMotion, depth_m: Metres, camera:
     """
     plane_m = _median_depth(depth_m)
 
-    def at(share: float) -> Array:
+    def at(share: float) -> FloatArray:
         return motion.homography(share, plane_m, camera)
 
     length_px = _longest_path(at(-0.5), at(0.5), camera)
@@ -151,7 +147,7 @@ def blur_along_motion(image: Rgb, motion: CameraMotion, depth_m: Metres, camera:
     return _mean(_warped(image, at(first)), _warped(image, at(first + 0.5)))
 
 
-def drop_edges(codes: Codes, rng: np.random.Generator) -> Codes:
+def drop_edges(codes: CodeArray, rng: np.random.Generator) -> CodeArray:
     """The codes with 2 percent of the pixels at depth edges (next to something much nearer or farther, or to no
     data) gone. Changes and returns its argument."""
     spread = cv2.morphologyEx(codes, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8))
@@ -160,26 +156,26 @@ def drop_edges(codes: Codes, rng: np.random.Generator) -> Codes:
     return codes
 
 
-def scale_channels(image: Rgb, gains: Array) -> Rgb:
+def scale_channels(image: ImageArray, gains: FloatArray) -> ImageArray:
     """Each channel times its gain (3,), rounded, saturating."""
     return _bytes(cv2.transform(image, np.diag(gains)))
 
 
-def _rodrigues(rotation: Array) -> Array:
+def _rodrigues(rotation: FloatArray) -> FloatArray:
     """A rotation vector (3,) to its matrix, or a matrix to its vector (3, 1)."""
     return np.asarray(cv2.Rodrigues(rotation)[0], np.float64)
 
 
-def _bytes(image: NDArray[Any]) -> Rgb:
+def _bytes(image: NDArray[Any]) -> ImageArray:
     """OpenCV's own types do not say that bytes stay bytes."""
-    return cast(Rgb, image)
+    return cast(ImageArray, image)
 
 
-def _mean(one: Rgb, other: Rgb) -> Rgb:
+def _mean(one: ImageArray, other: ImageArray) -> ImageArray:
     return _bytes(cv2.addWeighted(one, 0.5, other, 0.5, 0))
 
 
-def _warped(image: Rgb, homography: Array) -> Rgb:
+def _warped(image: ImageArray, homography: FloatArray) -> ImageArray:
     """Each pixel takes the one that is nearest to its place under the homography; the margin repeats the border.
 
     Interpolating would triple the time for a mean that is smooth anyway: against pictures rendered at 64 moments of
@@ -189,7 +185,7 @@ def _warped(image: Rgb, homography: Array) -> Rgb:
     return _bytes(cv2.warpPerspective(image, homography, size, flags=flags, borderMode=cv2.BORDER_REPLICATE))
 
 
-def _longest_path(first: Array, last: Array, camera: Camera) -> float:
+def _longest_path(first: FloatArray, last: FloatArray, camera: Camera) -> float:
     """Pixels between where two homographies put the middle and the corners of the picture."""
     w, h = camera.width - 1.0, camera.height - 1.0
     points = np.array([[w / 2, h / 2, 1], [0, 0, 1], [w, 0, 1], [0, h, 1], [w, h, 1]]).T
@@ -197,7 +193,7 @@ def _longest_path(first: Array, last: Array, camera: Camera) -> float:
     return float(np.linalg.norm(a[:2] / a[2] - b[:2] / b[2], axis=0).max())
 
 
-def _median_depth(depth_m: Metres) -> float:
+def _median_depth(depth_m: Float32Array) -> float:
     """Of a coarse grid; far away where the picture has nothing."""
     grid = np.abs(depth_m[::16, ::16])
     return float(np.clip(np.median(grid), 0.3, 100.0))

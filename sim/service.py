@@ -16,8 +16,7 @@ from msgspec import Meta
 from cocoro import topics
 from cocoro.clock import NS, Clock, FollowedClock
 from cocoro.latch import LatchKeeper
-from cocoro.messages import BaseCommand, BaseState, LatchState, Message, ServoCommand
-from cocoro.messages import Clock as ClockMessage
+from cocoro.messages import BaseCommand, BaseState, ClockTick, LatchState, Message, ServoCommand
 from cocoro.node import Node
 from cocoro.publisher import Publisher
 from cocoro.robot import Robot
@@ -186,7 +185,7 @@ class Simulator:
         return self._motion
 
     def tell_time(self) -> None:
-        sent = self._ticks.put(ClockMessage(rate=self.rate), self._world.time_ns)
+        sent = self._ticks.put(ClockTick(rate=self.rate), self._world.time_ns)
         if isinstance(self._clock, FollowedClock):
             self._clock.tick(sent.stamp_ns, sent.incarnation, self.rate)
 

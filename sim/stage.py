@@ -7,11 +7,12 @@ from math import cos, sin
 
 import numpy as np
 
-from cocoro.kinematics import Array
+from cocoro.arrays import FloatArray
+from cocoro.units import Vec3
 from sim.bullet import Bullet
 from sim.render.interface import Visual
 from sim.rigid import rotations
-from sim.scene import Obstacle, Scene, SceneObject, Vec3
+from sim.scene import Obstacle, Scene, SceneObject
 
 FLOOR = "floor"
 CAN_FRICTION = 0.9
@@ -55,7 +56,7 @@ class Stage:
         position, orientation = self._bullet.getBasePositionAndOrientation(self.bodies[label])
         return position, orientation
 
-    def poses(self) -> Array:
+    def poses(self) -> FloatArray:
         """4 x 4 poses of all bodies but the floor, in the order of `visuals`; shape (n, 4, 4)."""
         poses = np.zeros((len(self.labels), 4, 4))
         poses[:, 3, 3] = 1.0
@@ -101,7 +102,7 @@ class Mover:
         corners = [np.array(point) for point in points]
         if loop:
             corners.append(corners[0])
-        self._legs: list[tuple[float, Array, Array]] = []
+        self._legs: list[tuple[float, FloatArray, FloatArray]] = []
         start_s = 0.0
         for one, other in pairwise(corners):
             length_m = float(np.linalg.norm(other - one))
@@ -112,7 +113,7 @@ class Mover:
         self._last = corners[-1]
         self._loop = loop
 
-    def at(self, time_s: float) -> Array:
+    def at(self, time_s: float) -> FloatArray:
         """Position in the world, shape (3,)."""
         if self._loop and self._end_s:
             time_s %= self._end_s

@@ -7,11 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from cocoro.arrays import FloatArray
 from cocoro.clock import NS
 from cocoro.frames import to_spherical, wrap_rad
-from cocoro.kinematics import Array
-from cocoro.messages import PlannerStatus, TaskState, Truth, Vec3
+from cocoro.messages import PlannerStatus, TaskState, Truth
 from cocoro.robot import Robot
+from cocoro.units import Vec3
 from sim.rigid import rotation
 
 STALL_M = 0.005
@@ -117,7 +118,7 @@ class Trace:
         return {name: [row[name] for row in self._rows] for name in (self._rows[0] if self._rows else ())}
 
 
-def _vec3(values: Array) -> Vec3:
+def _vec3(values: FloatArray) -> Vec3:
     x, y, z = values.tolist()
     return x, y, z
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cocoro.kinematics import Array
+from cocoro.arrays import FloatArray
 from cocoro.messages import BaseCommand, BaseState, LatchState, ServoCommand, ServoState, TrueObject, Truth
 from cocoro.robot import Robot
 from sim.base import Bumper, MobileBase
@@ -240,7 +240,7 @@ class World:
             ),
         )
 
-    def body_pose(self) -> Array:
+    def body_pose(self) -> FloatArray:
         """World pose of the body frame: 4 x 4."""
         return self._mechanism.root_pose()
 
@@ -258,7 +258,7 @@ class World:
         """Everything to draw but the floor."""
         return self._visuals
 
-    def visual_poses(self) -> Array:
+    def visual_poses(self) -> FloatArray:
         """World poses of `visuals` now, in their order: shape (n, 4, 4)."""
         links = self._mechanism.link_poses()
         poses = np.empty((len(self._visuals), 4, 4))
@@ -267,14 +267,14 @@ class World:
         poses[on_robot:] = self._stage.poses()
         return poses
 
-    def camera_pose(self) -> Array:
+    def camera_pose(self) -> FloatArray:
         """World pose of the camera: 4 x 4, x right, y down, z forward."""
         return self.link_pose("camera")
 
-    def link_pose(self, link: str) -> Array:
+    def link_pose(self, link: str) -> FloatArray:
         """World pose of a link of the robot description: 4 x 4."""
         carrier, offset = self._model.carried[link]
-        pose: Array = self._mechanism.link_poses()[self._mechanism.index[carrier]] @ offset
+        pose: FloatArray = self._mechanism.link_poses()[self._mechanism.index[carrier]] @ offset
         return pose
 
     # --- inside -------------------------------------------------------------------------------------

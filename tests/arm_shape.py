@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from cocoro.kinematics import Array
+from cocoro.arrays import FloatArray
 from cocoro.robot import Robot
 from sim.body import Part, calliope_body
 
@@ -21,7 +21,7 @@ class ArmShape:
         self._chains = {link: robot.chain(link) for link in LINKS}
         self._low, self._high = np.array(robot.kinect.mount_min_m), np.array(robot.kinect.mount_max_m)
 
-    def points(self, angles_rad: Mapping[str, float]) -> Array:
+    def points(self, angles_rad: Mapping[str, float]) -> FloatArray:
         """Where they are in the body frame, (n, 3)."""
         placed = []
         for link, points in self._points.items():
@@ -39,7 +39,7 @@ class ArmShape:
         return float(self.points(angles_rad)[:, 2].min())
 
 
-def _surface(part: Part) -> Array:
+def _surface(part: Part) -> FloatArray:
     """Points on a part's surface at most `STEP_M` apart, in its link's frame."""
     if part.shape == "box":
         points = _box(part.size_m)
@@ -51,14 +51,14 @@ def _surface(part: Part) -> Array:
     return np.asarray(points @ pose[:3, :3].T + pose[:3, 3])
 
 
-def _box(size_m: tuple[float, ...]) -> Array:
+def _box(size_m: tuple[float, ...]) -> FloatArray:
     axes = [np.linspace(-size / 2, size / 2, max(2, round(size / STEP_M) + 1)) for size in size_m]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     on_face = (np.abs(np.abs(grid) - np.array(size_m) / 2) < 1e-9).any(axis=1)
     return np.asarray(grid[on_face])
 
 
-def _cylinder(radius_m: float, height_m: float) -> Array:
+def _cylinder(radius_m: float, height_m: float) -> FloatArray:
     around = np.linspace(0, 2 * np.pi, max(8, round(2 * np.pi * radius_m / STEP_M)), endpoint=False)
     along = np.linspace(-height_m / 2, height_m / 2, max(2, round(height_m / STEP_M) + 1))
     angle, z = (values.ravel() for values in np.meshgrid(around, along))

@@ -11,8 +11,6 @@ import msgspec
 
 from cocoro import topics
 from cocoro.bus.local import LocalMesh
-from cocoro.capture.compression import Compression, Packer
-from cocoro.capture.keys import KeyInfo, info_of
 from cocoro.capture.reader import Capture, Record
 from cocoro.clock import NS, VirtualClock
 from cocoro.component import load
@@ -21,7 +19,9 @@ from cocoro.node import Node
 from cocoro.robot import Robot
 from cocoro.vloop import run_virtual
 from deploy.processes import named
-from services.capture.writer import Entry, Limits, Writer
+from services.capture.file import Compression, Packer
+from services.capture.keys import Entry, KeyInfo, info_of
+from services.capture.writer import Limits, Writer
 
 ROBOT = Robot.load()
 STILL = {"odometry_yaw_rad": 0.0, "speed_mps": 0.0, "turn_rate_radps": 0.0}

@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from cocoro.robot import LensValues, Vec3
+from cocoro.arrays import BoolArray, CodeArray, FloatArray, ImageArray
+from cocoro.robot import LensValues
+from cocoro.units import Vec3
 from services.kinect.calibration import Board
 from services.kinect.lens import Lens
 
-Array = NDArray[np.float64]
 WALL_M = 3.2
 WIDTH, HEIGHT = 640, 480
 FINE = 2
@@ -30,15 +30,15 @@ class Eyes:
     curve: Vec3
 
     @property
-    def turn(self) -> Array:
+    def turn(self) -> FloatArray:
         return np.asarray(cv2.Rodrigues(np.array(self.turn_rad))[0], float)
 
-    def code(self, depth_m: Array) -> Array:
+    def code(self, depth_m: FloatArray) -> FloatArray:
         a, b, c = self.curve
         return b * (np.arctan(depth_m / a) - c)
 
 
-def lying(turn_rad: Vec3, middle_m: Vec3, board: Board) -> tuple[Array, Array]:
+def lying(turn_rad: Vec3, middle_m: Vec3, board: Board) -> tuple[FloatArray, FloatArray]:
     """Rotation and place of a board whose middle is there."""
     rotation = np.asarray(cv2.Rodrigues(np.array(turn_rad))[0], float)
     half = np.array([board.columns - 1, board.rows - 1, 0.0]) * board.square_m / 2
@@ -52,7 +52,7 @@ class Painter:
         self._colour_rays = Lens(eyes.colour).rays(_grid(FINE))
         self._depth_rays = Lens(eyes.depth).rays(_grid(1)) @ eyes.turn.T
 
-    def colour(self, rotation: Array, place: Array) -> NDArray[np.uint8]:
+    def colour(self, rotation: FloatArray, place: FloatArray) -> ImageArray:
         """With a little noise."""
         squares, _ = self._meet(self._colour_rays, np.zeros(3), rotation, place)
         inside = self._inside(squares)
@@ -62,7 +62,7 @@ class Painter:
         noisy = fine[..., None] + self._rng.normal(0.0, 2.0, (HEIGHT, WIDTH, 3))
         return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
 
-    def depth(self, rotation: Array, place: Array) -> NDArray[np.uint16]:
+    def depth(self, rotation: FloatArray, place: FloatArray) -> CodeArray:
         """Of the board before a wall, with a code's noise, as the depth camera sees it."""
         eyes = self._eyes
         squares, away = self._meet(self._depth_rays, np.array(eyes.place_m), rotation, place)
@@ -71,18 +71,20 @@ class Painter:
         codes = np.rint(eyes.code(depth_m) + self._rng.normal(0.0, 0.7, len(depth_m)))
         return np.clip(codes, 0, 2047).astype(np.uint16).reshape(HEIGHT, WIDTH)
 
-    def _meet(self, rays: Array, start: Array, rotation: Array, place: Array) -> tuple[Array, Array]:
+    def _meet(
+        self, rays: FloatArray, start: FloatArray, rotation: FloatArray, place: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
         """Where rays meet the board's plane, in squares from its first corner, and how far along them."""
         normal = rotation[:, 2]
         away = normal @ (place - start) / (rays @ normal)
         points = (start + rays * away[:, None] - place) @ rotation
         return points[:, :2] / self._board.square_m, away
 
-    def _inside(self, squares: Array) -> NDArray[np.bool_]:
+    def _inside(self, squares: FloatArray) -> BoolArray:
         return ((squares > -1) & (squares < [self._board.columns, self._board.rows])).all(axis=1)
 
 
-def _grid(fine: int) -> Array:
+def _grid(fine: int) -> FloatArray:
     """The middles of the pixels' parts, row by row: (n, 2)."""
     v, u = np.mgrid[0 : HEIGHT * fine, 0 : WIDTH * fine]
     return (np.column_stack([u.ravel(), v.ravel()]) + 0.5) / fine - 0.5

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from apps.learning.study import Sightings
-from cocoro.kinematics import Array
+from cocoro.arrays import FloatArray
 from cocoro.learning.nominal_model import NominalModel
 from cocoro.robot import Robot
 from sim.realism import body_of
@@ -27,7 +27,7 @@ def sightings(robot: Robot, *, seed: int = 0, draws: int = 150, each: int = 4, n
     return Sightings(angles, places, np.repeat(np.arange(draws), each))
 
 
-def slope_by_differences(function: object, at: Array, step: float = 1e-6) -> Array:
+def slope_by_differences(function: object, at: FloatArray, step: float = 1e-6) -> FloatArray:
     """The Jacobian of `function.at` by central differences, (outputs, inputs)."""
     columns = [
         (function.at(at + step * axis) - function.at(at - step * axis)) / (2 * step)  # type: ignore[attr-defined]

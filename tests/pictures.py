@@ -8,8 +8,8 @@ from functools import cache
 import numpy as np
 import pytest
 
+from cocoro.arrays import FloatArray
 from cocoro.errors import ConfigError
-from cocoro.kinematics import Array
 from cocoro.robot import Camera, Robot
 from sim.camera import moved
 from sim.render import Images, Renderer, make_renderer
@@ -34,7 +34,7 @@ VISUALS = [RED_CAN, BLUE_BOX, GREEN_BALL]
 PLACES = [(1.5, 0.0, 0.06), (1.8, 0.4, 0.125), (1.2, -0.3, 0.05)]
 
 
-def at(*position_m: float) -> Array:
+def at(*position_m: float) -> FloatArray:
     pose = np.eye(4)
     pose[:3, 3] = position_m
     return pose
@@ -43,16 +43,16 @@ def at(*position_m: float) -> Array:
 POSES = np.array([at(*place) for place in PLACES])
 
 
-def head(tilt_rad: float = -0.45, pan_rad: float = 0.0) -> Array:
+def head(tilt_rad: float = -0.45, pan_rad: float = 0.0) -> FloatArray:
     angles = dict.fromkeys(ROBOT.joints, 0.0) | {"neck_tilt": tilt_rad, "neck_pan": pan_rad}
     return ROBOT.chain("camera").pose(angles)
 
 
 def look(
     renderer: Renderer,
-    camera_pose: Array | None = None,
+    camera_pose: FloatArray | None = None,
     *,
-    poses: Array = POSES,
+    poses: FloatArray = POSES,
     light: Lamp | None = None,
     projector: bool = False,
 ) -> Images:
@@ -81,7 +81,7 @@ def renderer_of(name: str) -> Renderer:
     return gl_renderer(VISUALS) if name == "moderngl" else make_renderer(VISUALS, CAMERA, "tiny")
 
 
-def pixel_of(point_m: tuple[float, ...], camera_pose: Array, camera: Camera = CAMERA) -> tuple[float, float]:
+def pixel_of(point_m: tuple[float, ...], camera_pose: FloatArray, camera: Camera = CAMERA) -> tuple[float, float]:
     x, y, z, _ = np.linalg.inv(camera_pose) @ [*point_m, 1.0]
     return camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
 
@@ -91,7 +91,7 @@ def reddish(colour: np.ndarray) -> np.ndarray:
     return (r > 2 * g + 20) & (r > 2 * b + 20)
 
 
-def floor_depth(camera: Camera, camera_pose: Array) -> Array:
+def floor_depth(camera: Camera, camera_pose: FloatArray) -> FloatArray:
     """Along the optical axis to z = 0 in every pixel's direction, by the camera's own `ray`."""
     across = np.array([camera.ray(u, 0) for u in range(camera.width)])
     down = np.array([camera.ray(0, v) for v in range(camera.height)])

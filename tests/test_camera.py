@@ -12,13 +12,13 @@ import pytest
 from pictures import CAMERA, ROBOT, Lamp, profile, stripe
 from scipy.spatial.transform import Rotation
 
+from cocoro.arrays import FloatArray
 from cocoro.errors import ConfigError
-from cocoro.kinematics import Array
 from cocoro.messages import Frame
 from cocoro.robot import Camera
 from sim.camera import SimKinect, moved
 from sim.realism import Sensors
-from sim.render import Images, Light, make_renderer
+from sim.render import Images, Lighting, make_renderer
 from sim.render.interface import Visual
 from sim.sensor_effects import (
     NO_DATA,
@@ -41,15 +41,15 @@ class Painted:
         self.camera = CAMERA
         self.colour = np.full((HEIGHT, WIDTH, 3), 128, np.uint8) if colour is None else colour
         self.depth_m = np.full((HEIGHT, WIDTH), depth_m, np.float32)
-        self.projected: list[Array | None] = []
+        self.projected: list[FloatArray | None] = []
 
     def render(
         self,
-        poses: Array,
-        camera_pose: Array,
-        depth_camera_pose: Array,
-        light: Light,
-        projector_pose: Array | None = None,
+        poses: FloatArray,
+        camera_pose: FloatArray,
+        depth_camera_pose: FloatArray,
+        light: Lighting,
+        projector_pose: FloatArray | None = None,
     ) -> Images:
         self.projected.append(projector_pose)
         return Images(self.colour, self.depth_m)
@@ -69,7 +69,7 @@ def depth_of(frame: Frame) -> np.ndarray:
     return np.frombuffer(frame.depth, "<u2").reshape(frame.height, frame.width)
 
 
-def shoot(camera: SimKinect, stamp_ns: int = 0, pose: Array | None = None) -> Frame:
+def shoot(camera: SimKinect, stamp_ns: int = 0, pose: FloatArray | None = None) -> Frame:
     return camera.capture(NOTHING, np.eye(4) if pose is None else pose, stamp_ns, LAMP)
 
 

@@ -16,7 +16,7 @@ from mcap.records import Attachment
 from mcap.writer import CompressionType, IndexType, Writer
 
 from apps.captures.export import foxglove
-from apps.captures.export.attachments import file_name
+from apps.captures.export.files import file_name
 from apps.captures.info import report
 from apps.captures.player import Player
 from apps.captures.replay import played_keys

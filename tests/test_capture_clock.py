@@ -10,12 +10,12 @@ import pytest
 from capture_rig import all_of, entry, writer
 
 from apps.captures.info import report
-from apps.cli import capture_info
+from apps.cli import capture_files
 from cocoro.boottime import boottime_ns
 from cocoro.capture.reader import Capture
 from cocoro.clock import NS
 from services.capture.log_clock import KEPT_STEPS, TOGETHER_NS, WALL_CLOCK, LogClock
-from services.capture.retention import captures, file_name, make_room
+from services.capture.service import captures, file_name, make_room
 from services.capture.writer import Limits
 
 START_NS = 1_750_000_000 * NS
@@ -132,8 +132,8 @@ def test_a_capture_tells_in_each_of_its_files_how_the_clock_was_set(machine: Mac
     for found in reports:
         (step,) = found.metadata[WALL_CLOCK]["steps"]
         assert step["by_s"] == pytest.approx(-3600.0, abs=1e-4)
-    assert "set back by 3600.000 s at 50.500 s" in capture_info.text(reports[0])
-    assert "set back by 3600.000 s 69.500 s before this file began" in capture_info.text(reports[2])
+    assert "set back by 3600.000 s at 50.500 s" in capture_files.text(reports[0])
+    assert "set back by 3600.000 s 69.500 s before this file began" in capture_files.text(reports[2])
     times = [record.log_ns for path in files for record in all_of(path)]
     assert times == sorted(times)
 
@@ -143,7 +143,7 @@ def test_info_passes_by_what_another_program_calls_so(tmp_path: Path) -> None:
     written.remember(WALL_CLOCK, {"steps": "many"})
     written.close()
     with Capture.open(written.file.path) as capture:
-        assert "clock " not in capture_info.text(report(capture))
+        assert "clock " not in capture_files.text(report(capture))
 
 
 def test_the_run_that_goes_on_is_the_newest_though_the_clock_was_set_back_before_it_began(tmp_path: Path) -> None:

@@ -19,9 +19,9 @@ from mcap_conformance import CONTENTS, MAGIC, made, variants
 from apps.captures.info import report
 from apps.captures.rewrite import rewrite
 from apps.cli.main import main
-from cocoro.capture.compression import Packer
-from cocoro.capture.file import checksum
+from cocoro.capture.conventions import checksum
 from cocoro.capture.reader import Capture
+from services.capture.file import Packer
 
 FILES = dict(variants())
 

@@ -13,9 +13,9 @@ from capture_rig import all_of, drive, record
 from apps.captures.info import report
 from apps.captures.rewrite import rewrite
 from apps.cli.main import main
-from cocoro.capture.compression import Packer
-from cocoro.capture.errors import CaptureError
+from cocoro.capture.conventions import CaptureError
 from cocoro.capture.reader import Capture, Record
+from services.capture.file import Packer
 
 DAMAGES = 1000
 

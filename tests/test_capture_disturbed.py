@@ -11,12 +11,11 @@ import pytest
 from capture_rig import Room, all_of, drive, entry, writer
 
 from cocoro import topics
-from cocoro.capture.errors import CaptureError
+from cocoro.capture.conventions import CaptureError
 from cocoro.capture.reader import Capture
 from cocoro.messages import Recording
 from cocoro.vloop import run_virtual
-from services.capture.whereabouts import told, whereabouts
-from services.capture.writer import KEPT_DISTURBED, LOOK_S, Limits, Writer
+from services.capture.writer import KEPT_DISTURBED, LOOK_S, Limits, Writer, told, whereabouts
 
 
 class Watch:

@@ -18,20 +18,19 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from message_samples import data_of
 
+from apps.captures.compare import changes, known_to
 from apps.captures.info import report
 from apps.captures.rewrite import rewrite
-from cocoro.capture.compression import COMPRESSIONS, Compression, Packer, unpack
-from cocoro.capture.errors import CaptureError
-from cocoro.capture.keys import Alive, Choice
-from cocoro.capture.pictures import LossyFrame
+from cocoro.capture.conventions import CaptureError
+from cocoro.capture.mcap import unpack
 from cocoro.capture.reader import Capture
-from cocoro.capture.schema import changes, known_to, schema_of
-from cocoro.capture.types import NotReadableError
+from cocoro.capture.types import Alive, LossyFrame, NotReadableError, schema_of
 from cocoro.errors import ConfigError
 from cocoro.messages import BaseState, Detections, Frame, Message, PlannerStatus
 from cocoro.topics import TOPICS
-from services.capture.lossy import lossy
-from services.capture.retention import captures, make_room
+from services.capture.file import COMPRESSIONS, Compression, Packer
+from services.capture.keys import Choice, lossy
+from services.capture.service import captures, make_room
 from services.capture.writer import Limits, Missing
 
 BIG = msgspec.msgpack.encode(frame(7, 320, 240))
@@ -197,7 +196,7 @@ class Disk:
 
 def test_a_full_disk_ends_the_recording_with_a_readable_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     disk = Disk(40_000)
-    monkeypatch.setattr("cocoro.capture.file.os.writev", disk.writev)
+    monkeypatch.setattr("services.capture.file.os.writev", disk.writev)
     written = writer(tmp_path)
     flushed = -1
 

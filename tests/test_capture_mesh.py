@@ -18,12 +18,11 @@ from capture_rig import STILL, all_of, drive, record
 
 from apps.captures.info import report
 from apps.captures.rewrite import rewrite
-from apps.cli import capture_info
+from apps.cli import capture_files
 from cocoro import topics
 from cocoro.bus.base import Qos
 from cocoro.bus.endpoints import default
 from cocoro.bus.zenoh import ZenohBus
-from cocoro.capture.compression import Packer
 from cocoro.capture.reader import Capture
 from cocoro.clock import NS, RealClock
 from cocoro.component import load
@@ -32,6 +31,7 @@ from cocoro.node import Node
 from cocoro.robot import Robot
 from cocoro.tokens import recorder_key
 from deploy.processes import named
+from services.capture.file import Packer
 from services.capture.log_clock import WALL_CLOCK, LogClock
 
 pytestmark = pytest.mark.zenoh
@@ -226,7 +226,9 @@ def test_a_recorder_whose_wall_clock_is_set_goes_on_as_if_it_had_not_been_and_no
         found = report(capture)
     (step,) = found.metadata[WALL_CLOCK]["steps"]
     assert step["by_s"] == pytest.approx(by_s, abs=0.01)
-    assert f"clock     set {'forward' if by_s > 0 else 'back'} by {abs(step['by_s']):.3f} s" in capture_info.text(found)
+    assert f"clock     set {'forward' if by_s > 0 else 'back'} by {abs(step['by_s']):.3f} s" in capture_files.text(
+        found
+    )
 
 
 def test_a_recorder_without_a_place_to_write_says_so_and_exits_with_1(short_path: Path) -> None:

@@ -21,7 +21,7 @@ from cocoro.clock import NS, FollowedClock
 from cocoro.component import load
 from cocoro.core import Sample, Schedule, Take
 from cocoro.errors import CocoroError, RemoteError
-from cocoro.messages import AboutReply, BaseState, CancelRequest, Clock, Recording, TaskReply
+from cocoro.messages import AboutReply, BaseState, CancelRequest, ClockTick, Recording, TaskReply
 from cocoro.node import Node
 from cocoro.stepper import RECORDER_S
 from cocoro.testing import settle
@@ -138,7 +138,7 @@ def test_it_tells_simulated_time_by_what_it_hears_and_is_not_woken_for_it_beside
             recording = asyncio.ensure_future(component.run(node, config))
             ticks = mesh.join().publisher(key, Qos.STATE)
             await settle()
-            ticks.put(msgspec.msgpack.encode(Clock(stamp_ns=70 * NS, incarnation=1)))
+            ticks.put(msgspec.msgpack.encode(ClockTick(stamp_ns=70 * NS, incarnation=1)))
             ticks.put(b"\xc1 no clock")
             await settle()
             assert 70 * NS <= node.now_ns() < 71 * NS
@@ -212,7 +212,7 @@ def test_a_full_disk_in_the_middle_of_a_run_is_told_too(tmp_path: Path, monkeypa
         async with room.node("operator") as operator:
             operator.on(topics.RECORDING.of("capture"), told.append)
             await drive(room, 1.0)
-            monkeypatch.setattr("cocoro.capture.file.os.writev", _refuse)
+            monkeypatch.setattr("services.capture.file.os.writev", _refuse)
             await drive(room, 1.0)
 
     run_virtual(Room().recorded({"file": str(tmp_path / "full.mcap")}, scenario))

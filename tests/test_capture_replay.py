@@ -13,14 +13,13 @@ import pytest
 from capture_rig import ROBOT, Room, all_of, drive, entry, record, writer
 
 from apps.captures.player import AT_ONCE, FASTEST, Player
-from apps.captures.rebirth import reborn, with_rate
-from apps.captures.replay import Replay, played_keys, refuse_if_alive, services_of
+from apps.captures.replay import Replay, played_keys, reborn, refuse_if_alive, services_of, with_rate
 from cocoro import topics
 from cocoro.capture.reader import Capture
 from cocoro.clock import FollowedClock
 from cocoro.core import Output, Sample, Schedule, Take
 from cocoro.errors import ConfigError, RefusedError
-from cocoro.messages import BaseState, Clock, Detections, Frame, PlannerStatus, StepRecord
+from cocoro.messages import BaseState, ClockTick, Detections, Frame, PlannerStatus, StepRecord
 from cocoro.node import Node
 from cocoro.vloop import run_virtual
 
@@ -154,9 +153,9 @@ def test_the_first_pass_leaves_payloads_as_they_are_and_the_next_has_other_incar
 
 
 def test_the_clock_says_how_fast_time_goes() -> None:
-    payload = msgspec.msgpack.encode(Clock(rate=0.9, stamp_ns=5))
+    payload = msgspec.msgpack.encode(ClockTick(rate=0.9, stamp_ns=5))
     assert with_rate(payload, 1.0) is payload
-    assert msgspec.msgpack.decode(with_rate(payload, 2.0), type=Clock) == Clock(rate=1.8, stamp_ns=5)
+    assert msgspec.msgpack.decode(with_rate(payload, 2.0), type=ClockTick) == ClockTick(rate=1.8, stamp_ns=5)
     assert with_rate(b"\xc1", 2.0) == b"\xc1"
 
 

@@ -17,14 +17,14 @@ from apps.captures.reexecute import Result, rerun
 from apps.captures.rewrite import info_in, rewrite
 from apps.cli.main import main
 from cocoro import topics
-from cocoro.capture.compression import Packer
-from cocoro.capture.errors import CaptureError
+from cocoro.capture.conventions import CaptureError
 from cocoro.capture.reader import Capture, Record
 from cocoro.clock import NS
 from cocoro.core import Core, Output, Sample, Schedule, Take
 from cocoro.messages import Detections, PlannerStatus
-from services.capture.lossy import lossy
-from services.capture.writer import Entry, Limits, Writer
+from services.capture.file import Packer
+from services.capture.keys import Entry, lossy
+from services.capture.writer import Limits, Writer
 from services.perception import service as perception
 from services.planning import service as planning
 

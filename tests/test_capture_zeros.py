@@ -18,10 +18,9 @@ from mcap.writer import CompressionType, Writer
 
 from apps.captures.info import report
 from apps.captures.rewrite import rewrite
-from cocoro.capture.compression import Packer
-from cocoro.capture.file import CaptureFile
 from cocoro.capture.mcap import MAGIC, PREFIX
 from cocoro.capture.reader import Capture
+from services.capture.file import CaptureFile, Packer
 from services.capture.writer import Limits, sync_and_close
 
 CHUNK_CRC = PREFIX.size + 24

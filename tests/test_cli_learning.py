@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 from learning_arm import sightings
 
-from apps.cli.babble import BabbleView
+from apps.cli.babble import BabbleDisplay
 from apps.cli.main import main
-from apps.cli.progress import Silent
+from apps.cli.progress import SilentDisplay
 from apps.learning.collector import Coverage, HandCollector, WheelCollector, collector
 from apps.learning.study import BEST
 from cocoro.learning import model
@@ -146,7 +146,7 @@ def test_wheel_trials_go_on_with_a_new_pair(tmp_path: Path, robot: Robot) -> Non
 def test_progress_has_a_bar_the_coverage_and_the_time_that_is_left(tmp_path: Path, robot: Robot) -> None:
     angles = dict.fromkeys((*JOINTS, "neck_pan", "neck_tilt"), 0.1)
     with HandCollector(tmp_path / "arm.jsonl", robot) as kept:
-        view = BabbleView(Silent(), kept, 200)
+        view = BabbleDisplay(SilentDisplay(), kept, 200)
         assert "left" not in view.text(0.0)
         for number in range(50):
             kept.take(HandSample(stamp_ns=number, draw=1, angles_rad=angles, seen_m=(0.4, 0.0, 0.2), area_px=90))

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 from apps.cli import estop_mesh, exits, objects, reset, snapshot, status
-from apps.cli.estop import Stop
-from apps.cli.link import Where
+from apps.cli.estop import StopResult
+from apps.cli.options import RobotChoice
 from cocoro.bus.endpoints import default
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.clock import RealClock
@@ -46,7 +46,7 @@ from deploy.rundir import RunDir
 
 pytestmark = pytest.mark.zenoh
 
-ANY = Where()
+ANY = RobotChoice()
 
 
 class FakeRobot:
@@ -85,7 +85,7 @@ def answering(node: Node, latch: str, text: str = "") -> None:
     node.serve(ESTOP.of(node.name), answer)
 
 
-async def stop() -> Stop:
+async def stop() -> StopResult:
     run_dir = RunDir("calliope")
     return await estop_mesh.stop(run_dir, run_dir.join_as("operator"), time.monotonic())
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from apps.cli import estop, exits
-from apps.cli.estop import Stop, _left_open, _merged
+from apps.cli.estop import StopResult, _left_open, _merged
 from apps.cli.main import main
 from cocoro.stop.path import StopPoint, listen
 from deploy.rundir import RunDir
@@ -135,8 +135,8 @@ def test_where_the_kernel_does_not_list_its_sockets_the_mesh_is_asked_and_that_i
 
 
 def test_what_either_way_acknowledged_is_stopped() -> None:
-    path = Stop("robbie", ("base",), ("arm",), ("hand",), 0.1)
-    mesh = Stop("robbie", ("arm", "hand"), (), (), 0.4)
+    path = StopResult("robbie", ("base",), ("arm",), ("hand",), 0.1)
+    mesh = StopResult("robbie", ("arm", "hand"), (), (), 0.4)
     (both,) = _merged([path], [mesh])
     assert (both.acknowledged, both.missing, both.absent, both.seconds) == (("base", "arm", "hand"), (), (), 0.4)
     assert both.code == exits.DONE
@@ -147,14 +147,14 @@ def test_what_either_way_acknowledged_is_stopped() -> None:
 
 
 def test_a_robot_of_which_nothing_that_moves_answered_is_none() -> None:
-    assert Stop("robbie", ("executive",), (), ("base", "arm", "hand"), 0.1).code == exits.NO_MESH
-    assert "(of user 1001)" in str(Stop("robbie", ("base",), (), (), 0.1, owner=1001))
+    assert StopResult("robbie", ("executive",), (), ("base", "arm", "hand"), 0.1).code == exits.NO_MESH
+    assert "(of user 1001)" in str(StopResult("robbie", ("base",), (), (), 0.1, owner=1001))
 
 
 def test_what_others_robots_answer_says_nothing_about_ones_own(root: Path) -> None:
     run_dir = RunDir("robbie", root)
     run_dir.make()
-    foreign = Stop("robbie", ("base", "arm", "hand"), (), (), 0.1, owner=1001)
+    foreign = StopResult("robbie", ("base", "arm", "hand"), (), (), 0.1, owner=1001)
     assert _left_open(None, [foreign]) == set()
     run_dir.hold_supervisor("sim")
     (claim,) = run_dir.claim("base", ("base",))
@@ -163,14 +163,14 @@ def test_what_others_robots_answer_says_nothing_about_ones_own(root: Path) -> No
         assert _left_open("robbie", [foreign]) == {"robbie"}
         assert _left_open("other", [foreign]) == set()
         assert _left_open(None, [foreign._replace(owner=None)]) == set()
-        assert _left_open(None, [Stop("robbie", ("arm",), (), ("base",), 0.1)]) == {"robbie"}
+        assert _left_open(None, [StopResult("robbie", ("arm",), (), ("base",), 0.1)]) == {"robbie"}
     finally:
         claim.release()
 
 
 def test_what_neither_way_acknowledged_is_missing() -> None:
-    path = Stop("robbie", ("arm",), (), ("base", "hand"), 0.1)
-    mesh = Stop("robbie", ("arm",), ("base",), ("hand",), 0.4, ("the disk is full",))
+    path = StopResult("robbie", ("arm",), (), ("base", "hand"), 0.1)
+    mesh = StopResult("robbie", ("arm",), ("base",), ("hand",), 0.4, ("the disk is full",))
     (both,) = _merged([path], [mesh])
     assert both.not_kept == ("the disk is full",)
     assert (both.missing, both.absent, both.code) == (("base",), ("hand",), exits.FAILED)

@@ -26,9 +26,9 @@ from cli_surroundings import ARGUMENTS, COMMANDS, GOLDEN, NOT_UTF8, SURROUNDINGS
 from apps.captures.rewrite import rewrite
 from apps.cli import exits
 from apps.cli.main import failed
-from cocoro.capture.compression import Packer
 from cocoro.capture.reader import Capture
 from cocoro.clock import NS
+from services.capture.file import Packer
 
 
 @pytest.fixture(scope="module")

@@ -13,9 +13,9 @@ from typing import Any
 import pytest
 
 from apps.cli import exits
-from apps.cli.babble import Keeper
+from apps.cli.babble import SampleWriter
 from apps.cli.link import Link
-from apps.cli.progress import Lines, Live, View
+from apps.cli.progress import LineDisplay, LiveDisplay, TaskDisplay
 from apps.cli.tasks import Follower
 from cocoro.bus.local import LocalMesh
 from cocoro.clock import VirtualClock
@@ -86,8 +86,8 @@ class Scene:
         self.link = Link(RunDir("calliope", Path("unused")), self.mesh.join())
         self.out = io.StringIO()
 
-    def follower(self, view: View | None = None) -> Follower:
-        return Follower(self.link, REQUEST, view or Lines(self.out), None)
+    def follower(self, view: TaskDisplay | None = None) -> Follower:
+        return Follower(self.link, REQUEST, view or LineDisplay(self.out), None)
 
 
 def in_virtual_time(scenario: Callable[[Scene], Awaitable[None]]) -> Callable[[], None]:
@@ -283,7 +283,7 @@ async def test_babbling_that_cannot_be_kept_is_cancelled_on_the_robot(scene: Sce
     executive = Executive(scene.node)
     executive.on_cancel = lambda: executive.tell("end", 2.0, outcome="cancelled")
     follower, full = scene.follower(), Full()
-    keeper = Keeper(full, follower.cancel)  # type: ignore[arg-type]
+    keeper = SampleWriter(full, follower.cancel)  # type: ignore[arg-type]
     running = await following(follower)
     keeper.take(Message())
     keeper.take(Message())
@@ -384,7 +384,7 @@ async def test_without_an_executive_it_says_what_to_start(scene: Scene) -> None:
 def test_on_a_terminal_one_line_is_written_over_and_each_phases_last_stays(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "40")
     out = io.StringIO()
-    live = Live(out)
+    live = LiveDisplay(out)
     for elapsed_s, phase in ((0.1, "search"), (0.5, "search"), (0.7, "approach")):
         live.show(TaskState(phase=phase, elapsed_s=elapsed_s, text="a text that is much too long for this"))
     live.result("done: fetch red_can in 0.9 s")

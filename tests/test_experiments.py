@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 from learning_arm import sightings
 
-from apps.cli.experiment import Progress
+from apps.cli.experiment import RunProgress
 from apps.cli.main import main
 from apps.experiments import bodies, lessons, report
 from apps.experiments.every import EXPERIMENTS
-from apps.experiments.runs import Result, Run, perform
-from apps.experiments.settings import Settings
+from apps.experiments.runs import ExperimentRun, RunResult, perform
+from apps.experiments.settings import ExperimentSettings
 from apps.experiments.stats import summarise
 from apps.learning.study import BEST
 from apps.rehearsal.request import RehearsalRequest
@@ -54,11 +54,11 @@ class Quiet:
     def started(self, name: str) -> None:
         self.begun.append(name)
 
-    def ended(self, name: str, result: Result) -> None: ...
+    def ended(self, name: str, result: RunResult) -> None: ...
 
 
 def test_every_experiment_asks_for_rehearsals_that_are_possible_and_names_what_it_needs(tmp_path: Path) -> None:
-    settings = Settings(seeds=(0, 1), out=tmp_path)
+    settings = ExperimentSettings(seeds=(0, 1), out=tmp_path)
     for experiment in EXPERIMENTS.values():
         given: set[str] = set()
         for run in experiment.runs(settings):
@@ -74,8 +74,8 @@ def test_every_experiment_asks_for_rehearsals_that_are_possible_and_names_what_i
 
 def test_what_cannot_be_run_fails_with_its_reason_and_so_does_what_needs_it(tmp_path: Path) -> None:
     runs = [
-        Run("one", "learn", {"arm": str(tmp_path / "a"), "wheels": "w", "into": str(tmp_path / "m.json")}),
-        Run("two", "rehearse", {"task": "fetch"}, needs=("one",)),
+        ExperimentRun("one", "learn", {"arm": str(tmp_path / "a"), "wheels": "w", "into": str(tmp_path / "m.json")}),
+        ExperimentRun("two", "rehearse", {"task": "fetch"}, needs=("one",)),
     ]
     display = Quiet()
     results = perform(runs, tmp_path / "runs", 1, display)
@@ -85,7 +85,7 @@ def test_what_cannot_be_run_fails_with_its_reason_and_so_does_what_needs_it(tmp_
     assert not (tmp_path / "runs").exists()  # errors are not kept: the next time tries again
 
 
-def arm_and_wheels(settings: Settings, robot: Robot) -> None:
+def arm_and_wheels(settings: ExperimentSettings, robot: Robot) -> None:
     seen = sightings(robot, draws=60)
     header = hand_header(robot, NominalModel(robot).joints, LEVEL_ROLL_RAD)
     with Writer(settings.arm_file(0), HandRow, robot, header) as writer:
@@ -110,15 +110,17 @@ def arm_and_wheels(settings: Settings, robot: Robot) -> None:
 
 
 @pytest.fixture(scope="module")
-def learned(tmp_path_factory: pytest.TempPathFactory, robot: Robot) -> tuple[Settings, Result]:
+def learned(tmp_path_factory: pytest.TempPathFactory, robot: Robot) -> tuple[ExperimentSettings, RunResult]:
     """A body that has learned, and what its lesson says."""
-    settings = Settings(seeds=(0,), out=tmp_path_factory.mktemp("experiments"))
+    settings = ExperimentSettings(seeds=(0,), out=tmp_path_factory.mktemp("experiments"))
     arm_and_wheels(settings, robot)
     run = bodies.learned(settings, 0)[-1]
     return settings, lessons.learn(**run.fields, method=BEST.name)
 
 
-def test_a_lesson_tells_how_good_the_map_is_and_what_the_wheels_are(learned: tuple[Settings, Result]) -> None:
+def test_a_lesson_tells_how_good_the_map_is_and_what_the_wheels_are(
+    learned: tuple[ExperimentSettings, RunResult],
+) -> None:
     settings, result = learned
     assert settings.model_file(0).is_file()
     assert {score["name"] for score in result["arm"]["scores"]} >= {"the drawing", result["arm"]["chosen"]}
@@ -131,8 +133,8 @@ def test_a_kept_result_is_used_until_what_it_stands_on_changes(tmp_path: Path) -
     kept = {"kind": "rehearse", "fields": {"task": "park"}, "after": {}, "result": {"outcome": "done"}}
     (tmp_path / "one.json").write_text(json.dumps(kept))
     (tmp_path / "two.json").write_text(json.dumps({**kept, "after": {"one": "something else"}}))
-    one = Run("one", "rehearse", {"task": "park"})
-    two = Run("two", "learn", {"arm": str(tmp_path / "none"), "wheels": "", "into": ""}, needs=("one",))
+    one = ExperimentRun("one", "rehearse", {"task": "park"})
+    two = ExperimentRun("two", "learn", {"arm": str(tmp_path / "none"), "wheels": "", "into": ""}, needs=("one",))
     display = Quiet()
     results = perform([one, two], tmp_path, 1, display)
     assert results["one"] == {"outcome": "done"}
@@ -155,7 +157,7 @@ FOLLOWED = {"mean_gap_m": 0.8, "max_gap_m": 1.1, "min_gap_m": 0.7, "lost_s": 0.1
 FETCHED = {"held": True, "knocked_over": []}
 
 
-def made_up(run: Run, lesson: Result) -> dict[str, Any]:
+def made_up(run: ExperimentRun, lesson: RunResult) -> dict[str, Any]:
     """What a run might have come to."""
     if run.kind == "learn":
         return lesson
@@ -170,7 +172,9 @@ def made_up(run: Run, lesson: Result) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def test_the_report_has_tables_plots_and_verdicts_in_every_format(learned: tuple[Settings, Result]) -> None:
+def test_the_report_has_tables_plots_and_verdicts_in_every_format(
+    learned: tuple[ExperimentSettings, RunResult],
+) -> None:
     settings, lesson = learned
     sections = []
     for experiment in EXPERIMENTS.values():
@@ -195,7 +199,7 @@ def test_the_report_has_tables_plots_and_verdicts_in_every_format(learned: tuple
     assert manifest["versions"]["numpy"] == np.__version__
 
 
-def test_runs_that_could_not_be_are_reported_and_hold_nothing(learned: tuple[Settings, Result]) -> None:
+def test_runs_that_could_not_be_are_reported_and_hold_nothing(learned: tuple[ExperimentSettings, RunResult]) -> None:
     settings, _ = learned
     for experiment in EXPERIMENTS.values():
         results = {run.name: {"error": "it broke"} for run in experiment.runs(settings)}
@@ -221,7 +225,7 @@ def test_a_wrong_body_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
 def test_progress_tells_what_runs_and_what_could_not_be(capsys: pytest.CaptureFixture[str]) -> None:
     import sys
 
-    progress = Progress(sys.stdout)
+    progress = RunProgress(sys.stdout)
     progress.begin(4, 1)
     progress.started("learn-0")
     progress.ended("babble-arm-0", {"error": "it broke"})

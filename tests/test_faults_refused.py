@@ -6,8 +6,9 @@ import pytest
 from robot_rig import SMALL_FRAMES, RobotRig
 
 from cocoro import topics
-from cocoro.messages import BaseState, PlannerStatus, ServoState, TaskName, TaskReply, TaskRequest, Vec2
+from cocoro.messages import BaseState, PlannerStatus, ServoState, TaskName, TaskReply, TaskRequest
 from cocoro.testing import ServiceUnderTest, in_virtual_time
+from cocoro.units import Vec2
 
 LOW = 0.15
 

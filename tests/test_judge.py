@@ -8,7 +8,8 @@ from math import cos, radians, sin
 import msgspec
 import pytest
 
-from cocoro.messages import TrueObject, Truth, Vec3
+from cocoro.messages import TrueObject, Truth
+from cocoro.units import Vec3
 from sim.judge import Judge
 from sim.scene import Scene, SceneObject
 

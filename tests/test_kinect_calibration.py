@@ -11,10 +11,11 @@ from chessboard import Eyes, Painter, lying
 
 from apps.cli import kinect as command
 from apps.cli.robot_file import write_values
+from cocoro.arrays import FloatArray
 from cocoro.errors import CocoroError, ConfigError
 from cocoro.robot import Robot
 from services.kinect import tools
-from services.kinect.calibration import Array, Board, BoardView, Calibration, calibrate, find_corners
+from services.kinect.calibration import Board, BoardView, Calibration, calibrate, find_corners
 from services.kinect.device import RawFrame
 from services.kinect.lens import Lens, Straightener
 
@@ -31,7 +32,7 @@ CORNER_PX = 0.08
 """What finding a corner is off by."""
 
 
-def held(rng: np.random.Generator) -> tuple[Array, Array]:
+def held(rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
     """A board somewhere in the colour picture, tilted somehow, all of it seen."""
     while True:
         away_m = rng.uniform(0.55, 1.3)
@@ -43,7 +44,7 @@ def held(rng: np.random.Generator) -> tuple[Array, Array]:
             return rotation, origin
 
 
-def corners_of(rotation: Array, origin: Array) -> Array:
+def corners_of(rotation: FloatArray, origin: FloatArray) -> FloatArray:
     return Lens(EYES.colour).pixels(BOARD.points_m.astype(float) @ rotation.T + origin)
 
 

@@ -27,6 +27,7 @@ from services.kinect.freenect import (
     FrameMode,
     FreenectDevice,
     MissingLibraryError,
+    check_recording,
     load,
 )
 from services.kinect.grabber import NS, PERIOD_NS, BufferedImage, DeviceClock, Grabber, Pairer, grab

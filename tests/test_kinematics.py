@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cocoro.kinematics import Array, Chain, Link, turn_z
+from cocoro.arrays import FloatArray
+from cocoro.kinematics import Chain, Link, turn_z
 from cocoro.robot import Robot
 
 ROBOT = Robot.load()
@@ -19,12 +20,12 @@ angle = st.floats(-2.6, 2.6)
 angles_of_all = st.fixed_dictionaries(dict.fromkeys(ROBOT.joints, angle))
 
 
-def turn_x(angle_rad: float) -> Array:
+def turn_x(angle_rad: float) -> FloatArray:
     c, s = cos(angle_rad), sin(angle_rad)
     return np.array([[1, 0, 0, 0], [0, c, -s, 0], [0, s, c, 0], [0, 0, 0, 1]], dtype=float)
 
 
-def shift(x: float, z: float) -> Array:
+def shift(x: float, z: float) -> FloatArray:
     total = np.eye(4)
     total[0, 3], total[2, 3] = x, z
     return total

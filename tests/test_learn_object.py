@@ -8,9 +8,9 @@ import pytest
 from perception_scenes import CATALOGUE, ROBOT, Canvas, Scene, Thing, facing, known
 from test_objects import colours_in_changing_light
 
-from apps.appearance.learn import Learnt, Look, Wanted, learn
+from apps.appearance.learn import LearnedObject, ObjectHints, ObjectView, learn
 from apps.appearance.ranges import overlaps, range_of
-from apps.appearance.region import Picture, at_pixel, in_box, most_salient
+from apps.appearance.region import ColourField, at_pixel, in_box, most_salient
 from cocoro.colour import in_boxes, lab_of
 from cocoro.errors import ConfigError
 from cocoro.messages import Frame
@@ -20,13 +20,13 @@ from cocoro.picture import colour_of
 ORANGE, TEAL = (0.95, 0.45, 0.05), (0.05, 0.60, 0.55)
 
 
-def look_at(frame: Frame, pan: float, tilt: float) -> Look:
+def look_at(frame: Frame, pan: float, tilt: float) -> ObjectView:
     raw_depth = np.frombuffer(frame.depth, dtype="<u2").reshape(frame.height, frame.width)
     pose = ROBOT.chain("camera").pose({"neck_pan": pan, "neck_tilt": tilt})
-    return Look(colour_of(frame), ROBOT, raw_depth, pose)
+    return ObjectView(colour_of(frame), ROBOT, raw_depth, pose)
 
 
-def rendered(*things: Thing, sensors: str = "real", size: tuple[int, int] = (640, 480)) -> Look:
+def rendered(*things: Thing, sensors: str = "real", size: tuple[int, int] = (640, 480)) -> ObjectView:
     """The first thing in the middle of what a real camera sees."""
     pan, tilt = facing(things[0])
     with Scene(list(things), sensors=sensors, width=size[0], height=size[1]) as scene:  # type: ignore[arg-type]
@@ -40,17 +40,17 @@ def can(
 
 
 @pytest.fixture(scope="module")
-def orange() -> Learnt:
+def orange() -> LearnedObject:
     """An orange can between known things, as a real camera sees it."""
     return learn(
         rendered(can(ORANGE, 1.2, 0.1), known("green_can", 1.5, -0.35), known("yellow_ball", 1.4, 0.5)),
-        Wanted("orange_can"),
+        ObjectHints("orange_can"),
         CATALOGUE,
     )
 
 
 @pytest.mark.sim
-def test_a_new_can_in_the_middle_is_found_and_measured(orange: Learnt) -> None:
+def test_a_new_can_in_the_middle_is_found_and_measured(orange: LearnedObject) -> None:
     assert orange.known.shape == "cylinder"
     assert orange.known.radius_m == pytest.approx(0.030, abs=0.002)
     assert orange.known.height_m == pytest.approx(0.110, abs=0.004)
@@ -61,7 +61,7 @@ def test_a_new_can_in_the_middle_is_found_and_measured(orange: Learnt) -> None:
 
 
 @pytest.mark.sim
-def test_its_colours_hold_in_changing_light_and_are_not_those_of_rooms_and_robots(orange: Learnt) -> None:
+def test_its_colours_hold_in_changing_light_and_are_not_those_of_rooms_and_robots(orange: LearnedObject) -> None:
     own = lab_of(colours_in_changing_light(ORANGE))
     assert in_boxes(orange.range.boxes, own).mean() > 0.95
     for rgb in ((0.5, 0.49, 0.47), (0.7, 0.7, 0.69), (0.13, 0.13, 0.14), (0.45, 0.45, 0.46), (0.95, 0.95, 0.95)):
@@ -75,7 +75,7 @@ def test_its_colours_hold_in_changing_light_and_are_not_those_of_rooms_and_robot
 @pytest.mark.parametrize("size", [(640, 480), (320, 240)], ids=str)
 def test_a_ball_is_told_from_a_can_and_measured(size: tuple[int, int]) -> None:
     ball = Thing("new", "sphere", (0.045,), TEAL, (1.1, 0.0, 0.045))
-    learnt = learn(rendered(ball, size=size), Wanted("teal_ball"), CATALOGUE)
+    learnt = learn(rendered(ball, size=size), ObjectHints("teal_ball"), CATALOGUE)
     assert learnt.known.shape == "sphere"
     assert learnt.known.radius_m == pytest.approx(0.045, abs=0.003)
     assert not learnt.known.graspable  # the claws do not open so far
@@ -88,13 +88,13 @@ Patch = tuple[tuple[int, int, int, int], tuple[int, int, int]]
 """(left, top, right, bottom), and the colour."""
 
 
-def painted(*patches: Patch) -> Picture:
+def painted(*patches: Patch) -> ColourField:
     """Patches of a colour on noisy grey."""
     colour = np.full((240, 320, 3), 120, dtype=np.uint8)
     noise = np.random.default_rng(1).normal(0, 3, colour.shape)
     for (left, top, right, bottom), rgb in patches:
         colour[top:bottom, left:right] = rgb
-    return Picture(np.clip(colour + noise, 0, 255).astype(np.uint8))
+    return ColourField(np.clip(colour + noise, 0, 255).astype(np.uint8))
 
 
 RED_LEFT = ((60, 100, 90, 150), (200, 30, 30))
@@ -139,7 +139,7 @@ def test_shading_does_not_split_a_thing() -> None:
     colour = np.full((240, 320, 3), 120, dtype=np.uint8)
     light = np.linspace(0.35, 1.0, 60)[None, :, None]
     colour[80:160, 130:190] = np.rint(np.array([40, 60, 220]) * light).astype(np.uint8)
-    assert near(at_pixel(Picture(colour), 180, 120).box, (130, 80, 190, 160))
+    assert near(at_pixel(ColourField(colour), 180, 120).box, (130, 80, 190, 160))
 
 
 @pytest.mark.parametrize(
@@ -197,7 +197,7 @@ def test_what_is_dark_has_no_colour() -> None:
         range_of(np.full((500, 3), 2, dtype=np.uint8))
 
 
-def look_of(canvas: Canvas) -> Look:
+def look_of(canvas: Canvas) -> ObjectView:
     return look_at(canvas.frame(), 0.0, 0.0)
 
 
@@ -210,26 +210,26 @@ def canvas_with(rgb: tuple[int, int, int], depth_m: float | None = 1.0) -> Canva
 
 
 def test_warnings_tell_of_grey_of_known_colours_and_of_other_places_of_that_colour() -> None:
-    grey = learn(look_of(canvas_with((230, 230, 232))), Wanted("paper", at_px=(160, 120)), CATALOGUE)
+    grey = learn(look_of(canvas_with((230, 230, 232))), ObjectHints("paper", at_px=(160, 120)), CATALOGUE)
     assert any("nearly grey" in warning for warning in grey.warnings)
 
     red = canvas_with((200, 12, 14))
     red.colour[25:45, 25:45] = (200, 12, 14)
-    learnt = learn(look_of(red), Wanted("cup", at_px=(160, 120)), CATALOGUE)
+    learnt = learn(look_of(red), ObjectHints("cup", at_px=(160, 120)), CATALOGUE)
     assert learnt.elsewhere == 1
     assert any(warning.startswith("red_can has colours in common with it") for warning in learnt.warnings)
     assert any("one more place in this picture has its colour" in warning for warning in learnt.warnings)
 
 
 def test_relearning_an_object_is_not_warned_of_itself() -> None:
-    learnt = learn(look_of(canvas_with((200, 12, 14))), Wanted("red_can", at_px=(160, 120)), CATALOGUE)
+    learnt = learn(look_of(canvas_with((200, 12, 14))), ObjectHints("red_can", at_px=(160, 120)), CATALOGUE)
     assert "red_can" not in {overlap.label for overlap in learnt.overlaps}
 
 
 def test_a_thing_cut_by_the_pictures_edge_is_said_to_be() -> None:
     canvas = Canvas(320, 240)
     canvas.colour[200:240, 150:170] = (20, 150, 140)
-    learnt = learn(look_of(canvas), Wanted("cup", size_m=(0.06, 0.1)), CATALOGUE)
+    learnt = learn(look_of(canvas), ObjectHints("cup", size_m=(0.06, 0.1)), CATALOGUE)
     assert any("touches the picture's edge" in warning for warning in learnt.warnings)
 
 
@@ -238,18 +238,18 @@ def test_a_thing_cut_by_the_pictures_edge_is_said_to_be() -> None:
 
 def test_the_size_that_is_said_counts_and_says_the_shape() -> None:
     look = look_of(canvas_with((20, 150, 140), depth_m=None))
-    cup = learn(look, Wanted("cup", size_m=(0.08, 0.1)), CATALOGUE).known
+    cup = learn(look, ObjectHints("cup", size_m=(0.08, 0.1)), CATALOGUE).known
     assert (cup.shape, cup.radius_m, cup.height_m, cup.graspable) == ("cylinder", 0.04, 0.1, False)
-    ball = learn(look, Wanted("ball", size_m=(0.05,)), CATALOGUE).known
+    ball = learn(look, ObjectHints("ball", size_m=(0.05,)), CATALOGUE).known
     assert (ball.shape, ball.radius_m, ball.height_m) == ("sphere", 0.025, None)
-    box = learn(look, Wanted("box", size_m=(0.2, 0.05, 0.1), graspable=False, mass_kg=0.4), CATALOGUE).known
+    box = learn(look, ObjectHints("box", size_m=(0.2, 0.05, 0.1), graspable=False, mass_kg=0.4), CATALOGUE).known
     assert (box.shape, box.box_m, box.graspable, box.mass_kg) == ("box", (0.2, 0.05, 0.1), False, 0.4)
 
 
 def test_a_distance_that_is_said_stands_in_for_depth() -> None:
     look = look_of(canvas_with((20, 150, 140)))
-    picture = Look(look.colour, ROBOT)
-    learnt = learn(picture, Wanted("cup", distance_m=1.0), CATALOGUE)
+    picture = ObjectView(look.colour, ROBOT)
+    learnt = learn(picture, ObjectHints("cup", distance_m=1.0), CATALOGUE)
     assert learnt.known.radius_m == pytest.approx(0.03, abs=0.002)
     assert learnt.known.height_m == pytest.approx(0.10, abs=0.005)
     assert any("taken to look level" in warning for warning in learnt.warnings)
@@ -258,19 +258,19 @@ def test_a_distance_that_is_said_stands_in_for_depth() -> None:
 @pytest.mark.parametrize(
     ("wanted", "picture", "complaint"),
     [
-        (Wanted("cup"), True, "--size 0.066x0.12"),
-        (Wanted("cup"), False, "no depth where the object is"),
-        (Wanted("cup", shape="sphere", size_m=(0.1, 0.2)), False, "a sphere has 1 sizes, not 2"),
+        (ObjectHints("cup"), True, "--size 0.066x0.12"),
+        (ObjectHints("cup"), False, "no depth where the object is"),
+        (ObjectHints("cup", shape="sphere", size_m=(0.1, 0.2)), False, "a sphere has 1 sizes, not 2"),
     ],
 )
-def test_a_size_that_nobody_knows_is_asked_for(wanted: Wanted, picture: bool, complaint: str) -> None:
+def test_a_size_that_nobody_knows_is_asked_for(wanted: ObjectHints, picture: bool, complaint: str) -> None:
     look = look_of(canvas_with((20, 150, 140), depth_m=None))
     with pytest.raises(ConfigError, match=complaint):
-        learn(Look(look.colour, ROBOT) if picture else look, wanted, CATALOGUE)
+        learn(ObjectView(look.colour, ROBOT) if picture else look, wanted, CATALOGUE)
 
 
 def test_there_are_no_more_objects_than_can_be_told_apart() -> None:
     ball = CATALOGUE["yellow_ball"]
     many = Catalogue(tuple(msgspec.structs.replace(ball, label=f"ball_{number}") for number in range(32)))
     with pytest.raises(ConfigError, match="32 known objects already"):
-        learn(look_of(canvas_with((20, 150, 140))), Wanted("cup"), many)
+        learn(look_of(canvas_with((20, 150, 140))), ObjectHints("cup"), many)

@@ -7,8 +7,9 @@ import pytest
 
 from cocoro.learning.camera_tilt import LEAST_TRIALS, CameraTilt, eye_tilt
 from cocoro.learning.dataset import WheelRow
-from cocoro.messages import Obstacles, Vec3
+from cocoro.messages import Obstacles
 from cocoro.robot import Robot
+from cocoro.units import Vec3
 from services.planning.config import Config
 from services.planning.state_estimator import StateEstimator
 

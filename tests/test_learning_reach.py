@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cocoro.kinematics import Array
+from cocoro.arrays import FloatArray
 from cocoro.learning.reachability import Reach, ReachMesh
 
 
-def shell(count: int, seed: int = 0, inner_m: float = 0.25, outer_m: float = 0.5) -> Array:
+def shell(count: int, seed: int = 0, inner_m: float = 0.25, outer_m: float = 0.5) -> FloatArray:
     """Places evenly within a thick shell about the origin: a workspace with a hollow in the middle."""
     rng = np.random.default_rng(seed)
     directions = rng.normal(size=(count, 3))
@@ -74,7 +74,7 @@ def test_one_by_one_the_answers_are_those_of_the_batch() -> None:
     ],
     ids=["none", "one", "three", "a plane"],
 )
-def test_too_little_proves_nothing(places: Array) -> None:
+def test_too_little_proves_nothing(places: FloatArray) -> None:
     mesh = ReachMesh(places)
     assert mesh.verdict((0.3, 0.3, 0.0)) is Reach.OUTSIDE
     assert mesh.volume_m3() == 0.0

@@ -11,7 +11,7 @@ from arm_shape import ArmShape
 from hypothesis import Phase, example, given, settings
 from hypothesis import strategies as st
 
-from cocoro.kinematics import Array
+from cocoro.arrays import FloatArray
 from cocoro.robot import Robot
 from services.planning.arm import ROLL, ArmController, Step
 from services.planning.clearance import Clearance
@@ -45,7 +45,7 @@ anywhere = st.builds(
 )
 
 
-def within_limits(angles: Array) -> bool:
+def within_limits(angles: FloatArray) -> bool:
     limits = np.array([ROBOT.joints[name].limits_rad for name in ARM])
     return bool(((angles >= limits[:, 0] - 1e-9) & (angles <= limits[:, 1] + 1e-9)).all())
 

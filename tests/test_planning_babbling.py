@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from cocoro import topics
+from cocoro.arrays import FloatArray
 from cocoro.clock import NS
 from cocoro.core import Output, Sample
-from cocoro.kinematics import Array
 from cocoro.learning.nominal_model import NominalModel
 from cocoro.messages import (
     BaseCommand,
@@ -43,7 +43,7 @@ def postures(robot: Robot) -> Postures:
 
 
 @pytest.fixture(scope="module")
-def safe(postures: Postures) -> list[Array]:
+def safe(postures: Postures) -> list[FloatArray]:
     draws = islice(sobol(1, postures.ranges), 400)
     return [posture for _, posture in draws if postures.safe(posture)]
 
@@ -71,7 +71,7 @@ def test_draws_lie_within_the_papers_range_and_the_joints_limits(postures: Postu
 
 
 def test_about_a_quarter_of_the_draws_is_safe_and_about_half_of_those_can_be_seen(
-    postures: Postures, safe: list[Array]
+    postures: Postures, safe: list[FloatArray]
 ) -> None:
     assert 0.15 < len(safe) / 400 < 0.35
     assert 0.35 < np.mean([postures.seeable(posture) for posture in safe]) < 0.75
@@ -97,7 +97,9 @@ def test_between_two_safe_postures_the_straight_way_may_not_be_clear(postures: P
 # --- back to work from anywhere ----------------------------------------------------------------------
 
 
-def test_from_wherever_babbling_ended_the_arm_gets_ready_and_is_folded_again(robot: Robot, safe: list[Array]) -> None:
+def test_from_wherever_babbling_ended_the_arm_gets_ready_and_is_folded_again(
+    robot: Robot, safe: list[FloatArray]
+) -> None:
     goal = HandPose(CONFIG.arm.travel_radius_m, 0.0, CONFIG.arm.travel_height_m, CONFIG.arm.pitch_rad)
     for posture in safe[::4]:
         for park in (False, True):

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from cocoro.arrays import FloatArray
 from cocoro.clock import NS
 from cocoro.frames import Pose2
-from cocoro.kinematics import Array
 from cocoro.messages import TargetEstimate
 from services.planning.config import Memory
 from services.planning.memory import TargetMemory
@@ -23,7 +23,7 @@ FRAME_S = 1 / 30
 
 def feed(
     memory: TargetMemory,
-    places: list[Array],
+    places: list[FloatArray],
     start_s: float = 0.0,
     period_s: float = FRAME_S,
     doubtful: bool = False,
@@ -42,7 +42,7 @@ def believed(memory: TargetMemory, at_s: float, body: Pose2 = HERE) -> TargetEst
     return estimate
 
 
-def noisy(place: Array, count: int, sigma_m: float, seed: int = 0) -> list[Array]:
+def noisy(place: FloatArray, count: int, sigma_m: float, seed: int = 0) -> list[FloatArray]:
     return list(place + np.random.default_rng(seed).normal(0.0, sigma_m, (count, 3)))
 
 

@@ -11,8 +11,8 @@ from learning_arm import sightings
 from apps.learning.study import BEST, fit
 from apps.rehearsal.rehearse import rehearse
 from apps.rehearsal.request import RehearsalRequest
+from cocoro.arrays import FloatArray
 from cocoro.clock import NS
-from cocoro.kinematics import Array
 from cocoro.learning.model import Training, arm_model, empty, encode
 from cocoro.learning.nominal_model import NominalModel
 from cocoro.learning.reachability import ReachMesh
@@ -111,15 +111,15 @@ class LongerHand:
         self._drawn = robot.chain("pad_centre")
         self._more_m = more_m
 
-    def pose(self, angles: Mapping[str, float]) -> Array:
+    def pose(self, angles: Mapping[str, float]) -> FloatArray:
         pose = self._drawn.pose(angles)
         pose[:3, 3] += self._more_m * pose[:3, 2]
         return pose
 
-    def position(self, angles: Mapping[str, float]) -> Array:
+    def position(self, angles: Mapping[str, float]) -> FloatArray:
         return np.asarray(self.pose(angles)[:3, 3])
 
-    def jacobian(self, angles: Mapping[str, float], joints: Iterable[str]) -> Array:
+    def jacobian(self, angles: Mapping[str, float], joints: Iterable[str]) -> FloatArray:
         return self._drawn.jacobian(angles, joints)
 
 

@@ -22,7 +22,7 @@ from pictures import (
     reddish,
 )
 
-from cocoro.kinematics import Array
+from cocoro.arrays import FloatArray
 from cocoro.objects import Catalogue
 from sim.camera import moved
 from sim.render import Images, Renderer, make_renderer
@@ -184,7 +184,7 @@ def test_nothing_in_the_room_has_the_colour_of_a_known_object() -> None:
                 assert not any(((low <= lab) & (lab <= high)).all() for low, high in boxes), (grey, lab)
 
 
-def to_lab(rgb: Array) -> Array:
+def to_lab(rgb: FloatArray) -> FloatArray:
 
-    pixel: Array = cv2.cvtColor(rgb.astype(np.float32).reshape(1, 1, 3), cv2.COLOR_RGB2LAB)[0, 0].astype(float)
+    pixel: FloatArray = cv2.cvtColor(rgb.astype(np.float32).reshape(1, 1, 3), cv2.COLOR_RGB2LAB)[0, 0].astype(float)
     return pixel

@@ -9,7 +9,7 @@ import pytest
 from pictures import CAMERA, ROBOT, Lamp, profile, stripe
 from scipy.spatial.transform import Rotation
 
-from cocoro.kinematics import Array
+from cocoro.arrays import FloatArray
 from sim.camera import COLOUR_SIGMA, EXPOSURE_S
 from sim.render import make_renderer
 from sim.render.interface import Visual
@@ -112,7 +112,7 @@ def test_the_blur_is_what_the_renderer_would_have_seen_over_the_exposure() -> No
     angles = dict.fromkeys(ROBOT.joints, 0.0) | {"neck_tilt": -0.45}
     middle = ROBOT.chain("camera").pose(angles)
 
-    def turned(share: float) -> Array:
+    def turned(share: float) -> FloatArray:
         pose = middle.copy()
         pose[:3, :3] = middle[:3, :3] @ Rotation.from_rotvec(share * np.array([0.01, 0.05, 0.01])).as_matrix()
         return pose

@@ -17,9 +17,9 @@ from rich.console import Console
 
 from apps.cli import top_view
 from apps.cli.foreign import jsonable, lines, read
-from apps.cli.hz import Meter, rows, size_text
+from apps.cli.hz import RateMeter, rows, size_text
 from apps.cli.listening import keyexpr_of, takes_frames
-from apps.cli.logs import Tail, entries, files_of, robot_of
+from apps.cli.logs import LogTail, entries, files_of, robot_of
 from apps.cli.main import main
 from cocoro.errors import ConfigError
 from cocoro.messages import BaseCommand
@@ -130,7 +130,7 @@ def test_fields_stand_in_lines_and_long_lists_are_cut_unless_all_is_wanted() -> 
 
 
 def test_rate_jitter_and_data_are_of_the_window() -> None:
-    meter = Meter("calliope/base/command", 50.0, window_s=1.0)
+    meter = RateMeter("calliope/base/command", 50.0, window_s=1.0)
     for number in range(301):
         late_s = 0.002 if number % 2 else 0.0
         message = BaseCommand(left_mps=0, right_mps=0, seq=number, incarnation=1, stamp_ns=1 + number * 40_000_000)
@@ -148,7 +148,7 @@ def test_rate_jitter_and_data_are_of_the_window() -> None:
 
 
 def test_a_key_that_stops_loses_its_rate_and_is_said_to_be_silent() -> None:
-    meter = Meter("calliope/base/command", 50.0, window_s=2.0)
+    meter = RateMeter("calliope/base/command", 50.0, window_s=2.0)
     for number in range(50):
         meter.hear(command(), number * 0.02)
     lively, stopped = meter.report(1.0), meter.report(1.9)
@@ -161,7 +161,7 @@ def test_a_key_that_stops_loses_its_rate_and_is_said_to_be_silent() -> None:
 
 
 def test_gaps_in_the_sequence_are_losses_and_a_restart_is_none() -> None:
-    meter = Meter("calliope/base/command", None, window_s=5.0)
+    meter = RateMeter("calliope/base/command", None, window_s=5.0)
     for at_s, (incarnation, seq) in enumerate([(1, 5), (1, 6), (1, 9), (2, 0), (2, 2)]):
         message = BaseCommand(left_mps=0, right_mps=0, seq=seq, incarnation=incarnation)
         meter.hear(msgspec.msgpack.encode(message), float(at_s))
@@ -171,7 +171,7 @@ def test_gaps_in_the_sequence_are_losses_and_a_restart_is_none() -> None:
 
 
 def test_a_number_that_cannot_be_traffic_is_no_loss() -> None:
-    meter = Meter("calliope/base/command", 50.0, window_s=5.0)
+    meter = RateMeter("calliope/base/command", 50.0, window_s=5.0)
     for number, seq in enumerate([5, 6, 2**62, 7, 9]):
         message = BaseCommand(left_mps=0, right_mps=0, seq=seq, incarnation=1, stamp_ns=number * 20_000_000)
         meter.hear(msgspec.msgpack.encode(message), number * 0.02)
@@ -181,7 +181,7 @@ def test_a_number_that_cannot_be_traffic_is_no_loss() -> None:
 
 
 def test_what_is_no_message_of_ours_has_a_rate_all_the_same() -> None:
-    meter = Meter("calliope/somebody/else", None, window_s=5.0)
+    meter = RateMeter("calliope/somebody/else", None, window_s=5.0)
     assert meter.report(0.0) is None
     meter.hear(b"hello", 0.0)
     meter.hear(b"hello", 0.5)
@@ -281,7 +281,7 @@ def test_a_crash_that_python_itself_tells_of_counts_as_grave() -> None:
 
 def test_a_tail_reads_whole_lines_and_goes_on_in_the_file_that_takes_the_logs_place(tmp_path: Path) -> None:
     path = tmp_path / "sim.log"
-    tail = Tail(path)
+    tail = LogTail(path)
     assert tail.read() == []
     path.write_text("2026-01-01T10:00:01.000 INFO    sim: up\n2026-01-01T10:00:02.000 INF")
     assert [entry.lines for entry in tail.read()] == [("2026-01-01T10:00:01.000 INFO    sim: up",)]

@@ -16,7 +16,7 @@ import pytest
 from operator_shell import Shell
 
 from apps.cli import echo, exits, hz, top
-from apps.cli.link import Where
+from apps.cli.options import RobotChoice
 from cocoro.bus.base import Qos
 from cocoro.bus.endpoints import default
 from cocoro.bus.zenoh import ZenohBus
@@ -29,7 +29,7 @@ from deploy.rundir import RunDir
 
 pytestmark = pytest.mark.zenoh
 
-ANY = Where()
+ANY = RobotChoice()
 
 
 @asynccontextmanager

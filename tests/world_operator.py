@@ -7,7 +7,7 @@ from math import asin, atan2, cos, pi, radians
 
 import numpy as np
 
-from cocoro.kinematics import Array
+from cocoro.arrays import FloatArray
 from cocoro.messages import BaseCommand, ServoCommand, TrueObject, Truth
 from cocoro.robot import Robot
 from sim.judge import Judge
@@ -66,7 +66,7 @@ class Operator:
                     self.judge.feed(truth)
 
     def reach(
-        self, start_m: Array, end_m: Array, pitch_rad: float, seconds: float, arm: Mapping[str, float]
+        self, start_m: FloatArray, end_m: FloatArray, pitch_rad: float, seconds: float, arm: Mapping[str, float]
     ) -> dict[str, float]:
         """Carry the pad centre along a line; returns the arm's angles at its end."""
         angles = dict(arm)
@@ -77,7 +77,7 @@ class Operator:
         return angles
 
 
-def arm_angles(target_m: Array, pitch_rad: float, start: Mapping[str, float]) -> dict[str, float]:
+def arm_angles(target_m: FloatArray, pitch_rad: float, start: Mapping[str, float]) -> dict[str, float]:
     """Damped least squares: arm angles that bring the pad centre to a point of the body frame, the roll axis
     pitched so (up positive), the claws level."""
     chain = ROBOT.chain("pad_centre")

@@ -7,14 +7,13 @@ from math import pi
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from apps.appearance.ranges import NEARLY_GREY, Overlap, Range, overlaps, range_of
-from apps.appearance.region import Box, Picture, Region, at_pixel, in_box, most_salient
-from apps.appearance.size import Shape, Size, guessed_shape, size_of, surface_depth_m
-from cocoro.colour import Bools, Pixels, in_boxes, lab_of, matches
+from apps.appearance.ranges import NEARLY_GREY, ColourOverlap, ColourRange, overlaps, range_of
+from apps.appearance.region import ColourField, ObjectRegion, PixelBox, at_pixel, in_box, most_salient
+from apps.appearance.size import MeasuredSize, ObjectShape, guessed_shape, size_of, surface_depth_m
+from cocoro.arrays import BoolArray, CodeArray, FloatArray, ImageArray
+from cocoro.colour import in_boxes, lab_of, matches
 from cocoro.errors import ConfigError
-from cocoro.kinematics import Array
 from cocoro.objects import Catalogue, KnownObject
 from cocoro.robot import Robot
 
@@ -25,33 +24,33 @@ FEW_PX = 600.0
 """Of 640 x 480: with fewer pixels the size is off by more than a few per cent."""
 ELSEWHERE_PX = 32.0
 """Of 640 x 480: a smaller blob of the new colour elsewhere is passed over by the detector."""
-SIZES: dict[Shape, int] = {"sphere": 1, "cylinder": 2, "box": 3}
+SIZES: dict[ObjectShape, int] = {"sphere": 1, "cylinder": 2, "box": 3}
 """How many lengths a shape has, as the person gives them."""
 MAX_OBJECTS = 32
 """As many as the detector's colour table holds."""
 
 
 @dataclass(frozen=True)
-class Look:
+class ObjectView:
     """One look at the object."""
 
-    colour: Pixels
+    colour: ImageArray
     """RGB, (height, width, 3)."""
     robot: Robot
-    raw_depth: NDArray[np.uint16] | None = None
+    raw_depth: CodeArray | None = None
     """The depth camera's own view, (height, width); None for a mere picture."""
-    camera_pose: Array | None = None
+    camera_pose: FloatArray | None = None
     """4 x 4, camera frame to body frame; None when nobody knows how the head stood."""
 
 
 @dataclass(frozen=True)
-class Wanted:
+class ObjectHints:
     """What the person says of it."""
 
     label: str
     at_px: tuple[int, int] | None = None
-    box_px: Box | None = None
-    shape: Shape | None = None
+    box_px: PixelBox | None = None
+    shape: ObjectShape | None = None
     size_m: tuple[float, ...] | None = None
     """Sphere: diameter; cylinder: diameter, height; box: x, y, z."""
     distance_m: float | None = None
@@ -61,16 +60,16 @@ class Wanted:
 
 
 @dataclass(frozen=True)
-class Learnt:
+class LearnedObject:
     """What was learnt, and what is to be said of it."""
 
     known: KnownObject
-    region: Region
-    range: Range
-    measured: Size | None
+    region: ObjectRegion
+    range: ColourRange
+    measured: MeasuredSize | None
     """None when the person gave the size."""
-    overlaps: tuple[Overlap, ...]
-    matched: Bools
+    overlaps: tuple[ColourOverlap, ...]
+    matched: BoolArray
     """(height, width): pixels of the picture that have one of its colours, as the detector smooths them."""
     elsewhere: int
     """Blobs of them that are not the object."""
@@ -82,12 +81,12 @@ class Learnt:
         return float(self.matched[self.region.mask > 0].mean())
 
 
-def learn(look: Look, wanted: Wanted, catalogue: Catalogue) -> Learnt:
+def learn(look: ObjectView, wanted: ObjectHints, catalogue: Catalogue) -> LearnedObject:
     """Raises ConfigError when there is no object to be told in the picture, or its size is not known."""
     others = [known for known in catalogue if known.label != wanted.label]
     if len(others) >= MAX_OBJECTS:
         raise ConfigError(f"there are {len(others)} known objects already, {MAX_OBJECTS} is all that can be told apart")
-    picture = Picture(look.colour)
+    picture = ColourField(look.colour)
     region = _region(picture, wanted, others)
     smooth = np.asarray(cv2.blur(np.ascontiguousarray(look.colour), (3, 3)), dtype=np.uint8)
     found = range_of(smooth[region.coloured], others)
@@ -106,10 +105,10 @@ def learn(look: Look, wanted: Wanted, catalogue: Catalogue) -> Learnt:
         *(["the camera is taken to look level: say --size if it did not"]
           if measured is not None and look.camera_pose is None and shape != "sphere" else []),
     ]  # fmt: skip
-    return Learnt(known, region, found, measured, common, matched, elsewhere, tuple(warnings))
+    return LearnedObject(known, region, found, measured, common, matched, elsewhere, tuple(warnings))
 
 
-def _region(picture: Picture, wanted: Wanted, others: list[KnownObject]) -> Region:
+def _region(picture: ColourField, wanted: ObjectHints, others: list[KnownObject]) -> ObjectRegion:
     if wanted.at_px is not None:
         return at_pixel(picture, *wanted.at_px)
     if wanted.box_px is not None:
@@ -123,12 +122,12 @@ def _region(picture: Picture, wanted: Wanted, others: list[KnownObject]) -> Regi
 # --- its size -------------------------------------------------------------------------------------
 
 
-def _shape_of(size_m: tuple[float, ...] | None) -> Shape | None:
+def _shape_of(size_m: tuple[float, ...] | None) -> ObjectShape | None:
     """The shape that has as many sizes as are given."""
     return None if size_m is None else next(shape for shape, sizes in SIZES.items() if sizes == len(size_m))
 
 
-def _measured(look: Look, wanted: Wanted, region: Region, shape: Shape) -> Size:
+def _measured(look: ObjectView, wanted: ObjectHints, region: ObjectRegion, shape: ObjectShape) -> MeasuredSize:
     depth_m = wanted.distance_m
     if depth_m is None and look.raw_depth is None:
         raise ConfigError(
@@ -146,7 +145,7 @@ def _measured(look: Look, wanted: Wanted, region: Region, shape: Shape) -> Size:
     return size_of(region, camera, depth_m, shape, look.camera_pose)
 
 
-def _row(wanted: Wanted, shape: Shape, measured: Size | None, found: Range) -> KnownObject:
+def _row(wanted: ObjectHints, shape: ObjectShape, measured: MeasuredSize | None, found: ColourRange) -> KnownObject:
     if wanted.size_m is not None:
         sizes = wanted.size_m
         if _shape_of(sizes) != shape:
@@ -178,7 +177,7 @@ def _row(wanted: Wanted, shape: Shape, measured: Size | None, found: Range) -> K
 # --- what is to be said ---------------------------------------------------------------------------
 
 
-def _blobs_beside(matched: Bools, region: Region, scale: float) -> int:
+def _blobs_beside(matched: BoolArray, region: ObjectRegion, scale: float) -> int:
     near = np.asarray(cv2.dilate(region.mask, np.ones((7, 7), dtype=np.uint8)))
     beside = (matched & (near == 0)).astype(np.uint8)
     opened = cv2.morphologyEx(beside, cv2.MORPH_OPEN, np.ones((3, 3), dtype=np.uint8))
@@ -186,7 +185,7 @@ def _blobs_beside(matched: Bools, region: Region, scale: float) -> int:
     return int(np.count_nonzero(stats[1:, cv2.CC_STAT_AREA] >= ELSEWHERE_PX * scale**2))
 
 
-def _colour_warnings(found: Range, common: tuple[Overlap, ...], elsewhere: int) -> list[str]:
+def _colour_warnings(found: ColourRange, common: tuple[ColourOverlap, ...], elsewhere: int) -> list[str]:
     told = []
     if found.chromaticity < NEARLY_GREY:
         told.append("its colour is nearly grey, as walls, floors and the robot itself are: it will be seen everywhere")

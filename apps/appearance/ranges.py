@@ -7,9 +7,9 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cocoro.colour import Lab, Pixels, in_boxes, lab_of
+from cocoro.arrays import Float32Array, ImageArray
+from cocoro.colour import Lab, in_boxes, lab_of
 from cocoro.errors import ConfigError
 from cocoro.objects import KnownObject, LabBox
 
@@ -33,10 +33,10 @@ SHARED = 0.01
 NEARLY_GREY = 8.0
 """Chromaticity below which a colour is that of walls, floors and the robot itself."""
 
-Samples = NDArray[np.uint8]
+ColourSamples = ImageArray
 
 
-class Range(NamedTuple):
+class ColourRange(NamedTuple):
     """The colours of a new object, as a row of the catalogue has them."""
 
     lab: tuple[LabBox, ...]
@@ -51,7 +51,7 @@ class Range(NamedTuple):
         return self.lab + self.lab_by_shape
 
 
-class Overlap(NamedTuple):
+class ColourOverlap(NamedTuple):
     """What a new object and a known one have in common."""
 
     label: str
@@ -61,7 +61,7 @@ class Overlap(NamedTuple):
     """Share of the known one's that would pass for the new object's."""
 
 
-def range_of(pixels: Pixels, known: Iterable[KnownObject] = ()) -> Range:
+def range_of(pixels: ImageArray, known: Iterable[KnownObject] = ()) -> ColourRange:
     """The range that an object has whose pixels (n, 3), RGB, are these. Raises ConfigError when they are too dark."""
     own = _typical(pixels)
     samples = lab_of(in_other_light(own))
@@ -73,7 +73,7 @@ def range_of(pixels: Pixels, known: Iterable[KnownObject] = ()) -> Range:
     if all(shared):  # nothing is its alone: then at least the boxes are told, and the overlap is
         shared = [False] * len(boxes)
     lab = lab_of(own[None])[0]
-    return Range(
+    return ColourRange(
         lab=tuple(box for box, is_shared in zip(boxes, shared, strict=True) if not is_shared),
         lab_by_shape=tuple(box for box, is_shared in zip(boxes, shared, strict=True) if is_shared),
         rgb=_full_light(own),
@@ -82,7 +82,7 @@ def range_of(pixels: Pixels, known: Iterable[KnownObject] = ()) -> Range:
     )
 
 
-def in_other_light(pixels: Pixels) -> Samples:
+def in_other_light(pixels: ImageArray) -> ColourSamples:
     """The pixels (n, 3) as they would be in darker, brighter, warmer and colder light; (m, 3), nothing saturated
     that would not be, as a sensor clips."""
     gains = np.array([[k * (1 + tint), k, k * (1 - tint)] for k in BRIGHTNESS for tint in TINTS])
@@ -90,7 +90,7 @@ def in_other_light(pixels: Pixels) -> Samples:
     return np.asarray(np.clip(np.rint(values), 0, 255), dtype=np.uint8).reshape(-1, 3)
 
 
-def overlaps(found: Range, known: Iterable[KnownObject]) -> list[Overlap]:
+def overlaps(found: ColourRange, known: Iterable[KnownObject]) -> list[ColourOverlap]:
     """With each known object that has any colours in common with it, the most first."""
     common = []
     for other in known:
@@ -100,11 +100,11 @@ def overlaps(found: Range, known: Iterable[KnownObject]) -> list[Overlap]:
         of_new = float(in_boxes(boxes, found.samples).mean())
         of_known = float(in_boxes(found.boxes, theirs).mean()) if len(theirs) else 0.0
         if max(of_new, of_known) > SHARED:
-            common.append(Overlap(other.label, of_new, of_known))
+            common.append(ColourOverlap(other.label, of_new, of_known))
     return sorted(common, key=lambda overlap: -max(overlap.of_new, overlap.of_known))
 
 
-def _typical(pixels: Pixels) -> Pixels:
+def _typical(pixels: ImageArray) -> ImageArray:
     """Some of the pixels, without those that have another colour."""
     chromaticity = _chromaticity(lab_of(pixels[None])[0])
     off = np.linalg.norm(chromaticity - np.median(chromaticity, axis=0), axis=-1)
@@ -113,7 +113,7 @@ def _typical(pixels: Pixels) -> Pixels:
     return np.ascontiguousarray(kept[:: max(len(kept) // MOST_PIXELS, 1)], dtype=np.uint8)
 
 
-def _chromaticity(lab: Lab) -> NDArray[np.float32]:
+def _chromaticity(lab: Lab) -> Float32Array:
     return np.asarray(100 * lab[..., 1:] / (lab[..., :1] + 16), dtype=np.float32)
 
 
@@ -134,7 +134,7 @@ def _is_shared(box: LabBox, samples: Lab, known: Iterable[KnownObject]) -> bool:
     return any(in_boxes(other.lab, inside).mean() > SHARED for other in known)
 
 
-def _full_light(pixels: Pixels) -> tuple[float, float, float]:
+def _full_light(pixels: ImageArray) -> tuple[float, float, float]:
     """The surface's colour as its brightest pixels have it: 0 to 1 a channel."""
     bright = pixels.max(axis=1)
     red, green, blue = (float(value) for value in np.median(pixels[bright >= np.quantile(bright, 0.97)], axis=0) / 255)

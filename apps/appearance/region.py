@@ -10,14 +10,13 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from cocoro.colour import Bools, Lab, Pixels, lab_of
+from cocoro.arrays import BoolArray, Float32Array, FloatArray, ImageArray, IntArray, MaskArray
+from cocoro.colour import Lab, lab_of
 from cocoro.errors import ConfigError
 
-Chroma = NDArray[np.float32]
-Mask = NDArray[np.uint8]
-Box = tuple[int, int, int, int]
+ChromaArray = Float32Array
+PixelBox = tuple[int, int, int, int]
 """left, top, right, bottom in pixels; right and bottom exclusive."""
 
 MIN_AREA_PX = 150.0
@@ -52,36 +51,36 @@ CELL = 4.0
 
 
 @dataclass(frozen=True)
-class Region:
+class ObjectRegion:
     """The object's pixels in one picture."""
 
-    mask: Mask
+    mask: MaskArray
     """(height, width), 1 inside; holes are filled, since a label on a can is a part of the can."""
-    coloured: Bools
+    coloured: BoolArray
     """(height, width): those that have the object's colour, well inside of it."""
-    box: Box
+    box: PixelBox
     area_px: int
     cut: bool
     """It touches the picture's edge, so there may be more of it."""
 
 
-class Picture:
+class ColourField:
     """A picture, made ready for looking for a thing in it."""
 
-    def __init__(self, colour: Pixels) -> None:
+    def __init__(self, colour: ImageArray) -> None:
         """`colour`: RGB, (height, width, 3)."""
         self.height, self.width = colour.shape[:2]
         self.scale = float(np.sqrt(self.width * self.height / (640 * 480)))
         kernel = 5 if self.scale > 0.75 else 3
         self.lab: Lab = lab_of(np.asarray(cv2.medianBlur(np.ascontiguousarray(colour), kernel), dtype=np.uint8))
         light = self.lab[..., :1] + np.float32(16)
-        self.chroma: Chroma = np.float32(100) * self.lab[..., 1:] / light
+        self.chroma: ChromaArray = np.float32(100) * self.lab[..., 1:] / light
         self.doubt = np.maximum(np.float32(66) / light[..., 0], np.float32(1))
         """How much more noise there is in a pixel's chromaticity than in one of a middling lightness."""
-        self.lit: Bools = self.lab[..., 0] >= DARKEST_L
+        self.lit: BoolArray = self.lab[..., 0] >= DARKEST_L
 
 
-def at_pixel(picture: Picture, u_px: int, v_px: int) -> Region:
+def at_pixel(picture: ColourField, u_px: int, v_px: int) -> ObjectRegion:
     """The object that the pixel (u right, v down) is of. Raises ConfigError when there is none to be told there."""
     if not (0 <= u_px < picture.width and 0 <= v_px < picture.height):
         raise ConfigError(f"--at {u_px},{v_px} is outside of the picture, which has {picture.width} x {picture.height}")
@@ -95,7 +94,7 @@ def at_pixel(picture: Picture, u_px: int, v_px: int) -> Region:
     return _checked(picture, _grown(picture, seed), f"around {u_px},{v_px}")
 
 
-def in_box(picture: Picture, box: Box) -> Region:
+def in_box(picture: ColourField, box: PixelBox) -> ObjectRegion:
     """The object that fills most of a box: of what is in it and is not around it, the most frequent colour.
 
     Raises ConfigError when nothing in it stands out.
@@ -119,7 +118,7 @@ def in_box(picture: Picture, box: Box) -> Region:
     return _checked(picture, _grown(picture, seed & picture.lit, inside), "in the box")
 
 
-def most_salient(picture: Picture, known: Bools | None = None) -> Region:
+def most_salient(picture: ColourField, known: BoolArray | None = None) -> ObjectRegion:
     """The uniform blob that stands out most, near the picture's middle and, if possible, no known object (`known`,
     (height, width), is where their colours are). Raises ConfigError when nothing stands out."""
     rim = np.ones((picture.height, picture.width), dtype=np.bool_)
@@ -127,7 +126,7 @@ def most_salient(picture: Picture, known: Bools | None = None) -> Region:
     rim[edge[1] : -edge[1], edge[0] : -edge[0]] = False
     difference = _difference_from(picture, rim & picture.lit)
     candidates = np.asarray((difference > STANDS_OUT * picture.doubt) & picture.lit)
-    best: tuple[float, Bools] | None = None
+    best: tuple[float, BoolArray] | None = None
     for blob, middle in _blobs(candidates, picture):
         region = _grown(picture, blob)
         if region is None or region.area_px > MAX_SHARE * rim.size:
@@ -150,7 +149,7 @@ def most_salient(picture: Picture, known: Bools | None = None) -> Region:
 # --- growing --------------------------------------------------------------------------------------
 
 
-def _grown(picture: Picture, seed: Bools, within: Bools | None = None) -> Region | None:
+def _grown(picture: ColourField, seed: BoolArray, within: BoolArray | None = None) -> ObjectRegion | None:
     """All connected pixels that have the seed's colour; None when hardly any are left."""
     centre = np.median(picture.chroma[seed], axis=0)
     lightness = float(np.median(picture.lab[..., 0][seed]))
@@ -158,7 +157,7 @@ def _grown(picture: Picture, seed: Bools, within: Bools | None = None) -> Region
     grey = float(np.linalg.norm(centre)) < GREY
     lightness_like = np.abs(picture.lab[..., 0] - lightness) < GREY_LIGHTNESS
 
-    def part(tolerance: float) -> tuple[Bools, Mask | None]:
+    def part(tolerance: float) -> tuple[BoolArray, MaskArray | None]:
         like = (distance < tolerance) & picture.lit
         if grey:
             like &= lightness_like
@@ -178,7 +177,7 @@ def _grown(picture: Picture, seed: Bools, within: Bools | None = None) -> Region
     left, top, width, height = cv2.boundingRect(mask)
     inner = np.asarray(cv2.erode(mask, np.ones((5, 5), dtype=np.uint8)), dtype=np.bool_) & like
     coloured = inner if np.count_nonzero(inner) >= 30 else np.asarray((mask > 0) & like)
-    return Region(
+    return ObjectRegion(
         mask=mask,
         coloured=coloured,
         box=(left, top, left + width, top + height),
@@ -187,7 +186,7 @@ def _grown(picture: Picture, seed: Bools, within: Bools | None = None) -> Region
     )
 
 
-def _connected(like: Bools, seed: Bools) -> Mask | None:
+def _connected(like: BoolArray, seed: BoolArray) -> MaskArray | None:
     """The connected part that has most of the seed, its holes filled."""
     opened = cv2.morphologyEx(like.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), dtype=np.uint8))
     count, labels = cv2.connectedComponents(np.asarray(opened, dtype=np.uint8), connectivity=4, ltype=cv2.CV_32S)
@@ -200,7 +199,7 @@ def _connected(like: Bools, seed: Bools) -> Mask | None:
     return np.asarray(cv2.drawContours(np.zeros_like(part), outlines, -1, 1, cv2.FILLED), dtype=np.uint8)
 
 
-def _ring(mask: Mask, picture: Picture) -> Bools:
+def _ring(mask: MaskArray, picture: ColourField) -> BoolArray:
     """Just outside of a region, beyond the pixels that are blended with it."""
     near, far = (2 * round(reach * picture.scale) + 1 for reach in (3, 9))
     outer = cv2.dilate(mask, np.ones((far, far), dtype=np.uint8))
@@ -208,7 +207,7 @@ def _ring(mask: Mask, picture: Picture) -> Bools:
     return np.asarray((outer > 0) & (inner == 0), dtype=np.bool_)
 
 
-def _checked(picture: Picture, region: Region | None, where: str) -> Region:
+def _checked(picture: ColourField, region: ObjectRegion | None, where: str) -> ObjectRegion:
     least = MIN_AREA_PX * picture.scale**2
     if region is None or region.area_px < least:
         size = 0 if region is None else region.area_px
@@ -226,27 +225,27 @@ def _checked(picture: Picture, region: Region | None, where: str) -> Region:
 _CELLS = 64
 
 
-def _cells(picture: Picture) -> NDArray[np.int64]:
+def _cells(picture: ColourField) -> IntArray:
     """Each pixel's cell of chromaticities."""
     cell = np.clip(np.rint(picture.chroma / CELL).astype(np.int64) + _CELLS // 2, 0, _CELLS - 1)
     return np.asarray(cell[..., 0] * _CELLS + cell[..., 1])
 
 
-def _counted(picture: Picture, where: Bools) -> NDArray[np.float64]:
+def _counted(picture: ColourField, where: BoolArray) -> FloatArray:
     """The share that each cell has of these pixels, its neighbours counted in."""
     counts = np.bincount(_cells(picture)[where], minlength=_CELLS**2).reshape(_CELLS, _CELLS).astype(np.float32)
     summed = np.asarray(cv2.boxFilter(counts, -1, (3, 3), normalize=False), dtype=np.float64)
     return np.asarray(summed.reshape(-1) / max(int(np.count_nonzero(where)), 1))
 
 
-def _of_cell(picture: Picture, cell: int) -> Bools:
+def _of_cell(picture: ColourField, cell: int) -> BoolArray:
     """Pixels of a cell or next to it."""
     cells = _cells(picture)
     row, column = divmod(cell, _CELLS)
     return (np.abs(cells // _CELLS - row) <= 1) & (np.abs(cells % _CELLS - column) <= 1)
 
 
-def _difference_from(picture: Picture, rim: Bools) -> NDArray[np.float32]:
+def _difference_from(picture: ColourField, rim: BoolArray) -> Float32Array:
     """How far each pixel's colour is from the nearest of those that are frequent along the picture's rim."""
     colours = np.concatenate([picture.chroma, picture.lab[..., :1] / 3], axis=-1)
     samples = np.ascontiguousarray(colours[rim][:: max(np.count_nonzero(rim) // 4000, 1)])
@@ -261,7 +260,7 @@ def _difference_from(picture: Picture, rim: Bools) -> NDArray[np.float32]:
     return np.asarray(np.min(distances, axis=0), dtype=np.float32)
 
 
-def _blobs(candidates: Bools, picture: Picture) -> list[tuple[Bools, tuple[float, float]]]:
+def _blobs(candidates: BoolArray, picture: ColourField) -> list[tuple[BoolArray, tuple[float, float]]]:
     """The largest connected blobs, and their middles: seeds for growing."""
     opened = cv2.morphologyEx(candidates.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), dtype=np.uint8))
     _, labels, stats, middles = cv2.connectedComponentsWithStats(np.asarray(opened, dtype=np.uint8), connectivity=4)

@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from apps.appearance.region import Region
-from cocoro.kinematics import Array
+from apps.appearance.region import ObjectRegion
+from cocoro.arrays import CodeArray, FloatArray
 from cocoro.robot import Camera, Robot
 
-Shape = Literal["cylinder", "sphere", "box"]
+ObjectShape = Literal["cylinder", "sphere", "box"]
 
 MIN_DEPTH_SHARE = 0.3
 """Of the outline's pixels, that must have a depth."""
@@ -23,15 +23,15 @@ ROUND_ASPECT = 0.85
 """Least ratio of a ball's width and height."""
 
 
-class Size(NamedTuple):
-    shape: Shape
+class MeasuredSize(NamedTuple):
+    shape: ObjectShape
     width_m: float
     height_m: float
     distance_m: float
     """From the camera to the object's middle."""
 
 
-def surface_depth_m(raw_depth: NDArray[np.uint16], region: Region, robot: Robot) -> float | None:
+def surface_depth_m(raw_depth: CodeArray, region: ObjectRegion, robot: Robot) -> float | None:
     """Depth of the visible surface along the optical axis, of the colour camera; None when too little of it has any.
 
     The depth camera stands beside the colour camera, so each of its pixels is carried to the colour picture, where the
@@ -56,7 +56,7 @@ def surface_depth_m(raw_depth: NDArray[np.uint16], region: Region, robot: Robot)
     return float(np.median(own))
 
 
-def guessed_shape(region: Region, camera: Camera) -> Shape:
+def guessed_shape(region: ObjectRegion, camera: Camera) -> ObjectShape:
     """A ball when the outline is round, else a cylinder: a box looks like one, and has to be said."""
     left, top, right, bottom = region.box
     across, down = (right - left) / camera.fx, (bottom - top) / camera.fy
@@ -64,7 +64,9 @@ def guessed_shape(region: Region, camera: Camera) -> Shape:
     return "sphere" if fills < ROUND and min(across, down) / max(across, down) > ROUND_ASPECT else "cylinder"
 
 
-def size_of(region: Region, camera: Camera, depth_m: float, shape: Shape, pose: Array | None = None) -> Size:
+def size_of(
+    region: ObjectRegion, camera: Camera, depth_m: float, shape: ObjectShape, pose: FloatArray | None = None
+) -> MeasuredSize:
     """Width and height of the upright object whose visible surface is that far along the optical axis.
 
     The outline is that of its middle, a radius behind the surface. Seen from above at an angle e, a cylinder of height
@@ -81,7 +83,7 @@ def size_of(region: Region, camera: Camera, depth_m: float, shape: Shape, pose: 
     if shape == "sphere":
         angle = 2 * np.sqrt(region.area_px / (pi * camera.fx * camera.fy)) / stretch**1.5
         radius_m = surface_m * np.sin(angle / 2) / (1 - np.sin(angle / 2))
-        return Size(shape, 2 * radius_m, 2 * radius_m, surface_m + radius_m)
+        return MeasuredSize(shape, 2 * radius_m, 2 * radius_m, surface_m + radius_m)
     radius_m = surface_m * across / 2 / (1 - across / 2)
     distance_m = surface_m + radius_m
     sine = 0.0
@@ -89,10 +91,10 @@ def size_of(region: Region, camera: Camera, depth_m: float, shape: Shape, pose: 
         direction = pose[:3, :3] @ ray / stretch
         sine = float(np.clip(-direction[2], 0.0, 0.95))
     height_m = (down * distance_m - 2 * radius_m * sine) / np.sqrt(1 - sine**2)
-    return Size(shape, 2 * float(radius_m), max(float(height_m), 0.01), float(distance_m))
+    return MeasuredSize(shape, 2 * float(radius_m), max(float(height_m), 0.01), float(distance_m))
 
 
-def _width_px(region: Region, shape: Shape) -> float:
+def _width_px(region: ObjectRegion, shape: ObjectShape) -> float:
     """Of an upright thing: the median over the rows of its middle half."""
     left, top, right, bottom = region.box
     quarter = (bottom - top) // 4
@@ -101,11 +103,11 @@ def _width_px(region: Region, shape: Shape) -> float:
     return float(np.median(widths)) if shape != "sphere" and len(widths) else float(right - left)
 
 
-def _angle(a: Array, b: Array) -> float:
+def _angle(a: FloatArray, b: FloatArray) -> float:
     return acos(min(max(float(a @ b / np.linalg.norm(a) / np.linalg.norm(b)), -1.0), 1.0))
 
 
-def outline_of(region: Region) -> list[NDArray[np.int32]]:
+def outline_of(region: ObjectRegion) -> list[NDArray[np.int32]]:
     """The region's outline, as OpenCV draws it."""
     outlines, _ = cv2.findContours(region.mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     return [np.asarray(outline, dtype=np.int32) for outline in outlines]

@@ -8,16 +8,17 @@ from typing import Any
 
 import msgspec
 
+from apps.captures.compare import changes
 from cocoro.capture import mcap
-from cocoro.capture.errors import DamageError
-from cocoro.capture.file import TALLY, KeyTally, tally_names
-from cocoro.capture.keys import MADE_HERE
-from cocoro.capture.pictures import LossyFrame
+from cocoro.capture.conventions import TALLY, KeyTally, tally_names
+from cocoro.capture.former import todays_name
+from cocoro.capture.mcap import DamageError
 from cocoro.capture.reader import Capture
-from cocoro.capture.schema import changes, schema_of
+from cocoro.capture.types import MADE_HERE, LossyFrame, schema_of
 from cocoro.clock import NS
 from cocoro.messages import Message
 from cocoro.topics import RECORDING, topic_named
+from services.capture.file import packed
 
 MESSAGE_HEAD_BYTES = mcap.MESSAGE_HEAD.size
 
@@ -147,7 +148,7 @@ def _told_tallies(capture: Capture) -> dict[int, KeyTally] | None:
         return None
     if (first_ns, last_ns) != (statistics.message_start_time, statistics.message_end_time):
         return None
-    declared = len(mcap.packed(*capture.schemas.values(), *capture.channels.values()))
+    declared = len(packed(*capture.schemas.values(), *capture.channels.values()))
     messages = sum(tally.size_bytes + MESSAGE_HEAD_BYTES * tally.messages for tally in busy)
     return tallies if messages + declared == capture.chunk_bytes else None
 
@@ -217,7 +218,7 @@ def changed_since(capture: Capture, channel: int) -> list[str]:
         return []
     if schema.name == LossyFrame.__name__:
         return []
-    if schema.name != topic.type.__name__:
+    if todays_name(schema.name) != topic.type.__name__:
         return [f"it carries {topic.type.__name__} today"]
     kind: type[Message] = topic.type
     return [change.text for change in changes(schema.data, schema_of(kind).data)]

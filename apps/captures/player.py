@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterator
 
-from cocoro.capture.keys import MADE_HERE
 from cocoro.capture.reader import Capture, Record
+from cocoro.capture.types import MADE_HERE
 from cocoro.clock import NS
 from cocoro.topics import FRAME
 

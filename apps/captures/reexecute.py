@@ -15,12 +15,10 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from apps.captures.compare import difference
+from apps.captures.compare import difference, known_to
 from apps.captures.info import changed_since
-from apps.captures.inputs import Found, Id, Step, steps_of, with_messages
-from apps.captures.origin import Origin, origins
+from apps.captures.recorded import Found, Id, Origin, Step, origins, steps_of, with_messages
 from cocoro.capture.reader import Capture
-from cocoro.capture.schema import known_to
 from cocoro.capture.types import NotReadableError
 from cocoro.clock import NS
 from cocoro.core import Core, Output, Sample

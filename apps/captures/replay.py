@@ -5,20 +5,19 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Iterable
 from contextlib import suppress
+from typing import Any
 
 import msgspec
 
 from apps.captures.player import Player
-from apps.captures.rebirth import reborn, with_rate
 from cocoro.bus.base import Bus, Handle, Qos, RawPublisher
-from cocoro.capture.keys import MADE_HERE, Choice
-from cocoro.capture.pictures import LossyFrame
 from cocoro.capture.reader import Capture, Record
-from cocoro.capture.types import NotReadableError
+from cocoro.capture.types import MADE_HERE, LossyFrame, NotReadableError
 from cocoro.errors import ConfigError, RefusedError
-from cocoro.messages import Clock
+from cocoro.messages import ClockTick
 from cocoro.tokens import alive_key
 from cocoro.topics import ARM_STATE, BASE_STATE, CLOCK, FRAME, HAND_STATE, HARDWARE, RECORDING
+from services.capture.keys import Choice
 
 SIMULATOR = "sim"
 HARDWARE_TOPICS = (FRAME, BASE_STATE, ARM_STATE, HAND_STATE)
@@ -161,7 +160,7 @@ class Replay:
 
     def _tick(self) -> None:
         """A real robot's capture has no clock: its stamps are of the system's, as the log times are."""
-        clock = Clock(
+        clock = ClockTick(
             stamp_ns=self._player.position_ns(asyncio.get_running_loop().time()),
             seq=self._ticks,
             incarnation=self._incarnation + (self._player.passes << 48),
@@ -170,3 +169,54 @@ class Replay:
         )
         self._ticks += 1
         self._publisher(self._clock_key).put(msgspec.msgpack.encode(clock))
+
+
+_BITS = 48
+"""Incarnations are drawn from so many."""
+_PARTS = ("consumed", "produced")
+
+
+def reborn(payload: bytes | memoryview, passes: int) -> bytes | memoryview:
+    """The payload for a time line that has gone back so often. What is no MessagePack map stays as it is."""
+    if passes == 0:
+        return payload
+    try:
+        message = msgspec.msgpack.decode(payload)
+    except (msgspec.MsgspecError, ValueError, RecursionError):
+        return payload
+    return msgspec.msgpack.encode(_reborn(message, passes)) if isinstance(message, dict) else payload
+
+
+def with_rate(payload: bytes | memoryview, rate: float) -> bytes | memoryview:
+    """A clock's message, where time goes `rate` times as fast as it was recorded."""
+    if rate == 1.0:
+        return payload
+    try:
+        message = msgspec.msgpack.decode(payload)
+    except (msgspec.MsgspecError, ValueError, RecursionError):
+        return payload
+    if not isinstance(message, dict) or not isinstance(message.get("rate"), int | float):
+        return payload
+    return msgspec.msgpack.encode({**message, "rate": message["rate"] * rate})
+
+
+def _reborn(message: dict[Any, Any], passes: int) -> dict[Any, Any]:
+    found: dict[Any, Any] = {}
+    for name, value in message.items():
+        if isinstance(name, str) and name.endswith("incarnation") and isinstance(value, int):
+            found[name] = _next(value, passes)
+        elif name in _PARTS and isinstance(value, list):
+            found[name] = [_part(part, passes) for part in value]
+        else:
+            found[name] = value
+    return found
+
+
+def _part(part: Any, passes: int) -> Any:
+    if isinstance(part, list) and len(part) == 3 and isinstance(part[1], int):
+        return [part[0], _next(part[1], passes), part[2]]
+    return part
+
+
+def _next(incarnation: int, passes: int) -> int:
+    return incarnation + (passes << _BITS)

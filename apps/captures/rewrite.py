@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 from apps.captures.info import missing_of
-from cocoro.capture.compression import Packer
-from cocoro.capture.errors import CaptureError, DamageError
-from cocoro.capture.file import CaptureFile
-from cocoro.capture.keys import KeyInfo
+from cocoro.capture.conventions import CaptureError
+from cocoro.capture.mcap import DamageError
 from cocoro.capture.reader import Capture, Record
-from cocoro.capture.schema import TypeSchema
+from cocoro.capture.types import TypeSchema
+from services.capture.file import CaptureFile, Packer
+from services.capture.keys import KeyInfo
 from services.capture.writer import sync_and_close
 
 REPAIRED = "repaired"

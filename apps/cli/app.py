@@ -10,6 +10,23 @@ from typing import Annotated, Any
 import typer
 
 from apps.cli import capture_app, hardware_app, learning_app, objects_app, tools_app
+from apps.cli.options import (
+    AdaptOption,
+    DistanceOption,
+    ForOption,
+    FramesOption,
+    JsonOption,
+    LatencyOption,
+    MeshOption,
+    ModelOption,
+    ObjectsOption,
+    ProfileArgument,
+    ReachOption,
+    RobotChoice,
+    RobotOption,
+    SetOption,
+    TimeoutOption,
+)
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -23,41 +40,8 @@ app = typer.Typer(
 
 TASKS, WATCH, RUNNING, SAFETY = "Tasks", "Watching", "Starting and stopping", "Safety"
 
-Robot = Annotated[str | None, typer.Option(help="Which robot; needed only when several are up here.")]
-Reach = Annotated[
-    str | None,
-    typer.Option("--profile", metavar="PROFILE", help="Reach the robot as this profile says, on another machine."),
-]
-Json = Annotated[bool, typer.Option("--json", help="Print JSON, for scripts.")]
-Set = Annotated[
-    list[str] | None,
-    typer.Option("--set", metavar="KEY=VALUE", help="Any setting of the profile: service.sim.seed=3. Repeatable."),
-]
-Latency = Annotated[
-    list[str] | None,
-    typer.Option(metavar="NAME=SECONDS", help="Slow a service down: perception=0.5. Repeatable."),
-]
-Frames = Annotated[str | None, typer.Option(metavar="WxH@HZ", help="The camera's frames: 320x240@15.")]
-Timeout = Annotated[float | None, typer.Option(min=0.1, max=3600.0, metavar="SECONDS", help="Give up after this.")]
 
-Model = Annotated[Path | None, typer.Option(metavar="FILE", help="What was learned of the body (`cocoro learn`).")]
-Reaching = Annotated[str | None, typer.Option(metavar="learned|rigid", help="Rigid: whatever was learned of the arm.")]
-Adapt = Annotated[
-    bool, typer.Option("--adapt", help="What was learned of the arm goes on being taught by what is seen at work.")
-]
-Distance = Annotated[
-    float,
-    typer.Option(min=0.0, max=5.0, metavar="METRES", help="Go-to: from the robot's centre to the target's edge."),
-]
-Body = Annotated[str, typer.Option(metavar="nominal|worn", help="A body as drawn, or one that differs from it.")]
-
-Objects = Annotated[
-    Path | None,
-    typer.Option(metavar="FILE", help="Known objects instead of the project's own: see `cocoro objects learn`."),
-]
-For = Annotated[
-    float | None, typer.Option("--for", min=0.1, max=3600.0, metavar="SECONDS", help="Follow for so long, then stop.")
-]
+BodyOption = Annotated[str, typer.Option(metavar="nominal|worn", help="A body as drawn, or one that differs from it.")]
 
 
 # --- tasks ----------------------------------------------------------------------------------------
@@ -66,23 +50,22 @@ For = Annotated[
 def _task(where: tuple[str | None, str | None], as_json: bool, snapshot: Path | None = None, **request: Any) -> None:
     """`request`: the fields of a TaskRequest."""
     from apps.cli import tasks
-    from apps.cli.link import Where
     from cocoro.messages import TaskRequest
 
-    sys.exit(asyncio.run(tasks.run(Where(*where), TaskRequest(**request), as_json, snapshot)))
+    sys.exit(asyncio.run(tasks.run(RobotChoice(*where), TaskRequest(**request), as_json, snapshot)))
 
 
 @app.command(rich_help_panel=TASKS)
 def fetch(
     label: Annotated[str, typer.Argument(help="What to fetch; `cocoro objects` lists what the robot knows.")],
     bring: Annotated[bool, typer.Option("--bring", help="Bring it to where the task began and put it down.")] = False,
-    timeout: Timeout = None,
+    timeout: TimeoutOption = None,
     snapshot: Annotated[
         Path | None, typer.Option(metavar="OUT.png", help="Write what the robot sees when it grasps.")
     ] = None,
-    robot: Robot = None,
-    profile: Reach = None,
-    json: Json = False,
+    robot: RobotOption = None,
+    profile: MeshOption = None,
+    json: JsonOption = False,
 ) -> None:
     """Find an object, drive there, grasp it and lift it. Ctrl-C cancels it on the robot."""
     _task((robot, profile), json, snapshot, task="fetch", label=label, bring=bring, timeout_s=timeout)
@@ -91,10 +74,10 @@ def fetch(
 @app.command(rich_help_panel=TASKS)
 def follow(
     label: Annotated[str, typer.Argument(help="What to follow; `cocoro objects` lists what the robot knows.")],
-    for_: For = None,
-    robot: Robot = None,
-    profile: Reach = None,
-    json: Json = False,
+    for_: ForOption = None,
+    robot: RobotOption = None,
+    profile: MeshOption = None,
+    json: JsonOption = False,
 ) -> None:
     """Keep behind an object that moves, at a distance, until Ctrl-C or for a time."""
     _task((robot, profile), json, task="follow", label=label, for_s=for_)
@@ -103,10 +86,10 @@ def follow(
 @app.command(rich_help_panel=TASKS)
 def touch(
     label: Annotated[str, typer.Argument(help="What to touch: something within the arm's reach.")],
-    timeout: Timeout = None,
-    robot: Robot = None,
-    profile: Reach = None,
-    json: Json = False,
+    timeout: TimeoutOption = None,
+    robot: RobotOption = None,
+    profile: MeshOption = None,
+    json: JsonOption = False,
 ) -> None:
     """Bring the open hand around something within reach, on the floor or in the air; the wheels stand."""
     _task((robot, profile), json, task="touch", label=label, timeout_s=timeout)
@@ -115,35 +98,38 @@ def touch(
 @app.command("go-to", rich_help_panel=TASKS)
 def go_to(
     label: Annotated[str, typer.Argument(help="Where to go; `cocoro objects` lists what the robot knows.")],
-    distance: Distance = 0.2,
-    timeout: Timeout = None,
-    robot: Robot = None,
-    profile: Reach = None,
-    json: Json = False,
+    distance: DistanceOption = 0.2,
+    timeout: TimeoutOption = None,
+    robot: RobotOption = None,
+    profile: MeshOption = None,
+    json: JsonOption = False,
 ) -> None:
     """Drive to an object and stop at a distance from it. Ctrl-C cancels it on the robot."""
     _task((robot, profile), json, task="go-to", label=label, distance_m=distance, timeout_s=timeout)
 
 
 @app.command(rich_help_panel=TASKS)
-def park(timeout: Timeout = None, robot: Robot = None, profile: Reach = None, json: Json = False) -> None:
+def park(
+    timeout: TimeoutOption = None, robot: RobotOption = None, profile: MeshOption = None, json: JsonOption = False
+) -> None:
     """Fold the arm. Ctrl-C cancels it on the robot."""
     _task((robot, profile), json, task="park", timeout_s=timeout)
 
 
 @app.command("put-down", rich_help_panel=TASKS)
-def put_down(timeout: Timeout = None, robot: Robot = None, profile: Reach = None, json: Json = False) -> None:
+def put_down(
+    timeout: TimeoutOption = None, robot: RobotOption = None, profile: MeshOption = None, json: JsonOption = False
+) -> None:
     """Set down what the hand holds. Ctrl-C cancels it on the robot."""
     _task((robot, profile), json, task="put-down", timeout_s=timeout)
 
 
 @app.command(rich_help_panel=TASKS)
-def cancel(robot: Robot = None, profile: Reach = None) -> None:
+def cancel(robot: RobotOption = None, profile: MeshOption = None) -> None:
     """End the running task; the robot stands still."""
     from apps.cli import tasks
-    from apps.cli.link import Where
 
-    sys.exit(asyncio.run(tasks.cancel(Where(robot, profile))))
+    sys.exit(asyncio.run(tasks.cancel(RobotChoice(robot, profile))))
 
 
 @app.command(rich_help_panel=TASKS)
@@ -153,32 +139,32 @@ def rehearse(
     ],
     label: Annotated[str, typer.Argument(help="What to fetch, to follow, to touch or to go to.")] = "",
     bring: Annotated[bool, typer.Option("--bring", help="Fetch: bring it to where the task began.")] = False,
-    for_: For = None,
-    distance: Distance = 0.2,
+    for_: ForOption = None,
+    distance: DistanceOption = 0.2,
     scene: Annotated[str, typer.Option(help="A scene's name, or its file.")] = "paper",
     seed: Annotated[int, typer.Option(min=0, help="Everything that is drawn comes from it.")] = 0,
     sensors: Annotated[
         str, typer.Option(metavar="ideal|real", help="Perfect camera and body, or real ones.")
     ] = "ideal",
-    body: Body = "nominal",
-    model: Model = None,
-    reach: Reaching = None,
-    adapt: Adapt = False,
+    body: BodyOption = "nominal",
+    model: ModelOption = None,
+    reach: ReachOption = None,
+    adapt: AdaptOption = False,
     bend: Annotated[
         float | None, typer.Option(min=0.0, metavar="SECONDS", help="Then somebody bends the forearm: 3 cm.")
     ] = None,
     count: Annotated[int, typer.Option(min=1, metavar="N", help="Babbling: how many samples or trials.")] = 1000,
     samples: Annotated[Path | None, typer.Option(metavar="FILE", help="Babbling: where they are kept.")] = None,
-    latency: Latency = None,
+    latency: LatencyOption = None,
     lockstep: Annotated[bool, typer.Option("--lockstep", help="One serial cycle over all, as in the paper.")] = False,
-    frames: Frames = None,
-    objects: Objects = None,
-    timeout: Timeout = None,
+    frames: FramesOption = None,
+    objects: ObjectsOption = None,
+    timeout: TimeoutOption = None,
     picture: Annotated[
         Path | None, typer.Option(metavar="OUT.png", help="Write what the robot saw when it grasped.")
     ] = None,
     record: Annotated[Path | None, typer.Option(metavar="OUT.mcap", help="Record everything.")] = None,
-    json: Json = False,
+    json: JsonOption = False,
 ) -> None:
     """Try a task in simulation: the whole robot in one process, in virtual time."""
     from apps.cli import rehearse as rehearsing
@@ -198,12 +184,11 @@ def rehearse(
 
 
 @app.command(rich_help_panel=WATCH)
-def status(robot: Robot = None, profile: Reach = None, json: Json = False) -> None:
+def status(robot: RobotOption = None, profile: MeshOption = None, json: JsonOption = False) -> None:
     """What runs, how it is, what it does and why. Exit code 1 when something that should run does not."""
     from apps.cli import status as telling
-    from apps.cli.link import Where
 
-    sys.exit(asyncio.run(telling.status(Where(robot, profile), json)))
+    sys.exit(asyncio.run(telling.status(RobotChoice(robot, profile), json)))
 
 
 objects_app.add_to(app, WATCH)
@@ -212,20 +197,19 @@ objects_app.add_to(app, WATCH)
 @app.command(rich_help_panel=WATCH)
 def snapshot(
     out: Annotated[Path, typer.Argument(metavar="OUT.png", help="The picture's file.")],
-    robot: Robot = None,
-    profile: Reach = None,
+    robot: RobotOption = None,
+    profile: MeshOption = None,
 ) -> None:
     """What the robot sees now, with its detections drawn in."""
     from apps.cli import snapshot as taking
-    from apps.cli.link import Where
 
-    sys.exit(asyncio.run(taking.snapshot(Where(robot, profile), out)))
+    sys.exit(asyncio.run(taking.snapshot(RobotChoice(robot, profile), out)))
 
 
 @app.command(rich_help_panel=WATCH)
 def topics(
     markdown: Annotated[bool, typer.Option("--markdown", help="The whole page of the documentation.")] = False,
-    json: Json = False,
+    json: JsonOption = False,
 ) -> None:
     """What travels on the mesh: every key, its type, rate, quality of service and publisher."""
     from apps.cli import topics as listing
@@ -252,7 +236,7 @@ learning_app.add_to(app)
 
 @app.command(rich_help_panel=RUNNING)
 def up(
-    profile: Annotated[str, typer.Argument(help="A profile's name (sim, robot) or file.")] = "sim",
+    profile: ProfileArgument = "sim",
     detach: Annotated[bool, typer.Option("--detach", "-d", help="Return when the robot is up.")] = False,
     scene: Annotated[str | None, typer.Option(help="Simulator: a scene's name, or its file.")] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Simulator: the seed of all that is drawn.")] = None,
@@ -260,13 +244,13 @@ def up(
     body: Annotated[
         str | None, typer.Option(metavar="nominal|worn", help="Simulator: a body as drawn, or not.")
     ] = None,
-    model: Model = None,
-    reach: Reaching = None,
-    adapt: Adapt = False,
-    frames: Frames = None,
-    latency: Latency = None,
-    objects: Objects = None,
-    set_: Set = None,
+    model: ModelOption = None,
+    reach: ReachOption = None,
+    adapt: AdaptOption = False,
+    frames: FramesOption = None,
+    latency: LatencyOption = None,
+    objects: ObjectsOption = None,
+    set_: SetOption = None,
     unattended: Annotated[
         bool, typer.Option("--unattended", help="No person starts it: its first start comes up stopped.")
     ] = False,
@@ -284,7 +268,7 @@ def up(
 
 
 @app.command(rich_help_panel=RUNNING)
-def down(robot: Robot = None) -> None:
+def down(robot: RobotOption = None) -> None:
     """Stop a robot's processes. Nothing running is no error."""
     from apps.cli import running
 
@@ -297,7 +281,7 @@ def run(
     profile: Annotated[
         str | None, typer.Option(metavar="PROFILE", help="By default that of the robot that is up here, else sim.")
     ] = None,
-    set_: Set = None,
+    set_: SetOption = None,
 ) -> None:
     """One process in this terminal, on the mesh of the profile. Ctrl-C ends it."""
     from apps.cli import running
@@ -325,9 +309,8 @@ def stop(context: typer.Context) -> None:
 
 
 @app.command(rich_help_panel=SAFETY)
-def reset(robot: Robot = None, profile: Reach = None) -> None:
+def reset(robot: RobotOption = None, profile: MeshOption = None) -> None:
     """Release the emergency stop. The executive may refuse, and says why."""
     from apps.cli import reset as releasing
-    from apps.cli.link import Where
 
-    sys.exit(asyncio.run(releasing.reset(Where(robot, profile))))
+    sys.exit(asyncio.run(releasing.reset(RobotChoice(robot, profile))))

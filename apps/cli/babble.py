@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from apps.cli.ending import on_end
-from apps.cli.link import Link, Where, joined
+from apps.cli.link import Link, joined
+from apps.cli.options import RobotChoice
 from apps.cli.output import going_on
-from apps.cli.progress import View, view
+from apps.cli.progress import TaskDisplay, view
 from apps.cli.tasks import Follower
 from apps.learning.collector import TOPICS, Collector, collector
 from cocoro.errors import CocoroError, MeshError
@@ -22,10 +23,10 @@ BAR = 20
 """Characters of the progress bar."""
 
 
-class BabbleView:
+class BabbleDisplay:
     """Shows the samples beside what the task says: a bar, the coverage, and the time that is left at this rate."""
 
-    def __init__(self, view: View, kept: Collector[Any], wanted: int) -> None:
+    def __init__(self, view: TaskDisplay, kept: Collector[Any], wanted: int) -> None:
         self._view = view
         self._kept = kept
         self._wanted = wanted
@@ -50,7 +51,7 @@ class BabbleView:
         return f"[{'#' * full}{'.' * (BAR - full)}] {count} of {self._wanted}: {self._kept.said}{left}"
 
 
-class Keeper:
+class SampleWriter:
     """Keeps what is reported. When the file takes no more, it cancels: the robot need not move for nothing."""
 
     def __init__(self, kept: Collector[Any], cancel: Callable[[], None]) -> None:
@@ -67,13 +68,13 @@ class Keeper:
                 self._cancel()
 
 
-async def babble(where: Where, task: TaskName, wanted: int, file: Path, label: str, as_json: bool) -> int:
+async def babble(where: RobotChoice, task: TaskName, wanted: int, file: Path, label: str, as_json: bool) -> int:
     """Babble until the file holds `wanted` samples or trials. Ctrl-C stops the robot and keeps them. Returns the exit
     code; raises ConfigError or RefusedError for a file that cannot be gone on with."""
     async with joined(where) as link:
         robot = await description(link)
         with collector(task, file, robot, await _standing_height(link, label) if label else None) as kept:
-            shown = BabbleView(view(as_json), kept, wanted)
+            shown = BabbleDisplay(view(as_json), kept, wanted)
             if len(kept) >= wanted:
                 shown.result(f"{file} holds enough already")
                 return 0
@@ -82,7 +83,7 @@ async def babble(where: Where, task: TaskName, wanted: int, file: Path, label: s
             samples = link.inbox(TOPICS[task])  # before the task is asked for, so that nothing is missed
             request = TaskRequest(task=task, label=label, first=kept.next, count=wanted - len(kept))
             follower = Follower(link, request, shown, None)
-            keeper = Keeper(kept, follower.cancel)
+            keeper = SampleWriter(kept, follower.cancel)
             samples.add(lambda _key, message: keeper.take(message))
             with on_end(follower.interrupt), going_on():
                 code, result = await follower.run()

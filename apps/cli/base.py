@@ -9,7 +9,8 @@ from math import degrees
 import msgspec
 
 from apps.cli import exits
-from apps.cli.link import Where, joined, within
+from apps.cli.link import joined, within
+from apps.cli.options import RobotChoice
 from cocoro.errors import MeshError
 from cocoro.messages import BaseState, Health, RecoverRequest
 from cocoro.topics import BASE_STATE, HEALTH, RECOVER
@@ -17,7 +18,7 @@ from cocoro.topics import BASE_STATE, HEALTH, RECOVER
 HEARD_S = 2.5
 
 
-async def show(where: Where, as_json: bool) -> int:
+async def show(where: RobotChoice, as_json: bool) -> int:
     """Exit code 1 when it is not well."""
     async with joined(where) as link:
         if "base" not in await link.alive():
@@ -62,7 +63,7 @@ def _print(state: BaseState | None, health: Health | None) -> None:
         print(f"fault      {fault}")
 
 
-async def recover(where: Where) -> int:
+async def recover(where: RobotChoice) -> int:
     async with joined(where) as link:
         reply = await link.call(RECOVER, RecoverRequest())
         robot = link.robot

@@ -9,26 +9,21 @@ from typing import Annotated
 
 import typer
 
+from apps.cli.options import (
+    CaptureArgument,
+    FromOption,
+    JsonOption,
+    MeshOption,
+    OnlyOption,
+    RobotChoice,
+    RobotOption,
+    ToOption,
+    WithoutOption,
+)
+
 PANEL = "Captures"
 
 capture = typer.Typer(no_args_is_help=True, help="Look at, mend and execute captures.")
-
-Robot = Annotated[str | None, typer.Option(help="Which robot; needed only when several are up here.")]
-Reach = Annotated[
-    str | None,
-    typer.Option("--profile", metavar="PROFILE", help="Reach the robot as this profile says, on another machine."),
-]
-Json = Annotated[bool, typer.Option("--json", help="Print JSON, for scripts.")]
-File = Annotated[Path, typer.Argument(metavar="FILE", help="A capture: an MCAP file.")]
-Only = Annotated[
-    list[str] | None,
-    typer.Option("--only", metavar="KEYEXPR", help="Only these keys: base/state, */health, frames. Repeatable."),
-]
-Without = Annotated[
-    list[str] | None, typer.Option("--without", metavar="KEYEXPR", help="All keys but these. Repeatable.")
-]
-From = Annotated[float | None, typer.Option("--from", metavar="S", help="Seconds from the capture's start.")]
-To = Annotated[float | None, typer.Option("--to", metavar="S", help="Likewise; exclusive.")]
 
 
 def add_to(app: typer.Typer) -> None:
@@ -41,34 +36,33 @@ def add_to(app: typer.Typer) -> None:
 
 def record(
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Where the files go.")] = Path(),
-    only: Only = None,
-    without: Without = None,
+    only: OnlyOption = None,
+    without: WithoutOption = None,
     compression: Annotated[str, typer.Option(metavar="zstd|lz4|none", help="Without loss.")] = "zstd",
     jpeg: Annotated[
         int | None, typer.Option(min=1, max=100, metavar="QUALITY", help="The pictures with loss, far smaller.")
     ] = None,
     seconds: Annotated[float | None, typer.Option("--for", min=0.1, metavar="S", help="Stop by itself.")] = None,
-    robot: Robot = None,
-    profile: Reach = None,
+    robot: RobotOption = None,
+    profile: MeshOption = None,
 ) -> None:
     """Record what travels on the mesh into MCAP files, until Ctrl-C, beside what the robot's own recorder does."""
-    from apps.cli import capture_record
-    from apps.cli.link import Where
+    from apps.cli import capture_mesh
 
     settings = {
         "folder": str(out.resolve()), "only": only or (), "without": without or (),
         "compression": compression, "jpeg_quality": jpeg,
     }  # fmt: skip
-    sys.exit(asyncio.run(capture_record.record(Where(robot, profile), settings, seconds)))
+    sys.exit(asyncio.run(capture_mesh.record(RobotChoice(robot, profile), settings, seconds)))
 
 
 def replay(
-    file: File,
+    file: CaptureArgument,
     rate: Annotated[float, typer.Option(min=0.01, max=100.0, help="How many times as fast.")] = 1.0,
-    start: From = None,
-    end: To = None,
+    start: FromOption = None,
+    end: ToOption = None,
     loop: Annotated[bool, typer.Option("--loop", help="Again and again.")] = False,
-    only: Only = None,
+    only: OnlyOption = None,
     paused: Annotated[bool, typer.Option("--paused", help="Begin with a pause; needs a terminal.")] = False,
     hardware: Annotated[
         bool, typer.Option("--hardware", help="Only what the robot's hardware said: be the robot.")
@@ -78,14 +72,14 @@ def replay(
 
     Keys: space pauses, . goes to the next picture, left and right 5 s, + and - change the rate, q ends.
     """
-    from apps.cli import capture_replay
+    from apps.cli import capture_mesh
 
     options = {"start_s": 0.0 if start is None else start, "end_s": end, "rate": rate, "loop": loop, "paused": paused}
-    sys.exit(asyncio.run(capture_replay.replay(file, only or [], hardware, options)))
+    sys.exit(asyncio.run(capture_mesh.replay(file, only or [], hardware, options)))
 
 
 def export(
-    file: File,
+    file: CaptureArgument,
     video: Annotated[
         Path | None, typer.Option("--video", metavar="OUT.mp4", help="What the robot saw, detections drawn in.")
     ] = None,
@@ -110,45 +104,44 @@ def export(
 
 def view(
     file: Annotated[Path | None, typer.Argument(metavar="[FILE]", help="A capture; without one, the mesh.")] = None,
-    robot: Robot = None,
-    profile: Reach = None,
+    robot: RobotOption = None,
+    profile: MeshOption = None,
 ) -> None:
     """Open Rerun on a capture, or live on the mesh. Needs the extra `view`."""
-    from apps.cli import capture_view
-    from apps.cli.link import Where
+    from apps.cli import capture_mesh
 
     if file is not None:
-        sys.exit(capture_view.view_file(file))
-    sys.exit(asyncio.run(capture_view.view_mesh(Where(robot, profile))))
+        sys.exit(capture_mesh.view_file(file))
+    sys.exit(asyncio.run(capture_mesh.view_mesh(RobotChoice(robot, profile))))
 
 
 @capture.command()
 def info(
-    file: File,
+    file: CaptureArgument,
     check: Annotated[bool, typer.Option("--check", help="Read every byte, instead of believing the summary.")] = False,
-    json: Json = False,
+    json: JsonOption = False,
 ) -> None:
     """What a capture has: keys, counts, rates, gaps, losses and where it is from. Exit code 1 when it is damaged."""
-    from apps.cli import capture_info
+    from apps.cli import capture_files
 
-    sys.exit(capture_info.info(file, check, json))
+    sys.exit(capture_files.info(file, check, json))
 
 
 @capture.command()
 def repair(
-    file: File,
+    file: CaptureArgument,
     out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="By default FILE.repaired.mcap.")] = None,
     compression: Annotated[str, typer.Option(metavar="zstd|lz4|none", help="Of the new file.")] = "zstd",
     level: Annotated[int, typer.Option(min=1, max=19, help="Of zstd; 19 is small and slow.")] = 1,
-    only: Only = None,
-    without: Without = None,
-    start: From = None,
-    end: To = None,
+    only: OnlyOption = None,
+    without: WithoutOption = None,
+    start: FromOption = None,
+    end: ToOption = None,
 ) -> None:
     """Write a whole capture with all that can be read of a damaged or unfinished one; the old file stays."""
-    from apps.cli import capture_repair
+    from apps.cli import capture_files
 
-    sys.exit(capture_repair.repair(file, out, compression, level, only or [], without or [], start, end))
+    sys.exit(capture_files.repair(file, out, compression, level, only or [], without or [], start, end))
 
 
 @capture.command()
@@ -161,9 +154,9 @@ def rerun(
     tolerance: Annotated[
         float, typer.Option(min=0.0, max=0.1, help="Of numbers, relative to the largest of 1 and them; 0 is exact.")
     ] = 0.0,
-    json: Json = False,
+    json: JsonOption = False,
 ) -> None:
     """Execute a service again over what it was given then, and compare what it gives. Exit code 1 when it differs."""
-    from apps.cli import capture_rerun
+    from apps.cli import capture_files
 
-    sys.exit(capture_rerun.rerun(files, service, against, tolerance, json))
+    sys.exit(capture_files.rerun(files, service, against, tolerance, json))

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from apps.captures.export.outfile import refuse_existing
+from apps.captures.export.files import refuse_existing
 from apps.cli import exits
 from cocoro.capture.reader import Capture
 from cocoro.clock import NS
@@ -55,9 +55,9 @@ def export(
             messages = rerun_scene.export(capture, rrd, _progress(capture, rrd))
             _done(f"{rrd}: {messages} messages; open it with `rerun {rrd}`")
         if attachments is not None:
-            from apps.captures.export import attachments as attached
+            from apps.captures.export.files import export_attachments
 
-            _done(f"{attachments}: {attached.export(capture, attachments)} attachments")
+            _done(f"{attachments}: {export_attachments(capture, attachments)} attachments")
         for problem in capture.problems:
             print(f"missing: {problem}", file=sys.stderr)
         if capture.ending:

@@ -10,16 +10,17 @@ from typing import Any
 
 from apps.cli import exits
 from apps.cli.ending import told_to_end
-from apps.cli.foreign import HEAD, Reading, jsonable, lines, read
-from apps.cli.link import Where, joined
+from apps.cli.foreign import HEAD, DecodedPayload, jsonable, lines, read
+from apps.cli.link import joined
 from apps.cli.listening import Ear, Heard, keyexpr_of, takes_frames
+from apps.cli.options import RobotChoice
 
 HINT_S = 3.0
 """A person who has heard nothing for so long is told so, and where to look."""
 
 
 async def echo(
-    where: Where, text: str, count: int | None, seconds: float | None, as_json: bool, everything: bool
+    where: RobotChoice, text: str, count: int | None, seconds: float | None, as_json: bool, everything: bool
 ) -> int:
     """Print until interrupted, or so many messages, or for so long. Exit code 1 when the time is over and there was
     nothing, or fewer than were wanted."""
@@ -58,12 +59,12 @@ async def _print(
     return printed
 
 
-def _as_json(heard: Heard, reading: Reading) -> str:
+def _as_json(heard: Heard, reading: DecodedPayload) -> str:
     entry = {"key": heard.key, "type": reading.type or None, "message": jsonable(reading.value)}
     return json.dumps(entry | ({"problem": reading.problem} if reading.problem else {}))
 
 
-def _as_text(heard: Heard, reading: Reading, everything: bool) -> str:
+def _as_text(heard: Heard, reading: DecodedPayload, everything: bool) -> str:
     value = reading.value
     head: dict[Any, Any] = value if isinstance(value, dict) else {}
     title = [heard.key, reading.type or "(unknown type)"]

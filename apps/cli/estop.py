@@ -24,7 +24,7 @@ KEPT_S = 0.3
 """How long it then waits to hear whether the latches are on the disk."""
 
 
-class Stop(NamedTuple):
+class StopResult(NamedTuple):
     """How stopping one robot went."""
 
     robot: str
@@ -111,7 +111,7 @@ def main(command: str, arguments: list[str]) -> int:
     return code
 
 
-def by_path(robot: str | None) -> tuple[list[Stop], list[str]]:
+def by_path(robot: str | None) -> tuple[list[StopResult], list[str]]:
     """Stop by the stop path; how it went with each robot, and what was in the way."""
     try:
         with Asking(robot) as asking:
@@ -127,7 +127,7 @@ def by_path(robot: str | None) -> tuple[list[Stop], list[str]]:
     return [_stop_of(uid, name, points, started_s) for (uid, name), points in groups.items()], []
 
 
-def _left_open(robot: str | None, stops: list[Stop]) -> set[str]:
+def _left_open(robot: str | None, stops: list[StopResult]) -> set[str]:
     """This user's own robots of which something runs that the path did not stop. What others' robots answered says
     nothing about them."""
     own = {stop.robot: stop for stop in stops if stop.owner is None}
@@ -141,13 +141,13 @@ def _left_open(robot: str | None, stops: list[Stop]) -> set[str]:
     return left_open
 
 
-def _stop_of(uid: int, robot: str, points: list[Point], started_s: float) -> Stop:
+def _stop_of(uid: int, robot: str, points: list[Point], started_s: float) -> StopResult:
     there = {point.service for point in points}
     silent = {point.service for point in points if point.latched_ns is None}
     acknowledged = sorted(there - silent, key=_in_order)
     missing = silent - {EXECUTIVE}
     latched_s = [point.latched_ns / 1e9 for point in points if point.latched_ns is not None]
-    return Stop(
+    return StopResult(
         robot,
         tuple(acknowledged),
         tuple(sorted(missing, key=_in_order)),
@@ -170,9 +170,9 @@ def _by_mesh_too(
     profile: str | None,
     only: set[str] | None,
     started_s: float,
-    stops: list[Stop],
+    stops: list[StopResult],
     troubles: list[str],
-) -> tuple[list[Stop], list[str], int]:
+) -> tuple[list[StopResult], list[str], int]:
     """Ask on the mesh what the stop path left open (`only` these robots, or all): what both know of each robot, what
     was in the way, exit code."""
     from apps.cli import estop_mesh
@@ -192,7 +192,7 @@ def _by_mesh_too(
     return [*_merged(stops, by_mesh)], troubles, code
 
 
-def _merged(by_path: list[Stop], by_mesh: list[Stop]) -> list[Stop]:
+def _merged(by_path: list[StopResult], by_mesh: list[StopResult]) -> list[StopResult]:
     """What either way acknowledged is stopped."""
     found = {stop.robot: stop for stop in by_mesh}
     merged = []
@@ -212,7 +212,7 @@ def _merged(by_path: list[Stop], by_mesh: list[Stop]) -> list[Stop]:
     return [*merged, *found.values()]
 
 
-def _say(stop: Stop, as_json: bool) -> bool:
+def _say(stop: StopResult, as_json: bool) -> bool:
     if as_json:
         import json
 

@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import msgspec
 
-from apps.cli.estop import Stop
+from apps.cli.estop import StopResult
 from cocoro.bus.endpoints import ZenohConfig
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.errors import CallTimeoutError, CocoroError, MeshError
@@ -38,16 +38,16 @@ def found(robot: str | None, profile: str | None) -> list[tuple[RunDir, ZenohCon
     return [(run_dir, run_dir.join_as("operator")) for run_dir in here]
 
 
-def stop_all(which: list[tuple[RunDir, ZenohConfig]], started_s: float) -> tuple[list[Stop], list[CocoroError]]:
+def stop_all(which: list[tuple[RunDir, ZenohConfig]], started_s: float) -> tuple[list[StopResult], list[CocoroError]]:
     """Latch them one beside the other; how each went, and what kept others from being asked."""
 
-    async def run() -> list[Stop | BaseException]:
+    async def run() -> list[StopResult | BaseException]:
         stops = (stop(run_dir, config, started_s) for run_dir, config in which)
         return await asyncio.gather(*stops, return_exceptions=True)
 
     stops, errors = [], []
     for (run_dir, _), result in zip(which, asyncio.run(run()), strict=True):
-        if isinstance(result, Stop):
+        if isinstance(result, StopResult):
             stops.append(result)
         elif isinstance(result, CocoroError):
             errors.append(type(result)(f"{run_dir.robot}: {result}"))
@@ -56,7 +56,7 @@ def stop_all(which: list[tuple[RunDir, ZenohConfig]], started_s: float) -> tuple
     return stops, errors
 
 
-async def stop(run_dir: RunDir, config: ZenohConfig, started_s: float) -> Stop:
+async def stop(run_dir: RunDir, config: ZenohConfig, started_s: float) -> StopResult:
     """Latch one robot's emergency stop: ask again and again until all who run and move have acknowledged.
 
     Raises MeshError when the mesh is not there.
@@ -83,7 +83,7 @@ async def stop(run_dir: RunDir, config: ZenohConfig, started_s: float) -> Stop:
         absent = tuple(service for service in waiting if service not in living)
         took_s = took_s if missing else max(acknowledged.values(), default=took_s)
         why_not_kept = tuple(f"{service}: {text}" for service, text in not_kept.items() if text)
-        return Stop(run_dir.robot, tuple(acknowledged), missing, absent, took_s, why_not_kept)
+        return StopResult(run_dir.robot, tuple(acknowledged), missing, absent, took_s, why_not_kept)
 
 
 async def _ask(robot: str, bus: ZenohBus) -> dict[str, str]:

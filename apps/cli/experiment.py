@@ -14,14 +14,14 @@ from apps.cli import exits
 from apps.cli.options import frames_of
 from apps.cli.table import table
 from apps.experiments.every import EXPERIMENTS, run
-from apps.experiments.runs import Result
-from apps.experiments.settings import Settings
+from apps.experiments.runs import RunResult
+from apps.experiments.settings import ExperimentSettings
 from cocoro.errors import ConfigError
 
 EVERY = "all"
 
 
-class Progress:
+class RunProgress:
     """A bar and what runs now, on one line of a terminal; a line for each run that ended elsewhere."""
 
     BAR = 24
@@ -43,7 +43,7 @@ class Progress:
         if self._live:
             self._show()
 
-    def ended(self, name: str, result: Result) -> None:
+    def ended(self, name: str, result: RunResult) -> None:
         if name in self._running:
             self._running.remove(name)
         self._done += 1
@@ -89,13 +89,13 @@ def experiment(
     for name, value, known in (("sensors", sensors, ("ideal", "real")), ("body", body, ("nominal", "worn"))):
         if value not in known:
             raise ConfigError(f"--{name} {value}: it is {' or '.join(known)}")
-    settings = Settings(
+    settings = ExperimentSettings(
         seeds=tuple(range(seeds)), out=out.resolve(), sensors="real" if sensors == "real" else "ideal",
         body="worn" if body == "worn" else "nominal", samples=samples, jobs=jobs or os.cpu_count() or 1,
     )  # fmt: skip
     if frames:
         settings = msgspec.structs.replace(settings, **frames_of(frames))
-    progress = Progress(sys.stderr)
+    progress = RunProgress(sys.stderr)
     try:
         sections, path = run(keys, settings, progress, plots=plots)
     except KeyboardInterrupt:

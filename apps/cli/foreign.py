@@ -18,7 +18,7 @@ HEAD = ("stamp_ns", "seq", "incarnation")
 """What every message says of itself: in the headline, not among the fields."""
 
 
-class Reading(NamedTuple):
+class DecodedPayload(NamedTuple):
     type: str
     """The name of the topic's type; empty for a key that the table of topics does not have."""
     value: Any
@@ -27,7 +27,7 @@ class Reading(NamedTuple):
     """Why a reader of the topic's type would reject it; empty when it would not."""
 
 
-def read(payload: Payload, topic_name: str) -> Reading:
+def read(payload: Payload, topic_name: str) -> DecodedPayload:
     """Decode a payload without knowing its type; where the table of topics does, check it too. Never raises."""
     topic = topic_named(topic_name)
     name = topic.type.__name__ if topic is not None else ""
@@ -35,16 +35,18 @@ def read(payload: Payload, topic_name: str) -> Reading:
         value = msgpack.unpackb(payload, strict_map_key=False, timestamp=3, unicode_errors="replace")
     except Exception as error:  # the library raises what it likes for what is broken
         start = bytes(payload[:16]).hex(" ")
-        return Reading(name, None, f"no MessagePack ({error or type(error).__name__}): {len(payload)} bytes, {start}")
+        return DecodedPayload(
+            name, None, f"no MessagePack ({error or type(error).__name__}): {len(payload)} bytes, {start}"
+        )
     if topic is None:
-        return Reading("", value, "")
+        return DecodedPayload("", value, "")
     if len(payload) > topic.max_bytes:
-        return Reading(name, value, f"{len(payload)} bytes, at most {topic.max_bytes} are taken")
+        return DecodedPayload(name, value, f"{len(payload)} bytes, at most {topic.max_bytes} are taken")
     try:
         msgspec.msgpack.decode(payload, type=topic.type)
     except (msgspec.MsgspecError, ValueError, RecursionError, OverflowError) as error:
-        return Reading(name, value, f"no good {name}: {error}")
-    return Reading(name, value, "")
+        return DecodedPayload(name, value, f"no good {name}: {error}")
+    return DecodedPayload(name, value, "")
 
 
 def jsonable(value: Any) -> Any:

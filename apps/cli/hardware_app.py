@@ -9,6 +9,15 @@ from typing import Annotated
 
 import typer
 
+from apps.cli.options import (
+    JsonOption,
+    MeshOption,
+    ProfileArgument,
+    ProfileOption,
+    RobotChoice,
+    RobotOption,
+)
+
 PANEL = "Hardware"
 
 base = typer.Typer(invoke_without_command=True)
@@ -17,17 +26,14 @@ servos = typer.Typer(
 )
 kinect = typer.Typer(no_args_is_help=True, help="Calibrate the Kinect; tilt it.")
 
-Robot = Annotated[str | None, typer.Option(help="Which robot; needed only when several are up here.")]
-Reach = Annotated[
-    str | None,
-    typer.Option("--profile", metavar="PROFILE", help="Reach the robot as this profile says, on another machine."),
+JointsArgument = Annotated[
+    list[str] | None, typer.Argument(metavar="[JOINT]...", help="All of them where none is named.")
 ]
-Json = Annotated[bool, typer.Option("--json", help="Print JSON, for scripts.")]
-Joints = Annotated[list[str] | None, typer.Argument(metavar="[JOINT]...", help="All of them where none is named.")]
-Profile = Annotated[str, typer.Option(metavar="PROFILE", help="Ports and the robot's own file are what it says.")]
-Port = Annotated[list[str] | None, typer.Option(metavar="DEVICE", help="Instead of the profile's ports. Repeatable.")]
-Baud = Annotated[int | None, typer.Option(metavar="RATE", help="Instead of the robot description's.")]
-Write = Annotated[
+PortsOption = Annotated[
+    list[str] | None, typer.Option(metavar="DEVICE", help="Instead of the profile's ports. Repeatable.")
+]
+BaudOption = Annotated[int | None, typer.Option(metavar="RATE", help="Instead of the robot description's.")]
+WriteOption = Annotated[
     Path | None,
     typer.Option("--write", metavar="FILE", help="The file to write what was found into, instead of the robot's own."),
 ]
@@ -44,22 +50,22 @@ def add_to(app: typer.Typer) -> None:
 
 
 @base.callback()
-def show_base(context: typer.Context, robot: Robot = None, profile: Reach = None, json: Json = False) -> None:
+def show_base(
+    context: typer.Context, robot: RobotOption = None, profile: MeshOption = None, json: JsonOption = False
+) -> None:
     """What the base is like: mode, battery, bumpers, odometry; `recover` puts it back into its mode."""
     if context.invoked_subcommand is None:
         from apps.cli import base as showing
-        from apps.cli.link import Where
 
-        sys.exit(asyncio.run(showing.show(Where(robot, profile), json)))
+        sys.exit(asyncio.run(showing.show(RobotChoice(robot, profile), json)))
 
 
 @base.command()
-def recover(robot: Robot = None, profile: Reach = None) -> None:
+def recover(robot: RobotOption = None, profile: MeshOption = None) -> None:
     """Put a Create that left its mode (a cliff, a wheel drop, the charger) back into it."""
     from apps.cli import base as showing
-    from apps.cli.link import Where
 
-    sys.exit(asyncio.run(showing.recover(Where(robot, profile))))
+    sys.exit(asyncio.run(showing.recover(RobotChoice(robot, profile))))
 
 
 # --- servos, while the robot is up ------------------------------------------------------------------
@@ -67,25 +73,24 @@ def recover(robot: Robot = None, profile: Reach = None) -> None:
 
 def _ask(action: str, joints: list[str] | None, robot: str | None, profile: str | None) -> None:
     from apps.cli import servos as asking
-    from apps.cli.link import Where
 
-    sys.exit(asyncio.run(asking.ask(Where(robot, profile), action, joints or [])))
+    sys.exit(asyncio.run(asking.ask(RobotChoice(robot, profile), action, joints or [])))
 
 
 @servos.command()
-def clear(joints: Joints = None, robot: Robot = None, profile: Reach = None) -> None:
+def clear(joints: JointsArgument = None, robot: RobotOption = None, profile: MeshOption = None) -> None:
     """Forget latched faults, such as an overload, and have those joints hold again where they are."""
     _ask("clear", joints, robot, profile)
 
 
 @servos.command()
-def relax(joints: Joints = None, robot: Robot = None, profile: Reach = None) -> None:
+def relax(joints: JointsArgument = None, robot: RobotOption = None, profile: MeshOption = None) -> None:
     """Let joints go limp, to be turned by hand. The arm sinks: hold it."""
     _ask("relax", joints, robot, profile)
 
 
 @servos.command()
-def hold(joints: Joints = None, robot: Robot = None, profile: Reach = None) -> None:
+def hold(joints: JointsArgument = None, robot: RobotOption = None, profile: MeshOption = None) -> None:
     """Have joints hold where they are."""
     _ask("hold", joints, robot, profile)
 
@@ -95,14 +100,14 @@ def hold(joints: Joints = None, robot: Robot = None, profile: Reach = None) -> N
 
 @servos.command()
 def scan(
-    profile: Profile = "robot",
-    port: Port = None,
+    profile: ProfileOption = "robot",
+    port: PortsOption = None,
     baud: Annotated[list[int] | None, typer.Option(metavar="RATE", help="Only these. Repeatable.")] = None,
     last: Annotated[int, typer.Option(min=1, max=253, help="The highest ID to ask for.")] = 20,
     write: Annotated[
         Path | None, typer.Option("--write", metavar="FILE", help="Put the ports that were found into this profile.")
     ] = None,
-    json: Json = False,
+    json: JsonOption = False,
 ) -> None:
     """Find servos: on every serial port, at every baud rate. The robot must be down."""
     from apps.cli import servos_by_hand as tools
@@ -127,10 +132,10 @@ def set_id(
 def calibrate(
     joints: Annotated[list[str], typer.Argument(metavar="JOINT...", help="Which joints, one after the other.")],
     at: Annotated[float, typer.Option(metavar="DEG", help="The angle to which it will be turned by hand.")] = 0.0,
-    profile: Profile = "robot",
+    profile: ProfileOption = "robot",
     port: Annotated[str | None, typer.Option(metavar="DEVICE", help="Instead of the profile's port.")] = None,
-    baud: Baud = None,
-    write: Write = None,
+    baud: BaudOption = None,
+    write: WriteOption = None,
 ) -> None:
     """Measure where a joint's zero is and which way it turns, by turning it by hand. The robot must be down."""
     from apps.cli import servos_by_hand as tools
@@ -141,10 +146,10 @@ def calibrate(
 @servos.command()
 def limits(
     joints: Annotated[list[str], typer.Argument(metavar="JOINT...", help="Which joints, one after the other.")],
-    profile: Profile = "robot",
+    profile: ProfileOption = "robot",
     port: Annotated[str | None, typer.Option(metavar="DEVICE", help="Instead of the profile's port.")] = None,
-    baud: Baud = None,
-    write: Write = None,
+    baud: BaudOption = None,
+    write: WriteOption = None,
 ) -> None:
     """Measure how far a joint may turn, by turning it by hand from end to end. The robot must be down."""
     from apps.cli import servos_by_hand as tools
@@ -166,8 +171,8 @@ def calibrate_kinect(
         Path | None, typer.Option("--from", metavar="FOLDER", help="Views that were kept, instead of the device.")
     ] = None,
     keep: Annotated[Path | None, typer.Option(metavar="FOLDER", help="Keep the views, to calibrate from anew.")] = None,
-    profile: Profile = "robot",
-    write: Write = None,
+    profile: ProfileOption = "robot",
+    write: WriteOption = None,
 ) -> None:
     """Measure lenses, registration and depth curve from views of a chessboard. The robot must be down."""
     from apps.cli import kinect as tools
@@ -178,7 +183,7 @@ def calibrate_kinect(
 @kinect.command()
 def tilt(
     angle: Annotated[float, typer.Argument(metavar="DEG", min=-30.0, max=30.0, help="Upward is positive.")],
-    profile: Profile = "robot",
+    profile: ProfileOption = "robot",
 ) -> None:
     """Move the Kinect's own tilt motor. The robot's description wants it at 0: its neck tilts."""
     from apps.cli import kinect as tools
@@ -190,8 +195,8 @@ def tilt(
 
 
 def doctor(
-    profile: Annotated[str, typer.Argument(help="A profile's name (sim, robot) or file.")] = "robot",
-    json: Json = False,
+    profile: ProfileArgument = "robot",
+    json: JsonOption = False,
 ) -> None:
     """Look over a machine and its robot before a run; each line is well, or says what to do. Exit code 1 if not."""
     from apps.cli import doctor as looking

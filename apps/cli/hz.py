@@ -18,8 +18,9 @@ from rich.text import Text
 
 from apps.cli import exits
 from apps.cli.ending import told_to_end
-from apps.cli.link import Where, joined
+from apps.cli.link import joined
 from apps.cli.listening import Ear, keyexpr_of, takes_frames
+from apps.cli.options import RobotChoice
 from apps.cli.table import table
 from cocoro.bus.base import Payload
 from cocoro.source import ANY_HZ, Source
@@ -30,7 +31,7 @@ SILENT_PERIODS = 3.0
 """A key that is silent for so many of its periods has stopped, as far as its rate goes."""
 
 
-class Head(msgspec.Struct, gc=False):
+class MessageHeader(msgspec.Struct, gc=False):
     """What every message of ours says of itself; others may say none of it."""
 
     stamp_ns: int = 0
@@ -45,7 +46,7 @@ class Arrival(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Report:
+class RateReport:
     """Of one key over the last window."""
 
     key: str
@@ -71,7 +72,7 @@ class Report:
     """Since the newest."""
 
 
-class Meter:
+class RateMeter:
     """One key, as it is heard. `window_s`: what the figures are of."""
 
     def __init__(self, key: str, nominal_hz: float | None, window_s: float) -> None:
@@ -83,13 +84,13 @@ class Meter:
 
     def hear(self, payload: Payload, at_s: float) -> None:
         try:
-            head = msgspec.msgpack.decode(payload, type=Head)
+            head = msgspec.msgpack.decode(payload, type=MessageHeader)
         except (msgspec.MsgspecError, ValueError, RecursionError, OverflowError):
-            head = Head()  # nothing of ours; it has a rate all the same
+            head = MessageHeader()  # nothing of ours; it has a rate all the same
         self._count(head)
         self._arrivals.append(Arrival(at_s, len(payload), head.stamp_ns))
 
-    def _count(self, head: Head) -> None:
+    def _count(self, head: MessageHeader) -> None:
         """Losses, as a reader counts them: a number that cannot be traffic is none."""
         source = self._source
         if head.incarnation != source.incarnation:
@@ -102,7 +103,7 @@ class Meter:
         source.seq, source.stamp_ns = head.seq, head.stamp_ns
         source.settle()
 
-    def report(self, now_s: float) -> Report | None:
+    def report(self, now_s: float) -> RateReport | None:
         """None before the first message."""
         if not self._arrivals:
             return None
@@ -118,7 +119,7 @@ class Meter:
         stamped_s = (newest.stamp_ns - arrivals[0].stamp_ns) / 1e9
         size = fmean(arrival.size for arrival in arrivals)
         rate_hz = len(periods_s) / span_s if span_s > 0 else 0.0
-        return Report(
+        return RateReport(
             key=self.key,
             nominal_hz=self._nominal_hz,
             rate_hz=rate_hz,
@@ -135,9 +136,9 @@ class Meter:
         )
 
 
-async def hz(where: Where, text: str, window_s: float, once: bool, as_json: bool) -> int:
+async def hz(where: RobotChoice, text: str, window_s: float, once: bool, as_json: bool) -> int:
     """Measure until interrupted, or with `once` over one window. Exit code 1 when that heard nothing."""
-    meters: dict[str, Meter] = {}
+    meters: dict[str, RateMeter] = {}
     async with joined(where, frames=takes_frames(text)) as link:
         ear = Ear(link, keyexpr_of(text, link.robot))
         with told_to_end() as end, _view(as_json, once) as view:
@@ -146,7 +147,7 @@ async def hz(where: Where, text: str, window_s: float, once: bool, as_json: bool
                 await ear.wait(end, max(show_s - time.monotonic(), 0.0))
                 for heard in ear.take():
                     if heard.key not in meters:
-                        meters[heard.key] = Meter(heard.key, _nominal_hz(heard.key, link.robot), window_s)
+                        meters[heard.key] = RateMeter(heard.key, _nominal_hz(heard.key, link.robot), window_s)
                     meters[heard.key].hear(heard.payload, heard.at_s)
                 if time.monotonic() >= show_s:
                     show_s = time.monotonic() + SHOW_S
@@ -160,7 +161,7 @@ async def hz(where: Where, text: str, window_s: float, once: bool, as_json: bool
     return exits.DONE if meters else exits.FAILED
 
 
-def _reports(meters: Iterable[Meter]) -> list[Report]:
+def _reports(meters: Iterable[RateMeter]) -> list[RateReport]:
     now_s = time.monotonic()
     found = (meter.report(now_s) for meter in sorted(meters, key=lambda meter: meter.key))
     return [report for report in found if report is not None]
@@ -171,14 +172,14 @@ def _nominal_hz(key: str, robot: str) -> float | None:
     return None if topic is None else topic.rate_hz
 
 
-class _View:
+class _RateDisplay:
     """Lines of JSON; a table that is written over, where somebody watches; tables one after the other elsewhere."""
 
     def __init__(self, as_json: bool, live: Live | None) -> None:
         self._as_json = as_json
         self._live = live
 
-    def __enter__(self) -> _View:
+    def __enter__(self) -> _RateDisplay:
         if self._live is not None:
             self._live.start()
         return self
@@ -187,7 +188,7 @@ class _View:
         if self._live is not None:
             self._live.stop()
 
-    def show(self, reports: list[Report], keyexpr: str) -> None:
+    def show(self, reports: list[RateReport], keyexpr: str) -> None:
         if self._as_json:
             print(json.dumps([asdict(report) for report in reports]), flush=True)
             return
@@ -198,17 +199,17 @@ class _View:
             print(text, end="", flush=True)
 
 
-def _view(as_json: bool, once: bool) -> _View:
+def _view(as_json: bool, once: bool) -> _RateDisplay:
     watched = sys.stdout.isatty() and not as_json and not once
-    return _View(as_json, Live(auto_refresh=False, vertical_overflow="visible") if watched else None)
+    return _RateDisplay(as_json, Live(auto_refresh=False, vertical_overflow="visible") if watched else None)
 
 
-def rows(reports: list[Report]) -> str:
+def rows(reports: list[RateReport]) -> str:
     heads = ("key", "rate", "nominal", "by stamp", "period", "jitter", "min", "max", "data", "message", "lost", "")
     return table(heads, [_row(report) for report in reports])
 
 
-def _row(report: Report) -> tuple[str, ...]:
+def _row(report: RateReport) -> tuple[str, ...]:
     def ms(value: float | None) -> str:
         return "-" if value is None else f"{value:.1f} ms"
 

@@ -7,7 +7,8 @@ import sys
 from math import isnan
 from pathlib import Path
 
-from apps.cli.link import Where, joined
+from apps.cli.link import joined
+from apps.cli.options import RobotChoice
 from apps.cli.table import table
 from apps.learning import lesson, study
 from apps.learning.lesson import Report
@@ -41,7 +42,7 @@ def learn_wheels(samples: Path, into: Path, robot: Robot, *, as_json: bool) -> t
     return made, _wheels_json(fit, into) if as_json else _wheels_text(fit, robot) + f"\n{into} is written"
 
 
-async def send(where: Where, made: Model) -> str:
+async def send(where: RobotChoice, made: Model) -> str:
     """Have a running planner take the model over; what it says of it. Raises RefusedError when it would not."""
     async with joined(where) as link:
         reply = await link.call(LEARNED, ModelRequest(content=model.encode(made)))

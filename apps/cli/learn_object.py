@@ -12,11 +12,11 @@ from typing import Any
 
 import msgspec
 
-from apps.appearance.learn import Learnt, Wanted, learn
+from apps.appearance.learn import LearnedObject, ObjectHints, learn
 from apps.cli import exits
-from apps.cli.learn_sight import Sight, of_picture, of_robot, preview
-from apps.cli.link import Where
+from apps.cli.learn_sight import CameraView, of_picture, of_robot, preview
 from apps.cli.objects_file import save, text_of, with_object
+from apps.cli.options import RobotChoice
 from cocoro.errors import ConfigError, naming
 from cocoro.objects import Catalogue, KnownObject
 from cocoro.picture import save_png
@@ -27,7 +27,7 @@ FILE = "objects.toml"
 
 
 @dataclass(frozen=True)
-class Keeping:
+class SaveOptions:
     """What is to become of what was learnt."""
 
     catalogue: Path | None
@@ -38,7 +38,7 @@ class Keeping:
     as_json: bool
 
 
-async def learn_object(where: Where, source: str, wanted: Wanted, keeping: Keeping) -> int:
+async def learn_object(where: RobotChoice, source: str, wanted: ObjectHints, keeping: SaveOptions) -> int:
     """Raises ConfigError for what cannot be, MeshError when the view is to be live and there is no robot."""
     sight = await of_robot(where) if source == LIVE else of_picture(Path(source))
     path = keeping.catalogue or sight.catalogue or Path(FILE)
@@ -89,7 +89,7 @@ def _both(before: KnownObject, now: KnownObject) -> KnownObject:
 # --- what it looks like ---------------------------------------------------------------------------
 
 
-def _show(sight: Sight, learnt: Learnt, path: Path, picture: Path) -> list[str]:
+def _show(sight: CameraView, learnt: LearnedObject, path: Path, picture: Path) -> list[str]:
     """Write the picture; what the robot would say that it sees, with the new object in its catalogue."""
     with tempfile.TemporaryDirectory() as folder:
         draft = Path(folder) / "objects.toml"
@@ -100,7 +100,7 @@ def _show(sight: Sight, learnt: Learnt, path: Path, picture: Path) -> list[str]:
     return seen
 
 
-def _text(learnt: Learnt, seen: list[str], picture: Path) -> str:
+def _text(learnt: LearnedObject, seen: list[str], picture: Path) -> str:
     known, region = learnt.known, learnt.region
     sizes = " x ".join(f"{100 * side:.1f}" for side in known.size_m)
     measured = learnt.measured
@@ -124,7 +124,7 @@ def _shared(known: KnownObject) -> str:
     return f", {len(known.lab_by_shape)} more that it shares" if known.lab_by_shape else ""
 
 
-def _report(learnt: Learnt, seen: list[str], picture: Path, path: Path, *, saved: bool) -> dict[str, Any]:
+def _report(learnt: LearnedObject, seen: list[str], picture: Path, path: Path, *, saved: bool) -> dict[str, Any]:
     return {
         "object": msgspec.to_builtins(learnt.known),
         "region": {"box_px": learnt.region.box, "area_px": learnt.region.area_px, "cut": learnt.region.cut},
@@ -178,7 +178,7 @@ def size_of(text: str | None) -> tuple[float, ...] | None:
     return sizes
 
 
-def wanted_of(label: str, **options: Any) -> Wanted:
+def wanted_of(label: str, **options: Any) -> ObjectHints:
     """Raises ConfigError for a label or a shape that cannot be."""
     if not re.fullmatch(r"[a-z][a-z0-9_-]{0,63}", label):
         raise ConfigError(f"{label!r} is no label: small letters, digits, '_' and '-', a letter first: orange_box")
@@ -186,4 +186,4 @@ def wanted_of(label: str, **options: Any) -> Wanted:
         raise ConfigError(f"--shape {options['shape']}: it is cylinder, sphere or box")
     if options["at_px"] is not None and options["box_px"] is not None:
         raise ConfigError("--at and --box: say one of them")
-    return Wanted(label=label, **options)
+    return ObjectHints(label=label, **options)

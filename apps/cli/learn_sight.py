@@ -12,10 +12,11 @@ import cv2
 import msgspec
 import numpy as np
 
-from apps.appearance.learn import Learnt, Look
+from apps.appearance.learn import LearnedObject, ObjectView
 from apps.appearance.size import outline_of
-from apps.cli.link import Link, Where, joined, within
-from cocoro.colour import Pixels
+from apps.cli.link import Link, joined, within
+from apps.cli.options import RobotChoice
+from cocoro.arrays import ImageArray
 from cocoro.component import load as load_component
 from cocoro.core import Sample
 from cocoro.errors import ConfigError, MeshError
@@ -37,8 +38,8 @@ OWN, OTHER, OUTLINE = (0, 255, 120), (255, 0, 60), (255, 255, 255)
 
 
 @dataclass(frozen=True)
-class Sight:
-    look: Look
+class CameraView:
+    look: ObjectView
     frame: Frame
     head_rad: dict[str, float] | None
     """The neck's joints as the frame was taken; None for a picture."""
@@ -46,7 +47,7 @@ class Sight:
     """The file of known objects that the robot which is up was started with, if it was with one."""
 
 
-def of_picture(path: Path) -> Sight:
+def of_picture(path: Path) -> CameraView:
     """A picture file, taken to be the robot's camera's. Raises ConfigError when it is none."""
     if not path.is_file():
         raise ConfigError(f"there is no picture {path}; --from names a file, or says live")
@@ -61,10 +62,10 @@ def of_picture(path: Path) -> Sight:
     frame = Frame(
         width=width, height=height, colour=colour.reshape(-1).data, depth=depth.view(np.uint8).data, stamp_ns=MS
     )
-    return Sight(Look(colour, Robot.load()), frame, None, None)
+    return CameraView(ObjectView(colour, Robot.load()), frame, None, None)
 
 
-async def of_robot(where: Where) -> Sight:
+async def of_robot(where: RobotChoice) -> CameraView:
     """What a robot sees now. Raises MeshError when it is not there, or sends no frames."""
     async with joined(where, frames=True) as link:
         resolved = link.run_dir.resolved()
@@ -74,8 +75,8 @@ async def of_robot(where: Where) -> Sight:
         frame, head = await _frame(link, robot.chain("camera").joints)
     pose = robot.chain("camera").pose(head)
     raw_depth = np.frombuffer(frame.depth, dtype="<u2").reshape(frame.height, frame.width)
-    look = Look(colour_of(frame), robot, raw_depth, pose)
-    return Sight(look, frame, head, Path(named) if named else None)
+    look = ObjectView(colour_of(frame), robot, raw_depth, pose)
+    return CameraView(look, frame, head, Path(named) if named else None)
 
 
 DESCRIPTIONS = ("description", "measured")
@@ -131,7 +132,7 @@ def _with_head(
 # --- what was learnt ------------------------------------------------------------------------------
 
 
-def preview(sight: Sight, learnt: Learnt, catalogue: Path) -> tuple[Pixels, list[str]]:
+def preview(sight: CameraView, learnt: LearnedObject, catalogue: Path) -> tuple[ImageArray, list[str]]:
     """The picture with the region outlined, every pixel of its colour tinted (green: the object's, red: others), and
     what perception itself would see in it with that catalogue; and that in words."""
     image = sight.look.colour.copy()
@@ -146,7 +147,7 @@ def preview(sight: Sight, learnt: Learnt, catalogue: Path) -> tuple[Pixels, list
     return drawn, [describe(one) for one in seen.detections]
 
 
-def _put_close_up(image: Pixels, colour: Pixels, learnt: Learnt) -> None:
+def _put_close_up(image: ImageArray, colour: ImageArray, learnt: LearnedObject) -> None:
     """The object as it is, with its outline, large, in the corner of the picture that is furthest from it."""
     left, top, right, bottom = learnt.region.box
     height, width = image.shape[:2]
@@ -167,7 +168,7 @@ def _put_close_up(image: Pixels, colour: Pixels, learnt: Learnt) -> None:
     cv2.rectangle(image, (x, y), (x + size[0] - 1, y + size[1] - 1), OUTLINE, 1)
 
 
-def _perceived(sight: Sight, catalogue: Path) -> Detections:
+def _perceived(sight: CameraView, catalogue: Path) -> Detections:
     """What the robot's own perception makes of the frame."""
     component = load_component(processes.named(PERCEPTION))
     assert component.core is not None

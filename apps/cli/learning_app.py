@@ -9,6 +9,19 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from apps.cli.options import (
+    DescriptionOption,
+    FramesOption,
+    JsonOption,
+    MeasuredOption,
+    MeshOption,
+    ModelOutOption,
+    RobotChoice,
+    RobotOption,
+    SamplesOutOption,
+    SendOption,
+)
+
 if TYPE_CHECKING:
     from cocoro import robot as robots
     from cocoro.learning.model import Model
@@ -18,22 +31,6 @@ PANEL = "Learning"
 
 babble = typer.Typer(no_args_is_help=True, help="Move to learn: the arm before the eyes, the wheels before a target.")
 learn = typer.Typer(no_args_is_help=True, help="Learn from what babbling saw: a model that the planner loads.")
-
-Robot = Annotated[str | None, typer.Option(help="Which robot; needed only when several are up here.")]
-Reach = Annotated[
-    str | None,
-    typer.Option("--profile", metavar="PROFILE", help="Reach the robot as this profile says, on another machine."),
-]
-Json = Annotated[bool, typer.Option("--json", help="Print JSON, for scripts.")]
-Into = Annotated[Path, typer.Option("--model", metavar="FILE", help="Where the model goes; what else is in it stays.")]
-Description = Annotated[
-    Path | None, typer.Option(metavar="FILE", help="The robot's description, where it is not the Calliope's own.")
-]
-Measured = Annotated[
-    Path | None, typer.Option(metavar="FILE", help="What was measured on this robot, over the description.")
-]
-Kept = Annotated[Path, typer.Option(metavar="FILE", help="Where they are kept; one that is there is gone on with.")]
-Send = Annotated[bool, typer.Option("--send", help="Have the robot that is up take it over, without a restart.")]
 
 
 def add_to(app: typer.Typer) -> None:
@@ -45,10 +42,10 @@ def add_to(app: typer.Typer) -> None:
 @babble.command("arm")
 def babble_arm(
     samples: Annotated[int, typer.Option(min=1, max=1_000_000, metavar="N", help="How many, all in all.")] = 1000,
-    out: Kept = Path("arm.jsonl"),
-    robot: Robot = None,
-    profile: Reach = None,
-    json: Json = False,
+    out: SamplesOutOption = Path("arm.jsonl"),
+    robot: RobotOption = None,
+    profile: MeshOption = None,
+    json: JsonOption = False,
 ) -> None:
     """Move the arm about and look at the hand. Ctrl-C stops it; the same command goes on, and nothing is lost."""
     _babble("babble-arm", samples, out, "", robot, profile, json)
@@ -60,10 +57,10 @@ def babble_wheels(
     target: Annotated[
         str, typer.Option(metavar="LABEL", help="A known object that stands 1.5 m before the robot.")
     ] = "red_can",
-    out: Kept = Path("wheels.jsonl"),
-    robot: Robot = None,
-    profile: Reach = None,
-    json: Json = False,
+    out: SamplesOutOption = Path("wheels.jsonl"),
+    robot: RobotOption = None,
+    profile: MeshOption = None,
+    json: JsonOption = False,
 ) -> None:
     """Turn the wheels to and fro before a target. The robot needs half a metre around it. Ctrl-C stops it."""
     _babble("babble-wheels", trials, out, target, robot, profile, json)
@@ -73,25 +70,24 @@ def _babble(
     task: TaskName, wanted: int, out: Path, target: str, robot: str | None, profile: str | None, as_json: bool
 ) -> None:
     from apps.cli import babble as babbling
-    from apps.cli.link import Where
 
-    sys.exit(asyncio.run(babbling.babble(Where(robot, profile), task, wanted, out, target, as_json)))
+    sys.exit(asyncio.run(babbling.babble(RobotChoice(robot, profile), task, wanted, out, target, as_json)))
 
 
 @learn.command("arm")
 def learn_arm(
     samples: Annotated[Path, typer.Argument(metavar="FILE", help="What `babble arm` kept.")] = Path("arm.jsonl"),
-    into: Into = Path("model.json"),
+    into: ModelOutOption = Path("model.json"),
     search: Annotated[bool, typer.Option("--search", help="A grid of bases, widths and rates too.")] = False,
     method: Annotated[
         str | None, typer.Option(metavar="NAME", help="This one, in place of the one that measures best.")
     ] = None,
-    description: Description = None,
-    measured: Measured = None,
-    send: Send = False,
-    robot: Robot = None,
-    profile: Reach = None,
-    json: Json = False,
+    description: DescriptionOption = None,
+    measured: MeasuredOption = None,
+    send: SendOption = False,
+    robot: RobotOption = None,
+    profile: MeshOption = None,
+    json: JsonOption = False,
 ) -> None:
     """The hand-eye map: every way of learning it, measured on samples that it did not learn from; the best is kept."""
     from apps.cli import learn as learning
@@ -106,13 +102,13 @@ def learn_arm(
 @learn.command("wheels")
 def learn_wheels(
     samples: Annotated[Path, typer.Argument(metavar="FILE", help="What `babble wheels` kept.")] = Path("wheels.jsonl"),
-    into: Into = Path("model.json"),
-    description: Description = None,
-    measured: Measured = None,
-    send: Send = False,
-    robot: Robot = None,
-    profile: Reach = None,
-    json: Json = False,
+    into: ModelOutOption = Path("model.json"),
+    description: DescriptionOption = None,
+    measured: MeasuredOption = None,
+    send: SendOption = False,
+    robot: RobotOption = None,
+    profile: MeshOption = None,
+    json: JsonOption = False,
 ) -> None:
     """The distance between the wheels."""
     from apps.cli import learn as learning
@@ -131,9 +127,8 @@ def _robot(description: Path | None, measured: Path | None) -> robots.Robot:
 def _send(wanted: bool, made: Model, robot: str | None, profile: str | None, as_json: bool) -> None:
     if wanted:
         from apps.cli import learn as learning
-        from apps.cli.link import Where
 
-        text = asyncio.run(learning.send(Where(robot, profile), made))
+        text = asyncio.run(learning.send(RobotChoice(robot, profile), made))
         print(text, file=sys.stderr if as_json else sys.stdout)
 
 
@@ -145,7 +140,7 @@ def experiment(
     ] = Path("experiments"),
     sensors: Annotated[str, typer.Option(metavar="ideal|real", help="Perfect or real sensors.")] = "real",
     body: Annotated[str, typer.Option(metavar="nominal|worn", help="A body as drawn, or not.")] = "worn",
-    frames: Annotated[str | None, typer.Option(metavar="WxH@HZ", help="The camera's frames: 320x240@15.")] = None,
+    frames: FramesOption = None,
     samples: Annotated[
         int, typer.Option(min=100, max=100_000, metavar="N", help="Of each body's babbling; a fifth is held out.")
     ] = 2600,

@@ -5,11 +5,12 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Generic, NamedTuple, TypeVar
 
 import msgspec
 
+from apps.cli.options import RobotChoice
 from cocoro.bus.base import Bus, Handle, Reply
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.errors import CallTimeoutError, ConfigError, MeshError, RemoteError
@@ -24,14 +25,6 @@ Q = TypeVar("Q", bound=msgspec.Struct)
 R = TypeVar("R", bound=msgspec.Struct)
 
 START = "start one with `cocoro up sim`"
-
-
-@dataclass(frozen=True)
-class Where:
-    """Which robot, as the operator said it: by its name, by a profile, or not at all when there is but one."""
-
-    robot: str | None = None
-    profile: str | None = None
 
 
 class Answer(NamedTuple, Generic[R]):
@@ -109,7 +102,7 @@ def _understood(request: Request[Q, R], reply: Reply) -> Answer[R]:
         return Answer(service, None, f"answered something that is no {request.reply.__name__}: {error}")
 
 
-def find(where: Where) -> RunDir:
+def find(where: RobotChoice) -> RunDir:
     """The robot that is meant. Raises MeshError when none is up, ConfigError when it is not clear which."""
     if where.robot is not None:
         return RunDir(where.robot)
@@ -122,7 +115,7 @@ def find(where: Where) -> RunDir:
 
 
 @asynccontextmanager
-async def joined(where: Where, patience_s: float | None = None, *, frames: bool = False) -> AsyncIterator[Link]:
+async def joined(where: RobotChoice, patience_s: float | None = None, *, frames: bool = False) -> AsyncIterator[Link]:
     """Join the mesh of a robot. Raises MeshError when it is not there. `frames`: it is to read them, or everything."""
     if where.profile is not None:
         from deploy import profiles

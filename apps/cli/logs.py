@@ -25,7 +25,7 @@ _CRASHES = ("Traceback (most recent call last)", "Fatal Python error")
 """Written without a level, by Python itself, and worth one."""
 
 
-class Entry(NamedTuple):
+class LogEntry(NamedTuple):
     """What was written at once: a line with a time, and those without one that follow it (a traceback, say)."""
 
     stamp: str
@@ -71,23 +71,23 @@ def _process_of(run_dir: RunDir, service: str) -> str:
     return next((row.name for row in rows if row.name in started), rows[0].name if rows else service)
 
 
-def entries(lines: Iterable[str], stamp: str = "") -> Iterator[Entry]:
+def entries(lines: Iterable[str], stamp: str = "") -> Iterator[LogEntry]:
     """Lines as entries; `stamp` is that of what was before them."""
     level, gathered = "", list[str]()
     for line in lines:
         match = _STAMP.match(line)
         if match is not None:
             if gathered:
-                yield Entry(stamp, level, tuple(gathered))
+                yield LogEntry(stamp, level, tuple(gathered))
             stamp, level, gathered = f"{match[1]}T{match[2]}.{match[3]}", match[4].lower(), []
         elif line.startswith(_CRASHES):
             level = "critical"
         gathered.append(line)
     if gathered:
-        yield Entry(stamp, level, tuple(gathered))
+        yield LogEntry(stamp, level, tuple(gathered))
 
 
-class Tail:
+class LogTail:
     """One log, read on as it grows, and in the file that takes its place when the process starts again."""
 
     def __init__(self, path: Path) -> None:
@@ -96,7 +96,7 @@ class Tail:
         self._stamp = ""
         self._part = ""
 
-    def read(self) -> list[Entry]:
+    def read(self) -> list[LogEntry]:
         """What is new. A last line that has no end yet waits for it."""
         text = self._rest()
         if self._replaced():
@@ -134,14 +134,14 @@ async def logs(robot: str | None, name: str | None, follow: bool, count: int, le
         raise ConfigError(f"--level {level}: it is one of {', '.join(LEVELS)}")
     run_dir = robot_of(robot)
     wanted = {*LEVELS, ""} if level is None else set(LEVELS[LEVELS.index(level) :])
-    tails = {path: Tail(path) for path in files_of(run_dir, name)}
+    tails = {path: LogTail(path) for path in files_of(run_dir, name)}
     try:
         _print(deque(_chosen(tails.values(), wanted), maxlen=count))
         if follow:
             with told_to_end() as end:
                 while await passed(end, LOOK_S):
                     if name is None:
-                        tails |= {path: Tail(path) for path in files_of(run_dir, None) if path not in tails}
+                        tails |= {path: LogTail(path) for path in files_of(run_dir, None) if path not in tails}
                     _print(_chosen(tails.values(), wanted))
     finally:
         for tail in tails.values():
@@ -149,12 +149,12 @@ async def logs(robot: str | None, name: str | None, follow: bool, count: int, le
     return exits.DONE
 
 
-def _chosen(tails: Iterable[Tail], wanted: set[str]) -> Iterator[Entry]:
+def _chosen(tails: Iterable[LogTail], wanted: set[str]) -> Iterator[LogEntry]:
     """What is new in all of them, by time."""
     merged = heapq.merge(*(tail.read() for tail in tails), key=lambda entry: entry.stamp)
     return (entry for entry in merged if entry.level in wanted)
 
 
-def _print(found: Iterable[Entry]) -> None:
+def _print(found: Iterable[LogEntry]) -> None:
     for entry in found:
         print(*entry.lines, sep="\n", flush=True)

@@ -7,13 +7,14 @@ import json
 import msgspec
 
 from apps.cli import exits
-from apps.cli.link import Where, joined
+from apps.cli.link import joined
+from apps.cli.options import RobotChoice
 from apps.cli.table import print_table
 from cocoro.messages import KnownObject, ObjectsRequest
 from cocoro.topics import OBJECTS
 
 
-async def objects(where: Where, as_json: bool) -> int:
+async def objects(where: RobotChoice, as_json: bool) -> int:
     async with joined(where) as link:
         reply = await link.call(OBJECTS, ObjectsRequest())
     if as_json:

@@ -9,14 +9,9 @@ from typing import Annotated
 
 import typer
 
-objects = typer.Typer(invoke_without_command=True)
+from apps.cli.options import JsonOption, MeshOption, RobotChoice, RobotOption
 
-Robot = Annotated[str | None, typer.Option(help="Which robot; needed only when several are up here.")]
-Reach = Annotated[
-    str | None,
-    typer.Option("--profile", metavar="PROFILE", help="Reach the robot as this profile says, on another machine."),
-]
-Json = Annotated[bool, typer.Option("--json", help="Print JSON, for scripts.")]
+objects = typer.Typer(invoke_without_command=True)
 
 
 def add_to(app: typer.Typer, panel: str) -> None:
@@ -24,13 +19,14 @@ def add_to(app: typer.Typer, panel: str) -> None:
 
 
 @objects.callback()
-def list_them(context: typer.Context, robot: Robot = None, profile: Reach = None, json: Json = False) -> None:
+def list_them(
+    context: typer.Context, robot: RobotOption = None, profile: MeshOption = None, json: JsonOption = False
+) -> None:
     """The objects that the robot knows, and where it saw each last; `learn` adds one."""
     if context.invoked_subcommand is None:
         from apps.cli import objects as listing
-        from apps.cli.link import Where
 
-        sys.exit(asyncio.run(listing.objects(Where(robot, profile), json)))
+        sys.exit(asyncio.run(listing.objects(RobotChoice(robot, profile), json)))
 
 
 @objects.command()
@@ -65,16 +61,15 @@ def learn(
     yes: Annotated[bool, typer.Option("--yes", "-y", help="Save it without asking.")] = False,
     replace: Annotated[bool, typer.Option("--replace", help="Forget what an object of that name looked like.")] = False,
     add: Annotated[bool, typer.Option("--add", help="Add these colours to it: seen in another light.")] = False,
-    robot: Robot = None,
-    profile: Reach = None,
-    json: Json = False,
+    robot: RobotOption = None,
+    profile: MeshOption = None,
+    json: JsonOption = False,
 ) -> None:
     """A new object's colours and size, from one look at it: what is pointed at, or what stands out in the middle.
 
     Says and draws what it would match before it saves anything, and warns of what else looks like it.
     """
     from apps.cli import learn_object as learning
-    from apps.cli.link import Where
     from apps.cli.snapshot import check
 
     wanted = learning.wanted_of(
@@ -83,5 +78,5 @@ def learn(
     )  # fmt: skip
     if picture is not None:
         check(picture)
-    keeping = learning.Keeping(catalogue, picture, yes, replace, add, json)
-    sys.exit(asyncio.run(learning.learn_object(Where(robot, profile), source, wanted, keeping)))
+    keeping = learning.SaveOptions(catalogue, picture, yes, replace, add, json)
+    sys.exit(asyncio.run(learning.learn_object(RobotChoice(robot, profile), source, wanted, keeping)))

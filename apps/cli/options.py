@@ -1,15 +1,141 @@
-"""Options whose values have a form of their own."""
+"""Options that several commands share: how typer declares them, and how their values are read.
+
+Every command file imports this one, and `cocoro --help` imports every command file, so it imports little.
+"""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import typer
 
 from cocoro.errors import ConfigError
 
+# --- which robot, and how to print ----------------------------------------------------------------
+
+RobotOption = Annotated[
+    str | None, typer.Option("--robot", help="Name of the robot; needed only when several are up on this machine.")
+]
+MeshOption = Annotated[
+    str | None,
+    typer.Option(
+        "--profile", metavar="PROFILE", help="Reach a robot on another machine through the mesh of this profile."
+    ),
+]
+
+
+@dataclass(frozen=True)
+class RobotChoice:
+    """Which robot a command is for, from `--robot` and `--profile`; neither is needed when one robot is up here."""
+
+    robot: str | None = None
+    profile: str | None = None
+    """Reach it through the mesh of this profile, on another machine."""
+
+
+JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON, for scripts.")]
+
+# --- profiles and the simulator -------------------------------------------------------------------
+
+ProfileArgument = Annotated[str, typer.Argument(help="A profile's name (sim, robot) or file.")]
+ProfileOption = Annotated[
+    str,
+    typer.Option(
+        "--profile", metavar="PROFILE", help="Take the ports and the robot's measured file from this profile."
+    ),
+]
+SetOption = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="Any setting of the profile: service.sim.seed=3. Repeatable."),
+]
+FramesOption = Annotated[
+    str | None, typer.Option("--frames", metavar="WxH@HZ", help="Size and rate of the camera's frames: 320x240@15.")
+]
+LatencyOption = Annotated[
+    list[str] | None,
+    typer.Option("--latency", metavar="NAME=SECONDS", help="Slow a service down: perception=0.5. Repeatable."),
+]
+ObjectsOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--objects", metavar="FILE", help="Known objects instead of the project's own (`cocoro objects learn`)."
+    ),
+]
+DescriptionOption = Annotated[
+    Path | None,
+    typer.Option("--description", metavar="FILE", help="Description of the robot, if it is not the Calliope."),
+]
+MeasuredOption = Annotated[
+    Path | None,
+    typer.Option("--measured", metavar="FILE", help="Values measured on this robot; they replace the description's."),
+]
+
+# --- the learned model ----------------------------------------------------------------------------
+
+ModelOption = Annotated[
+    Path | None, typer.Option("--model", metavar="FILE", help="Learned model of the body (from `cocoro learn`).")
+]
+ReachOption = Annotated[
+    str | None,
+    typer.Option("--reach", metavar="learned|rigid", help="rigid: reach without the learned model of the arm."),
+]
+AdaptOption = Annotated[
+    bool, typer.Option("--adapt", help="Keep training the learned model of the arm with what the camera sees at work.")
+]
+ModelOutOption = Annotated[
+    Path,
+    typer.Option("--model", metavar="FILE", help="Where to write the model; other parts in that file are kept."),
+]
+SamplesOutOption = Annotated[
+    Path, typer.Option("--out", metavar="FILE", help="Where to keep the samples; an existing file is continued.")
+]
+SendOption = Annotated[bool, typer.Option("--send", help="Send the model to the running planner; no restart needed.")]
+
+# --- tasks ----------------------------------------------------------------------------------------
+
+TimeoutOption = Annotated[
+    float | None,
+    typer.Option("--timeout", min=0.1, max=3600.0, metavar="SECONDS", help="Fail the task after this time."),
+]
+ForOption = Annotated[
+    float | None, typer.Option("--for", min=0.1, max=3600.0, metavar="SECONDS", help="Follow for this time, then stop.")
+]
+DistanceOption = Annotated[
+    float,
+    typer.Option(
+        "--distance", min=0.0, max=5.0, metavar="METRES", help="go-to: from the robot's centre to the object's edge."
+    ),
+]
+
+# --- captures and topics --------------------------------------------------------------------------
+
+CaptureArgument = Annotated[Path, typer.Argument(metavar="FILE", help="A capture (MCAP file).")]
+OnlyOption = Annotated[
+    list[str] | None,
+    typer.Option("--only", metavar="KEYEXPR", help="Only these keys: base/state, */health, frames. Repeatable."),
+]
+WithoutOption = Annotated[
+    list[str] | None, typer.Option("--without", metavar="KEYEXPR", help="All keys except these. Repeatable.")
+]
+FromOption = Annotated[
+    float | None, typer.Option("--from", metavar="S", help="Start here, in seconds from the capture's start.")
+]
+ToOption = Annotated[
+    float | None, typer.Option("--to", metavar="S", help="End before this, in seconds from the capture's start.")
+]
+KeyArgument = Annotated[
+    str, typer.Argument(metavar="KEY", help="base/state, */health, ** (all); `cocoro topics` lists the known keys.")
+]
+
+# --- values with a form of their own --------------------------------------------------------------
+
 
 def frames_of(text: str) -> dict[str, int | float]:
-    """'320x240@15' as width, height and frame_rate_hz; without '@15' just the size. Raises ConfigError."""
+    """Reads '320x240@15' into width, height and frame_rate_hz; '@15' may be absent. Raises ConfigError."""
     match = re.fullmatch(r"(\d+)x(\d+)(?:@(\d+(?:\.\d+)?))?", text)
     if match is None:
         raise ConfigError(f"--frames {text}: write it as WIDTHxHEIGHT@HZ, for example 320x240@15")
@@ -18,7 +144,7 @@ def frames_of(text: str) -> dict[str, int | float]:
 
 
 def latencies_of(texts: Iterable[str]) -> dict[str, float]:
-    """'perception=0.5' and others like it, as seconds by name. Raises ConfigError."""
+    """Reads 'perception=0.5' and the like into seconds by service name. Raises ConfigError."""
     found: dict[str, float] = {}
     for text in texts:
         name, equals, seconds = text.partition("=")

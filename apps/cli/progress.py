@@ -13,7 +13,7 @@ EVERY_S = 2.0
 """How often a long phase gets a further line, where lines are not written over."""
 
 
-class View(Protocol):
+class TaskDisplay(Protocol):
     def show(self, state: TaskState) -> None: ...
 
     def say(self, text: str) -> None:
@@ -23,11 +23,11 @@ class View(Protocol):
         """The last line."""
 
 
-def view(as_json: bool, out: TextIO | None = None) -> View:
+def view(as_json: bool, out: TextIO | None = None) -> TaskDisplay:
     out = out or sys.stdout
     if as_json:
-        return Silent()
-    return Live(out) if out.isatty() else Lines(out)
+        return SilentDisplay()
+    return LiveDisplay(out) if out.isatty() else LineDisplay(out)
 
 
 def line(state: TaskState) -> str:
@@ -35,7 +35,7 @@ def line(state: TaskState) -> str:
     return f"{state.elapsed_s:6.1f} s  {state.phase:<10} {distance:<8}  {state.text}".rstrip()
 
 
-class Silent:
+class SilentDisplay:
     def show(self, state: TaskState) -> None:
         pass
 
@@ -46,7 +46,7 @@ class Silent:
         pass
 
 
-class Lines:
+class LineDisplay:
     """A line for each phase, and one now and then while it lasts."""
 
     def __init__(self, out: TextIO) -> None:
@@ -71,7 +71,7 @@ class Lines:
         self.say(text)
 
 
-class Live:
+class LiveDisplay:
     """A line that is written over; what a phase came to stays above it."""
 
     def __init__(self, out: TextIO) -> None:

@@ -5,13 +5,14 @@ from __future__ import annotations
 import sys
 
 from apps.cli import exits
-from apps.cli.link import Answer, Where, joined
+from apps.cli.link import Answer, joined
+from apps.cli.options import RobotChoice
 from cocoro.errors import MeshError
 from cocoro.messages import EstopReply, EstopRequest
 from cocoro.topics import ESTOP, STOPPABLE
 
 
-async def reset(where: Where) -> int:
+async def reset(where: RobotChoice) -> int:
     """The executive is asked first: when it refuses, everything stays latched."""
     question = EstopRequest(latched=False, by="operator")
     async with joined(where) as link:

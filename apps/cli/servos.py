@@ -6,7 +6,8 @@ import sys
 from typing import cast
 
 from apps.cli import exits
-from apps.cli.link import Link, Where, joined
+from apps.cli.link import Link, joined
+from apps.cli.options import RobotChoice
 from cocoro.errors import ConfigError, MeshError
 from cocoro.messages import ServoRequest
 from cocoro.robot import Robot
@@ -16,7 +17,7 @@ NETWORKS = ("arm", "hand")
 DID = {"clear": "cleared", "relax": "limp", "hold": "holding"}
 
 
-async def ask(where: Where, action: str, joints: list[str]) -> int:
+async def ask(where: RobotChoice, action: str, joints: list[str]) -> int:
     """Ask the networks that have these joints. Exit code 3 when something could not be done."""
     networks = _networks_of(joints)
     code = exits.DONE

@@ -26,7 +26,7 @@ from services.servos.bus import ServoBus
 
 
 @dataclass
-class Workshop:
+class ServoWorkbench:
     """A robot, its ports and the file of its own, as a profile tells."""
 
     profile: Profile
@@ -36,7 +36,7 @@ class Workshop:
     file: Path
 
     @classmethod
-    def of(cls, profile_name: str, write: Path | None) -> Workshop:
+    def of(cls, profile_name: str, write: Path | None) -> ServoWorkbench:
         profile = profiles.read(profile_name)
         description = None if profile.description is None else Path(profile.description)
         measured = None if profile.measured is None else Path(profile.measured)
@@ -68,7 +68,7 @@ class Workshop:
 
 def scan(profile: str, ports: list[str], bauds: list[int], last: int, write: Path | None, as_json: bool) -> int:
     """Exit code 1 when a servo of the robot's was not found."""
-    shop = Workshop.of(profile, None)
+    shop = ServoWorkbench.of(profile, None)
     known = [port for port in dict.fromkeys(shop.ports.values()) if Path(port).exists()]
     resolved = {str(Path(port).resolve()) for port in known}
     wanted = ports or known + [port for port in tools.candidates() if str(Path(port).resolve()) not in resolved]
@@ -106,7 +106,7 @@ def _print_found(found: list[Any], names: dict[int, Joint]) -> None:
     print_table(heads, rows) if rows else print("no servo answers")
 
 
-def _write_ports(shop: Workshop, found: list[Any], names: dict[int, Joint], file: Path) -> None:
+def _write_ports(shop: ServoWorkbench, found: list[Any], names: dict[int, Joint], file: Path) -> None:
     """The port of each network into a profile, and its baud rate into the robot's own file where it is another."""
     for network, row in shop.robot.networks.items():
         places = {(one.port, one.baud) for one in found if one.number in names and names[one.number].network == network}
@@ -132,7 +132,7 @@ def set_id(port: str, baud: int, old: int, new: int) -> int:
 def calibrate(
     profile: str, joints: list[str], at_deg: float, port: str | None, baud: int | None, write: Path | None
 ) -> int:
-    shop = Workshop.of(profile, write)
+    shop = ServoWorkbench.of(profile, write)
     for joint in [shop.joint(name) for name in joints]:
         with shop.line(joint, port, baud) as line:
             shop.write(joint, tools.calibrate(line, joint, at_deg, _ask))
@@ -140,7 +140,7 @@ def calibrate(
 
 
 def limits(profile: str, joints: list[str], port: str | None, baud: int | None, write: Path | None) -> int:
-    shop = Workshop.of(profile, write)
+    shop = ServoWorkbench.of(profile, write)
     for joint in [shop.joint(name) for name in joints]:
         with shop.line(joint, port, baud) as line:
             print(f"{joint.name} is limp: turn it from end to end, then press Enter")

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from apps.cli import exits
-from apps.cli.link import Link, Where, joined, within
+from apps.cli.link import Link, joined, within
+from apps.cli.options import RobotChoice
 from cocoro.errors import ConfigError, MeshError
 from cocoro.inbox import Inbox
 from cocoro.messages import Detections, Frame
@@ -21,10 +22,10 @@ DETECTIONS_S = 3.0
 """How long to wait for a frame at all, and for what was detected in one."""
 
 
-async def snapshot(where: Where, out: Path) -> int:
+async def snapshot(where: RobotChoice, out: Path) -> int:
     check(out)
     async with joined(where, frames=True) as link:
-        camera = Snapshot(link)
+        camera = SnapshotTaker(link)
         camera.open()
         print(await camera.write(out))
     return exits.DONE
@@ -36,7 +37,7 @@ def check(out: Path) -> None:
         raise ConfigError(f"{out}: the picture is a PNG, so let its name end with .png")
 
 
-class Snapshot:
+class SnapshotTaker:
     """The newest frame whose detections are known, from `open` on; `write` it when the moment has come."""
 
     def __init__(self, link: Link) -> None:

@@ -10,7 +10,8 @@ from typing import Any
 import msgspec
 
 from apps.cli import exits
-from apps.cli.link import Link, Where, joined, within
+from apps.cli.link import Link, joined, within
+from apps.cli.options import RobotChoice
 from apps.cli.table import print_table
 from cocoro.errors import ConfigError
 from cocoro.messages import Health, Message, TaskState
@@ -22,7 +23,7 @@ HEALTH_S = 2.5
 """How long to wait for those that are alive to tell their health; they do so once a second of the robot's time."""
 
 
-async def status(where: Where, as_json: bool) -> int:
+async def status(where: RobotChoice, as_json: bool) -> int:
     async with joined(where) as link:
         report = await Survey(link).take()
     if as_json:

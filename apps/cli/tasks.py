@@ -12,10 +12,11 @@ import msgspec
 
 from apps.cli import exits
 from apps.cli.ending import on_end
-from apps.cli.link import Link, Where, joined
+from apps.cli.link import Link, joined
+from apps.cli.options import RobotChoice
 from apps.cli.output import going_on
-from apps.cli.progress import View, view
-from apps.cli.snapshot import Snapshot, check
+from apps.cli.progress import TaskDisplay, view
+from apps.cli.snapshot import SnapshotTaker, check
 from cocoro.contact import Contact
 from cocoro.errors import CallTimeoutError, CocoroError
 from cocoro.messages import CancelRequest, TaskReply, TaskRequest, TaskState
@@ -37,7 +38,7 @@ LOOK_S = 0.2
 """How often it is looked whether an executive that is not heard has died."""
 
 
-async def run(where: Where, request: TaskRequest, as_json: bool, picture: Path | None) -> int:
+async def run(where: RobotChoice, request: TaskRequest, as_json: bool, picture: Path | None) -> int:
     """Run a task to its outcome and return the exit code. `picture`: where to write what is seen at the grasp."""
     if picture is not None:
         check(picture)
@@ -50,7 +51,7 @@ async def run(where: Where, request: TaskRequest, as_json: bool, picture: Path |
     return code
 
 
-async def cancel(where: Where) -> int:
+async def cancel(where: RobotChoice) -> int:
     async with joined(where) as link:
         reply = await link.call(CANCEL, CancelRequest())
     if not reply.accepted:
@@ -64,7 +65,7 @@ class Follower:
     """One task, from the request to the outcome. `interrupt` cancels it on the robot."""
 
     def __init__(
-        self, link: Link, request: TaskRequest, view: View, picture: Path | None, contact: Contact | None = None
+        self, link: Link, request: TaskRequest, view: TaskDisplay, picture: Path | None, contact: Contact | None = None
     ) -> None:
         """`contact` knows what became of an executive that is not heard any more."""
         self._contact = contact or Contact(link.run_dir.claimant_pid)
@@ -126,7 +127,7 @@ class Follower:
 
     async def _follow(self) -> TaskState:
         """The task's last state, as the executive says it, or as it is when that is not heard any more."""
-        camera: Snapshot | None = None
+        camera: SnapshotTaker | None = None
         while True:
             news = await self._news.get()
             state = await self._after_silence() if news is False else news
@@ -134,7 +135,7 @@ class Follower:
                 continue
             if self._picture is not None:
                 if state.phase == SNAPSHOT_PHASE and camera is None:
-                    camera = Snapshot(self._link)
+                    camera = SnapshotTaker(self._link)
                     camera.open()
                 elif state.phase != SNAPSHOT_PHASE and camera is not None:
                     await self._take(camera, self._picture)
@@ -169,7 +170,7 @@ class Follower:
             task_id=self._task_id, task=self._request.task, label=self._request.label, outcome="failed", reason=reason
         )
 
-    async def _take(self, camera: Snapshot, picture: Path) -> None:
+    async def _take(self, camera: SnapshotTaker, picture: Path) -> None:
         try:
             self._view.say(await camera.write(picture))
         except CocoroError as error:

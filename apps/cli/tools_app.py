@@ -9,19 +9,11 @@ from typing import Annotated
 
 import typer
 
+from apps.cli.options import JsonOption, KeyArgument, MeshOption, RobotChoice, RobotOption
+
 PANEL = "Tools"
 
 new = typer.Typer(no_args_is_help=True, help="Write a component from a template: `cocoro new service NAME`.")
-
-Robot = Annotated[str | None, typer.Option(help="Which robot; needed only when several are up here.")]
-Reach = Annotated[
-    str | None,
-    typer.Option("--profile", metavar="PROFILE", help="Reach the robot as this profile says, on another machine."),
-]
-Json = Annotated[bool, typer.Option("--json", help="Print JSON, for scripts.")]
-Key = Annotated[
-    str, typer.Argument(metavar="KEY", help="base/state, */health, ** (all): `cocoro topics` lists the known ones.")
-]
 
 
 def add_to(app: typer.Typer) -> None:
@@ -33,49 +25,46 @@ def add_to(app: typer.Typer) -> None:
 def top(
     once: Annotated[bool, typer.Option("--once", help="Show it once; exit code 1 when something is missing.")] = False,
     every: Annotated[float, typer.Option(min=0.1, max=60.0, metavar="S", help="How often it is shown anew.")] = 1.0,
-    robot: Robot = None,
-    profile: Reach = None,
-    json: Json = False,
+    robot: RobotOption = None,
+    profile: MeshOption = None,
+    json: JsonOption = False,
 ) -> None:
     """What runs and what travels, live: cpu, memory, rates against nominal, ages, what was skipped, lost, rejected.
 
     Ctrl-C ends it. Counts are since the start; what is wrong now, or grows and should not, is red.
     """
     from apps.cli import top as showing
-    from apps.cli.link import Where
 
-    sys.exit(asyncio.run(showing.top(Where(robot, profile), once, json, every)))
+    sys.exit(asyncio.run(showing.top(RobotChoice(robot, profile), once, json, every)))
 
 
 def echo(
-    key: Key,
+    key: KeyArgument,
     count: Annotated[int | None, typer.Option("--count", "-n", min=1, help="End after so many messages.")] = None,
     seconds: Annotated[float | None, typer.Option("--for", min=0.1, metavar="S", help="End after so long.")] = None,
     full: Annotated[bool, typer.Option("--full", help="All elements of long lists.")] = False,
-    robot: Robot = None,
-    profile: Reach = None,
-    json: Json = False,
+    robot: RobotOption = None,
+    profile: MeshOption = None,
+    json: JsonOption = False,
 ) -> None:
     """What travels on a key, decoded, of whatever type it is; what a reader would reject is marked with its reason."""
     from apps.cli import echo as echoing
-    from apps.cli.link import Where
 
-    sys.exit(asyncio.run(echoing.echo(Where(robot, profile), key, count, seconds, json, full)))
+    sys.exit(asyncio.run(echoing.echo(RobotChoice(robot, profile), key, count, seconds, json, full)))
 
 
 def hz(
-    key: Key,
+    key: KeyArgument,
     window: Annotated[float, typer.Option(min=0.5, max=600.0, metavar="S", help="What the figures are of.")] = 5.0,
     once: Annotated[bool, typer.Option("--once", help="Measure one window and end.")] = False,
-    robot: Robot = None,
-    profile: Reach = None,
-    json: Json = False,
+    robot: RobotOption = None,
+    profile: MeshOption = None,
+    json: JsonOption = False,
 ) -> None:
     """How often, how evenly and how much travels on a key, as it arrives here, over the last seconds."""
     from apps.cli import hz as measuring
-    from apps.cli.link import Where
 
-    sys.exit(asyncio.run(measuring.hz(Where(robot, profile), key, window, once, json)))
+    sys.exit(asyncio.run(measuring.hz(RobotChoice(robot, profile), key, window, once, json)))
 
 
 def logs(

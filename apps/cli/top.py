@@ -15,7 +15,8 @@ import psutil
 
 from apps.cli import exits
 from apps.cli.ending import passed, told_to_end
-from apps.cli.link import Link, Where, joined, within
+from apps.cli.link import Link, joined, within
+from apps.cli.options import RobotChoice
 from apps.cli.status import expected
 from cocoro.bus.keys import matches
 from cocoro.component import Process
@@ -31,10 +32,10 @@ SILENT_S = 3.0
 NEWS: dict[str, Topic[Any]] = {"clock": CLOCK, "task": TASK, "plan": PLAN, "latch": LATCH, "base": BASE_STATE}
 
 
-async def top(where: Where, once: bool, as_json: bool, every_s: float) -> int:
+async def top(where: RobotChoice, once: bool, as_json: bool, every_s: float) -> int:
     """Show until interrupted, or once. Exit code 1, with `once`, when something that should run does not."""
     async with joined(where) as link:
-        watch = Watch(link)
+        watch = MeshWatch(link)
         await watch.first()
         if once:
             report = watch.report()
@@ -64,7 +65,7 @@ def _print(report: dict[str, Any], as_json: bool) -> None:
         print_report(report)
 
 
-class Watch:
+class MeshWatch:
     """Listens to everyone's health; `report` is what is known now, as data."""
 
     def __init__(self, link: Link) -> None:

@@ -8,9 +8,9 @@ from typing import Any
 
 from apps.experiments import bodies, figures
 from apps.experiments.lessons import SIZES
-from apps.experiments.runs import Result, Run
+from apps.experiments.runs import ExperimentRun, RunResult
 from apps.experiments.section import Plot, Section, row
-from apps.experiments.settings import Settings
+from apps.experiments.settings import ExperimentSettings
 from apps.learning.study import BEST, METHODS
 
 KEY, TITLE = "E1", "The hand-eye map, from babbling"
@@ -20,7 +20,7 @@ AFTER = 100
 """So many sightings after the bend the adapted map is judged over the rest."""
 
 
-def runs(settings: Settings) -> list[Run]:
+def runs(settings: ExperimentSettings) -> list[ExperimentRun]:
     found = []
     for seed in settings.seeds:
         found += bodies.learned(settings, seed)
@@ -29,12 +29,14 @@ def runs(settings: Settings) -> list[Run]:
             **settings.common(seed),
         }  # fmt: skip
         lesson = {"into": str(settings.model_file(seed)), "bent": str(settings.bent_file(seed)), "bend_s": BEND_S}
-        found.append(Run(f"babble-bent-{seed}", "rehearse", bent))
-        found.append(Run(f"bend-{seed}", "bend", lesson, needs=(f"babble-bent-{seed}", bodies.learned_name(seed))))
+        found.append(ExperimentRun(f"babble-bent-{seed}", "rehearse", bent))
+        found.append(
+            ExperimentRun(f"bend-{seed}", "bend", lesson, needs=(f"babble-bent-{seed}", bodies.learned_name(seed)))
+        )
     return found
 
 
-def section(settings: Settings, results: Mapping[str, Result]) -> Section:
+def section(settings: ExperimentSettings, results: Mapping[str, RunResult]) -> Section:
     learned = {seed: results[bodies.learned_name(seed)] for seed in settings.seeds}
     good = {seed: result for seed, result in learned.items() if "error" not in result}
     bent = [r for seed in settings.seeds if "error" not in (r := results[f"bend-{seed}"])]
@@ -76,7 +78,7 @@ def section(settings: Settings, results: Mapping[str, Result]) -> Section:
     return made
 
 
-def _about(good: Mapping[int, Result]) -> str:
+def _about(good: Mapping[int, RunResult]) -> str:
     text = (
         "The arm goes from Sobol draw to Sobol draw over its joints' range (±2.62 rad, within the joints' limits), the"
         " head looks at the hand's marker, and each frame that shows it is a sample. Every fifth draw is held out,"
@@ -93,11 +95,11 @@ def _about(good: Mapping[int, Result]) -> str:
     )
 
 
-def _bent_rows(bent: list[Result]) -> list[Any]:
+def _bent_rows(bent: list[RunResult]) -> list[Any]:
     def mean_cm(values: list[float]) -> float:
         return 100 * sum(values) / max(len(values), 1)
 
-    def late(result: Result, key: str) -> float:
+    def late(result: RunResult, key: str) -> float:
         return mean_cm(result[key][result["bent_at"] + AFTER :])
 
     measure = f"error {AFTER} sightings after the arm was bent by 3 cm, and later"
@@ -108,7 +110,7 @@ def _bent_rows(bent: list[Result]) -> list[Any]:
     ]
 
 
-def _plots(settings: Settings, good: Mapping[int, Result], bent: list[Result]) -> list[Plot]:
+def _plots(settings: ExperimentSettings, good: Mapping[int, RunResult], bent: list[RunResult]) -> list[Plot]:
     plots = []
     if good:
         seed = next(iter(good))

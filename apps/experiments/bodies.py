@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-from apps.experiments.runs import Run
-from apps.experiments.settings import Settings
+from apps.experiments.runs import ExperimentRun
+from apps.experiments.settings import ExperimentSettings
 
 
-def babbled(settings: Settings, seed: int) -> list[Run]:
+def babbled(settings: ExperimentSettings, seed: int) -> list[ExperimentRun]:
     """Arm and wheels of one body."""
     common = settings.common(seed)
     arm = {"task": "babble-arm", "count": settings.samples, "samples": str(settings.arm_file(seed)), **common}
@@ -16,24 +16,27 @@ def babbled(settings: Settings, seed: int) -> list[Run]:
         "task": "babble-wheels", "label": "red_can", "scene": "wheels", "count": settings.trials,
         "samples": str(settings.wheels_file(seed)), **common,
     }  # fmt: skip
-    return [Run(f"babble-arm-{seed}", "rehearse", arm), Run(f"babble-wheels-{seed}", "rehearse", wheels)]
+    return [
+        ExperimentRun(f"babble-arm-{seed}", "rehearse", arm),
+        ExperimentRun(f"babble-wheels-{seed}", "rehearse", wheels),
+    ]
 
 
-def learned(settings: Settings, seed: int) -> list[Run]:
+def learned(settings: ExperimentSettings, seed: int) -> list[ExperimentRun]:
     """The same, and a model of them."""
     fields = {
         "arm": str(settings.arm_file(seed)), "wheels": str(settings.wheels_file(seed)),
         "into": str(settings.model_file(seed)),
     }  # fmt: skip
     runs = babbled(settings, seed)
-    return [*runs, Run(learned_name(seed), "learn", fields, needs=tuple(run.name for run in runs))]
+    return [*runs, ExperimentRun(learned_name(seed), "learn", fields, needs=tuple(run.name for run in runs))]
 
 
 def learned_name(seed: int) -> str:
     return f"learn-{seed}"
 
 
-def with_model(settings: Settings, seed: int, name: str, **fields: Any) -> Run:
+def with_model(settings: ExperimentSettings, seed: int, name: str, **fields: Any) -> ExperimentRun:
     """A rehearsal of a body that has learned."""
     request = {**settings.common(seed), "model": str(settings.model_file(seed)), **fields}
-    return Run(name, "rehearse", request, needs=(learned_name(seed),))
+    return ExperimentRun(name, "rehearse", request, needs=(learned_name(seed),))

@@ -7,18 +7,18 @@ from pathlib import Path
 from typing import Protocol
 
 from apps.experiments import arm_map, fetching, figures, following, going, reaching, report, wheel_distance
-from apps.experiments.runs import Display, Result, Run, perform
+from apps.experiments.runs import ExperimentRun, RunDisplay, RunResult, perform
 from apps.experiments.section import Section
-from apps.experiments.settings import Settings
+from apps.experiments.settings import ExperimentSettings
 
 
 class Experiment(Protocol):
     KEY: str
     TITLE: str
 
-    def runs(self, settings: Settings) -> list[Run]: ...
+    def runs(self, settings: ExperimentSettings) -> list[ExperimentRun]: ...
 
-    def section(self, settings: Settings, results: dict[str, Result]) -> Section: ...
+    def section(self, settings: ExperimentSettings, results: dict[str, RunResult]) -> Section: ...
 
 
 EXPERIMENTS: dict[str, Experiment] = {
@@ -26,11 +26,13 @@ EXPERIMENTS: dict[str, Experiment] = {
 }
 
 
-def run(keys: Sequence[str], settings: Settings, display: Display, *, plots: bool) -> tuple[list[Section], Path]:
+def run(
+    keys: Sequence[str], settings: ExperimentSettings, display: RunDisplay, *, plots: bool
+) -> tuple[list[Section], Path]:
     """Run them and write the report. Raises ConfigError; what was run before an end of any kind is kept."""
     if plots:
         figures.available()
-    runs: dict[str, Run] = {}
+    runs: dict[str, ExperimentRun] = {}
     for key in keys:
         runs |= {run.name: run for run in EXPERIMENTS[key].runs(settings)}
     results = perform(runs.values(), settings.out / "runs", settings.jobs, display)

@@ -8,9 +8,9 @@ from math import ceil
 from typing import Any
 
 from apps.experiments import bodies, figures
-from apps.experiments.runs import Result, Run
+from apps.experiments.runs import ExperimentRun, RunResult
 from apps.experiments.section import Plot, Section, row
-from apps.experiments.settings import Settings
+from apps.experiments.settings import ExperimentSettings
 
 KEY, TITLE = "E6", "Fetching"
 CANS = ("red_can", "green_can", "blue_can")
@@ -22,7 +22,7 @@ WAYS: dict[str, tuple[str, dict[str, Any]]] = {
 }
 
 
-def runs(settings: Settings) -> list[Run]:
+def runs(settings: ExperimentSettings) -> list[ExperimentRun]:
     found = []
     for seed in settings.seeds:
         found += bodies.learned(settings, seed)
@@ -33,7 +33,7 @@ def runs(settings: Settings) -> list[Run]:
     return found
 
 
-def section(settings: Settings, results: Mapping[str, Result]) -> Section:
+def section(settings: ExperimentSettings, results: Mapping[str, RunResult]) -> Section:
     made = Section(
         KEY,
         TITLE,
@@ -41,7 +41,7 @@ def section(settings: Settings, results: Mapping[str, Result]) -> Section:
         " is one that is held 0.1 m high for 2 s, by the truth, with none knocked over.",
     )
     total = len(settings.seeds) * len(CANS)
-    phases: dict[str, list[Result]] = {}
+    phases: dict[str, list[RunResult]] = {}
     for way, (who, _) in WAYS.items():
         found = [results[f"fetch-{way}-{can}-{seed}"] for seed in settings.seeds for can in CANS]
         good = [result for result in found if _fetched(result)]
@@ -70,6 +70,6 @@ def section(settings: Settings, results: Mapping[str, Result]) -> Section:
     return made
 
 
-def _fetched(result: Result) -> bool:
+def _fetched(result: RunResult) -> bool:
     truth = result.get("truth", {})
     return bool(result.get("outcome") == "done" and truth["held"] and not truth["knocked_over"])

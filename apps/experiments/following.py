@@ -7,9 +7,9 @@ from functools import partial
 from typing import Any
 
 from apps.experiments import bodies, figures
-from apps.experiments.runs import Result, Run
+from apps.experiments.runs import ExperimentRun, RunResult
 from apps.experiments.section import Plot, Section, row
-from apps.experiments.settings import Settings
+from apps.experiments.settings import ExperimentSettings
 
 KEY, TITLE = "E5", "Following"
 FOR_S = 33.0
@@ -21,7 +21,7 @@ WAYS: dict[str, tuple[str, dict[str, Any]]] = {
 }
 
 
-def runs(settings: Settings) -> list[Run]:
+def runs(settings: ExperimentSettings) -> list[ExperimentRun]:
     found = []
     for seed in settings.seeds:
         found += bodies.learned(settings, seed)
@@ -34,7 +34,7 @@ def runs(settings: Settings) -> list[Run]:
     return found
 
 
-def section(settings: Settings, results: Mapping[str, Result]) -> Section:
+def section(settings: ExperimentSettings, results: Mapping[str, RunResult]) -> Section:
     made = Section(
         KEY,
         TITLE,

@@ -8,9 +8,9 @@ from math import cos, isnan, radians, sin
 from typing import Any
 
 from apps.experiments import bodies, figures
-from apps.experiments.runs import Result, Run
+from apps.experiments.runs import ExperimentRun, RunResult
 from apps.experiments.section import Plot, Section, row
-from apps.experiments.settings import Settings
+from apps.experiments.settings import ExperimentSettings
 
 KEY, TITLE = "E4", "Navigation"
 BEARINGS_DEG = (-90, -45, 0, 45, 90)
@@ -32,7 +32,7 @@ floating = true
 """
 
 
-def runs(settings: Settings) -> list[Run]:
+def runs(settings: ExperimentSettings) -> list[ExperimentRun]:
     found = []
     folder = settings.out / "scenes"
     folder.mkdir(parents=True, exist_ok=True)
@@ -55,7 +55,7 @@ def runs(settings: Settings) -> list[Run]:
     return found
 
 
-def section(settings: Settings, results: Mapping[str, Result]) -> Section:
+def section(settings: ExperimentSettings, results: Mapping[str, RunResult]) -> Section:
     made = Section(
         KEY,
         TITLE,
@@ -97,7 +97,7 @@ def section(settings: Settings, results: Mapping[str, Result]) -> Section:
     return made
 
 
-def _reached(results: Mapping[str, Result], way: str, bearing: int, seed: int) -> Result | None:
+def _reached(results: Mapping[str, RunResult], way: str, bearing: int, seed: int) -> RunResult | None:
     result = results[_name(way, bearing, seed)]
     return result if result.get("outcome") == "done" else None
 

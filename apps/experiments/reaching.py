@@ -7,9 +7,9 @@ from functools import partial
 from typing import Any
 
 from apps.experiments import bodies, figures
-from apps.experiments.runs import Result, Run
-from apps.experiments.section import Plot, Row, Section, row
-from apps.experiments.settings import Settings
+from apps.experiments.runs import ExperimentRun, RunResult
+from apps.experiments.section import Plot, ResultRow, Section, row
+from apps.experiments.settings import ExperimentSettings
 
 KEY, TITLE = "E2", "Reaching four suspended targets"
 TARGETS = ("red_can", "green_can", "blue_can", "yellow_ball")
@@ -25,7 +25,7 @@ WAYS: dict[str, tuple[str, dict[str, Any]]] = {
 REACHED = {"rho_m": 0.02, "azimuth_rad": 0.034, "elevation_rad": 0.034}
 
 
-def runs(settings: Settings) -> list[Run]:
+def runs(settings: ExperimentSettings) -> list[ExperimentRun]:
     found = []
     for seed in settings.seeds:
         found += bodies.learned(settings, seed)
@@ -41,7 +41,7 @@ def runs(settings: Settings) -> list[Run]:
     return found
 
 
-def section(settings: Settings, results: Mapping[str, Result]) -> Section:
+def section(settings: ExperimentSettings, results: Mapping[str, RunResult]) -> Section:
     made = Section(
         KEY,
         TITLE,
@@ -70,7 +70,7 @@ def section(settings: Settings, results: Mapping[str, Result]) -> Section:
     return made
 
 
-def _rows(said: str, who: str, tasks: list[list[dict[str, Any]]], *, ours: bool) -> list[Row]:
+def _rows(said: str, who: str, tasks: list[list[dict[str, Any]]], *, ours: bool) -> list[ResultRow]:
     reached = [float(sum(task["outcome"] == "done" for task in seed)) for seed in tasks]
     stalls = [max((task["longest_stall_s"] for task in seed), default=float("nan")) for seed in tasks]
     gaps = [task["hand_to_target"] for seed in tasks for task in seed if task["outcome"] == "done"]

@@ -13,8 +13,8 @@ from typing import Any
 
 import msgspec
 
-from apps.experiments.section import Row, Section
-from apps.experiments.settings import Settings
+from apps.experiments.section import ResultRow, Section
+from apps.experiments.settings import ExperimentSettings
 from cocoro.about import DISTRIBUTIONS
 from cocoro.errors import naming
 from cocoro.learning.dataset import fingerprint_of
@@ -29,7 +29,7 @@ tr.ours{background:#eef5fa} td.missed{color:#b00020;font-weight:600} td.held{col
 figure{margin:1.5rem 0} img{max-width:100%} figcaption{color:#555;font-size:13px} h2{margin-top:3rem}"""
 
 
-def write(sections: Sequence[Section], settings: Settings, *, plots: bool) -> Path:
+def write(sections: Sequence[Section], settings: ExperimentSettings, *, plots: bool) -> Path:
     """Everything, into the settings' folder. Returns the Markdown's path."""
     folder = settings.out
     folder.mkdir(parents=True, exist_ok=True)
@@ -47,7 +47,7 @@ def write(sections: Sequence[Section], settings: Settings, *, plots: bool) -> Pa
     return path
 
 
-def _manifest(settings: Settings) -> dict[str, Any]:
+def _manifest(settings: ExperimentSettings) -> dict[str, Any]:
     versions = {}
     for name in (*DISTRIBUTIONS, "pybullet", "moderngl", "matplotlib"):
         try:
@@ -65,7 +65,7 @@ def _manifest(settings: Settings) -> dict[str, Any]:
     }
 
 
-def _about(settings: Settings) -> str:
+def _about(settings: ExperimentSettings) -> str:
     seeds = settings.seeds
     which = f"{seeds[0]} to {seeds[-1]}" if len(seeds) > 1 else str(seeds[0])
     count = f"{len(seeds)} seed" + ("" if len(seeds) == 1 else "s")
@@ -77,11 +77,11 @@ def _about(settings: Settings) -> str:
     )
 
 
-def _cells(row: Row) -> tuple[str, ...]:
+def _cells(row: ResultRow) -> tuple[str, ...]:
     return (row.measure, row.who, row.mean, row.worst, row.unit, row.wanted, row.verdict, row.paper)
 
 
-def _markdown(sections: Sequence[Section], settings: Settings, plots: bool) -> Iterator[str]:
+def _markdown(sections: Sequence[Section], settings: ExperimentSettings, plots: bool) -> Iterator[str]:
     yield "# The paper's experiments"
     yield ""
     yield _about(settings)
@@ -101,7 +101,7 @@ def _markdown(sections: Sequence[Section], settings: Settings, plots: bool) -> I
                 yield f"\n![{plot.caption}]({plot.name}.png)\n\n*{plot.caption}*"
 
 
-def _page(sections: Sequence[Section], settings: Settings, plots: bool) -> str:
+def _page(sections: Sequence[Section], settings: ExperimentSettings, plots: bool) -> str:
     said = html.escape
     parts = [f"<h1>The paper's experiments</h1><p>{said(_about(settings))}</p>"]
     for section in sections:

@@ -23,12 +23,12 @@ from cocoro.errors import CocoroError, naming
 TASKS_A_PROCESS = 25
 """A new one now and then, lest something grows; to begin costs each as long as a short run."""
 LESSONS: dict[str, Callable[..., dict[str, Any]]] = {"learn": lessons.learn, "bend": lessons.bend}
-Result = dict[str, Any]
+RunResult = dict[str, Any]
 """JSON; with 'error' in it where the run could not be."""
 
 
 @dataclass(frozen=True)
-class Run:
+class ExperimentRun:
     """One piece of work. Equal names, equal runs."""
 
     name: str
@@ -40,15 +40,15 @@ class Run:
     """Names of the runs that must be done before."""
 
 
-class Display(Protocol):
+class RunDisplay(Protocol):
     def begin(self, total: int, had: int) -> None: ...
 
     def started(self, name: str) -> None: ...
 
-    def ended(self, name: str, result: Result) -> None: ...
+    def ended(self, name: str, result: RunResult) -> None: ...
 
 
-def carry_out(kind: str, fields: dict[str, Any]) -> Result:
+def carry_out(kind: str, fields: dict[str, Any]) -> RunResult:
     """In a process of its own."""
     try:
         if kind == "rehearse":
@@ -63,11 +63,11 @@ def carry_out(kind: str, fields: dict[str, Any]) -> Result:
         return {"error": f"{type(error).__name__}: {error}"}
 
 
-def perform(runs: Iterable[Run], folder: Path, jobs: int, display: Display) -> dict[str, Result]:
+def perform(runs: Iterable[ExperimentRun], folder: Path, jobs: int, display: RunDisplay) -> dict[str, RunResult]:
     """All runs, by name, each given after what it needs. What the folder holds of them already is not done again,
     unless something that it needs was; a run whose needs failed fails."""
-    results: dict[str, Result] = {}
-    waiting: dict[str, Run] = {}
+    results: dict[str, RunResult] = {}
+    waiting: dict[str, ExperimentRun] = {}
     for run in runs:
         kept = _kept(run, folder, results) if all(name in results for name in run.needs) else None
         if kept is not None:
@@ -82,7 +82,7 @@ def perform(runs: Iterable[Run], folder: Path, jobs: int, display: Display) -> d
     os.environ |= {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(jobs, context, initializer=_quiet, max_tasks_per_child=TASKS_A_PROCESS) as pool:
-        running: dict[Future[Result], Run] = {}
+        running: dict[Future[RunResult], ExperimentRun] = {}
         try:
             while waiting or running:
                 _start(waiting, running, results, jobs, pool.submit, display)
@@ -99,12 +99,12 @@ def perform(runs: Iterable[Run], folder: Path, jobs: int, display: Display) -> d
 
 
 def _start(
-    waiting: dict[str, Run],
-    running: dict[Future[Result], Run],
-    results: dict[str, Result],
+    waiting: dict[str, ExperimentRun],
+    running: dict[Future[RunResult], ExperimentRun],
+    results: dict[str, RunResult],
     jobs: int,
-    submit: Callable[..., Future[Result]],
-    display: Display,
+    submit: Callable[..., Future[RunResult]],
+    display: RunDisplay,
 ) -> None:
     for run in list(waiting.values()):
         failed = next((name for name in run.needs if "error" in results.get(name, {})), None)
@@ -125,11 +125,11 @@ def _quiet() -> None:
     os.dup2(null, 2)
 
 
-def _path(run: Run, folder: Path) -> Path:
+def _path(run: ExperimentRun, folder: Path) -> Path:
     return folder / f"{run.name}.json"
 
 
-def _kept(run: Run, folder: Path, results: Mapping[str, Result]) -> Result | None:
+def _kept(run: ExperimentRun, folder: Path, results: Mapping[str, RunResult]) -> RunResult | None:
     """The result of an earlier time, if it was of the same run, after the same, and no error."""
     try:
         data = json.loads(_path(run, folder).read_text())
@@ -139,7 +139,7 @@ def _kept(run: Run, folder: Path, results: Mapping[str, Result]) -> Result | Non
         return None
 
 
-def _keep(run: Run, folder: Path, results: Mapping[str, Result]) -> None:
+def _keep(run: ExperimentRun, folder: Path, results: Mapping[str, RunResult]) -> None:
     result = results[run.name]
     if "error" in result:
         return
@@ -152,7 +152,7 @@ def _keep(run: Run, folder: Path, results: Mapping[str, Result]) -> None:
     beside.replace(path)
 
 
-def _after(run: Run, results: Mapping[str, Result]) -> dict[str, str]:
+def _after(run: ExperimentRun, results: Mapping[str, RunResult]) -> dict[str, str]:
     """Fingerprints of what the run stood on."""
     return {
         name: hashlib.sha256(json.dumps(results[name], sort_keys=True).encode()).hexdigest()[:16] for name in run.needs

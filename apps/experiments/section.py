@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-class Row(NamedTuple):
+class ResultRow(NamedTuple):
     """One measure of one way of doing it."""
 
     measure: str
@@ -69,7 +69,7 @@ class Section:
     title: str
     about: str
     """What was done, in a few sentences."""
-    rows: list[Row] = field(default_factory=list)
+    rows: list[ResultRow] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     plots: list[Plot] = field(default_factory=list)
     errors: list[str] = field(default_factory=list)
@@ -83,6 +83,6 @@ class Section:
         }  # fmt: skip
 
 
-def row(measure: str, who: str, values: Sequence[float], unit: str, *, best: Best = "low", **more: Any) -> Row:
+def row(measure: str, who: str, values: Sequence[float], unit: str, *, best: Best = "low", **more: Any) -> ResultRow:
     """A row over values, one a seed or a run."""
-    return Row(measure, who, summarise(values, best=best), unit, **more)
+    return ResultRow(measure, who, summarise(values, best=best), unit, **more)

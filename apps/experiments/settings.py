@@ -10,7 +10,7 @@ import msgspec
 from apps.rehearsal.request import Body, Sensors
 
 
-class Settings(msgspec.Struct, frozen=True, kw_only=True):
+class ExperimentSettings(msgspec.Struct, frozen=True, kw_only=True):
     seeds: tuple[int, ...]
     out: Path
     sensors: Sensors = "real"

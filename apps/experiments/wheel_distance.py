@@ -7,20 +7,20 @@ from functools import partial
 from typing import Any
 
 from apps.experiments import bodies, figures
-from apps.experiments.runs import Result, Run
-from apps.experiments.section import Plot, Row, Section, row
-from apps.experiments.settings import Settings
+from apps.experiments.runs import ExperimentRun, RunResult
+from apps.experiments.section import Plot, ResultRow, Section, row
+from apps.experiments.settings import ExperimentSettings
 from cocoro.robot import Robot
 
 KEY, TITLE = "E3", "The distance between the wheels, from babbling"
 MEDIAN_M, WORST_M = 0.003, 0.008
 
 
-def runs(settings: Settings) -> list[Run]:
+def runs(settings: ExperimentSettings) -> list[ExperimentRun]:
     return [run for seed in settings.seeds for run in bodies.learned(settings, seed)]
 
 
-def section(settings: Settings, results: Mapping[str, Result]) -> Section:
+def section(settings: ExperimentSettings, results: Mapping[str, RunResult]) -> Section:
     good = [
         (results[bodies.learned_name(seed)]["wheels"], results[f"babble-wheels-{seed}"]["body"])
         for seed in settings.seeds
@@ -65,7 +65,7 @@ def _scale(fit: Mapping[str, Any]) -> float:
 
 def _row(
     measure: str, who: str, found_m: list[float], true_m: list[float], *, wanted: bool = False, paper: str = ""
-) -> Row:
+) -> ResultRow:
     mm = [1000 * abs(one - true) for one, true in zip(found_m, true_m, strict=True)]
     found = row(f"error of the {measure}", who, mm, "mm", paper=paper)
     said = f"{found.mean}, median {found.values.median:.1f}"

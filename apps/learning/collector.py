@@ -11,9 +11,10 @@ from typing import Any, Generic, Self
 
 from cocoro.learning.dataset import HandRow, Row, WheelRow, Writer, hand_header, wheel_header
 from cocoro.learning.nominal_model import LEVEL_ROLL_RAD, arm_joints
-from cocoro.messages import HandSample, Message, Vec3, WheelTrial
+from cocoro.messages import HandSample, Message, WheelTrial
 from cocoro.robot import Robot
 from cocoro.topics import HAND_SAMPLES, WHEEL_TRIALS, Topic
+from cocoro.units import Vec3
 
 CELL_M = 0.05
 TOPICS: dict[str, Topic[Any]] = {"babble-arm": HAND_SAMPLES, "babble-wheels": WHEEL_TRIALS}

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from cocoro.learning.network import Array
+from cocoro.arrays import BoolArray, FloatArray
 
 NEIGHBOUR_M = 0.025
 """The paper's: a sighting whose nearest neighbour is further away is an outlier."""
 SPARSE_FACTOR = 4.0
 
 
-def inliers(places_m: Array, limit_m: float = NEIGHBOUR_M) -> NDArray[np.bool_]:
+def inliers(places_m: FloatArray, limit_m: float = NEIGHBOUR_M) -> BoolArray:
     """Which of the places (b, 3) have a neighbour within the limit; shape (b,).
 
     The paper's 2.5 cm supposes sightings that lie densely. Where they do not, most of them would be outliers; so the
@@ -25,7 +24,7 @@ def inliers(places_m: Array, limit_m: float = NEIGHBOUR_M) -> NDArray[np.bool_]:
     return np.asarray(nearest <= max(limit_m, SPARSE_FACTOR * float(np.median(nearest))))
 
 
-def plausible(errors_m: Array, limit: float = 6.0) -> NDArray[np.bool_]:
+def plausible(errors_m: FloatArray, limit: float = 6.0) -> BoolArray:
     """Which of the errors (b, 3) of a map are of the usual size; shape (b,). Usual is up to `limit` times their median
     length: a wrong sighting in the midst of good ones has near neighbours and is found only so."""
     size = np.linalg.norm(errors_m, axis=1)

@@ -14,12 +14,12 @@ from functools import lru_cache
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from apps.learning.outliers import inliers, plausible
+from cocoro.arrays import BoolArray, FloatArray, IntArray
 from cocoro.learning.fitting import LeastSquares, folds, learn_in_order
 from cocoro.learning.handmap import Coordinates, HandMap
-from cocoro.learning.network import PAPER_BASES, PAPER_RANGE_RAD, PAPER_RATE, PAPER_WIDTH_RAD, Array, HyperplaneRbf
+from cocoro.learning.network import PAPER_BASES, PAPER_RANGE_RAD, PAPER_RATE, PAPER_WIDTH_RAD, HyperplaneRbf
 from cocoro.learning.nominal_model import NominalModel
 
 PRIMING_SHARE = 0.1
@@ -35,14 +35,14 @@ CHANCE = 0.05
 class Sightings:
     """What was seen, as arrays: angles (b, n) rad, places (b, 3) m, draws (b,)."""
 
-    angles_rad: Array
-    places_m: Array
-    draws: NDArray[np.int64]
+    angles_rad: FloatArray
+    places_m: FloatArray
+    draws: IntArray
 
     def __len__(self) -> int:
         return len(self.draws)
 
-    def pick(self, mask: NDArray[np.bool_] | slice) -> Sightings:
+    def pick(self, mask: BoolArray | slice) -> Sightings:
         return Sightings(self.angles_rad[mask], self.places_m[mask], self.draws[mask])
 
 
@@ -145,12 +145,12 @@ def _primed(method: Method, drawing: NominalModel) -> tuple[HandMap, LeastSquare
     return learned, learner
 
 
-def errors_m(learned: HandMap | NominalModel, sightings: Sightings) -> Array:
+def errors_m(learned: HandMap | NominalModel, sightings: Sightings) -> FloatArray:
     """Distances (b,) between where the hand was seen and where a map has it."""
     return np.asarray(np.linalg.norm(learned.predict(sightings.angles_rad) - sightings.places_m, axis=1))
 
 
-def rms(errors: Array) -> float:
+def rms(errors: FloatArray) -> float:
     return float(np.sqrt(np.mean(errors**2))) if len(errors) else float("nan")
 
 

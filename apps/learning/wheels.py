@@ -13,10 +13,10 @@ from math import atan2, cos, sin
 
 import numpy as np
 
+from cocoro.arrays import FloatArray
 from cocoro.frames import wrap_rad
 from cocoro.learning.dataset import WheelRow
-from cocoro.learning.network import Array
-from cocoro.messages import Vec2
+from cocoro.units import Vec2
 
 LEAST_TURN_RAD = 0.10
 """A trial that turned less says little: errors of the bearings count as much as the turn."""
@@ -88,7 +88,7 @@ _BEARING_RAD, _RANGE_M = 0.006, 0.008
 """Of a sighting while the robot stands: what backlash and depth leave uncertain."""
 
 
-def _solve(trials: Sequence[WheelRow], state: Array) -> tuple[Array, float]:
+def _solve(trials: Sequence[WheelRow], state: FloatArray) -> tuple[FloatArray, float]:
     """(1 / L with the mean scale in it, left, right scale beyond one) and the standard deviation of the first."""
     for _ in range(_ITERATIONS):
         residual = _residuals(trials, state)
@@ -104,7 +104,7 @@ def _solve(trials: Sequence[WheelRow], state: Array) -> tuple[Array, float]:
     return state, scatter * float(np.sqrt(np.linalg.inv(normal)[0, 0]))
 
 
-def _residuals(trials: Sequence[WheelRow], state: Array) -> Array:
+def _residuals(trials: Sequence[WheelRow], state: FloatArray) -> FloatArray:
     """How far each target's second place is from where the arc would have brought it, in bearing and in distance."""
     inverse, left, right = state.tolist()
     found = []

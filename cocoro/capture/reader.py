@@ -31,13 +31,11 @@ from mcap.records import Attachment, AttachmentIndex, Channel, Schema, Statistic
 
 from cocoro.bus.keys import matches
 from cocoro.capture import mcap
-from cocoro.capture.agreement import miscounted
-from cocoro.capture.contents import Contents, Disk, Place, read_place
-from cocoro.capture.errors import CaptureError, DamageError, NotAFileError
-from cocoro.capture.file import CHECKSUM, TALLY, checksum
-from cocoro.capture.keys import JSON, MSGPACK
+from cocoro.capture.contents import Contents, Disk, Place, miscounted, read_place
+from cocoro.capture.conventions import CHECKSUM, TALLY, CaptureError, NotAFileError, checksum
+from cocoro.capture.mcap import DamageError
 from cocoro.capture.scan import contents, front_to_back
-from cocoro.capture.types import NotReadableError, reader_of
+from cocoro.capture.types import JSON, MSGPACK, NotReadableError, reader_of
 
 Raw = bytes | memoryview
 AHEAD = 4

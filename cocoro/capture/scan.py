@@ -17,10 +17,8 @@ from mcap.opcode import Opcode
 from mcap.records import ChunkIndex, Footer, MetadataIndex, Statistics
 
 from cocoro.capture import mcap
-from cocoro.capture.agreement import compare
-from cocoro.capture.contents import Contents, Disk, Place, begun, read_chunk
-from cocoro.capture.errors import CutOffError, DamageError
-from cocoro.capture.mcap import MAGIC, PREFIX
+from cocoro.capture.contents import Contents, Disk, Place, begun, compare, read_chunk
+from cocoro.capture.mcap import MAGIC, PREFIX, CutOffError, DamageError
 from cocoro.capture.walk import Walk
 
 LARGEST_SUMMARY = 1 << 30

@@ -22,10 +22,8 @@ from mcap.records import (
 )
 
 from cocoro.capture import mcap
-from cocoro.capture.compression import KNOWN
 from cocoro.capture.contents import LARGEST_RECORD, Contents, Disk, Place, unpacked
-from cocoro.capture.errors import CutOffError, DamageError
-from cocoro.capture.mcap import MAGIC, PREFIX
+from cocoro.capture.mcap import KNOWN, MAGIC, PREFIX, CutOffError, DamageError
 
 RUN_BYTES = 1 << 20
 """A run of messages outside of chunks is closed at this size, so that a reader need not hold more at once."""

@@ -12,9 +12,9 @@ from math import atan2, cos, hypot, sin
 
 import numpy as np
 
+from cocoro.arrays import FloatArray
 from cocoro.learning.dataset import WheelRow
-from cocoro.learning.network import Array
-from cocoro.messages import Vec3
+from cocoro.messages import FiniteVec3
 from cocoro.robot import Robot
 
 LEAST_TRIALS = 4
@@ -30,7 +30,7 @@ class CameraTilt:
         )
         self.tilt_rad = tilt_rad
 
-    def straight(self, seen_m: Vec3) -> Vec3:
+    def straight(self, seen_m: FiniteVec3) -> FiniteVec3:
         """Where something is that is seen at a place; body frame."""
         if self.tilt_rad == 0.0:
             return seen_m
@@ -40,13 +40,13 @@ class CameraTilt:
         share = (c * level + s * up) / max(level, 1e-6)
         return self._axis_x_m + share * x, share * y, self._axis_z_m + c * up - s * level
 
-    def heights(self, seen_m: Array) -> Array:
+    def heights(self, seen_m: FloatArray) -> FloatArray:
         """How high things are above the floor that are seen at places (b, 3); shape (b,)."""
         level = np.hypot(seen_m[:, 0] - self._axis_x_m, seen_m[:, 1])
         up = seen_m[:, 2] - self._axis_z_m
         return np.asarray(self._axis_z_m + np.cos(self.tilt_rad) * up - np.sin(self.tilt_rad) * level)
 
-    def tilt_of(self, seen_m: Vec3, height_m: float) -> float:
+    def tilt_of(self, seen_m: FiniteVec3, height_m: float) -> float:
         """What one sighting of something of a known height says of the tilt, radians."""
         level, up = hypot(seen_m[0] - self._axis_x_m, seen_m[1]), seen_m[2] - self._axis_z_m
         # It is turned up to where it is seen from where it is: as far from the axis, at the known height.

@@ -18,7 +18,7 @@ from typing import Generic, TypeVar
 import msgspec
 
 from cocoro.errors import ConfigError, RefusedError
-from cocoro.messages import Vec2, Vec3
+from cocoro.messages import FiniteVec2, FiniteVec3
 from cocoro.robot import Robot
 
 VERSION = 1
@@ -34,9 +34,9 @@ class HandRow(msgspec.Struct, frozen=True, kw_only=True):
     """The number of the Sobol draw that the arm was on its way to: rows of one draw lie near one another."""
     angles_rad: tuple[float, ...]
     """Of the header's joints, at the frame's stamp."""
-    head_rad: Vec2
+    head_rad: FiniteVec2
     """Pan and tilt at the frame's stamp."""
-    seen_m: Vec3
+    seen_m: FiniteVec3
     """The marker's centre, body frame, as the drawing of the neck places what the camera saw."""
     area_px: int
 
@@ -53,8 +53,8 @@ class WheelRow(msgspec.Struct, frozen=True, kw_only=True):
     left_m: float
     right_m: float
     """How far each wheel rolled, by the base's odometry."""
-    before_m: Vec2
-    after_m: Vec2
+    before_m: FiniteVec2
+    after_m: FiniteVec2
     """The target over the floor, body frame, each the mean of several frames while the robot stood."""
     turned_rad: float
     """What the base's own odometry said of the turn."""

@@ -10,13 +10,13 @@ import numpy as np
 import scipy  # which loads its parts when they are needed: a robot that has learned nothing does without
 from numpy.typing import NDArray
 
-from cocoro.learning.network import Array, HyperplaneRbf
+from cocoro.arrays import BoolArray, FloatArray, IntArray
+from cocoro.learning.network import HyperplaneRbf
 
-Mask = NDArray[np.bool_]
 _BLOCK = 128
 
 
-def learn_in_order(network: HyperplaneRbf, inputs: Array, targets: Array, rate: float) -> None:
+def learn_in_order(network: HyperplaneRbf, inputs: FloatArray, targets: FloatArray, rate: float) -> None:
     """The paper's rule: each sample once, in order. Changes the network. inputs (b, n), targets (b, k).
 
     Block by block, exactly as sample by sample: with G the Gram matrix of a block's features, the errors E that the
@@ -53,17 +53,17 @@ class LeastSquares:
         other._covariance = self._covariance.copy()
         return other
 
-    def add(self, x: Array, target: Array) -> Array:
+    def add(self, x: FloatArray, target: FloatArray) -> FloatArray:
         """One sample: input (n,), target (k,). Returns the error before it was learned, (k,)."""
         phi = self.network.features(x[None])[0]
         gain = self._covariance @ phi
         step = gain / (1.0 + float(phi @ gain))
-        error: Array = target - phi @ self.network.weights
+        error: FloatArray = target - phi @ self.network.weights
         self._covariance -= np.multiply.outer(gain, step)
         self.network.weights += np.multiply.outer(step, error)
         return error
 
-    def add_all(self, inputs: Array, targets: Array, weight: float | Array = 1.0) -> None:
+    def add_all(self, inputs: FloatArray, targets: FloatArray, weight: float | FloatArray = 1.0) -> None:
         """Samples (b, n) and (b, k) at once; `weight` counts each, or all of them alike, as so many."""
         phi = self.network.features(inputs)
         scale = np.broadcast_to(np.asarray(weight, dtype=np.float64), len(phi))
@@ -74,7 +74,7 @@ class LeastSquares:
         self.network.weights += self._covariance @ (scaled.T @ errors)
 
 
-def folds(groups: NDArray[np.int64], count: int) -> Iterable[tuple[Mask, Mask]]:
+def folds(groups: IntArray, count: int) -> Iterable[tuple[BoolArray, BoolArray]]:
     """`count` pairs of boolean masks (learn, check), whole groups in each: what is checked was never near to what was
     learned. `groups` (b,) tells which samples belong together."""
     names = np.unique(groups)
@@ -83,5 +83,5 @@ def folds(groups: NDArray[np.int64], count: int) -> Iterable[tuple[Mask, Mask]]:
         yield ~check, check
 
 
-def _symmetric(matrix: NDArray[Any]) -> Array:
+def _symmetric(matrix: NDArray[Any]) -> FloatArray:
     return np.asarray((matrix + matrix.T) / 2)

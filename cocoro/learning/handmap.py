@@ -12,8 +12,9 @@ from typing import Literal
 
 import numpy as np
 
+from cocoro.arrays import FloatArray
 from cocoro.frames import Spherical, to_cartesian
-from cocoro.learning.network import Array, HyperplaneRbf
+from cocoro.learning.network import HyperplaneRbf
 from cocoro.learning.nominal_model import NominalModel
 
 Coordinates = Literal["cartesian", "spherical"]
@@ -36,7 +37,7 @@ class HandMap:
         self.coordinates: Coordinates = coordinates
         self.joints = drawing.joints
 
-    def targets(self, angles_rad: Array, places_m: Array) -> Array:
+    def targets(self, angles_rad: FloatArray, places_m: FloatArray) -> FloatArray:
         """What the network is to give for postures (b, n) whose hand is at places (b, 3); shape (b, 3)."""
         if not self.over_drawing:
             return spherical_of(places_m) if self.coordinates == "spherical" else np.asarray(places_m)
@@ -47,7 +48,7 @@ class HandMap:
         gap[:, 1] = np.remainder(gap[:, 1] + np.pi, 2 * np.pi) - np.pi
         return np.asarray(gap)
 
-    def predict(self, angles_rad: Array) -> Array:
+    def predict(self, angles_rad: FloatArray) -> FloatArray:
         """Where the marker is seen, for postures (b, n); shape (b, 3)."""
         given = self.network.predict(angles_rad)
         if not self.over_drawing:
@@ -57,13 +58,13 @@ class HandMap:
             return np.asarray(drawn + given)
         return cartesian_of(spherical_of(drawn) + given)
 
-    def at(self, angles_rad: Array) -> Array:
+    def at(self, angles_rad: FloatArray) -> FloatArray:
         """For one posture (n,), shape (3,)."""
         if self.over_drawing and self.coordinates == "cartesian":  # the one that is asked for all the time
             return np.asarray(self.drawing.at(angles_rad) + self.network.at(angles_rad))
         return np.asarray(self.predict(angles_rad[None])[0])
 
-    def jacobian(self, angles_rad: Array) -> Array:
+    def jacobian(self, angles_rad: FloatArray) -> FloatArray:
         """d place / d angle at one posture (n,), Cartesian, metres a radian, shape (3, n)."""
         slope = self.network.jacobian(angles_rad)
         if self.coordinates == "cartesian":
@@ -76,21 +77,21 @@ class HandMap:
         return np.asarray(spherical_slope(np.array(to_cartesian(Spherical(*given)))) @ slope)
 
 
-def spherical_of(places_m: Array) -> Array:
+def spherical_of(places_m: FloatArray) -> FloatArray:
     """(x, y, z) to (rho, azimuth, elevation), row by row, as `cocoro.frames.to_spherical` has it; shape (b, 3)."""
     x, y, z = places_m.T
     planar = np.hypot(x, y)
     return np.stack([np.hypot(planar, z), np.arctan2(y, x), np.arctan2(z, planar)], axis=1)
 
 
-def cartesian_of(spherical: Array) -> Array:
+def cartesian_of(spherical: FloatArray) -> FloatArray:
     """(rho, azimuth, elevation) to (x, y, z), row by row; shape (b, 3)."""
     rho, azimuth, elevation = spherical.T
     planar = rho * np.cos(elevation)
     return np.stack([planar * np.cos(azimuth), planar * np.sin(azimuth), rho * np.sin(elevation)], axis=1)
 
 
-def spherical_slope(place_m: Array) -> Array:
+def spherical_slope(place_m: FloatArray) -> FloatArray:
     """d (x, y, z) / d (rho, azimuth, elevation) at a place (3,), shape (3, 3). Singular on the body's vertical axis, so
     that axis counts as a millimetre away."""
     x, y, z = place_m.tolist()

@@ -15,12 +15,13 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
+from cocoro.arrays import FloatArray
 from cocoro.errors import ConfigError
 from cocoro.learning.dataset import fingerprint_of
 from cocoro.learning.handmap import Coordinates, HandMap
-from cocoro.learning.network import Array, HyperplaneRbf
+from cocoro.learning.network import HyperplaneRbf
 from cocoro.learning.nominal_model import NominalModel
-from cocoro.messages import Vec3
+from cocoro.messages import FiniteVec3
 from cocoro.robot import Robot
 
 FORMAT = "cocoro.model"
@@ -28,7 +29,7 @@ VERSION = 1
 LARGEST_WEIGHT = 1e6
 
 Number = Annotated[float, Meta(ge=-LARGEST_WEIGHT, le=LARGEST_WEIGHT)]
-NonNegative = Annotated[float, Meta(ge=0, le=LARGEST_WEIGHT)]
+BoundedNonNegative = Annotated[float, Meta(ge=0, le=LARGEST_WEIGHT)]
 
 
 class Training(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -52,7 +53,7 @@ class ArmModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     centres: list[list[Number]]
     widths: list[Annotated[float, Meta(gt=0, le=100)]]
     weights: list[list[Number]]
-    seen_m: list[Vec3]
+    seen_m: list[FiniteVec3]
     """Where the hand was seen: what the reachability mesh is made of."""
     training: Training
 
@@ -145,7 +146,7 @@ def save(model: Model, path: Path) -> None:
         raise ConfigError(f"model {path}: {error.strerror}") from error
 
 
-def arm_model(learned: HandMap, roll_rad: float, seen_m: Array, training: Training) -> ArmModel:
+def arm_model(learned: HandMap, roll_rad: float, seen_m: FloatArray, training: Training) -> ArmModel:
     network = learned.network
     return ArmModel(
         joints=learned.joints,

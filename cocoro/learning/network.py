@@ -10,9 +10,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from cocoro.arrays import FloatArray
 
 PAPER_RANGE_RAD = 2.62
 PAPER_BASES = 3
@@ -24,7 +23,7 @@ PAPER_RATE = 0.025
 class HyperplaneRbf:
     """A network of `centres` (m, n) and `widths_rad` (n,) with `outputs` outputs, that begins as zero everywhere."""
 
-    def __init__(self, centres: Array, widths: Array, outputs: int) -> None:
+    def __init__(self, centres: FloatArray, widths: FloatArray, outputs: int) -> None:
         self.centres = np.ascontiguousarray(centres, dtype=np.float64)
         self.widths = np.asarray(widths, dtype=np.float64)
         count, inputs = self.centres.shape
@@ -36,7 +35,9 @@ class HyperplaneRbf:
         """W, shape (m (1 + n), k): first the w of every basis, then the v, basis by basis."""
 
     @classmethod
-    def spread(cls, bases: Sequence[int], widths: Sequence[float], ranges: Array, outputs: int = 3) -> HyperplaneRbf:
+    def spread(
+        cls, bases: Sequence[int], widths: Sequence[float], ranges: FloatArray, outputs: int = 3
+    ) -> HyperplaneRbf:
         """Bases evenly over a box: so many along each input, from its low to its high end (`ranges`, (n, 2)); a single
         one stands in the middle."""
         axes = [
@@ -64,22 +65,22 @@ class HyperplaneRbf:
     def outputs(self) -> int:
         return int(self.weights.shape[1])
 
-    def features(self, x: Array) -> Array:
+    def features(self, x: FloatArray) -> FloatArray:
         """phi for inputs (b, n), shape (b, m (1 + n))."""
         h, c = self._activate(x)
         planes = (h[..., None] * c).reshape(len(x), -1)
         return np.concatenate([h, planes], axis=1)
 
-    def predict(self, x: Array) -> Array:
+    def predict(self, x: FloatArray) -> FloatArray:
         """y for inputs (b, n), shape (b, k)."""
         return np.asarray(self.features(x) @ self.weights)
 
-    def at(self, x: Array) -> Array:
+    def at(self, x: FloatArray) -> FloatArray:
         """y for one input (n,), shape (k,)."""
         h, c = self._activate_one(x)
         return np.asarray(h.dot(self.weights[: len(h)]) + (h[:, None] * c).ravel().dot(self.weights[len(h) :]))
 
-    def jacobian(self, x: Array) -> Array:
+    def jacobian(self, x: FloatArray) -> FloatArray:
         """dy/dx at one input (n,), exact, shape (k, n). Derived: with a_j = w_j + V_j c_j the value of plane j and
         dh_j/dx_i = h_j (sum_l h_l c_li - c_ji) / sigma_i, it is sum_j a_j dh_j/dx + sum_j h_j V_j / sigma."""
         h, c = self._activate_one(x)
@@ -91,7 +92,7 @@ class HyperplaneRbf:
         jac += h.dot(planes.reshape(count, -1)).reshape(inputs, -1).T
         return np.asarray(jac * self._scale)
 
-    def learn(self, x: Array, target: Array, rate: float) -> None:
+    def learn(self, x: FloatArray, target: FloatArray, rate: float) -> None:
         """The paper's rule on one sample: dw_kj = a (t_k - y_k) h_j, dv_kji = a (t_k - y_k) h_j c_ji."""
         phi = self.features(x[None])[0]
         self.weights += np.multiply.outer(rate * phi, target - phi @ self.weights)
@@ -101,7 +102,7 @@ class HyperplaneRbf:
         other.weights = self.weights.copy()
         return other
 
-    def _activate_one(self, x: Array) -> tuple[Array, Array]:
+    def _activate_one(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """h (m,) and c (m, n): as `_activate`, but as quick as can be for one input."""
         c = (x - self.centres) * self._scale
         exponent = (c * c).dot(self._minus_half)
@@ -109,7 +110,7 @@ class HyperplaneRbf:
         g = np.exp(exponent, out=exponent)
         return g / g.sum(), c
 
-    def _activate(self, x: Array) -> tuple[Array, Array]:
+    def _activate(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """h (b, m) and c (b, m, n)."""
         c = (x[:, None, :] - self.centres) / self.widths
         exponent = -0.5 * np.einsum("bmn,bmn->bm", c, c)

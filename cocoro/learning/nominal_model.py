@@ -6,8 +6,8 @@ from math import pi
 
 import numpy as np
 
+from cocoro.arrays import FloatArray
 from cocoro.kinematics import turn_z
-from cocoro.learning.network import Array
 from cocoro.robot import Robot
 
 LEVEL_ROLL_RAD = pi / 2
@@ -33,7 +33,7 @@ class NominalModel:
         self._chain = robot.chain(robot.marker.link)
         self._marker = np.array([*robot.marker.position_m, 1.0])
         self._rest = {name: roll_rad for name in self._chain.joints if name not in self.joints}
-        self._steps: list[tuple[Array, int, float]] = []
+        self._steps: list[tuple[FloatArray, int, float]] = []
         """For each joint from the body on: the fixed transform before it, which of `joints` it is, its offset."""
         rows = []
         name = robot.marker.link
@@ -50,7 +50,7 @@ class NominalModel:
                 before = before @ turn_z(self._rest[row.joint] + row.offset_rad)
         self._marker = before @ self._marker
 
-    def predict(self, angles_rad: Array) -> Array:
+    def predict(self, angles_rad: FloatArray) -> FloatArray:
         """Marker positions, body frame, metres, for postures (b, n); shape (b, 3)."""
         points = np.broadcast_to(self._marker[:3], (len(angles_rad), 3))
         for fixed, which, offset_rad in reversed(self._steps):
@@ -60,14 +60,14 @@ class NominalModel:
             points = np.stack([c * x - s * y, s * x + c * y, z], axis=1) @ fixed[:3, :3].T + fixed[:3, 3]
         return np.asarray(points)
 
-    def at(self, angles_rad: Array) -> Array:
+    def at(self, angles_rad: FloatArray) -> FloatArray:
         """For one posture (n,), shape (3,)."""
         total = np.eye(4)
         for fixed, which, offset_rad in self._steps:
             total = total @ fixed @ turn_z(float(angles_rad[which]) + offset_rad)
         return np.asarray((total @ self._marker)[:3])
 
-    def jacobian(self, angles_rad: Array) -> Array:
+    def jacobian(self, angles_rad: FloatArray) -> FloatArray:
         """d position / d angle at one posture (n,), metres a radian, shape (3, n)."""
         total = np.eye(4)
         axes, origins = np.empty((len(self.joints), 3)), np.empty((len(self.joints), 3))
@@ -79,7 +79,7 @@ class NominalModel:
         # The cross product, by hand: np.cross takes as long as all the rest.
         return np.asarray((axes[:, _NEXT] * arms[:, _LAST] - axes[:, _LAST] * arms[:, _NEXT]).T)
 
-    def priming(self, count: int = PRIMING_A_JOINT, reach_rad: float = 2.62) -> tuple[Array, Array]:
+    def priming(self, count: int = PRIMING_A_JOINT, reach_rad: float = 2.62) -> tuple[FloatArray, FloatArray]:
         """Evenly spaced postures and the marker's places in them: (count ** n, n) and (count ** n, 3).
 
         As the paper has them, over +-2.62 rad a joint whatever its limits; shuffled, always the same way, because a

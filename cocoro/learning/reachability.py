@@ -14,9 +14,8 @@ from enum import IntEnum
 
 import numpy as np
 import scipy  # which loads its parts when they are needed: a robot that has learned nothing does without
-from numpy.typing import NDArray
 
-from cocoro.learning.network import Array
+from cocoro.arrays import BoolArray, FloatArray, IntArray
 
 GAP_FACTOR = 3.0
 """A ball is small while its radius is at most so many times the distance within which sightings have neighbours."""
@@ -40,34 +39,34 @@ class Reach(IntEnum):
 class ReachMesh:
     """The mesh over places (b, 3), body frame, metres. Fewer than five places in general position prove nothing."""
 
-    def __init__(self, places_m: Array | None = None, *, radius_m: float | None = None) -> None:
+    def __init__(self, places_m: FloatArray | None = None, *, radius_m: float | None = None) -> None:
         """`radius_m`: of the largest ball that counts as small; None derives it from the sightings' own spacing."""
         self._wanted_m = radius_m
         self._mesh: scipy.spatial.Delaunay | None = None
-        self._waiting: list[Array] = []
+        self._waiting: list[FloatArray] = []
         self._held = np.empty((0, 3))
         self._cells: set[tuple[int, ...]] = set()
-        self._small: NDArray[np.bool_] = np.zeros(0, dtype=np.bool_)
+        self._small: BoolArray = np.zeros(0, dtype=np.bool_)
         self.radius_m = radius_m if radius_m is not None else LEAST_RADIUS_M
         if places_m is not None and len(places_m):
             self.add(places_m)
 
     @property
-    def places_m(self) -> Array:
+    def places_m(self) -> FloatArray:
         """The places that the mesh is made of, those that wait to be entered included; shape (b, 3)."""
         return np.concatenate([self._held, *self._waiting])
 
-    def add(self, places_m: Array | Sequence[Sequence[float]]) -> None:
+    def add(self, places_m: FloatArray | Sequence[Sequence[float]]) -> None:
         """More places where the hand was seen, shape (b, 3)."""
         self._waiting.append(np.asarray(places_m, dtype=np.float64).reshape(-1, 3))
         if self._mesh is None or sum(map(len, self._waiting)) >= _LUMP:
             self._enter()
 
-    def verdict(self, place_m: Sequence[float] | Array) -> Reach:
+    def verdict(self, place_m: Sequence[float] | FloatArray) -> Reach:
         """For one place."""
         return Reach(int(self.verdicts(np.asarray(place_m, dtype=np.float64)[None])[0]))
 
-    def verdicts(self, places_m: Array) -> NDArray[np.int64]:
+    def verdicts(self, places_m: FloatArray) -> IntArray:
         """For places (b, 3): their `Reach`, shape (b,)."""
         self._enter()
         if self._mesh is None:
@@ -76,7 +75,7 @@ class ReachMesh:
         inside = np.where(self._small[simplex], Reach.INSIDE, Reach.UNPROVEN)
         return np.where(simplex < 0, Reach.OUTSIDE, inside)
 
-    def nearest_m(self, place_m: Sequence[float] | Array) -> float:
+    def nearest_m(self, place_m: Sequence[float] | FloatArray) -> float:
         """From one place to the nearest at which the hand was seen; infinite where it was nowhere."""
         places = self.places_m
         return float(np.linalg.norm(places - np.asarray(place_m), axis=1).min()) if len(places) else float("inf")
@@ -111,7 +110,7 @@ class ReachMesh:
             self._held = np.concatenate([self._held, fresh])
         self._measure()
 
-    def _thinned(self, places_m: Array) -> Array:
+    def _thinned(self, places_m: FloatArray) -> FloatArray:
         """One a cell of a fine grid, the first that came: an incremental mesh suffers from doubles."""
         kept = []
         for place, cell in zip(places_m, map(tuple, np.floor(places_m / _GRID_M).astype(int).tolist()), strict=True):
@@ -131,7 +130,7 @@ class ReachMesh:
         self._mesh.find_simplex(self._held[:1])  # what it makes for the first question takes long: now, not then
 
 
-def _radii_m(corners: Array) -> Array:
+def _radii_m(corners: FloatArray) -> FloatArray:
     """Circumradii of tetrahedra (s, 4, 3), shape (s,); infinite for flat ones. Derived: the centre is as far from each
     corner, which gives three linear equations in its offset from the first."""
     edges = corners[:, 1:] - corners[:, :1]

@@ -6,7 +6,7 @@ from typing import Literal
 
 import msgspec
 
-from cocoro.messages.common import Count, Message, NonNegative
+from cocoro.messages.common import Count, FiniteNonNegative, Message
 
 
 class DisturbedFile(msgspec.Struct, kw_only=True):
@@ -43,7 +43,7 @@ class Recording(Message):
     """The newest of those that somebody moved or removed while they were being recorded."""
     removed: Count = 0
     """Messages that were in the removed ones, all of them together."""
-    longest_sync_ms: NonNegative = 0.0
+    longest_sync_ms: FiniteNonNegative = 0.0
     """That the disk took to make sure of what it was given."""
     fault: str = ""
     """Why nothing is recorded any more."""

@@ -12,11 +12,11 @@ LARGEST = 1e12
 """Beyond any quantity of a robot's in SI units: so large a number is a fault, and its square still a number."""
 Finite = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
 """MessagePack can carry NaN and infinity; bounds refuse both when a message is decoded."""
-NonNegative = Annotated[float, Meta(ge=0, le=LARGEST)]
+FiniteNonNegative = Annotated[float, Meta(ge=0, le=LARGEST)]
 Count = Annotated[int, Meta(ge=0)]
-Vec2 = tuple[Finite, Finite]
-Vec3 = tuple[Finite, Finite, Finite]
-Quaternion = tuple[Finite, Finite, Finite, Finite]
+FiniteVec2 = tuple[Finite, Finite]
+FiniteVec3 = tuple[Finite, Finite, Finite]
+FiniteQuaternion = tuple[Finite, Finite, Finite, Finite]
 """x, y, z, w."""
 
 

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from cocoro.messages.common import Count, Finite, Message, Vec3
+from cocoro.messages.common import Count, Finite, FiniteVec3, Message
 from cocoro.messages.planning import TargetEstimate
 
 TaskName = Literal["fetch", "follow", "touch", "go-to", "park", "put-down", "babble-arm", "babble-wheels"]
@@ -81,7 +81,7 @@ class ObjectsRequest(msgspec.Struct, kw_only=True):
 class KnownObject(msgspec.Struct, kw_only=True):
     label: str
     shape: Literal["cylinder", "sphere", "box"]
-    size_m: Vec3
+    size_m: FiniteVec3
     graspable: bool
     seen: TargetEstimate | None = None
 

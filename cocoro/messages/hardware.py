@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from cocoro.messages.common import Finite, LatchState, Message, NonNegative, Vec2, require_finite
+from cocoro.messages.common import Finite, FiniteNonNegative, FiniteVec2, LatchState, Message, require_finite
 
 
 class Frame(Message):
@@ -34,7 +34,7 @@ class Frame(Message):
 class BaseState(Message):
     """The Create: odometry since the service started, its bumpers and its health."""
 
-    odometry_m: Vec2
+    odometry_m: FiniteVec2
     """x, y of the body in the odometry frame: where the body stood when the service started."""
     odometry_yaw_rad: Finite
     """Heading in the odometry frame, counter-clockwise, not wrapped."""
@@ -51,7 +51,7 @@ class BaseState(Message):
     """Those of the Create's own that are pressed: play, advance."""
     mode: Literal["off", "passive", "safe", "full"] = "full"
     battery_fraction: Annotated[float, Meta(ge=0, le=1)] = 1.0
-    battery_v: NonNegative = 16.0
+    battery_v: FiniteNonNegative = 16.0
     charging: bool = False
     latch: LatchState = "unknown"
     stopped_by: str = ""
@@ -101,7 +101,7 @@ class ServoCommand(Message):
 
     joints: tuple[str, ...]
     goal_rad: tuple[Finite, ...]
-    speed_radps: tuple[NonNegative, ...]
+    speed_radps: tuple[FiniteNonNegative, ...]
     """Speed limit on the way to the goal. 0 means hold where it is (never 'full speed', as the servo has it)."""
 
     def __post_init__(self) -> None:

@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 import msgspec
 
-from cocoro.messages.common import Count, Finite, Message, NonNegative
+from cocoro.messages.common import Count, Finite, FiniteNonNegative, Message
 
 
 class TopicHealth(msgspec.Struct, kw_only=True):
@@ -76,7 +76,7 @@ class Exchange(Message):
     answer: Any = None
     error: str = ""
     """In place of an answer."""
-    took_ms: NonNegative = 0.0
+    took_ms: FiniteNonNegative = 0.0
 
 
 class AboutRequest(msgspec.Struct, kw_only=True):
@@ -106,7 +106,7 @@ class AboutReply(msgspec.Struct, kw_only=True):
     """The component's resolved Config, as a map."""
     description: Any = None
     """The robot description that it computes with, as a map."""
-    latency_s: NonNegative = 0.0
+    latency_s: FiniteNonNegative = 0.0
     record_steps: bool = False
     pid: int = 0
     host: str = ""

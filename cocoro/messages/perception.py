@@ -7,7 +7,7 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from cocoro.messages.common import Count, Finite, Message, Vec2, Vec3
+from cocoro.messages.common import Count, Finite, FiniteVec2, FiniteVec3, Message
 
 
 class Detection(msgspec.Struct, kw_only=True):
@@ -22,7 +22,7 @@ class Detection(msgspec.Struct, kw_only=True):
     """left, top, right, bottom of the matching pixels, right and bottom exclusive."""
     depth_m: Finite | None = None
     """Along the optical axis, of the visible surface; None when the depth image has none there."""
-    position_m: Vec3 | None = None
+    position_m: FiniteVec3 | None = None
     """The object's centre (visible surface carried inwards by the known radius), body frame as the body
     stood at the frame's stamp; None without depth or without head angles for that stamp."""
     note: str = ""
@@ -46,10 +46,10 @@ class Obstacles(Message):
     """What stands on the floor and where the floor is free, from one depth image; known objects included.
     `stamp_ns` is the frame's. Body frame as the body stood then."""
 
-    points_m: Annotated[tuple[Vec3, ...], Meta(max_length=4096)] = ()
+    points_m: Annotated[tuple[FiniteVec3, ...], Meta(max_length=4096)] = ()
     """One a floor cell of 4 cm in which something stands: its middle x, y, and the height of the highest point seen."""
-    free: Annotated[tuple[Vec3, ...], Meta(max_length=1024)] = ()
+    free: Annotated[tuple[FiniteVec3, ...], Meta(max_length=1024)] = ()
     """Rays over free floor from `origin_m`: bearing (rad, body frame), and from which to which distance (m) the floor
     is seen; a ray ends before the first thing that stands in it."""
-    origin_m: Vec2 = (0.0, 0.0)
+    origin_m: FiniteVec2 = (0.0, 0.0)
     """Where the camera stood, on the floor."""

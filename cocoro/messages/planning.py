@@ -6,7 +6,7 @@ from typing import Literal
 
 import msgspec
 
-from cocoro.messages.common import Count, Finite, Message, NonNegative, Vec2, Vec3
+from cocoro.messages.common import Count, Finite, FiniteNonNegative, FiniteVec2, FiniteVec3, Message
 
 Behaviour = Literal[
     "idle", "park", "search", "explore", "approach", "reach", "grasp", "lift", "carry", "place", "follow",
@@ -23,9 +23,9 @@ class Intent(Message):
     """Counts the intents of one run of the executive, so that a status can say which one it answers."""
     behaviour: Behaviour = "idle"
     label: str = ""
-    place_m: Vec2 | None = None
+    place_m: FiniteVec2 | None = None
     """For 'carry': where to put down, in the odometry frame."""
-    distance_m: NonNegative = 0.0
+    distance_m: FiniteNonNegative = 0.0
     """For 'go-to': from the body's centre to the target's, over the floor, when it stands there."""
     first: Count = 0
     """For babbling: the number of its first draw."""
@@ -37,15 +37,15 @@ class TargetEstimate(msgspec.Struct, kw_only=True):
     """What the planner believes of one object now: fused over time and carried by odometry."""
 
     label: str
-    position_m: Vec3
+    position_m: FiniteVec3
     """Centre, body frame, now."""
-    velocity_mps: Vec3 = (0.0, 0.0, 0.0)
+    velocity_mps: FiniteVec3 = (0.0, 0.0, 0.0)
     """In the odometry frame."""
     sigma_m: Finite = 0.0
     """Standard deviation of the horizontal position."""
     age_s: Finite = 0.0
     """Since the newest frame in which it was localised."""
-    odometry_position_m: Vec3 = (0.0, 0.0, 0.0)
+    odometry_position_m: FiniteVec3 = (0.0, 0.0, 0.0)
     """The same centre in the odometry frame."""
 
 
@@ -63,11 +63,11 @@ class PlannerStatus(Message):
     target: TargetEstimate | None = None
     distance_m: Finite | None = None
     """What is left to go: to the stopping place when driving, hand to target when reaching."""
-    hand_m: Vec3 | None = None
+    hand_m: FiniteVec3 | None = None
     """Centre between the pads, body frame, felt (from the joint angles)."""
     holding: bool = False
     """The claws are stopped by something between them."""
-    body_m: Vec2 | None = None
+    body_m: FiniteVec2 | None = None
     body_yaw_rad: Finite = 0.0
     """Where the body stands in the odometry frame."""
     known: tuple[TargetEstimate, ...] = ()
@@ -103,7 +103,7 @@ class HandSample(Message):
     """The number of the draw that the arm was on its way to."""
     angles_rad: dict[str, Finite]
     """Of every joint, neck and hand included."""
-    seen_m: Vec3
+    seen_m: FiniteVec3
     """The marker's centre, body frame."""
     area_px: Count
 
@@ -118,8 +118,8 @@ class WheelTrial(Message):
     way_m: Finite
     turned_rad: Finite
     """What the base's odometry says of the way of the body's origin along its arc, and of the turn."""
-    before_m: Vec2
-    after_m: Vec2
+    before_m: FiniteVec2
+    after_m: FiniteVec2
     """The target over the floor, body frame, each the mean of several frames while the robot stood."""
     height_m: Finite | None = None
     """How high above the floor its centre was seen, at the end."""

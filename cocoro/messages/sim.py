@@ -7,10 +7,10 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from cocoro.messages.common import Finite, Message, Quaternion, Vec3
+from cocoro.messages.common import Finite, FiniteQuaternion, FiniteVec3, Message
 
 
-class Clock(Message):
+class ClockTick(Message):
     """Simulated time is `stamp_ns`; a new incarnation is a new epoch."""
 
     rate: Annotated[float, Meta(gt=0, le=1e3)] = 1.0
@@ -21,17 +21,17 @@ class Clock(Message):
 class TrueObject(msgspec.Struct, kw_only=True):
     label: str
     kind: Literal["object", "obstacle"]
-    position_m: Vec3
+    position_m: FiniteVec3
     """Centre, world frame."""
-    orientation: Quaternion
+    orientation: FiniteQuaternion
     touching: tuple[str, ...] = ()
     """Names of what it touches: robot links ('claw_left'), 'floor', other labels."""
 
 
 class Truth(Message):
-    body_m: Vec3
+    body_m: FiniteVec3
     """The body frame's origin in the world."""
-    body_orientation: Quaternion
+    body_orientation: FiniteQuaternion
     joints_rad: dict[str, Finite]
     """True joint angles."""
     objects: tuple[TrueObject, ...]

@@ -1,4 +1,5 @@
-"""The base service's end of the guard: starts the guard's process, talks to it, and replaces it when it dies or hangs."""
+"""The base service's end of the guard: starts the guard's process, talks to it, and replaces it when it dies or
+hangs."""
 
 from __future__ import annotations
 
@@ -22,9 +23,9 @@ from services.base.driver import GuardReport
 log = logging.getLogger("cocoro.base")
 
 LATE_S, HANGS_S = 0.12, 0.25
-"""A guard reports at least 20 times a second. When a report is later than the first time (or, at high wheel speeds, than
-the shorter `patience_s`), this process writes a stop to the port itself; a guard that was only slow undoes that with its
-next command. A guard that is silent for the second time hangs, and is killed."""
+"""A guard reports at least 20 times a second. When a report is later than the first time (or, at high wheel speeds,
+than the shorter `patience_s`), this process writes a stop to the port itself; a guard that was only slow undoes that
+with its next command. A guard that is silent for the second time hangs, and is killed."""
 START_S = 5.0
 """Time in which a new guard must report first, on a busy machine. Until then it has turned no wheels."""
 AGAIN_S = 1.0

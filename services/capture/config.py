@@ -9,9 +9,9 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from cocoro.capture.compression import Compression
+from cocoro.units import Positive
+from services.capture.file import Compression
 
-Positive = Annotated[float, Meta(gt=0)]
 FOLDER = "COCORO_CAPTURE_DIR"
 """Environment variable: where captures go when the configuration does not say."""
 

@@ -14,17 +14,17 @@ import msgspec
 
 from cocoro.about import about, versions
 from cocoro.bus.base import Handle, Heard, Payload
-from cocoro.capture.keys import ALIVE_INFO, Alive, Choice, KeyInfo
+from cocoro.capture.types import Alive
 from cocoro.clock import NS, FollowedClock
 from cocoro.errors import MeshError, RemoteError
-from cocoro.messages import AboutReply, AboutRequest, Clock, DisturbedFile, Recording
+from cocoro.messages import AboutReply, AboutRequest, ClockTick, DisturbedFile, Recording
 from cocoro.node import Node
 from cocoro.tokens import alive_key, recorder_key
 from cocoro.topics import ABOUT, CLOCK, RECORDING
+from services.capture.keys import ALIVE_INFO, Choice, Entry, KeyInfo
 from services.capture.log_clock import WALL_CLOCK, LogClock, words
 from services.capture.sink import Progress, Sink
-from services.capture.whereabouts import told
-from services.capture.writer import Entry, Missing
+from services.capture.writer import Missing, told
 
 TELL_S = 1.0
 """How often the recorder tells how it is getting on."""
@@ -97,7 +97,7 @@ class Recorder:
         self._head = msgspec.msgpack.Decoder(Head)
         self._clock: FollowedClock | None = None
         self._clock_key = CLOCK.key(node.robot_name)
-        self._time = msgspec.msgpack.Decoder(Clock)
+        self._time = msgspec.msgpack.Decoder(ClockTick)
         self._newest_ns = 0
         self._alive: dict[str, bool] = {}
 

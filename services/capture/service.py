@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 import asyncio
+import re
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from functools import partial
 from pathlib import Path
 
-from cocoro.capture.compression import Packer
-from cocoro.capture.keys import Choice, info_of
 from cocoro.clock import NS, VirtualClock
 from cocoro.node import Node
 from services.capture.config import Config, folder_of
+from services.capture.file import Packer
+from services.capture.keys import Choice, info_of, lossy
 from services.capture.log_clock import LogClock
-from services.capture.lossy import lossy
 from services.capture.recorder import Ledger, Recorder
-from services.capture.retention import file_name, make_room
 from services.capture.sink import DirectSink, ThreadedSink
 from services.capture.writer import MB, Limits, Writer, sync_and_close
 
@@ -86,3 +86,46 @@ def _place(robot: str, config: Config, started: datetime) -> Callable[[int], Pat
         return folder / file_name(robot, started, number)
 
     return place
+
+
+def file_name(robot: str, started: datetime, number: int) -> str:
+    """Of a run's nth file; names sort by time, as the wall clock told it when the run began."""
+    return f"{_run(robot, started)}-{number:03}.mcap"
+
+
+def _run(robot: str, started: datetime) -> str:
+    return f"{robot}-{started:%Y%m%dT%H%M%SZ}"
+
+
+def captures(folder: Path, robot: str) -> list[Path]:
+    """The files of these names, oldest first."""
+    pattern = re.compile(rf"{re.escape(robot)}-\d{{8}}T\d{{6}}Z-\d{{3,}}\.mcap")
+    return sorted(path for path in folder.glob("*.mcap") if pattern.fullmatch(path.name))
+
+
+def make_room(folder: Path, robot: str, keep_bytes: int, started: datetime | None = None) -> list[Path]:
+    """Delete the oldest captures until the others take no more than this; never the newest. Returns those deleted.
+
+    The files of the run that goes on, begun at `started`, are the newest, in the order of their numbers, whatever the
+    wall clock said when the others were begun.
+    """
+    own = "" if started is None else f"{_run(robot, started)}-"
+    files = sorted(captures(folder, robot), key=lambda path: _age(path, own))
+    sizes = {path: path.stat().st_size for path in files}
+    left = sum(sizes.values())
+    gone = []
+    for path in files[:-1]:
+        if left <= keep_bytes:
+            break
+        with suppress(OSError):
+            path.unlink()
+            left -= sizes[path]
+            gone.append(path)
+    return gone
+
+
+def _age(path: Path, own: str) -> tuple[bool, int, str]:
+    """Sorts the oldest first."""
+    if own and path.name.startswith(own):
+        return True, int(path.stem.rpartition("-")[2]), path.name
+    return False, 0, path.name

@@ -11,10 +11,11 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from typing import NamedTuple, Protocol
 
-from cocoro.capture.errors import CaptureError
-from cocoro.capture.file import LARGE_BYTES
+from cocoro.capture.conventions import CaptureError
 from cocoro.messages import DisturbedFile
-from services.capture.writer import Entry, Writer
+from services.capture.file import LARGE_BYTES
+from services.capture.keys import Entry
+from services.capture.writer import Writer
 
 log = logging.getLogger(__name__)
 

@@ -7,18 +7,16 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 from mcap.records import Channel, Schema
 
-from cocoro.capture.compression import Packer
-from cocoro.capture.errors import CaptureError
-from cocoro.capture.file import CaptureFile
-from cocoro.capture.keys import KeyInfo
-from cocoro.capture.schema import TypeSchema
+from cocoro.capture.conventions import CaptureError
+from cocoro.capture.types import TypeSchema
 from cocoro.clock import NS
 from cocoro.messages import DisturbedFile
-from services.capture.whereabouts import whereabouts
+from services.capture.file import CaptureFile, Packer
+from services.capture.keys import Entry, KeyInfo, Prepared
 
 MB = 1_000_000
 LOOK_S = 1.0
@@ -28,28 +26,6 @@ KEPT_DISTURBED = 20
 
 Name = str | tuple[str, int]
 """A channel of a writer: the key, or the key and a number where the key may have several."""
-
-
-class Entry(NamedTuple):
-    """A message on its way into a capture."""
-
-    key: str
-    sequence: int
-    log_ns: int
-    publish_ns: int
-    payload: bytes
-    info: KeyInfo | None = None
-    """What to write of the key, where that is not to be seen from the payload."""
-    channel: int | None = None
-    """A number, where the key may have several channels; it is not the number in the file."""
-
-
-class Prepared(NamedTuple):
-    """What is written in place of an entry."""
-
-    entry: Entry
-    schema: TypeSchema | None
-    """In place of the key's own, where the payload is of another type now."""
 
 
 @dataclass(frozen=True)
@@ -295,3 +271,46 @@ def _sync_folder(folder: Path) -> None:
         os.fsync(fd)
     finally:
         os.close(fd)
+
+
+class Whereabouts(NamedTuple):
+    state: Literal["there", "moved", "removed"]
+    path: str
+    """Where it is; '' when it was removed, or when the system does not tell where it was moved."""
+
+
+def whereabouts(path: Path, fd: int) -> Whereabouts:
+    """Whether the file that is open as `fd` still has its path. A move to another disk is a copy and a removal, and so
+    it looks here: the copy may lack what was written last."""
+    mine = os.fstat(fd)
+    try:
+        if os.path.samestat(path.stat(), mine):
+            return Whereabouts("there", str(path))
+    except (FileNotFoundError, NotADirectoryError):
+        pass
+    except OSError:  # a folder that must not be looked into, a disk that does not answer: nothing is known
+        return Whereabouts("there", str(path))
+    now = _name(fd, mine)
+    # A network file system keeps what is removed under such a name for as long as it is open.
+    if mine.st_nlink == 0 or Path(now).name.startswith(".nfs"):
+        return Whereabouts("removed", "")
+    return Whereabouts("moved", now)
+
+
+def told(file: DisturbedFile) -> str:
+    """A line for people."""
+    if file.became == "removed":
+        return (
+            f"{file.file} was removed (or moved to another disk) while it was recorded: {file.lost} messages are lost"
+        )
+    where = f"to {file.now}" if file.now else "elsewhere"
+    return f"{file.file} was moved {where} while it was recorded"
+
+
+def _name(fd: int, mine: os.stat_result) -> str:
+    """The name that the system knows a descriptor's file by; '' when that is not the file's name any more."""
+    try:
+        name = Path(f"/proc/self/fd/{fd}").readlink()
+        return str(name) if os.path.samestat(name.stat(), mine) else ""
+    except OSError:
+        return ""

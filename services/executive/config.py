@@ -7,7 +7,7 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-Positive = Annotated[float, Meta(gt=0)]
+from cocoro.units import Positive
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

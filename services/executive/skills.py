@@ -9,8 +9,9 @@ from typing import Protocol
 
 from cocoro import topics
 from cocoro.clock import NS
-from cocoro.messages import Behaviour, Intent, PlannerStatus, Vec2
+from cocoro.messages import Behaviour, Intent, PlannerStatus
 from cocoro.node import Node
+from cocoro.units import Vec2
 
 LOOSE_S = 0.5
 """A hand that feels nothing for so long has lost what it held. When the arm comes to rest the claws may feel nothing

@@ -17,13 +17,12 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from cocoro.arrays import BoolArray, CodeArray, Float32Array, FloatArray, ImageArray
 from cocoro.errors import CocoroError
-from cocoro.robot import LensValues, Robot, Vec3
+from cocoro.robot import LensValues, Robot
+from cocoro.units import Vec3
 from services.kinect.lens import Lens
-
-Array = NDArray[np.float64]
 
 LEAST_VIEWS = 6
 LEAST_PIXELS = 100
@@ -61,12 +60,12 @@ class Board:
     square_m: float
 
     @property
-    def points_m(self) -> NDArray[np.float32]:
+    def points_m(self) -> Float32Array:
         """Of the corners, row by row, in the board's plane: (columns * rows, 3)."""
         grid = np.mgrid[0 : self.columns, 0 : self.rows].T.reshape(-1, 2) * self.square_m
         return np.column_stack([grid, np.zeros(len(grid))]).astype(np.float32)
 
-    def covers(self, points_m: Array) -> NDArray[np.bool_]:
+    def covers(self, points_m: FloatArray) -> BoolArray:
         """Whether points (n, 2) of its plane are on the board, and not near its edge."""
         squares = points_m / self.square_m
         ends = np.array([self.columns - 1 + BORDER, self.rows - 1 + BORDER])
@@ -74,9 +73,9 @@ class Board:
 
 
 class BoardView(NamedTuple):
-    corners_px: Array
+    corners_px: FloatArray
     """In the colour picture, in the order of the board's points: (n, 2)."""
-    depth: NDArray[np.uint16]
+    depth: CodeArray
     """Raw codes of the same moment, (height, width)."""
 
 
@@ -104,7 +103,7 @@ class Calibration:
         return {name: getattr(self, name) for name in names}
 
 
-def find_corners(colour: NDArray[np.uint8], board: Board, *, quick: bool = False) -> Array | None:
+def find_corners(colour: ImageArray, board: Board, *, quick: bool = False) -> FloatArray | None:
     """The board's corners in a picture, (n, 2) pixels; None where not all of them are seen."""
     grey = cv2.cvtColor(colour, cv2.COLOR_RGB2GRAY)
     found, corners = cv2.findChessboardCornersSB(grey, (board.columns, board.rows), flags=0)
@@ -166,15 +165,15 @@ def calibrate(views: Sequence[BoardView], board: Board, robot: Robot) -> Calibra
 class _Lying(NamedTuple):
     """How a board lies before the colour camera: a point p of its plane is at `rotation @ p + place`."""
 
-    rotation: Array
-    place: Array
+    rotation: FloatArray
+    place: FloatArray
 
     @classmethod
     def of(cls, turn: cv2.typing.MatLike, place: cv2.typing.MatLike) -> _Lying:
         return cls(np.asarray(cv2.Rodrigues(turn)[0], float), np.asarray(place, float).ravel())
 
     @property
-    def plane(self) -> Array:
+    def plane(self) -> FloatArray:
         """Its normal, and the distance along it, (4,)."""
         normal = self.rotation[:, 2]
         return np.append(normal, normal @ self.place)
@@ -187,7 +186,7 @@ class _Guess(NamedTuple):
     searched for, and `a` stays as it is.
     """
 
-    values: Array
+    values: FloatArray
     a: float
 
     @property
@@ -196,11 +195,11 @@ class _Guess(NamedTuple):
         return fx, fy, cx, cy, k1, k2, 0.0, 0.0, 0.0
 
     @property
-    def turn_rad(self) -> Array:
+    def turn_rad(self) -> FloatArray:
         return self.values[6:9]
 
     @property
-    def place_m(self) -> Array:
+    def place_m(self) -> FloatArray:
         return self.values[9:12]
 
     @property
@@ -209,7 +208,7 @@ class _Guess(NamedTuple):
         b = scale / self.a
         return self.a, b, pi / 2 - endless / b
 
-    def along(self, pixels: Array, planes: Array) -> tuple[Array, Array]:
+    def along(self, pixels: FloatArray, planes: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Where the pixels' (n, 2) rays meet planes (n, 4) of the colour camera's frame, (n, 3), and at which depth of
         the depth camera's."""
         rays = Lens(self.lens).rays(pixels) @ np.asarray(cv2.Rodrigues(self.turn_rad)[0], float).T
@@ -217,9 +216,9 @@ class _Guess(NamedTuple):
         depth = (planes[:, 3] - normals @ self.place_m) / (normals * rays).sum(axis=1)
         return self.place_m + rays * depth[:, None], depth
 
-    def codes(self, depth_m: Array) -> Array:
+    def codes(self, depth_m: FloatArray) -> FloatArray:
         a, b, c = self.curve
-        codes: Array = b * (np.arctan(depth_m / a) - c)
+        codes: FloatArray = b * (np.arctan(depth_m / a) - c)
         return codes
 
 
@@ -240,7 +239,7 @@ class _DepthFit:
         )  # fmt: skip
         self._start, self._sigma = np.array(start), np.array(sigma)
 
-    def fit(self) -> tuple[_Guess, Array, float]:
+    def fit(self) -> tuple[_Guess, FloatArray, float]:
         """The depth camera, the doubt of its place (m, one sigma), and the misfit in codes."""
         steps = np.zeros(len(self._start))
         for count in PIXELS_A_VIEW:  # which pixels show the board depends on the guess
@@ -251,11 +250,13 @@ class _DepthFit:
         misfit = float(np.median(np.abs(self._misfits(steps, *seen)))) * NOISE_CODES
         return guess, doubt[9:12], MEDIAN_TO_SIGMA * misfit
 
-    def _guess(self, steps: Array) -> _Guess:
+    def _guess(self, steps: FloatArray) -> _Guess:
         """So many sigmas from the start, for each of its numbers."""
         return _Guess(self._start + steps * self._sigma, self._a)
 
-    def _descend(self, steps: Array, pixels: Array, codes: Array, planes: Array) -> tuple[Array, Array]:
+    def _descend(
+        self, steps: FloatArray, pixels: FloatArray, codes: FloatArray, planes: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
         """Gauss-Newton with Huber weights and the priors; where it settles, and the information there."""
         for _ in range(ITERATIONS):
             misfits = self._misfits(steps, pixels, codes, planes)
@@ -272,13 +273,13 @@ class _DepthFit:
                 break
         return steps, information
 
-    def _misfits(self, steps: Array, pixels: Array, codes: Array, planes: Array) -> Array:
+    def _misfits(self, steps: FloatArray, pixels: FloatArray, codes: FloatArray, planes: FloatArray) -> FloatArray:
         """Of each pixel, in sigmas."""
         guess = self._guess(steps)
         _, depth_m = guess.along(pixels, planes)
         return (guess.codes(depth_m) - codes) / NOISE_CODES
 
-    def _on_boards(self, guess: _Guess, count: int) -> tuple[Array, Array, Array]:
+    def _on_boards(self, guess: _Guess, count: int) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Pixels (n, 2), codes (n,) and planes (n, 4) of the depth that shows the boards."""
         parts = []
         for view, board in zip(self._views, self._boards, strict=True):
@@ -304,6 +305,6 @@ class _DepthFit:
         return pixels, codes, planes
 
 
-def _vec3(values: Array) -> Vec3:
+def _vec3(values: FloatArray) -> Vec3:
     x, y, z = (float(value) for value in values)
     return x, y, z

@@ -15,8 +15,8 @@ from math import degrees
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cocoro.arrays import ImageArray
 from cocoro.child import ChildProcess, wait_or_kill
 from cocoro.clock import NS, Clock
 from cocoro.errors import ConfigError
@@ -30,14 +30,15 @@ log = logging.getLogger("cocoro.kinect")
 AGAIN_S = 1.0
 """Time between two attempts to open the device."""
 FIRST_S, HANGS_S = 6.0, 2.0
-"""A grabber that sends no frame for this long (the first one takes longer) and does not end either hangs, and is killed.
-Both are longer than the grabber's own limits."""
+"""A grabber that sends no frame for this long (the first one takes longer) and does not end either hangs, and is
+killed. Both are longer than the grabber's own limits."""
 END_S = 1.0
 OUTPUT_BYTES = 4096
 
 
 class FreenectCamera:
-    """The Kinect v1 through libfreenect. Calls `on_fault(fault)` in the running event loop whenever the fault changes."""
+    """The Kinect v1 through libfreenect. Calls `on_fault(fault)` in the running event loop whenever the fault
+    changes."""
 
     def __init__(self, config: Config, clock: Clock, on_fault: OnFault) -> None:
         try:
@@ -105,7 +106,7 @@ class FreenectCamera:
         age_ns = time.monotonic_ns() - pair["t"] + round(self._config.latency_s * NS)
         return RawFrame(self._clock.now_ns() - age_ns, colour, depth)
 
-    def _view(self, kind: ImageKind, buffer: int) -> NDArray[np.uint8]:
+    def _view(self, kind: ImageKind, buffer: int) -> ImageArray:
         return np.frombuffer(self._memory, np.uint8, grabber.size(kind), grabber.offset(kind, buffer))
 
     def _receive(self, data: bytes) -> None:

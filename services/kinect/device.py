@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import AsyncIterator, Callable
 from typing import NamedTuple, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
+from cocoro.arrays import CodeArray, ImageArray
 from cocoro.clock import Clock
 from services.kinect.config import Config
 from services.kinect.freenect import LED
@@ -21,9 +19,9 @@ class RawFrame(NamedTuple):
 
     stamp_ns: int
     """Middle of the exposure, robot's clock."""
-    colour: NDArray[np.uint8]
+    colour: ImageArray
     """RGB, (height, width, 3)."""
-    depth: NDArray[np.uint16]
+    depth: CodeArray
     """Raw 11-bit codes from the depth camera's viewpoint, (height, width); 2047 is no data."""
 
 

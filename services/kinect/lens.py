@@ -12,12 +12,11 @@ from math import pi
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from cocoro.arrays import Float32Array, FloatArray
 from cocoro.robot import Camera, Robot
 from services.kinect.device import RawFrame
 
-Array = NDArray[np.float64]
 Maps = tuple[cv2.typing.MatLike, cv2.typing.MatLike]
 NO_DATA = 2047
 MATTERS_CODES = 0.5
@@ -29,19 +28,19 @@ class Lens:
 
     def __init__(self, values: tuple[float, ...]) -> None:
         fx, fy, cx, cy = values[:4]
-        self.matrix: Array = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-        self.distortion: Array = np.array(values[4:])
+        self.matrix: FloatArray = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        self.distortion: FloatArray = np.array(values[4:])
 
     @classmethod
     def of(cls, camera: Camera) -> Lens:
         return cls((camera.fx, camera.fy, camera.cx, camera.cy, 0.0, 0.0, 0.0, 0.0, 0.0))
 
-    def pixels(self, rays: Array) -> Array:
+    def pixels(self, rays: FloatArray) -> FloatArray:
         """Where directions (n, 3), camera frame, appear: (n, 2)."""
         points, _ = cv2.projectPoints(rays.reshape(-1, 1, 3), np.zeros(3), np.zeros(3), self.matrix, self.distortion)
         return np.asarray(points, float).reshape(-1, 2)
 
-    def rays(self, pixels: Array) -> Array:
+    def rays(self, pixels: FloatArray) -> FloatArray:
         """The directions of pixels (n, 2), with z = 1: (n, 3)."""
         points = cv2.undistortPoints(pixels.reshape(-1, 1, 2), self.matrix, self.distortion).reshape(-1, 2)
         return np.column_stack([points, np.ones(len(points))])
@@ -60,7 +59,7 @@ class Straightener:
         if kinect.colour_lens is not None:
             self._colour = _maps(Lens(kinect.colour_lens).pixels(rays), shape)
         self._depth: Maps | None = None
-        self._move: tuple[NDArray[np.float32], NDArray[np.float32]] | None = None
+        self._move: tuple[Float32Array, Float32Array] | None = None
         if kinect.depth_lens is not None:
             turn, _ = cv2.Rodrigues(np.array(kinect.depth_rotation_rad))
             turned = rays @ turn  # by its inverse: into the depth camera's own frame
@@ -94,7 +93,7 @@ class Straightener:
 
 
 def _maps(
-    pixels: Array, shape: tuple[int, int], *, nearest: bool = False
+    pixels: FloatArray, shape: tuple[int, int], *, nearest: bool = False
 ) -> tuple[cv2.typing.MatLike, cv2.typing.MatLike]:
     u, v = (pixels[:, axis].reshape(shape).astype(np.float32) for axis in (0, 1))
     return cv2.convertMaps(u, v, cv2.CV_16SC2, nninterpolation=nearest)

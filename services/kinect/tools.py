@@ -13,13 +13,13 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from cocoro.arrays import CodeArray, FloatArray, ImageArray
 from cocoro.clock import RealClock
 from cocoro.errors import CocoroError, ConfigError
 from cocoro.picture import load as load_picture
 from cocoro.picture import save as save_picture
-from services.kinect.calibration import Array, Board, BoardView, find_corners
+from services.kinect.calibration import Board, BoardView, find_corners
 from services.kinect.camera import open_device
 from services.kinect.config import Config
 from services.kinect.device import DepthCamera, RawFrame
@@ -44,8 +44,8 @@ class ViewCollector:
         self._board = board
         self._folder = folder
         self._still: list[RawFrame] = []
-        self._before: Array | None = None
-        self._places: list[Array] = []
+        self._before: FloatArray | None = None
+        self._places: list[FloatArray] = []
 
     def take(self, shot: RawFrame) -> str:
         """What there is to tell of a shot: '' when nothing."""
@@ -65,7 +65,7 @@ class ViewCollector:
             return ""
         return self._keep(rough)
 
-    def _keep(self, place: Array) -> str:
+    def _keep(self, place: FloatArray) -> str:
         shots, self._still = self._still, []
         corners = find_corners(shots[-1].colour, self._board)
         if corners is None:
@@ -78,7 +78,7 @@ class ViewCollector:
         return f"view {len(self.views)}"
 
 
-def mean_depth(depths: list[NDArray[np.uint16]]) -> NDArray[np.uint16]:
+def mean_depth(depths: list[CodeArray]) -> CodeArray:
     """The codes in the middle, of pictures of something that stood still; no data where one of them has none."""
     stack = np.stack(depths)
     middle = np.median(stack, axis=0).astype(np.uint16)
@@ -158,7 +158,7 @@ async def _tilt(config: Config, angle_rad: float) -> None:
 # --- views in files -------------------------------------------------------------------------------
 
 
-def save(folder: Path, number: int, colour: NDArray[np.uint8], depth: NDArray[np.uint16]) -> None:
+def save(folder: Path, number: int, colour: ImageArray, depth: CodeArray) -> None:
     """As two PNG files, the depth's of 16 bits."""
     for what, picture in (("colour", cv2.cvtColor(colour, cv2.COLOR_RGB2BGR)), ("depth", depth)):
         file = folder / f"view-{number:02}-{what}.png"
@@ -180,7 +180,7 @@ def read(folder: Path, board: Board, tell: Tell) -> list[BoardView]:
     return views
 
 
-def _pictures(folder: Path) -> Iterator[tuple[Path, NDArray[np.uint8], NDArray[np.uint16]]]:
+def _pictures(folder: Path) -> Iterator[tuple[Path, ImageArray, CodeArray]]:
     files = sorted(folder.glob("view-*-colour.png"))
     if not files:
         raise ConfigError(f"{folder} holds no views: view-01-colour.png, view-01-depth.png and so on")
@@ -202,6 +202,6 @@ def _prepare(folder: Path) -> None:
         raise ConfigError(f"{folder} holds views already: name another folder, or use them with --from")
 
 
-def _apart_px(one: Array, other: Array) -> float:
+def _apart_px(one: FloatArray, other: FloatArray) -> float:
     """Mean distance of the corners; which of them is the first is no difference where a board looks the same turned."""
     return min(float(np.linalg.norm(one - order, axis=1).mean()) for order in (other, other[::-1]))

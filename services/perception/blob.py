@@ -12,11 +12,12 @@ from math import log, sqrt
 import cv2
 import numpy as np
 
+from cocoro.arrays import MaskArray
 from cocoro.objects import Catalogue, KnownObject
 from services.perception.colours import ColourTable
 from services.perception.config import Config
 from services.perception.image import Box, RgbdImage
-from services.perception.region import Mask, Region, components
+from services.perception.region import Region, components
 from services.perception.shapes import area_range_m2, counted_px, reach_m
 from services.perception.sighting import Sighting
 
@@ -48,7 +49,7 @@ class BlobDetector:
                     sightings.append(sighting)
         return sightings
 
-    def _find(self, known: KnownObject, mask: Mask, origin: tuple[int, int], image: RgbdImage) -> Sighting | None:
+    def _find(self, known: KnownObject, mask: MaskArray, origin: tuple[int, int], image: RgbdImage) -> Sighting | None:
         """The object in the part of the image whose first pixel is `origin` and whose matching pixels are `mask`."""
         parts = _clean_components(mask, origin, image, self._config.min_area_px * image.scale**2)
         if not parts:
@@ -142,8 +143,8 @@ class _Fit:
 
 
 def _clean_components(
-    mask: Mask, origin: tuple[int, int], image: RgbdImage, min_area_px: float
-) -> list[tuple[Mask, Box]]:
+    mask: MaskArray, origin: tuple[int, int], image: RgbdImage, min_area_px: float
+) -> list[tuple[MaskArray, Box]]:
     """The mask's connected regions, after specks and threads of noise are opened away."""
     if cv2.countNonZero(mask) < min_area_px:
         return []

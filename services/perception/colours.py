@@ -8,10 +8,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cocoro.colour import Pixels, lab_of, matches
+from cocoro.arrays import ImageArray
+from cocoro.colour import lab_of, matches
 from cocoro.objects import Catalogue
 
-__all__ = ["Classes", "ColourTable", "Pixels", "lab_of", "matches"]
+__all__ = ["Classes", "ColourTable", "lab_of", "matches"]
 
 Classes = NDArray[Any]
 """An unsigned integer a pixel; bit i stands for the catalogue's i-th object."""
@@ -39,7 +40,7 @@ class ColourTable:
             table |= matches(known, lab, by_shape=True).astype(np.uint32) << np.uint32(bit)
         self._table: Classes = table.astype(dtype)
 
-    def classify(self, colour: Pixels) -> Classes:
+    def classify(self, colour: ImageArray) -> Classes:
         """For RGB (height, width, 3): each pixel's objects as bits, (height, width).
 
         A 3 x 3 mean comes first: it takes the sensor's noise to a third, and one wild pixel is no object.

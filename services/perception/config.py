@@ -7,8 +7,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-Positive = Annotated[float, Meta(gt=0)]
-Share = Annotated[float, Meta(gt=0, le=1)]
+from cocoro.units import Positive, PositiveShare
 
 
 class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -27,14 +26,14 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
     min_area_px: Positive = 32.0
     """Smaller blobs are noise. A can at 3.5 m has 220 pixels, the hand's marker at 1 m 170."""
-    min_share: Share = 0.5
+    min_share: PositiveShare = 0.5
     """Of the pixels that an object of that size has at that distance; with fewer it is another, smaller thing of that
     colour, unless something hides the rest."""
-    min_hidden_share: Share = 0.08
+    min_hidden_share: PositiveShare = 0.08
     """The same where the image's edge or something nearer hides the rest."""
     max_share: Annotated[float, Meta(ge=1)] = 1.7
     """With more it is another, larger thing of that colour."""
-    occluded_share: Share = 0.6
+    occluded_share: PositiveShare = 0.6
     """Below this share of the expected pixels a detection is noted 'occluded'."""
 
     paper_grid: Annotated[int, Meta(ge=1)] = 5

@@ -7,11 +7,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from cocoro.arrays import Float32Array, FloatArray
 from cocoro.core import Output, Sample, Schedule, Take
-from cocoro.history import History, Vector
+from cocoro.history import History
 from cocoro.messages import Detections, Frame, Obstacles, ServoState
 from cocoro.objects import Catalogue
 from cocoro.robot import Camera, Robot
@@ -40,7 +38,7 @@ class _Pending:
     frame_incarnation: int
     camera: Camera
     sightings: tuple[Sighting, ...]
-    floor_depth_m: NDArray[np.float32] | None
+    floor_depth_m: Float32Array | None
     """The depth on a coarse grid, where the floor is due to be scanned."""
     deadline_ns: int
 
@@ -132,7 +130,7 @@ class PerceptionCore:
         self._floor_ns = stamp_ns
         return True
 
-    def _scanned(self, pending: _Pending, angles: Vector) -> Obstacles:
+    def _scanned(self, pending: _Pending, angles: FloatArray) -> Obstacles:
         assert pending.floor_depth_m is not None
         camera, pose = pending.camera, self._localiser.camera_pose(angles)
         scan = self._floor.scan(pending.floor_depth_m, camera.width, camera.height, pose)
@@ -144,7 +142,7 @@ class PerceptionCore:
         passed = newest is not None and newest[0] >= pending.stamp_ns
         return not passed and now_ns < pending.deadline_ns and len(self._pending) <= MAX_PENDING
 
-    def _localised(self, pending: _Pending, angles: Vector | None) -> Detections:
+    def _localised(self, pending: _Pending, angles: FloatArray | None) -> Detections:
         if angles is None:
             self.unlocalised_frames += 1
         head = dict(zip(self._localiser.joints, angles.tolist(), strict=True)) if angles is not None else {}

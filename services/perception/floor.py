@@ -7,9 +7,8 @@ something stands. The tolerance grows with the distance as the sensor's noise an
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cocoro.kinematics import Array
+from cocoro.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from cocoro.messages import Obstacles
 from cocoro.robot import Robot
 from services.perception.config import Config
@@ -30,15 +29,15 @@ class FloorScanner:
         self._robot = robot
         self._config = config
         self._offset_m = np.array(robot.kinect.depth_offset_m)
-        self._directions: dict[tuple[int, int], Array] = {}
+        self._directions: dict[tuple[int, int], FloatArray] = {}
 
-    def sample(self, image: RgbdImage) -> NDArray[np.float32]:
+    def sample(self, image: RgbdImage) -> Float32Array:
         """Depth, metres, on a coarse grid (80 x 60 whatever the resolution); NaN without data. Kept until the head
         angles of the frame are known."""
         step = max(image.width // 80, 1)
         return self._robot.depth_m(image.raw_depth[step // 2 :: step, step // 2 :: step])
 
-    def scan(self, depth_m: NDArray[np.float32], width: int, height: int, camera_pose: Array) -> Obstacles:
+    def scan(self, depth_m: Float32Array, width: int, height: int, camera_pose: FloatArray) -> Obstacles:
         """The message, its stamp left to the caller. `camera_pose`: colour camera in the body frame, 4 x 4."""
         config = self._config
         rotation = camera_pose[:3, :3]
@@ -65,7 +64,7 @@ class FloorScanner:
             origin_m=(float(origin[0]), float(origin[1])),
         )
 
-    def _rays(self, shape: tuple[int, ...], width: int, height: int) -> Array:
+    def _rays(self, shape: tuple[int, ...], width: int, height: int) -> FloatArray:
         """Directions of the grid's pixels, depth camera's frame, z = 1; shape (rows, columns, 3)."""
         rays = self._directions.get((width, height))
         if rays is None:
@@ -77,7 +76,7 @@ class FloorScanner:
         return rays
 
 
-def _cells(points: Array) -> tuple[Array, Array]:
+def _cells(points: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Middles (n, 2) of the floor cells in which enough points stand, and the highest point in each, (n,)."""
     if not len(points):
         return np.zeros((0, 2)), np.zeros(0)
@@ -91,7 +90,7 @@ def _cells(points: Array) -> tuple[Array, Array]:
 
 
 def _free(
-    ray: NDArray[np.int64], distance: Array, floor: NDArray[np.bool_], standing: NDArray[np.bool_]
+    ray: IntArray, distance: FloatArray, floor: BoolArray, standing: BoolArray
 ) -> tuple[tuple[float, float, float], ...]:
     """Bearing, nearest and farthest floor of each ray, ended before the first thing that stands on it."""
     nearest, farthest = np.full(_RAYS, np.inf), np.zeros(_RAYS)

@@ -6,12 +6,11 @@ from functools import cached_property
 from math import ceil, floor, sqrt
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cocoro.arrays import CodeArray, Float32Array, ImageArray
 from cocoro.messages import Frame
 from cocoro.robot import Camera, Robot
 
-Pixels = NDArray[np.uint8]
 Box = tuple[int, int, int, int]
 """left, top, right, bottom in pixels; right and bottom exclusive."""
 
@@ -19,7 +18,7 @@ Box = tuple[int, int, int, int]
 class RgbdImage:
     """Colour (height, width, 3) and raw depth codes (height, width) of one frame: views, nothing is copied."""
 
-    def __init__(self, colour: Pixels, raw_depth: NDArray[np.uint16], robot: Robot) -> None:
+    def __init__(self, colour: ImageArray, raw_depth: CodeArray, robot: Robot) -> None:
         self.colour = colour
         self.raw_depth = raw_depth
         self.height, self.width = raw_depth.shape
@@ -56,7 +55,7 @@ class RgbdImage:
         depth = float(self._robot.depth_m(self.raw_depth[v : v + 1, u : u + 1])[0, 0])
         return depth if np.isfinite(depth) else None
 
-    def depth_m(self, box: Box) -> NDArray[np.float32]:
+    def depth_m(self, box: Box) -> Float32Array:
         """Depth along the optical axis at the colour pixels of a box, shape (bottom - top, right - left).
 
         The depth camera stands beside the colour camera, so each depth pixel of the neighbourhood is carried to

@@ -12,17 +12,16 @@ from math import hypot, log
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cocoro.messages import Detection, Vec3
+from cocoro.arrays import FloatArray
+from cocoro.messages import Detection
 from cocoro.objects import Catalogue, KnownObject
 from cocoro.robot import Camera, Robot
+from cocoro.units import Vec3
 from services.perception.image import Box
 from services.perception.region import depth_doubt_m
 from services.perception.shapes import counted_px, distance_from, reach_m, seen_area_m2, signed_distance
 from services.perception.sighting import Evidence, Sighting
-
-Array = NDArray[np.float64]
 
 ITERATIONS = 12
 SETTLED_M = 1e-4
@@ -50,11 +49,11 @@ class Localiser:
         self.joints = self._chain.joints
         """The head's joints, in the order of `camera_pose`'s angles."""
 
-    def camera_pose(self, angles_rad: Array) -> Array:
+    def camera_pose(self, angles_rad: FloatArray) -> FloatArray:
         """4 x 4, camera frame (x right, y down, z forward) to body frame."""
         return self._chain.pose(dict(zip(self.joints, angles_rad, strict=True)))
 
-    def locate(self, sightings: Sequence[Sighting], camera: Camera, angles_rad: Array | None) -> list[Detection]:
+    def locate(self, sightings: Sequence[Sighting], camera: Camera, angles_rad: FloatArray | None) -> list[Detection]:
         """The detections as they are published: with the centre's position, or with a note of why there is none.
 
         Where two objects share a colour, both may have been sighted in one place: the one stays whose shape and size
@@ -76,7 +75,7 @@ class Localiser:
         bottom_m = z - self._catalogue[detection.label].size_m[2] / 2
         return bottom_m < -UNDER_FLOOR_M - UNDER_FLOOR_PER_M * hypot(x, y)
 
-    def _place(self, sighting: Sighting, camera: Camera, pose: Array | None) -> _Placed:
+    def _place(self, sighting: Sighting, camera: Camera, pose: FloatArray | None) -> _Placed:
         position: Vec3 | None = None
         fit: _Fit | None = None
         note = ""
@@ -148,19 +147,19 @@ def _overlap(a: Box, b: Box) -> float:
     return common / ((a[2] - a[0]) * (a[3] - a[1]) + (b[2] - b[0]) * (b[3] - b[1]) - common)
 
 
-def first_guess(known: KnownObject, surface_m: Array, pose: Array) -> Array:
+def first_guess(known: KnownObject, surface_m: FloatArray, pose: FloatArray) -> FloatArray:
     """The object's centre, body frame, from one point of its visible surface (camera frame), shape (3,).
 
     The point is pushed inwards by the radius: along the ray for a sphere, horizontally for what stands upright.
     """
-    point: Array = pose[:3, :3] @ surface_m + pose[:3, 3]
-    inwards: Array = point - pose[:3, 3]
+    point: FloatArray = pose[:3, :3] @ surface_m + pose[:3, 3]
+    inwards: FloatArray = point - pose[:3, 3]
     if known.shape != "sphere":
         inwards = inwards * np.array([1.0, 1.0, 0.0])
     return point + inwards * (known.planar_radius_m / max(float(np.linalg.norm(inwards)), 1e-9))
 
 
-def fit_centre(known: KnownObject, evidence: Evidence, pose: Array, start: Array) -> tuple[Array, float]:
+def fit_centre(known: KnownObject, evidence: Evidence, pose: FloatArray, start: FloatArray) -> tuple[FloatArray, float]:
     """The centre, body frame, of the upright shape that goes best with the evidence, shape (3,), and its misfit.
 
     Gauss-Newton on signed distances, with Huber weights: surface points want distance 0, each against its
@@ -202,9 +201,9 @@ class _Rays:
     that was nearest before, which follows the centre as it moves.
     """
 
-    def __init__(self, known: KnownObject, evidence: Evidence, rotation: Array, guess: Array) -> None:
+    def __init__(self, known: KnownObject, evidence: Evidence, rotation: FloatArray, guess: FloatArray) -> None:
         self._known = known
-        self.directions: Array = np.concatenate([evidence.outline, evidence.beside]) @ rotation.T
+        self.directions: FloatArray = np.concatenate([evidence.outline, evidence.beside]) @ rotation.T
         self._free_to = np.concatenate([np.full(len(evidence.outline), np.inf), evidence.free_to_m])[:, None]
         self._every = np.arange(len(self.directions))
         length2 = (self.directions * self.directions).sum(axis=1)
@@ -212,19 +211,19 @@ class _Rays:
         self._depth = self._nearest_depth((self.directions @ guess / length2)[:, None] + steps, guess)
         self._fine_steps = steps * 1.5 / (RAY_SAMPLES - 1)
 
-    def nearest(self, centre: Array) -> Array:
+    def nearest(self, centre: FloatArray) -> FloatArray:
         """The point of each ray, of its free part, that is nearest to (or deepest in) the shape there, (n, 3)."""
         self._depth = self._nearest_depth(self._depth[:, None] + self._fine_steps, centre)
         return self._depth[:, None] * self.directions
 
-    def _nearest_depth(self, depths: Array, centre: Array) -> Array:
+    def _nearest_depth(self, depths: FloatArray, centre: FloatArray) -> FloatArray:
         depths = np.minimum(depths, self._free_to)
         points = depths[:, :, None] * self.directions[:, None, :] - centre
-        nearest: Array = depths[self._every, distance_from(self._known, points).argmin(axis=1)]
+        nearest: FloatArray = depths[self._every, distance_from(self._known, points).argmin(axis=1)]
         return nearest
 
 
-def expected_area_px(known: KnownObject, centre: Array, camera: Camera, pose: Array) -> float:
+def expected_area_px(known: KnownObject, centre: FloatArray, camera: Camera, pose: FloatArray) -> float:
     """Pixels that the whole object covers from here: its silhouette's solid angle, over that of a pixel."""
     to_camera = pose[:3, 3] - centre
     distance = float(np.linalg.norm(to_camera))

@@ -11,8 +11,8 @@ from itertools import pairwise
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from cocoro.arrays import ImageArray
 from cocoro.objects import Catalogue, KnownObject
 from services.perception.config import Config
 from services.perception.image import RgbdImage
@@ -29,7 +29,7 @@ class PaperDetector:
         found = (self._find(known, lab, image) for known in self._catalogue)
         return [sighting for sighting in found if sighting is not None]
 
-    def _find(self, known: KnownObject, lab: NDArray[np.uint8], image: RgbdImage) -> Sighting | None:
+    def _find(self, known: KnownObject, lab: ImageArray, image: RgbdImage) -> Sighting | None:
         mask = np.zeros(lab.shape[:2], dtype=np.uint8)
         for box in known.lab:
             mask |= np.asarray(cv2.inRange(lab, _eight_bit(box.low), _eight_bit(box.high)), dtype=np.uint8)
@@ -52,7 +52,7 @@ def _eight_bit(lab: tuple[float, float, float]) -> tuple[float, float, float]:
     return lab[0] * 255 / 100, lab[1] + 128, lab[2] + 128
 
 
-def _fullest_tile(mask: NDArray[np.uint8], grid: int) -> int:
+def _fullest_tile(mask: ImageArray, grid: int) -> int:
     height, width = mask.shape
     rows = np.linspace(0, height, grid + 1).astype(int)
     columns = np.linspace(0, width, grid + 1).astype(int)

@@ -7,14 +7,10 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from cocoro.arrays import BoolArray, Float32Array, FloatArray, MaskArray
 from services.perception.image import Box, RgbdImage
 from services.perception.sighting import Evidence
-
-Mask = NDArray[np.uint8]
-Bools = NDArray[np.bool_]
-Depth = NDArray[np.float32]
 
 MIN_DEPTH_PIXELS = 6
 MIN_DEPTH_SHARE = 0.4
@@ -42,7 +38,7 @@ def depth_doubt_m(depth_m: Any) -> Any:
 class Region:
     """`mask` (uint8, non-zero inside) and `box`, its place in the image, have a margin around the region."""
 
-    def __init__(self, mask: Mask, box: Box, image: RgbdImage) -> None:
+    def __init__(self, mask: MaskArray, box: Box, image: RgbdImage) -> None:
         self.mask = mask
         self.box = box
         self.image = image
@@ -71,7 +67,7 @@ class Region:
         return left <= 1 or top <= 1 or right >= self.image.width - 1 or bottom >= self.image.height - 1
 
     @cached_property
-    def depth(self) -> Depth:
+    def depth(self) -> Float32Array:
         """Registered, of `box`; NaN without data."""
         return self.image.depth_m(self.box)
 
@@ -91,7 +87,7 @@ class Region:
         return float(np.median(self.depth[window]))
 
     @cached_property
-    def surroundings(self) -> Bools:
+    def surroundings(self) -> BoolArray:
         """A ring just outside of the outline, where neither blended pixels nor the cleaning's one pixel reach."""
         ring = 2 * _ring_px(self.image) + 1
         outer = cv2.dilate(self.mask, np.ones((ring, ring), dtype=np.uint8))
@@ -116,7 +112,7 @@ class Region:
             unknown = 0
         return bool(nearer >= NEARER_SHARE * total or unknown >= UNKNOWN_SHARE * total)
 
-    def split_by_depth(self) -> list[tuple[Mask, Box]]:
+    def split_by_depth(self) -> list[tuple[MaskArray, Box]]:
         """The region cut where its depth jumps: an object before a wall of its colour, one can before another."""
         depth = np.nan_to_num(self.depth, nan=0.0)
         far = np.asarray(cv2.dilate(depth, _AROUND))
@@ -140,7 +136,7 @@ class Region:
         outline = self._rays((self.mask > 0) & (core == 0), MAX_RAYS)
         return Evidence(surface[:, :3] * surface[:, 3:], outline[:, :3], around[:, :3], free_to_m)
 
-    def _rays(self, where: Bools, at_most: int) -> NDArray[np.float64]:
+    def _rays(self, where: BoolArray, at_most: int) -> FloatArray:
         """Directions with z = 1, and depth, of some of the pixels; (n, 4)."""
         camera = self.image.camera
         rows, columns = np.nonzero(where)
@@ -156,8 +152,8 @@ class Region:
 
 
 def components(
-    mask: Mask, origin: tuple[int, int], image: RgbdImage, min_area_px: float, at_most: int = 8
-) -> list[tuple[Mask, Box]]:
+    mask: MaskArray, origin: tuple[int, int], image: RgbdImage, min_area_px: float, at_most: int = 8
+) -> list[tuple[MaskArray, Box]]:
     """The largest connected regions of a mask whose first pixel is the image's `origin`, each with a margin around."""
     _, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8, ltype=cv2.CV_32S)
     by_area = 1 + np.argsort(-stats[1:, cv2.CC_STAT_AREA], kind="stable")  # 0 is what is not in the mask

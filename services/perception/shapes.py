@@ -5,14 +5,12 @@ from __future__ import annotations
 from math import hypot, pi, sqrt
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cocoro.arrays import FloatArray
 from cocoro.objects import KnownObject
 
-Points = NDArray[np.float64]
 
-
-def distance_from(known: KnownObject, offsets_m: Points) -> Points:
+def distance_from(known: KnownObject, offsets_m: FloatArray) -> FloatArray:
     """Distance from the upright object's surface, negative inside, for points (..., 3) relative to its centre, z up.
 
     A box, whose yaw nobody knows, counts as the cylinder of equal base and height.
@@ -20,15 +18,15 @@ def distance_from(known: KnownObject, offsets_m: Points) -> Points:
     squares = offsets_m * offsets_m
     planar2 = squares[..., 0] + squares[..., 1]
     if known.shape == "sphere":
-        from_centre: Points = np.sqrt(planar2 + squares[..., 2])
+        from_centre: FloatArray = np.sqrt(planar2 + squares[..., 2])
         return from_centre - known.planar_radius_m
     beside = np.sqrt(planar2) - known.planar_radius_m
     above = np.abs(offsets_m[..., 2]) - known.size_m[2] / 2
-    outside: Points = np.sqrt(np.maximum(beside, 0.0) ** 2 + np.maximum(above, 0.0) ** 2)
+    outside: FloatArray = np.sqrt(np.maximum(beside, 0.0) ** 2 + np.maximum(above, 0.0) ** 2)
     return outside + np.minimum(np.maximum(beside, above), 0.0)
 
 
-def signed_distance(known: KnownObject, offsets_m: Points) -> tuple[Points, Points]:
+def signed_distance(known: KnownObject, offsets_m: FloatArray) -> tuple[FloatArray, FloatArray]:
     """`distance_from` for points (n, 3), with its gradient (n, 3)."""
     if known.shape == "sphere":
         length = np.sqrt((offsets_m * offsets_m).sum(axis=1))

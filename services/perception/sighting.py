@@ -5,25 +5,21 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
+from cocoro.arrays import FloatArray
 from services.perception.image import Box, RgbdImage
-
-Points = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Evidence:
     """What the depth image says of the object's extent, colour camera's frame (x right, y down, z forward)."""
 
-    surface_m: Points
+    surface_m: FloatArray
     """Points on its visible surface, (n, 3)."""
-    outline: Points
+    outline: FloatArray
     """Directions (k, 3), z = 1, of its outermost pixels: each ray meets the object."""
-    beside: Points
+    beside: FloatArray
     """Directions (m, 3), z = 1, of pixels just outside of its outline whose depth is known."""
-    free_to_m: Points
+    free_to_m: FloatArray
     """How far along the optical axis each ray beside is known to pass through nothing, (m,)."""
 
     @property

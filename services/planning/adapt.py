@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from cocoro.arrays import FloatArray
 from cocoro.learning.fitting import LeastSquares
 from cocoro.learning.handmap import HandMap
-from cocoro.learning.network import Array
 
 NUDGE = 0.02
 """Doubt of the weights while all is as usual, in units of a sighting's variance."""
@@ -50,7 +50,7 @@ class Adapter:
         """Mean square of the latest errors, in units of the usual: about 1 while nothing has changed."""
         return self._mean2 / self._usual2
 
-    def add(self, angles_rad: Array, place_m: Array) -> float:
+    def add(self, angles_rad: FloatArray, place_m: FloatArray) -> float:
         """One sighting of the hand: angles (n,), place (3,). Returns the error before it was learned, metres."""
         error_m = float(np.linalg.norm(self.map.at(angles_rad) - place_m))
         if error_m > WILD_M:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cocoro.kinematics import Array
+from cocoro.arrays import FloatArray
 from cocoro.robot import Robot
 from services.planning.clearance import Clearance
 from services.planning.config import Arm
@@ -33,8 +33,8 @@ _ASTRAY_RAD = 0.6
 class Step(NamedTuple):
     """Goals for the arm's joints (order of ARM) and the wrist roll, with speeds."""
 
-    goal_rad: Array
-    speed_radps: Array
+    goal_rad: FloatArray
+    speed_radps: FloatArray
     roll_rad: float
     left: float
     """What is left: metres for a hand pose, radians for joint poses."""

@@ -10,7 +10,7 @@ from math import cos, radians, sin
 
 import numpy as np
 
-from cocoro.kinematics import Array
+from cocoro.arrays import FloatArray
 from cocoro.robot import Robot
 
 TUBES = (
@@ -40,11 +40,11 @@ class Clearance:
         self._chassis_radius_m = robot.base.chassis_diameter_m / 2
         self._chassis_top_m = robot.base.chassis_height_m + 0.03
 
-    def hull(self, angles: Mapping[str, float]) -> tuple[Array, Array]:
+    def hull(self, angles: Mapping[str, float]) -> tuple[FloatArray, FloatArray]:
         """Centres (n, 3) in the body frame and radii (n,) of the arm's balls. The claws' angles may be left out."""
         angles = dict.fromkeys(_FINGER_TURN_RAD, 0.0) | dict(angles)
         poses = self._tree.poses(angles)
-        balls: list[Array] = []
+        balls: list[FloatArray] = []
         for (start, end, *_), share in zip(TUBES, self._shares, strict=True):
             balls.append((1 - share) * poses[start][:3, 3] + share * poses[end][:3, 3])
         for name, turn in self._fingers.items():

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Literal
 
 import msgspec
-from msgspec import Meta
 
-Positive = Annotated[float, Meta(gt=0)]
+from cocoro.units import Positive
 
 
 class Memory(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from cocoro import topics
+from cocoro.arrays import FloatArray
 from cocoro.clock import NS
 from cocoro.core import Output, Sample, Schedule, Take
-from cocoro.kinematics import Array
 from cocoro.messages import BaseCommand, Intent, LearnedModel, PlannerStatus, ServoCommand
 from cocoro.robot import Robot
 from cocoro.topics import Topic
@@ -101,7 +101,7 @@ class PlanningCore:
         status = self._status(plan, snapshot)
         return [*self._commands(plan, snapshot), *plan.reports, Output(topics.PLAN, status)]
 
-    def _own_hull(self, angles: Mapping[str, float]) -> tuple[Array, Array]:
+    def _own_hull(self, angles: Mapping[str, float]) -> tuple[FloatArray, FloatArray]:
         """Where the robot itself, and what it holds, is in its own view in a posture."""
         centres, radii = self._actuators.arm.clearance.hull(angles)
         off = self.learned.offset_m(angles)

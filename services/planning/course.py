@@ -12,9 +12,9 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from cocoro.arrays import FloatArray
 from cocoro.clock import NS
 from cocoro.frames import Pose2, wrap_rad
-from cocoro.kinematics import Array
 from cocoro.robot import Robot
 from services.planning.config import Config
 from services.planning.navigation import Driver, Offset, offset_to
@@ -59,7 +59,7 @@ class Course:
         *,
         arm: Literal["last", "out", "folded"],
         arrive_m: float | None = None,
-        swing_m: Array | None = None,
+        swing_m: FloatArray | None = None,
     ) -> None:
         """When the hand is out: on the `last` stretch only, all the way, or never. `arrive_m`: near enough, from
         whichever side; by default the driver's own tolerances count. `swing_m`: the floor places (n, 2), body frame,
@@ -226,7 +226,9 @@ class Course:
 
     # --- driving ----------------------------------------------------------------------------------
 
-    def _along(self, detour: Detour, body: Pose2, target_m: tuple[float, float], driver: Driver) -> tuple[Move, Array]:
+    def _along(
+        self, detour: Detour, body: Pose2, target_m: tuple[float, float], driver: Driver
+    ) -> tuple[Move, FloatArray]:
         config = self._config
         path = np.array(detour.path)
         gaps = np.hypot(path[:, 0] - body.x_m, path[:, 1] - body.y_m)
@@ -254,7 +256,7 @@ class Course:
     def _watch(
         self,
         move: Move,
-        ahead: Array,
+        ahead: FloatArray,
         body: Pose2,
         around: Surroundings,
         fields: Fields,

@@ -7,10 +7,10 @@ from collections.abc import Iterator
 import numpy as np
 import scipy  # which loads its parts when they are needed: half a second for this one
 
-from cocoro.learning.network import Array
+from cocoro.arrays import FloatArray
 
 
-def sobol(first: int, ranges: Array) -> Iterator[tuple[int, Array]]:
+def sobol(first: int, ranges: FloatArray) -> Iterator[tuple[int, FloatArray]]:
     """(number, point) from the draw `first` on, for ever; points (n,) within `ranges` (n, 2). Equal numbers, equal
     points. Number 0, the sequence's own first, is a corner of the box like any other."""
     engine = scipy.stats.qmc.Sobol(len(ranges), scramble=False)

@@ -11,13 +11,10 @@ from math import cos, sin
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from cocoro.arrays import BoolArray, FloatArray, IntArray
 from cocoro.frames import Pose2
-from cocoro.kinematics import Array
 from cocoro.messages import Obstacles
-
-Cells = NDArray[np.bool_]
 
 CELL_M = 0.05
 SIZE = 160
@@ -43,7 +40,7 @@ class FloorMap:
 
     # --- what is seen -----------------------------------------------------------------------------
 
-    def enter(self, seen: Obstacles, body: Pose2, own: tuple[Array, Array] | None) -> None:
+    def enter(self, seen: Obstacles, body: Pose2, own: tuple[FloatArray, FloatArray] | None) -> None:
         """One depth image's floor and obstacles, seen from a pose of the body.
 
         `own` are the centres (n, 3) and radii (n,) of the robot's own hull in the body frame: what is inside is itself.
@@ -72,15 +69,15 @@ class FloorMap:
         self._looked |= self._disc(*place_m, 0.10)
 
     @staticmethod
-    def _along(rays: Array, origin: Array, yaw_rad: float) -> Array:
+    def _along(rays: FloatArray, origin: FloatArray, yaw_rad: float) -> FloatArray:
         """Points every half cell along the rays (bearing, near, far), odometry frame."""
         steps = np.arange(0.0, float(rays[:, 2].max()), CELL_M)
         inside = (steps[None, :] >= rays[:, 1:2]) & (steps[None, :] <= rays[:, 2:3])
         directions = np.stack([np.cos(rays[:, 0] + yaw_rad), np.sin(rays[:, 0] + yaw_rad)], axis=1)
-        points: Array = (origin + directions[:, None, :] * steps[None, :, None])[inside]
+        points: FloatArray = (origin + directions[:, None, :] * steps[None, :, None])[inside]
         return points
 
-    def _add(self, points_m: Array, evidence: int) -> None:
+    def _add(self, points_m: FloatArray, evidence: int) -> None:
         """Add evidence, once a cell however many points fall into it."""
         index = self._index(points_m)
         index = index[((index >= 0) & (index < SIZE)).all(axis=1)]
@@ -103,8 +100,8 @@ class FloorMap:
 
     # --- what is asked ----------------------------------------------------------------------------
 
-    def _index(self, points_m: Array) -> NDArray[np.int64]:
-        index: NDArray[np.int64] = np.floor(np.asarray(points_m)[:, :2] / CELL_M).astype(np.int64) - self._corner
+    def _index(self, points_m: FloatArray) -> IntArray:
+        index: IntArray = np.floor(np.asarray(points_m)[:, :2] / CELL_M).astype(np.int64) - self._corner
         return index
 
     def centre(self, row: int, column: int) -> tuple[float, float]:
@@ -117,45 +114,45 @@ class FloorMap:
         row, column = self._index(np.array([[x_m, y_m]]))[0]
         return (int(row), int(column)) if 0 <= row < SIZE and 0 <= column < SIZE else None
 
-    def occupied(self, ignore: Sequence[tuple[float, float, float]] = ()) -> Cells:
+    def occupied(self, ignore: Sequence[tuple[float, float, float]] = ()) -> BoolArray:
         """Where something stands; (SIZE, SIZE), rows along x. `ignore`: discs (x, y, radius) that do not count."""
-        cells: Cells = self._evidence >= _OCCUPIED
+        cells: BoolArray = self._evidence >= _OCCUPIED
         for x, y, radius in ignore:
             cells &= ~self._disc(x, y, radius)
         return cells
 
-    def looked_at(self) -> Cells:
+    def looked_at(self) -> BoolArray:
         """Where the floor, or what stands on it, was seen."""
         return self._looked
 
-    def add_discs(self, cells: Cells, discs: Sequence[tuple[float, float, float]]) -> Cells:
+    def add_discs(self, cells: BoolArray, discs: Sequence[tuple[float, float, float]]) -> BoolArray:
         """The same with discs (x, y, radius) that count as occupied."""
         for x, y, radius in discs:
             cells = cells | self._disc(x, y, radius)
         return cells
 
-    def _disc(self, x_m: float, y_m: float, radius_m: float) -> Cells:
+    def _disc(self, x_m: float, y_m: float, radius_m: float) -> BoolArray:
         rows = (np.arange(SIZE) + self._corner[0] + 0.5) * CELL_M - x_m
         columns = (np.arange(SIZE) + self._corner[1] + 0.5) * CELL_M - y_m
-        disc: Cells = rows[:, None] ** 2 + columns[None, :] ** 2 <= radius_m**2
+        disc: BoolArray = rows[:, None] ** 2 + columns[None, :] ** 2 <= radius_m**2
         return disc
 
 
 class ClearanceField:
     """Distance from any place to the nearest occupied cell."""
 
-    def __init__(self, floor: FloorMap, occupied: Cells) -> None:
+    def __init__(self, floor: FloorMap, occupied: BoolArray) -> None:
         self._floor = floor
         free = (~occupied).astype(np.uint8)
         distance = cv2.distanceTransform(free, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) if occupied.any() else None
-        self.metres: Array = (
+        self.metres: FloatArray = (
             np.full((SIZE, SIZE), 9.0)
             if distance is None
             # From cell middle to cell middle: the occupied cell's own half is taken off.
             else np.maximum(np.asarray(distance, dtype=np.float64) * CELL_M - CELL_M / 2, 0.0)
         )
 
-    def at(self, places_m: Array) -> Array:
+    def at(self, places_m: FloatArray) -> FloatArray:
         """Clearance at places (n, 2) of the odometry frame, metres, shape (n,); far where the map ends."""
         index = self._floor._index(places_m)
         inside = ((index >= 0) & (index < SIZE)).all(axis=1)
@@ -164,14 +161,14 @@ class ClearanceField:
         return clearance
 
 
-def _inside(points: Array, centres: Array, radii: Array) -> Cells:
+def _inside(points: FloatArray, centres: FloatArray, radii: FloatArray) -> BoolArray:
     """Which points (n, 3) lie within any of the balls, seen from above: nothing stands where the robot itself is."""
     gaps = np.linalg.norm(points[:, None, :2] - centres[None, :, :2], axis=2) - radii[None, :]
-    inside: Cells = (gaps < 0.0).any(axis=1)
+    inside: BoolArray = (gaps < 0.0).any(axis=1)
     return inside
 
 
-def _overlap(shift: NDArray[np.int64]) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
+def _overlap(shift: IntArray) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
     """Where to and where from to copy an array that moves by `shift` cells."""
     to, source = [], []
     for step in shift:

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
+from cocoro.arrays import FloatArray
 from cocoro.clock import NS
 from cocoro.errors import ConfigError
-from cocoro.kinematics import Array
 from cocoro.learning import model as models
 from cocoro.learning.camera_tilt import CameraTilt
 from cocoro.learning.handmap import HandMap
@@ -39,15 +39,15 @@ class LearnedHand:
         self._drawn = robot.chain("pad_centre")
         self._map = learned
 
-    def pose(self, angles: Mapping[str, float]) -> Array:
+    def pose(self, angles: Mapping[str, float]) -> FloatArray:
         pose = self._drawn.pose(angles)
         pose[:3, 3] += self._offset(angles)
         return pose
 
-    def position(self, angles: Mapping[str, float]) -> Array:
+    def position(self, angles: Mapping[str, float]) -> FloatArray:
         return np.asarray(self._drawn.position(angles) + self._offset(angles))
 
-    def jacobian(self, angles: Mapping[str, float], joints: Iterable[str]) -> Array:
+    def jacobian(self, angles: Mapping[str, float], joints: Iterable[str]) -> FloatArray:
         """As `Chain.jacobian`, for the joints of ARM in their order."""
         jac = self._drawn.jacobian(angles, joints)
         at = _arm(angles)
@@ -57,7 +57,7 @@ class LearnedHand:
             jac[:3] += self._map.jacobian(at) - self._map.drawing.jacobian(at)
         return jac
 
-    def _offset(self, angles: Mapping[str, float]) -> Array:
+    def _offset(self, angles: Mapping[str, float]) -> FloatArray:
         at = _arm(angles)
         if self._map.over_drawing and self._map.coordinates == "cartesian":
             return self._map.network.at(at)
@@ -81,19 +81,19 @@ class SeenHand:
         self._seen_ns: int | None = None
 
     @property
-    def correction_m(self) -> Array:
+    def correction_m(self) -> FloatArray:
         """Added to where the hand is felt, shape (3,)."""
         return self._correction
 
-    def pose(self, angles: Mapping[str, float]) -> Array:
+    def pose(self, angles: Mapping[str, float]) -> FloatArray:
         pose = self._felt.pose(angles)
         pose[:3, 3] += self._correction
         return pose
 
-    def position(self, angles: Mapping[str, float]) -> Array:
+    def position(self, angles: Mapping[str, float]) -> FloatArray:
         return np.asarray(self._felt.position(angles) + self._correction)
 
-    def jacobian(self, angles: Mapping[str, float], joints: Iterable[str]) -> Array:
+    def jacobian(self, angles: Mapping[str, float], joints: Iterable[str]) -> FloatArray:
         return self._felt.jacobian(angles, joints)
 
     def seen(self, now_ns: int) -> bool:
@@ -150,7 +150,7 @@ class Learned:
         if self.hand is not None:
             self.hand.step(sightings, now_ns)
 
-    def offset_m(self, angles: Mapping[str, float]) -> Array | None:
+    def offset_m(self, angles: Mapping[str, float]) -> FloatArray | None:
         """By how much the hand is seen beside where the drawing has it, shape (3,); None where nothing was learned."""
         if self.map is None:
             return None

@@ -11,9 +11,9 @@ from math import exp, hypot
 
 import numpy as np
 
+from cocoro.arrays import FloatArray
 from cocoro.clock import NS
 from cocoro.frames import Pose2
-from cocoro.kinematics import Array
 from cocoro.messages import TargetEstimate
 from services.planning.config import Memory
 
@@ -27,15 +27,15 @@ _AGREE = 3
 class Track:
     """One object's filter. Positions in the odometry frame, metres; `covariance` of (position, velocity)."""
 
-    position_m: Array
+    position_m: FloatArray
     stamp_ns: int
     sigma_m: float
-    velocity_mps: Array = field(default_factory=lambda: np.zeros(3))
-    covariance: Array = field(default_factory=lambda: np.diag([1e-4, 1e-2]))
+    velocity_mps: FloatArray = field(default_factory=lambda: np.zeros(3))
+    covariance: FloatArray = field(default_factory=lambda: np.diag([1e-4, 1e-2]))
     sightings: int = 1
     surprise: float = 1.0
     """Smoothed normalised innovation: above 1 the object moves more than was expected of it."""
-    outliers: list[Array] = field(default_factory=list)
+    outliers: list[FloatArray] = field(default_factory=list)
 
 
 class TargetMemory:
@@ -49,7 +49,7 @@ class TargetMemory:
     def forget(self, label: str) -> None:
         self._tracks.pop(label, None)
 
-    def see(self, label: str, position_m: Array, distance_m: float, stamp_ns: int, *, doubtful: bool) -> None:
+    def see(self, label: str, position_m: FloatArray, distance_m: float, stamp_ns: int, *, doubtful: bool) -> None:
         """One sighting: the object's centre in the odometry frame at the frame's stamp."""
         config = self._config
         sigma_m = config.sigma_m + config.sigma_per_m * distance_m
@@ -73,7 +73,7 @@ class TargetMemory:
         track.stamp_ns = stamp_ns
         track.sightings += 1
 
-    def _update(self, track: Track, predicted: Array, seen: Array, dt_s: float, sigma_m: float) -> None:
+    def _update(self, track: Track, predicted: FloatArray, seen: FloatArray, dt_s: float, sigma_m: float) -> None:
         fade = exp(-dt_s / self._config.velocity_fade_s) if dt_s > 0.2 else 1.0
         q = self._config.acceleration_mps2**2 * max(track.surprise, 1.0) ** 2
         step = np.array([[1.0, dt_s], [0.0, fade]])
@@ -90,7 +90,7 @@ class TargetMemory:
         track.sigma_m = float(np.sqrt(track.covariance[0, 0]))
 
     def _outlier(
-        self, label: str, track: Track, position_m: Array, stamp_ns: int, sigma_m: float, doubtful: bool
+        self, label: str, track: Track, position_m: FloatArray, stamp_ns: int, sigma_m: float, doubtful: bool
     ) -> None:
         """A sighting far from where the object should be: something else, or it was moved."""
         if doubtful:
@@ -134,6 +134,6 @@ class TargetMemory:
         return tuple(estimate for estimate in found if estimate is not None)
 
 
-def _moved(track: Track, dt_s: float, fade_s: float) -> Array:
+def _moved(track: Track, dt_s: float, fade_s: float) -> FloatArray:
     """The place after `dt_s`, the velocity fading: the integral of v exp(-t / fade)."""
     return track.position_m + track.velocity_mps * fade_s * (1.0 - exp(-dt_s / fade_s))

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from cocoro.kinematics import Array
+from cocoro.arrays import FloatArray
 from cocoro.robot import Robot
 from services.planning.clearance import TUBES, Clearance
 from services.planning.reach import ARM, LEVEL_ROLL_RAD
@@ -42,7 +42,7 @@ class Postures:
         x, y, z = (chain.pose(angles) @ marker)[:3].tolist()
         return x, y, z
 
-    def safe(self, posture: Array) -> bool:
+    def safe(self, posture: FloatArray) -> bool:
         """Nothing is nearer than the margin: mount, chassis, floor, Kinect, and the hand to the arm it hangs on."""
         angles = self._angles(posture)
         if self._clearance.of(angles) < MARGIN_M:
@@ -58,7 +58,7 @@ class Postures:
         away = np.linalg.norm(hand - share[:, None] * along, axis=1) - radii[_HAND_FROM:]
         return float(away.min()) > _UPPER_ARM_M + MARGIN_M / 2
 
-    def seeable(self, posture: Array) -> bool:
+    def seeable(self, posture: FloatArray) -> bool:
         """The drawing has the marker where the camera might see it: not too near, and not behind the hand."""
         chain, marker = self._marker
         pose = chain.pose(self._angles(posture))
@@ -67,11 +67,11 @@ class Postures:
         # The link's y points from the roll axis to the marker.
         return distance_m > self._nearest_m and float(pose[:3, 1] @ to_camera) > -0.1 * distance_m
 
-    def clear_way(self, start: Array, end: Array) -> bool:
+    def clear_way(self, start: FloatArray, end: FloatArray) -> bool:
         """Every posture on the straight way in joint space is safe; the start itself need not be."""
         count = int(np.ceil(float(np.abs(end - start).max()) / WAY_RAD))
         return all(self.safe(start + (end - start) * step / count) for step in range(1, count + 1))
 
     @staticmethod
-    def _angles(posture: Array) -> dict[str, float]:
+    def _angles(posture: FloatArray) -> dict[str, float]:
         return dict(zip(ARM, posture.tolist(), strict=True), wrist_roll=LEVEL_ROLL_RAD)

@@ -9,8 +9,8 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from cocoro.arrays import FloatArray
 from cocoro.frames import wrap_rad
-from cocoro.kinematics import Array
 from cocoro.robot import Robot
 
 ARM = ("arm_base", "shoulder", "elbow", "wrist_pitch")
@@ -45,13 +45,13 @@ class HandPose(NamedTuple):
 class HandModel(Protocol):
     """Where the pads' centre is: the drawing's chain, or what was learned of it."""
 
-    def pose(self, angles: Mapping[str, float]) -> Array:
+    def pose(self, angles: Mapping[str, float]) -> FloatArray:
         """4 x 4, hand to body frame."""
 
-    def position(self, angles: Mapping[str, float]) -> Array:
+    def position(self, angles: Mapping[str, float]) -> FloatArray:
         """Body frame, shape (3,)."""
 
-    def jacobian(self, angles: Mapping[str, float], joints: Iterable[str]) -> Array:
+    def jacobian(self, angles: Mapping[str, float], joints: Iterable[str]) -> FloatArray:
         """Shape (6, n), as `Chain.jacobian`."""
 
 
@@ -69,7 +69,7 @@ class Reacher:
         """Reach with this from now on; None is the rigid body."""
         self._pad = hand if hand is not None else self._rigid
 
-    def position(self, angles: Mapping[str, float]) -> Array:
+    def position(self, angles: Mapping[str, float]) -> FloatArray:
         """The pads' centre, body frame, shape (3,)."""
         return self._pad.position(angles)
 
@@ -78,7 +78,7 @@ class Reacher:
         x, y, z = transform[:3, 3] - self._axis * [1, 1, 0]
         return HandPose(hypot(x, y), atan2(y, x), float(z), asin(min(max(float(transform[2, 2]), -1.0), 1.0)))
 
-    def point(self, pose: HandPose) -> Array:
+    def point(self, pose: HandPose) -> FloatArray:
         """A hand pose's place in the body frame, shape (3,)."""
         return np.array(
             [
@@ -93,7 +93,7 @@ class Reacher:
         x, y = point_m[0] - self._axis[0], point_m[1] - self._axis[1]
         return hypot(x, y), atan2(y, x), point_m[2]
 
-    def step(self, angles: Mapping[str, float], pose: HandPose) -> Array:
+    def step(self, angles: Mapping[str, float], pose: HandPose) -> FloatArray:
         """Joint angles (in the order of ARM, shape (4,)) one step nearer to a hand pose.
 
         A joint that a step would carry over its limit is put on the limit and the others are solved again.

@@ -9,7 +9,7 @@ import numpy as np
 
 from cocoro.learning.handmap import HandMap
 from cocoro.learning.reachability import Reach, ReachMesh
-from cocoro.messages import Vec3
+from cocoro.units import Vec3
 from services.planning.config import Arm
 from services.planning.reach import ARM, LEVEL_ROLL_RAD, HandPose, Reacher
 

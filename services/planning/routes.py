@@ -8,7 +8,7 @@ import numpy as np
 import scipy  # which loads its parts when they are needed: a robot that never meets a detour does without
 from numpy.typing import NDArray
 
-from cocoro.kinematics import Array
+from cocoro.arrays import FloatArray
 from services.planning.floor_map import CELL_M, SIZE, ClearanceField, FloorMap
 
 _STEPS = ((1, 0), (0, 1), (1, 1), (1, -1))
@@ -28,7 +28,7 @@ class Routes:
         )
         start = floor.cell(*start_m)
         self._predecessors: NDArray[np.int32] | None = None
-        self._distance: Array = np.full(SIZE * SIZE, np.inf)
+        self._distance: FloatArray = np.full(SIZE * SIZE, np.inf)
         if start is None:
             return
         row, column = start
@@ -61,7 +61,7 @@ class Routes:
         return path
 
 
-def _graph(cost: Array) -> Any:
+def _graph(cost: FloatArray) -> Any:
     """Neighbouring cells joined by the mean of their costs times the step's length."""
     numbers = np.arange(SIZE * SIZE).reshape(SIZE, SIZE)
     rows, columns, weights = [], [], []

@@ -11,14 +11,15 @@ import msgspec
 import numpy as np
 
 from cocoro import topics
+from cocoro.arrays import FloatArray
 from cocoro.clock import NS, is_fresh
 from cocoro.frames import Pose2
 from cocoro.history import History
-from cocoro.kinematics import Array
 from cocoro.learning.camera_tilt import CameraTilt
-from cocoro.messages import BaseState, Detection, Detections, Intent, Message, Obstacles, ServoState, Vec3
+from cocoro.messages import BaseState, Detection, Detections, Intent, Message, Obstacles, ServoState
 from cocoro.robot import Robot
 from cocoro.topics import Topic
+from cocoro.units import Vec3
 from services.planning.config import Config
 from services.planning.memory import TargetMemory
 from services.planning.surroundings import Surroundings
@@ -166,7 +167,7 @@ class StateEstimator:
             elif now_ns - detections.stamp_ns < _WAIT_FOR_ODOMETRY_NS:
                 self._waiting.append(detections)
 
-    def look_around(self, now_ns: int, own: Callable[[Mapping[str, float]], tuple[Array, Array]]) -> None:
+    def look_around(self, now_ns: int, own: Callable[[Mapping[str, float]], tuple[FloatArray, FloatArray]]) -> None:
         """Enter what was seen of the floor where its odometry is known; `own` gives the robot's hull in a posture."""
         while self._floors:
             seen = self._floors[0]

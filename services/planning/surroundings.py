@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from cocoro.arrays import FloatArray
 from cocoro.clock import NS
 from cocoro.frames import Pose2
-from cocoro.kinematics import Array
 from cocoro.messages import TargetEstimate
 from services.planning.floor_map import ClearanceField, FloorMap
 from services.planning.routes import Routes
@@ -65,7 +65,7 @@ class Surroundings:
             self._built, self._built_ns = what, now_ns
         return self._fields
 
-    def unseen(self, places_m: Array) -> Array:
+    def unseen(self, places_m: FloatArray) -> FloatArray:
         """Which of the places (n, 2) of the odometry frame nobody has looked at."""
         looked = self.floor.looked_at()
         hidden = []
@@ -78,14 +78,14 @@ class Surroundings:
         return Routes(self.floor, field, (body.x_m, body.y_m), radius_m, comfort_m)
 
 
-def placed(points_m: Array, pose: Pose2) -> Array:
+def placed(points_m: FloatArray, pose: Pose2) -> FloatArray:
     """Points (n, 2) of a pose's frame in its parent; shape (n, 2)."""
     c, s = np.cos(pose.yaw_rad), np.sin(pose.yaw_rad)
-    moved: Array = points_m @ np.array([[c, s], [-s, c]]) + np.array([pose.x_m, pose.y_m])
+    moved: FloatArray = points_m @ np.array([[c, s], [-s, c]]) + np.array([pose.x_m, pose.y_m])
     return moved
 
 
-def swept_by(hulls: Sequence[tuple[Array, Array]]) -> Array:
+def swept_by(hulls: Sequence[tuple[FloatArray, FloatArray]]) -> FloatArray:
     """The floor places, 3 cm apart, under a motion of the arm: shape (n, 2), body frame."""
     points = np.concatenate([centres[:, :2] for centres, _ in hulls])
     cells: Mapping[tuple[int, int], None] = dict.fromkeys(

@@ -6,8 +6,8 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
+from cocoro.arrays import FloatArray
 from cocoro.clock import NS
-from cocoro.kinematics import Array
 from cocoro.learning.handmap import HandMap
 from cocoro.learning.reachability import ReachMesh
 from services.planning.adapt import WILD_M, Adapter
@@ -27,7 +27,7 @@ class Teacher:
     def __init__(self, learned: HandMap, usual_m: float, mesh: ReachMesh) -> None:
         self._adapter = Adapter(learned, usual_m)
         self._mesh = mesh
-        self._places: list[Array] = []
+        self._places: list[FloatArray] = []
         self._last_ns: int | None = None
 
     @property
@@ -47,7 +47,7 @@ class Teacher:
                 self._last_ns = sighting.stamp_ns
                 self._take(arm_angles(sighting.angles_rad), np.array(sighting.position_m))
 
-    def _take(self, angles_rad: Array, place_m: Array) -> None:
+    def _take(self, angles_rad: FloatArray, place_m: FloatArray) -> None:
         if self._adapter.add(angles_rad, place_m) > WILD_M:
             return
         self._places.append(place_m)
@@ -59,6 +59,6 @@ class Teacher:
             self._places = []
 
 
-def arm_angles(angles_rad: Mapping[str, float]) -> Array:
+def arm_angles(angles_rad: Mapping[str, float]) -> FloatArray:
     """In the order of ARM, shape (4,)."""
     return np.array([angles_rad[name] for name in ARM])

@@ -20,6 +20,7 @@ from cocoro.node import Node
 from cocoro.ports import port_path
 from cocoro.robot import SERVO_COUNT_RAD
 from cocoro.topics import Topic
+from cocoro.units import PositiveShare
 from services.servos import table
 from services.servos.line import CycleResult, ServoLine, ServoSettings
 from services.servos.network import ServoNetwork
@@ -32,8 +33,6 @@ NETWORKS: dict[str, tuple[Topic[ServoState], Topic[ServoCommand]]] = {
 }
 DONE_S = 2.0
 
-Share = Annotated[float, Meta(gt=0, le=1)]
-
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     arm_port: str = "/dev/cocoro-arm"
@@ -41,7 +40,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     hand_port: str = "/dev/cocoro-hand"
     reply_s: Annotated[float, Meta(gt=0, le=0.5)] = 0.03
     """How long a servo's answer may take."""
-    torque: dict[str, Share] = {}
+    torque: dict[str, PositiveShare] = {}
     """By joint, the share of its stall torque that it may push with; all of it where nothing is said."""
 
 

@@ -17,7 +17,7 @@ import moderngl
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cocoro.kinematics import Array
+from cocoro.arrays import FloatArray
 from cocoro.robot import Camera
 from sim.render.interface import Images, Lighting, Visual
 from sim.render.meshes import batches_of, floor_batch, wall_batch
@@ -83,11 +83,11 @@ class GlRenderer:
 
     def render(
         self,
-        poses: Array,
-        camera_pose: Array,
-        depth_camera_pose: Array,
+        poses: FloatArray,
+        camera_pose: FloatArray,
+        depth_camera_pose: FloatArray,
         light: Lighting,
-        projector_pose: Array | None = None,
+        projector_pose: FloatArray | None = None,
     ) -> Images:
         self._ctx.enable_only(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
         placed = poses.astype(np.float32)
@@ -107,7 +107,7 @@ class GlRenderer:
 
     # --- passes -----------------------------------------------------------------------------------
 
-    def _draw_colour(self, pose: Array, light: Lighting) -> None:
+    def _draw_colour(self, pose: FloatArray, light: Lighting) -> None:
         direction = np.asarray(light.direction) / np.linalg.norm(light.direction)
         lamp = lamp_view(direction, _floor_ahead(pose), LAMP_HALF_WIDTH_M, LAMP_TEXELS)
         # The sides away from the lamp go into its map: a lit surface is then never behind itself.
@@ -126,7 +126,7 @@ class GlRenderer:
             batch.draw(self._lambert)
         self._floor.draw(self._tiles)
 
-    def _draw_depth(self, pose: Array, projector_pose: Array | None) -> None:
+    def _draw_depth(self, pose: FloatArray, projector_pose: FloatArray | None) -> None:
         if projector_pose is not None:
             self._draw_projector_map(projector_pose, float(np.linalg.norm(projector_pose[:3, 3] - pose[:3, 3])))
         view = rigid_inverse(pose)
@@ -136,7 +136,7 @@ class GlRenderer:
         for batch in (*self._objects, self._floor, self._walls):
             batch.draw(self._metres)
 
-    def _draw_projector_map(self, pose: Array, baseline_m: float) -> None:
+    def _draw_projector_map(self, pose: FloatArray, baseline_m: float) -> None:
         """What the projector's light reaches. It stands beside the depth camera and looks the same way, so a row
         of its map is a row of the depth picture."""
         wide = projector_camera(self.camera, baseline_m)
@@ -149,7 +149,7 @@ class GlRenderer:
         _set(self._metres, projector=nearer)
         self._projector_map.depth.use(0)
 
-    def _draw_shadow_map(self, shadow_map: _ShadowMap, view: Array, front_face: str = "cw") -> None:
+    def _draw_shadow_map(self, shadow_map: _ShadowMap, view: FloatArray, front_face: str = "cw") -> None:
         target = shadow_map.target
         _set(self._shade, view=view)
         target.use()
@@ -204,7 +204,7 @@ def _set(program: moderngl.Program, **values: ArrayLike) -> None:
         uniform.write(np.asarray(value, np.float32).tobytes())
 
 
-def _floor_ahead(pose: Array) -> Array:
+def _floor_ahead(pose: FloatArray) -> FloatArray:
     """Where the shadows matter: on the floor a little before the camera, (3,)."""
     ahead = pose[:2, 2] / max(float(np.linalg.norm(pose[:2, 2])), 1e-6)
     return np.array([*(pose[:2, 3] + LAMP_AHEAD_M * ahead), 0.0])

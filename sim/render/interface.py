@@ -7,11 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
+from cocoro.arrays import Float32Array, FloatArray, ImageArray
 from cocoro.errors import ConfigError
-from cocoro.kinematics import Array
 from cocoro.robot import Camera
 
 
@@ -38,9 +35,9 @@ class Lighting(Protocol):
 class Images(NamedTuple):
     """One look at the world. The arrays are the renderer's own: they hold until its next `render`."""
 
-    colour: NDArray[np.uint8]
+    colour: ImageArray
     """height x width x 3, RGB, the colour camera's view."""
-    depth_m: NDArray[np.float32]
+    depth_m: Float32Array
     """height x width, metres along the depth camera's optical axis, from that camera's own pose; infinite where
     there is nothing. NEGATIVE (the same metres) where the projector's light does not reach, if a projector
     was given."""
@@ -61,11 +58,11 @@ class Renderer(Protocol):
 
     def render(
         self,
-        poses: Array,
-        camera_pose: Array,
-        depth_camera_pose: Array,
+        poses: FloatArray,
+        camera_pose: FloatArray,
+        depth_camera_pose: FloatArray,
         light: Lighting,
-        projector_pose: Array | None = None,
+        projector_pose: FloatArray | None = None,
     ) -> Images:
         """One frame. `poses` is (n, 4, 4) in the order of the visuals."""
 

@@ -11,12 +11,13 @@ from math import pi
 
 import moderngl
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from cocoro.arrays import Float32Array, FloatArray
 from sim.render.interface import Shape, Visual
 from sim.render.room import HALF_WIDTH_M, walls
 
-TriangleMesh = NDArray[np.float32]
+TriangleMesh = Float32Array
 
 CYLINDER_SLICES = 32
 """At a can's 33 mm radius the flat sides are at most 0.16 mm inside of the round."""
@@ -79,7 +80,7 @@ def cylinder() -> TriangleMesh:
 def sphere() -> TriangleMesh:
     """Radius 1."""
 
-    def corner(stack: int, slice_: int) -> NDArray[np.float64]:
+    def corner(stack: int, slice_: int) -> FloatArray:
         down, round_ = stack * pi / SPHERE_STACKS, slice_ * 2 * pi / SPHERE_SLICES
         return np.array([np.sin(down) * np.cos(round_), np.sin(down) * np.sin(round_), np.cos(down)])
 
@@ -96,20 +97,17 @@ def sphere() -> TriangleMesh:
     return _stack(parts)
 
 
-def _triangle(corners: list[NDArray[np.float64]], normals: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+def _triangle(corners: list[FloatArray], normals: list[FloatArray]) -> FloatArray:
     return np.hstack([np.array(corners), np.array(normals)])
 
 
-def _quad(corners: list[NDArray[np.float64]], normals: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+def _quad(corners: list[FloatArray], normals: list[FloatArray]) -> FloatArray:
     rows = _triangle(corners, normals)
     return rows[[0, 1, 2, 0, 2, 3]]
 
 
-def _stack(parts: list[NDArray[np.float64]]) -> TriangleMesh:
+def _stack(parts: list[FloatArray]) -> TriangleMesh:
     return np.vstack(parts).astype(np.float32)
-
-
-Floats = NDArray[np.float32]
 
 
 class InstancedMesh:
@@ -134,7 +132,7 @@ class InstancedMesh:
         self._poses = ctx.buffer(reserve=64 * len(self._rows))
         self._arrays: dict[moderngl.Program, moderngl.VertexArray] = {}
 
-    def place(self, poses: Floats) -> None:
+    def place(self, poses: Float32Array) -> None:
         """Where everything stands in this frame: (m, 4, 4), of which this batch takes its rows."""
         self._poses.write(poses[self._rows].tobytes())
 

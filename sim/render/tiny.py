@@ -11,10 +11,9 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from cocoro.kinematics import Array
+from cocoro.arrays import BoolArray, Float32Array, FloatArray, ImageArray
 from cocoro.robot import Camera
 from sim.bullet import Bullet
 from sim.render.interface import Images, Lighting, Visual
@@ -62,11 +61,11 @@ class TinyRenderer:
 
     def render(
         self,
-        poses: Array,
-        camera_pose: Array,
-        depth_camera_pose: Array,
+        poses: FloatArray,
+        camera_pose: FloatArray,
+        depth_camera_pose: FloatArray,
         light: Lighting,
-        projector_pose: Array | None = None,
+        projector_pose: FloatArray | None = None,
     ) -> Images:
         quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
         for body, pose, quaternion in zip(self._bodies, poses, quaternions, strict=True):
@@ -80,7 +79,7 @@ class TinyRenderer:
             depth[_shaded(depth, self.camera, lit, wide, baseline_m)] *= -1
         return Images(colour, depth)
 
-    def _view(self, camera: Camera, pose: Array, light: Lighting) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+    def _view(self, camera: Camera, pose: FloatArray, light: Lighting) -> tuple[ImageArray, Float32Array]:
         view = _TO_OPENGL @ rigid_inverse(pose)
         camera = replace(camera, cx=camera.cx + _SAMPLE_OFFSET_PX[0], cy=camera.cy + _SAMPLE_OFFSET_PX[1])
         flip_rows = np.diag([1.0, -1.0, 1.0, 1.0])
@@ -112,8 +111,8 @@ class TinyRenderer:
 
 
 def _shaded(
-    depth_m: NDArray[np.float32], camera: Camera, lit_m: NDArray[np.float32], projector: Camera, baseline_m: float
-) -> NDArray[np.bool_]:
+    depth_m: Float32Array, camera: Camera, lit_m: Float32Array, projector: Camera, baseline_m: float
+) -> BoolArray:
     """Which pixels of the depth camera's picture the projector does not reach.
 
     `lit_m` is the depth picture from the projector, which stands `baseline_m` to the right and looks the same way:
@@ -123,5 +122,5 @@ def _shaded(
     u = np.rint(columns - camera.fx * baseline_m / depth_m).astype(np.intp)
     inside = (u >= 0) & (u < projector.width)
     reached = np.take_along_axis(lit_m, np.clip(u, 0, projector.width - 1), axis=1)
-    shaded: NDArray[np.bool_] = inside & (1 / reached - 1 / depth_m > PROJECTOR_BIAS_PER_M)
+    shaded: BoolArray = inside & (1 / reached - 1 / depth_m > PROJECTOR_BIAS_PER_M)
     return shaded

@@ -7,7 +7,7 @@ from math import ceil
 
 import numpy as np
 
-from cocoro.kinematics import Array
+from cocoro.arrays import FloatArray
 from cocoro.robot import Camera
 
 NEAR_M = 0.03
@@ -18,7 +18,7 @@ PROJECTOR_BIAS_PER_M = 0.005
 a pixel of disparity. It keeps slanted surfaces from shading themselves."""
 
 
-def rigid_inverse(pose: Array) -> Array:
+def rigid_inverse(pose: FloatArray) -> FloatArray:
     """Inverse of a 4 x 4 rotation and translation."""
     inverse = np.eye(4)
     inverse[:3, :3] = pose[:3, :3].T
@@ -26,7 +26,7 @@ def rigid_inverse(pose: Array) -> Array:
     return inverse
 
 
-def projection(camera: Camera, near_m: float = NEAR_M, far_m: float = FAR_M) -> Array:
+def projection(camera: Camera, near_m: float = NEAR_M, far_m: float = FAR_M) -> FloatArray:
     """Camera frame (x right, y down, z forward) to clip space, so that row 0 of the picture comes out at
     y = -1: OpenGL hands its rows out from y = -1 upwards, so the picture needs no flip.
 
@@ -51,7 +51,7 @@ def projector_camera(camera: Camera, baseline_m: float) -> Camera:
     return replace(camera, width=camera.width + 2 * margin, cx=camera.cx + margin)
 
 
-def lamp_view(direction: Array, centre_m: Array, half_width_m: float, texels: int) -> Array:
+def lamp_view(direction: FloatArray, centre_m: FloatArray, half_width_m: float, texels: int) -> FloatArray:
     """World to the lamp's clip space: what a parallel light along `direction` (3,) sees of the cube of that
     half width around `centre_m` (3,).
 
@@ -70,7 +70,7 @@ def lamp_view(direction: Array, centre_m: Array, half_width_m: float, texels: in
     return view
 
 
-def lamp_tint(temperature_k: float) -> Array:
+def lamp_tint(temperature_k: float) -> FloatArray:
     """RGB factors of a lamp of this colour temperature, for pixel values as they are displayed; (3,).
 
     Planckian locus (cubic fit of Kim et al., US patent 7024034, 1667 to 25000 K) to linear sRGB (IEC
@@ -78,11 +78,11 @@ def lamp_tint(temperature_k: float) -> Array:
     that it multiplies are display values. Temperatures outside of the fit count as its ends.
     """
     rgb = _planck_rgb(temperature_k) / _planck_rgb(6500.0)
-    tint: Array = (rgb / rgb.max()) ** (1 / 2.2)
+    tint: FloatArray = (rgb / rgb.max()) ** (1 / 2.2)
     return tint
 
 
-def _planck_rgb(temperature_k: float) -> Array:
+def _planck_rgb(temperature_k: float) -> FloatArray:
     k = 1000.0 / min(max(temperature_k, 1667.0), 25000.0)
     if k > 1 / 4:
         x = ((-0.2661239 * k - 0.2343589) * k + 0.8776956) * k + 0.179910
@@ -96,5 +96,5 @@ def _planck_rgb(temperature_k: float) -> Array:
         y = ((3.0817580 * x - 5.87338670) * x + 3.75112997) * x - 0.37001483
     xyz = np.array([x / y, 1.0, (1 - x - y) / y])
     to_srgb = np.array([[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], [0.0557, -0.2040, 1.0570]])
-    rgb: Array = np.maximum(to_srgb @ xyz, 1e-3)
+    rgb: FloatArray = np.maximum(to_srgb @ xyz, 1e-3)
     return rgb

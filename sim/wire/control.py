@@ -10,19 +10,18 @@ import threading
 import time
 from pathlib import Path
 from types import TracebackType
-from typing import Annotated, Any
+from typing import Any
 
 import msgspec
-from msgspec import Meta
 
 from cocoro.clock import NS
+from cocoro.units import Share
 from sim.wire.create import EmulatedCreate
 from sim.wire.dynamixel import EmulatedServo, EmulatedServoBus
 from sim.wire.emulator import Emulator, Line
 from sim.wire.line import Direction, FaultKind, LineFault
 
 SOCKET = "control"
-Share = Annotated[float, Meta(ge=0, le=1)]
 
 
 class Disturb(msgspec.Struct, tag_field="do", tag="disturb", forbid_unknown_fields=True):

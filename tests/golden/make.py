@@ -13,10 +13,10 @@ from apps.captures.reexecute import rerun, words
 from apps.captures.rewrite import rewrite
 from apps.rehearsal.rehearse import rehearse
 from apps.rehearsal.request import RehearsalRequest
-from cocoro.capture.compression import Packer
-from cocoro.capture.keys import Choice
 from cocoro.capture.reader import Capture
 from cocoro.clock import NS
+from services.capture.file import Packer
+from services.capture.keys import Choice
 
 GOLDEN = Path(__file__).with_name("fetch.mcap")
 LENGTH_S = 6.0

@@ -16,15 +16,13 @@ import msgspec
 import numpy as np
 
 from apps.captures.export import foxglove_types as fg
+from apps.captures.export.files import making
 from apps.captures.export.geometry import CAMERA, Posture, about_z, conjugate, points, quaternion, rotated
-from apps.captures.export.outfile import making
 from apps.captures.export.story import catalogue_of, robot_of
 from apps.captures.rewrite import info_in
-from cocoro.capture.compression import Packer
-from cocoro.capture.errors import DamageError
-from cocoro.capture.keys import JSON, KeyInfo
+from cocoro.capture.mcap import DamageError
 from cocoro.capture.reader import Capture, Record
-from cocoro.capture.types import NotReadableError
+from cocoro.capture.types import JSON, NotReadableError
 from cocoro.clock import NS
 from cocoro.messages import (
     BaseState,
@@ -36,11 +34,13 @@ from cocoro.messages import (
     TargetEstimate,
     TaskState,
     Truth,
-    Vec3,
 )
 from cocoro.objects import KnownObject
 from cocoro.picture import describe
-from services.capture.writer import Entry, Limits, Writer
+from cocoro.units import Vec3
+from services.capture.file import Packer
+from services.capture.keys import Entry, KeyInfo
+from services.capture.writer import Limits, Writer
 
 ODOMETRY, BODY = "odometry", "body"
 """Names of frames; the links' are their own."""

@@ -9,10 +9,10 @@ from typing import Any
 
 import msgspec
 
-from cocoro.capture.schema import ENCODING, TypeSchema
+from cocoro.capture.types import ENCODING, TypeSchema
 from cocoro.clock import NS
-from cocoro.messages import Quaternion as Turn
-from cocoro.messages import Vec3
+from cocoro.units import Quaternion as Turn
+from cocoro.units import Vec3
 
 INFO, ERROR = 2, 4
 """Of `Log.level`."""

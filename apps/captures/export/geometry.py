@@ -6,17 +6,18 @@ from collections.abc import Mapping
 from math import cos, sin
 
 import numpy as np
-from numpy.typing import NDArray
 
+from cocoro.arrays import Float32Array, FloatArray, ImageArray
 from cocoro.frames import Pose2
-from cocoro.kinematics import Array, Tree
-from cocoro.messages import BaseState, Frame, Quaternion, ServoState, Vec3
+from cocoro.kinematics import Tree
+from cocoro.messages import BaseState, Frame, ServoState
 from cocoro.robot import Robot
+from cocoro.units import Quaternion, Vec3
 
 CAMERA = "camera"
 
 
-def quaternion(turn: Array) -> Quaternion:
+def quaternion(turn: FloatArray) -> Quaternion:
     """x, y, z, w of a 3 x 3 rotation (Shepperd's method: the largest component is found first)."""
     xx, yy, zz = turn[0, 0], turn[1, 1], turn[2, 2]
     squares = np.array([1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz, 1 + xx + yy + zz])
@@ -66,13 +67,13 @@ class Posture:
     def bend(self, servos: ServoState) -> None:
         self.angles_rad.update(zip(servos.joints, servos.position_rad, strict=True))
 
-    def links(self) -> dict[str, Array]:
+    def links(self) -> dict[str, FloatArray]:
         """4 x 4, each link's frame to the body's; empty until every joint has been heard of."""
         if not self.robot.joints.keys() <= self.angles_rad.keys():
             return {}
         return {name: pose for name, pose in self._tree.poses(self.angles_rad).items() if name in self._parents}
 
-    def bones(self, links: Mapping[str, Array]) -> list[tuple[Vec3, Vec3]]:
+    def bones(self, links: Mapping[str, FloatArray]) -> list[tuple[Vec3, Vec3]]:
         """A line from each link's parent to it, in the body frame."""
         found = []
         for name, pose in links.items():
@@ -82,7 +83,7 @@ class Posture:
         return found
 
 
-def points(frame: Frame, robot: Robot, step: int) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+def points(frame: Frame, robot: Robot, step: int) -> tuple[Float32Array, ImageArray]:
     """The depth image as points in the colour camera's frame, shape (n, 3), and their colours, RGB, shape (n, 3);
     of every `step`th row and column."""
     camera = robot.camera.scaled(frame.width, frame.height)
@@ -100,5 +101,5 @@ def points(frame: Frame, robot: Robot, step: int) -> tuple[NDArray[np.float32], 
     return places[seen], colour[v[seen], u[seen]]
 
 
-def _vec3(place: Array) -> Vec3:
+def _vec3(place: FloatArray) -> Vec3:
     return float(place[0]), float(place[1]), float(place[2])

@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 
+from apps.captures.export.files import making
 from apps.captures.export.geometry import CAMERA, Posture, about_z, conjugate, points, quaternion, rotated
-from apps.captures.export.outfile import making
 from apps.captures.export.story import catalogue_of, robot_of
-from cocoro.capture.errors import CaptureError
+from cocoro.capture.conventions import CaptureError
 from cocoro.capture.reader import Capture
 from cocoro.capture.types import NotReadableError
 from cocoro.clock import NS

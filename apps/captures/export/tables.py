@@ -7,8 +7,9 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Protocol
 
-from apps.captures.export.truth import beliefs
-from cocoro.capture.errors import CaptureError, DamageError
+from apps.captures.export.story import beliefs
+from cocoro.capture.conventions import CaptureError
+from cocoro.capture.mcap import DamageError
 from cocoro.capture.reader import Capture
 from cocoro.clock import NS
 

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import closing
+import os
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
+from types import TracebackType
 
 import cv2
 
-from apps.captures.export.opencv_file import Complaints, spelt_for_opencv, why_not_more
-from apps.captures.export.outfile import making
+from apps.captures.export.files import making
 from apps.captures.export.story import Story, catalogue_of, read
-from cocoro.capture.errors import CaptureError
+from cocoro.arrays import ImageArray
+from cocoro.capture.conventions import CaptureError
 from cocoro.capture.reader import Capture
 from cocoro.clock import NS
 from cocoro.messages import Frame
-from cocoro.picture import Pixels, draw
+from cocoro.picture import draw
 from cocoro.topics import FRAME
 
 RATE_HZ = 30.0
@@ -56,14 +59,14 @@ class _Film:
         self._size = first.width, first.height
         self._start_s = start_s
         self._count = 0
-        self._picture: Pixels | None = None
+        self._picture: ImageArray | None = None
         with complaints:
             self._writer = cv2.VideoWriter(name, cv2.VideoWriter.fourcc(*CODEC), RATE_HZ, self._size)
         if not self._writer.isOpened():
             raise CaptureError(f"{out}: OpenCV cannot write a film there; choose another place")
         complaints.are_new()  # of opening it: it is open
 
-    def show(self, at_s: float, picture: Pixels) -> None:
+    def show(self, at_s: float, picture: ImageArray) -> None:
         self._hold_until(at_s)
         if (picture.shape[1], picture.shape[0]) != self._size:
             picture = cv2.resize(picture, self._size).astype(picture.dtype)
@@ -91,7 +94,7 @@ class _Film:
         while self._picture is not None and self._start_s + (self._count + 0.5) / RATE_HZ < at_s:
             self._write(self._picture)
 
-    def _write(self, picture: Pixels) -> None:
+    def _write(self, picture: ImageArray) -> None:
         with self._complaints:
             self._writer.write(cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
         self._count += 1
@@ -118,3 +121,74 @@ def _caption(story: Story, log_ns: int, at_s: float) -> str:
         if plan.why:
             words.append(plan.why)
     return "  ".join(words)
+
+
+AHEAD_BYTES = 64 * 1024
+"""More than FFmpeg gathers before it writes, so that a write that failed would not have fitted."""
+
+
+@contextmanager
+def spelt_for_opencv(path: Path) -> Iterator[str]:
+    """A path as OpenCV takes it, which is in UTF-8 whatever the locale is; another one makes it crash. Such a path is
+    given by a link of a plain name while this lasts. Raises CaptureError where there cannot be one."""
+    try:
+        name = os.fsencode(path).decode("utf-8")
+    except UnicodeDecodeError:
+        pass
+    else:
+        yield name
+        return
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            link = os.fsencode(folder).decode("utf-8") + "/film" + path.suffix
+            Path(link).symlink_to(path.absolute())
+            yield link
+    except UnicodeDecodeError as error:
+        raise CaptureError(f"{path}: a name in UTF-8 is needed for it, or for TMPDIR") from error
+
+
+class Complaints:
+    """What OpenCV prints on standard error, which is the only place where it says that a write failed. A context
+    manager: while it is entered, what is printed is kept from people, and counted."""
+
+    def __init__(self) -> None:
+        self._paper = os.memfd_create("complaints")
+        self._stderr: int | None = None
+        self._read_bytes = 0
+
+    def __enter__(self) -> Complaints:
+        try:
+            self._stderr = os.dup(2)
+        except OSError:  # there is none, and OpenCV says nothing
+            return self
+        os.dup2(self._paper, 2)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._stderr is not None:
+            os.dup2(self._stderr, 2)
+            os.close(self._stderr)
+            self._stderr = None
+
+    def are_new(self) -> bool:
+        """Whether anything has been printed since the last call."""
+        before, self._read_bytes = self._read_bytes, os.fstat(self._paper).st_size
+        return self._read_bytes > before
+
+    def close(self) -> None:
+        os.close(self._paper)
+
+
+def why_not_more(path: Path) -> str:
+    """Why a file can grow no further, in the system's words; empty when it can."""
+    try:
+        with tempfile.TemporaryFile(dir=path.parent, buffering=0) as probe:
+            probe.seek(path.stat().st_size)
+            left = AHEAD_BYTES
+            while left:
+                left -= probe.write(bytes(left))
+    except OSError as error:
+        return error.strerror or str(error)
+    return ""

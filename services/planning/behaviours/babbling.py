@@ -8,12 +8,13 @@ from math import hypot, sin
 
 import numpy as np
 
+from cocoro.arrays import FloatArray
 from cocoro.clock import NS
 from cocoro.core import Output
 from cocoro.frames import Pose2
-from cocoro.kinematics import Array
-from cocoro.messages import BaseCommand, HandSample, Vec2, Vec3, WheelTrial
+from cocoro.messages import BaseCommand, HandSample, WheelTrial
 from cocoro.topics import HAND_SAMPLES, WHEEL_TRIALS
+from cocoro.units import Vec2, Vec3
 from services.planning.behaviours.base import Plan, Snapshot
 from services.planning.draws import sobol
 from services.planning.postures import Postures
@@ -39,12 +40,12 @@ class BabbleArm:
         self._first = first
         self._count = count
         self._samples = 0
-        self._draws: Iterator[tuple[int, Array]] | None = None
+        self._draws: Iterator[tuple[int, FloatArray]] | None = None
         self._draw = first
         self._looked = 0
         self._postures: Postures | None = None
-        self._goal: Array | None = None
-        self._trail: list[Array] = []
+        self._goal: FloatArray | None = None
+        self._trail: list[FloatArray] = []
         """Postures from home to here, each with a clear way to the next."""
         self._returning = False
         self._last_ns: int | None = None
@@ -107,7 +108,7 @@ class BabbleArm:
             self._trail.pop()
             self._goal, self._looked = self._trail.pop(), 0
 
-    def _go_home(self, here: Array) -> None:
+    def _go_home(self, here: FloatArray) -> None:
         """Straight where there is a clear way, else back along the trail."""
         assert self._postures is not None
         home = self._trail[0]

@@ -9,9 +9,9 @@ from typing import Literal, Protocol
 
 import numpy as np
 
+from cocoro.arrays import FloatArray
 from cocoro.core import Output
 from cocoro.frames import Pose2
-from cocoro.kinematics import Array
 from cocoro.learning.camera_tilt import CameraTilt
 from cocoro.messages import BaseCommand, TargetEstimate
 from cocoro.robot import Robot
@@ -41,7 +41,7 @@ class Actuators:
     grip: Grip = field(init=False)
     gaze: Gaze = field(init=False)
     reachability: Reachability = field(init=False)
-    unfolding: Array = field(init=False)
+    unfolding: FloatArray = field(init=False)
     """The floor places (n, 2), body frame, over which the arm swings when it unfolds."""
     camera_tilt: CameraTilt = field(init=False)
     grasp_height_m: float = 0.065
@@ -58,7 +58,7 @@ class Actuators:
         self.unfolding = self._unfolding()
         self.camera_tilt = CameraTilt(robot)
 
-    def _unfolding(self) -> Array:
+    def _unfolding(self) -> FloatArray:
         arm = ArmController(self.robot, self.config.arm, self.reacher)
         angles = dict.fromkeys(self.robot.joints, 0.0) | self.robot.poses["park"]
         travel = self.config.arm

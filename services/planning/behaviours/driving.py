@@ -7,7 +7,8 @@ from math import atan2, cos, hypot, sin
 
 from cocoro.clock import NS
 from cocoro.frames import Pose2
-from cocoro.messages import BaseState, TargetEstimate, Vec2
+from cocoro.messages import BaseState, TargetEstimate
+from cocoro.units import Vec2
 from services.planning.arm import Step
 from services.planning.behaviours.base import Actuators, Plan, Snapshot, hand_place, planar_m
 from services.planning.course import Course, Move

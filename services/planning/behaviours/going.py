@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from math import hypot
 
-from cocoro.messages import Vec2
+from cocoro.units import Vec2
 from services.planning.behaviours.base import Plan, Snapshot
 from services.planning.behaviours.driving import BackOff
 from services.planning.course import Course

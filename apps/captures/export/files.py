@@ -1,19 +1,45 @@
-"""`--attachments`: the files that were attached to a capture, as files again."""
+"""A file that an export makes."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
-from apps.captures.export.outfile import refuse_existing
-from cocoro.capture.errors import CaptureError, DamageError
+from cocoro.capture.conventions import CaptureError
+from cocoro.capture.mcap import DamageError
 from cocoro.capture.reader import Capture
+
+
+def refuse_existing(out: Path) -> None:
+    """An export writes over nothing: it might be the capture. Raises CaptureError."""
+    if out.exists():
+        raise CaptureError(f"{out} is there already; remove it, or choose another name")
+
+
+@contextmanager
+def making(out: Path) -> Iterator[None]:
+    """While a file is made; one that failed does not stay. Raises CaptureError where none can be made."""
+    refuse_existing(out)
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        out.touch()
+    except OSError as error:
+        raise CaptureError(f"{out}: {error.strerror}") from error
+    try:
+        out.unlink()
+        yield
+    except BaseException:
+        out.unlink(missing_ok=True)
+        raise
+
 
 LONGEST_NAME = 200
 """Characters: file systems take 255 bytes."""
 
 
-def export(capture: Capture, folder: Path) -> int:
+def export_attachments(capture: Capture, folder: Path) -> int:
     """Write each attachment into the folder under its own name, made one that a file can have there; a name that is
     there twice has a number the second time. Returns how many were written; a damaged one is told in
     `capture.problems`. Raises CaptureError when one cannot be written, or is there already."""

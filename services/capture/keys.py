@@ -1,31 +1,24 @@
-"""What a capture says of each key, and which keys are meant by what an operator writes."""
+"""keys"""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
+import cv2
 import msgspec
+import numpy as np
 
 from cocoro.bus.base import Qos
 from cocoro.bus.keys import matches
-from cocoro.capture.schema import TypeSchema, schema_of
+from cocoro.capture.types import JSON, MADE_HERE, MSGPACK, OTHER, Alive, LossyFrame, TypeSchema, schema_of
 from cocoro.errors import ConfigError
-from cocoro.messages import Message
-from cocoro.topics import TOPICS, topic_named
+from cocoro.messages import Frame, Message
+from cocoro.topics import FRAME, TOPICS, topic_named
 
-MSGPACK, JSON, OTHER = "msgpack", "json", "application/octet-stream"
-MADE_HERE = "recorder"
-"""The channel metadata `publisher` of what was never published: the recorder's own notes."""
 FRAMES = "frames"
 """In place of a key expression: all that carries pictures."""
-
-
-class Alive(Message):
-    """A liveliness token came or went, as the recorder saw it: a service of the robot, by its key."""
-
-    alive: bool
 
 
 class KeyInfo(NamedTuple):
@@ -86,3 +79,58 @@ def _expressions(text: str, robot: str) -> list[str]:
     if not text or any(not chunk or ("*" in chunk and chunk not in ("*", "**")) for chunk in text.split("/")):
         raise ConfigError(f"{text!r} is no key expression; write it as base/** or calliope/*/health, or {FRAMES}")
     return [text, f"{robot}/{text}"]
+
+
+_decoder = msgspec.msgpack.Decoder(Frame)
+
+
+def lossy(quality: int) -> Callable[[Entry], Prepared]:
+    """Makes lossy frames of frames; everything else passes."""
+
+    def prepare(entry: Entry) -> Prepared:
+        if not entry.key.endswith(f"/{FRAME.name}"):
+            return Prepared(entry, None)
+        try:
+            frame = _decoder.decode(entry.payload)
+        except (msgspec.MsgspecError, ValueError):
+            return Prepared(entry, None)
+        payload = msgspec.msgpack.encode(compress(frame, quality))
+        return Prepared(entry._replace(payload=payload), schema_of(LossyFrame))
+
+    return prepare
+
+
+def compress(frame: Frame, quality: int) -> LossyFrame:
+    pixels = np.frombuffer(frame.colour, dtype=np.uint8).reshape(frame.height, frame.width, 3)
+    _, jpeg = cv2.imencode(".jpg", cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])
+    return LossyFrame(
+        stamp_ns=frame.stamp_ns,
+        seq=frame.seq,
+        incarnation=frame.incarnation,
+        width=frame.width,
+        height=frame.height,
+        colour_jpeg=jpeg.tobytes(),
+        depth=frame.depth,
+    )
+
+
+class Entry(NamedTuple):
+    """A message on its way into a capture."""
+
+    key: str
+    sequence: int
+    log_ns: int
+    publish_ns: int
+    payload: bytes
+    info: KeyInfo | None = None
+    """What to write of the key, where that is not to be seen from the payload."""
+    channel: int | None = None
+    """A number, where the key may have several channels; it is not the number in the file."""
+
+
+class Prepared(NamedTuple):
+    """What is written in place of an entry."""
+
+    entry: Entry
+    schema: TypeSchema | None
+    """In place of the key's own, where the payload is of another type now."""

@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
+import sys
 from collections import Counter
 from collections.abc import Mapping
+from contextlib import ExitStack
 from datetime import UTC, datetime
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
 from apps.captures.info import AttachmentReport, Report, report
-from apps.captures.rewrite import REPAIRED
+from apps.captures.rewrite import REPAIRED, rewrite
 from apps.cli import exits
 from apps.cli.table import table
+from cocoro.capture.conventions import CaptureError
 from cocoro.capture.reader import Capture
 from cocoro.clock import NS
+from cocoro.errors import ConfigError
+from services.capture.file import COMPRESSIONS, Compression, Packer
+from services.capture.keys import Choice
 from services.capture.log_clock import WALL_CLOCK, Step, words
 
 MB = 1e6
@@ -123,3 +130,87 @@ def _files(found: Report) -> list[str]:
         if name.startswith("service/")
         for file in entries.get("files", ())
     ]
+
+
+def repair(
+    file: Path,
+    out: Path | None,
+    compression: str,
+    level: int,
+    only: list[str],
+    without: list[str],
+    start_s: float | None,
+    end_s: float | None,
+) -> int:
+    """Raises CaptureError, and ConfigError for options that cannot be."""
+    packer = Packer(_compression(compression), level)
+    with Capture.open(file) as capture:
+        choice = Choice(capture.robot, only, without)
+        check_span(capture, start_s, end_s)
+        done = rewrite(
+            capture,
+            out or file.with_suffix(".repaired.mcap"),
+            packer,
+            keep=(lambda record: record.key in choice) if only or without else None,
+            start_ns=_at(capture, start_s),
+            end_ns=_at(capture, end_s),
+        )
+    attachments = f", {done.attachments} attachments" if done.attachments else ""
+    print(f"{done.path}: {done.messages} messages{attachments}, {done.size_bytes / 1e6:.1f} MB")
+    for problem in done.problems:
+        print(f"missing: {problem}")
+    for note in done.notes:
+        print(f"left out: {note}")
+    if capture.ending:
+        print(f"note: {file} was {capture.ending}")
+    return exits.DONE
+
+
+def _at(capture: Capture, seconds: float | None) -> int | None:
+    return None if seconds is None else capture.start_ns + round(seconds * NS)
+
+
+def _compression(text: str) -> Compression:
+    for known in COMPRESSIONS:
+        if text == known:
+            return known
+    raise ConfigError(f"--compression {text}: known are {', '.join(COMPRESSIONS)}")
+
+
+def check_span(capture: Capture, start_s: float | None, end_s: float | None) -> None:
+    """Both are seconds from the capture's start. Raises ConfigError with what is wrong with which of them."""
+    length_s = (capture.end_ns - capture.start_ns) / NS
+    for option, given_s in (("--from", start_s), ("--to", end_s)):
+        if given_s is not None and not (isfinite(given_s) and given_s >= 0):
+            raise ConfigError(f"{option} {given_s:g}: give seconds from the capture's start, 0 or more")
+    if start_s is not None and start_s > length_s:
+        raise ConfigError(
+            f"--from {start_s:g}: {capture.path} lasts {length_s:.3f} s, so there is nothing from there on"
+        )
+    if end_s is not None and end_s <= (start_s or 0.0):
+        before = "the capture's start" if not start_s else f"--from {start_s:g}"
+        raise ConfigError(
+            f"--to {end_s:g}: it is exclusive and must be later than {before}, or there is nothing between"
+        )
+
+
+def rerun(files: list[Path], service: str, against: str, tolerance: float, as_json: bool) -> int:
+    """Raises CaptureError when the captures do not have what that takes."""
+    from apps.captures import reexecute as rerunning
+
+    if against not in ("recorded", "nothing"):
+        raise ConfigError(f"--against {against}: known are recorded and nothing")
+    with ExitStack() as stack:
+        captures = [stack.enter_context(Capture.open(file)) for file in files]
+        if len({capture.robot for capture in captures}) > 1:
+            raise CaptureError("these captures are of several robots")
+        result = rerunning.rerun(captures, service, tolerance, compare=against == "recorded")
+    for capture in captures:
+        if capture.ending:
+            print(f"note: {capture.path} was {capture.ending}", file=sys.stderr)
+    if as_json:
+        print(msgspec.json.encode(result).decode())
+    else:
+        print("\n".join(rerunning.words(result)))
+    bad = result.differing or result.problems or (against == "recorded" and not result.equal)
+    return exits.FAILED if bad else exits.DONE
