@@ -3,10 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import socket
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -14,8 +10,9 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+from cocoro.child import ChildProcess
 from services.base import oi
-from services.base.guard_supervisor import _PACKAGES
+from services.base.guard_supervisor import PYSERIAL
 from sim.wire.create import EmulatedCreate
 from sim.wire.emulator import Emulator, SimplePlant
 
@@ -70,13 +67,10 @@ class FakeService:
     """Stands in for the service: the other end of a guard's socket."""
 
     def __init__(self, port: str, mode: str = "safe", robot: str = "") -> None:
-        self.channel, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        arguments = [port, "--mode", mode, *(["--robot", robot] if robot else [])]
+        child = ChildProcess("services.base.guard", *arguments, packages=(PYSERIAL,), site_packages=False)
+        self.guard, self.channel = child.process, child.channel
         self.channel.settimeout(30.0)
-        environment = os.environ | {"PYTHONPATH": os.pathsep.join(_PACKAGES)}
-        command = [sys.executable, "-S", "-P", "-m", "services.base.guard", port, "--fd", str(theirs.fileno())]
-        arguments = ["--mode", mode, *(["--robot", robot] if robot else [])]
-        with theirs:
-            self.guard = subprocess.Popen(command + arguments, env=environment, pass_fds=(theirs.fileno(),))
         self._asking = threading.Event()
         self._thread: threading.Thread | None = None
         self.asked_ns = 0

@@ -32,7 +32,7 @@ AGAIN_S = 1.0
 """A guard that dies sooner than this after its start is not replaced before this time is over."""
 END_S = 2.0
 _REPORT = msgspec.json.Decoder(GuardReport)
-_SERIAL = str(Path(serial.__file__).parents[1])
+PYSERIAL = str(Path(serial.__file__).parents[1])
 """Pyserial's folder: the only third-party package that the guard imports."""
 
 
@@ -110,7 +110,7 @@ class GuardSupervisor:
     def _start(self) -> None:
         # Without site packages it starts within milliseconds and stays small.
         self._guard = ChildProcess(
-            "services.base.guard", self._port, *self._arguments, packages=(_SERIAL,), site_packages=False
+            "services.base.guard", self._port, *self._arguments, packages=(PYSERIAL,), site_packages=False
         )
         self._started_s = time.monotonic()
         self._reported_s = 0.0
