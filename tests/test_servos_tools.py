@@ -195,7 +195,7 @@ def test_the_doctor_talks_to_the_create(tmp_path: Path) -> None:
     still = type("Still", (), {"advance": lambda self, now_ns: None, "fileno": lambda self: -1})()
     with Emulator(tmp_path, {"create": create}, still) as emulator:
         checks = {check.name: check for check in check_base(config, ROBOT, "robbie")}
-        assert checks["EmulatedCreate"].text == "answers, passive mode"
+        assert checks["Create"].text == "answers, passive mode"
         assert checks["battery"].text.startswith("85%, 15.8 V")
         create.around.charge_mah = 100
         create.around.drop_left = True
@@ -204,7 +204,7 @@ def test_the_doctor_talks_to_the_create(tmp_path: Path) -> None:
         assert checks["wheels"].state == "bad"
         emulator.call(lambda: setattr(create, "powered", False))
         checks = {check.name: check for check in check_base(config, ROBOT, "robbie")}
-        assert "switch it on" in checks["EmulatedCreate"].text
+        assert "switch it on" in checks["Create"].text
     assert "plug the adapter in" in check_base(config, ROBOT, "robbie")[0].text
 
 
