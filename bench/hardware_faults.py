@@ -28,7 +28,7 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from bench.hardware_driver import REACH_RAD, WHEELS
 from bench.hardware_rig import LINES, MS, NS, ROBOT, Hardware, Services
@@ -208,7 +208,7 @@ class Campaign:
 
     def _line(self) -> Trial:
         draws, name, kind = self._draws, self._draws.choice(LINES), self._draws.choice(KINDS)
-        way = draws.choice(("to_device", "to_driver"))
+        way: Literal["to_device", "to_driver"] = draws.choice(("to_device", "to_driver"))
         share = draws.uniform(0.003, 0.05) if kind in ("lost", "corrupted") else draws.uniform(0.05, 0.4)
         line = self._hardware.emulator.lines[name]
         fault = LineFault(kind, share, way, FAR_NS, round(draws.uniform(5, 80) * MS))
@@ -274,7 +274,8 @@ class Campaign:
         servo = self._servo()
 
         def end() -> None:
-            self._call(lambda: (servo.put(42, 120), servo.power_up()))
+            self._call(lambda: servo.put(42, 120))
+            self._call(servo.power_up)
 
         return Trial("servo: power lost", lambda: self._call(lambda: servo.put(42, 30)), end, 0.5, ("does not answer",))
 

@@ -14,7 +14,8 @@ from cocoro.robot import Robot
 from cocoro.topics import ARM_STATE, FRAME
 from services.perception.config import Config
 from services.perception.core import PerceptionCore
-from sim.camera import Sensors, SimKinect
+from sim.camera import SimKinect
+from sim.realism import Sensors
 from sim.render import make_renderer
 from sim.render.interface import Visual
 from sim.scene import Light
@@ -64,8 +65,8 @@ class Canvas:
             stamp_ns=stamp_ns,
             width=width,
             height=height,
-            colour=memoryview(self.colour.copy().reshape(-1)),
-            depth=memoryview(codes.astype("<u2").reshape(-1).view(np.uint8)),
+            colour=self.colour.copy().reshape(-1).data,
+            depth=codes.astype("<u2").reshape(-1).view(np.uint8).data,
             **more,
         )
 

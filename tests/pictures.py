@@ -87,8 +87,8 @@ def pixel_of(point_m: tuple[float, ...], camera_pose: FloatArray, camera: Camera
 
 
 def reddish(colour: np.ndarray) -> np.ndarray:
-    r, g, b = np.moveaxis(colour.astype(int), -1, 0)
-    return (r > 2 * g + 20) & (r > 2 * b + 20)
+    r, g, b = (colour[..., channel].astype(int) for channel in range(3))
+    return np.logical_and(r > 2 * g + 20, r > 2 * b + 20)
 
 
 def floor_depth(camera: Camera, camera_pose: FloatArray) -> FloatArray:

@@ -8,9 +8,10 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
 from contextlib import asynccontextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 from wire_base import DEADMAN_NS, MS, PATIENCE_NS, Bench
@@ -94,9 +95,9 @@ async def driven(bench: Bench) -> AsyncIterator[Driven]:
         base.silence()
 
 
-def in_real_time(test: Callable[[Bench], AsyncIterator[None]]) -> Callable[[Bench], None]:
+def in_real_time(test: Callable[[Bench], Coroutine[Any, Any, None]]) -> Callable[[Bench], None]:
     def run(bench: Bench) -> None:
-        asyncio.run(asyncio.wait_for(test(bench), 60.0))  # type: ignore[arg-type]
+        asyncio.run(asyncio.wait_for(test(bench), 60.0))
 
     run.__name__ = test.__name__
     return run

@@ -84,7 +84,7 @@ def test_ideal_colours_are_the_renderers_own() -> None:
 def test_ideal_depth_is_the_formulas_code() -> None:
     depth = np.linspace(0.3, 4.5, HEIGHT * WIDTH, dtype=np.float32).reshape(HEIGHT, WIDTH)
     codes = depth_of(shoot(kinect(Painted(depth_m=depth), "ideal"))).astype(int)
-    formula = ROBOT.depth_code(depth).astype(int)
+    formula = ROBOT.depth_code(depth.astype(float)).astype(int)
     agree = codes == formula
     assert agree.mean() > 0.99
     assert np.abs(codes - formula)[formula != NO_DATA].max() <= 1  # on the border between two codes
@@ -109,8 +109,10 @@ def test_an_ideal_frame_asks_for_no_projector_a_real_one_for_the_kinects_own() -
     pose[:3, :3] = Rotation.from_euler("z", 90, degrees=True).as_matrix()
     shoot(kinect(painted, "ideal"), 0, pose)
     shoot(kinect(painted, "real"), 0, pose)
-    assert painted.projected[0] is None
-    np.testing.assert_allclose(painted.projected[1][:3, 3], [0.0, ROBOT.kinect.projector_offset_m[0], 0.0], atol=1e-12)
+    none, projector = painted.projected
+    assert none is None
+    assert projector is not None
+    np.testing.assert_allclose(projector[:3, 3], [0.0, ROBOT.kinect.projector_offset_m[0], 0.0], atol=1e-12)
 
 
 def test_a_frame_is_the_message_with_its_stamp_and_keeps_its_pixels() -> None:

@@ -29,7 +29,8 @@ from cocoro.vloop import run_virtual
 from deploy import profiles
 from deploy.processes import named
 from services.capture.config import Config, folder_of
-from services.capture.sink import LARGE_BYTES, RESERVE_BYTES, Syncer, ThreadedSink
+from services.capture.file import LARGE_BYTES
+from services.capture.sink import RESERVE_BYTES, Syncer, ThreadedSink
 from services.capture.writer import CaptureWriter
 
 

@@ -147,8 +147,9 @@ def test_a_step_whose_input_is_missing_is_counted_and_not_equal(tmp_path: Path) 
 
 
 def test_a_step_whose_output_is_missing_is_not_equal_either(tmp_path: Path) -> None:
-    lost = lambda each: each.key.endswith("planning/status") and each.sequence == 30  # noqa: E731
-    path = without(GOLDEN, tmp_path / "few.mcap", lambda each: not lost(each))
+    path = without(
+        GOLDEN, tmp_path / "few.mcap", lambda each: not (each.key.endswith("planning/status") and each.sequence == 30)
+    )
     result = again(path, "planning", TOLERANCE)
     assert (result.not_executable, result.equal) == (1, result.steps - 1)
     assert result.reasons == {"the capture lacks an output on planning/status": 1}

@@ -10,6 +10,7 @@ import time
 from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -281,7 +282,7 @@ def test_ctrl_c_on_a_running_fetch_cancels_the_task_on_the_robot(root: Path) -> 
 
             async def tell() -> None:
                 async for _ in node.every(20.0):
-                    outcome = "cancelled" if cancelled else None
+                    outcome: Literal["cancelled"] | None = "cancelled" if cancelled else None
                     node.publish(TASK, TaskState(task_id="fetch-1", phase="approach", outcome=outcome, elapsed_s=1.0))
 
             async def cancel(request: CancelRequest) -> TaskReply:

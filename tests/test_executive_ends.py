@@ -137,7 +137,8 @@ def test_only_of_one_that_is_known_to_be_dead_it_is_said_that_it_died(
 
     @in_virtual_time
     async def scenario() -> None:
-        clock, said = Sleepy(), []
+        clock = Sleepy()
+        said: list[str] = []
         async with robot(contact=Contact(run_dir.claimant_pid, Vigil(said.append, clock))) as it:
             it.script = {"search": ["never"]}
             await it.begin()

@@ -185,7 +185,8 @@ def test_pairs_come_with_tilt_and_light_set_and_the_light_goes_out_at_the_end(
     monkeypatch: pytest.MonkeyPatch, ends: tuple[socket.socket, Grabber]
 ) -> None:
     ours, grabber = ends
-    library, told = FakeLibrary(), []
+    library = FakeLibrary()
+    told: list[Any] = []
     colour, depth = (ctypes.c_char * COLOUR_BYTES)(), (ctypes.c_char * DEPTH_BYTES)()
 
     def process() -> int:
@@ -242,7 +243,12 @@ def test_a_kinect_whose_motor_cannot_be_opened_gives_pictures_all_the_same(
     ours, grabber = ends
     library = FakeLibrary()
     library.opens = lambda parts: 0 if parts == 2 else -1
-    library.process = lambda: ours.close() or 0
+
+    def process() -> int:
+        ours.close()
+        return 0
+
+    library.process = process
     run(monkeypatch, grabber, library, tilt=5.0)
     assert library.calls == [("shutdown", 0)]  # nothing was asked of the motor, which has the light
 
@@ -318,7 +324,13 @@ def test_a_process_that_ends_by_itself_is_told_and_started_again(tmp_path: Path)
             patch.setattr("services.kinect.camera.AGAIN_S", 0.01)
             camera = FreenectCamera(config, RealClock(), faults.append)
             starts = camera._start
-            patch.setattr(camera, "_start", lambda: starts() or (camera.starts > 1 and twice.set()))
+
+            def start() -> None:
+                starts()
+                if camera.starts > 1:
+                    twice.set()
+
+            patch.setattr(camera, "_start", start)
             with closing(camera):
                 async with asyncio.timeout(30.0):
                     await twice.wait()

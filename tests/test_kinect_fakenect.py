@@ -79,7 +79,9 @@ class Played:
     took_s: float = 0.0
 
 
-def play(library: str, recording: Path, until: Callable[[Played], bool], on_fault: Callable[[], None] = int) -> Played:
+def play(
+    library: str, recording: Path, until: Callable[[Played], bool], on_fault: Callable[[], object] = int
+) -> Played:
     """Take pairs until it is enough. `on_fault` is called once, with the first real fault."""
 
     async def scenario() -> Played:
@@ -150,7 +152,7 @@ def test_a_damaged_recording_is_not_played_and_named_and_played_once_it_is_whole
     copy = copied(recording, tmp_path)
     cut = sorted(copy.glob("d-*"))[3]
     whole = damage(cut, 5000)
-    played = play(library, copy, lambda so_far: bool(so_far.shots), lambda: cut.write_bytes(whole) and None)
+    played = play(library, copy, lambda so_far: bool(so_far.shots), lambda: cut.write_bytes(whole))
     assert f"{cut} is damaged: its pixels take 4983 bytes, not 614400" in played.faults[1]
     assert played.faults[-1] == ""
 

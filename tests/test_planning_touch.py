@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,7 +25,7 @@ from services.planning.reachability import ReachMesh
 from services.planning.state_estimator import PostureSighting
 from services.planning.teaching import LUMP, Teacher
 
-QUICK = {"width": 160, "height": 120, "frame_rate_hz": 15.0}
+QUICK: dict[str, Any] = {"width": 160, "height": 120, "frame_rate_hz": 15.0}
 
 
 @pytest.mark.sim

@@ -47,7 +47,7 @@ class Wire:
             self.misses -= 1
             raise SilentError(number)
         self.position += 1
-        return ServoReading(0, self.position, 0, 0, 12.0, 38, 0)
+        return ServoReading(0, self.position, 0, 0, 12, 38, 0)
 
     def read_block(self, _number: int, _first: int, _length: int) -> tuple[bytes, int]:
         return b"", 0

@@ -94,8 +94,8 @@ def test_a_port_that_is_not_there_or_goes_away_is_said(bench: ServoBench, tmp_pa
 
 
 def test_an_answer_that_comes_late_is_not_taken_for_that_to_another_question(bench: ServoBench) -> None:
-    line, servo = bench.emulator.lines["arm"], bench.servo(ELBOW)
-    bench.call(lambda: (servo.put(28, 2), servo.put(29, 2)))  # in a reading's place these would be a load
+    line = bench.emulator.lines["arm"]
+    bench.put(ELBOW, {28: 2, 29: 2})  # in a reading's place these would be a load
     with ServoBus(bench.port("arm"), 1_000_000, 0.3) as bus:
         for _ in range(3):
             bench.call(lambda: line.disturb(LineFault("late", 1.0, "to_driver", FOREVER_NS, 450 * MS)))
@@ -123,7 +123,7 @@ async def test_joints_go_where_they_are_told_and_tell_where_they_are(bench: Serv
 @in_real_time
 async def test_torque_comes_on_without_a_snap(bench: ServoBench) -> None:
     servo = bench.servo(ELBOW)
-    bench.call(lambda: (servo.put(30, 1000), servo.put(36, 512)))
+    bench.put(ELBOW, {30: 1000, 36: 512})
     async with moved(bench):
         written = [(address, value) for _, address, value in bench.call(servo.acted.copy)]
         first = [address for address, _ in written]
@@ -223,9 +223,10 @@ async def test_a_servo_whose_power_comes_back_holds_again_where_it_is(bench: Ser
         servos.move("arm", elbow=0.5)
         await servos.state("arm", lambda state: abs(angle(state, "elbow") - 0.5) < 2 * SERVO_COUNT_RAD)
         servos.silence()
-        bench.call(lambda: bench.servo(ELBOW).put(42, 40))
+        bench.put(ELBOW, {42: 40})
         await servos.fault("arm", "elbow (ID 5) does not answer")
-        bench.call(lambda: (bench.servo(ELBOW).put(42, 120), bench.servo(ELBOW).power_up()))
+        bench.put(ELBOW, {42: 120})
+        bench.call(bench.servo(ELBOW).power_up)
         state = await servos.state("arm", lambda state: len(state.joints) == 6 and all(state.torque_enabled))
         assert angle(state, "elbow") == pytest.approx(0.5, abs=3 * SERVO_COUNT_RAD)
         assert bench.servo(ELBOW).get(28) == 2  # its slopes were lost, too

@@ -44,9 +44,8 @@ def told(text: str) -> None:
 
 def test_a_scan_finds_servos_at_every_baud_rate(bench: ServoBench, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tools, "SCAN_S", 0.1)
-    servo = bench.servo(4)
-    bench.call(lambda: (servo.put(4, 16), servo.put(5, 250)))  # 117647 baud is 115200 to a port, nearly
-    bench.call(lambda: servo.put(4, 3))  # 500000
+    bench.put(4, {4: 16, 5: 250})  # 117647 baud is 115200 to a port, nearly
+    bench.put(4, {4: 3})  # 500000
     lines: list[str] = []
     found = list(tools.scan([bench.port("arm"), "/dev/nothing"], [1_000_000, 500_000], range(3, 6), lines.append))
     assert [(one.number, one.baud, one.model) for one in found] == [
@@ -98,17 +97,17 @@ def test_a_joint_that_was_not_turned_has_no_direction(bench: ServoBench, line: S
 
 def test_limits_are_felt_from_end_to_end_and_written_into_the_servo(bench: ServoBench, line: ServoBus) -> None:
     turn = by_hand(bench, 300, 800)
-    steps = iter([lambda: turn(""), lambda: turn(""), lambda: None])
+    turns = iter([True, True, False])  # two ends, then a pause before Return is pressed
 
     def done() -> bool:
-        step = next(steps, None)
-        if step is not None:
-            step()
-        return step is None
+        turned = next(turns, None)
+        if turned:
+            turn("")
+        return turned is None
 
     limits = tools.feel_limits(line, ELBOW, done, told)
     first, last = (degrees(ELBOW.to_angle(count)) for count in (300, 800))
-    assert limits == (pytest.approx(first + 2.0, abs=0.1), pytest.approx(last - 2.0, abs=0.1))
+    assert limits == pytest.approx((first + 2.0, last - 2.0), abs=0.1)
     low, high = tools.write_limits(line, ELBOW, limits)
     assert (bench.servo(5).get(6), bench.servo(5).get(8)) == (low, high)
     assert 300 < low < high < 800
@@ -181,7 +180,8 @@ def test_the_doctor_looks_at_every_servo(bench: ServoBench) -> None:
     config = ServoConfig(arm_port=bench.port("arm"), hand_port=bench.port("hand"), reply_s=REPLY_S)
     assert {check.state for check in check_servos(config, ROBOT, "robbie")} == {"ok"}
     bench.call(lambda: setattr(bench.servo(9), "mute", True))
-    bench.call(lambda: (bench.servo(5).put(5, 250), bench.servo(4).put(43, 75), bench.servo(3).put(42, 70)))
+    for number, registers in {5: {5: 250}, 4: {43: 75}, 3: {42: 70}}.items():
+        bench.put(number, registers)
     texts = {check.name: check.text for check in check_servos(config, ROBOT, "robbie") if check.state == "bad"}
     assert "waits 500 us" in texts["servo 5, elbow"]
     assert "let it cool" in texts["servo 4, shoulder"]

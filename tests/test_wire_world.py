@@ -107,9 +107,13 @@ def test_firmware_and_physics_tell_each_other_the_newest_and_notice_the_end() ->
     for left_m in (0.0, 0.5, 1.0):
         ours.send(PlantState(0, left_m, left_m, True, False, {5: (600, -20, 0.25)}))
         body.advance(0)
-    assert ours.newest(MotorOrders) == MotorOrders(
-        50, 100, {5: MotorOrder(True, 512, 0, 1.0, 32, pytest.approx(32 / 1023))}
-    )
+    orders = ours.newest(MotorOrders)
+    assert isinstance(orders, MotorOrders)
+    assert (orders.left_mmps, orders.right_mmps) == (50, 100)
+    motor = orders.motors.pop(5)
+    assert not orders.motors
+    assert motor == MotorOrder(True, 512, 0, 1.0, 32, motor.punch)
+    assert motor.punch == pytest.approx(32 / 1023)
     assert create.mode == DRIVING
     servo = lines["arm"].servos[0]
     assert (servo.get(36), servo.get(38), servo.get(40)) == (600, 1024 + 20, 256)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import TypeVar
@@ -50,6 +50,15 @@ class ServoBench:
 
     def servo(self, number: int) -> EmulatedServo:
         return next(servo for bus in (self.arm, self.hand) for servo in bus.servos if servo.number == number)
+
+    def put(self, number: int, registers: Mapping[int, int]) -> None:
+        """Set registers of a servo, by address, between two of the line's packets."""
+
+        def put() -> None:
+            for address, value in registers.items():
+                self.servo(number).put(address, value)
+
+        self.emulator.call(put)
 
     def call(self, job: Callable[[], T]) -> T:
         return self.emulator.call(job)

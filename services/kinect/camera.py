@@ -9,7 +9,7 @@ import mmap
 import os
 import subprocess
 import time
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncGenerator, Mapping
 from contextlib import suppress
 from math import degrees
 from typing import Any
@@ -66,7 +66,7 @@ class FreenectCamera:
         self._again = self._loop.call_soon(self._start)
         on_fault(self._fault)
 
-    async def frames(self) -> AsyncIterator[RawFrame]:
+    async def frames(self) -> AsyncGenerator[RawFrame, None]:
         while True:
             limit_s = FIRST_S if self._fault else HANGS_S
             try:
