@@ -24,7 +24,7 @@ from cocoro.node import Node
 from cocoro.robot import Robot
 from deploy.processes import hardware, named, needs
 from services.planning.config import PlanningConfig
-from sim.motion import Motion, read_motion
+from sim.motion import MotionRow, read_motion
 
 SERVICES = ("sim", "perception", "planning", "executive")
 STANDING_MPS = 0.01
@@ -81,7 +81,7 @@ class FaultRobot:
         self._nodes: dict[str, Node] = {}
         self._runs: list[asyncio.Future[None]] = []
         self._stack = AsyncExitStack()
-        self._rows: list[Motion] = []
+        self._rows: list[MotionRow] = []
         self._said: dict[str, bytes] = {}
         self.operator = Node("operator", self._mesh.join(), self._clock, self._robot)
 
@@ -111,7 +111,7 @@ class FaultRobot:
 
     # --- before -----------------------------------------------------------------------------------
 
-    async def drive(self, rng: random.Random) -> Motion:
+    async def drive(self, rng: random.Random) -> MotionRow:
         """Give the task, and be at full speed at a random moment; how the body moves then. Raises NotFastError."""
         await self._begin()
         full_mps = 0.97 * full_speed_mps(self._errand.task)
@@ -141,7 +141,7 @@ class FaultRobot:
     def _now_s(self) -> float:
         return self.operator.now_ns() / NS
 
-    def _newest(self) -> Motion:
+    def _newest(self) -> MotionRow:
         self._rows += read_motion(self._motion, len(self._rows))
         return self._rows[-1]
 

@@ -32,8 +32,8 @@ from typing import Any, Literal
 
 from bench.hardware_driver import REACH_RAD, WHEELS
 from bench.hardware_rig import LINES, MS, NS, ROBOT, Hardware, Services
-from sim.wire.dynamixel import Servo
-from sim.wire.faults import KINDS, Fault
+from sim.wire.dynamixel import EmulatedServo
+from sim.wire.line import KINDS, LineFault
 
 STOP_NS = 300 * MS
 AGAIN_S = 40.0
@@ -211,7 +211,7 @@ class Campaign:
         way: Literal["to_device", "to_driver"] = draws.choice(("to_device", "to_driver"))
         share = draws.uniform(0.003, 0.05) if kind in ("lost", "corrupted") else draws.uniform(0.05, 0.4)
         line = self._hardware.emulator.lines[name]
-        fault = Fault(kind, share, way, FAR_NS, round(draws.uniform(5, 80) * MS))
+        fault = LineFault(kind, share, way, FAR_NS, round(draws.uniform(5, 80) * MS))
         cut = kind == "silent"
         shown: tuple[str, ...] = ("disturbed",)
         if cut:
@@ -244,7 +244,7 @@ class Campaign:
             self._draws.uniform(0.2, 1.0), ("plugged in",),
         )  # fmt: skip
 
-    def _servo(self) -> Servo:
+    def _servo(self) -> EmulatedServo:
         return self._hardware.servos[ROBOT.joints[self._draws.choice(list(REACH_RAD))].id]
 
     def _overload(self) -> Trial:

@@ -21,13 +21,12 @@ from cocoro.messages import BaseCommand, BaseState, ClockTick, LatchState, Messa
 from cocoro.node import Node
 from cocoro.publisher import Publisher
 from cocoro.robot import Robot
-from sim.camera import Kinect
+from sim.camera import SimKinect
 from sim.component import SIM
 from sim.motion import MotionWriter
 from sim.random_scene import find_scene
-from sim.realism import BodyRealism
+from sim.realism import BodyKind, BodyRealism, body_of
 from sim.render import make_renderer
-from sim.wear import BodyKind, body_of
 from sim.world import Motors, World, services_motors
 
 TICK_HZ = 120
@@ -100,7 +99,7 @@ class _Every:
 class Simulator:
     """Steps the world and exchanges its commands, states and frames with the mesh."""
 
-    def __init__(self, node: Node, config: SimConfig, world: World, kinect: Kinect) -> None:
+    def __init__(self, node: Node, config: SimConfig, world: World, kinect: SimKinect) -> None:
         self._config = config
         self._world = world
         self._kinect = kinect
@@ -224,10 +223,12 @@ def make_world(
     )
 
 
-def make_kinect(robot: Robot, config: SimConfig, world: World) -> Kinect:
+def make_kinect(robot: Robot, config: SimConfig, world: World) -> SimKinect:
     camera = robot.camera.scaled(config.width, config.height)
     renderer = make_renderer(world.visuals, camera, config.renderer)
-    return Kinect(robot, renderer, sensors=config.sensors, seed=config.seed, width=config.width, height=config.height)
+    return SimKinect(
+        robot, renderer, sensors=config.sensors, seed=config.seed, width=config.width, height=config.height
+    )
 
 
 async def keep_going(node: Node, config: SimConfig, simulator: Simulator) -> None:

@@ -14,11 +14,11 @@ from cocoro.robot import Robot
 from cocoro.topics import ARM_STATE, FRAME
 from services.perception.config import PerceptionConfig
 from services.perception.core import PerceptionCore
-from sim.camera import Kinect
+from sim.camera import SimKinect
 from sim.realism import Sensors
 from sim.render import make_renderer
+from sim.render.interface import Visual
 from sim.scene import Light
-from sim.visual import Visual
 
 ROBOT = Robot.load()
 CATALOGUE = Catalogue.load()
@@ -114,7 +114,7 @@ class Scene:
     def __post_init__(self) -> None:
         visuals = [Visual(t.name, t.shape, t.size_m, t.rgb) for t in self.things]  # type: ignore[arg-type]
         self._renderer = make_renderer(visuals, ROBOT.camera.scaled(self.width, self.height))
-        self._kinect = Kinect(
+        self._kinect = SimKinect(
             ROBOT, self._renderer, sensors=self.sensors, seed=self.seed, width=self.width, height=self.height
         )
         self._chain = ROBOT.chain("camera")

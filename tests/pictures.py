@@ -13,7 +13,7 @@ from cocoro.errors import ConfigError
 from cocoro.robot import Camera, Robot
 from sim.camera import moved
 from sim.render import Images, Renderer, make_renderer
-from sim.visual import Visual
+from sim.render.interface import Visual
 
 ROBOT = Robot.load()
 CAMERA = ROBOT.camera.scaled(320, 240)

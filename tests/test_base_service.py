@@ -20,8 +20,8 @@ from cocoro import topics
 from cocoro.clock import RealClock
 from cocoro.messages import BaseCommand, BaseState, EstopRequest, Latch, RecoverRequest
 from cocoro.testing import ServiceUnderTest
-from services.base.service import BaseConfig, BaseService
-from sim.wire.faults import Fault
+from services.base.service import BaseService
+from sim.wire.line import LineFault
 
 pytestmark = pytest.mark.zenoh
 
@@ -203,7 +203,7 @@ def test_a_disturbed_line_is_told_and_stops_nothing_for_long(bench: Bench, way: 
     async def scenario(bench: Bench) -> None:
         async with driven(bench) as base:
             await base.roll()
-            fault = Fault("corrupted", 0.01, way, 10**19)  # type: ignore[arg-type]
+            fault = LineFault("corrupted", 0.01, way, 10**19)  # type: ignore[arg-type]
             bench.emulator.call(lambda: bench.line.disturb(fault))
             await base.fault("its line is disturbed, look after the cable")
             bench.emulator.call(bench.line.undisturb)
@@ -240,7 +240,7 @@ def test_a_guard_that_dies_or_hangs_is_replaced_and_the_wheels_stopped_meanwhile
     async def scenario(bench: Bench) -> None:
         async with driven(bench) as base:
             await base.roll()
-            pid = services[0].guardian.pid
+            pid = services[0].guard.pid
             assert pid is not None
             base.silence()
             killed_ns = time.monotonic_ns()
@@ -249,7 +249,7 @@ def test_a_guard_that_dies_or_hangs_is_replaced_and_the_wheels_stopped_meanwhile
             await asyncio.to_thread(bench.emulator.until, lambda: bench.create.mode == 1)  # woken by the next guard
             await asyncio.to_thread(bench.until_awake)
             await base.state(lambda state: state.mode == "safe")
-            assert services[0].guardian.pid != pid
+            assert services[0].guard.pid != pid
             base.drive(0.1, 0.1)
             await base.wheels(100, 100)
 

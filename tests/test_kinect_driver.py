@@ -18,7 +18,6 @@ import pytest
 from cocoro.clock import RealClock
 from cocoro.errors import ConfigError
 from services.kinect import grabber as grabbing
-from services.kinect import recording
 from services.kinect.camera import FreenectCamera
 from services.kinect.config import KinectConfig
 from services.kinect.freenect import (
@@ -26,12 +25,12 @@ from services.kinect.freenect import (
     DEPTH_BYTES,
     DeviceError,
     FrameMode,
-    Kinect,
+    FreenectDevice,
     MissingLibraryError,
+    check_recording,
     load,
 )
-from services.kinect.grabber import Grabber, grab
-from services.kinect.pairing import NS, PERIOD_NS, DeviceClock, Pairer, Picture
+from services.kinect.grabber import NS, PERIOD_NS, BufferedImage, DeviceClock, Grabber, Pairer, grab
 
 MS = 1_000_000
 TICKS_A_MS = 60_000
@@ -72,7 +71,7 @@ def test_each_colour_picture_goes_with_the_nearest_depth_picture(behind_ms: int)
     pictures += [("depth", n * PERIOD_NS + behind_ms * MS, n) for n in range(20)]
     pairs = []
     for kind, at_ns, buffer in sorted(pictures, key=lambda picture: picture[1]):
-        pair, _ = pairer.add(kind, Picture(at_ns, buffer))  # type: ignore[arg-type]
+        pair, _ = pairer.add(kind, BufferedImage(at_ns, buffer))  # type: ignore[arg-type]
         if pair is not None:
             pairs.append((pair.colour.buffer, pair.depth.buffer))
     assert pairs == [(n, n) for n in range(20)]
@@ -80,9 +79,9 @@ def test_each_colour_picture_goes_with_the_nearest_depth_picture(behind_ms: int)
 
 def test_a_picture_whose_partner_was_lost_is_given_up_and_its_buffer_with_it() -> None:
     pairer = Pairer()
-    assert pairer.add("colour", Picture(0, 1)) == (None, [])
-    assert pairer.add("colour", Picture(PERIOD_NS, 2)) == (None, [])
-    pair, free = pairer.add("depth", Picture(PERIOD_NS, 3))
+    assert pairer.add("colour", BufferedImage(0, 1)) == (None, [])
+    assert pairer.add("colour", BufferedImage(PERIOD_NS, 2)) == (None, [])
+    pair, free = pairer.add("depth", BufferedImage(PERIOD_NS, 3))
     assert pair is not None
     assert (pair.colour.buffer, pair.depth.buffer) == (2, 3)
     assert free == [("colour", 1)]
@@ -91,7 +90,7 @@ def test_a_picture_whose_partner_was_lost_is_given_up_and_its_buffer_with_it() -
 def test_of_a_stream_without_the_other_no_more_than_two_pictures_are_kept() -> None:
     pairer, freed = Pairer(), []
     for n in range(5):
-        freed += pairer.add("depth", Picture(n * PERIOD_NS, n))[1]
+        freed += pairer.add("depth", BufferedImage(n * PERIOD_NS, n))[1]
     assert freed == [("depth", 0), ("depth", 1), ("depth", 2)]
 
 
@@ -232,7 +231,7 @@ def test_what_nobody_reads_is_dropped_and_the_next_is_read_again(ends: tuple[soc
             break
     assert len(pairs) == grabbing.BUFFERS
     ours.send(json.dumps({"free": [pairs[0]["colour"], pairs[0]["depth"]]}).encode())
-    assert grabber.obey(Kinect(FakeLibrary(), lambda *_: None))  # type: ignore[arg-type]
+    assert grabber.obey(FreenectDevice(FakeLibrary(), lambda *_: None))  # type: ignore[arg-type]
     picture(20)
     again = json.loads(ours.recv(4096))
     assert (again["colour"], again["depth"]) == (pairs[0]["colour"], pairs[0]["depth"])
@@ -355,7 +354,7 @@ def test_a_recording_is_checked_before_it_is_played(tmp_path: Path) -> None:
     def fault(*names: str) -> str:
         index.write_text("\n".join(names) + "\n")
         with pytest.raises(DeviceError) as error:
-            recording.check(str(tmp_path))
+            check_recording(str(tmp_path))
         return str(error.value)
 
     whole = (depth.name, colour.name)
@@ -365,6 +364,6 @@ def test_a_recording_is_checked_before_it_is_played(tmp_path: Path) -> None:
     assert "an empty line" in fault(depth.name, "", colour.name)
     assert "a-1.0-60.dump is empty" in fault(*whole, "a-1.0-60.dump")
     index.write_text("\n".join(whole) + "\n")
-    recording.check(str(tmp_path))
+    check_recording(str(tmp_path))
     depth.write_bytes(b"P5 640 480 65535" + bytes(DEPTH_BYTES))
     assert "is damaged" in fault(*whole)

@@ -23,13 +23,12 @@ from services.kinect import doctor, tools
 from services.kinect.calibration import Board
 from services.kinect.camera import FreenectCamera
 from services.kinect.config import KinectConfig
-from services.kinect.device import Shot
-from services.kinect.service import as_frame
+from services.kinect.device import RawFrame
+from services.kinect.service import to_message
 from services.perception.config import PerceptionConfig
 from services.perception.core import PerceptionCore
 from sim.service import SimConfig
-from sim.wire.record import RATE_HZ, record
-from sim.wire.recording import RecordingWriter
+from sim.wire.record import RATE_HZ, RecordingWriter, record
 
 pytestmark = pytest.mark.sim
 
@@ -75,7 +74,7 @@ def pixels(recording: Path, kind: str) -> list[bytes]:
 
 @dataclass
 class Played:
-    shots: list[Shot] = field(default_factory=list)
+    shots: list[RawFrame] = field(default_factory=list)
     faults: list[str] = field(default_factory=list)
     took_s: float = 0.0
 
@@ -99,7 +98,7 @@ def play(
                 enough.set()
 
         async def take() -> None:
-            async with aclosing(camera.shots()) as shots:
+            async with aclosing(camera.frames()) as shots:
                 async for shot in shots:
                     played.shots.append(shot)
                     if until(played):
@@ -119,7 +118,7 @@ def play(
     return asyncio.run(scenario())
 
 
-def number_of(shot: Shot, colours: list[bytes], depths: list[bytes]) -> int:
+def number_of(shot: RawFrame, colours: list[bytes], depths: list[bytes]) -> int:
     """Which picture of the recording it is; both its halves must be whole, and of one moment."""
     number = colours.index(shot.colour.tobytes())
     assert shot.depth.astype("<u2").tobytes() == depths[number]
@@ -191,7 +190,7 @@ def test_perception_finds_the_recorded_objects_where_they_stand(
             ServoState(stamp_ns=at_ns, joints=joints, position_rad=angles, speed_radps=(0.0, 0.0), load=(0.0, 0.0))
             for at_ns in (shot.stamp_ns - NS // 100, shot.stamp_ns + NS // 100)
         ]
-        samples = [*(Sample(ARM_STATE, head) for head in heads), Sample(FRAME, as_frame(shot))]
+        samples = [*(Sample(ARM_STATE, head) for head in heads), Sample(FRAME, to_message(shot))]
         for output in core.step(samples, shot.stamp_ns + NS // 50):
             if isinstance(output.message, Detections):
                 places += [seen.position_m for seen in output.message.detections if seen.label == label]
@@ -208,7 +207,7 @@ def test_views_of_a_chessboard_are_taken_from_the_device_and_kept(library: str, 
     pictures = [(painter.colour(*pose), painter.depth(*pose)) for pose in poses]
     with RecordingWriter(tmp_path / "recording") as writer:
         for number in range(40):
-            writer.add(as_frame(Shot(NS + number * NS // 30, *pictures[number // 20])))
+            writer.add(to_message(RawFrame(NS + number * NS // 30, *pictures[number // 20])))
     told: list[str] = []
     config = KinectConfig(library=library, recording=str(tmp_path / "recording"))
     views = tools.capture(config, board, 2, tmp_path / "views", told.append)

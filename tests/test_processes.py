@@ -16,6 +16,7 @@ from cocoro.component import Component
 from cocoro.component import load as load_component
 from cocoro.errors import ConfigError
 from cocoro.installed import third_parties
+from cocoro.messages import Message
 from cocoro.topics import REQUESTS, TOPICS, Topic
 from deploy import processes, profiles
 from deploy.processes import COMPONENTS
@@ -59,7 +60,7 @@ def test_names_are_unique_and_each_component_stands_for_something() -> None:
 
 
 @pytest.mark.parametrize("topic", TOPICS, ids=lambda topic: topic.name)
-def test_every_topic_is_published_by_a_component_under_the_name_that_it_says(topic: Topic[object]) -> None:
+def test_every_topic_is_published_by_a_component_under_the_name_that_it_says(topic: Topic[Message]) -> None:
     declared = any(one.name == topic.name for component in COMPONENTS for one in component.publishes)
     assert declared != (topic in NODES)
     assert topic.publisher in processes.publishers(topic)

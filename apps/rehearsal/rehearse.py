@@ -31,12 +31,10 @@ from cocoro.robot import Robot
 from cocoro.stepper import Stepper
 from cocoro.vloop import run_virtual
 from deploy.processes import named, needs
-from sim.judge import Judge
-from sim.pursuit import PursuitJudge
+from sim.judge import Judge, PursuitJudge
 from sim.random_scene import find_scene
-from sim.realism import REALISM, wheel_scales
+from sim.realism import REALISM, body_of, wheel_scales
 from sim.trace import Trace
-from sim.wear import body_of
 
 RECORDER = "capture"
 PROCESSES = ("sim", "perception", "planning", "executive")

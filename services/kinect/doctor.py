@@ -9,8 +9,8 @@ from cocoro.checks import Check, bad, note, ok
 from cocoro.clock import RealClock
 from cocoro.errors import ConfigError
 from cocoro.robot import Robot
+from services.kinect.camera import open_device
 from services.kinect.config import KinectConfig
-from services.kinect.device import open_device
 
 __all__ = ["check"]
 
@@ -36,9 +36,9 @@ async def _look(config: KinectConfig) -> Check:
     with closing(camera):
         try:
             async with asyncio.timeout(LOOK_S):
-                async for shot in camera.shots():
-                    height, width = shot.depth.shape
-                    seen = float((shot.depth < 2047).mean())
+                async for frame in camera.frames():
+                    height, width = frame.depth.shape
+                    seen = float((frame.depth < 2047).mean())
                     return ok("Kinect", f"sends pictures, {width} x {height}, depth in {100 * seen:.0f}% of them")
         except TimeoutError:
             pass
