@@ -20,7 +20,7 @@ from cocoro import topics
 from cocoro.clock import RealClock
 from cocoro.messages import BaseCommand, BaseState, EstopRequest, Latch, RecoverRequest
 from cocoro.testing import ServiceUnderTest
-from services.base.service import BaseService
+from services.base.service import BaseConfig, BaseService
 from sim.wire.line import LineFault
 
 pytestmark = pytest.mark.zenoh

@@ -10,6 +10,7 @@ import pytest
 
 from cocoro.robot import SERVO_COUNT_RAD, Robot
 from sim.scene import Scene, load_scene
+from sim.service import SimConfig
 from sim.wire.firmware import Channel, LinkedPlant, MotorOrder, MotorOrders, PlantState, ServoSetup, Setup, firmware
 from sim.wire.service import WireMotors, setup_of
 from sim.world import World
