@@ -27,11 +27,10 @@ from cocoro.contact import SleepDetector
 from cocoro.errors import CocoroError, ConfigError, RefusedError
 from cocoro.keys import alive_key, service_of
 from cocoro.stop.record import latch_dir, prepare
-from cocoro.topics import STOPPABLE
 from deploy import robot_time, service_manager
 from deploy.child import Child, StartError
 from deploy.launch import CRASHED
-from deploy.processes import shared_bytes
+from deploy.processes import shared_bytes, stoppable
 from deploy.profiles import Profile, from_data
 from deploy.quit import quit_process
 from deploy.rundir import RunDir
@@ -164,7 +163,7 @@ class Supervisor:
 
     def _prepare_latches(self) -> None:
         """See to it that the emergency stop's latch has its place on the disk before anything moves."""
-        services = {*self._profile.services()} & {*STOPPABLE, "executive"}
+        services = {*self._profile.services()} & {*stoppable(), "executive"}
         folder = latch_dir(self._profile.robot)
         try:
             records = prepare(folder, services, by_hand=self._by_hand)

@@ -13,9 +13,10 @@ import numpy as np
 from cocoro.bus.base import Qos
 from cocoro.capture.types import JSON, MADE_HERE, MSGPACK, OTHER, Alive, LossyFrame, TypeSchema, schema_of
 from cocoro.errors import ConfigError
+from cocoro.installed import topic_named
 from cocoro.keys import matches
 from cocoro.messages import Frame, Message
-from cocoro.topics import FRAME, TOPICS, topic_named
+from cocoro.topics import FRAME, TOPICS
 
 FRAMES = "frames"
 """In place of a key expression: all that carries pictures."""
