@@ -25,7 +25,7 @@ from sim.motion import MotionWriter
 from sim.random_scene import find_scene
 from sim.realism import BodyKind, BodyRealism, body_of
 from sim.render import make_renderer
-from sim.world import Motors, World, services_motors
+from sim.world import Motors, World, message_motors
 
 __all__ = ["Config", "run"]
 
@@ -206,7 +206,7 @@ async def run(node: Node, config: Config) -> None:
 def make_world(
     robot: Robot,
     config: Config,
-    motors: Callable[[Robot, Mapping[str, float], BodyRealism], Motors] = services_motors,
+    motors: Callable[[Robot, Mapping[str, float], BodyRealism], Motors] = message_motors,
 ) -> World:
     """The scene with the robot in it."""
     return World(
