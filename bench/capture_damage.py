@@ -46,8 +46,8 @@ def damage(folder: Path, times: int) -> None:
         commands = [
             ["capture", "info", str(spoilt), "--check"],
             ["capture", "repair", str(spoilt), "--out", str(folder / f"{number}.mcap")],
-            ["capture", "rerun", str(spoilt), "--service", "perception"],
-            ["capture", "rerun", str(spoilt), "--service", "planning"],
+            ["capture", "reexecute", str(spoilt), "--service", "perception"],
+            ["capture", "reexecute", str(spoilt), "--service", "planning"],
             ["export", str(spoilt), "--csv", str(folder / "csv"), "--foxglove", str(folder / f"{number}-fox.mcap")],
             ["export", str(spoilt), "--video", str(folder / f"{number}.mp4")],
         ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 from math import cos, isnan, sin
 from pathlib import Path
@@ -21,7 +22,7 @@ from apps.experiments.settings import ExperimentSettings
 from apps.experiments.stats import summarise
 from apps.learning.study import BEST
 from apps.rehearsal.request import RehearsalRequest
-from cocoro.learning.dataset import HandRow, WheelRow, Writer, hand_header, wheel_header
+from cocoro.learning.dataset import HandRow, SampleFile, WheelRow, hand_header, wheel_header
 from cocoro.learning.nominal_model import LEVEL_ROLL_RAD, NominalModel
 from cocoro.robot import Robot
 
@@ -88,7 +89,7 @@ def test_what_cannot_be_run_fails_with_its_reason_and_so_does_what_needs_it(tmp_
 def arm_and_wheels(settings: ExperimentSettings, robot: Robot) -> None:
     seen = sightings(robot, draws=60)
     header = hand_header(robot, NominalModel(robot).joints, LEVEL_ROLL_RAD)
-    with Writer(settings.arm_file(0), HandRow, robot, header) as writer:
+    with SampleFile(settings.arm_file(0), HandRow, robot, header) as writer:
         writer.append(
             HandRow(
                 stamp_ns=number * 10**8, draw=int(draw), angles_rad=tuple(angles), head_rad=(0.0, 0.0),
@@ -98,7 +99,7 @@ def arm_and_wheels(settings: ExperimentSettings, robot: Robot) -> None:
                 zip(seen.angles_rad.tolist(), seen.places_m.tolist(), seen.draws, strict=True)
             )
         )  # fmt: skip
-    with Writer(settings.wheels_file(0), WheelRow, robot, wheel_header(robot, 0.06)) as writer:
+    with SampleFile(settings.wheels_file(0), WheelRow, robot, wheel_header(robot, 0.06)) as writer:
         writer.append(
             WheelRow(
                 stamp_ns=number, trial=number, left_mps=-0.1, right_mps=0.1, left_m=-0.03 * way, right_m=0.03 * way,
@@ -219,17 +220,34 @@ def test_an_unknown_experiment_is_refused_with_those_there_are(capsys: pytest.Ca
 
 def test_a_wrong_body_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["experiment", "E1", "--body", "bent"]) == 2
-    assert "nominal or worn" in capsys.readouterr().err
+    assert "nominal and worn" in capsys.readouterr().err
 
 
-def test_progress_tells_what_runs_and_what_could_not_be(capsys: pytest.CaptureFixture[str]) -> None:
-    import sys
-
-    progress = RunProgress(sys.stdout)
+def test_progress_without_a_terminal_is_a_line_for_each_finished_run() -> None:
+    out = io.StringIO()
+    progress = RunProgress(out)
     progress.begin(4, 1)
     progress.started("learn-0")
     progress.ended("babble-arm-0", {"error": "it broke"})
-    assert "2 of 4" in progress.text()
-    assert "1 could not be" in progress.text()
-    assert "learn-0" in progress.text()
-    assert "babble-arm-0: it broke" in capsys.readouterr().out
+    progress.end()
+    assert out.getvalue().splitlines() == ["4 runs; 1 of them have a result already", "2 of 4 babble-arm-0: it broke"]
+    assert progress.text() == "1 failed; learn-0"
+
+
+def test_progress_on_a_terminal_is_a_bar_and_the_runs_in_work(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TERM", "xterm")
+    out = Terminal()
+    progress = RunProgress(out)
+    progress.begin(4, 1)
+    progress.started("learn-0")
+    progress.ended("babble-arm-0", {"outcome": "done"})
+    progress.end()
+    shown = out.getvalue()
+    assert "2/4" in shown
+    assert "learn-0" in shown
+    assert "babble-arm-0" not in shown  # a run that succeeded is counted, not listed
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True

@@ -27,7 +27,7 @@ from cocoro.component import load
 from cocoro.errors import ConfigError
 from cocoro.messages import ServoState
 from cocoro.node import Node
-from cocoro.objects import Catalogue, KnownObject, LabBox, own_text
+from cocoro.objects import Catalogue, LabBox, ObjectSpec, own_text
 from cocoro.picture import colour_of
 from cocoro.robot import Robot
 from cocoro.topics import ARM_STATE, FRAME
@@ -142,7 +142,7 @@ def test_what_is_known_is_only_replaced_or_added_to_when_that_is_said(
         (["cup", "--from", "photo.png", "--box", "1,2,3"], "LEFT,TOP,RIGHT,BOTTOM"),
         (["cup", "--from", "photo.png", "--at", "1,2", "--box", "1,2,3,4"], "say one of them"),
         (["cup", "--from", "photo.png", "--shape", "cone"], "cylinder, sphere or box"),
-        (["cup", "--from", "photo.png", "--picture", "cup.jpg"], "let its name end with .png"),
+        (["cup", "--from", "photo.png", "--picture", "cup.jpg"], "name must end with .png"),
         (["cup", "--from", "photo.png", "--size", "0.1", "--catalogue", "words.png"], "words.png"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
@@ -248,7 +248,7 @@ def test_what_was_learnt_from_one_look_is_fetched(here: Path) -> None:
 
 # --- the file -------------------------------------------------------------------------------------
 
-CUP = KnownObject(
+CUP = ObjectSpec(
     label="cup", shape="cylinder", radius_m=0.031, height_m=0.1, mass_kg=0.15, graspable=True, rgb=(0.1, 0.6, 0.5),
     lab=(LabBox((10, -30, -5), (60, -10, 5)),), lab_by_shape=(LabBox((5, -12, -5.5), (10, -4, 5)),),
 )  # fmt: skip
@@ -256,7 +256,7 @@ BOX = msgspec.structs.replace(CUP, shape="box", radius_m=None, height_m=None, bo
 
 
 @pytest.mark.parametrize("known", [CUP, BOX, *Catalogue.load()], ids=lambda known: f"{known.label} {known.shape}")
-def test_an_objects_table_says_what_the_object_is(known: KnownObject) -> None:
+def test_an_objects_table_says_what_the_object_is(known: ObjectSpec) -> None:
     assert tuple(Catalogue.from_text(as_toml(known), "test")) == (known,)
 
 

@@ -15,13 +15,13 @@ from cocoro.arrays import FloatArray
 from cocoro.clock import NS
 from cocoro.learning.model import Training, arm_model, empty, encode
 from cocoro.learning.nominal_model import NominalModel
-from cocoro.learning.reachability import ReachMesh
 from cocoro.robot import Robot
 from services.planning.behaviours.base import Actuators
 from services.planning.config import Config
 from services.planning.learned import Learned
 from services.planning.reach import ARM, LEVEL_ROLL_RAD
-from services.planning.state_estimator import Sighting
+from services.planning.reachability import ReachMesh
+from services.planning.state_estimator import PostureSighting
 from services.planning.teaching import LUMP, Teacher
 
 QUICK = {"width": 160, "height": 120, "frame_rate_hz": 15.0}
@@ -53,10 +53,10 @@ def test_the_robot_stops_at_the_distance_that_was_asked() -> None:
     assert result["truth"]["knocked_over"] == ()
 
 
-def sighting(number: int, angles: np.ndarray, place: np.ndarray, roll_rad: float = LEVEL_ROLL_RAD) -> Sighting:
+def sighting(number: int, angles: np.ndarray, place: np.ndarray, roll_rad: float = LEVEL_ROLL_RAD) -> PostureSighting:
     posture = dict(zip(ARM, angles.tolist(), strict=True), wrist_roll=roll_rad)
     x, y, z = place.tolist()
-    return Sighting("hand_marker", number * NS // 10, (x, y, z), 300, posture)
+    return PostureSighting("hand_marker", number * NS // 10, (x, y, z), 300, posture)
 
 
 def test_sightings_at_work_teach_a_copy_of_the_map_and_the_mesh(robot: Robot) -> None:

@@ -51,21 +51,43 @@ COMMANDS = (
     CommandRow("capture", CAPTURES, "Look at capture files, repair them, re-execute services on them."),
     CommandRow("record", CAPTURES, "Record what travels on the mesh into MCAP files, until Ctrl-C."),
     CommandRow("replay", CAPTURES, "Send a capture into the mesh again."),
-    CommandRow("export", CAPTURES, "Turn a capture into a film, tables, or a file for Foxglove or Rerun; or extract its attachments."),
+    CommandRow(
+        "export",
+        CAPTURES,
+        "Turn a capture into a film, tables, or a file for Foxglove or Rerun; or extract its attachments.",
+    ),
     CommandRow("view", CAPTURES, "Open Rerun on a capture, or live on the mesh."),
-    CommandRow("top", TOOLS, "What runs and what travels, live: cpu, memory, rates against nominal, ages, what was skipped, lost, rejected."),
-    CommandRow("echo", TOOLS, "What travels on a key, decoded, of whatever type it is; what a reader would reject is marked with its reason."),
+    CommandRow(
+        "top",
+        TOOLS,
+        "What runs and what travels, live: cpu, memory, rates against nominal, ages, what was skipped, lost, rejected.",
+    ),
+    CommandRow(
+        "echo",
+        TOOLS,
+        "What travels on a key, decoded, of whatever type it is; what a reader would reject is marked with its reason.",
+    ),
     CommandRow("hz", TOOLS, "Rate, jitter and amount of data on a key, as it arrives here, over the last seconds."),
     CommandRow("logs", TOOLS, "What the robot's processes on this machine wrote since their start, merged by time."),
     CommandRow("new", TOOLS, "Write a component from a template: `cocoro new service NAME`."),
-    CommandRow("base", HARDWARE, "Show the base: mode, battery, bumpers, odometry; `recover` puts it back into its mode."),
+    CommandRow(
+        "base", HARDWARE, "Show the base: mode, battery, bumpers, odometry; `recover` puts it back into its mode."
+    ),
     CommandRow("servos", HARDWARE, "Find, set up, calibrate, hold and relax the servos; clear their faults."),
     CommandRow("kinect", HARDWARE, "Calibrate the Kinect; tilt it."),
-    CommandRow("doctor", HARDWARE, "Look over a machine and its robot before a run; each line is well, or says what to do."),
+    CommandRow(
+        "doctor", HARDWARE, "Look over a machine and its robot before a run; each line is well, or says what to do."
+    ),
     CommandRow("babble", LEARNING, "Move to learn: the arm before the eyes, the wheels before a target."),
     CommandRow("learn", LEARNING, "Learn from what babbling saw: a model that the planner loads."),
-    CommandRow("experiment", LEARNING, "Run the paper's experiments in virtual time and report them beside the paper's text and baselines."),
-    CommandRow("up", RUNNING, "Start a robot's processes and stay until Ctrl-C (or, with --detach, until they are ready)."),
+    CommandRow(
+        "experiment",
+        LEARNING,
+        "Run the paper's experiments in virtual time and report them beside the paper's text and baselines.",
+    ),
+    CommandRow(
+        "up", RUNNING, "Start a robot's processes and stay until Ctrl-C (or, with --detach, until they are ready)."
+    ),
     CommandRow("down", RUNNING, "Stop a robot's processes."),
     CommandRow("run", RUNNING, "Run one process in this terminal, on the mesh of the profile."),
     CommandRow("estop", SAFETY, "Emergency stop, now: everything that moves stands still until `reset`."),
@@ -297,5 +319,3 @@ def topics(
     from apps.cli import topics as listing
 
     print(listing.markdown() if markdown else listing.as_json() if json else listing.table(), end="")
-
-

@@ -13,7 +13,7 @@ from apps.cli.options import RobotChoice
 from apps.cli.output import going_on
 from apps.cli.progress import TaskDisplay, view
 from apps.cli.tasks import Follower
-from apps.learning.collector import TOPICS, Collector, collector
+from apps.learning.collector import TOPICS, SampleCollector, collector
 from cocoro.errors import CocoroError, MeshError
 from cocoro.messages import AboutRequest, Message, ObjectsRequest, TaskName, TaskRequest, TaskState
 from cocoro.robot import Robot
@@ -26,7 +26,7 @@ BAR = 20
 class BabbleDisplay:
     """Shows the samples beside what the task says: a bar, the coverage, and the time that is left at this rate."""
 
-    def __init__(self, view: TaskDisplay, kept: Collector[Any], wanted: int) -> None:
+    def __init__(self, view: TaskDisplay, kept: SampleCollector[Any], wanted: int) -> None:
         self._view = view
         self._kept = kept
         self._wanted = wanted
@@ -54,7 +54,7 @@ class BabbleDisplay:
 class SampleWriter:
     """Keeps what is reported. When the file takes no more, it cancels: the robot need not move for nothing."""
 
-    def __init__(self, kept: Collector[Any], cancel: Callable[[], None]) -> None:
+    def __init__(self, kept: SampleCollector[Any], cancel: Callable[[], None]) -> None:
         self.failure: OSError | None = None
         self._kept = kept
         self._cancel = cancel

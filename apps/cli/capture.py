@@ -14,7 +14,7 @@ from typing import Annotated, Any
 import msgspec
 import typer
 
-from apps.captures.info import AttachmentReport, Report, report
+from apps.captures.info import AttachmentReport, CaptureReport, report
 from apps.captures.rewrite import REPAIRED, rewrite
 from apps.cli import exits
 from apps.cli.options import CaptureArgument, FromOption, JsonOption, OnlyOption, ToOption, WithoutOption
@@ -24,8 +24,8 @@ from cocoro.capture.reader import Capture
 from cocoro.clock import NS
 from cocoro.errors import ConfigError
 from services.capture.file import COMPRESSIONS, Compression, Packer
-from services.capture.keys import Choice
-from services.capture.log_clock import WALL_CLOCK, Step, words
+from services.capture.keys import KeyFilter
+from services.capture.log_clock import WALL_CLOCK, WallClockStep, describe_step
 
 MB = 1e6
 
@@ -57,7 +57,7 @@ def show_info(file: Path, check: bool, as_json: bool) -> int:
     return exits.FAILED if found.problems else exits.DONE
 
 
-def text(found: Report) -> str:
+def text(found: CaptureReport) -> str:
     several = Counter(key.key for key in found.keys)
     names = {key.channel: key.key if several[key.key] == 1 else f"{key.key}#{key.channel}" for key in found.keys}
     rows = [
@@ -88,7 +88,7 @@ def _attachment(found: AttachmentReport) -> str:
     return f"{found.name}{media}, {found.size_bytes} bytes"
 
 
-def _head(found: Report) -> list[str]:
+def _head(found: CaptureReport) -> list[str]:
     run = found.metadata.get("run", {})
     unix = run.get("log_clock", "unix") == "unix"
     start = datetime.fromtimestamp(found.start_ns / NS, UTC).isoformat(timespec="milliseconds") if unix else "0"
@@ -114,21 +114,21 @@ def _head(found: Report) -> list[str]:
     return [f"{name:<9} {value}" for name, value in lines if value]
 
 
-def _clock_steps(found: Report) -> list[str]:
+def _clock_steps(found: CaptureReport) -> list[str]:
     """The steps of the wall clock while the capture was recorded, in words; times from the capture's start."""
     try:
-        steps = msgspec.convert(found.metadata.get(WALL_CLOCK, {}).get("steps", ()), tuple[Step, ...])
+        steps = msgspec.convert(found.metadata.get(WALL_CLOCK, {}).get("steps", ()), tuple[WallClockStep, ...])
     except msgspec.ValidationError:  # another program's metadata of this name
         return []
     found_steps = []
     for step in steps:
         at_s = (step.log_ns - found.start_ns) / NS
         when = f"at {at_s:.3f} s" if at_s >= 0 else f"{-at_s:.3f} s before this file began"
-        found_steps.append(f"{words(step)} {when}")
+        found_steps.append(f"{describe_step(step)} {when}")
     return found_steps
 
 
-def _state(found: Report) -> str:
+def _state(found: CaptureReport) -> str:
     if found.problems:
         return "damaged; the readable part is below"
     if not found.closed:
@@ -144,7 +144,7 @@ def _repaired(repaired: Mapping[str, Any]) -> list[str]:
     return [ending, *map(str, repaired.get("problems") or ())]
 
 
-def _files(found: Report) -> list[str]:
+def _files(found: CaptureReport) -> list[str]:
     """The files that services were configured with, and their fingerprints."""
     return [
         f"{name.partition('/')[2]} {file['field']} {file['path']} (sha256 {file['sha256'][:12]})"
@@ -191,13 +191,13 @@ def repair_file(
     """
     packer = Packer(_compression(compression), level)
     with Capture.open(file) as capture:
-        choice = Choice(capture.robot, only, without)
+        key_filter = KeyFilter(capture.robot, only, without)
         check_span(capture, start_s, end_s)
         done = rewrite(
             capture,
             out or file.with_suffix(".repaired.mcap"),
             packer,
-            keep=(lambda record: record.key in choice) if only or without else None,
+            keep=(lambda record: record.key in key_filter) if only or without else None,
             start_ns=_at(capture, start_s),
             end_ns=_at(capture, end_s),
         )
@@ -224,7 +224,7 @@ def _compression(text: str) -> Compression:
 
 
 def check_span(capture: Capture, start_s: float | None, end_s: float | None) -> None:
-    """Checks `--from` and `--to`, both in seconds from the capture's start. Raises ConfigError for an impossible one."""
+    """Checks `--from` and `--to`, in seconds from the capture's start. Raises ConfigError for an impossible one."""
     length_s = (capture.end_ns - capture.start_ns) / NS
     for option, given_s in (("--from", start_s), ("--to", end_s)):
         if given_s is not None and not (isfinite(given_s) and given_s >= 0):
@@ -243,8 +243,9 @@ def check_span(capture: Capture, start_s: float | None, end_s: float | None) -> 
 # --- re-execute -----------------------------------------------------------------------------------
 
 
+@capture.command("rerun", hidden=True)
 @capture.command()
-def rerun(
+def reexecute(
     files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="The captures of one run, in order.")],
     service: Annotated[str, typer.Option("--service", help="perception, planning, or another with a pure core.")],
     against: Annotated[
@@ -272,14 +273,16 @@ def reexecute_service(files: list[Path], service: str, against: str, tolerance: 
     with ExitStack() as stack:
         captures = [stack.enter_context(Capture.open(file)) for file in files]
         if len({capture.robot for capture in captures}) > 1:
-            raise CaptureError(f"these captures are of several robots ({', '.join(sorted({c.robot for c in captures}))}); give those of one run")
-        result = reexecution.rerun(captures, service, tolerance, compare=against == "recorded")
+            raise CaptureError(
+                f"captures of several robots ({', '.join(sorted({c.robot for c in captures}))}): give those of one run"
+            )
+        result = reexecution.reexecute(captures, service, tolerance, compare=against == "recorded")
     for capture in captures:
         if capture.ending:
             print(f"note: {capture.path} was {capture.ending}", file=sys.stderr)
     if as_json:
         print(msgspec.json.encode(result).decode())
     else:
-        print("\n".join(reexecution.words(result)))
+        print("\n".join(reexecution.describe_result(result)))
     bad = result.differing or result.problems or (against == "recorded" and not result.equal)
     return exits.FAILED if bad else exits.DONE

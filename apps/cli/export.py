@@ -28,7 +28,7 @@ from cocoro.robot import Robot
 from cocoro.topics import TOPICS, Topic
 
 if TYPE_CHECKING:
-    from apps.captures.export.rerun_scene import Teller
+    from apps.captures.export.rerun_scene import RerunScene
 
 PER_SERVICE = "{service}"
 DEPTH = 4
@@ -153,13 +153,13 @@ def view(
 
 def view_file(file: Path) -> int:
     """Opens Rerun on a capture. Raises CaptureError when Rerun is not installed, or the file cannot be read."""
-    from apps.captures.export.rerun_scene import library, no_viewer, opened, tell
+    from apps.captures.export.rerun_scene import library, log_capture, no_viewer, opened
 
     rerun = library()
     with Capture.open(file) as capture:
         recording = opened(rerun)
         with no_viewer():
-            count = tell(capture, recording)
+            count = log_capture(capture, recording)
             recording.flush()
         print(f"{count} messages are in Rerun")
         return exits.FAILED if capture.problems else exits.DONE
@@ -170,7 +170,7 @@ async def view_mesh(choice: RobotChoice) -> int:
 
     Raises CaptureError when Rerun is not installed, MeshError when there is no mesh.
     """
-    from apps.captures.export.rerun_scene import Teller, library, opened
+    from apps.captures.export.rerun_scene import RerunScene, library, opened
 
     rerun = library()
     async with joined(choice, frames=True) as link:
@@ -179,19 +179,19 @@ async def view_mesh(choice: RobotChoice) -> int:
             Path(file) if (file := resolved.get(name)) else None for name in ("description", "measured")
         )
         recording = opened(rerun)
-        watch(link.bus, link.robot, Teller(recording, Robot.load(description, measured), Catalogue.load()))
+        watch(link.bus, link.robot, RerunScene(recording, Robot.load(description, measured), Catalogue.load()))
         print("Ctrl-C ends it")
         with told_to_end() as end:
             await end.wait()
     return exits.DONE
 
 
-def watch(bus: Bus, robot: str, teller: Teller) -> None:
+def watch(bus: Bus, robot: str, scene: RerunScene) -> None:
     """Sends every message that arrives from now on to the viewer, however old it is: a viewer controls nothing."""
 
     def receive(topic: Topic[Any], decoder: msgspec.msgpack.Decoder[Message], _key: str, payload: Payload) -> None:
         with suppress(msgspec.MsgspecError, ValueError, RecursionError):
-            teller.tell(topic.name, decoder.decode(payload))
+            scene.log(topic.name, decoder.decode(payload))
 
     for topic in TOPICS:
         if PER_SERVICE not in topic.name:

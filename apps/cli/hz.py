@@ -175,7 +175,10 @@ async def show_rates(choice: RobotChoice, text: str, window_s: float, once: bool
                     if once:
                         break
         if ear.dropped:
-            print(f"cocoro: {ear.dropped} messages came faster than this command could count, so they are not in the figures", file=sys.stderr)
+            print(
+                f"cocoro: {ear.dropped} messages came faster than this command could count, and are not in the figures",
+                file=sys.stderr,
+            )
         if end.is_set() and not once:
             return exits.DONE
     return exits.DONE if meters else exits.FAILED

@@ -23,7 +23,7 @@ from apps.cli.options import (
 
 if TYPE_CHECKING:
     from cocoro import robot as robots
-    from cocoro.learning.model import Model
+    from cocoro.learning.model import BodyModel
     from cocoro.messages import TaskName
 
 app = typer.Typer()
@@ -118,7 +118,7 @@ def _robot(description: Path | None, measured: Path | None) -> robots.Robot:
     return Robot.load(description, measured)
 
 
-def _send(wanted: bool, made: Model, robot: str | None, profile: str | None, as_json: bool) -> None:
+def _send(wanted: bool, made: BodyModel, robot: str | None, profile: str | None, as_json: bool) -> None:
     if wanted:
         from apps.cli import learn as learning
 

@@ -26,7 +26,7 @@ from cocoro.node import Node
 from cocoro.robot import Robot
 from cocoro.topics import RECORDING
 from deploy import processes, robot_time
-from services.capture.writer import told
+from services.capture.writer import describe_disturbance
 
 RECORDER = "capture"
 """The process whose component records."""
@@ -115,7 +115,7 @@ class _RecordingDisplay:
         if not recording.ended:
             self._files.add(recording.file)
             for file in new:
-                self._line.print(f"cocoro: {told(file)}", sys.stderr)
+                self._line.print(f"cocoro: {describe_disturbance(file)}", sys.stderr)
         if recording.ended:
             self.ended.set()
         elif recording.fault:
@@ -135,7 +135,7 @@ class _RecordingDisplay:
         others += sum(file.became == "moved" and file.now != newest.file for file in newest.disturbed)
         print(_recording_line(newest, others))
         for file in newest.disturbed:
-            print(f"cocoro: {told(file)}", file=sys.stderr)
+            print(f"cocoro: {describe_disturbance(file)}", file=sys.stderr)
         if newest.fault:
             print(f"cocoro: {newest.fault}", file=sys.stderr)
         return exits.FAILED if newest.fault or newest.removed else exits.DONE

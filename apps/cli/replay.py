@@ -71,7 +71,9 @@ async def replay_file(file: Path, only: list[str], hardware: bool, options: dict
         raise ConfigError("--paused waits for a key, so it needs a terminal")
     with Capture.open(file) as capture:
         if not capture.robot:
-            raise CaptureError(f"{file}: it names no robot, so `cocoro record` has not made it; only captures of a robot can be replayed")
+            raise CaptureError(
+                f"{file}: it names no robot, so it cannot be replayed; `cocoro record` makes captures that can"
+            )
         check_span(capture, options["start_s"], options["end_s"])
         keys = played_keys(capture, only, hardware)
         player = Player(capture, keys.__contains__, **options)

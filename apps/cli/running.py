@@ -121,7 +121,9 @@ def overrides(
         sim["body"] = body
     if frames is not None:
         sim.update(frames_of(frames))
-    found = [f"service.sim.{name}={json.dumps(value)}" for name, value in sim.items()]  # these JSON values are TOML values, too
+    found = [
+        f"service.sim.{name}={json.dumps(value)}" for name, value in sim.items()
+    ]  # these JSON values are TOML values, too
     found += [f"service.{name}.latency_s={seconds}" for name, seconds in latencies_of(latency).items()]
     return found + settings
 
@@ -272,7 +274,9 @@ def run_process(process: str, profile: str | None, settings: list[str]) -> int:
     """Runs one process in the foreground; returns its exit code. Raises ConfigError when the profile is not clear."""
     if profile is None and not settings and (up_here := robots()):
         if len(up_here) > 1:
-            raise ConfigError(f"several robots are up ({', '.join(r.robot for r in up_here)}): choose one with --profile")
+            raise ConfigError(
+                f"several robots are up ({', '.join(r.robot for r in up_here)}): choose one with --profile"
+            )
         data = up_here[0].resolved()
         read = profiles.from_data(data, data.get("name", "")) if data else profiles.read("sim")
     else:

@@ -18,7 +18,6 @@ from cocoro.errors import MeshError
 from cocoro.messages import EstopReply, EstopRequest
 from cocoro.topics import ESTOP, STOPPABLE
 
-
 app = typer.Typer()
 CONTEXT = {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}
 

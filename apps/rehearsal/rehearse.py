@@ -14,7 +14,7 @@ from typing import Any
 
 import msgspec
 
-from apps.learning.collector import TOPICS, Collector, collector
+from apps.learning.collector import TOPICS, SampleCollector, collector
 from apps.rehearsal.request import RehearsalRequest
 from cocoro import topics
 from cocoro.bus.local import LocalMesh
@@ -125,7 +125,7 @@ class _Rehearsal:
         self._frame: Frame | None = None
         self._seen: Detections | None = None
         self._recording: Recording | None = None
-        self._collector: Collector[Any] | None = None
+        self._collector: SampleCollector[Any] | None = None
 
     async def run(self) -> dict[str, Any]:
         request = self._request

@@ -13,7 +13,7 @@ from cocoro.core import Output, Sample, Schedule, Take
 from cocoro.messages import BaseCommand, Intent, LearnedModel, PlannerStatus, ServoCommand
 from cocoro.robot import Robot
 from cocoro.topics import Topic
-from services.planning.arm import Step
+from services.planning.arm import ArmStep
 from services.planning.behaviours import BEHAVIOURS, Actuators, Behaviour, Idle, Plan, Snapshot
 from services.planning.config import Config
 from services.planning.head import PAN, TILT
@@ -231,7 +231,7 @@ class PlanningCore:
 
     def _commands(self, plan: Plan, snapshot: Snapshot) -> list[Output]:
         base: BaseCommand = plan.base
-        step: Step = plan.arm
+        step: ArmStep = plan.arm
         if plan.head is not None:
             self._head_goal = plan.head[:2]
         if self._head_goal is None:

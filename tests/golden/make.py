@@ -9,14 +9,14 @@ from __future__ import annotations
 import tempfile
 from pathlib import Path
 
-from apps.captures.reexecute import rerun, words
+from apps.captures.reexecute import describe_result, reexecute
 from apps.captures.rewrite import rewrite
 from apps.rehearsal.rehearse import rehearse
 from apps.rehearsal.request import RehearsalRequest
 from cocoro.capture.reader import Capture
 from cocoro.clock import NS
 from services.capture.file import Packer
-from services.capture.keys import Choice
+from services.capture.keys import KeyFilter
 
 GOLDEN = Path(__file__).with_name("fetch.mcap")
 LENGTH_S = 6.0
@@ -33,7 +33,7 @@ def main() -> None:
         )
         GOLDEN.unlink(missing_ok=True)
         with Capture.open(whole) as capture:
-            choice = Choice(capture.robot, without=["sim/truth"])
+            choice = KeyFilter(capture.robot, without=["sim/truth"])
             done = rewrite(
                 capture,
                 GOLDEN,
@@ -45,7 +45,7 @@ def main() -> None:
     assert done.size_bytes < LARGEST_BYTES
     for service in ("perception", "planning"):
         with Capture.open(GOLDEN) as capture:
-            print("\n".join(words(rerun([capture], service))))
+            print("\n".join(describe_result(reexecute([capture], service))))
 
 
 if __name__ == "__main__":
