@@ -25,7 +25,7 @@ from cocoro.bus.zenoh import ZenohBus
 from cocoro.capture.conventions import CaptureError
 from cocoro.capture.reader import Capture
 from cocoro.errors import ConfigError, RefusedError
-from cocoro.topics import HARDWARE
+from deploy import processes
 from deploy.rundir import RunDir
 
 SHOW_S = 0.1
@@ -77,7 +77,7 @@ async def replay_file(file: Path, only: list[str], hardware: bool, options: dict
         check_span(capture, options["start_s"], options["end_s"])
         keys = played_keys(capture, only, hardware)
         player = Player(capture, keys.__contains__, **options)
-        services = services_of(keys) | (set(HARDWARE) if hardware else set())
+        services = services_of(keys) | (set(processes.hardware()) if hardware else set())
         run_dir = RunDir(capture.robot)
         run_dir.make()
         claims = run_dir.claim("replay", services)
@@ -102,7 +102,7 @@ async def _play(bus: ZenohBus, capture: Capture, player: Player, hardware: bool,
 
     def on_alive(key: str, alive: bool) -> None:
         service = key.split("/")[1]
-        if alive and service in ({SIMULATOR} if hardware else services | {*HARDWARE, SIMULATOR}):
+        if alive and service in ({SIMULATOR} if hardware else services | {*processes.hardware(), SIMULATOR}):
             intruder.append(service)
             end.set()
 

@@ -16,7 +16,8 @@ from apps.cli.link import Answer, joined
 from apps.cli.options import MeshOption, RobotChoice, RobotOption
 from cocoro.errors import MeshError
 from cocoro.messages import EstopReply, EstopRequest
-from cocoro.topics import ESTOP, STOPPABLE
+from cocoro.topics import ESTOP
+from deploy.processes import stoppable
 
 app = typer.Typer()
 CONTEXT = {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}
@@ -48,7 +49,7 @@ async def release(choice: RobotChoice) -> int:
     question = EstopRequest(latched=False, by="operator")
     async with joined(choice) as link:
         alive = await link.alive()
-        moving = {service for service in STOPPABLE if service in alive}
+        moving = {service for service in stoppable() if service in alive}
         if not moving:
             raise MeshError(f"no service that moves something is alive on {link.robot}: see `cocoro status`")
         if "executive" in alive and _refused({"executive"}, await link.call_all(ESTOP.of("executive"), question)):

@@ -29,7 +29,7 @@ from deploy import profiles
 from deploy.processes import named
 from deploy.profiles import Profile
 from services.servos import tools
-from services.servos.bus import Bus
+from services.servos.bus import ServoBus
 
 NETWORKS = ("arm", "hand")
 DONE_WORDS = {"clear": "cleared", "relax": "limp", "hold": "holding"}
@@ -161,9 +161,11 @@ class ServoWorkbench:
         return self.robot.joints[name]
 
     @contextmanager
-    def line(self, joint: Joint, port: str | None, baud: int | None) -> Iterator[Bus]:
+    def line(self, joint: Joint, port: str | None, baud: int | None) -> Iterator[ServoBus]:
         """Opens the serial line that the joint's servo is on."""
-        with Bus(port or self.ports[joint.network], baud or self.robot.networks[joint.network].baud, REPLY_S) as line:
+        with ServoBus(
+            port or self.ports[joint.network], baud or self.robot.networks[joint.network].baud, REPLY_S
+        ) as line:
             yield line
 
     def write(self, joint: Joint, values: dict[str, Any]) -> None:
@@ -256,7 +258,7 @@ def set_id(
     baud: Annotated[int, typer.Option(metavar="RATE", help="The servo's baud rate.")] = 1_000_000,
 ) -> None:
     """Give a servo another ID, and set its return delay to 0. Best with no other servo on the line."""
-    with Bus(port, baud, REPLY_S) as line:
+    with ServoBus(port, baud, REPLY_S) as line:
         tools.set_number(line, old, new)
     print(f"the servo on {port} has ID {new} and return delay 0")
 
