@@ -21,7 +21,7 @@ from cocoro.messages import Frame, ServoState
 from cocoro.objects import Catalogue
 from cocoro.robot import Robot
 from cocoro.topics import ARM_STATE, FRAME
-from services.perception.config import Config
+from services.perception.config import PerceptionConfig
 from services.perception.core import PerceptionCore
 from sim.camera import SimKinect
 from sim.render import make_renderer
@@ -80,7 +80,7 @@ def step_ms(core: PerceptionCore, frame: Frame) -> tuple[float, int]:
 def measure(size: tuple[int, int], count: int) -> dict[str, object]:
     robot, catalogue = Robot.load(), Catalogue.load()
     shown = frames(robot, catalogue, size, count + 3)
-    configs = {name: Config(detector=name, floor_rate_hz=1e-3) for name in ("blob", "paper")}  # objects alone
+    configs = {name: PerceptionConfig(detector=name, floor_rate_hz=1e-3) for name in ("blob", "paper")}  # objects alone
     cores = {name: PerceptionCore(robot, config, catalogue) for name, config in configs.items()}
     times: dict[str, list[float]] = {name: [] for name in cores}
     placed: dict[str, int] = dict.fromkeys(cores, 0)

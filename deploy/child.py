@@ -12,7 +12,7 @@ from contextlib import suppress
 from typing import IO
 
 from cocoro import child
-from cocoro.component import Process
+from cocoro.component import Component
 from cocoro.errors import ConfigError
 from cocoro.vigil import RECOVERY_S, Vigil
 from deploy.launch import CRASHED, MISCONFIGURED, REFUSED
@@ -43,7 +43,7 @@ class Child:
     """`start`, then `keep` for ever, then `stop`. `tell` gets what people should know, a line at a time."""
 
     def __init__(
-        self, row: Process, run_dir: RunDir, parent_fd: int, tell: Callable[[str], None], vigil: Vigil
+        self, row: Component, run_dir: RunDir, parent_fd: int, tell: Callable[[str], None], vigil: Vigil
     ) -> None:
         """`vigil` knows whether this process was itself asleep."""
         self.row = row

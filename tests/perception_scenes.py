@@ -12,7 +12,7 @@ from cocoro.messages import Detection, Detections, Frame, ServoState
 from cocoro.objects import Catalogue
 from cocoro.robot import Robot
 from cocoro.topics import ARM_STATE, FRAME
-from services.perception.config import Config
+from services.perception.config import PerceptionConfig
 from services.perception.core import PerceptionCore
 from sim.camera import SimKinect
 from sim.realism import Sensors
@@ -133,7 +133,7 @@ class Scene:
 
 
 def perception(**config: object) -> PerceptionCore:
-    return PerceptionCore(ROBOT, Config(**config), CATALOGUE)  # type: ignore[arg-type]
+    return PerceptionCore(ROBOT, PerceptionConfig(**config), CATALOGUE)  # type: ignore[arg-type]
 
 
 def head_at(stamp_ns: int, pan: float = 0.0, tilt: float = 0.0, incarnation: int = 0) -> Sample:

@@ -20,7 +20,7 @@ from cocoro import topics
 from cocoro.clock import RealClock
 from cocoro.messages import BaseCommand, BaseState, EstopRequest, Latch, RecoverRequest
 from cocoro.testing import ServiceUnderTest
-from services.base.service import BaseService, Config
+from services.base.service import BaseConfig, BaseService
 from sim.wire.line import LineFault
 
 pytestmark = pytest.mark.zenoh
@@ -276,7 +276,7 @@ def test_wheels_stop_when_the_service_itself_is_killed_or_stopped(bench: Bench, 
 
 def test_a_service_without_its_port_says_so_and_lives(tmp_path: Path) -> None:
     async def scenario() -> None:
-        config = Config(port=str(tmp_path / "nothing"))
+        config = BaseConfig(port=str(tmp_path / "nothing"))
         async with ServiceUnderTest("services.base.service", config, clock=RealClock()) as service:
             async for health in service.tester.stream(topics.HEALTH.of("base")):
                 if any("is the adapter plugged in?" in fault for fault in health.faults):

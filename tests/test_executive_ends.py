@@ -13,8 +13,8 @@ from cocoro.clock import NS
 from cocoro.contact import Contact
 from cocoro.messages import CancelRequest
 from cocoro.testing import JumpingClock, in_virtual_time
-from cocoro.topics import HARDWARE
 from cocoro.vigil import Vigil
+from deploy.processes import hardware
 from deploy.rundir import RunDir, hold
 from services.executive import executive
 
@@ -87,7 +87,7 @@ def test_whatever_ends_a_task_and_whenever_it_ends_once_and_another_can_follow(e
     scenario()
 
 
-@pytest.mark.parametrize("service", [*HARDWARE, "perception", "planning"])
+@pytest.mark.parametrize("service", [*hardware(), "perception", "planning"])
 def test_a_task_fails_when_a_service_that_it_needs_is_not_heard_any_more(service: str) -> None:
     @in_virtual_time
     async def scenario() -> None:

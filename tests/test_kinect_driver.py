@@ -19,7 +19,7 @@ from cocoro.clock import RealClock
 from cocoro.errors import ConfigError
 from services.kinect import grabber as grabbing
 from services.kinect.camera import FreenectCamera
-from services.kinect.config import Config
+from services.kinect.config import KinectConfig
 from services.kinect.freenect import (
     COLOUR_BYTES,
     DEPTH_BYTES,
@@ -306,7 +306,7 @@ def test_a_library_that_is_not_there_or_is_another_is_said_with_the_package_to_i
         load("libc.so.6")
 
     async def open_it() -> None:
-        FreenectCamera(Config(library="/nowhere/libfreenect.so.0.5"), RealClock(), print)
+        FreenectCamera(KinectConfig(library="/nowhere/libfreenect.so.0.5"), RealClock(), print)
 
     with pytest.raises(ConfigError, match=r"kinect: libfreenect .*sudo apt install libfreenect0\.5"):
         asyncio.run(open_it())
@@ -318,7 +318,7 @@ def test_a_process_that_ends_by_itself_is_told_and_started_again(tmp_path: Path)
     async def scenario() -> tuple[list[str], int]:
         faults: list[str] = []
         twice = asyncio.Event()
-        config = Config(library="libc.so.6", recording=str(tmp_path))
+        config = KinectConfig(library="libc.so.6", recording=str(tmp_path))
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr("services.kinect.camera.freenect.load", lambda _: None)
             patch.setattr("services.kinect.camera.AGAIN_S", 0.01)

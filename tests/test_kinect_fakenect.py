@@ -22,12 +22,12 @@ from cocoro.topics import ARM_STATE, FRAME
 from services.kinect import doctor, tools
 from services.kinect.calibration import Board
 from services.kinect.camera import FreenectCamera
-from services.kinect.config import Config
+from services.kinect.config import KinectConfig
 from services.kinect.device import RawFrame
 from services.kinect.service import to_message
-from services.perception.config import Config as PerceptionConfig
+from services.perception.config import PerceptionConfig
 from services.perception.core import PerceptionCore
-from sim.service import Config as SimConfig
+from sim.service import SimConfig
 from sim.wire.record import RATE_HZ, RecordingWriter, record
 
 pytestmark = pytest.mark.sim
@@ -104,7 +104,7 @@ def play(
                     if until(played):
                         enough.set()
 
-        config = Config(library=library, recording=str(recording))
+        config = KinectConfig(library=library, recording=str(recording))
         with closing(FreenectCamera(config, RealClock(), tell)) as camera:
             work = asyncio.create_task(take())
             began_s = loop.time()
@@ -209,7 +209,7 @@ def test_views_of_a_chessboard_are_taken_from_the_device_and_kept(library: str, 
         for number in range(40):
             writer.add(to_message(RawFrame(NS + number * NS // 30, *pictures[number // 20])))
     told: list[str] = []
-    config = Config(library=library, recording=str(tmp_path / "recording"))
+    config = KinectConfig(library=library, recording=str(tmp_path / "recording"))
     views = tools.capture(config, board, 2, tmp_path / "views", told.append)
     assert [text for text in told if text.startswith("view")] == ["view 1 of 2", "view 2 of 2"]
     assert {view.depth.tobytes() for view in views} == {depth.tobytes() for _, depth in pictures}
@@ -218,13 +218,13 @@ def test_views_of_a_chessboard_are_taken_from_the_device_and_kept(library: str, 
 
 def test_the_doctor_says_whether_pictures_come(library: str, recording: Path, tmp_path: Path) -> None:
     robot = Robot.load()
-    sends, lenses = doctor.check(Config(library=library, recording=str(recording)), robot, "calliope")
+    sends, lenses = doctor.check(KinectConfig(library=library, recording=str(recording)), robot, "calliope")
     assert (sends.state, sends.text[:30]) == ("ok", "sends pictures, 640 x 480, dep")
     assert (lenses.state, lenses.text) == ("note", "not measured: `cocoro kinect calibrate`")
-    nothing, _ = doctor.check(Config(library=library, recording=str(tmp_path)), robot, "calliope")
+    nothing, _ = doctor.check(KinectConfig(library=library, recording=str(tmp_path)), robot, "calliope")
     assert nothing.state == "bad"
     assert "is no recording" in nothing.text
-    missing, _ = doctor.check(Config(library="/nowhere/libfreenect.so"), robot, "calliope")
+    missing, _ = doctor.check(KinectConfig(library="/nowhere/libfreenect.so"), robot, "calliope")
     assert missing.text.endswith("sudo apt install libfreenect0.5")
 
 

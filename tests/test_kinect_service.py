@@ -16,9 +16,10 @@ from cocoro.node import Node
 from cocoro.robot import Robot
 from cocoro.vloop import run_virtual
 from services.kinect import camera
+from services.kinect.config import KinectConfig
 from services.kinect.device import OnFault, RawFrame
 from services.kinect.freenect import LED
-from services.kinect.service import Config, run
+from services.kinect.service import run
 
 
 class _Two:
@@ -47,7 +48,7 @@ class _Two:
 def test_every_pair_is_published_with_its_own_stamp_and_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
     cameras: list[_Two] = []
 
-    def open_two(config: Config, clock: Clock, on_fault: OnFault) -> _Two:
+    def open_two(config: KinectConfig, clock: Clock, on_fault: OnFault) -> _Two:
         cameras.append(_Two(clock))
         return cameras[-1]
 
@@ -60,7 +61,7 @@ def test_every_pair_is_published_with_its_own_stamp_and_pixels(monkeypatch: pyte
             Node("viewer", mesh.join(), clock, robot) as viewer,
         ):
             stream = viewer.stream(topics.FRAME)
-            work = kinect.spawn(run(kinect, Config(device="two")))
+            work = kinect.spawn(run(kinect, KinectConfig(device="two")))
             frames = [await stream.next(), await stream.next()]
             work.cancel()
             await asyncio.wait([work])
@@ -74,4 +75,4 @@ def test_every_pair_is_published_with_its_own_stamp_and_pixels(monkeypatch: pyte
 
 def test_a_driver_that_is_not_there_is_said_with_what_to_do() -> None:
     with pytest.raises(ConfigError, match=r"no driver 'nonesuch' \(known: .*freenect"):
-        camera.open_device(Config(device="nonesuch"), VirtualClock(), print)
+        camera.open_device(KinectConfig(device="nonesuch"), VirtualClock(), print)

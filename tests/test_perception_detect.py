@@ -6,7 +6,7 @@ import pytest
 from perception_scenes import CATALOGUE, ROBOT, Canvas, seen, the
 
 from cocoro.messages import Detections
-from services.perception.config import Config
+from services.perception.config import PerceptionConfig
 from services.perception.image import RgbdImage
 from services.perception.paper import PaperDetector
 
@@ -263,7 +263,7 @@ def test_no_frame_however_odd_is_an_error(size: tuple[int, int], detector: str) 
 
 
 def paper(canvas: Canvas) -> list[str]:
-    detector = PaperDetector(CATALOGUE, Config())
+    detector = PaperDetector(CATALOGUE, PerceptionConfig())
     return [sighting.label for sighting in detector.detect(RgbdImage.of(canvas.frame(), ROBOT))]
 
 

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from perception_scenes import CATALOGUE, MS, ROBOT, STAMP_NS, Scene, Thing, block, error_mm, facing, known, seen, the
 
-from services.perception.config import Config
+from services.perception.config import PerceptionConfig
 from services.perception.localise import Localiser
 from services.perception.shapes import distance_from, signed_distance
 from services.perception.sighting import ImageSighting
@@ -109,7 +109,7 @@ def test_what_seems_to_be_a_part_of_something_that_reaches_into_the_floor_is_no_
     area_px: int, is_told: bool
 ) -> None:
     """Of a can that the arm hides in part, what is left may be as round as a ball."""
-    localiser = Localiser(ROBOT, CATALOGUE, Config().occluded_share)
+    localiser = Localiser(ROBOT, CATALOGUE, PerceptionConfig().occluded_share)
     camera = ROBOT.camera
     head_rad = np.array([0.3, -0.6])
     into_floor = np.linalg.inv(localiser.camera_pose(head_rad)) @ [1.05, 0.35, -0.07, 1.0]

@@ -14,11 +14,11 @@ from apps.cli.main import main
 from cocoro.errors import RefusedError
 from cocoro.robot import SERVO_COUNT_RAD, Robot
 from services.base.doctor import check as check_base
-from services.base.service import Config as BaseConfig
+from services.base.service import BaseConfig
 from services.servos import tools
 from services.servos.bus import ServoBus
 from services.servos.doctor import check as check_servos
-from services.servos.service import Config as ServoConfig
+from services.servos.service import ServosConfig
 from sim.wire.create import EmulatedCreate
 from sim.wire.emulator import Emulator
 
@@ -157,7 +157,7 @@ def test_a_scan_names_what_is_missing_and_writes_ports_where_it_is_told(
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["calibrate", "elbo"], "there is no joint 'elbo'; there are neck_pan,"),
+        (["calibrate", "elbo"], "there is no joint 'elbo'; known are neck_pan,"),
         (["calibrate", "elbow", "--port", "/dev/nothing"], "/dev/nothing: there is no such port"),
         (["set-id", "5", "4", "--port", "PORT"], "there is a servo 4 on this line already"),
     ],
@@ -177,7 +177,7 @@ def test_mistakes_get_one_line(
 
 
 def test_the_doctor_looks_at_every_servo(bench: ServoBench) -> None:
-    config = ServoConfig(arm_port=bench.port("arm"), hand_port=bench.port("hand"), reply_s=REPLY_S)
+    config = ServosConfig(arm_port=bench.port("arm"), hand_port=bench.port("hand"), reply_s=REPLY_S)
     assert {check.state for check in check_servos(config, ROBOT, "robbie")} == {"ok"}
     bench.call(lambda: setattr(bench.servo(9), "mute", True))
     for number, registers in {5: {5: 250}, 4: {43: 75}, 3: {42: 70}}.items():

@@ -10,7 +10,7 @@ import pytest
 
 from cocoro.robot import SERVO_COUNT_RAD, Robot
 from sim.scene import Scene, load_scene
-from sim.service import Config
+from sim.service import SimConfig
 from sim.wire.firmware import Channel, LinkedPlant, MotorOrder, MotorOrders, PlantState, ServoSetup, Setup, firmware
 from sim.wire.service import WireMotors, setup_of
 from sim.world import World
@@ -96,7 +96,7 @@ def test_the_setup_tells_the_firmware_how_the_robot_stands(world: World, motors:
     assert elbow.get(36) == elbow.get(30) == motors.servos[ELBOW].count
     assert elbow.motor.on
     assert create.mode == 0
-    assert Config() is not None
+    assert SimConfig() is not None
 
 
 def test_firmware_and_physics_tell_each_other_the_newest_and_notice_the_end() -> None:

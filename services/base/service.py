@@ -10,6 +10,7 @@ import msgspec
 from msgspec import Meta
 
 from cocoro import topics
+from cocoro.component import Implementation
 from cocoro.faults import FaultReporter
 from cocoro.latch import LatchKeeper
 from cocoro.messages import BaseCommand, LatchState, RecoverReply, RecoverRequest
@@ -18,8 +19,6 @@ from cocoro.ports import port_path
 from services.base.driver import BaseDriver, GuardReport
 from services.base.guard_supervisor import GuardSupervisor
 
-__all__ = ["Config", "run"]
-
 BEAT_S = 0.02
 """How often the guard is asked anew; a tenth of the time after which it stops the wheels."""
 RECOVERY_S = 2.0
@@ -27,7 +26,7 @@ DEGRADED = {"up": "", "waking": "waking the Create", "fallen": "not obeying"}
 """What the service says of itself by the link to the Create; without any, 'no Create'."""
 
 
-class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class BaseConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     port: str = "/dev/cocoro-create"
     """The serial port: a device, or wire:NAME for an emulated one."""
     mode: Literal["safe", "full"] = "safe"
@@ -37,7 +36,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class BaseService:
-    def __init__(self, node: Node, config: Config) -> None:
+    def __init__(self, node: Node, config: BaseConfig) -> None:
         self._node = node
         self._reporter = FaultReporter(node)
         self._driver = BaseDriver(node.robot.base)
@@ -126,6 +125,9 @@ class BaseService:
         self._reporter.report(self._driver.faults(), degraded=DEGRADED.get(self._driver.link, "no Create"))
 
 
-async def run(node: Node, config: Config) -> None:
+async def run(node: Node, config: BaseConfig) -> None:
     """Serve for ever."""
     await BaseService(node, config).run()
+
+
+implementation = Implementation(BaseConfig, run)

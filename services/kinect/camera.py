@@ -21,7 +21,7 @@ from cocoro.child import ChildProcess, wait_or_kill
 from cocoro.clock import NS, Clock
 from cocoro.errors import ConfigError
 from services.kinect import freenect, grabber
-from services.kinect.config import Config
+from services.kinect.config import KinectConfig
 from services.kinect.device import DepthCamera, DriverFactory, OnFault, RawFrame
 from services.kinect.freenect import HEIGHT, LED, WIDTH, ImageKind
 
@@ -40,7 +40,7 @@ class FreenectCamera:
     """The Kinect v1 through libfreenect. Calls `on_fault(fault)` in the running event loop whenever the fault
     changes."""
 
-    def __init__(self, config: Config, clock: Clock, on_fault: OnFault) -> None:
+    def __init__(self, config: KinectConfig, clock: Clock, on_fault: OnFault) -> None:
         try:
             freenect.load(freenect.find(config.library, bool(config.recording)))
         except freenect.MissingLibraryError as error:
@@ -190,7 +190,7 @@ DRIVERS: Mapping[str, DriverFactory] = {"freenect": FreenectCamera}
 """Drivers by the name that `device` in the service's settings chooses."""
 
 
-def open_device(config: Config, clock: Clock, on_fault: OnFault) -> DepthCamera:
+def open_device(config: KinectConfig, clock: Clock, on_fault: OnFault) -> DepthCamera:
     """Open the configured device. Raises ConfigError when there is no such driver, or its library is missing."""
     if config.device not in DRIVERS:
         raise ConfigError(f"kinect: there is no driver {config.device!r} (known: {', '.join(DRIVERS)})")

@@ -7,7 +7,7 @@ from typing import NamedTuple, Protocol
 
 from cocoro.arrays import CodeArray, ImageArray
 from cocoro.clock import Clock
-from services.kinect.config import Config
+from services.kinect.config import KinectConfig
 from services.kinect.freenect import LED
 
 OnFault = Callable[[str], None]
@@ -39,5 +39,5 @@ class DepthCamera(Protocol):
     def close(self) -> None: ...
 
 
-DriverFactory = Callable[[Config, Clock, OnFault], DepthCamera]
+DriverFactory = Callable[[KinectConfig, Clock, OnFault], DepthCamera]
 """Opens a device. Raises ConfigError that names the package to install when the driver's library is missing."""

@@ -10,14 +10,14 @@ from cocoro.clock import RealClock
 from cocoro.errors import ConfigError
 from cocoro.robot import Robot
 from services.kinect.camera import open_device
-from services.kinect.config import Config
+from services.kinect.config import KinectConfig
 
 __all__ = ["check"]
 
 LOOK_S = 4.0
 
 
-def check(config: Config, robot: Robot, robot_name: str) -> list[Check]:
+def check(config: KinectConfig, robot: Robot, robot_name: str) -> list[Check]:
     """Whether pictures come of it."""
     checks = [asyncio.run(_look(config))]
     if robot.kinect.depth_lens is None:
@@ -27,7 +27,7 @@ def check(config: Config, robot: Robot, robot_name: str) -> list[Check]:
     return checks
 
 
-async def _look(config: Config) -> Check:
+async def _look(config: KinectConfig) -> Check:
     faults: list[str] = []
     try:
         camera = open_device(config, RealClock(), faults.append)

@@ -12,14 +12,12 @@ from cocoro.faults import FaultReporter
 from cocoro.messages import Frame
 from cocoro.node import Node
 from services.kinect.camera import open_device
-from services.kinect.config import Config
+from services.kinect.config import KinectConfig
 from services.kinect.device import RawFrame
 from services.kinect.lens import Straightener
 
-__all__ = ["Config", "run"]
 
-
-async def run(node: Node, config: Config) -> None:
+async def run(node: Node, config: KinectConfig) -> None:
     """Publish every frame for ever. Raises ConfigError when the driver or its library is missing."""
     straighten = Straightener(node.robot)
     reporter = FaultReporter(node)

@@ -21,7 +21,7 @@ from cocoro.picture import load as load_picture
 from cocoro.picture import save as save_picture
 from services.kinect.calibration import Board, BoardView, find_corners
 from services.kinect.camera import open_device
-from services.kinect.config import Config
+from services.kinect.config import KinectConfig
 from services.kinect.device import DepthCamera, RawFrame
 from services.kinect.lens import NO_DATA
 
@@ -85,14 +85,14 @@ def mean_depth(depths: list[CodeArray]) -> CodeArray:
     return np.where((stack >= NO_DATA).any(axis=0), np.uint16(NO_DATA), middle)
 
 
-def capture(config: Config, board: Board, wanted: int, folder: Path | None, tell: Tell) -> list[BoardView]:
+def capture(config: KinectConfig, board: Board, wanted: int, folder: Path | None, tell: Tell) -> list[BoardView]:
     """Views from the device. Raises ConfigError where its library is missing, CocoroError where nothing comes of it."""
     if folder is not None:
         _prepare(folder)
     return asyncio.run(_capture(config, ViewCollector(board, folder), wanted, tell))
 
 
-async def _capture(config: Config, collector: ViewCollector, wanted: int, tell: Tell) -> list[BoardView]:
+async def _capture(config: KinectConfig, collector: ViewCollector, wanted: int, tell: Tell) -> list[BoardView]:
     told = ""
 
     def say(text: str) -> None:
@@ -138,12 +138,12 @@ async def _shots(camera: DepthCamera) -> AsyncGenerator[RawFrame | None, None]:
             coming.cancel()
 
 
-def tilt(config: Config, angle_rad: float) -> None:
+def tilt(config: KinectConfig, angle_rad: float) -> None:
     """Move the device's own tilt motor. Raises CocoroError where there is no device."""
     asyncio.run(_tilt(config, angle_rad))
 
 
-async def _tilt(config: Config, angle_rad: float) -> None:
+async def _tilt(config: KinectConfig, angle_rad: float) -> None:
     faults: list[str] = []
     with closing(open_device(config, RealClock(), faults.append)) as camera:
         camera.tilt(angle_rad)

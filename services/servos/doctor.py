@@ -8,12 +8,12 @@ from cocoro.robot import Joint, Robot
 from services.servos import tools
 from services.servos.bus import PortError, ServoBus, SilentError
 from services.servos.network import HIGH_V, HOT_C, LOW_V
-from services.servos.service import NETWORKS, Config
+from services.servos.service import NETWORKS, ServosConfig
 
 __all__ = ["check"]
 
 
-def check(config: Config, robot: Robot, robot_name: str) -> list[Check]:
+def check(config: ServosConfig, robot: Robot, robot_name: str) -> list[Check]:
     checks: list[Check] = []
     for name in NETWORKS:
         port = config.arm_port if name == "arm" else config.hand_port

@@ -12,6 +12,7 @@ import msgspec
 from msgspec import Meta
 
 from cocoro import topics
+from cocoro.component import Implementation
 from cocoro.errors import CocoroError, ConfigError
 from cocoro.faults import FaultReporter
 from cocoro.latch import LatchKeeper
@@ -25,8 +26,6 @@ from services.servos import table
 from services.servos.line import CycleResult, ServoLine, ServoSettings
 from services.servos.network import ServoNetwork
 
-__all__ = ["Config", "run"]
-
 NETWORKS: dict[str, tuple[Topic[ServoState], Topic[ServoCommand]]] = {
     "arm": (topics.ARM_STATE, topics.ARM_COMMAND),
     "hand": (topics.HAND_STATE, topics.HAND_COMMAND),
@@ -34,7 +33,7 @@ NETWORKS: dict[str, tuple[Topic[ServoState], Topic[ServoCommand]]] = {
 DONE_S = 2.0
 
 
-class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class ServosConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     arm_port: str = "/dev/cocoro-arm"
     """The serial port of neck and arm: a device, or wire:NAME for an emulated one."""
     hand_port: str = "/dev/cocoro-hand"
@@ -47,7 +46,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class NetworkService:
     """One network: one line, one thread, one participant of the mesh."""
 
-    def __init__(self, node: Node, config: Config) -> None:
+    def __init__(self, node: Node, config: ServosConfig) -> None:
         self._node = node
         self._reporter = FaultReporter(node)
         robot = node.robot
@@ -155,7 +154,7 @@ class NetworkService:
         self._reporter.report(network.faults(self._node.now_ns()), degraded=degraded)
 
 
-async def run(node: Node, config: Config) -> None:
+async def run(node: Node, config: ServosConfig) -> None:
     """Serve both networks for ever."""
     unknown = sorted(set(config.torque) - set(node.robot.joints))
     if unknown:
@@ -166,3 +165,6 @@ async def run(node: Node, config: Config) -> None:
         async with asyncio.TaskGroup() as group:
             for one in nodes:
                 group.create_task(NetworkService(one, config).run())
+
+
+implementation = Implementation(ServosConfig, run)

@@ -26,7 +26,7 @@ from cocoro.errors import CocoroError, ConfigError
 from cocoro.messages import Frame, ServoCommand
 from cocoro.robot import Robot
 from sim.rigid import rotation
-from sim.service import Config, make_kinect, make_world
+from sim.service import SimConfig, make_kinect, make_world
 from sim.world import World
 
 WIDTH, HEIGHT = 640, 480
@@ -84,7 +84,7 @@ START_NS = NS
 
 
 def record(
-    folder: Path, robot: Robot, config: Config, frames: int, *, pan_rad: float = 0.0, tilt_rad: float = 0.0
+    folder: Path, robot: Robot, config: SimConfig, frames: int, *, pan_rad: float = 0.0, tilt_rad: float = 0.0
 ) -> dict[str, Any]:
     """Write so many frames; where the objects are, by label, in the body frame, and the head's angles."""
     config = msgspec.structs.replace(config, width=WIDTH, height=HEIGHT)
@@ -133,7 +133,7 @@ def main() -> int:
     parser.add_argument("--pan", type=float, default=0.0, metavar="DEG")
     parser.add_argument("--tilt", type=float, default=-25.0, metavar="DEG")
     options = parser.parse_args()
-    config = Config(scene=options.scene, seed=options.seed, sensors=options.sensors)
+    config = SimConfig(scene=options.scene, seed=options.seed, sensors=options.sensors)
     try:
         record(
             options.folder, Robot.load(), config, round(options.seconds * RATE_HZ),

@@ -11,6 +11,7 @@ from math import radians
 from pathlib import Path
 
 from cocoro.child import ChildProcess, wait_or_kill
+from cocoro.component import Implementation
 from cocoro.errors import CocoroError
 from cocoro.node import Node
 from cocoro.ports import wire_dir
@@ -18,7 +19,7 @@ from cocoro.robot import Base, Joint, Robot
 from sim.base import MobileBase
 from sim.camera import SimKinect
 from sim.realism import BodyRealism
-from sim.service import Config, Simulator, keep_going, make_kinect, make_world
+from sim.service import SimConfig, Simulator, keep_going, make_kinect, make_world
 from sim.servos import LOAD_COUNTS, SPEED_COUNT_RADPS, Drive, SimServo, SimServoNetwork
 from sim.wire.dynamixel import Motor
 from sim.wire.firmware import Channel, MotorOrders, PlantState, ServoSetup, Setup
@@ -99,8 +100,6 @@ class WireMotors:
         return Motors(self.base, networks)
 
 
-__all__ = ["Config", "run"]
-
 MODELS = {"arm": 28, "hand": 12}
 START_S, END_S = 30.0, 3.0
 
@@ -109,7 +108,7 @@ class WireSimulator(Simulator):
     """A simulator whose motors are driven by firmware in another process."""
 
     def __init__(
-        self, node: Node, config: Config, world: World, kinect: SimKinect, motors: WireMotors, channel: Channel
+        self, node: Node, config: SimConfig, world: World, kinect: SimKinect, motors: WireMotors, channel: Channel
     ) -> None:
         super().__init__(node, config, world, kinect)
         self._motors = motors
@@ -170,7 +169,7 @@ def firmware_process(folder: Path, setup: Setup) -> Iterator[Channel]:
         wait_or_kill(child.process, END_S)
 
 
-async def run(node: Node, config: Config) -> None:
+async def run(node: Node, config: SimConfig) -> None:
     """Simulate for ever."""
     motors = WireMotors()
     folder = wire_dir(node.robot_name)
@@ -185,3 +184,6 @@ async def run(node: Node, config: Config) -> None:
                 for part in (node, camera):
                     part.ready(f"simulated behind wires, scene {world.scene.name}, {config.sensors} sensors")
                 await keep_going(node, config, simulator)
+
+
+implementation = Implementation(SimConfig, run)
