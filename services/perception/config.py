@@ -11,7 +11,7 @@ from cocoro.topics import ARM_STATE
 from cocoro.units import Positive, PositiveShare
 
 
-class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class PerceptionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Pixel counts are for a frame of 640 x 480 and are scaled with the frame's area."""
 
     detector: Literal["blob", "paper"] = "blob"
