@@ -274,4 +274,5 @@ def _with_timeout(robot: Robot, timeout_s: float | None) -> Robot:
     """The robot with another deadman, which is the same at all speeds."""
     if timeout_s is None:
         return robot
-    return robot.with_base(command_timeout_s=timeout_s, stand_within_s=timeout_s + 1.0)
+    slow = robot.with_base(command_timeout_s=timeout_s, stand_within_s=timeout_s + 1.0)
+    return slow.with_networks(command_timeout_s=timeout_s)

@@ -57,7 +57,7 @@ def message_motors(robot: Robot, angles_rad: Mapping[str, float], realism: BodyR
             {joint: robot.joints[joint] for joint in robot.network_joints(name)},
             angles_rad,
             keeps_goal=name == "hand",
-            timeout_s=robot.base.command_timeout_s,
+            timeout_s=robot.networks[name].command_timeout_s,
             backlash_deg=realism.backlash_deg,
         )
         for name in NETWORKS
