@@ -149,6 +149,7 @@ def preload() -> None:
     import typer.main
 
     typer.main.get_command = functools.cache(typer.main.get_command)  # to make them is most of what a command costs
+    typer.main.get_group = functools.cache(typer.main.get_group)
     from apps import cli
     from apps.cli.main import main
 

@@ -22,7 +22,7 @@ from apps.captures.export import foxglove, rerun_scene, tables, video
 from apps.captures.export.foxglove_types import SceneUpdate, schema_of
 from apps.captures.export.geometry import Posture, about_z, conjugate, points, quaternion, rotated
 from apps.captures.export.story import catalogue_of, robot_of
-from apps.cli.capture_mesh import watch
+from apps.cli.export import watch
 from apps.cli.main import main
 from cocoro import topics
 from cocoro.bus.base import Qos

@@ -16,7 +16,7 @@ from apps.cli import estop
 from apps.cli.main import PACKAGES, main
 from apps.cli.options import frames_of, latencies_of
 from apps.cli.running import overrides
-from apps.cli.table import table
+from apps.cli.terminal import table
 from apps.rehearsal import rehearse as rehearsing
 from apps.rehearsal.request import RehearsalRequest
 from cocoro.errors import CocoroError, ConfigError

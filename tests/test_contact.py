@@ -31,22 +31,22 @@ class Kept:
     def __init__(self) -> None:
         self.steady = Steady()
         self.told: list[str] = []
-        self.vigil = SleepDetector(self.told.append, self.steady)
-        self.keeping = asyncio.ensure_future(self.vigil.keep())
+        self.sleep_detector = SleepDetector(self.told.append, self.steady)
+        self.keeping = asyncio.ensure_future(self.sleep_detector.keep())
 
 
 @in_virtual_time
 async def test_a_sleep_is_told_once_and_is_an_excuse_until_connections_are_made_anew() -> None:
     it = Kept()
     await asyncio.sleep(60.0)
-    assert (it.vigil.look(), it.told) == ("", [])
+    assert (it.sleep_detector.look(), it.told) == ("", [])
     it.steady.slept_s += 15.0
     words = "this machine was asleep or starved for 15 s"
-    assert it.vigil.look() == words, "before the vigil's own beat"
+    assert it.sleep_detector.look() == words, "before its own check"
     await asyncio.sleep(RECOVERY_S - 1.0)
-    assert it.vigil.look() == words
+    assert it.sleep_detector.look() == words
     await asyncio.sleep(2.0)
-    assert (it.vigil.look(), it.told) == ("", [words])
+    assert (it.sleep_detector.look(), it.told) == ("", [words])
     it.steady.slept_s += 3.0
     await asyncio.sleep(1.0)
     assert it.told == [words, "this machine was asleep or starved for 3 s"]
@@ -59,7 +59,7 @@ async def test_a_busy_machine_is_not_asleep() -> None:
     for _ in range(100):
         it.steady.slept_s += LATE_S - BEAT_S
         await asyncio.sleep(BEAT_S)
-    assert (it.vigil.look(), it.told) == ("", [])
+    assert (it.sleep_detector.look(), it.told) == ("", [])
     it.keeping.cancel()
 
 
@@ -124,7 +124,7 @@ class Watched:
     def __init__(self, folder: Path) -> None:
         self.kept = Kept()
         self.told: list[str] = []
-        self.child = Child(named("perception"), RunDir("calliope", folder), 0, self.told.append, self.kept.vigil)
+        self.child = Child(named("perception"), RunDir("calliope", folder), 0, self.told.append, self.kept.sleep_detector)
         self.child._process = _Process()  # type: ignore[assignment]
         self.child.on_alive("perception", True)
         self.child._say_ready()
