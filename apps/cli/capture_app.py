@@ -83,7 +83,9 @@ def export(
     video: Annotated[
         Path | None, typer.Option("--video", metavar="OUT.mp4", help="What the robot saw, detections drawn in.")
     ] = None,
-    foxglove: Annotated[Path | None, typer.Option("--foxglove", metavar="OUT.mcap", help="For Foxglove.")] = None,
+    foxglove: Annotated[
+        Path | None, typer.Option("--foxglove", metavar="OUT.mcap", help="For Foxglove; needs cocoro-mesh[foxglove].")
+    ] = None,
     csv: Annotated[Path | None, typer.Option("--csv", metavar="DIR", help="Tables, truth beside belief.")] = None,
     parquet: Annotated[
         Path | None, typer.Option("--parquet", metavar="DIR", help="The same; needs cocoro-mesh[tables].")

@@ -38,9 +38,9 @@ def export(
             pictures = films.export(capture, video, _progress(capture, video))
             _done(f"{video}: {pictures} pictures")
         if foxglove is not None:
-            from apps.captures.export import foxglove as foxes
+            from apps.captures.export.foxglove import export as export_foxglove
 
-            messages = foxes.export(capture, foxglove, _progress(capture, foxglove))
+            messages = export_foxglove(capture, foxglove, _progress(capture, foxglove))
             _done(f"{foxglove}: {messages} messages; open it with Foxglove")
         if csv is not None or parquet is not None:
             from apps.captures.export import tables
