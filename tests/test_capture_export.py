@@ -21,7 +21,7 @@ from mcap.reader import make_reader
 from apps.captures.export import rerun_scene, tables, video
 from apps.captures.export.geometry import Posture, about_z, conjugate, points, quaternion, rotated
 from apps.captures.export.story import catalogue_of, robot_of
-from apps.cli.capture_mesh import watch
+from apps.cli.export import watch
 from apps.cli.main import main
 from cocoro import topics
 from cocoro.bus.base import Qos
@@ -151,8 +151,9 @@ def test_belief_stands_beside_truth_in_the_body_frame(tmp_path: Path) -> None:
         async with room.node("sim") as sim, room.node("planning") as planning:
             can = TrueObject(label="red_can", kind="object", position_m=(2.0, 1.0, 0.06), orientation=(0, 0, 0, 1))
             for tick in range(11):
-                body = {"body_m": (1.0, tick / 10, 0.0), "body_orientation": about_z(pi / 2)}
-                sim.publish(topics.TRUTH, Truth(**body, joints_rad={}, objects=(can,)))
+                place, turn = (1.0, tick / 10, 0.0), about_z(pi / 2)
+                truth = Truth(body_m=place, body_orientation=turn, joints_rad={}, objects=(can,))
+                sim.publish(topics.TRUTH, truth)
                 if tick == 5:
                     await room.clock.sleep_until(room.clock.now_ns() + 10_000_000)
                     believed = TargetEstimate(label="red_can", position_m=(0.5, -1.0, 0.06))

@@ -10,11 +10,12 @@ import time
 from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
 
-from apps.cli import estop_mesh, exits, objects, reset, snapshot, status
+from apps.cli import estop_mesh, exits, objects, safety, snapshot, status
 from apps.cli.estop import StopResult
 from apps.cli.options import RobotChoice
 from cocoro.bus.endpoints import default
@@ -41,7 +42,8 @@ from cocoro.messages import (
 )
 from cocoro.node import Node
 from cocoro.robot import Robot
-from cocoro.topics import BASE_STATE, CANCEL, DETECTIONS, ESTOP, FRAME, LATCH, OBJECTS, PLAN, RUN, STOPPABLE, TASK
+from cocoro.topics import BASE_STATE, CANCEL, DETECTIONS, ESTOP, FRAME, LATCH, OBJECTS, PLAN, RUN, TASK
+from deploy.processes import stoppable
 from deploy.rundir import RunDir
 
 pytestmark = pytest.mark.zenoh
@@ -69,7 +71,7 @@ async def robot(*services: str, without_latch: tuple[str, ...] = ()) -> AsyncIte
         nodes = {name: Node(name, bus, clock, description, health_hz=20.0) for name in services}
         for node in nodes.values():
             await stack.enter_async_context(node)
-        keeping = [name for name in STOPPABLE if name in nodes and name not in without_latch]
+        keeping = [name for name in stoppable() if name in nodes and name not in without_latch]
         keepers = {name: LatchKeeper(nodes[name], lambda *_: None) for name in keeping}
         for node in nodes.values():
             node.ready("all is well")
@@ -143,7 +145,7 @@ def test_reset_releases_what_was_stopped(root: Path, capsys: pytest.CaptureFixtu
         async with robot("base", "arm", "hand", "executive") as calliope:
             answering(calliope.nodes["executive"], "released")
             await stop()
-            assert await reset.reset(ANY) == exits.DONE
+            assert await safety.release(ANY) == exits.DONE
             assert calliope.latches == {"released"}
 
     asyncio.run(scenario())
@@ -157,7 +159,7 @@ def test_when_the_executive_refuses_a_reset_everything_stays_latched(
         async with robot("base", "arm", "hand", "executive") as calliope:
             answering(calliope.nodes["executive"], "latched", "a servo is overloaded")
             await stop()
-            assert await reset.reset(ANY) == exits.REFUSED
+            assert await safety.release(ANY) == exits.REFUSED
             assert calliope.latches == {"latched"}
 
     asyncio.run(scenario())
@@ -185,7 +187,7 @@ def test_status_tells_of_services_task_and_plan(root: Path, capsys: pytest.Captu
     async def scenario(as_json: bool) -> int:
         async with robot("base", "planning", "executive") as calliope:
             calliope.nodes["base"].spawn(tell(calliope))
-            return await status.status(ANY, as_json)
+            return await status.show_status(ANY, as_json)
 
     assert asyncio.run(scenario(as_json=False)) == exits.FAILED  # perception should run, and does not
     text = capsys.readouterr().out
@@ -261,7 +263,7 @@ def test_a_snapshot_is_a_frame_with_what_was_detected_in_that_frame(
     async def scenario() -> None:
         async with robot("kinect", "perception") as calliope:
             calliope.nodes["kinect"].spawn(see(calliope, detect))
-            assert await snapshot.snapshot(ANY, out) == exits.DONE
+            assert await snapshot.take_snapshot(ANY, out) == exits.DONE
 
     asyncio.run(scenario())
     assert capsys.readouterr().out == f"{out}: {words}\n"
@@ -281,7 +283,7 @@ def test_ctrl_c_on_a_running_fetch_cancels_the_task_on_the_robot(root: Path) -> 
 
             async def tell() -> None:
                 async for _ in node.every(20.0):
-                    outcome = "cancelled" if cancelled else None
+                    outcome: Literal["cancelled"] | None = "cancelled" if cancelled else None
                     node.publish(TASK, TaskState(task_id="fetch-1", phase="approach", outcome=outcome, elapsed_s=1.0))
 
             async def cancel(request: CancelRequest) -> TaskReply:
@@ -308,6 +310,6 @@ def test_of_several_robots_one_must_be_named(root: Path) -> None:
     async def scenario() -> None:
         async with robot("executive"), await ZenohBus.open(default("robbie", "robot")):
             with pytest.raises(ConfigError, match=r"say which: --robot calliope, --robot robbie"):
-                await status.status(ANY, as_json=False)
+                await status.show_status(ANY, as_json=False)
 
     asyncio.run(scenario())

@@ -24,12 +24,12 @@ from cocoro.messages import (
 )
 from cocoro.node import Node
 from cocoro.objects import Catalogue
-from services.executive.config import Config
+from services.executive.config import ExecutiveConfig
 from services.executive.estop import Estop
 from services.executive.skills import PlannerSkills, Skills, TaskFailedError
 from services.executive.tasks import babble_arm, babble_wheels, fetch, follow, go_to, park, put_down, touch
 
-Task = Callable[[Skills, TaskRequest, Config], Awaitable[None]]
+Task = Callable[[Skills, TaskRequest, ExecutiveConfig], Awaitable[None]]
 Ending = tuple[Outcome, str | Awaitable[str]]
 """A task's outcome and its reason, which may not be known yet when the outcome is."""
 _CLOCK_STANDS_S = 1.0
@@ -48,7 +48,7 @@ TASKS: dict[str, Task] = {
 
 
 class Executive:
-    def __init__(self, node: Node, config: Config, catalogue: Catalogue) -> None:
+    def __init__(self, node: Node, config: ExecutiveConfig, catalogue: Catalogue) -> None:
         self._node = node
         self._config = config
         self._catalogue = catalogue
