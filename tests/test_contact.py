@@ -26,7 +26,7 @@ class Steady:
 
 
 class Kept:
-    """A vigil that is kept, and what it told."""
+    """A sleep detector that runs, and what it reported."""
 
     def __init__(self) -> None:
         self.steady = Steady()
@@ -124,7 +124,8 @@ class Watched:
     def __init__(self, folder: Path) -> None:
         self.kept = Kept()
         self.told: list[str] = []
-        self.child = Child(named("perception"), RunDir("calliope", folder), 0, self.told.append, self.kept.sleep_detector)
+        detector = self.kept.sleep_detector
+        self.child = Child(named("perception"), RunDir("calliope", folder), 0, self.told.append, detector)
         self.child._process = _Process()  # type: ignore[assignment]
         self.child.on_alive("perception", True)
         self.child._say_ready()

@@ -25,6 +25,7 @@ from cocoro.bus.zenoh import ZenohBus
 from cocoro.capture.conventions import CaptureError
 from cocoro.capture.reader import Capture
 from cocoro.errors import ConfigError, RefusedError
+from cocoro.keys import alive_key, service_of
 from deploy import processes
 from deploy.rundir import RunDir
 
