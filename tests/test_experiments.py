@@ -23,7 +23,7 @@ from apps.experiments.stats import summarise
 from apps.learning.study import BEST
 from apps.rehearsal.request import RehearsalRequest
 from cocoro.learning.dataset import HandRow, SampleFile, WheelRow, hand_header, wheel_header
-from cocoro.learning.nominal_model import LEVEL_ROLL_RAD, NominalModel
+from cocoro.learning.nominal_model import NominalModel
 from cocoro.robot import Robot
 
 # --- statistics ---------------------------------------------------------------------------------------
@@ -88,7 +88,7 @@ def test_what_cannot_be_run_fails_with_its_reason_and_so_does_what_needs_it(tmp_
 
 def arm_and_wheels(settings: ExperimentSettings, robot: Robot) -> None:
     seen = sightings(robot, draws=60)
-    header = hand_header(robot, NominalModel(robot).joints, LEVEL_ROLL_RAD)
+    header = hand_header(robot, NominalModel(robot).joints, robot.claw.level_roll_rad)
     with SampleFile(settings.arm_file(0), HandRow, robot, header) as writer:
         writer.append(
             HandRow(

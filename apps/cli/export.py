@@ -44,7 +44,9 @@ def export(
         Path | None,
         typer.Option("--video", metavar="OUT.mp4", help="Film of the camera's pictures with the detections drawn in."),
     ] = None,
-    foxglove: Annotated[Path | None, typer.Option("--foxglove", metavar="OUT.mcap", help="For Foxglove.")] = None,
+    foxglove: Annotated[
+        Path | None, typer.Option("--foxglove", metavar="OUT.mcap", help="For Foxglove; needs cocoro-mesh[foxglove].")
+    ] = None,
     csv: Annotated[
         Path | None, typer.Option("--csv", metavar="DIR", help="Tables, simulated truth beside belief.")
     ] = None,
@@ -91,10 +93,10 @@ def export_capture(
                 pictures = films.export(capture, video, show)
             print(f"{video}: {pictures} pictures")
         if foxglove is not None:
-            from apps.captures.export import foxglove as foxglove_export
+            from apps.captures.export.foxglove import export as export_foxglove
 
             with _progress_bar(capture, foxglove) as show:
-                messages = foxglove_export.export(capture, foxglove, show)
+                messages = export_foxglove(capture, foxglove, show)
             print(f"{foxglove}: {messages} messages; open it with Foxglove")
         if csv is not None or parquet is not None:
             from apps.captures.export import tables
