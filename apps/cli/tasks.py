@@ -11,13 +11,13 @@ from pathlib import Path
 import msgspec
 
 from apps.cli import exits
-from apps.cli.ending import on_end
+from apps.cli.interrupt import on_interrupt
 from apps.cli.link import Link, joined
 from apps.cli.options import RobotChoice
 from apps.cli.output import going_on
-from apps.cli.progress import TaskDisplay, view
+from apps.cli.progress import TaskDisplay, task_display
 from apps.cli.snapshot import SnapshotTaker, check
-from cocoro.contact import RECOVERY_S, Contact, SleepDetector
+from cocoro.contact import RECOVERY_S, Contact
 from cocoro.errors import CallTimeoutError, CocoroError
 from cocoro.messages import CancelRequest, TaskReply, TaskRequest, TaskState
 from cocoro.topics import CANCEL, LATCH, RUN, TASK
@@ -42,8 +42,9 @@ async def run(where: RobotChoice, request: TaskRequest, as_json: bool, picture: 
     if picture is not None:
         check(picture)
     async with joined(where, frames=picture is not None) as link:
-        follower = Follower(link, request, view(as_json), picture, Contact(link.run_dir.claimant_pid, SleepDetector()))
-        with on_end(follower.interrupt), going_on():
+        contact = Contact(link.run_dir.claimant_pid, SleepDetector())
+        follower = Follower(link, request, task_display(as_json), picture, contact)
+        with on_interrupt(follower.interrupt), going_on():
             code, result = await follower.run()
     if as_json:
         print(json.dumps(result))
@@ -103,6 +104,7 @@ class Follower:
         try:
             state = await self._follow()
         finally:
+            self._view.close()
             alive.close()
             for task in beside:
                 task.cancel()
