@@ -17,7 +17,7 @@ from apps.cli.options import RobotChoice
 from apps.cli.output import going_on
 from apps.cli.progress import TaskDisplay, task_display
 from apps.cli.snapshot import SnapshotTaker, check
-from cocoro.contact import RECOVERY_S, Contact
+from cocoro.contact import RECOVERY_S, Contact, SleepDetector
 from cocoro.errors import CallTimeoutError, CocoroError
 from cocoro.messages import CancelRequest, TaskReply, TaskRequest, TaskState
 from cocoro.topics import CANCEL, LATCH, RUN, TASK
