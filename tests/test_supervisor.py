@@ -129,7 +129,7 @@ def test_run_joins_the_robot_that_is_up_and_ends_with_ctrl_c(shell: Shell) -> No
     run = shell.start("run", "once")
     run.until("joined the mesh")
     assert run.end(signal.SIGINT) == 0
-    assert run.lines[-1].endswith("once: told to end")
+    assert run.lines[-1].endswith("once: ended by a signal")
 
 
 def test_processes_do_not_outlive_a_killed_supervisor_and_the_robot_can_be_started_again(shell: Shell) -> None:
