@@ -105,6 +105,7 @@ def test_a_robot_s_name_must_do_as_path_and_key(robot: str, tmp_path: Path) -> N
         default(robot, "base", tmp_path)
 
 
+@pytest.mark.process
 def test_a_fork_does_not_take_its_parent_out_of_the_mesh(directory: Path) -> None:
     script = """
 import atexit, os
@@ -224,8 +225,8 @@ async def test_who_cannot_have_the_register_s_lock_joins_all_the_same(directory:
 
 
 @scenario
-async def test_two_robots_on_one_machine_never_meet(tmp_path_factory: pytest.TempPathFactory) -> None:
-    run_dir = tmp_path_factory.mktemp("m")
+async def test_two_robots_on_one_machine_never_meet(short_path: Path) -> None:
+    run_dir = short_path
     async with (
         await ZenohBus.open(default("one", "base", run_dir)) as one,
         await ZenohBus.open(default("two", "base", run_dir)) as two,

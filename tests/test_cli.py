@@ -5,12 +5,12 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+from places import in_short_folder
 
 from apps.cli import app, estop
 from apps.cli.main import PACKAGES, main
@@ -32,8 +32,8 @@ ROOT = Path(__file__).parent.parent
 
 @pytest.fixture(autouse=True)
 def no_robot_here(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    with tempfile.TemporaryDirectory(prefix="cocoro") as folder:  # a short path: sockets could live there
-        monkeypatch.setenv("COCORO_RUN_DIR", folder)
+    with in_short_folder() as folder:
+        monkeypatch.setenv("COCORO_RUN_DIR", str(folder))
         yield
 
 
@@ -154,6 +154,7 @@ def test_a_commands_own_help_begins_with_its_line_of_the_list(row: app.CommandRo
     assert command.hidden == row.hidden
 
 
+@pytest.mark.process
 def test_the_emergency_stop_imports_next_to_nothing() -> None:
     code = "import sys; from apps.cli import main, estop; estop.by_path('nobody'); print(*sys.modules)"
     done = subprocess.run([sys.executable, "-S", "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)

@@ -66,6 +66,7 @@ def test_a_process_gives_back_what_it_alone_holds(place: Path) -> None:
     assert list(place.iterdir()) == []
 
 
+@pytest.mark.process
 def test_what_another_process_holds_too_is_left_to_it(place: Path) -> None:
     both = segment(place)
     hold = "import fcntl, sys; f = open(sys.argv[1]); fcntl.flock(f, fcntl.LOCK_SH); print(flush=True); input()"

@@ -12,7 +12,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -21,6 +20,7 @@ from typing import Any
 
 import pytest
 from operator_shell import PATIENCE_S, Running
+from places import short_folder
 from robot_rig import RobotRig
 from wall_clock import NoPreloadError, WallClock
 from wire_base import MS, Bench
@@ -173,7 +173,7 @@ class Driven:
 
 @contextmanager
 def driven(wall: WallClock, folder: Path) -> Iterator[Driven]:
-    root = Path(tempfile.mkdtemp(prefix="cocoro"))  # short: sockets live there
+    root = short_folder()
     try:
         with Bench(folder) as bench:
             robot = Driven(bench, wall, root, folder)

@@ -7,6 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+pytestmark = pytest.mark.process
+
 COUNT = 16
 SLOWEST_MS = 800.0
 """What a busy machine makes of 0.3 s."""
