@@ -140,6 +140,7 @@ def test_the_topics_page_of_the_documentation_is_up_to_date(capsys: pytest.Captu
     assert capsys.readouterr().out == page, "make it anew: cocoro topics --markdown > docs/topics.md"
 
 
+@pytest.mark.process
 def test_help_imports_no_command() -> None:
     code = "import sys; from apps.cli.main import main; main(['--help']); print(*sys.modules, file=sys.stderr)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)

@@ -270,6 +270,7 @@ def test_a_snapshot_is_a_frame_with_what_was_detected_in_that_frame(
     assert out.read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.process
 def test_ctrl_c_on_a_running_fetch_cancels_the_task_on_the_robot(root: Path) -> None:
     cancelled: list[str] = []
 

@@ -173,6 +173,7 @@ def test_sizes_are_one_to_three_lengths() -> None:
     ]  # fmt: skip
 
 
+@pytest.mark.process
 @pytest.mark.zenoh
 def test_the_live_view_brings_depth_and_the_heads_angles(
     short_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

@@ -87,6 +87,7 @@ print("done")
 """
 
 
+@pytest.mark.process
 @pytest.mark.zenoh
 def test_a_thread_of_zenoh_that_comes_back_late_aborts_nothing(short_path: Path) -> None:
     assert ended(CAUGHT_IN_A_CALLBACK + "quit_process(0)", short_path) == (0, "done\n", "")

@@ -30,6 +30,8 @@ from sim.camera import moved
 from sim.render import Images, Renderer, make_renderer
 from sim.render import gl as gl_module
 
+pytestmark = pytest.mark.sim
+
 # --- the infrared projector -----------------------------------------------------------------------
 
 
