@@ -32,6 +32,7 @@ from cocoro.capture.reader import Capture
 from cocoro.clock import FollowedClock
 from cocoro.component import load as load_component
 from cocoro.errors import ConfigError, RefusedError
+from cocoro.installed import unrecorded
 from cocoro.messages import Message, Recording
 from cocoro.node import Node
 from cocoro.objects import Catalogue
@@ -55,6 +56,8 @@ async def record(where: RobotChoice, settings: dict[str, Any], seconds: float | 
         config = msgspec.convert(settings, component.config)
     except msgspec.ValidationError as error:
         raise ConfigError(f"record: {error}") from error
+    if left_out := unrecorded():
+        print(f"not recorded, as declared: {', '.join(left_out)}", file=sys.stderr)
     async with joined(where, frames=True) as link:
         resolved = link.run_dir.resolved()
         description, measured = (Path(file) if (file := resolved.get(name)) else None for name in _DESCRIPTIONS)
@@ -283,6 +286,8 @@ def view_file(file: Path) -> int:
 async def view_mesh(where: RobotChoice) -> int:
     """Open Rerun on the mesh, until Ctrl-C. Raises CaptureError when Rerun is not installed, MeshError for no mesh."""
     rr = library()
+    if left_out := unrecorded():
+        print(f"not recorded, as declared: {', '.join(left_out)}", file=sys.stderr)
     async with joined(where, frames=True) as link:
         resolved = link.run_dir.resolved()
         description, measured = (_path(resolved.get(name)) for name in ("description", "measured"))
