@@ -13,7 +13,8 @@ import typer.main
 from cli_forks import Case, Ending
 
 from apps.cli import exits
-from apps.cli.app import app
+from apps.cli.app import COMMANDS as LISTED
+from apps.cli.app import app, load
 
 GOLDEN = Path(__file__).parent / "golden" / "fetch.mcap"
 CODES = (exits.DONE, exits.FAILED, exits.USAGE, exits.REFUSED, exits.NO_MESH)
@@ -64,7 +65,12 @@ def commands(command: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[str, An
         yield from commands(sub, (*path, name))
 
 
-COMMANDS = dict(commands(typer.main.get_command(app)))
+LOADED = {row.name: load(row.name) for row in LISTED}
+COMMANDS = dict(
+    found
+    for name, command in typer.main.get_group(app).commands.items()
+    for found in commands(LOADED.get(name, command), (name,))
+)
 
 
 @dataclass(frozen=True)

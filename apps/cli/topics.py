@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from importlib import resources
 from typing import Any, NamedTuple
 
-from apps.cli.table import table as plain_table
+from apps.cli.terminal import table as plain_table
 from cocoro.bus.base import Qos
 from cocoro.component import Component
 from cocoro.installed import all_requests, all_topics
