@@ -5,8 +5,10 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator, Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +19,7 @@ from wire_servos import REPLY_S, ServoBench
 from cocoro import topics
 from cocoro.clock import FollowedClock, RealClock
 from cocoro.learning import model
-from cocoro.messages import Intent, ModelRequest
+from cocoro.messages import Intent, ModelRequest, TaskName
 from cocoro.robot import Robot
 from cocoro.testing import ServiceUnderTest, in_virtual_time, misdeclared
 from cocoro.topics import (
@@ -50,11 +52,16 @@ SIMULATED = ("capture", "sim", "perception", "planning", "executive")
 @in_virtual_time
 async def test_the_simulated_robot_speaks_as_it_declares(tmp_path: Path) -> None:
     """Over all that makes a component say something: recording, both kinds of babbling, a learned model."""
-    settings = {"capture": {"file": str(tmp_path / "all.mcap")}, "sim": SMALL_FRAMES | {"scene": "wheels"}}
+    settings: dict[str, dict[str, Any]] = {
+        "capture": {"file": str(tmp_path / "all.mcap")}, "sim": SMALL_FRAMES | {"scene": "wheels"},
+    }  # fmt: skip
+    runs: tuple[tuple[TaskName, str, str], ...] = (
+        ("babble-arm", "", HAND_SAMPLES.name), ("babble-wheels", "red_can", WHEEL_TRIALS.name),
+    )  # fmt: skip
     async with RobotRig(services=SIMULATED, settings=settings, record_steps=True) as rig:
-        for task, label, topic in (("babble-arm", "", HAND_SAMPLES), ("babble-wheels", "red_can", WHEEL_TRIALS)):
+        for task, label, topic in runs:
             task_id = await rig.begin(task, label)
-            await rig.until(lambda topic=topic: topic.name in rig.bus("planning").publishes, 120.0)
+            await rig.until(partial(rig.bus("planning").publishes.__contains__, topic), 120.0)
             await rig.cancel()
             await rig.outcome(task_id)
         content = model.encode(model.empty(Robot.load()))

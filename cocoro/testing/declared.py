@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from typing import Any
 
-from cocoro.bus.base import Handle, OnLot, OnSample, Qos, Reply, Server
+from cocoro.bus.base import Handle, OnBatch, OnSample, Qos, Reply, Server
 from cocoro.bus.local import LocalBus, LocalMesh, LocalPublisher, LocalSubscription
 from cocoro.component import Component
 from cocoro.topics import ABOUT, CLOCK, EXCHANGES, HEALTH, STEPS, Request, Topic
@@ -33,7 +33,7 @@ class NotedBus(LocalBus):
         self.reads.add(self._name(keyexpr))
         return super().subscribe(keyexpr, qos, handler, depth=depth)
 
-    def listen(self, keyexpr: str, handler: OnLot, every_s: float) -> Handle:
+    def listen(self, keyexpr: str, handler: OnBatch, every_s: float) -> Handle:
         self.records = True
         return super().listen(keyexpr, handler, every_s)
 

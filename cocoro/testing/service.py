@@ -62,11 +62,7 @@ class ServiceUnderTest:
         self.bus = NotedBus(self.mesh, self.robot.name)
         """The service's own; `misdeclared(component, service.bus)` compares it with a declaration."""
         self.node = Node(
-<<<<<<< HEAD
-            self.name, self.bus, self._clock, self.robot, latency_s=latency_s, record_steps=record_steps,
-=======
-            self.name, self._bus, self._clock, self.robot, record_steps=record_steps,
->>>>>>> main
+            self.name, self.bus, self._clock, self.robot, record_steps=record_steps,
             module=module, config=self._config, latches=latches,
         )  # fmt: skip
         self.tester = Node("tester", self.mesh.join(), self._clock, self.robot)

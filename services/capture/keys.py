@@ -13,12 +13,8 @@ import numpy as np
 from cocoro.bus.base import Qos
 from cocoro.capture.types import JSON, MADE_HERE, MSGPACK, OTHER, Alive, LossyFrame, TypeSchema, schema_of
 from cocoro.errors import ConfigError
-<<<<<<< HEAD
 from cocoro.installed import all_topics, topic_named
-=======
-from cocoro.installed import topic_named
 from cocoro.keys import matches
->>>>>>> main
 from cocoro.messages import Frame, Message
 from cocoro.topics import FRAME
 

@@ -17,12 +17,8 @@ from cocoro.bus.base import Handle, Payload, Received
 from cocoro.capture.types import Alive, MessageHead
 from cocoro.clock import NS, Clock
 from cocoro.errors import MeshError, RemoteError
-<<<<<<< HEAD
 from cocoro.installed import topic_named, unrecorded
-=======
-from cocoro.installed import topic_named
 from cocoro.keys import alive_key, recorder_key
->>>>>>> main
 from cocoro.messages import AboutReply, AboutRequest, ClockTick, DisturbedFile, Recording
 from cocoro.node import Node
 from cocoro.stream_checks import ANY_HZ, SequenceTracker
