@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from apps.cli.robot_file import with_values, write_values
+from apps.cli.toml_files import with_values, write_values
 from cocoro.errors import ConfigError
 from cocoro.robot import Robot
 
