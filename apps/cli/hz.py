@@ -19,7 +19,7 @@ from rich.live import Live
 from rich.text import Text
 
 from apps.cli import exits
-from apps.cli.ending import told_to_end
+from apps.cli.interrupt import interrupt_event
 from apps.cli.link import joined
 from apps.cli.listening import Ear, keyexpr_of, takes_frames
 from apps.cli.options import JsonOption, KeyArgument, MeshOption, RobotChoice, RobotOption
@@ -161,7 +161,7 @@ async def show_rates(choice: RobotChoice, text: str, window_s: float, once: bool
     meters: dict[str, RateMeter] = {}
     async with joined(choice, frames=takes_frames(text)) as link:
         ear = Ear(link, keyexpr_of(text, link.robot))
-        with told_to_end() as end, _view(as_json, once) as view:
+        with interrupt_event() as end, _view(as_json, once) as view:
             show_s = time.monotonic() + (window_s if once else SHOW_S)
             while not end.is_set():
                 await ear.wait(end, max(show_s - time.monotonic(), 0.0))

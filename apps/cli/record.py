@@ -13,7 +13,7 @@ import msgspec
 import typer
 
 from apps.cli import exits
-from apps.cli.ending import told_to_end
+from apps.cli.interrupt import interrupt_event
 from apps.cli.link import joined
 from apps.cli.options import MeshOption, OnlyOption, RobotChoice, RobotOption, WithoutOption
 from apps.cli.output import going_on
@@ -79,7 +79,7 @@ async def record_mesh(choice: RobotChoice, settings: dict[str, Any], seconds: fl
         robot = Robot.load(description, measured)
         name = f"record-{os.getpid()}"
         async with Node(name, link.bus, clock, robot, robot_name=link.robot, module=row.module, config=config) as node:
-            with StatusLine() as line, told_to_end() as end, going_on():
+            with StatusLine() as line, interrupt_event() as end, going_on():
                 display = _RecordingDisplay(line)
                 node.on(RECORDING.of(name), display.show)
                 await _run_until(component.run(node, config), end, display.failed, seconds)

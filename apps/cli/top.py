@@ -15,7 +15,7 @@ import psutil
 import typer
 
 from apps.cli import exits
-from apps.cli.ending import passed, told_to_end
+from apps.cli.interrupt import elapsed, interrupt_event
 from apps.cli.link import Link, joined, within
 from apps.cli.options import JsonOption, MeshOption, RobotChoice, RobotOption
 from apps.cli.status import expected
@@ -61,16 +61,16 @@ async def show_top(choice: RobotChoice, once: bool, as_json: bool, every_s: floa
             report = watch.report()
             _print(report, as_json)
             return exits.DONE if all(service["alive"] for service in report["services"]) else exits.FAILED
-        with told_to_end() as end:
+        with interrupt_event() as end:
             if as_json or not sys.stdout.isatty():
                 while not end.is_set():
                     _print(watch.report(), as_json)
-                    await passed(end, every_s)
+                    await elapsed(end, every_s)
             else:
                 with Screen() as screen:
                     while not end.is_set():
                         screen.show(watch.report())
-                        await passed(end, every_s)
+                        await elapsed(end, every_s)
     return exits.DONE
 
 
