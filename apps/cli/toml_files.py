@@ -9,6 +9,8 @@ import os
 import tempfile
 import tomllib
 from collections.abc import Callable, Iterable, Mapping, MutableMapping
+from contextlib import suppress
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +46,9 @@ def with_values(text: str, table: str, values: Mapping[str, Value], name: str = 
         row = _plain_row(data.setdefault(last, []), "name", name) if name else data.setdefault(last, {})
         row.update(_plain_values(items))
 
-    return _verified(text, document, edit, f"[{table}]")
+    heading = tomlkit.key([*outer, last]).as_string()
+    lines = [f"[[{heading}]]", f"name = {tomlkit.item(name).as_string()}"] if name else [f"[{heading}]"]
+    return _verified(text, [tomlkit.dumps(document), _appended(text, lines, items)], edit, f"[{table}]")
 
 
 def write_values(path: Path, table: str, values: Mapping[str, Value], name: str = "") -> None:
@@ -80,7 +84,7 @@ def with_object(text: str, known: ObjectSpec) -> str:
         plain.clear()
         plain.update(_plain_values(items))
 
-    return _verified(text, document, edit, f"[[{OBJECTS}]] {known.label}")
+    return _verified(text, [tomlkit.dumps(document)], edit, f"[[{OBJECTS}]] {known.label}")
 
 
 def text_of(path: Path) -> str:
@@ -127,9 +131,13 @@ def _boxes(boxes: Iterable[LabBox]) -> Array:
     array = tomlkit.array()
     for box in boxes:
         row = tomlkit.inline_table()
-        row.update({"low": _item(box.low, 6), "high": _item(box.high, 6)})
+        row.update({"low": _item(_whole(box.low), 6), "high": _item(_whole(box.high), 6)})
         array.append(row)
     return array.multiline(multiline=True)
+
+
+def _whole(values: tuple[float, ...]) -> tuple[float, ...]:
+    return tuple(int(value) if value == int(value) else value for value in values)
 
 
 # --- editing --------------------------------------------------------------------------------------
@@ -147,7 +155,7 @@ def _item(value: Value | bool, digits: int = 10) -> Item:
     """A value as it is written, numbers with so many significant digits at most."""
     if isinstance(value, tuple):
         array = tomlkit.array()
-        array.extend([float(f"{one:.{digits}g}") for one in value])
+        array.extend([one if isinstance(one, int) else float(f"{one:.{digits}g}") for one in value])
         return array
     return tomlkit.item(float(f"{value:.{digits}g}") if isinstance(value, float) else value)
 
@@ -203,7 +211,10 @@ def _cut_comments(rows: AoT) -> list[Any]:
 
 
 def _put(place: Any, key: str, item: Item) -> None:
-    """Set a key where it stands, or behind the last plain value of its table, before comments on what follows."""
+    """Set a key where it stands, or behind the last plain value of its table, before comments on what follows. A value
+    that is equal keeps its form."""
+    if key in place and tomlkit.item(place[key]).unwrap() == item.unwrap():
+        return
     if key in place or not isinstance(place, Table):
         place[key] = item
         return
@@ -222,23 +233,30 @@ def _plain_row(rows: list[dict[str, Any]], field: str, value: str) -> dict[str, 
 
 
 def _plain_values(items: Mapping[str, Item]) -> dict[str, Any]:
-    return {key: tomllib.loads(f"v = {item.as_string()}", parse_float=str)["v"] for key, item in items.items()}
+    return {key: tomllib.loads(f"v = {item.as_string()}", parse_float=_exact)["v"] for key, item in items.items()}
 
 
-def _verified(
-    text: str, document: tomlkit.TOMLDocument, edit: Callable[[dict[str, Any]], None], where: str
-) -> str:
-    """The document's text. Raises ConfigError unless it holds what `text` holds, with the edit done to it."""
-    wanted = tomllib.loads(text, parse_float=str)
+def _exact(number: str) -> Decimal | str:
+    """A number that compares equal to itself, also when it is not one."""
+    return number if "nan" in number else Decimal(number)
+
+
+def _appended(text: str, heading: Iterable[str], items: Mapping[str, Item]) -> str:
+    """The text with a new table at its end."""
+    lines = ["", *heading, *(f"{tomlkit.key(key).as_string()} = {item.as_string()}" for key, item in items.items())]
+    return f"{text.rstrip()}\n" + "\n".join(lines) + "\n"
+
+
+def _verified(text: str, edited: Iterable[str], edit: Callable[[dict[str, Any]], None], where: str) -> str:
+    """The first of the edited texts that holds what `text` holds with the edit done to it: tomlkit puts a table that it
+    adds below a dotted key before keys which then fall into it. Raises ConfigError where there is none."""
+    wanted = tomllib.loads(text, parse_float=_exact)
     edit(wanted)
-    changed = tomlkit.dumps(document)
-    try:
-        same = tomllib.loads(changed, parse_float=str) == wanted
-    except tomllib.TOMLDecodeError:
-        same = False
-    if not same:
-        raise ConfigError(f"{where} cannot be edited by a program in its present form")
-    return changed
+    for changed in edited:
+        with suppress(tomllib.TOMLDecodeError):
+            if tomllib.loads(changed, parse_float=_exact) == wanted:
+                return changed
+    raise ConfigError(f"{where} cannot be edited by a program in its present form")
 
 
 def _replace(path: Path, text: str) -> None:
