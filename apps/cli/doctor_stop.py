@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 
+from apps.cli.stop_asking import addresses
 from cocoro.checks import Check, bad, note, ok
-from cocoro.stop.asking import addresses
 from cocoro.stop.path import StopPoint
 from cocoro.stop.record import latch_dir, read
 
@@ -46,7 +46,7 @@ def _latch(robot: str) -> Check:
     if (kind := _filesystem(there)) in IN_MEMORY:
         return bad(
             "its latch",
-            f"{folder} is in memory ({kind}) and does not survive a reboot; set COCORO_STATE_DIR to a directory on a disk",
+            f"{folder} is in memory ({kind}) and does not survive a reboot; set COCORO_STATE_DIR",
         )
     latched = (
         [latch for file in sorted(folder.glob("[!.]*")) if (latch := read(file)).latched] if folder.is_dir() else []

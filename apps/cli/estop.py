@@ -11,7 +11,7 @@ import time
 from typing import NamedTuple, TextIO
 
 from apps.cli import exits
-from cocoro.stop.asking import Asking, Point
+from apps.cli.stop_asking import Asking, Point
 
 STOPPABLE = ("base", "arm", "hand")
 """Copy of the list in `cocoro.topics`, which is slow to import."""
