@@ -15,7 +15,7 @@ import typer
 
 from apps.captures.export.files import refuse_existing
 from apps.cli import exits
-from apps.cli.ending import told_to_end
+from apps.cli.interrupt import interrupt_event
 from apps.cli.link import joined
 from apps.cli.options import CaptureArgument, MeshOption, RobotChoice, RobotOption
 from cocoro.bus.base import Bus, Payload
@@ -183,7 +183,7 @@ async def view_mesh(choice: RobotChoice) -> int:
         recording = opened(rerun)
         watch(link.bus, link.robot, RerunScene(recording, Robot.load(description, measured), Catalogue.load()))
         print("Ctrl-C ends it")
-        with told_to_end() as end:
+        with interrupt_event() as end:
             await end.wait()
     return exits.DONE
 

@@ -117,13 +117,13 @@ Read = Callable[[bytes | memoryview], msgspec.Struct]
 def reader_of(name: str, schema: str | None) -> Read | None:
     """Returns a decoder for the payloads of a topic (the key without the robot) by the recorded schema's name; None
     when no type is known for the key. It returns lossy frames as frames."""
+    topic = topic_named(name)
+    if topic is not None and (schema is None or topic.type.__name__ in (schema, todays_name(schema))):
+        kind: type[Message] = topic.type
+        return msgspec.msgpack.Decoder(kind).decode
     if schema == Alive.__name__:
         return msgspec.msgpack.Decoder(Alive).decode
     if schema == LossyFrame.__name__:
         decoder = msgspec.msgpack.Decoder(LossyFrame)
         return lambda payload: expand(decoder.decode(payload))
-    topic = topic_named(name)
-    if topic is None or (schema is not None and todays_name(schema) != topic.type.__name__):
-        return None
-    kind: type[Message] = topic.type
-    return msgspec.msgpack.Decoder(kind).decode
+    return None
