@@ -64,7 +64,7 @@ def test_a_servo_gets_another_number_and_no_delay(bench: ServoBench, line: Servo
     tools.set_number(line, 50, 50)
     with pytest.raises(RefusedError, match="there is a servo 4 on this line already"):
         tools.set_number(line, 50, 4)
-    with pytest.raises(RefusedError, match="nobody answers as 5: is it alone"):
+    with pytest.raises(RefusedError, match="no servo answers as 5: is it alone"):
         tools.set_number(line, 5, 6)
 
 
