@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from apps.cli import estop
+from apps.cli import app, estop
 from apps.cli.main import PACKAGES, main
 from apps.cli.options import frames_of, latencies_of
 from apps.cli.running import overrides
@@ -140,13 +140,27 @@ def test_the_topics_page_of_the_documentation_is_up_to_date(capsys: pytest.Captu
     assert capsys.readouterr().out == page, "make it anew: cocoro topics --markdown > docs/topics.md"
 
 
+def test_help_imports_no_command() -> None:
+    code = "import sys; from apps.cli.main import main; main(['--help']); print(*sys.modules, file=sys.stderr)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
+    heavy = {"msgspec", "numpy", "zenoh", "psutil", "rich.live", "cocoro.messages", "apps.cli.link", "apps.cli.status"}
+    assert heavy & set(done.stderr.split()) == set()
+
+
+@pytest.mark.parametrize("row", app.COMMANDS, ids=lambda row: row.name)
+def test_a_commands_own_help_begins_with_its_line_of_the_list(row: app.CommandRow) -> None:
+    command = app.load(row.name)
+    assert " ".join((command.help or "").split()).startswith(row.summary)
+    assert command.hidden == row.hidden
+
+
 def test_the_emergency_stop_imports_next_to_nothing() -> None:
     code = "import sys; from apps.cli import main, estop; estop.by_path('nobody'); print(*sys.modules)"
     done = subprocess.run([sys.executable, "-S", "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
     modules = set(done.stdout.split())
     assert {name for name in modules if name.partition(".")[0] in PACKAGES} == {
-        "apps", "cocoro", "deploy", "apps.cli", "apps.cli.main", "apps.cli.exits", "apps.cli.output", "apps.cli.estop",
-        "deploy.quit", "cocoro.stop", "cocoro.stop.asking", "cocoro.stop.owners",
+        "apps", "deploy", "apps.cli", "apps.cli.main", "apps.cli.exits", "apps.cli.output", "apps.cli.estop",
+        "apps.cli.stop_asking", "deploy.quit",
     }  # fmt: skip
     assert modules.isdisjoint({"asyncio", "argparse", "json", "pathlib", "typing_extensions", "msgspec", "zenoh"})
 

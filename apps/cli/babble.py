@@ -7,11 +7,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from apps.cli.ending import on_end
+from apps.cli.interrupt import on_interrupt
 from apps.cli.link import Link, joined
 from apps.cli.options import RobotChoice
 from apps.cli.output import going_on
-from apps.cli.progress import TaskDisplay, view
+from apps.cli.progress import TaskDisplay, task_display
 from apps.cli.tasks import Follower
 from apps.learning.collector import TOPICS, SampleCollector, collector
 from cocoro.errors import CocoroError, MeshError
@@ -42,6 +42,9 @@ class BabbleDisplay:
 
     def result(self, text: str) -> None:
         self._view.result(f"{text}; {self._kept.said}")
+
+    def close(self) -> None:
+        self._view.close()
 
     def text(self, elapsed_s: float) -> str:
         count = len(self._kept)
@@ -74,7 +77,7 @@ async def babble(where: RobotChoice, task: TaskName, wanted: int, file: Path, la
     async with joined(where) as link:
         robot = await description(link)
         with collector(task, file, robot, await _standing_height(link, label) if label else None) as kept:
-            shown = BabbleDisplay(view(as_json), kept, wanted)
+            shown = BabbleDisplay(task_display(as_json), kept, wanted)
             if len(kept) >= wanted:
                 shown.result(f"{file} holds enough already")
                 return 0
@@ -85,7 +88,7 @@ async def babble(where: RobotChoice, task: TaskName, wanted: int, file: Path, la
             follower = Follower(link, request, shown, None)
             keeper = SampleWriter(kept, follower.cancel)
             samples.add(lambda _key, message: keeper.take(message))
-            with on_end(follower.interrupt), going_on():
+            with on_interrupt(follower.interrupt), going_on():
                 code, result = await follower.run()
             if keeper.failure is not None:
                 raise CocoroError(

@@ -15,7 +15,7 @@ import typer
 
 from apps.captures.export.files import refuse_existing
 from apps.cli import exits
-from apps.cli.ending import told_to_end
+from apps.cli.interrupt import interrupt_event
 from apps.cli.link import joined
 from apps.cli.options import CaptureArgument, MeshOption, RobotChoice, RobotOption
 from cocoro.bus.base import Bus, Payload
@@ -44,7 +44,9 @@ def export(
         Path | None,
         typer.Option("--video", metavar="OUT.mp4", help="Film of the camera's pictures with the detections drawn in."),
     ] = None,
-    foxglove: Annotated[Path | None, typer.Option("--foxglove", metavar="OUT.mcap", help="For Foxglove.")] = None,
+    foxglove: Annotated[
+        Path | None, typer.Option("--foxglove", metavar="OUT.mcap", help="For Foxglove; needs cocoro-mesh[foxglove].")
+    ] = None,
     csv: Annotated[
         Path | None, typer.Option("--csv", metavar="DIR", help="Tables, simulated truth beside belief.")
     ] = None,
@@ -91,10 +93,10 @@ def export_capture(
                 pictures = films.export(capture, video, show)
             print(f"{video}: {pictures} pictures")
         if foxglove is not None:
-            from apps.captures.export import foxglove as foxglove_export
+            from apps.captures.export.foxglove import export as export_foxglove
 
             with _progress_bar(capture, foxglove) as show:
-                messages = foxglove_export.export(capture, foxglove, show)
+                messages = export_foxglove(capture, foxglove, show)
             print(f"{foxglove}: {messages} messages; open it with Foxglove")
         if csv is not None or parquet is not None:
             from apps.captures.export import tables
@@ -181,7 +183,7 @@ async def view_mesh(choice: RobotChoice) -> int:
         recording = opened(rerun)
         watch(link.bus, link.robot, RerunScene(recording, Robot.load(description, measured), Catalogue.load()))
         print("Ctrl-C ends it")
-        with told_to_end() as end:
+        with interrupt_event() as end:
             await end.wait()
     return exits.DONE
 

@@ -19,14 +19,14 @@ from rich.live import Live
 from rich.text import Text
 
 from apps.cli import exits
-from apps.cli.ending import told_to_end
+from apps.cli.interrupt import interrupt_event
 from apps.cli.link import joined
 from apps.cli.listening import Ear, keyexpr_of, takes_frames
 from apps.cli.options import JsonOption, KeyArgument, MeshOption, RobotChoice, RobotOption
 from apps.cli.terminal import table
 from cocoro.bus.base import Payload
 from cocoro.installed import topic_named
-from cocoro.source import ANY_HZ, Source
+from cocoro.stream_checks import ANY_HZ, SequenceTracker
 
 SHOW_S = 1.0
 SILENT_PERIODS = 3.0
@@ -82,7 +82,7 @@ class RateMeter:
         self._nominal_hz = nominal_hz
         self._window_s = window_s
         self._arrivals: deque[Arrival] = deque()
-        self._source = Source()
+        self._source = SequenceTracker()
 
     def hear(self, payload: Payload, at_s: float) -> None:
         try:
@@ -161,7 +161,7 @@ async def show_rates(choice: RobotChoice, text: str, window_s: float, once: bool
     meters: dict[str, RateMeter] = {}
     async with joined(choice, frames=takes_frames(text)) as link:
         ear = Ear(link, keyexpr_of(text, link.robot))
-        with told_to_end() as end, _view(as_json, once) as view:
+        with interrupt_event() as end, _view(as_json, once) as view:
             show_s = time.monotonic() + (window_s if once else SHOW_S)
             while not end.is_set():
                 await ear.wait(end, max(show_s - time.monotonic(), 0.0))

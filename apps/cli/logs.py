@@ -15,7 +15,7 @@ from typing import Annotated, NamedTuple, TextIO
 import typer
 
 from apps.cli import exits
-from apps.cli.ending import passed, told_to_end
+from apps.cli.interrupt import elapsed, interrupt_event
 from apps.cli.options import RobotOption
 from cocoro.bus.endpoints import default_run_dir
 from cocoro.errors import ConfigError
@@ -163,8 +163,8 @@ async def print_logs(robot: str | None, name: str | None, follow: bool, count: i
     try:
         _print(deque(_chosen(tails.values(), wanted), maxlen=count))
         if follow:
-            with told_to_end() as end:
-                while await passed(end, LOOK_S):
+            with interrupt_event() as end:
+                while await elapsed(end, LOOK_S):
                     if name is None:
                         tails |= {path: LogTail(path) for path in files_of(run_dir, None) if path not in tails}
                     _print(_chosen(tails.values(), wanted))

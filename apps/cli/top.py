@@ -15,14 +15,14 @@ import psutil
 import typer
 
 from apps.cli import exits
-from apps.cli.ending import passed, told_to_end
+from apps.cli.interrupt import elapsed, interrupt_event
 from apps.cli.link import Link, joined, within
 from apps.cli.options import JsonOption, MeshOption, RobotChoice, RobotOption
 from apps.cli.status import expected
 from apps.cli.top_view import Screen, print_report
-from cocoro.bus.keys import matches
 from cocoro.component import Component
 from cocoro.installed import topic_named
+from cocoro.keys import matches
 from cocoro.messages import Health, Message, TopicHealth
 from cocoro.topics import BASE_STATE, CLOCK, HEALTH, LATCH, PLAN, TASK, Topic
 from deploy import processes
@@ -61,16 +61,16 @@ async def show_top(choice: RobotChoice, once: bool, as_json: bool, every_s: floa
             report = watch.report()
             _print(report, as_json)
             return exits.DONE if all(service["alive"] for service in report["services"]) else exits.FAILED
-        with told_to_end() as end:
+        with interrupt_event() as end:
             if as_json or not sys.stdout.isatty():
                 while not end.is_set():
                     _print(watch.report(), as_json)
-                    await passed(end, every_s)
+                    await elapsed(end, every_s)
             else:
                 with Screen() as screen:
                     while not end.is_set():
                         screen.show(watch.report())
-                        await passed(end, every_s)
+                        await elapsed(end, every_s)
     return exits.DONE
 
 
@@ -97,15 +97,14 @@ class MeshWatch:
         link.inbox(HEALTH.of("*")).add(lambda _key, health: self._on_health(health))
         for what, topic in NEWS.items():
             link.inbox(topic).add(partial(self._on_news, what))
-        link.bus.watch_alive(f"{link.robot}/*/alive", self._on_alive)
+        link.watch_alive(self._on_alive)
 
     async def first(self) -> None:
         """Waits for the health of every live service, at most FIRST_S."""
         self._alive |= set(await self._link.alive())
         await within(FIRST_S, lambda: self._alive <= set(self._health), self._changed)
 
-    def _on_alive(self, key: str, alive: bool) -> None:
-        service = key.split("/")[1]
+    def _on_alive(self, service: str, alive: bool) -> None:
         (self._alive.add if alive else self._alive.discard)(service)
         self._changed.set()
 

@@ -28,16 +28,16 @@ class NotReadableError(DamageError):
 def reader_of(name: str, schema: str | None) -> Read | None:
     """How payloads of a topic (the key without the robot) are read, by the recorded schema's name; None for keys that
     are not in today's table. Lossy frames come as frames."""
+    topic = topic_named(name)
+    if topic is not None and (schema is None or topic.type.__name__ in (schema, todays_name(schema))):
+        kind: type[Message] = topic.type
+        return msgspec.msgpack.Decoder(kind).decode
     if schema == Alive.__name__:
         return msgspec.msgpack.Decoder(Alive).decode
     if schema == LossyFrame.__name__:
         decoder = msgspec.msgpack.Decoder(LossyFrame)
         return lambda payload: expand(decoder.decode(payload))
-    topic = topic_named(name)
-    if topic is None or (schema is not None and todays_name(schema) != topic.type.__name__):
-        return None
-    kind: type[Message] = topic.type
-    return msgspec.msgpack.Decoder(kind).decode
+    return None
 
 
 class LossyFrame(Message):
