@@ -198,5 +198,5 @@ def test_a_folder_without_views_and_one_with_half_a_view_are_said(tmp_path: Path
         tools.read(tmp_path, BOARD, print)
     tools.save(tmp_path, 1, np.zeros((48, 64, 3), np.uint8), np.zeros((48, 64), np.uint16))
     (tmp_path / "view-01-depth.png").unlink()
-    with pytest.raises(ConfigError, match=r"view-01-depth.png are no view"):
+    with pytest.raises(ConfigError, match=r"view-01-depth.png are not a view"):
         tools.read(tmp_path, BOARD, print)
