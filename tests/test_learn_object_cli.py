@@ -134,7 +134,7 @@ def test_what_is_known_is_only_replaced_or_added_to_when_that_is_said(
         (["Cup", "--from", "photo.png"], "is no label"),
         (["cup", "--from", "nowhere.png"], "there is no picture nowhere.png"),
         (["cup", "--from", "words.png"], "is no picture that can be read"),
-        (["cup", "--from", "photo.png"], "say --size"),
+        (["cup", "--from", "photo.png"], "give --size"),
         (["cup", "--from", "photo.png", "--size", "6cm"], "write it in metres"),
         (["cup", "--from", "photo.png", "--size", "60"], "it is in metres"),
         (["cup", "--from", "photo.png", "--size", "0x1"], "write it in metres"),
