@@ -121,7 +121,7 @@ def test_it_is_exported(rejected: dict[str, Any], tmp_path: Path) -> None:
     assert main(["export", str(rejected["path"]), "--csv", str(tmp_path)]) == 0
     with (tmp_path / f"{NAME}_travelled.csv").open() as table:
         distances = [float(row["distance_m"]) for row in csv.DictReader(table)]
-    assert max(distances) == pytest.approx(1.98)
+    assert 1.9 < max(distances) < 2.0
 
 
 def test_it_is_exported_to_foxglove(rejected: dict[str, Any], tmp_path: Path) -> None:
