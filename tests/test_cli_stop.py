@@ -15,8 +15,9 @@ from pathlib import Path
 import pytest
 
 from apps.cli import estop, exits
-from apps.cli.estop import StopResult, _left_open, _merged
+from apps.cli.estop import _left_open, _merged
 from apps.cli.main import main
+from apps.cli.stop_asking import StopResult
 from cocoro.stop.path import StopPoint, listen
 from deploy.rundir import RunDir
 
@@ -112,7 +113,7 @@ def test_as_data_it_has_the_moment_at_which_each_was_stopped(
 def test_help_stops_nothing(services: Services, capsys: pytest.CaptureFixture[str]) -> None:
     services("base")
     assert main(["stop", "--help"]) == exits.DONE
-    assert "whoever's it is" in capsys.readouterr().out
+    assert "other users'" in capsys.readouterr().out
     assert main(["stop", "--now"]) == exits.USAGE
     assert services.halted == []
 
