@@ -14,15 +14,13 @@ import moderngl
 import pytest
 import zenoh
 
-import sim.bullet  # before pybullet: silences its greeting
-
-pybullet = sim.bullet.pybullet
+import sim.bullet  # noqa: F401  imports pybullet without its greeting
 
 STARTS_A_PROCESS = {"subprocess.Popen", "os.fork", "os.forkpty", "os.posix_spawn", "os.exec", "os.system"}
 """Audit events of the interpreter."""
 CHECKED: tuple[tuple[Any, str, str], ...] = (
     (zenoh, "open", "zenoh"),
-    (pybullet, "connect", "sim"),
+    (sys.modules["pybullet"], "connect", "sim"),
     (moderngl, "create_context", "sim"),
 )
 """Module, function and the marker of tests that may call it."""
