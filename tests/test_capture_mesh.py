@@ -137,6 +137,7 @@ def test_a_recording_ends_well_when_it_is_told_to(short_path: Path) -> None:
     asyncio.run(scenario())
 
 
+@pytest.mark.process
 @pytest.mark.parametrize("became", ["moved", "removed"])
 def test_a_recording_whose_file_is_taken_away_goes_on_in_the_next_one_and_says_what_is_on_the_disk(
     became: str, short_path: Path

@@ -73,7 +73,6 @@ def test_every_piece_of_python_says_which_file_it_is() -> None:
 
 
 @pytest.mark.process
-@pytest.mark.zenoh
 @pytest.mark.sim
 def test_the_tutorial_works_word_for_word(tmp_path: Path, environment: dict[str, str]) -> None:
     folder = tmp_path / "work"
