@@ -87,7 +87,7 @@ def with_messages(captures: Sequence[Capture], steps: Sequence[tuple[int, StepRe
                 continue
             if record.key not in counts:
                 counts[record.key] = counts_of(record.key, capture.robot)
-            in_sequence = counts[record.key].hear(head)
+            in_sequence = counts[record.key].count(head)
             name = (record.key.removeprefix(f"{capture.robot}/"), head.incarnation, head.seq)
             # Of several messages with one number readers take the one that is in sequence, and so does this.
             if name in wanted and (in_sequence or name not in known) and not _lossy(capture, record):
