@@ -13,8 +13,8 @@ __all__ = ["Config", "run"]
 
 
 async def run(node: Node, config: Config) -> None:
-    """Take tasks for ever."""
+    """Take tasks until the service is ended."""
     catalogue = Catalogue.load(Path(config.objects) if config.objects else None)
     executive = Executive(node, config, catalogue)
     node.ready()
-    await executive.tell()
+    await executive.publish_progress()

@@ -144,6 +144,13 @@ class Plan:
 
 
 class Behaviour(Protocol):
+    """Carries out one action. Made when the action is asked for, then stepped at the planner's rate until it reports
+    `done` or `failed`."""
+
+    @property
+    def needs_sight(self) -> bool:
+        """Whether it drives or looks for something, and so pauses while perception is silent. A class attribute does."""
+
     def step(self, snapshot: Snapshot) -> Plan: ...
 
 
