@@ -2,14 +2,14 @@
 
     python bench/capture.py traffic [--seconds 30] [--sensors ideal|real] [--compression zstd]
     python bench/capture.py kill [--times 20]
-    python bench/capture.py rerun
+    python bench/capture.py reexecute
     python bench/capture.py again
     python bench/capture.py frames
 
 `traffic` starts the simulated robot as processes with its recorder, has it fetch the red can, and reads what the
 recorder's process cost (from the operating system, not from the recorder) and what it dropped or never got. `kill`
 sends the recorder SIGKILL at random moments while a stand-in for a robot publishes, and looks how much is missing.
-`rerun` executes perception and planning again over what `traffic` recorded. `again` plays that into a mesh where
+`reexecute` executes perception and planning again over what `traffic` recorded. `again` plays that into a mesh where
 another recorder listens, and compares the two captures. `frames` packs rendered frames of both
 kinds of sensors by each compression, in one thread.
 """
@@ -30,7 +30,7 @@ from pathlib import Path
 import psutil
 
 from apps.captures.info import report
-from apps.captures.reexecute import rerun, words
+from apps.captures.reexecute import describe_result, reexecute
 from apps.rehearsal.rehearse import rehearse
 from apps.rehearsal.request import RehearsalRequest
 from cocoro import topics
@@ -44,6 +44,7 @@ from cocoro.robot import Robot
 from cocoro.tokens import recorder_key
 from deploy.rundir import RunDir
 from services.capture.file import Packer
+from services.executive.tasks import FetchTask
 
 COCORO = [sys.executable, "-m", "apps.cli.main"]
 HEARD_S, LOOK_S = 10.0, 0.2
@@ -159,7 +160,7 @@ def execute(folder: Path) -> None:
     (path,) = sorted(folder.glob("*.mcap"))[:1]
     for service in ("perception", "planning"):
         with Capture.open(path) as capture:
-            print("\n".join(words(rerun([capture], service))))
+            print("\n".join(describe_result(reexecute([capture], service))))
 
 
 def again(folder: Path) -> None:
@@ -205,7 +206,7 @@ def frames(folder: Path) -> None:
     """Time of the processor, since the machine may have other work."""
     for sensors in ("ideal", "real"):
         path = folder / f"{sensors}.mcap"
-        rehearse(RehearsalRequest(task="fetch", label="red_can", sensors=sensors, record=str(path)))
+        rehearse(RehearsalRequest(task=FetchTask(label="red_can"), sensors=sensors, record=str(path)))
         with Capture.open(path) as capture:
             payloads = [bytes(each.payload) for each in list(capture.messages("kinect/frame"))[10:250:8]]
         for compression in ("zstd", "lz4"):
@@ -219,7 +220,7 @@ def frames(folder: Path) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("traffic", "kill", "rerun", "again", "frames"))
+    parser.add_argument("what", choices=("traffic", "kill", "reexecute", "again", "frames"))
     parser.add_argument("--seconds", type=float, default=30.0)
     parser.add_argument("--sensors", default="ideal")
     parser.add_argument("--compression", default="zstd")
@@ -235,7 +236,7 @@ def main() -> None:
             asyncio.run(kill(folder, options.times))
             return
         traffic(folder, options.seconds, options.sensors, options.compression)
-        if options.what == "rerun":
+        if options.what == "reexecute":
             execute(folder)
         if options.what == "again":
             again(folder)

@@ -28,8 +28,8 @@ from mcap.data_stream import ReadDataStream
 from mcap.reader import make_reader
 from mcap.records import Chunk, Message, MessageIndex
 from mcap.stream_reader import breakup_chunk
+from mcap.writer import CaptureWriter as PackageWriter
 from mcap.writer import CompressionType
-from mcap.writer import Writer as PackageWriter
 
 from apps.rehearsal.rehearse import rehearse
 from apps.rehearsal.request import RehearsalRequest
@@ -39,29 +39,32 @@ from cocoro.capture.reader import Capture
 from cocoro.clock import NS
 from services.capture import file
 from services.capture.file import QUICK, Packer
-from services.capture.keys import Entry, info_of
-from services.capture.writer import Limits, Writer
+from services.capture.keys import QueuedMessage, info_of
+from services.capture.writer import CaptureWriter, Limits
+from services.executive.tasks import FetchTask
 
 SMALL_BYTES = 64 * 1024
 MEMORY = Path("/dev/shm")
 
 
-def recorded(folder: Path, sensors: Literal["ideal", "real"], seconds: float) -> list[Entry]:
+def recorded(folder: Path, sensors: Literal["ideal", "real"], seconds: float) -> list[QueuedMessage]:
     """The first messages of a rehearsed fetch, in order."""
     path = folder / f"{sensors}.mcap"
-    rehearse(RehearsalRequest(task="fetch", label="red_can", sensors=sensors, record=str(path)))
+    rehearse(RehearsalRequest(task=FetchTask(label="red_can"), sensors=sensors, record=str(path)))
     with Capture.open(path) as capture:
         end_ns = capture.start_ns + round(seconds * NS)
         made = [
-            Entry(one.key, one.sequence, one.log_ns, one.publish_ns, bytes(one.payload))
+            QueuedMessage(one.key, one.sequence, one.log_ns, one.publish_ns, bytes(one.payload))
             for one in capture.messages(end_ns=end_ns)
         ]
     path.unlink()
     return made
 
 
-def write_here(made: list[Entry], out: Path) -> None:
-    writer = Writer(lambda _: out, Packer("zstd"), Limits(), lambda key, payload: info_of(key, "calliope", payload))
+def write_here(made: list[QueuedMessage], out: Path) -> None:
+    writer = CaptureWriter(
+        lambda _: out, Packer("zstd"), Limits(), lambda key, payload: info_of(key, "calliope", payload)
+    )
     due_ns = made[0].log_ns
     for one in made:
         if one.log_ns >= due_ns:  # as the recorder does it
@@ -71,7 +74,7 @@ def write_here(made: list[Entry], out: Path) -> None:
     writer.close()
 
 
-def write_by_package(made: list[Entry], out: Path) -> None:
+def write_by_package(made: list[QueuedMessage], out: Path) -> None:
     with out.open("wb") as file:
         writer = PackageWriter(file, compression=CompressionType.ZSTD)
         writer.start(profile="cocoro")
@@ -106,9 +109,9 @@ def in_turn(times: int, **ways: Callable[[], object]) -> dict[str, float]:
     return {name: statistics.median(all_s) for name, all_s in spent.items()}
 
 
-def peak_of_a_frame(folder: Path, frame: Entry) -> float:
+def peak_of_a_frame(folder: Path, frame: QueuedMessage) -> float:
     """MB that writing one frame takes at the peak, beside the frame itself."""
-    writer = Writer(lambda _: folder / "peak.mcap", Packer("zstd"), Limits(), lambda *_: info_of(*_of(frame)))
+    writer = CaptureWriter(lambda _: folder / "peak.mcap", Packer("zstd"), Limits(), lambda *_: info_of(*_of(frame)))
     writer.put(frame)
     tracemalloc.start()
     writer.put(frame._replace(log_ns=frame.log_ns + 1))
@@ -118,7 +121,7 @@ def peak_of_a_frame(folder: Path, frame: Entry) -> float:
     return peak / 1e6
 
 
-def _of(frame: Entry) -> tuple[str, str, bytes]:
+def _of(frame: QueuedMessage) -> tuple[str, str, bytes]:
     return frame.key, "calliope", frame.payload
 
 
@@ -133,10 +136,10 @@ def compare(folder: Path, seconds: float, times: int) -> None:
         (folder / "peak.mcap").unlink()
 
 
-def _compare(folder: Path, name: str, made: list[Entry], times: int) -> None:
+def _compare(folder: Path, name: str, made: list[QueuedMessage], times: int) -> None:
     out, paths = folder / "out.mcap", [folder / "here.mcap", folder / "package.mcap"]
 
-    def anew(write: Callable[[list[Entry], Path], None]) -> Callable[[], None]:
+    def anew(write: Callable[[list[QueuedMessage], Path], None]) -> Callable[[], None]:
         def way() -> None:
             write(made, out)
             out.unlink()

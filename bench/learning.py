@@ -23,8 +23,8 @@ from apps.learning.study import BEST, METHODS, Sightings, fit
 from cocoro.learning.fitting import LeastSquares, learn_in_order
 from cocoro.learning.network import PAPER_RATE, HyperplaneRbf
 from cocoro.learning.nominal_model import NominalModel
-from cocoro.learning.reachability import ReachMesh
 from cocoro.robot import Robot
+from services.planning.reachability import ReachMesh
 
 SAMPLES = 1000
 

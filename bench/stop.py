@@ -38,6 +38,7 @@ from cocoro.messages import TaskRequest
 from cocoro.node import Node
 from cocoro.robot import Robot
 from deploy.rundir import Target
+from services.executive.tasks import FetchTask
 
 STANDING_MPS = 0.01
 BOUNDS_S = {"quiet": 0.3, "loaded": 1.0}
@@ -249,7 +250,7 @@ async def _still_latched(here: Place) -> str:
         for topic in (topics.BASE_STATE, topics.ARM_STATE, topics.HAND_STATE):
             await asyncio.wait_for(node.latest(topic).next(), PATIENCE_S)  # type: ignore[arg-type]
         await asyncio.sleep(1.5)  # longer than a cold start takes to be believed
-        reply = await node.call(topics.RUN, TaskRequest(task="fetch", label="red_can"), 10.0)
+        reply = await node.call(topics.RUN, TaskRequest(task=FetchTask(label="red_can")), 10.0)
         if reply.accepted or set(states.values()) != {"latched"}:
             return f"{states}, a fetch was {reply.refusal or 'accepted'}"
     return ""

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from cocoro.arrays import BoolArray, Float32Array, ImageArray
-from cocoro.objects import KnownObject, LabBox
+from cocoro.objects import LabBox, ObjectSpec
 
 Lab = Float32Array
 
@@ -31,6 +31,6 @@ def in_boxes(boxes: Iterable[LabBox], lab: Lab) -> BoolArray:
     return found
 
 
-def matches(known: KnownObject, lab: Lab, *, by_shape: bool = False) -> BoolArray:
+def matches(known: ObjectSpec, lab: Lab, *, by_shape: bool = False) -> BoolArray:
     """Whether each colour (..., 3) is the object's; with `by_shape` also when it is one that it shares."""
     return in_boxes(known.lab + known.lab_by_shape if by_shape else known.lab, lab)

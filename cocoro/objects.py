@@ -34,7 +34,7 @@ class LabBox(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
                 raise ValueError(f"{axis} must rise within {bounds[0]:g} to {bounds[1]:g}, not {low:g} to {high:g}")
 
 
-class KnownObject(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class ObjectSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """One row of the catalogue. A cylinder stands upright; a box stands on its x-y face, at any yaw."""
 
     label: Label
@@ -90,14 +90,14 @@ class KnownObject(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
         return self.radius_m
 
 
-class _File(msgspec.Struct, forbid_unknown_fields=True):
+class _CatalogueFile(msgspec.Struct, forbid_unknown_fields=True):
     object: list[dict[str, Any]]
 
 
 class Catalogue:
     """The known objects, in the file's order; `catalogue[label]`, `label in catalogue`, iteration, `len`."""
 
-    def __init__(self, objects: tuple[KnownObject, ...]) -> None:
+    def __init__(self, objects: tuple[ObjectSpec, ...]) -> None:
         self.objects = objects
         self._by_label = {known.label: known for known in objects}
 
@@ -115,16 +115,16 @@ class Catalogue:
     def from_text(cls, text: str, where: str) -> Catalogue:
         """Read what stands in a catalogue's file; `where` it is from, for messages. Raises ConfigError as `load`."""
         try:
-            rows = msgspec.convert(tomllib.loads(text), _File).object
+            rows = msgspec.convert(tomllib.loads(text), _CatalogueFile).object
         except tomllib.TOMLDecodeError as error:
             raise ConfigError(f"known objects {where}: {error}") from error
         except msgspec.ValidationError as error:
             raise ConfigError(f"known objects {where}: {error}; it must be a list of [[object]] tables") from error
-        objects: list[KnownObject] = []
+        objects: list[ObjectSpec] = []
         for number, row in enumerate(rows, start=1):
             table = f"[[object]] {number} ({row.get('label', 'no label')})"
             try:
-                known = msgspec.convert(row, KnownObject)
+                known = msgspec.convert(row, ObjectSpec)
             except msgspec.ValidationError as error:
                 raise ConfigError(f"known objects {where}: {table}: {_field(error)}") from error
             for earlier in objects:
@@ -142,24 +142,24 @@ class Catalogue:
         return tuple(self._by_label)
 
     @property
-    def targets(self) -> tuple[KnownObject, ...]:
+    def targets(self) -> tuple[ObjectSpec, ...]:
         """Every object but the hand's marker."""
         return tuple(known for known in self.objects if not known.marker)
 
     @property
-    def marker(self) -> KnownObject | None:
+    def marker(self) -> ObjectSpec | None:
         return next((known for known in self.objects if known.marker), None)
 
-    def get(self, label: str) -> KnownObject | None:
+    def get(self, label: str) -> ObjectSpec | None:
         return self._by_label.get(label)
 
-    def __getitem__(self, label: str) -> KnownObject:
+    def __getitem__(self, label: str) -> ObjectSpec:
         return self._by_label[label]
 
     def __contains__(self, label: object) -> bool:
         return label in self._by_label
 
-    def __iter__(self) -> Iterator[KnownObject]:
+    def __iter__(self) -> Iterator[ObjectSpec]:
         return iter(self.objects)
 
     def __len__(self) -> int:

@@ -140,7 +140,7 @@ class _LinkRow(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     offset_deg: float = 0.0
 
 
-class _File(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class _DescriptionFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     name: str
     base: Base
     kinect: Kinect
@@ -204,7 +204,7 @@ class Camera:
 class Robot:
     """The description, ready to compute with. Make it with `Robot.load()`."""
 
-    def __init__(self, spec: _File) -> None:
+    def __init__(self, spec: _DescriptionFile) -> None:
         self._spec = spec
         self.name = spec.name
         self.base = spec.base
@@ -242,7 +242,7 @@ class Robot:
             if override is not None:
                 where = str(override)
                 _merge(data, tomllib.loads(override.read_text(encoding="utf-8")))
-            return cls(msgspec.convert(data, _File))
+            return cls(msgspec.convert(data, _DescriptionFile))
         except (ValueError, OSError) as error:  # not UTF-8, not TOML, not a description, not there
             raise ConfigError(f"robot description {where}: {error}") from error
 
@@ -250,7 +250,7 @@ class Robot:
     def from_data(cls, data: Any, where: str = "robot description") -> Robot:
         """From what `to_data` gave. Raises ConfigError naming the field."""
         try:
-            return cls(msgspec.convert(data, _File))
+            return cls(msgspec.convert(data, _DescriptionFile))
         except msgspec.ValidationError as error:
             raise ConfigError(f"{where}: {error}") from error
 

@@ -7,7 +7,7 @@ from math import cos, hypot, pi, radians, sin
 import numpy as np
 
 from cocoro.errors import ConfigError
-from cocoro.objects import Catalogue, KnownObject
+from cocoro.objects import Catalogue, ObjectSpec
 from sim.scene import Light, Obstacle, Scene, SceneObject, load_scene
 from sim.seeds import stream
 
@@ -69,7 +69,7 @@ def _places(rng: np.random.Generator, count: int) -> list[tuple[float, float]]:
     return places
 
 
-def _object(known: KnownObject, place: tuple[float, float]) -> SceneObject:
+def _object(known: ObjectSpec, place: tuple[float, float]) -> SceneObject:
     return SceneObject(
         label=known.label,
         shape=known.shape,

@@ -20,8 +20,8 @@ from cocoro.robot import Robot
 from cocoro.vloop import run_virtual
 from deploy.processes import named
 from services.capture.file import Compression, Packer
-from services.capture.keys import Entry, KeyInfo, info_of
-from services.capture.writer import Limits, Writer
+from services.capture.keys import KeyInfo, QueuedMessage, info_of
+from services.capture.writer import CaptureWriter, Limits
 
 ROBOT = Robot.load()
 STILL = {"odometry_yaw_rad": 0.0, "speed_mps": 0.0, "turn_rate_radps": 0.0}
@@ -81,19 +81,19 @@ def frame(number: int, width: int = 16, height: int = 12) -> Frame:
     return Frame(width=width, height=height, colour=memoryview(shade), depth=memoryview(shade[: 2 * width * height]))
 
 
-def writer(folder: Path, limits: Limits = FOR_EVER, compression: Compression = "zstd", **options: Any) -> Writer:
+def writer(folder: Path, limits: Limits = FOR_EVER, compression: Compression = "zstd", **options: Any) -> CaptureWriter:
     """Writes one-1.mcap, one-2.mcap and so on."""
 
     def info(key: str, payload: bytes) -> KeyInfo:
         return info_of(key, "calliope", payload)
 
-    return Writer(lambda number: folder / f"one-{number}.mcap", Packer(compression), limits, info, **options)
+    return CaptureWriter(lambda number: folder / f"one-{number}.mcap", Packer(compression), limits, info, **options)
 
 
-def entry(key: str, number: int, payload: bytes = b"", log_ns: int | None = None) -> Entry:
+def entry(key: str, number: int, payload: bytes = b"", log_ns: int | None = None) -> QueuedMessage:
     """The nth message of a key, 10 ms apart."""
     at_ns = NS + number * NS // 100 if log_ns is None else log_ns
-    return Entry(f"calliope/{key}", number, at_ns, at_ns - 1000, payload or state(number))
+    return QueuedMessage(f"calliope/{key}", number, at_ns, at_ns - 1000, payload or state(number))
 
 
 def state(number: int) -> bytes:

@@ -39,6 +39,7 @@ ARGUMENTS: dict[str, str] = {
     "objects learn": "mug --from {name}.png",
     "capture info": "{capture}",
     "capture repair": "{capture} --out {name}.mcap",
+    "capture reexecute": "{capture} --service {name}",
     "capture rerun": "{capture} --service {name}",
     "new service": "nearest --into {name}",
     "servos set-id": "1 2 --port {name}",

@@ -138,7 +138,7 @@ def test_what_is_no_capture_is_told_in_one_line(
     for command in (
         ["capture", "info"],
         ["capture", "repair"],
-        ["capture", "rerun", "--service", "perception"],
+        ["capture", "reexecute", "--service", "perception"],
         ["replay"],
     ):
         assert main([*command, str(path)]) == 1

@@ -15,7 +15,7 @@ from cocoro.capture.conventions import CaptureError
 from cocoro.capture.reader import Capture
 from cocoro.messages import Recording
 from cocoro.vloop import run_virtual
-from services.capture.writer import KEPT_DISTURBED, LOOK_S, Limits, Writer, told, whereabouts
+from services.capture.writer import KEPT_DISTURBED, LOOK_S, CaptureWriter, Limits, describe_disturbance, locate
 
 
 class Watch:
@@ -35,7 +35,7 @@ class Disturbed:
         self.watch = Watch()
         self.folder = folder
         self.number = 0
-        self.writer: Writer = writer(folder, limits or Limits(), monotonic_s=self.watch)
+        self.writer: CaptureWriter = writer(folder, limits or Limits(), monotonic_s=self.watch)
 
     def put(self, count: int) -> None:
         for _ in range(count):
@@ -78,7 +78,10 @@ def test_after_a_removal_it_goes_on_in_the_next_file_and_tells_what_is_lost(it: 
     assert it.writer.where == str(it.folder / "one-2.mcap")
     (gone,) = it.writer.disturbed
     assert (gone.became, gone.lost) == ("removed", 35)
-    assert "one-1.mcap was removed (or moved to another disk) while it was recorded: 35 messages are lost" in told(gone)
+    assert (
+        "one-1.mcap was removed (or moved to another disk) while it was recorded: 35 messages are lost"
+        in describe_disturbance(gone)
+    )
     with Capture.open(it.folder / "one-2.mcap") as capture:
         assert capture.whole
         assert capture.robot == "calliope"
@@ -98,7 +101,7 @@ def test_after_a_move_the_moved_file_is_made_whole_where_it_is_and_nothing_is_lo
     assert (it.writer.messages, it.writer.removed) == (45, 0)
     (file,) = it.writer.disturbed
     assert (file.became, file.now, file.lost) == ("moved", str(moved), 0)
-    assert told(file) == f"{it.folder / 'one-1.mcap'} was moved to {moved} while it was recorded"
+    assert describe_disturbance(file) == f"{it.folder / 'one-1.mcap'} was moved to {moved} while it was recorded"
     with Capture.open(moved) as capture:
         assert capture.whole
 
@@ -204,7 +207,7 @@ def test_a_move_whose_end_the_system_does_not_tell_loses_nothing(
     it.writer.close()
     (file,) = it.writer.disturbed
     assert (file.became, file.now, it.writer.messages) == ("moved", "", 30)
-    assert "was moved elsewhere" in told(file)
+    assert "was moved elsewhere" in describe_disturbance(file)
 
 
 def test_a_second_name_that_is_left_is_no_loss(it: Disturbed, tmp_path: Path) -> None:
@@ -221,7 +224,7 @@ def test_what_a_network_file_system_keeps_of_a_removed_file_is_a_removed_file(tm
     path = tmp_path / "one.mcap"
     with path.open("wb") as file:
         path.rename(tmp_path / ".nfs0000000012")
-        assert whereabouts(path, file.fileno()) == ("removed", "")
+        assert locate(path, file.fileno()) == ("removed", "")
 
 
 def test_a_folder_that_cannot_be_looked_into_says_nothing_of_the_file(
@@ -232,7 +235,7 @@ def test_a_folder_that_cannot_be_looked_into_says_nothing_of_the_file(
 
     it.put(30)
     monkeypatch.setattr(Path, "stat", denied)
-    assert whereabouts(it.writer.file.path, it.writer.file.fileno()).state == "there"
+    assert locate(it.writer.file.path, it.writer.file.fileno()).state == "there"
 
 
 def test_it_is_looked_once_a_second(it: Disturbed, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -240,9 +243,9 @@ def test_it_is_looked_once_a_second(it: Disturbed, monkeypatch: pytest.MonkeyPat
 
     def look(path: Path, fd: int) -> Any:
         looks.append(it.watch.now_s)
-        return whereabouts(path, fd)
+        return locate(path, fd)
 
-    monkeypatch.setattr("services.capture.writer.whereabouts", look)
+    monkeypatch.setattr("services.capture.writer.locate", look)
     for _ in range(100):
         it.watch.now_s += 0.1
         it.writer.flush()

@@ -305,7 +305,7 @@ def test_rerun_is_told_of_the_mesh_as_it_goes(monkeypatch: pytest.MonkeyPatch) -
     async def look() -> None:
         room = Room()
         bus = room.mesh.join()
-        watch(bus, "calliope", rerun_scene.Teller(Stream("cocoro"), ROBOT, Catalogue.load()))
+        watch(bus, "calliope", rerun_scene.RerunScene(Stream("cocoro"), ROBOT, Catalogue.load()))
         bus.publisher("calliope/base/state", Qos.STATE).put(b"no message")
         async with room.node("planning") as planning:
             await room.clock.sleep_until(10**9)

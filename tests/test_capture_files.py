@@ -29,7 +29,7 @@ from cocoro.errors import ConfigError
 from cocoro.messages import BaseState, Detections, Frame, Message, PlannerStatus
 from cocoro.topics import TOPICS
 from services.capture.file import COMPRESSIONS, Compression, Packer
-from services.capture.keys import Choice, lossy
+from services.capture.keys import KeyFilter, lossy
 from services.capture.service import captures, make_room
 from services.capture.writer import Limits, Missing
 
@@ -349,11 +349,11 @@ def test_lossy_frames_look_like_the_frames_and_keep_their_depth(tmp_path: Path) 
     ],
 )
 def test_an_operator_chooses_keys_by_expressions(only: list[str], without: list[str], chosen: set[str]) -> None:
-    choice = Choice("calliope", only, without)
+    choice = KeyFilter("calliope", only, without)
     assert {key for key in ("base/state", "kinect/frame", "base/health") if f"calliope/{key}" in choice} == chosen
 
 
 @pytest.mark.parametrize("text", ["", "a//b", "base/st*"])
 def test_what_is_no_key_expression_is_told_of(text: str) -> None:
     with pytest.raises(ConfigError, match="no key expression"):
-        Choice("calliope", [text])
+        KeyFilter("calliope", [text])

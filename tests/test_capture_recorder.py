@@ -30,7 +30,7 @@ from deploy import profiles
 from deploy.processes import named
 from services.capture.config import Config, folder_of
 from services.capture.sink import LARGE_BYTES, RESERVE_BYTES, Syncer, ThreadedSink
-from services.capture.writer import Writer
+from services.capture.writer import CaptureWriter
 
 
 def test_every_message_of_every_key_is_there_with_its_stamp_and_number(tmp_path: Path) -> None:
@@ -186,6 +186,19 @@ def test_what_never_arrived_is_counted_by_key(tmp_path: Path) -> None:
         assert newest.lost == {"calliope/base/state": 5}
 
 
+def test_a_sequence_number_that_cannot_be_right_is_no_loss(tmp_path: Path) -> None:
+    async def leaping(room: Room) -> None:
+        put = room.mesh.join().publisher("calliope/base/state", Qos.STATE).put
+        for seq in (0, 1, 1 << 62, 2, 3, 5):
+            put(msgspec.msgpack.encode(BaseState(seq=seq, incarnation=7, odometry_m=(0.0, 0.0), **STILL)))
+        await asyncio.sleep(0.1)
+
+    path = record(tmp_path / "leaping.mcap", leaping)
+    assert len(all_of(path, "base/state")) == 6
+    with Capture.open(path) as capture:
+        assert json.loads(capture.metadata["tally"]["lost"]) == {"calliope/base/state": 1}
+
+
 def test_a_fault_of_the_disk_is_told_on_the_mesh_and_the_robot_goes_on(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("no folder")
     told: list[Recording] = []
@@ -237,7 +250,7 @@ class Stalled:
         self.go = threading.Event()
         self._folder = folder
 
-    def make(self, release: Callable[[int], None] | None) -> Writer:
+    def make(self, release: Callable[[int], None] | None) -> CaptureWriter:
         self.go.wait()
         return writer(self._folder)
 
@@ -261,7 +274,7 @@ def test_while_the_disk_stalls_memory_is_bounded_and_large_messages_are_dropped_
 
 
 def test_what_is_given_after_a_fault_is_forgotten(tmp_path: Path) -> None:
-    def fail(_: object) -> Writer:
+    def fail(_: object) -> CaptureWriter:
         raise ZeroDivisionError("a bug")
 
     sink = ThreadedSink(fail, capacity_bytes=10, flush_s=0.1, sync_s=0.5)

@@ -13,7 +13,7 @@ import pytest
 from capture_rig import ROBOT, Room, all_of, drive, entry, record, writer
 
 from apps.captures.player import AT_ONCE, FASTEST, Player
-from apps.captures.replay import Replay, played_keys, reborn, refuse_if_alive, services_of, with_rate
+from apps.captures.replay import Replay, played_keys, refuse_if_alive, restarted, services_of, with_rate
 from cocoro import topics
 from cocoro.capture.reader import Capture
 from cocoro.clock import FollowedClock
@@ -139,17 +139,17 @@ def test_much_that_is_due_comes_in_parts(tmp_path: Path) -> None:
 def test_the_first_pass_leaves_payloads_as_they_are_and_the_next_has_other_incarnations() -> None:
     seen = Detections(seq=3, incarnation=70, frame_seq=5, frame_incarnation=90, width=1, height=1)
     payload = msgspec.msgpack.encode(seen)
-    assert reborn(payload, 0) is payload
-    again = [msgspec.msgpack.decode(reborn(payload, passes), type=Detections) for passes in (1, 2)]
+    assert restarted(payload, 0) is payload
+    again = [msgspec.msgpack.decode(restarted(payload, passes), type=Detections) for passes in (1, 2)]
     assert len({seen.incarnation, *(each.incarnation for each in again)}) == 3
     assert again[0].frame_incarnation - 90 == again[0].incarnation - 70
     assert (again[0].seq, again[0].frame_seq) == (3, 5)
     step = StepRecord(incarnation=1, now_ns=7, consumed=(("base/state", 70, 1),), produced=(("x/y", 90, 2),))
-    later = msgspec.msgpack.decode(reborn(msgspec.msgpack.encode(step), 1), type=StepRecord)
+    later = msgspec.msgpack.decode(restarted(msgspec.msgpack.encode(step), 1), type=StepRecord)
     assert later.consumed == (("base/state", again[0].incarnation, 1),)
     assert later.produced == (("x/y", again[0].frame_incarnation, 2),)
     for strange in (b"", b"\xc1", msgspec.msgpack.encode([1, 2])):
-        assert reborn(strange, 1) == strange
+        assert restarted(strange, 1) == strange
 
 
 def test_the_clock_says_how_fast_time_goes() -> None:

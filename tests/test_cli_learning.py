@@ -15,7 +15,7 @@ from apps.cli.progress import SilentDisplay
 from apps.learning.collector import Coverage, HandCollector, WheelCollector, collector
 from apps.learning.study import BEST
 from cocoro.learning import model
-from cocoro.learning.dataset import HandRow, WheelRow, Writer, hand_header, wheel_header
+from cocoro.learning.dataset import HandRow, SampleFile, WheelRow, hand_header, wheel_header
 from cocoro.learning.nominal_model import LEVEL_ROLL_RAD, NominalModel
 from cocoro.messages import HandSample, TaskState, WheelTrial
 from cocoro.robot import Robot
@@ -27,7 +27,7 @@ JOINTS = ("arm_base", "shoulder", "elbow", "wrist_pitch")
 def arm_file(tmp_path: Path, robot: Robot) -> Path:
     path = tmp_path / "arm.jsonl"
     seen = sightings(robot, draws=60)
-    with Writer(path, HandRow, robot, hand_header(robot, NominalModel(robot).joints, LEVEL_ROLL_RAD)) as writer:
+    with SampleFile(path, HandRow, robot, hand_header(robot, NominalModel(robot).joints, LEVEL_ROLL_RAD)) as writer:
         writer.append(
             HandRow(
                 stamp_ns=number, draw=int(draw), angles_rad=tuple(angles), head_rad=(0.0, -0.5), seen_m=tuple(place),
@@ -96,7 +96,7 @@ def test_mistakes_are_said_in_one_line(
     few = tmp_path / "few.jsonl"
     few.write_bytes(b"".join(arm_file.read_bytes().splitlines(keepends=True)[:20]))
     straight = tmp_path / "straight.jsonl"
-    with Writer(straight, WheelRow, robot, wheel_header(robot)):
+    with SampleFile(straight, WheelRow, robot, wheel_header(robot)):
         pass
     (tmp_path / "broken.json").write_text("{")
     for arguments, text in (

@@ -21,7 +21,7 @@ from apps.experiments.settings import ExperimentSettings
 from apps.experiments.stats import summarise
 from apps.learning.study import BEST
 from apps.rehearsal.request import RehearsalRequest
-from cocoro.learning.dataset import HandRow, WheelRow, Writer, hand_header, wheel_header
+from cocoro.learning.dataset import HandRow, SampleFile, WheelRow, hand_header, wheel_header
 from cocoro.learning.nominal_model import LEVEL_ROLL_RAD, NominalModel
 from cocoro.robot import Robot
 
@@ -88,7 +88,7 @@ def test_what_cannot_be_run_fails_with_its_reason_and_so_does_what_needs_it(tmp_
 def arm_and_wheels(settings: ExperimentSettings, robot: Robot) -> None:
     seen = sightings(robot, draws=60)
     header = hand_header(robot, NominalModel(robot).joints, LEVEL_ROLL_RAD)
-    with Writer(settings.arm_file(0), HandRow, robot, header) as writer:
+    with SampleFile(settings.arm_file(0), HandRow, robot, header) as writer:
         writer.append(
             HandRow(
                 stamp_ns=number * 10**8, draw=int(draw), angles_rad=tuple(angles), head_rad=(0.0, 0.0),
@@ -98,7 +98,7 @@ def arm_and_wheels(settings: ExperimentSettings, robot: Robot) -> None:
                 zip(seen.angles_rad.tolist(), seen.places_m.tolist(), seen.draws, strict=True)
             )
         )  # fmt: skip
-    with Writer(settings.wheels_file(0), WheelRow, robot, wheel_header(robot, 0.06)) as writer:
+    with SampleFile(settings.wheels_file(0), WheelRow, robot, wheel_header(robot, 0.06)) as writer:
         writer.append(
             WheelRow(
                 stamp_ns=number, trial=number, left_mps=-0.1, right_mps=0.1, left_m=-0.03 * way, right_m=0.03 * way,

@@ -27,12 +27,13 @@ from cocoro.component import load
 from cocoro.errors import ConfigError
 from cocoro.messages import ServoState
 from cocoro.node import Node
-from cocoro.objects import Catalogue, KnownObject, LabBox, own_text
+from cocoro.objects import Catalogue, LabBox, ObjectSpec, own_text
 from cocoro.picture import colour_of
 from cocoro.robot import Robot
 from cocoro.topics import ARM_STATE, FRAME
 from deploy import profiles
 from deploy.processes import named
+from services.executive.tasks import FetchTask
 from sim.scene import Light
 
 TEAL = (20, 150, 140)
@@ -238,7 +239,7 @@ def test_what_was_learnt_from_one_look_is_fetched(here: Path) -> None:
         """
     )
     rehearsal = RehearsalRequest(
-        task="fetch", label="orange_can", scene="scene.toml", sensors="real", objects="objects.toml",
+        task=FetchTask(label="orange_can"), scene="scene.toml", sensors="real", objects="objects.toml",
         width=320, height=240, frame_rate_hz=15.0,
     )  # fmt: skip
     result = rehearse(rehearsal)
@@ -248,7 +249,7 @@ def test_what_was_learnt_from_one_look_is_fetched(here: Path) -> None:
 
 # --- the file -------------------------------------------------------------------------------------
 
-CUP = KnownObject(
+CUP = ObjectSpec(
     label="cup", shape="cylinder", radius_m=0.031, height_m=0.1, mass_kg=0.15, graspable=True, rgb=(0.1, 0.6, 0.5),
     lab=(LabBox((10, -30, -5), (60, -10, 5)),), lab_by_shape=(LabBox((5, -12, -5.5), (10, -4, 5)),),
 )  # fmt: skip
@@ -256,7 +257,7 @@ BOX = msgspec.structs.replace(CUP, shape="box", radius_m=None, height_m=None, bo
 
 
 @pytest.mark.parametrize("known", [CUP, BOX, *Catalogue.load()], ids=lambda known: f"{known.label} {known.shape}")
-def test_an_objects_table_says_what_the_object_is(known: KnownObject) -> None:
+def test_an_objects_table_says_what_the_object_is(known: ObjectSpec) -> None:
     assert tuple(Catalogue.from_text(as_toml(known), "test")) == (known,)
 
 

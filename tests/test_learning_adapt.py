@@ -9,7 +9,7 @@ from learning_arm import sightings
 from apps.learning.study import BEST, Sightings, errors_m, fit, rms, split
 from cocoro.learning.nominal_model import NominalModel
 from cocoro.robot import Robot
-from services.planning.adapt import Adapter
+from services.planning.teaching import Adapter
 from sim.wear import BEND_RAD
 
 

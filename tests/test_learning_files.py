@@ -16,7 +16,7 @@ from learning_arm import sightings
 from apps.learning.study import BEST, METHODS, fit
 from cocoro.errors import ConfigError, RefusedError
 from cocoro.learning import dataset, model
-from cocoro.learning.dataset import HandRow, WheelRow, Writer, hand_header, wheel_header
+from cocoro.learning.dataset import HandRow, SampleFile, WheelRow, hand_header, wheel_header
 from cocoro.learning.model import Training, WheelModel
 from cocoro.learning.nominal_model import NominalModel
 from cocoro.robot import Robot
@@ -31,8 +31,8 @@ def row(draw: int) -> HandRow:
     )  # fmt: skip
 
 
-def opened(path: Path, robot: Robot) -> Writer[HandRow]:
-    return Writer(path, HandRow, robot, hand_header(robot, NominalModel(robot).joints, np.pi / 2))
+def opened(path: Path, robot: Robot) -> SampleFile[HandRow]:
+    return SampleFile(path, HandRow, robot, hand_header(robot, NominalModel(robot).joints, np.pi / 2))
 
 
 # --- samples ----------------------------------------------------------------------------------------
@@ -63,12 +63,12 @@ def test_any_tool_reads_them_line_by_line(tmp_path: Path, robot: Robot) -> None:
 KILLED = """
 import sys
 from pathlib import Path
-from cocoro.learning.dataset import HandRow, Writer, hand_header
-from cocoro.learning.nominal_model import Drawing
+from cocoro.learning.dataset import HandRow, SampleFile, hand_header
+from cocoro.learning.nominal_model import NominalModel
 from cocoro.robot import Robot
 
 robot = Robot.load()
-with Writer(Path(sys.argv[1]), HandRow, robot, hand_header(robot, Drawing(robot).joints, 1.57)) as writer:
+with SampleFile(Path(sys.argv[1]), HandRow, robot, hand_header(robot, NominalModel(robot).joints, 1.57)) as writer:
     for draw in range(1_000_000):
         writer.append([HandRow(stamp_ns=draw, draw=draw, angles_rad=(0.0,) * 4, head_rad=(0.0, 0.0),
                                seen_m=(0.1, 0.2, 0.3), area_px=1)])
@@ -86,7 +86,7 @@ def test_killed_in_the_middle_nothing_that_was_appended_is_lost(tmp_path: Path, 
                 process.send_signal(signal.SIGKILL)
                 break
         said = [200, *map(int, process.stdout.read().split())]
-    writer = Writer(path, HandRow, robot, hand_header(robot, NominalModel(robot).joints, 1.57))
+    writer = SampleFile(path, HandRow, robot, hand_header(robot, NominalModel(robot).joints, 1.57))
     with writer:
         draws = [sample.draw for sample in writer.rows]
         assert draws[: said[-1] + 1] == list(range(said[-1] + 1))
@@ -133,7 +133,7 @@ def test_samples_of_another_kind_robot_or_description_are_refused(tmp_path: Path
     with pytest.raises(ConfigError, match="of robot 'calliope', this one is 'robbie'"):
         dataset.read(path, HandRow, Robot.from_data(data))
     with pytest.raises(ConfigError, match="holds cocoro"):
-        Writer(path, WheelRow, robot, wheel_header(robot))
+        SampleFile(path, WheelRow, robot, wheel_header(robot))
 
 
 @pytest.mark.parametrize(
@@ -167,7 +167,7 @@ def test_a_damaged_line_is_named(tmp_path: Path, robot: Robot) -> None:
 
 
 @pytest.fixture(scope="module")
-def learned(robot: Robot) -> model.Model:
+def learned(robot: Robot) -> model.BodyModel:
     seen = sightings(robot, draws=60)
     arm = model.arm_model(fit(BEST, NominalModel(robot), seen), np.pi / 2, seen.places_m, TRAINING)
     return msgspec.structs.replace(
@@ -177,7 +177,7 @@ def learned(robot: Robot) -> model.Model:
 
 @pytest.mark.parametrize("method", [BEST, METHODS[1]], ids=lambda method: method.name)
 def test_a_map_computes_the_same_after_it_was_saved(
-    tmp_path: Path, robot: Robot, method: object, learned: model.Model
+    tmp_path: Path, robot: Robot, method: object, learned: model.BodyModel
 ) -> None:
     seen = sightings(robot, draws=60)
     before = fit(method, NominalModel(robot), seen)  # type: ignore[arg-type]
@@ -200,7 +200,7 @@ def _edited(data: bytes, **changes: object) -> bytes:
     return json.dumps(json.loads(data) | changes).encode()
 
 
-def test_every_wrong_model_is_refused_in_one_line_that_says_why(robot: Robot, learned: model.Model) -> None:
+def test_every_wrong_model_is_refused_in_one_line_that_says_why(robot: Robot, learned: model.BodyModel) -> None:
     good = model.encode(learned)
     flipped = good.replace(b'"separation_m":0.2575', b'"separation_m":0.2775')
     assert flipped != good
@@ -237,7 +237,7 @@ def test_a_model_file_that_is_not_there_is_refused(tmp_path: Path, robot: Robot)
         model.save(model.empty(robot), tmp_path / "file" / "model.json")
 
 
-def test_saving_replaces_a_file_whole(tmp_path: Path, robot: Robot, learned: model.Model) -> None:
+def test_saving_replaces_a_file_whole(tmp_path: Path, robot: Robot, learned: model.BodyModel) -> None:
     path = tmp_path / "model.json"
     model.save(learned, path)
     model.save(model.empty(robot), path)

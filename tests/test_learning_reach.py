@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cocoro.arrays import FloatArray
-from cocoro.learning.reachability import Reach, ReachMesh
+from services.planning.reachability import ReachMesh, ReachVerdict
 
 
 def shell(count: int, seed: int = 0, inner_m: float = 0.25, outer_m: float = 0.5) -> FloatArray:
@@ -20,24 +20,24 @@ def shell(count: int, seed: int = 0, inner_m: float = 0.25, outer_m: float = 0.5
 
 def test_amidst_what_was_seen_is_inside_and_beyond_it_outside() -> None:
     mesh = ReachMesh(shell(3000))
-    assert mesh.verdict((0.38, 0.0, 0.0)) is Reach.INSIDE
-    assert mesh.verdict((0.0, -0.27, -0.27)) is Reach.INSIDE
-    assert mesh.verdict((0.6, 0.0, 0.0)) is Reach.OUTSIDE
+    assert mesh.verdict((0.38, 0.0, 0.0)) is ReachVerdict.INSIDE
+    assert mesh.verdict((0.0, -0.27, -0.27)) is ReachVerdict.INSIDE
+    assert mesh.verdict((0.6, 0.0, 0.0)) is ReachVerdict.OUTSIDE
 
 
 def test_a_hollow_is_not_called_reachable_though_the_hull_holds_it() -> None:
     mesh = ReachMesh(shell(3000))
     inside_hollow = shell(200, seed=3, inner_m=0.0, outer_m=0.18)
-    assert set(mesh.verdicts(inside_hollow).tolist()) == {Reach.UNPROVEN}
+    assert set(mesh.verdicts(inside_hollow).tolist()) == {ReachVerdict.UNPROVEN}
 
 
 def test_a_dent_from_outside_is_not_called_reachable_either() -> None:
     places = np.random.default_rng(0).uniform(-0.4, 0.4, (6000, 3))
     dented = places[(np.abs(places[:, :2]).max(axis=1) > 0.15) | (places[:, 2] < 0.0)]
     mesh = ReachMesh(dented)
-    assert mesh.verdict((0.0, 0.0, 0.25)) is Reach.UNPROVEN
-    assert mesh.verdict((0.0, 0.0, -0.2)) is Reach.INSIDE
-    assert mesh.verdict((0.3, 0.0, 0.25)) is Reach.INSIDE
+    assert mesh.verdict((0.0, 0.0, 0.25)) is ReachVerdict.UNPROVEN
+    assert mesh.verdict((0.0, 0.0, -0.2)) is ReachVerdict.INSIDE
+    assert mesh.verdict((0.3, 0.0, 0.25)) is ReachVerdict.INSIDE
 
 
 def test_the_volume_is_that_of_the_shell_and_not_of_its_hull() -> None:
@@ -76,7 +76,7 @@ def test_one_by_one_the_answers_are_those_of_the_batch() -> None:
 )
 def test_too_little_proves_nothing(places: FloatArray) -> None:
     mesh = ReachMesh(places)
-    assert mesh.verdict((0.3, 0.3, 0.0)) is Reach.OUTSIDE
+    assert mesh.verdict((0.3, 0.3, 0.0)) is ReachVerdict.OUTSIDE
     assert mesh.volume_m3() == 0.0
 
 
@@ -85,7 +85,7 @@ def test_a_plane_becomes_a_body_once_something_is_seen_beside_it() -> None:
     flat = np.c_[rng.uniform(-0.1, 0.1, (100, 2)), np.zeros(100)]
     mesh = ReachMesh(flat)
     mesh.add(rng.uniform(-0.1, 0.1, (300, 3)))
-    assert mesh.verdict((0.0, 0.0, 0.03)) is Reach.INSIDE
+    assert mesh.verdict((0.0, 0.0, 0.03)) is ReachVerdict.INSIDE
 
 
 def test_doubles_add_nothing() -> None:

@@ -9,7 +9,7 @@ from perception_scenes import CATALOGUE, MS, ROBOT, STAMP_NS, Scene, Thing, bloc
 from services.perception.config import Config
 from services.perception.localise import Localiser
 from services.perception.shapes import distance_from, signed_distance
-from services.perception.sighting import Sighting
+from services.perception.sighting import ImageSighting
 from sim.scene import Light
 
 pytestmark = pytest.mark.sim
@@ -107,7 +107,7 @@ def test_what_seems_to_be_a_part_of_something_that_reaches_into_the_floor_is_no_
     into_floor = np.linalg.inv(localiser.camera_pose(head_rad)) @ [1.05, 0.35, -0.07, 1.0]
     x, y, z, _ = into_floor.tolist()
     u, v = x / z * camera.fx + camera.cx, y / z * camera.fy + camera.cy
-    sighting = Sighting("blue_ball", u, v, area_px, (0, 0, 30, 30), z, hidden=True)
+    sighting = ImageSighting("blue_ball", u, v, area_px, (0, 0, 30, 30), z, hidden=True)
     assert bool(localiser.locate([sighting], camera, head_rad)) == is_told
 
 

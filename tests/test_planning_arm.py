@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from cocoro.arrays import FloatArray
 from cocoro.robot import Robot
-from services.planning.arm import ROLL, ArmController, Step
+from services.planning.arm import ROLL, ArmController, ArmStep
 from services.planning.clearance import Clearance
 from services.planning.config import Config
 from services.planning.reach import ARM, LEVEL_ROLL_RAD, HandPose, Reacher
@@ -57,9 +57,9 @@ class Arm:
         self.controller = ArmController(ROBOT, CONFIG.arm, REACHER)
         self.angles = angles
         self.path = [angles]
-        self.steps: list[Step] = []
+        self.steps: list[ArmStep] = []
 
-    def go(self, command: Callable[[], Step], most_s: float = 12.0) -> Step:
+    def go(self, command: Callable[[], ArmStep], most_s: float = 12.0) -> ArmStep:
         """Until it says that it has arrived or is blocked."""
         for _ in range(round(most_s / TICK_S)):
             step = command()
@@ -70,10 +70,10 @@ class Arm:
                 break
         return step
 
-    def reach(self, goal: HandPose, speed_mps: float = 0.25) -> Step:
+    def reach(self, goal: HandPose, speed_mps: float = 0.25) -> ArmStep:
         return self.go(lambda: self.controller.reach(goal, speed_mps, self.angles, TICK_S))
 
-    def park(self) -> Step:
+    def park(self) -> ArmStep:
         return self.go(lambda: self.controller.park(self.angles, TICK_S))
 
 

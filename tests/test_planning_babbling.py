@@ -29,8 +29,7 @@ from cocoro.robot import Robot
 from services.planning.arm import ROLL, ArmController
 from services.planning.config import Config
 from services.planning.core import PlanningCore
-from services.planning.draws import sobol
-from services.planning.postures import Postures
+from services.planning.postures import Postures, sobol
 from services.planning.reach import ARM, LEVEL_ROLL_RAD, HandPose, Reacher
 
 TICK_NS = NS // 50

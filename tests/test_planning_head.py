@@ -10,11 +10,11 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from cocoro.robot import Robot
-from services.planning.config import Head
+from services.planning.config import HeadConfig
 from services.planning.head import PAN, TILT, Gaze, Sweep
 
 ROBOT = Robot.load()
-CONFIG = Head()
+CONFIG = HeadConfig()
 GAZE = Gaze(ROBOT, CONFIG)
 CAMERA = ROBOT.chain("camera")
 

@@ -13,7 +13,7 @@ from cocoro.arrays import FloatArray
 from cocoro.clock import NS
 from cocoro.frames import Pose2
 from cocoro.messages import TargetEstimate
-from services.planning.config import Memory
+from services.planning.config import MemoryConfig
 from services.planning.memory import TargetMemory
 
 HERE = Pose2()
@@ -47,7 +47,7 @@ def noisy(place: FloatArray, count: int, sigma_m: float, seed: int = 0) -> list[
 
 
 def test_what_was_never_seen_is_not_known() -> None:
-    memory = TargetMemory(Memory())
+    memory = TargetMemory(MemoryConfig())
     assert memory.estimate("can", HERE, NS) is None
     assert memory.sightings("can") == 0
     assert memory.all(HERE, NS) == ()
@@ -55,7 +55,7 @@ def test_what_was_never_seen_is_not_known() -> None:
 
 @pytest.mark.parametrize("seed", range(5))
 def test_noise_on_something_that_stands_is_smoothed_away_and_makes_it_no_mover(seed: int) -> None:
-    memory = TargetMemory(Memory())
+    memory = TargetMemory(MemoryConfig())
     end_s = feed(memory, noisy(CAN, 60, 0.01, seed))
     estimate = believed(memory, end_s)
     assert np.linalg.norm(np.array(estimate.position_m) - CAN) < 0.01
@@ -66,7 +66,7 @@ def test_noise_on_something_that_stands_is_smoothed_away_and_makes_it_no_mover(s
 
 @pytest.mark.parametrize("speed_mps", [0.1, 0.25, 0.35])
 def test_the_velocity_of_something_that_moves_is_found_and_it_is_not_lagged_behind(speed_mps: float) -> None:
-    memory, velocity = TargetMemory(Memory()), speed_mps * np.array([0.6, 0.8, 0.0])
+    memory, velocity = TargetMemory(MemoryConfig()), speed_mps * np.array([0.6, 0.8, 0.0])
     path = [place + velocity * k * FRAME_S for k, place in enumerate(noisy(CAN, 90, 0.005))]
     end_s = feed(memory, path)
     estimate = believed(memory, end_s)
@@ -75,7 +75,7 @@ def test_the_velocity_of_something_that_moves_is_found_and_it_is_not_lagged_behi
 
 
 def test_what_stops_is_soon_believed_to_stand() -> None:
-    memory, velocity = TargetMemory(Memory()), np.array([0.25, 0.0, 0.0])
+    memory, velocity = TargetMemory(MemoryConfig()), np.array([0.25, 0.0, 0.0])
     moving_s = feed(memory, [CAN + velocity * k * FRAME_S for k in range(60)])
     stopped = CAN + velocity * moving_s
     end_s = feed(memory, [stopped] * 45, start_s=moving_s + FRAME_S)
@@ -86,7 +86,7 @@ def test_what_stops_is_soon_believed_to_stand() -> None:
 
 @pytest.mark.parametrize("count", [1, 2])
 def test_a_stray_sighting_or_two_move_nothing(count: int) -> None:
-    memory = TargetMemory(Memory())
+    memory = TargetMemory(MemoryConfig())
     at_s = feed(memory, [CAN] * 30)
     at_s = feed(memory, [CAN + np.array([0.5, 0.0, 0.0])] * count, start_s=at_s + FRAME_S)
     assert np.array(believed(memory, at_s).position_m) == pytest.approx(CAN, abs=0.01)
@@ -95,14 +95,14 @@ def test_a_stray_sighting_or_two_move_nothing(count: int) -> None:
 
 
 def test_what_was_put_elsewhere_is_believed_when_three_sightings_agree() -> None:
-    memory, elsewhere = TargetMemory(Memory()), CAN + np.array([0.5, 0.3, 0.0])
+    memory, elsewhere = TargetMemory(MemoryConfig()), CAN + np.array([0.5, 0.3, 0.0])
     at_s = feed(memory, [CAN] * 30)
     at_s = feed(memory, [elsewhere] * 3, start_s=at_s + FRAME_S)
     assert np.array(believed(memory, at_s).position_m) == pytest.approx(elsewhere, abs=0.01)
 
 
 def test_sightings_that_do_not_agree_with_each_other_convince_nobody() -> None:
-    memory = TargetMemory(Memory())
+    memory = TargetMemory(MemoryConfig())
     at_s = feed(memory, [CAN] * 30)
     strays = [CAN + np.array([0.5 * (k + 1), (-1) ** k * 0.6, 0.0]) for k in range(6)]
     at_s = feed(memory, strays, start_s=at_s + FRAME_S)
@@ -110,7 +110,7 @@ def test_sightings_that_do_not_agree_with_each_other_convince_nobody() -> None:
 
 
 def test_doubtful_sightings_weigh_little_and_never_move_it_away() -> None:
-    sure, unsure = TargetMemory(Memory()), TargetMemory(Memory())
+    sure, unsure = TargetMemory(MemoryConfig()), TargetMemory(MemoryConfig())
     shifted = CAN + np.array([0.04, 0.0, 0.0])
     for memory, doubtful in ((sure, False), (unsure, True)):
         at_s = feed(memory, [CAN] * 30)
@@ -123,7 +123,7 @@ def test_doubtful_sightings_weigh_little_and_never_move_it_away() -> None:
 
 @given(x=st.floats(-2, 2), y=st.floats(-2, 2), yaw=st.floats(-pi, pi))
 def test_what_is_not_seen_is_carried_by_odometry(x: float, y: float, yaw: float) -> None:
-    memory = TargetMemory(Memory())
+    memory = TargetMemory(MemoryConfig())
     at_s = feed(memory, [CAN] * 10)
     body = Pose2(x, y, yaw)
     estimate = believed(memory, at_s + 1.0, body)
@@ -132,7 +132,7 @@ def test_what_is_not_seen_is_carried_by_odometry(x: float, y: float, yaw: float)
 
 
 def test_the_longer_it_is_unseen_the_older_and_the_less_certain() -> None:
-    memory = TargetMemory(Memory())
+    memory = TargetMemory(MemoryConfig())
     at_s = feed(memory, [CAN] * 10)
     young, old = believed(memory, at_s + 0.5), believed(memory, at_s + 20.0)
     assert (young.age_s, old.age_s) == pytest.approx((0.5, 20.0))
@@ -140,7 +140,7 @@ def test_the_longer_it_is_unseen_the_older_and_the_less_certain() -> None:
 
 
 def test_an_unseen_movers_way_fades_out() -> None:
-    memory, velocity, config = TargetMemory(Memory()), np.array([0.3, 0.0, 0.0]), Memory()
+    memory, velocity, config = TargetMemory(MemoryConfig()), np.array([0.3, 0.0, 0.0]), MemoryConfig()
     at_s = feed(memory, [CAN + velocity * k * FRAME_S for k in range(60)])
     last = CAN + velocity * at_s
     far = believed(memory, at_s + 30.0).position_m[0] - last[0]
@@ -148,7 +148,7 @@ def test_an_unseen_movers_way_fades_out() -> None:
 
 
 def test_what_was_not_seen_for_long_is_forgotten() -> None:
-    memory = TargetMemory(Memory(forget_s=10.0))
+    memory = TargetMemory(MemoryConfig(forget_s=10.0))
     at_s = feed(memory, [CAN] * 10)
     assert memory.estimate("can", HERE, round((at_s + 9.9) * NS)) is not None
     assert memory.estimate("can", HERE, round((at_s + 10.1) * NS)) is None
@@ -156,7 +156,7 @@ def test_what_was_not_seen_for_long_is_forgotten() -> None:
 
 
 def test_a_late_frame_changes_nothing() -> None:
-    memory = TargetMemory(Memory())
+    memory = TargetMemory(MemoryConfig())
     at_s = feed(memory, [CAN] * 10)
     before = believed(memory, at_s)
     feed(memory, [CAN + np.array([0.05, 0.0, 0.0])], start_s=at_s - 0.1)
@@ -164,7 +164,7 @@ def test_a_late_frame_changes_nothing() -> None:
 
 
 def test_objects_are_remembered_apart() -> None:
-    memory = TargetMemory(Memory())
+    memory = TargetMemory(MemoryConfig())
     feed(memory, [CAN] * 5)
     at_s = feed(memory, [-CAN] * 5, label="ball")
     labels = [estimate.label for estimate in memory.all(HERE, round(at_s * NS))]
@@ -177,7 +177,7 @@ def test_objects_are_remembered_apart() -> None:
 
 @pytest.mark.parametrize("period_s", [1 / 30, 0.1, 0.5])
 def test_at_any_rate_of_perception_a_standing_object_stands(period_s: float) -> None:
-    memory = TargetMemory(Memory())
+    memory = TargetMemory(MemoryConfig())
     end_s = feed(memory, noisy(CAN, 40, 0.01), period_s=period_s)
     estimate = believed(memory, end_s)
     assert np.linalg.norm(np.array(estimate.position_m) - CAN) < (0.012 if period_s < 0.3 else 0.02)

@@ -15,13 +15,14 @@ from cocoro.arrays import FloatArray
 from cocoro.clock import NS
 from cocoro.learning.model import Training, arm_model, empty, encode
 from cocoro.learning.nominal_model import NominalModel
-from cocoro.learning.reachability import ReachMesh
 from cocoro.robot import Robot
+from services.executive.tasks import GoToTask, TouchTask
 from services.planning.behaviours.base import Actuators
 from services.planning.config import Config
 from services.planning.learned import Learned
 from services.planning.reach import ARM, LEVEL_ROLL_RAD
-from services.planning.state_estimator import Sighting
+from services.planning.reachability import ReachMesh
+from services.planning.state_estimator import PostureSighting
 from services.planning.teaching import LUMP, Teacher
 
 QUICK = {"width": 160, "height": 120, "frame_rate_hz": 15.0}
@@ -30,7 +31,7 @@ QUICK = {"width": 160, "height": 120, "frame_rate_hz": 15.0}
 @pytest.mark.sim
 def test_what_hangs_before_the_robot_is_touched_in_turn() -> None:
     request = RehearsalRequest(
-        task="touch", label="red_can", then=("green_can", "blue_can", "yellow_ball", "red_can"), scene="targets",
+        task=TouchTask(label="red_can"), then=("green_can", "blue_can", "yellow_ball", "red_can"), scene="targets",
         trace=True, **QUICK,
     )  # fmt: skip
     result = rehearse(request)
@@ -46,17 +47,17 @@ def test_what_hangs_before_the_robot_is_touched_in_turn() -> None:
 
 @pytest.mark.sim
 def test_the_robot_stops_at_the_distance_that_was_asked() -> None:
-    request = RehearsalRequest(task="go-to", label="blue_can", distance_m=0.35, **QUICK)
+    request = RehearsalRequest(task=GoToTask(label="blue_can", distance_m=0.35), **QUICK)
     result = rehearse(request)
     assert result["outcome"] == "done"
     assert result["tasks"][0]["target_edge_m"] == pytest.approx(0.35, abs=0.015)
     assert result["truth"]["knocked_over"] == ()
 
 
-def sighting(number: int, angles: np.ndarray, place: np.ndarray, roll_rad: float = LEVEL_ROLL_RAD) -> Sighting:
+def sighting(number: int, angles: np.ndarray, place: np.ndarray, roll_rad: float = LEVEL_ROLL_RAD) -> PostureSighting:
     posture = dict(zip(ARM, angles.tolist(), strict=True), wrist_roll=roll_rad)
     x, y, z = place.tolist()
-    return Sighting("hand_marker", number * NS // 10, (x, y, z), 300, posture)
+    return PostureSighting("hand_marker", number * NS // 10, (x, y, z), 300, posture)
 
 
 def test_sightings_at_work_teach_a_copy_of_the_map_and_the_mesh(robot: Robot) -> None:

@@ -14,7 +14,7 @@ from apps.appearance.size import MeasuredSize, ObjectShape, guessed_shape, size_
 from cocoro.arrays import BoolArray, CodeArray, FloatArray, ImageArray
 from cocoro.colour import in_boxes, lab_of, matches
 from cocoro.errors import ConfigError
-from cocoro.objects import Catalogue, KnownObject
+from cocoro.objects import Catalogue, ObjectSpec
 from cocoro.robot import Robot
 
 GRASPABLE_WIDTH_M = (0.02, 0.075)
@@ -63,7 +63,7 @@ class ObjectHints:
 class LearnedObject:
     """What was learnt, and what is to be said of it."""
 
-    known: KnownObject
+    known: ObjectSpec
     region: ObjectRegion
     range: ColourRange
     measured: MeasuredSize | None
@@ -108,7 +108,7 @@ def learn(look: ObjectView, wanted: ObjectHints, catalogue: Catalogue) -> Learne
     return LearnedObject(known, region, found, measured, common, matched, elsewhere, tuple(warnings))
 
 
-def _region(picture: ColourField, wanted: ObjectHints, others: list[KnownObject]) -> ObjectRegion:
+def _region(picture: ColourField, wanted: ObjectHints, others: list[ObjectSpec]) -> ObjectRegion:
     if wanted.at_px is not None:
         return at_pixel(picture, *wanted.at_px)
     if wanted.box_px is not None:
@@ -145,7 +145,7 @@ def _measured(look: ObjectView, wanted: ObjectHints, region: ObjectRegion, shape
     return size_of(region, camera, depth_m, shape, look.camera_pose)
 
 
-def _row(wanted: ObjectHints, shape: ObjectShape, measured: MeasuredSize | None, found: ColourRange) -> KnownObject:
+def _row(wanted: ObjectHints, shape: ObjectShape, measured: MeasuredSize | None, found: ColourRange) -> ObjectSpec:
     if wanted.size_m is not None:
         sizes = wanted.size_m
         if _shape_of(sizes) != shape:
@@ -160,7 +160,7 @@ def _row(wanted: ObjectHints, shape: ObjectShape, measured: MeasuredSize | None,
     narrow_m = width_m if round_shape or box_m is None else min(box_m[:2])
     fits = GRASPABLE_WIDTH_M[0] <= narrow_m <= GRASPABLE_WIDTH_M[1] and height_m >= GRASPABLE_HEIGHT_M
     volume_m3 = (pi / 6 if shape == "sphere" else pi / 4 if round_shape else 1.0) * width_m * narrow_m * height_m
-    return KnownObject(
+    return ObjectSpec(
         label=wanted.label,
         shape=shape,
         radius_m=width_m / 2 if round_shape else None,

@@ -11,7 +11,7 @@ import numpy as np
 from cocoro.arrays import Float32Array, ImageArray
 from cocoro.colour import Lab, in_boxes, lab_of
 from cocoro.errors import ConfigError
-from cocoro.objects import KnownObject, LabBox
+from cocoro.objects import LabBox, ObjectSpec
 
 EDGES_L = (8.0, 12.0, 20.0, 30.0, 40.0, 50.0, 60.0, 75.0, 99.0)
 """One box between each two: chroma falls with lightness, so one box for all would hold many other colours too."""
@@ -61,7 +61,7 @@ class ColourOverlap(NamedTuple):
     """Share of the known one's that would pass for the new object's."""
 
 
-def range_of(pixels: ImageArray, known: Iterable[KnownObject] = ()) -> ColourRange:
+def range_of(pixels: ImageArray, known: Iterable[ObjectSpec] = ()) -> ColourRange:
     """The range that an object has whose pixels (n, 3), RGB, are these. Raises ConfigError when they are too dark."""
     own = _typical(pixels)
     samples = lab_of(in_other_light(own))
@@ -90,7 +90,7 @@ def in_other_light(pixels: ImageArray) -> ColourSamples:
     return np.asarray(np.clip(np.rint(values), 0, 255), dtype=np.uint8).reshape(-1, 3)
 
 
-def overlaps(found: ColourRange, known: Iterable[KnownObject]) -> list[ColourOverlap]:
+def overlaps(found: ColourRange, known: Iterable[ObjectSpec]) -> list[ColourOverlap]:
     """With each known object that has any colours in common with it, the most first."""
     common = []
     for other in known:
@@ -129,7 +129,7 @@ def _box(samples: Lab, low_l: float, high_l: float) -> LabBox | None:
     return LabBox(low=(bottom, a[0], b[0]), high=(top, a[1], b[1]))
 
 
-def _is_shared(box: LabBox, samples: Lab, known: Iterable[KnownObject]) -> bool:
+def _is_shared(box: LabBox, samples: Lab, known: Iterable[ObjectSpec]) -> bool:
     inside = samples[in_boxes([box], samples)]
     return any(in_boxes(other.lab, inside).mean() > SHARED for other in known)
 

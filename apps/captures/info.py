@@ -56,7 +56,7 @@ class AttachmentReport(msgspec.Struct, kw_only=True):
     """0: unknown."""
 
 
-class Report(msgspec.Struct, kw_only=True):
+class CaptureReport(msgspec.Struct, kw_only=True):
     path: str
     size_bytes: int
     raw_bytes: int
@@ -79,7 +79,7 @@ class Report(msgspec.Struct, kw_only=True):
     metadata: dict[str, dict[str, Any]]
 
 
-def report(capture: Capture, check: bool = False) -> Report:
+def report(capture: Capture, check: bool = False) -> CaptureReport:
     """Report on a capture. The counts of a whole capture are those of its own tally (checksums vouch for it), where
     that agrees with its statistics and chunks. Of any other capture, and with `check`, all is read and counted."""
     told = _told_tallies(capture) if capture.whole and capture.summarised else None
@@ -93,7 +93,7 @@ def report(capture: Capture, check: bool = False) -> Report:
     keys = tuple(
         _key_report(capture, channel, tallies[channel], dropped, lost) for key in names for channel in capture.keys[key]
     )
-    return Report(
+    return CaptureReport(
         path=str(capture.path),
         size_bytes=capture.size_bytes,
         raw_bytes=sum(tally.size_bytes for tally in tallies.values()),

@@ -18,7 +18,7 @@ import msgspec
 
 from cocoro.capture.conventions import CaptureError
 from cocoro.capture.reader import Capture, Record
-from cocoro.capture.types import LossyFrame, NotReadableError
+from cocoro.capture.types import LossyFrame, MessageHead, NotReadableError
 from cocoro.clock import NS
 from cocoro.component import Component
 from cocoro.component import load as load_component
@@ -28,30 +28,26 @@ from cocoro.messages import StepRecord
 from cocoro.robot import Robot
 from cocoro.topics import STEPS
 from deploy import processes
+from services.capture.recorder import KeyCounts, counts_of
 
-Id = tuple[str, int, int]
+MessageId = tuple[str, int, int]
 """Topic, incarnation, sequence: what a StepRecord calls a message by."""
 
 LATE_NS = 3 * NS
 """A message that is recorded so long after the step that speaks of it is not waited for."""
 
 
-class Head(msgspec.Struct, gc=False):
-    seq: int = 0
-    incarnation: int = 0
-
-
-class Found(NamedTuple):
+class FoundMessage(NamedTuple):
     """A message of a step, with the capture that it is in."""
 
     capture: Capture
     record: Record
 
 
-class Step(NamedTuple):
+class RecordedStep(NamedTuple):
     record: StepRecord
     log_ns: int
-    messages: dict[Id, Found]
+    messages: dict[MessageId, FoundMessage]
     """What the captures have of those that were consumed and produced."""
 
 
@@ -74,47 +70,52 @@ def steps_of(captures: Sequence[Capture], service: str) -> list[tuple[int, StepR
     return found
 
 
-def with_messages(captures: Sequence[Capture], steps: Sequence[tuple[int, StepRecord]]) -> Iterator[Step]:
+def with_messages(captures: Sequence[Capture], steps: Sequence[tuple[int, StepRecord]]) -> Iterator[RecordedStep]:
     """The steps in order, each as soon as all is there that it speaks of, or as soon as that will not come any more."""
-    wanted: set[Id] = set()
+    wanted: set[MessageId] = set()
     for _, step in steps:
         wanted.update(step.consumed, step.produced)
     topics = {topic for topic, _, _ in wanted}
     waiting = deque(steps)
-    known: dict[Id, Found] = {}
+    known: dict[MessageId, FoundMessage] = {}
+    counts: dict[str, KeyCounts] = {}
     for capture in captures:
-        decoder = msgspec.msgpack.Decoder(Head)
+        decoder = msgspec.msgpack.Decoder(MessageHead)
         for record in capture.messages(*(f"{capture.robot}/{topic}" for topic in topics)) if topics else ():
             head = _head(decoder, record)
             if head is None:
                 continue
+            if record.key not in counts:
+                counts[record.key] = counts_of(record.key, capture.robot)
+            in_sequence = counts[record.key].hear(head)
             name = (record.key.removeprefix(f"{capture.robot}/"), head.incarnation, head.seq)
-            if name in wanted and not _lossy(capture, record):
-                known[name] = Found(capture, record)
+            # Of several messages with one number readers take the one that is in sequence, and so does this.
+            if name in wanted and (in_sequence or name not in known) and not _lossy(capture, record):
+                known[name] = FoundMessage(capture, record)
             while waiting and (_complete(waiting[0][1], known) or record.log_ns > waiting[0][0] + LATE_NS):
                 yield _taken(waiting.popleft(), known, wanted)
     while waiting:
         yield _taken(waiting.popleft(), known, wanted)
 
 
-def _head(decoder: msgspec.msgpack.Decoder[Head], record: Record) -> Head | None:
+def _head(decoder: msgspec.msgpack.Decoder[MessageHead], record: Record) -> MessageHead | None:
     try:
         return decoder.decode(record.payload)
     except (msgspec.MsgspecError, ValueError, RecursionError):
         return None
 
 
-def _complete(step: StepRecord, known: dict[Id, Found]) -> bool:
+def _complete(step: StepRecord, known: dict[MessageId, FoundMessage]) -> bool:
     return all(name in known for name in step.consumed) and all(name in known for name in step.produced)
 
 
-def _taken(step: tuple[int, StepRecord], known: dict[Id, Found], wanted: set[Id]) -> Step:
+def _taken(step: tuple[int, StepRecord], known: dict[MessageId, FoundMessage], wanted: set[MessageId]) -> RecordedStep:
     """Each message belongs to one step, so it need not be kept any more; nor is it when it comes late."""
     log_ns, record = step
     names = (*record.consumed, *record.produced)
     wanted.difference_update(names)
     messages = {name: known.pop(name) for name in names if name in known}
-    return Step(record, log_ns, messages)
+    return RecordedStep(record, log_ns, messages)
 
 
 def _lossy(capture: Capture, record: Record) -> bool:

@@ -17,7 +17,7 @@ import numpy as np
 
 from apps.captures.compare import difference, known_to
 from apps.captures.info import changed_since
-from apps.captures.recorded import Found, Id, Origin, Step, origins, steps_of, with_messages
+from apps.captures.recorded import FoundMessage, MessageId, Origin, RecordedStep, origins, steps_of, with_messages
 from cocoro.capture.reader import Capture
 from cocoro.capture.types import NotReadableError
 from cocoro.clock import NS
@@ -36,7 +36,7 @@ class FirstDifference(msgspec.Struct, kw_only=True):
     """A step before it could not be executed, which may be why."""
 
 
-class Result(msgspec.Struct, kw_only=True):
+class ReexecutionResult(msgspec.Struct, kw_only=True):
     service: str
     steps: int = 0
     equal: int = 0
@@ -65,7 +65,9 @@ class Result(msgspec.Struct, kw_only=True):
         return self.recorded_s / self.wall_s if self.wall_s else 0.0
 
 
-def rerun(captures: Sequence[Capture], service: str, tolerance: float = 0.0, compare: bool = True) -> Result:
+def reexecute(
+    captures: Sequence[Capture], service: str, tolerance: float = 0.0, compare: bool = True
+) -> ReexecutionResult:
     """Execute a service again over a run's captures, given in order; without `compare` just to see how fast it goes.
 
     Raises CaptureError when they do not have what that takes: its steps, its configuration, a component with a core.
@@ -73,7 +75,7 @@ def rerun(captures: Sequence[Capture], service: str, tolerance: float = 0.0, com
     started, cpu_started = time.perf_counter(), time.process_time()
     with origins(captures, service) as made:
         steps = steps_of(captures, service)
-        run = _Rerun(service, made, captures[0], tolerance if compare else None)
+        run = _Reexecution(service, made, captures[0], tolerance if compare else None)
         for step in with_messages(captures, steps):
             run.execute(step)
     result = run.result
@@ -84,9 +86,9 @@ def rerun(captures: Sequence[Capture], service: str, tolerance: float = 0.0, com
     return result
 
 
-class _Rerun:
+class _Reexecution:
     def __init__(self, service: str, made: Sequence[Origin], first: Capture, tolerance: float | None) -> None:
-        self.result = Result(service=service, tolerance=tolerance or 0.0)
+        self.result = ReexecutionResult(service=service, tolerance=tolerance or 0.0)
         self._made = made
         self._tolerance = tolerance
         self._start_ns = first.start_ns
@@ -100,7 +102,7 @@ class _Rerun:
         self.changed: dict[str, None] = {}
         self._encoder = msgspec.msgpack.Encoder(enc_hook=_plain)
 
-    def execute(self, step: Step) -> None:
+    def execute(self, step: RecordedStep) -> None:
         record = step.record
         if record.incarnation != self._incarnation:
             self._begin(record.incarnation)
@@ -139,7 +141,7 @@ class _Rerun:
         self._incarnation, self._seq = incarnation, -1
         self._inputs_missed = False
 
-    def _samples(self, core: Core, step: Step) -> tuple[list[Sample], str]:
+    def _samples(self, core: Core, step: RecordedStep) -> tuple[list[Sample], str]:
         """What the core is given, and why that is not all that it was given then ('' when it is)."""
         topics = {topic.name: topic for topic in core.reads}
         samples, missing = [], ""
@@ -159,7 +161,7 @@ class _Rerun:
                     missing = f"an input of {name[0]} cannot be read as today's type"
         return samples, missing
 
-    def _compare(self, step: Step, outputs: Sequence[Output]) -> tuple[str, str]:
+    def _compare(self, step: RecordedStep, outputs: Sequence[Output]) -> tuple[str, str]:
         """Why the step's outputs cannot be compared, and what is different first; '' for nothing."""
         produced = step.record.produced
         given, now = [name[0] for name in produced], [output.topic.name for output in outputs]
@@ -182,7 +184,7 @@ class _Rerun:
                 return "", f"{name[0]}: {text}"
         return "", ""
 
-    def _encoded(self, name: Id, output: Output, now_ns: int) -> bytes:
+    def _encoded(self, name: MessageId, output: Output, now_ns: int) -> bytes:
         """As the node published it, or would have."""
         message = output.message
         if message.stamp_ns == 0:
@@ -190,7 +192,7 @@ class _Rerun:
         _, message.incarnation, message.seq = name
         return self._encoder.encode(message)
 
-    def _difference(self, found: Found, payload: bytes) -> str:
+    def _difference(self, found: FoundMessage, payload: bytes) -> str:
         """By meaning, and by the fields that the type had then and has today."""
         recorded = found.capture.read(found.record)
         now = found.capture.read(found.record._replace(payload=memoryview(payload)))
@@ -201,7 +203,7 @@ class _Rerun:
         unlike = difference(plain[0], plain[1], self._tolerance or 0.0)
         return "" if unlike is None else unlike.text
 
-    def _look_at(self, found: Found) -> None:
+    def _look_at(self, found: FoundMessage) -> None:
         """Whether the type of its key has changed since."""
         key, channel = found.record.key, found.record.channel
         if (found.capture.path, channel) not in self._looked_at:
@@ -215,7 +217,7 @@ class _Rerun:
         if reason == "its record is missing":
             self.result.steps += count
 
-    def _differs(self, step: Step, text: str) -> None:
+    def _differs(self, step: RecordedStep, text: str) -> None:
         self.result.differing += 1
         if self.result.first is None:
             self.result.first = FirstDifference(
@@ -234,7 +236,7 @@ def _plain(value: object) -> Any:
     raise TypeError(f"a {type(value).__name__} cannot be sent")
 
 
-def words(result: Result) -> list[str]:
+def describe_result(result: ReexecutionResult) -> list[str]:
     """What came of it, a fact a line."""
     within = f" within {result.tolerance:g}" if result.tolerance else ""
     compared = f"{result.service}: {result.steps} steps, {result.outputs} outputs compared{within}: "

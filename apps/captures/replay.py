@@ -17,7 +17,7 @@ from cocoro.errors import ConfigError, RefusedError
 from cocoro.messages import ClockTick
 from cocoro.tokens import alive_key
 from cocoro.topics import ARM_STATE, BASE_STATE, CLOCK, FRAME, HAND_STATE, HARDWARE, RECORDING
-from services.capture.keys import Choice
+from services.capture.keys import KeyFilter
 
 SIMULATOR = "sim"
 HARDWARE_TOPICS = (FRAME, BASE_STATE, ARM_STATE, HAND_STATE)
@@ -35,7 +35,7 @@ def played_keys(capture: Capture, only: Iterable[str], hardware: bool) -> frozen
     """
     robot = capture.robot
     recorders = {key.split("/")[1] for key in capture.keys if key.endswith(RECORDING.name.partition("}")[2])}
-    choice = Choice(robot, only)
+    choice = KeyFilter(robot, only)
     keys = {
         key
         for key, channels in capture.keys.items()
@@ -130,7 +130,7 @@ class Replay:
                 await self._changed.wait()
 
     def _send(self, record: Record) -> None:
-        payload = reborn(self._payload(record), self._player.passes)
+        payload = restarted(self._payload(record), self._player.passes)
         if record.key == self._clock_key:
             payload = with_rate(payload, self._player.rate)
         self._publisher(record.key).put(payload)
@@ -176,7 +176,7 @@ _BITS = 48
 _PARTS = ("consumed", "produced")
 
 
-def reborn(payload: bytes | memoryview, passes: int) -> bytes | memoryview:
+def restarted(payload: bytes | memoryview, passes: int) -> bytes | memoryview:
     """The payload for a time line that has gone back so often. What is no MessagePack map stays as it is."""
     if passes == 0:
         return payload
@@ -184,7 +184,7 @@ def reborn(payload: bytes | memoryview, passes: int) -> bytes | memoryview:
         message = msgspec.msgpack.decode(payload)
     except (msgspec.MsgspecError, ValueError, RecursionError):
         return payload
-    return msgspec.msgpack.encode(_reborn(message, passes)) if isinstance(message, dict) else payload
+    return msgspec.msgpack.encode(_restarted(message, passes)) if isinstance(message, dict) else payload
 
 
 def with_rate(payload: bytes | memoryview, rate: float) -> bytes | memoryview:
@@ -200,7 +200,7 @@ def with_rate(payload: bytes | memoryview, rate: float) -> bytes | memoryview:
     return msgspec.msgpack.encode({**message, "rate": message["rate"] * rate})
 
 
-def _reborn(message: dict[Any, Any], passes: int) -> dict[Any, Any]:
+def _restarted(message: dict[Any, Any], passes: int) -> dict[Any, Any]:
     found: dict[Any, Any] = {}
     for name, value in message.items():
         if isinstance(name, str) and name.endswith("incarnation") and isinstance(value, int):

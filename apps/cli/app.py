@@ -5,15 +5,13 @@ from __future__ import annotations
 import asyncio
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
-from apps.cli import capture_app, hardware_app, learning_app, objects_app, tools_app
+from apps.cli import capture_app, hardware_app, learning_app, objects_app, task_app, tools_app
 from apps.cli.options import (
     AdaptOption,
-    DistanceOption,
-    ForOption,
     FramesOption,
     JsonOption,
     LatencyOption,
@@ -25,10 +23,10 @@ from apps.cli.options import (
     RobotChoice,
     RobotOption,
     SetOption,
-    TimeoutOption,
 )
 
 app = typer.Typer(
+    cls=task_app.group_of(task_app.operate),
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -38,90 +36,13 @@ app = typer.Typer(
     epilog="Exit codes: 0 done, 1 the task failed, 2 bad usage, 3 refused or cancelled, 4 the mesh is not there.",
 )
 
-TASKS, WATCH, RUNNING, SAFETY = "Tasks", "Watching", "Starting and stopping", "Safety"
-
-
-BodyOption = Annotated[str, typer.Option(metavar="nominal|worn", help="A body as drawn, or one that differs from it.")]
+TASKS, WATCH, RUNNING, SAFETY = task_app.PANEL, "Watching", "Starting and stopping", "Safety"
 
 
 # --- tasks ----------------------------------------------------------------------------------------
 
 
-def _task(where: tuple[str | None, str | None], as_json: bool, snapshot: Path | None = None, **request: Any) -> None:
-    """`request`: the fields of a TaskRequest."""
-    from apps.cli import tasks
-    from cocoro.messages import TaskRequest
-
-    sys.exit(asyncio.run(tasks.run(RobotChoice(*where), TaskRequest(**request), as_json, snapshot)))
-
-
-@app.command(rich_help_panel=TASKS)
-def fetch(
-    label: Annotated[str, typer.Argument(help="What to fetch; `cocoro objects` lists what the robot knows.")],
-    bring: Annotated[bool, typer.Option("--bring", help="Bring it to where the task began and put it down.")] = False,
-    timeout: TimeoutOption = None,
-    snapshot: Annotated[
-        Path | None, typer.Option(metavar="OUT.png", help="Write what the robot sees when it grasps.")
-    ] = None,
-    robot: RobotOption = None,
-    profile: MeshOption = None,
-    json: JsonOption = False,
-) -> None:
-    """Find an object, drive there, grasp it and lift it. Ctrl-C cancels it on the robot."""
-    _task((robot, profile), json, snapshot, task="fetch", label=label, bring=bring, timeout_s=timeout)
-
-
-@app.command(rich_help_panel=TASKS)
-def follow(
-    label: Annotated[str, typer.Argument(help="What to follow; `cocoro objects` lists what the robot knows.")],
-    for_: ForOption = None,
-    robot: RobotOption = None,
-    profile: MeshOption = None,
-    json: JsonOption = False,
-) -> None:
-    """Keep behind an object that moves, at a distance, until Ctrl-C or for a time."""
-    _task((robot, profile), json, task="follow", label=label, for_s=for_)
-
-
-@app.command(rich_help_panel=TASKS)
-def touch(
-    label: Annotated[str, typer.Argument(help="What to touch: something within the arm's reach.")],
-    timeout: TimeoutOption = None,
-    robot: RobotOption = None,
-    profile: MeshOption = None,
-    json: JsonOption = False,
-) -> None:
-    """Bring the open hand around something within reach, on the floor or in the air; the wheels stand."""
-    _task((robot, profile), json, task="touch", label=label, timeout_s=timeout)
-
-
-@app.command("go-to", rich_help_panel=TASKS)
-def go_to(
-    label: Annotated[str, typer.Argument(help="Where to go; `cocoro objects` lists what the robot knows.")],
-    distance: DistanceOption = 0.2,
-    timeout: TimeoutOption = None,
-    robot: RobotOption = None,
-    profile: MeshOption = None,
-    json: JsonOption = False,
-) -> None:
-    """Drive to an object and stop at a distance from it. Ctrl-C cancels it on the robot."""
-    _task((robot, profile), json, task="go-to", label=label, distance_m=distance, timeout_s=timeout)
-
-
-@app.command(rich_help_panel=TASKS)
-def park(
-    timeout: TimeoutOption = None, robot: RobotOption = None, profile: MeshOption = None, json: JsonOption = False
-) -> None:
-    """Fold the arm. Ctrl-C cancels it on the robot."""
-    _task((robot, profile), json, task="park", timeout_s=timeout)
-
-
-@app.command("put-down", rich_help_panel=TASKS)
-def put_down(
-    timeout: TimeoutOption = None, robot: RobotOption = None, profile: MeshOption = None, json: JsonOption = False
-) -> None:
-    """Set down what the hand holds. Ctrl-C cancels it on the robot."""
-    _task((robot, profile), json, task="put-down", timeout_s=timeout)
+task_app.add_to(app)
 
 
 @app.command(rich_help_panel=TASKS)
@@ -130,54 +51,6 @@ def cancel(robot: RobotOption = None, profile: MeshOption = None) -> None:
     from apps.cli import tasks
 
     sys.exit(asyncio.run(tasks.cancel(RobotChoice(robot, profile))))
-
-
-@app.command(rich_help_panel=TASKS)
-def rehearse(
-    task: Annotated[
-        str, typer.Argument(help="fetch, follow, touch, go-to, park, put-down, babble-arm or babble-wheels.")
-    ],
-    label: Annotated[str, typer.Argument(help="What to fetch, to follow, to touch or to go to.")] = "",
-    bring: Annotated[bool, typer.Option("--bring", help="Fetch: bring it to where the task began.")] = False,
-    for_: ForOption = None,
-    distance: DistanceOption = 0.2,
-    scene: Annotated[str, typer.Option(help="A scene's name, or its file.")] = "paper",
-    seed: Annotated[int, typer.Option(min=0, help="Everything that is drawn comes from it.")] = 0,
-    sensors: Annotated[
-        str, typer.Option(metavar="ideal|real", help="Perfect camera and body, or real ones.")
-    ] = "ideal",
-    body: BodyOption = "nominal",
-    model: ModelOption = None,
-    reach: ReachOption = None,
-    adapt: AdaptOption = False,
-    bend: Annotated[
-        float | None, typer.Option(min=0.0, metavar="SECONDS", help="Then somebody bends the forearm: 3 cm.")
-    ] = None,
-    count: Annotated[int, typer.Option(min=1, metavar="N", help="Babbling: how many samples or trials.")] = 1000,
-    samples: Annotated[Path | None, typer.Option(metavar="FILE", help="Babbling: where they are kept.")] = None,
-    latency: LatencyOption = None,
-    lockstep: Annotated[bool, typer.Option("--lockstep", help="One serial cycle over all, as in the paper.")] = False,
-    frames: FramesOption = None,
-    objects: ObjectsOption = None,
-    timeout: TimeoutOption = None,
-    picture: Annotated[
-        Path | None, typer.Option(metavar="OUT.png", help="Write what the robot saw when it grasped.")
-    ] = None,
-    record: Annotated[Path | None, typer.Option(metavar="OUT.mcap", help="Record everything.")] = None,
-    json: JsonOption = False,
-) -> None:
-    """Try a task in simulation: the whole robot in one process, in virtual time."""
-    from apps.cli import rehearse as rehearsing
-
-    options = {
-        "task": task, "label": label, "bring": bring, "for_s": for_, "scene": scene, "seed": seed, "sensors": sensors,
-        "distance_m": distance, "adapt": adapt, "bend_s": bend,
-        "body": body, "lockstep": lockstep, "timeout_s": timeout, "picture": None if picture is None else str(picture),
-        "record": None if record is None else str(record), "count": count, "reach": reach or "learned",
-        "model": None if model is None else str(model), "samples": None if samples is None else str(samples),
-        "objects": None if objects is None else str(objects),
-    }  # fmt: skip
-    sys.exit(rehearsing.rehearse(options, latency or [], frames, json))
 
 
 # --- watching -------------------------------------------------------------------------------------

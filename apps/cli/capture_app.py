@@ -144,8 +144,9 @@ def repair(
     sys.exit(capture_files.repair(file, out, compression, level, only or [], without or [], start, end))
 
 
+@capture.command("rerun", hidden=True)
 @capture.command()
-def rerun(
+def reexecute(
     files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="The captures of one run, in order.")],
     service: Annotated[str, typer.Option("--service", help="perception, planning, or another with a pure core.")],
     against: Annotated[
@@ -159,4 +160,4 @@ def rerun(
     """Execute a service again over what it was given then, and compare what it gives. Exit code 1 when it differs."""
     from apps.cli import capture_files
 
-    sys.exit(capture_files.rerun(files, service, against, tolerance, json))
+    sys.exit(capture_files.reexecute(files, service, against, tolerance, json))

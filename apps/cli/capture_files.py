@@ -13,7 +13,7 @@ from typing import Any
 
 import msgspec
 
-from apps.captures.info import AttachmentReport, Report, report
+from apps.captures.info import AttachmentReport, CaptureReport, report
 from apps.captures.rewrite import REPAIRED, rewrite
 from apps.cli import exits
 from apps.cli.table import table
@@ -22,8 +22,8 @@ from cocoro.capture.reader import Capture
 from cocoro.clock import NS
 from cocoro.errors import ConfigError
 from services.capture.file import COMPRESSIONS, Compression, Packer
-from services.capture.keys import Choice
-from services.capture.log_clock import WALL_CLOCK, Step, words
+from services.capture.keys import KeyFilter
+from services.capture.log_clock import WALL_CLOCK, WallClockStep, describe_step
 
 MB = 1e6
 
@@ -35,7 +35,7 @@ def info(file: Path, check: bool, as_json: bool) -> int:
     return exits.FAILED if found.problems else exits.DONE
 
 
-def text(found: Report) -> str:
+def text(found: CaptureReport) -> str:
     several = Counter(key.key for key in found.keys)
     names = {key.channel: key.key if several[key.key] == 1 else f"{key.key}#{key.channel}" for key in found.keys}
     rows = [
@@ -66,7 +66,7 @@ def _attachment(found: AttachmentReport) -> str:
     return f"{found.name}{media}, {found.size_bytes} bytes"
 
 
-def _head(found: Report) -> list[str]:
+def _head(found: CaptureReport) -> list[str]:
     run = found.metadata.get("run", {})
     unix = run.get("log_clock", "unix") == "unix"
     start = datetime.fromtimestamp(found.start_ns / NS, UTC).isoformat(timespec="milliseconds") if unix else "0"
@@ -92,21 +92,21 @@ def _head(found: Report) -> list[str]:
     return [f"{name:<9} {value}" for name, value in lines if value]
 
 
-def _steps(found: Report) -> list[str]:
+def _steps(found: CaptureReport) -> list[str]:
     """How somebody set the wall clock while it was recorded; times since the capture's start."""
     try:
-        steps = msgspec.convert(found.metadata.get(WALL_CLOCK, {}).get("steps", ()), tuple[Step, ...])
+        steps = msgspec.convert(found.metadata.get(WALL_CLOCK, {}).get("steps", ()), tuple[WallClockStep, ...])
     except msgspec.ValidationError:  # somebody else's record of this name
         return []
     told = []
     for step in steps:
         at_s = (step.log_ns - found.start_ns) / NS
         when = f"at {at_s:.3f} s" if at_s >= 0 else f"{-at_s:.3f} s before this file began"
-        told.append(f"{words(step)} {when}")
+        told.append(f"{describe_step(step)} {when}")
     return told
 
 
-def _state(found: Report) -> str:
+def _state(found: CaptureReport) -> str:
     if found.problems:
         return "damaged: what can be read is below"
     if not found.closed:
@@ -122,7 +122,7 @@ def _repaired(repaired: Mapping[str, Any]) -> list[str]:
     return [ending, *map(str, repaired.get("problems") or ())]
 
 
-def _files(found: Report) -> list[str]:
+def _files(found: CaptureReport) -> list[str]:
     """The files that services were configured with, by their fingerprints."""
     return [
         f"{name.partition('/')[2]} {file['field']} {file['path']} (sha256 {file['sha256'][:12]})"
@@ -145,7 +145,7 @@ def repair(
     """Raises CaptureError, and ConfigError for options that cannot be."""
     packer = Packer(_compression(compression), level)
     with Capture.open(file) as capture:
-        choice = Choice(capture.robot, only, without)
+        choice = KeyFilter(capture.robot, only, without)
         check_span(capture, start_s, end_s)
         done = rewrite(
             capture,
@@ -194,9 +194,9 @@ def check_span(capture: Capture, start_s: float | None, end_s: float | None) -> 
         )
 
 
-def rerun(files: list[Path], service: str, against: str, tolerance: float, as_json: bool) -> int:
+def reexecute(files: list[Path], service: str, against: str, tolerance: float, as_json: bool) -> int:
     """Raises CaptureError when the captures do not have what that takes."""
-    from apps.captures import reexecute as rerunning
+    from apps.captures import reexecute as execution
 
     if against not in ("recorded", "nothing"):
         raise ConfigError(f"--against {against}: known are recorded and nothing")
@@ -204,13 +204,13 @@ def rerun(files: list[Path], service: str, against: str, tolerance: float, as_js
         captures = [stack.enter_context(Capture.open(file)) for file in files]
         if len({capture.robot for capture in captures}) > 1:
             raise CaptureError("these captures are of several robots")
-        result = rerunning.rerun(captures, service, tolerance, compare=against == "recorded")
+        result = execution.reexecute(captures, service, tolerance, compare=against == "recorded")
     for capture in captures:
         if capture.ending:
             print(f"note: {capture.path} was {capture.ending}", file=sys.stderr)
     if as_json:
         print(msgspec.json.encode(result).decode())
     else:
-        print("\n".join(rerunning.words(result)))
+        print("\n".join(execution.describe_result(result)))
     bad = result.differing or result.problems or (against == "recorded" and not result.equal)
     return exits.FAILED if bad else exits.DONE

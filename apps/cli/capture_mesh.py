@@ -16,7 +16,7 @@ from typing import Any
 
 import msgspec
 
-from apps.captures.export.rerun_scene import Teller, library, no_viewer, opened, tell
+from apps.captures.export.rerun_scene import RerunScene, library, log_capture, no_viewer, opened
 from apps.captures.player import Player
 from apps.captures.replay import SIMULATOR, Replay, played_keys, refuse_if_alive, services_of
 from apps.cli import exits
@@ -39,7 +39,7 @@ from cocoro.robot import Robot
 from cocoro.topics import HARDWARE, RECORDING, TOPICS, Topic
 from deploy import processes, robot_time
 from deploy.rundir import RunDir
-from services.capture.writer import told
+from services.capture.writer import describe_disturbance
 
 RECORDER = "capture"
 """The process whose component does it: loaded by name, since the API knows no services."""
@@ -100,7 +100,11 @@ class _RecordingDisplay:
         if not recording.ended:
             self._files.add(recording.file)
             for file in new:
-                print(f"{CLEAR if sys.stdout.isatty() else ''}cocoro: {told(file)}", file=sys.stderr, flush=True)
+                print(
+                    f"{CLEAR if sys.stdout.isatty() else ''}cocoro: {describe_disturbance(file)}",
+                    file=sys.stderr,
+                    flush=True,
+                )
         if recording.ended:
             self.ended.set()
         elif recording.fault:
@@ -119,7 +123,7 @@ class _RecordingDisplay:
         others += sum(file.became == "moved" and file.now != newest.file for file in newest.disturbed)
         print(f"{CLEAR if sys.stdout.isatty() else ''}{_recording_line(newest, others)}")
         for file in newest.disturbed:
-            print(f"cocoro: {told(file)}", file=sys.stderr)
+            print(f"cocoro: {describe_disturbance(file)}", file=sys.stderr)
         if newest.fault:
             print(f"cocoro: {newest.fault}", file=sys.stderr)
         return exits.FAILED if newest.fault or newest.removed else exits.DONE
@@ -128,10 +132,12 @@ class _RecordingDisplay:
 def _recording_line(recording: Recording, others: int = 0) -> str:
     """`others`: how many files there are besides."""
     missing = sum(recording.dropped.values()), sum(recording.lost.values())
-    told = "".join(f", {count} {word}" for count, word in zip(missing, ("dropped", "lost"), strict=True) if count)
+    not_recorded = "".join(
+        f", {count} {word}" for count, word in zip(missing, ("dropped", "lost"), strict=True) if count
+    )
     more = f" and {others} before it" if others > 0 else ""
     where = f"{recording.file}{more}" if recording.file else "no file is left" if others <= 0 else f"{others} files"
-    return f"{where}: {recording.messages} messages, {recording.size_bytes / 1e6:.1f} MB{told}"
+    return f"{where}: {recording.messages} messages, {recording.size_bytes / 1e6:.1f} MB{not_recorded}"
 
 
 SHOW_S = 0.1
@@ -268,7 +274,7 @@ def view_file(file: Path) -> int:
     with Capture.open(file) as capture:
         recording = opened(rr)
         with no_viewer():
-            count = tell(capture, recording)
+            count = log_capture(capture, recording)
             recording.flush()
         print(f"{count} messages are in Rerun")
         return exits.FAILED if capture.problems else exits.DONE
@@ -281,19 +287,19 @@ async def view_mesh(where: RobotChoice) -> int:
         resolved = link.run_dir.resolved()
         description, measured = (_path(resolved.get(name)) for name in ("description", "measured"))
         recording = opened(rr)
-        watch(link.bus, link.robot, Teller(recording, Robot.load(description, measured), Catalogue.load()))
+        watch(link.bus, link.robot, RerunScene(recording, Robot.load(description, measured), Catalogue.load()))
         print("Ctrl-C ends it")
         with told_to_end() as end:
             await end.wait()
     return exits.DONE
 
 
-def watch(bus: Bus, robot: str, teller: Teller) -> None:
+def watch(bus: Bus, robot: str, scene: RerunScene) -> None:
     """Tell of everything that travels from now on, however old it is: a viewer acts on nothing."""
 
     def heard(topic: Topic[Any], decoder: msgspec.msgpack.Decoder[Message], _key: str, payload: Payload) -> None:
         with suppress(msgspec.MsgspecError, ValueError, RecursionError):
-            teller.tell(topic.name, decoder.decode(payload))
+            scene.log(topic.name, decoder.decode(payload))
 
     for topic in TOPICS:
         if PER_SERVICE not in topic.name:

@@ -11,11 +11,11 @@ from apps.cli.link import joined
 from apps.cli.options import RobotChoice
 from apps.cli.table import table
 from apps.learning import lesson, study
-from apps.learning.lesson import Report
+from apps.learning.lesson import ArmReport
 from apps.learning.wheels import WheelFit
 from cocoro.errors import RefusedError
 from cocoro.learning import model
-from cocoro.learning.model import Model
+from cocoro.learning.model import BodyModel
 from cocoro.messages import ModelRequest
 from cocoro.robot import Robot
 from cocoro.topics import LEARNED
@@ -23,7 +23,7 @@ from cocoro.topics import LEARNED
 
 def learn_arm(
     samples: Path, into: Path, robot: Robot, *, search: bool, method: str | None, as_json: bool
-) -> tuple[Model, str]:
+) -> tuple[BodyModel, str]:
     """Learn, write the model; returns it with what is to be printed. Raises ConfigError."""
     shown = sys.stderr.isatty()
 
@@ -36,13 +36,13 @@ def learn_arm(
     return made, json.dumps(report.data() | {"model": str(into)}) if as_json else _text(report) + f"\n{into} is written"
 
 
-def learn_wheels(samples: Path, into: Path, robot: Robot, *, as_json: bool) -> tuple[Model, str]:
+def learn_wheels(samples: Path, into: Path, robot: Robot, *, as_json: bool) -> tuple[BodyModel, str]:
     """Likewise."""
     made, fit = lesson.learn_wheels(samples, into, robot)
     return made, _wheels_json(fit, into) if as_json else _wheels_text(fit, robot) + f"\n{into} is written"
 
 
-async def send(where: RobotChoice, made: Model) -> str:
+async def send(where: RobotChoice, made: BodyModel) -> str:
     """Have a running planner take the model over; what it says of it. Raises RefusedError when it would not."""
     async with joined(where) as link:
         reply = await link.call(LEARNED, ModelRequest(content=model.encode(made)))
@@ -51,7 +51,7 @@ async def send(where: RobotChoice, made: Model) -> str:
     return f"{link.robot} has taken it over"
 
 
-def _text(report: Report) -> str:
+def _text(report: ArmReport) -> str:
     heads = ("", "held out, mm", "95 of 100, mm", "cross-validated, mm", "fit, s")
     rows = [
         (

@@ -18,7 +18,7 @@ from apps.cli.learn_sight import CameraView, of_picture, of_robot, preview
 from apps.cli.objects_file import save, text_of, with_object
 from apps.cli.options import RobotChoice
 from cocoro.errors import ConfigError, naming
-from cocoro.objects import Catalogue, KnownObject
+from cocoro.objects import Catalogue, ObjectSpec
 from cocoro.picture import save_png
 
 LIVE = "live"
@@ -79,7 +79,7 @@ def _how_to_use(path: Path, used: Path | None) -> str:
     return f"a robot knows it that is started with `cocoro up sim --objects {path}`"
 
 
-def _both(before: KnownObject, now: KnownObject) -> KnownObject:
+def _both(before: ObjectSpec, now: ObjectSpec) -> ObjectSpec:
     """The old row with the new look's colours added to its own."""
     lab = tuple(dict.fromkeys((*before.lab, *now.lab)))
     shared = tuple(dict.fromkeys((*before.lab_by_shape, *now.lab_by_shape)))
@@ -120,7 +120,7 @@ def _text(learnt: LearnedObject, seen: list[str], picture: Path) -> str:
     return "\n".join(lines)
 
 
-def _shared(known: KnownObject) -> str:
+def _shared(known: ObjectSpec) -> str:
     return f", {len(known.lab_by_shape)} more that it shares" if known.lab_by_shape else ""
 
 

@@ -9,12 +9,12 @@ from contextlib import suppress
 from pathlib import Path
 
 from cocoro.errors import ConfigError
-from cocoro.objects import Catalogue, KnownObject, LabBox, own_text
+from cocoro.objects import Catalogue, LabBox, ObjectSpec, own_text
 
 HEAD = "[[object]]"
 
 
-def as_toml(known: KnownObject) -> str:
+def as_toml(known: ObjectSpec) -> str:
     """The object as an [[object]] table, in the manner of the project's own file."""
     lines = [HEAD, f'label = "{known.label}"', f'shape = "{known.shape}"']
     for name, value in (("radius_m", known.radius_m), ("height_m", known.height_m)):
@@ -45,7 +45,7 @@ def _number(value: float) -> str:
     return f"{value:.6g}"
 
 
-def with_object(text: str, known: KnownObject) -> str:
+def with_object(text: str, known: ObjectSpec) -> str:
     """A catalogue's text with the object in it: in place of its own table if it has one, else at the end. All else,
     comments too, stays as it is."""
     lines = text.splitlines()
@@ -84,7 +84,7 @@ def text_of(path: Path) -> str:
         raise ConfigError(f"known objects {path}: {error}") from error
 
 
-def save(path: Path, known: KnownObject) -> Catalogue:
+def save(path: Path, known: ObjectSpec) -> Catalogue:
     """Put the object into the file, all at once, and return the catalogue that it is now. Raises ConfigError, with the
     file as it was, when the result would be no catalogue or cannot be written."""
     text = with_object(text_of(path), known)

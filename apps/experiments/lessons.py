@@ -17,7 +17,7 @@ from cocoro.learning import dataset, model
 from cocoro.learning.dataset import HandRow, WheelRow
 from cocoro.learning.nominal_model import NominalModel
 from cocoro.robot import Robot
-from services.planning.adapt import Adapter
+from services.planning.teaching import Adapter
 
 SIZES = (100, 300, 1000, 2000)
 

@@ -35,7 +35,7 @@ class ExperimentRun:
     """Its file's, under `runs`."""
     kind: Literal["rehearse", "learn", "bend"]
     fields: dict[str, Any] = field(hash=False)
-    """Rehearse: of the request; else the arguments of the lesson of that name."""
+    """Rehearse: the request's fields; otherwise the arguments of the lesson of that name."""
     needs: tuple[str, ...] = ()
     """Names of the runs that must be done before."""
 
@@ -160,4 +160,4 @@ def _after(run: ExperimentRun, results: Mapping[str, RunResult]) -> dict[str, st
 
 
 def _plain(fields: dict[str, Any]) -> Any:
-    return json.loads(json.dumps(fields))
+    return json.loads(msgspec.json.encode(fields))

@@ -9,7 +9,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Generic, Self
 
-from cocoro.learning.dataset import HandRow, Row, WheelRow, Writer, hand_header, wheel_header
+from cocoro.errors import ConfigError
+from cocoro.learning.dataset import HandRow, SampleFile, SampleRow, WheelRow, hand_header, wheel_header
 from cocoro.learning.nominal_model import LEVEL_ROLL_RAD, arm_joints
 from cocoro.messages import HandSample, Message, WheelTrial
 from cocoro.robot import Robot
@@ -17,8 +18,6 @@ from cocoro.topics import HAND_SAMPLES, WHEEL_TRIALS, Topic
 from cocoro.units import Vec3
 
 CELL_M = 0.05
-TOPICS: dict[str, Topic[Any]] = {"babble-arm": HAND_SAMPLES, "babble-wheels": WHEEL_TRIALS}
-"""What each task reports on."""
 
 
 class Coverage:
@@ -41,10 +40,10 @@ class Coverage:
         return 1.0 - self._alone / self._count if self._count else 0.0
 
 
-class Collector(ABC, Generic[Row]):
-    """Rows of one task's babbling. Use it with `with`; raises as `Writer` does."""
+class SampleCollector(ABC, Generic[SampleRow]):
+    """Rows of one task's babbling. Use it with `with`; raises as `SampleFile` does."""
 
-    def __init__(self, writer: Writer[Row]) -> None:
+    def __init__(self, writer: SampleFile[SampleRow]) -> None:
         self._writer = writer
 
     def __enter__(self) -> Self:
@@ -73,12 +72,12 @@ class Collector(ABC, Generic[Row]):
         """Keep what is reported; a message of another task is passed over."""
 
 
-class HandCollector(Collector[HandRow]):
+class HandCollector(SampleCollector[HandRow]):
     """Of the arm's babbling."""
 
     def __init__(self, path: Path, robot: Robot) -> None:
         self._joints = arm_joints(robot)
-        super().__init__(Writer(path, HandRow, robot, hand_header(robot, self._joints, LEVEL_ROLL_RAD)))
+        super().__init__(SampleFile(path, HandRow, robot, hand_header(robot, self._joints, LEVEL_ROLL_RAD)))
         self._coverage = Coverage()
         for row in self._writer.rows:
             self._coverage.add(row.seen_m)
@@ -107,13 +106,13 @@ class HandCollector(Collector[HandRow]):
             self._coverage.add(row.seen_m)
 
 
-class WheelCollector(Collector[WheelRow]):
+class WheelCollector(SampleCollector[WheelRow]):
     """Of the wheels' babbling."""
 
     def __init__(self, path: Path, robot: Robot, target_height_m: float | None = None) -> None:
         """`target_height_m`: of the target's centre above the floor, where that is known."""
         self._separation_m = robot.base.wheel_separation_m
-        super().__init__(Writer(path, WheelRow, robot, wheel_header(robot, target_height_m)))
+        super().__init__(SampleFile(path, WheelRow, robot, wheel_header(robot, target_height_m)))
 
     @property
     def next(self) -> int:
@@ -144,6 +143,13 @@ class WheelCollector(Collector[WheelRow]):
             self._writer.append([row])
 
 
-def collector(task: str, path: Path, robot: Robot, target_height_m: float | None = None) -> Collector[Any]:
-    """For the task 'babble-arm' or 'babble-wheels'; for the latter how high its target's centre stands."""
-    return HandCollector(path, robot) if task == "babble-arm" else WheelCollector(path, robot, target_height_m)
+def collector(
+    samples: Topic[Any], path: Path, robot: Robot, target_height_m: float | None = None
+) -> SampleCollector[Any]:
+    """The collector of what is reported on a topic (`Task.samples`). `target_height_m`: height of the centre of the
+    object that stands before the wheels, where it is known. Raises ConfigError for a topic that no file is made of."""
+    if samples.name == HAND_SAMPLES.name:
+        return HandCollector(path, robot)
+    if samples.name == WHEEL_TRIALS.name:
+        return WheelCollector(path, robot, target_height_m)
+    raise ConfigError(f"{samples.name}: there is no file format for these samples")

@@ -18,7 +18,7 @@ from cocoro.errors import ConfigError
 from cocoro.learning import dataset, model
 from cocoro.learning.camera_tilt import eye_tilt
 from cocoro.learning.dataset import HandRow, WheelRow
-from cocoro.learning.model import Model, Training, WheelModel
+from cocoro.learning.model import BodyModel, Training, WheelModel
 from cocoro.learning.nominal_model import NominalModel
 from cocoro.robot import Robot
 
@@ -27,7 +27,7 @@ CURVE = (100, 300, 1000, 2000)
 
 
 @dataclass(frozen=True)
-class Report:
+class ArmReport:
     """What came of the arm's samples."""
 
     samples: int
@@ -63,7 +63,7 @@ def learn_arm(
     search: bool = False,
     method: str | None = None,
     tell: Callable[[str], None] = lambda text: None,
-) -> tuple[Model, Report]:
+) -> tuple[BodyModel, ArmReport]:
     """Fit every method, choose, write the model. `tell` hears what is being done. Raises ConfigError."""
     recorded = dataset.read(samples, HandRow, robot)
     rows = recorded.rows
@@ -83,7 +83,7 @@ def learn_arm(
     chosen = study.best(scores, methods)
     sizes = [*[size for size in CURVE if size < len(learn)], len(learn)]
     curve_m = study.curve(chosen, drawing, learn, held, sizes)
-    report = Report(
+    report = ArmReport(
         samples=len(kept), outliers=len(seen) - len(kept), draws=len(np.unique(kept.draws)),
         scores=[*study.baselines(drawing, learn, held), *scores], chosen=chosen,
         curve=dict(zip(sizes, curve_m, strict=True)),
@@ -103,7 +103,7 @@ def learn_arm(
     return made, report
 
 
-def learn_wheels(samples: Path, into: Path, robot: Robot) -> tuple[Model, WheelFit]:
+def learn_wheels(samples: Path, into: Path, robot: Robot) -> tuple[BodyModel, WheelFit]:
     """Fit the distance of the wheels, write the model. Raises ConfigError."""
     recorded = dataset.read(samples, WheelRow, robot)
     fit = fit_wheels(recorded.rows)
@@ -121,7 +121,7 @@ def learn_wheels(samples: Path, into: Path, robot: Robot) -> tuple[Model, WheelF
     return made, fit
 
 
-def _before(into: Path, robot: Robot) -> Model:
+def _before(into: Path, robot: Robot) -> BodyModel:
     """What the file holds already, so that arm and wheels can be learned one after the other."""
     return model.load(into, robot) if into.is_file() else model.empty(robot)
 

@@ -21,7 +21,7 @@ LARGEST_RECORD = 1 << 28
 NEAR_BYTES = 1 << 18
 
 
-class Place(NamedTuple):
+class MessageBlock(NamedTuple):
     """Where messages are: a chunk, or a run of messages that are in none."""
 
     offset: int
@@ -45,7 +45,7 @@ class Contents:
     """False where the header has zeros in its texts, or is longer than its fields: by others it may be."""
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
-    places: list[Place] = field(default_factory=list)
+    places: list[MessageBlock] = field(default_factory=list)
     metadata: list[Metadata] = field(default_factory=list)
     """As they stand in the file."""
     metadata_at: list[int] = field(default_factory=list)
@@ -184,7 +184,7 @@ def unpacked(content: bytes, ours: bool) -> tuple[bytes | memoryview, int]:
     return raw, taken
 
 
-def read_place(disk: Disk, place: Place, ours: bool) -> bytes | memoryview:
+def read_block(disk: Disk, place: MessageBlock, ours: bool) -> bytes | memoryview:
     """The records of a place; `ours` as for `unpacked`."""
     return disk.read(place.offset, place.length) if place.loose else read_chunk(disk, place.offset, ours)[1]
 

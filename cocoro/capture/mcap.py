@@ -115,7 +115,7 @@ def footer_crc(summary: bytes, summary_start: int, offsets_start: int) -> int:
 # --- by hand --------------------------------------------------------------------------------------
 
 
-class Message(NamedTuple):
+class McapMessage(NamedTuple):
     """As it stands in a file; the payload is a view of what was read, where the package makes a copy."""
 
     channel_id: int
@@ -150,12 +150,12 @@ def channel_of(content: memoryview) -> int:
     return content[0] | content[1] << 8
 
 
-def message(content: memoryview) -> Message:
+def message(content: memoryview) -> McapMessage:
     """From a message record's content."""
     if len(content) < MESSAGE_FIELDS.size:
         raise DamageError("a message is shorter than its head")
     channel_id, sequence, log_ns, publish_ns = MESSAGE_FIELDS.unpack_from(content)
-    return Message(channel_id, sequence, log_ns, publish_ns, content[MESSAGE_FIELDS.size :])
+    return McapMessage(channel_id, sequence, log_ns, publish_ns, content[MESSAGE_FIELDS.size :])
 
 
 def check_message_index(content: Bytes) -> int:

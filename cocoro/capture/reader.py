@@ -31,7 +31,7 @@ from mcap.records import Attachment, AttachmentIndex, Channel, Schema, Statistic
 
 from cocoro.bus.keys import matches
 from cocoro.capture import mcap
-from cocoro.capture.contents import Contents, Disk, Place, miscounted, read_place
+from cocoro.capture.contents import Contents, Disk, MessageBlock, miscounted, read_block
 from cocoro.capture.conventions import CHECKSUM, TALLY, CaptureError, NotAFileError, checksum
 from cocoro.capture.mcap import DamageError
 from cocoro.capture.scan import contents, front_to_back
@@ -147,7 +147,7 @@ class Capture:
         return [f"{kinds.total()} records of kinds that are not MCAP's own ({names}) are passed by"]
 
     @property
-    def places(self) -> tuple[Place, ...]:
+    def places(self) -> tuple[MessageBlock, ...]:
         """Where its messages are, in the order of the file."""
         return tuple(self._contents.places)
 
@@ -294,17 +294,17 @@ class Capture:
     def _matches(self, key: str, wanted: tuple[str, ...]) -> bool:
         return any(matches(expr, key) or matches(f"{self.robot}/{expr}", key) for expr in wanted)
 
-    def _record(self, message: mcap.Message) -> Record:
+    def _record(self, message: mcap.McapMessage) -> Record:
         channel_id, sequence, log_ns, publish_ns, payload = message
         return Record(self.channels[channel_id].topic, log_ns, publish_ns, sequence, payload, channel_id)
 
-    def _read_ahead(self, places: list[Place]) -> Iterator[tuple[Place, Future[Raw]]]:
+    def _read_ahead(self, places: list[MessageBlock]) -> Iterator[tuple[MessageBlock, Future[Raw]]]:
         """Read and unpack in a thread what is wanted next, while this one works on what it has."""
         with ThreadPoolExecutor(1, "capture reader") as pool:
-            ahead: deque[tuple[Place, Future[Raw]]] = deque()
+            ahead: deque[tuple[MessageBlock, Future[Raw]]] = deque()
             try:
                 for place in places:
-                    ahead.append((place, pool.submit(read_place, self._disk, place, self._contents.ours)))
+                    ahead.append((place, pool.submit(read_block, self._disk, place, self._contents.ours)))
                     if len(ahead) > AHEAD:
                         yield ahead.popleft()
                 while ahead:
@@ -312,7 +312,7 @@ class Capture:
             finally:
                 pool.shutdown(cancel_futures=True)
 
-    def _messages_in(self, place: Place, raw: Future[Raw], wanted: set[int]) -> Iterator[mcap.Message]:
+    def _messages_in(self, place: MessageBlock, raw: Future[Raw], wanted: set[int]) -> Iterator[mcap.McapMessage]:
         try:
             for op, content, _ in mcap.records(raw.result()):
                 if op != Opcode.MESSAGE:

@@ -17,7 +17,7 @@ from mcap.opcode import Opcode
 from mcap.records import ChunkIndex, Footer, MetadataIndex, Statistics
 
 from cocoro.capture import mcap
-from cocoro.capture.contents import Contents, Disk, Place, begun, compare, read_chunk
+from cocoro.capture.contents import Contents, Disk, MessageBlock, begun, compare, read_chunk
 from cocoro.capture.mcap import MAGIC, PREFIX, CutOffError, DamageError
 from cocoro.capture.walk import Walk
 
@@ -135,9 +135,9 @@ def _between_chunks(disk: Disk, found: Contents, indices: list[ChunkIndex], end:
     walk.through(at, end)
 
 
-def _place(index: ChunkIndex) -> Place:
+def _place(index: ChunkIndex) -> MessageBlock:
     channels = frozenset(index.message_index_offsets) or None
-    return Place(
+    return MessageBlock(
         index.chunk_start_offset, index.chunk_length, index.message_start_time, index.message_end_time, channels
     )
 

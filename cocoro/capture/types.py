@@ -72,6 +72,14 @@ MADE_HERE = "recorder"
 """The channel metadata `publisher` of what was never published: the recorder's own notes."""
 
 
+class MessageHead(msgspec.Struct, gc=False):
+    """The fields that every message has, decoded alone; a payload of others may lack any of them."""
+
+    stamp_ns: int = 0
+    seq: int = 0
+    incarnation: int = 0
+
+
 class Alive(Message):
     """A liveliness token came or went, as the recorder saw it: a service of the robot, by its key."""
 

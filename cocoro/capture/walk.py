@@ -22,7 +22,7 @@ from mcap.records import (
 )
 
 from cocoro.capture import mcap
-from cocoro.capture.contents import LARGEST_RECORD, Contents, Disk, Place, unpacked
+from cocoro.capture.contents import LARGEST_RECORD, Contents, Disk, MessageBlock, unpacked
 from cocoro.capture.mcap import KNOWN, MAGIC, PREFIX, CutOffError, DamageError
 
 RUN_BYTES = 1 << 20
@@ -82,7 +82,7 @@ class Walk:
         """Close the run of messages outside of chunks, if there is one."""
         if self._run_times:
             self._found.places.append(
-                Place(
+                MessageBlock(
                     self._run_at, self._run_end - self._run_at, min(self._run_times), max(self._run_times),
                     frozenset(self._run_channels), loose=True,
                 )
@@ -171,7 +171,7 @@ class Walk:
         self._found.chunks += 1
         self._found.messages.update({channel: len(entries) for channel, entries in index.items()})
         if times:
-            self._found.places.append(Place(at, end - at, min(times), max(times), frozenset(index)))
+            self._found.places.append(MessageBlock(at, end - at, min(times), max(times), frozenset(index)))
         if self._found.ours:
             self._due = index
             head, _ = mcap.ChunkHead.unpack(record)

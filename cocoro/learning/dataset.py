@@ -76,13 +76,13 @@ class Header(msgspec.Struct, frozen=True, kw_only=True):
     units: str = "rad, m, m/s, ns; body frame: x forward, y left, z up, origin on the floor between the wheels"
 
 
-Row = TypeVar("Row", bound=HandRow | WheelRow)
+SampleRow = TypeVar("SampleRow", bound=HandRow | WheelRow)
 
 
-class Recorded(Generic[Row]):
+class Recorded(Generic[SampleRow]):
     """A file that was read."""
 
-    def __init__(self, path: Path, header: Header, rows: list[Row]) -> None:
+    def __init__(self, path: Path, header: Header, rows: list[SampleRow]) -> None:
         self.path = path
         self.header = header
         self.rows = rows
@@ -115,7 +115,7 @@ def fingerprint_of(robot: Robot) -> str:
     return hashlib.sha256(msgspec.json.encode(drawing, order="deterministic")).hexdigest()[:16]
 
 
-def read(path: Path, kind: type[Row], robot: Robot | None = None) -> Recorded[Row]:
+def read(path: Path, kind: type[SampleRow], robot: Robot | None = None) -> Recorded[SampleRow]:
     """Read a file of one kind of rows. Raises ConfigError, naming file and line, when it is none, is damaged, or (with
     `robot`) is another robot's."""
     try:
@@ -125,7 +125,7 @@ def read(path: Path, kind: type[Row], robot: Robot | None = None) -> Recorded[Ro
     return _parse(path, data, kind, robot)
 
 
-def _parse(path: Path, data: bytes, kind: type[Row], robot: Robot | None) -> Recorded[Row]:
+def _parse(path: Path, data: bytes, kind: type[SampleRow], robot: Robot | None) -> Recorded[SampleRow]:
     lines = data[: data.rfind(b"\n") + 1].splitlines()  # a line without an end was being written
     if not lines:
         raise ConfigError(f"samples {path}: there is nothing in it; babble into a new file")
@@ -135,7 +135,7 @@ def _parse(path: Path, data: bytes, kind: type[Row], robot: Robot | None) -> Rec
     if robot is not None and header.drawing != fingerprint_of(robot):
         raise ConfigError(f"samples {path}: they were seen with another description of {robot.name}: babble anew")
     decoder = msgspec.json.Decoder(kind)
-    rows: list[Row] = []
+    rows: list[SampleRow] = []
     for number, line in enumerate(lines[1:], start=2):
         try:
             row = decoder.decode(line)
@@ -147,7 +147,7 @@ def _parse(path: Path, data: bytes, kind: type[Row], robot: Robot | None) -> Rec
     return Recorded(path, header, rows)
 
 
-def _header(path: Path, line: bytes, kind: type[Row]) -> Header:
+def _header(path: Path, line: bytes, kind: type[SampleRow]) -> Header:
     wanted = HAND if kind is HandRow else WHEELS
     try:
         header = msgspec.json.decode(line, type=Header)
@@ -160,14 +160,14 @@ def _header(path: Path, line: bytes, kind: type[Row]) -> Header:
     return header
 
 
-class Writer(Generic[Row]):
+class SampleFile(Generic[SampleRow]):
     """Appends to a file, or begins it. Use it with `with`.
 
     Raises ConfigError when the file cannot be written or holds something else (another robot's samples, say), and
     RefusedError when another process is writing it.
     """
 
-    def __init__(self, path: Path, kind: type[Row], robot: Robot, header: Header) -> None:
+    def __init__(self, path: Path, kind: type[SampleRow], robot: Robot, header: Header) -> None:
         self.path = path
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -176,13 +176,13 @@ class Writer(Generic[Row]):
             raise ConfigError(f"samples {path}: {error.strerror}") from error
         try:
             self._lock()
-            self.rows: list[Row] = self._resume(kind, robot, header)
+            self.rows: list[SampleRow] = self._resume(kind, robot, header)
             """All rows of the file, those from before included."""
         except BaseException:
             self._file.close()
             raise
 
-    def __enter__(self) -> Writer[Row]:
+    def __enter__(self) -> SampleFile[SampleRow]:
         return self
 
     def __exit__(
@@ -191,7 +191,7 @@ class Writer(Generic[Row]):
         os.fsync(self._file.fileno())
         self._file.close()
 
-    def append(self, rows: Iterable[Row]) -> None:
+    def append(self, rows: Iterable[SampleRow]) -> None:
         """Write rows at once: when this returns they outlive the process. Raises OSError with the file's name."""
         added = list(rows)
         self._write(b"".join(msgspec.json.encode(row) + b"\n" for row in added))
@@ -212,7 +212,7 @@ class Writer(Generic[Row]):
         except OSError as error:
             raise RefusedError(f"samples {self.path}: another process is writing it") from error
 
-    def _resume(self, kind: type[Row], robot: Robot, header: Header) -> list[Row]:
+    def _resume(self, kind: type[SampleRow], robot: Robot, header: Header) -> list[SampleRow]:
         self._file.seek(0)
         data = self._file.read()
         whole = data.rfind(b"\n") + 1

@@ -28,7 +28,7 @@ FORMAT = "cocoro.model"
 VERSION = 1
 LARGEST_WEIGHT = 1e6
 
-Number = Annotated[float, Meta(ge=-LARGEST_WEIGHT, le=LARGEST_WEIGHT)]
+Weight = Annotated[float, Meta(ge=-LARGEST_WEIGHT, le=LARGEST_WEIGHT)]
 BoundedNonNegative = Annotated[float, Meta(ge=0, le=LARGEST_WEIGHT)]
 
 
@@ -47,12 +47,12 @@ class ArmModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     """The hand-eye map."""
 
     joints: tuple[str, ...]
-    roll_rad: Number
+    roll_rad: Weight
     over_drawing: bool
     coordinates: Coordinates
-    centres: list[list[Number]]
+    centres: list[list[Weight]]
     widths: list[Annotated[float, Meta(gt=0, le=100)]]
-    weights: list[list[Number]]
+    weights: list[list[Weight]]
     seen_m: list[FiniteVec3]
     """Where the hand was seen: what the reachability mesh is made of."""
     training: Training
@@ -65,7 +65,7 @@ class WheelModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     training: Training
 
 
-class Model(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class BodyModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Each part may be missing: then the drawing's own serves."""
 
     robot: str
@@ -83,18 +83,18 @@ class _Document(msgspec.Struct, frozen=True, kw_only=True):
     model: msgspec.Raw
 
 
-def empty(robot: Robot) -> Model:
+def empty(robot: Robot) -> BodyModel:
     """Nothing learned yet."""
-    return Model(robot=robot.name, drawing=fingerprint_of(robot))
+    return BodyModel(robot=robot.name, drawing=fingerprint_of(robot))
 
 
-def encode(model: Model) -> bytes:
+def encode(model: BodyModel) -> bytes:
     body = msgspec.json.encode(model)
     checksum = hashlib.sha256(body).hexdigest()[:16]
     return msgspec.json.encode(_Document(format=FORMAT, version=VERSION, checksum=checksum, model=msgspec.Raw(body)))
 
 
-def decode(data: bytes, robot: Robot, where: str) -> Model:
+def decode(data: bytes, robot: Robot, where: str) -> BodyModel:
     """Read what `encode` gave. Raises ConfigError with one line: damaged, foreign, or of another version."""
     try:
         document = msgspec.json.decode(data, type=_Document)
@@ -111,7 +111,7 @@ def decode(data: bytes, robot: Robot, where: str) -> Model:
     if hashlib.sha256(bytes(document.model)).hexdigest()[:16] != document.checksum:
         raise ConfigError(f"model {where}: it is damaged (its checksum is wrong): learn it anew (cocoro learn)")
     try:
-        model = msgspec.json.decode(document.model, type=Model)
+        model = msgspec.json.decode(document.model, type=BodyModel)
     except msgspec.MsgspecError as error:
         raise ConfigError(f"model {where}: {error}") from error
     if model.robot != robot.name:
@@ -123,7 +123,7 @@ def decode(data: bytes, robot: Robot, where: str) -> Model:
     return model
 
 
-def load(path: Path, robot: Robot) -> Model:
+def load(path: Path, robot: Robot) -> BodyModel:
     """Raises ConfigError as `decode` does, or when the file cannot be read."""
     try:
         data = path.read_bytes()
@@ -132,7 +132,7 @@ def load(path: Path, robot: Robot) -> Model:
     return decode(data, robot, str(path))
 
 
-def save(model: Model, path: Path) -> None:
+def save(model: BodyModel, path: Path) -> None:
     """Write it whole or not at all. Raises ConfigError when it cannot be written."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -57,7 +57,7 @@ def _encoding(payload: bytes | memoryview) -> str:
     return JSON
 
 
-class Choice:
+class KeyFilter:
     """Which keys an operator means: those of `only` (all, when there is none), but for those of `without`.
 
     Each is a key expression with or without the robot's name, or `frames`. Raises ConfigError for what is none.
@@ -84,18 +84,18 @@ def _expressions(text: str, robot: str) -> list[str]:
 _decoder = msgspec.msgpack.Decoder(Frame)
 
 
-def lossy(quality: int) -> Callable[[Entry], Prepared]:
+def lossy(quality: int) -> Callable[[QueuedMessage], PreparedMessage]:
     """Makes lossy frames of frames; everything else passes."""
 
-    def prepare(entry: Entry) -> Prepared:
+    def prepare(entry: QueuedMessage) -> PreparedMessage:
         if not entry.key.endswith(f"/{FRAME.name}"):
-            return Prepared(entry, None)
+            return PreparedMessage(entry, None)
         try:
             frame = _decoder.decode(entry.payload)
         except (msgspec.MsgspecError, ValueError):
-            return Prepared(entry, None)
+            return PreparedMessage(entry, None)
         payload = msgspec.msgpack.encode(compress(frame, quality))
-        return Prepared(entry._replace(payload=payload), schema_of(LossyFrame))
+        return PreparedMessage(entry._replace(payload=payload), schema_of(LossyFrame))
 
     return prepare
 
@@ -114,7 +114,7 @@ def compress(frame: Frame, quality: int) -> LossyFrame:
     )
 
 
-class Entry(NamedTuple):
+class QueuedMessage(NamedTuple):
     """A message on its way into a capture."""
 
     key: str
@@ -128,9 +128,9 @@ class Entry(NamedTuple):
     """A number, where the key may have several channels; it is not the number in the file."""
 
 
-class Prepared(NamedTuple):
+class PreparedMessage(NamedTuple):
     """What is written in place of an entry."""
 
-    entry: Entry
+    entry: QueuedMessage
     schema: TypeSchema | None
     """In place of the key's own, where the payload is of another type now."""

@@ -22,7 +22,7 @@ TRIES = 3
 KEPT_STEPS = 100
 
 
-class Step(msgspec.Struct, frozen=True):
+class WallClockStep(msgspec.Struct, frozen=True):
     """Somebody set the wall clock."""
 
     log_ns: int
@@ -45,7 +45,7 @@ class LogClock:
         self._wall_ns = wall_ns
         self._steady_ns = steady_ns
         self._start = self._newest = min((self._read() for _ in range(TRIES)), key=lambda reading: reading.apart_ns)
-        self._steps: list[Step] = []
+        self._steps: list[WallClockStep] = []
         self._count = 0
 
     def at(self, steady_ns: int) -> int:
@@ -55,13 +55,13 @@ class LogClock:
     def now_ns(self) -> int:
         return self.at(self._steady_ns())
 
-    def look(self) -> Step | None:
+    def look(self) -> WallClockStep | None:
         """How the wall clock was set since the last look; None when it was not, or when that cannot be told now."""
         reading = self._read()
         by_ns = reading.offset_ns - self._newest.offset_ns
         if reading.apart_ns > TOGETHER_NS or abs(by_ns) < STEP_NS:
             return None
-        step = Step(self.now_ns(), by_ns / NS)
+        step = WallClockStep(self.now_ns(), by_ns / NS)
         self._newest = reading
         self._steps = [*self._steps, step][-KEPT_STEPS:]
         self._count += 1
@@ -82,5 +82,5 @@ class LogClock:
         return _Reading(wall_ns - (before_ns + after_ns) // 2, after_ns - before_ns)
 
 
-def words(step: Step) -> str:
+def describe_step(step: WallClockStep) -> str:
     return f"set {'forward' if step.by_s > 0 else 'back'} by {abs(step.by_s):.3f} s"

@@ -14,17 +14,18 @@ import msgspec
 
 from cocoro.about import about, versions
 from cocoro.bus.base import Handle, Heard, Payload
-from cocoro.capture.types import Alive
+from cocoro.capture.types import Alive, MessageHead
 from cocoro.clock import NS, FollowedClock
 from cocoro.errors import MeshError, RemoteError
 from cocoro.messages import AboutReply, AboutRequest, ClockTick, DisturbedFile, Recording
 from cocoro.node import Node
+from cocoro.source import ANY_HZ, Source
 from cocoro.tokens import alive_key, recorder_key
-from cocoro.topics import ABOUT, CLOCK, RECORDING
-from services.capture.keys import ALIVE_INFO, Choice, Entry, KeyInfo
-from services.capture.log_clock import WALL_CLOCK, LogClock, words
-from services.capture.sink import Progress, Sink
-from services.capture.writer import Missing, told
+from cocoro.topics import ABOUT, CLOCK, RECORDING, topic_named
+from services.capture.keys import ALIVE_INFO, KeyFilter, KeyInfo, QueuedMessage
+from services.capture.log_clock import WALL_CLOCK, LogClock, describe_step
+from services.capture.sink import RecordingProgress, RecordingSink
+from services.capture.writer import Missing, describe_disturbance
 
 TELL_S = 1.0
 """How often the recorder tells how it is getting on."""
@@ -36,57 +37,70 @@ LOOK_S = 0.1
 """How often it looks whether a fault has come up, and whether somebody has set the wall clock."""
 
 
-class Head(msgspec.Struct, gc=False):
-    """What every message of ours says of itself; other messages may have none of it."""
+class KeyCounts:
+    """How many messages of one key arrived, were lost on the way, and were dropped."""
 
-    stamp_ns: int = 0
-    seq: int = 0
-    incarnation: int = 0
-
-
-class Source:
-    """One key, as it is heard."""
-
-    def __init__(self) -> None:
+    def __init__(self, rate_hz: float) -> None:
+        """`rate_hz`: the nominal rate, by which a jump of the sequence numbers is judged."""
         self.heard = 0
-        self.lost = 0
         self.dropped = 0
-        self._incarnation: int | None = None
-        self._seq = -1
+        self._rate_hz = rate_hz
+        self._source = Source()
 
-    def hear(self, head: Head) -> None:
+    @property
+    def lost(self) -> int:
+        return self._source.gaps
+
+    def hear(self, head: MessageHead) -> bool:
+        """Count a message. Returns whether its sequence number can be right, by the rules of `cocoro.source`; gaps
+        before one that cannot are no losses."""
         self.heard += 1
-        if head.incarnation == self._incarnation and head.seq > self._seq:
-            self.lost += head.seq - self._seq - 1
-        self._incarnation, self._seq = head.incarnation, head.seq
+        source = self._source
+        if head.incarnation != source.incarnation:
+            source.begin(head.incarnation)
+        elif head.seq != source.seq + 1:
+            lost = source.jump(head.seq, head.stamp_ns, self._rate_hz, None)
+            if lost is None:
+                return False
+            source.gaps += lost
+        source.seq, source.stamp_ns = head.seq, head.stamp_ns
+        if source.troubled:
+            source.settle()
+        return True
+
+
+def counts_of(key: str, robot: str) -> KeyCounts:
+    topic = topic_named(key.removeprefix(f"{robot}/"))
+    return KeyCounts(ANY_HZ if topic is None else topic.rate_hz or ANY_HZ)
 
 
 class Ledger:
-    """What was heard of each key, and what was not."""
+    """The counts of every key that is recorded."""
 
-    def __init__(self, choice: Choice) -> None:
-        self._choice = choice
-        self._sources: dict[str, Source | None] = {}
+    def __init__(self, robot: str, chosen: KeyFilter) -> None:
+        self._robot = robot
+        self._chosen = chosen
+        self._counts: dict[str, KeyCounts | None] = {}
 
-    def source(self, key: str) -> Source | None:
-        """None for a key that is not chosen."""
-        if key not in self._sources:
-            self._sources[key] = Source() if key in self._choice else None
-        return self._sources[key]
+    def counts(self, key: str) -> KeyCounts | None:
+        """None for a key that is not recorded."""
+        if key not in self._counts:
+            self._counts[key] = counts_of(key, self._robot) if key in self._chosen else None
+        return self._counts[key]
 
     def missing(self) -> Missing:
-        """Where there is any. (From any thread: the newest numbers, or nearly.)"""
-        sources = [(key, source) for key, source in list(self._sources.items()) if source is not None]
+        """Keys with dropped or lost messages. Any thread may call this; the numbers may lag by a message."""
+        counts = [(key, count) for key, count in list(self._counts.items()) if count is not None]
         return Missing(
-            dropped={key: source.dropped for key, source in sources if source.dropped},
-            lost={key: source.lost for key, source in sources if source.lost},
+            dropped={key: count.dropped for key, count in counts if count.dropped},
+            lost={key: count.lost for key, count in counts if count.lost},
         )
 
 
 class Recorder:
     """`start` it, and `tell` for ever; `close` takes its ears off the mesh, and `end` says how it went."""
 
-    def __init__(self, node: Node, ledger: Ledger, sink: Sink, log_clock: LogClock | None) -> None:
+    def __init__(self, node: Node, ledger: Ledger, sink: RecordingSink, log_clock: LogClock | None) -> None:
         """Without `log_clock`, log times are the node's (virtual) time."""
         self._node = node
         self._ledger = ledger
@@ -94,7 +108,7 @@ class Recorder:
         self._log_clock = log_clock
         self._disturbed: tuple[DisturbedFile, ...] = ()
         self._handles: list[Handle] = []
-        self._head = msgspec.msgpack.Decoder(Head)
+        self._head = msgspec.msgpack.Decoder(MessageHead)
         self._clock: FollowedClock | None = None
         self._clock_key = CLOCK.key(node.robot_name)
         self._time = msgspec.msgpack.Decoder(ClockTick)
@@ -140,15 +154,15 @@ class Recorder:
         )
         self.say(ended=True)
 
-    def _complain(self, progress: Progress) -> None:
+    def _complain(self, progress: RecordingProgress) -> None:
         """Have it known what is wrong, or has been."""
         for file in progress.disturbed:
             if file not in self._disturbed:
-                self._node.log.error("%s", told(file))
+                self._node.log.error("%s", describe_disturbance(file))
         if progress.fault:
             self._node.log.error("%s", progress.fault)
         self._disturbed = progress.disturbed
-        self._node.faults = (*filter(None, (progress.fault,)), *map(told, progress.disturbed))
+        self._node.faults = (*filter(None, (progress.fault,)), *map(describe_disturbance, progress.disturbed))
         if progress.fault:
             self._node.degraded("not recording")
         elif progress.removed:
@@ -158,7 +172,7 @@ class Recorder:
         """Note in the capture, and say, when somebody has set the wall clock."""
         step = None if self._log_clock is None else self._log_clock.look()
         if step is not None and self._log_clock is not None:
-            self._node.log.warning("the wall clock was %s: log times go on as if it had not been", words(step))
+            self._node.log.warning("the wall clock was %s: log times go on as if it had not been", describe_step(step))
             self._sink.remember(WALL_CLOCK, self._log_clock.metadata())
 
     def say(self, ended: bool) -> None:
@@ -175,15 +189,15 @@ class Recorder:
         for key, payload, heard_ns in lot:
             if key == self._clock_key:
                 self._tick(payload)
-            source = self._ledger.source(key)
-            if source is None:
+            counts = self._ledger.counts(key)
+            if counts is None:
                 continue
             try:
                 head = self._head.decode(payload)
             except (msgspec.MsgspecError, ValueError, RecursionError):
-                head = Head(seq=source.heard)
-            source.hear(head)
-            self._put(source, key, head.seq, head.stamp_ns, payload, None, heard_ns)
+                head = MessageHead(seq=counts.heard)
+            counts.hear(head)
+            self._put(counts, key, head.seq, head.stamp_ns, payload, None, heard_ns)
 
     def _tick(self, payload: Payload) -> None:
         """Who hears everything need not be woken for the time besides."""
@@ -194,13 +208,13 @@ class Recorder:
             self._clock.tick(time_is.stamp_ns, time_is.incarnation, time_is.rate)
 
     def _on_alive(self, key: str, alive: bool) -> None:
-        source = self._ledger.source(key)
+        counts = self._ledger.counts(key)
         changed, self._alive[key] = self._alive.get(key) != alive, alive
-        if source is not None and changed:
-            message = Alive(alive=alive, seq=source.heard, stamp_ns=self._node.now_ns())
-            source.heard += 1
+        if counts is not None and changed:
+            message = Alive(alive=alive, seq=counts.heard, stamp_ns=self._node.now_ns())
+            counts.heard += 1
             data = msgspec.msgpack.encode(message)
-            self._put(source, key, message.seq, message.stamp_ns, data, ALIVE_INFO, None)
+            self._put(counts, key, message.seq, message.stamp_ns, data, ALIVE_INFO, None)
         _, _, rest = key.partition("/")
         service, _, what = rest.partition("/")
         if alive and what == "alive" and service != self._node.name:
@@ -208,7 +222,7 @@ class Recorder:
 
     def _put(
         self,
-        source: Source,
+        counts: KeyCounts,
         key: str,
         sequence: int,
         stamp_ns: int,
@@ -219,8 +233,8 @@ class Recorder:
         # When it was heard (None is now); each later than the last, so that the order can be told by it.
         log_ns = self._newest_ns = max(self._log_ns(heard_ns), self._newest_ns + 1)
         data = payload if isinstance(payload, bytes) else bytes(payload)
-        if not self._sink.offer(Entry(key, sequence, log_ns, stamp_ns or log_ns, data, info)):
-            source.dropped += 1
+        if not self._sink.offer(QueuedMessage(key, sequence, log_ns, stamp_ns or log_ns, data, info)):
+            counts.dropped += 1
 
     def _log_ns(self, heard_ns: int | None) -> int:
         if self._log_clock is None:

@@ -15,11 +15,11 @@ from cocoro.clock import NS, VirtualClock
 from cocoro.node import Node
 from services.capture.config import Config, folder_of
 from services.capture.file import Packer
-from services.capture.keys import Choice, info_of, lossy
+from services.capture.keys import KeyFilter, info_of, lossy
 from services.capture.log_clock import LogClock
 from services.capture.recorder import Ledger, Recorder
 from services.capture.sink import DirectSink, ThreadedSink
-from services.capture.writer import MB, Limits, Writer, sync_and_close
+from services.capture.writer import MB, CaptureWriter, Limits, sync_and_close
 
 __all__ = ["Config", "run"]
 
@@ -27,7 +27,7 @@ __all__ = ["Config", "run"]
 async def run(node: Node, config: Config, log_clock: LogClock | None = None) -> None:
     """Record until cancelled. A disk that does not take it is a fault that the mesh hears of, not the end. `log_clock`
     is of use in real time alone, and made when there is none."""
-    ledger = Ledger(Choice(node.robot_name, config.only, config.without))
+    ledger = Ledger(node.robot_name, KeyFilter(node.robot_name, config.only, config.without))
     virtual = isinstance(node.clock, VirtualClock)
     if virtual:
         log_clock = None
@@ -56,11 +56,11 @@ async def run(node: Node, config: Config, log_clock: LogClock | None = None) -> 
 
 def _writer(
     robot: str, config: Config, ledger: Ledger, started: datetime, release: Callable[[int], None] | None
-) -> Writer:
+) -> CaptureWriter:
     limits = Limits(min_free_bytes=round(config.min_free_mb * MB))
     if config.file is None:
         limits = replace(limits, file_bytes=config.rotate_mb * MB, file_s=config.rotate_s)
-    return Writer(
+    return CaptureWriter(
         _place(robot, config, started),
         Packer(config.compression, config.level),
         limits,

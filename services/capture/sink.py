@@ -14,8 +14,8 @@ from typing import NamedTuple, Protocol
 from cocoro.capture.conventions import CaptureError
 from cocoro.messages import DisturbedFile
 from services.capture.file import LARGE_BYTES
-from services.capture.keys import Entry
-from services.capture.writer import Writer
+from services.capture.keys import QueuedMessage
+from services.capture.writer import CaptureWriter
 
 log = logging.getLogger(__name__)
 
@@ -25,7 +25,7 @@ RESERVE_BYTES = 16 * 1024 * 1024
 """For small messages, when the large ones have filled the rest."""
 
 
-class Progress(NamedTuple):
+class RecordingProgress(NamedTuple):
     file: str = ""
     messages: int = 0
     size_bytes: int = 0
@@ -38,14 +38,14 @@ class Progress(NamedTuple):
     removed: int = 0
 
 
-class Sink(Protocol):
-    def offer(self, entry: Entry) -> bool:
+class RecordingSink(Protocol):
+    def offer(self, entry: QueuedMessage) -> bool:
         """Whether it was taken; there may be no room. What comes after a fault is taken and forgotten."""
 
     def remember(self, name: str, entries: Mapping[str, str]) -> None:
         """Metadata of the run."""
 
-    def progress(self) -> Progress: ...
+    def progress(self) -> RecordingProgress: ...
 
     def close(self) -> None:
         """Write what waits, and make the file whole. Blocks."""
@@ -54,15 +54,15 @@ class Sink(Protocol):
 class DirectSink:
     """Writes at once, for virtual time: there is no thread, and no hurry."""
 
-    def __init__(self, make: Callable[[Callable[[int], None] | None], Writer], flush_s: float) -> None:
-        self._writer: Writer | None = None
+    def __init__(self, make: Callable[[Callable[[int], None] | None], CaptureWriter], flush_s: float) -> None:
+        self._writer: CaptureWriter | None = None
         self._fault = ""
         self._flush_ns = round(flush_s * 1e9)
         self._flushed_ns = 0
         with self._guarded():
             self._writer = make(None)
 
-    def offer(self, entry: Entry) -> bool:
+    def offer(self, entry: QueuedMessage) -> bool:
         if self._writer is not None and not self._fault:
             with self._guarded():
                 self._writer.put(entry)
@@ -76,7 +76,7 @@ class DirectSink:
             with self._guarded():
                 self._writer.remember(name, entries)
 
-    def progress(self) -> Progress:
+    def progress(self) -> RecordingProgress:
         return _progress(self._writer, 0, 0.0, self._fault)
 
     def close(self) -> None:
@@ -84,8 +84,8 @@ class DirectSink:
             with self._guarded():
                 self._writer.close()
 
-    def _guarded(self) -> _Guard:
-        return _Guard(self._set_fault)
+    def _guarded(self) -> _FaultReporter:
+        return _FaultReporter(self._set_fault)
 
     def _set_fault(self, fault: str) -> None:
         self._fault = fault
@@ -96,7 +96,7 @@ class ThreadedSink:
 
     def __init__(
         self,
-        make: Callable[[Callable[[int], None] | None], Writer],
+        make: Callable[[Callable[[int], None] | None], CaptureWriter],
         capacity_bytes: int,
         flush_s: float,
         sync_s: float,
@@ -105,17 +105,17 @@ class ThreadedSink:
         self._make = make
         self._capacity_bytes = capacity_bytes
         self._flush_s = flush_s
-        self._waiting: deque[Entry | tuple[str, Mapping[str, str]]] = deque()
+        self._waiting: deque[QueuedMessage | tuple[str, Mapping[str, str]]] = deque()
         self._taken_bytes = 0  # by the loop
         self._done_bytes = 0  # by the thread: each number has one writer, so no lock is needed
         self._fault = ""
-        self._writer: Writer | None = None
+        self._writer: CaptureWriter | None = None
         self._closing = threading.Event()
         self._syncer = Syncer(sync_s, self._current)
         self._thread = threading.Thread(target=self._run, name="capture writer", daemon=True)
         self._thread.start()
 
-    def offer(self, entry: Entry) -> bool:
+    def offer(self, entry: QueuedMessage) -> bool:
         if self._fault:
             return True
         size = len(entry.payload)
@@ -129,7 +129,7 @@ class ThreadedSink:
     def remember(self, name: str, entries: Mapping[str, str]) -> None:
         self._waiting.append((name, entries))
 
-    def progress(self) -> Progress:
+    def progress(self) -> RecordingProgress:
         waiting_bytes = self._taken_bytes - self._done_bytes
         return _progress(self._writer, waiting_bytes, self._syncer.longest_ms, self._fault)
 
@@ -142,7 +142,7 @@ class ThreadedSink:
         return None if self._writer is None else self._writer.file.fileno()
 
     def _run(self) -> None:
-        with _Guard(self._failed):
+        with _FaultReporter(self._failed):
             self._writer = writer = self._make(self._syncer.release)
             self._syncer.start()
             flush_at_s = 0.0
@@ -156,12 +156,12 @@ class ThreadedSink:
                     writer.close()
                     return
 
-    def _write(self, writer: Writer) -> None:
+    def _write(self, writer: CaptureWriter) -> None:
         """What waits now; and flush meanwhile, when that is much."""
         flush_at_s = time.monotonic() + self._flush_s
         for _ in range(len(self._waiting)):
             item = self._waiting.popleft()
-            if isinstance(item, Entry):
+            if isinstance(item, QueuedMessage):
                 writer.put(item)
                 self._done_bytes += len(item.payload)
             else:
@@ -243,7 +243,7 @@ class Syncer:
         self.longest_ms = max(self.longest_ms, (time.perf_counter() - started) * 1e3)
 
 
-class _Guard:
+class _FaultReporter:
     """Turns a CaptureError into a fault that is told; so too a bug, so that the recorder says that it is dead."""
 
     def __init__(self, tell: Callable[[str], None]) -> None:
@@ -263,10 +263,12 @@ class _Guard:
         return False
 
 
-def _progress(writer: Writer | None, waiting_bytes: int, longest_sync_ms: float, fault: str) -> Progress:
+def _progress(
+    writer: CaptureWriter | None, waiting_bytes: int, longest_sync_ms: float, fault: str
+) -> RecordingProgress:
     if writer is None:
-        return Progress(waiting_bytes=waiting_bytes, fault=fault)
-    return Progress(
+        return RecordingProgress(waiting_bytes=waiting_bytes, fault=fault)
+    return RecordingProgress(
         file=writer.where,
         messages=writer.messages,
         size_bytes=writer.size_bytes,

@@ -16,7 +16,7 @@ from cocoro.capture.types import TypeSchema
 from cocoro.clock import NS
 from cocoro.messages import DisturbedFile
 from services.capture.file import CaptureFile, Packer
-from services.capture.keys import Entry, KeyInfo, Prepared
+from services.capture.keys import KeyInfo, PreparedMessage, QueuedMessage
 
 MB = 1_000_000
 LOOK_S = 1.0
@@ -24,7 +24,7 @@ LOOK_S = 1.0
 KEPT_DISTURBED = 20
 
 
-Name = str | tuple[str, int]
+ChannelName = str | tuple[str, int]
 """A channel of a writer: the key, or the key and a number where the key may have several."""
 
 
@@ -52,7 +52,7 @@ class Missing(NamedTuple):
     lost: Mapping[str, int]
 
 
-class Writer:
+class CaptureWriter:
     """Takes entries in order of their log times. Raises CaptureError when the disk does not take them; what was
     written until then is closed as well as can be, and the writer is of no more use."""
 
@@ -64,7 +64,7 @@ class Writer:
         info: Callable[[str, bytes], KeyInfo],
         missing: Callable[[], Missing] = lambda: Missing({}, {}),
         release: Callable[[int], None] = sync_and_close,
-        prepare: Callable[[Entry], Prepared] | None = None,
+        prepare: Callable[[QueuedMessage], PreparedMessage] | None = None,
         monotonic_s: Callable[[], float] = time.monotonic,
     ) -> None:
         """`place(n)` is the nth file's path, from 1 on; `info(key, payload)` says what to write of a key; `release`
@@ -79,8 +79,8 @@ class Writer:
         self._monotonic_s = monotonic_s
         self._look_at_s = 0.0
         self._metadata: dict[str, dict[str, str]] = {}
-        self._infos: dict[Name, KeyInfo] = {}
-        self._channels: dict[Name, int] = {}
+        self._infos: dict[ChannelName, KeyInfo] = {}
+        self._channels: dict[ChannelName, int] = {}
         self._schemas: dict[TypeSchema, int] = {}
         """The numbers of channels and schemas in this file."""
         self._number = 0
@@ -107,7 +107,7 @@ class Writer:
     def raw_bytes(self) -> int:
         return self._closed_raw_bytes + (0 if self._ended is self.file else self.file.raw_bytes)
 
-    def put(self, entry: Entry) -> None:
+    def put(self, entry: QueuedMessage) -> None:
         if self._first_ns is None:
             self._first_ns = entry.log_ns
         elif (
@@ -119,14 +119,14 @@ class Writer:
         if self._prepare is not None:
             entry, schema = self._prepare(entry)
         try:
-            name: Name = entry.key if entry.channel is None else (entry.key, entry.channel)
+            name: ChannelName = entry.key if entry.channel is None else (entry.key, entry.channel)
             channel = self._channels.get(name) or self._channel(name, entry, schema)
             self.file.add(channel, entry.sequence, entry.log_ns, entry.publish_ns, entry.payload)
         except OSError as error:
             raise self._failed(error) from error
         self.messages += 1
 
-    def _channel(self, name: Name, entry: Entry, schema: TypeSchema | None) -> int:
+    def _channel(self, name: ChannelName, entry: QueuedMessage, schema: TypeSchema | None) -> int:
         """Make a key known to the file."""
         info = self._infos.get(name)
         if info is None:
@@ -180,7 +180,7 @@ class Writer:
         if now_s < self._look_at_s:
             return
         self._look_at_s = now_s + LOOK_S
-        if whereabouts(self.file.path, self.file.fileno()).state != "there":
+        if locate(self.file.path, self.file.fileno()).state != "there":
             self._rotate()
             self._first_ns = None
 
@@ -237,7 +237,7 @@ class Writer:
         """See, once, what has become of a file that gets no more, before it is closed."""
         if self._ended is file:
             return
-        found = whereabouts(file.path, file.fileno())
+        found = locate(file.path, file.fileno())
         self._ended, self.where = file, found.path
         if found.state == "removed":
             lost = sum(tally.messages for tally in file.tallies.values())
@@ -248,8 +248,8 @@ class Writer:
             self._closed_bytes += file.size_bytes
             self._closed_raw_bytes += file.raw_bytes
         if found.state != "there":
-            told = DisturbedFile(file=str(file.path), became=found.state, now=found.path, lost=lost)
-            self.disturbed = (*self.disturbed, told)[-KEPT_DISTURBED:]
+            disturbed = DisturbedFile(file=str(file.path), became=found.state, now=found.path, lost=lost)
+            self.disturbed = (*self.disturbed, disturbed)[-KEPT_DISTURBED:]
 
     def _failed(self, error: OSError) -> CaptureError:
         """Leave the file as good as it can be."""
@@ -273,31 +273,31 @@ def _sync_folder(folder: Path) -> None:
         os.close(fd)
 
 
-class Whereabouts(NamedTuple):
+class FileLocation(NamedTuple):
     state: Literal["there", "moved", "removed"]
     path: str
     """Where it is; '' when it was removed, or when the system does not tell where it was moved."""
 
 
-def whereabouts(path: Path, fd: int) -> Whereabouts:
+def locate(path: Path, fd: int) -> FileLocation:
     """Whether the file that is open as `fd` still has its path. A move to another disk is a copy and a removal, and so
     it looks here: the copy may lack what was written last."""
     mine = os.fstat(fd)
     try:
         if os.path.samestat(path.stat(), mine):
-            return Whereabouts("there", str(path))
+            return FileLocation("there", str(path))
     except (FileNotFoundError, NotADirectoryError):
         pass
     except OSError:  # a folder that must not be looked into, a disk that does not answer: nothing is known
-        return Whereabouts("there", str(path))
+        return FileLocation("there", str(path))
     now = _name(fd, mine)
     # A network file system keeps what is removed under such a name for as long as it is open.
     if mine.st_nlink == 0 or Path(now).name.startswith(".nfs"):
-        return Whereabouts("removed", "")
-    return Whereabouts("moved", now)
+        return FileLocation("removed", "")
+    return FileLocation("moved", now)
 
 
-def told(file: DisturbedFile) -> str:
+def describe_disturbance(file: DisturbedFile) -> str:
     """A line for people."""
     if file.became == "removed":
         return (

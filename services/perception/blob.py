@@ -13,13 +13,13 @@ import cv2
 import numpy as np
 
 from cocoro.arrays import MaskArray
-from cocoro.objects import Catalogue, KnownObject
+from cocoro.objects import Catalogue, ObjectSpec
 from services.perception.colours import ColourTable
 from services.perception.config import Config
-from services.perception.image import Box, RgbdImage
-from services.perception.region import Region, components
+from services.perception.image import PixelBox, RgbdImage
+from services.perception.region import ColourRegion, components
 from services.perception.shapes import area_range_m2, counted_px, reach_m
-from services.perception.sighting import Sighting
+from services.perception.sighting import ImageSighting
 
 NEAREST_M = 0.3
 """A blob without depth is no larger than the object is from here: nearer, little of it fits into the image."""
@@ -33,7 +33,7 @@ class BlobDetector:
         self._config = config
         self._table = ColourTable(catalogue)
 
-    def detect(self, image: RgbdImage) -> list[Sighting]:
+    def detect(self, image: RgbdImage) -> list[ImageSighting]:
         classes = self._table.classify(image.colour)
         # Which rows and columns have a pixel of which object: one pass for all of them.
         rows, columns = np.bitwise_or.reduce(classes, axis=1), np.bitwise_or.reduce(classes, axis=0)
@@ -49,18 +49,20 @@ class BlobDetector:
                     sightings.append(sighting)
         return sightings
 
-    def _find(self, known: KnownObject, mask: MaskArray, origin: tuple[int, int], image: RgbdImage) -> Sighting | None:
+    def _find(
+        self, known: ObjectSpec, mask: MaskArray, origin: tuple[int, int], image: RgbdImage
+    ) -> ImageSighting | None:
         """The object in the part of the image whose first pixel is `origin` and whose matching pixels are `mask`."""
         parts = _clean_components(mask, origin, image, self._config.min_area_px * image.scale**2)
         if not parts:
             return None
         fit = _Fit(known, image, self._config)
-        regions: list[Region] = []
-        plausible: list[Region] = []
+        regions: list[ColourRegion] = []
+        plausible: list[ColourRegion] = []
         for part in parts:
-            region = Region(*part, image)
+            region = ColourRegion(*part, image)
             if fit.too_large(region):
-                pieces = [Region(*piece, image) for piece in region.split_by_depth()]
+                pieces = [ColourRegion(*piece, image) for piece in region.split_by_depth()]
                 regions += pieces
                 plausible += [piece for piece in pieces if fit.whole(piece)]
             else:
@@ -70,7 +72,7 @@ class BlobDetector:
         if not plausible:
             return None
         best = fit.completed(max(plausible, key=fit.score), regions)
-        return Sighting(
+        return ImageSighting(
             label=known.label,
             u_px=best.u_px,
             v_px=best.v_px,
@@ -86,7 +88,7 @@ class BlobDetector:
 class _Fit:
     """How well a region's size goes with one known object at the region's own distance."""
 
-    def __init__(self, known: KnownObject, image: RgbdImage, config: Config) -> None:
+    def __init__(self, known: ObjectSpec, image: RgbdImage, config: Config) -> None:
         camera = image.camera
         self._config = config
         self._focal2 = camera.fx * camera.fy
@@ -101,28 +103,28 @@ class _Fit:
     def _diagonal_px(self, depth_m: float) -> float:
         return MAX_STRETCH * 2 * self._reach_m * sqrt(self._focal2) / depth_m + 4
 
-    def too_large(self, region: Region) -> bool:
+    def too_large(self, region: ColourRegion) -> bool:
         depth_m = region.depth_m or NEAREST_M
         most = self._config.max_share * self._pixels(self._greatest_m2, depth_m)
         return region.area_px > most or region.diagonal_px > self._diagonal_px(depth_m)
 
-    def whole(self, region: Region) -> bool:
+    def whole(self, region: ColourRegion) -> bool:
         """It may be the whole object; without depth, for all that is known."""
         if region.area_px < self._min_area_px or self.too_large(region):
             return False
         return not self.too_small(region, self._config.min_share)
 
-    def partly_hidden(self, region: Region) -> bool:
+    def partly_hidden(self, region: ColourRegion) -> bool:
         """It may be a part of the object, whose rest the image's edge or something nearer hides."""
         if region.area_px < 2 * self._min_area_px or self.too_small(region, self._config.min_hidden_share):
             return False
         return region.cut or region.hidden
 
-    def too_small(self, region: Region, share: float = 0.85) -> bool:
+    def too_small(self, region: ColourRegion, share: float = 0.85) -> bool:
         """It has a smaller share of the pixels that the whole object would have at that depth."""
         return region.depth_m is not None and region.area_px < share * self._pixels(self._least_m2, region.depth_m)
 
-    def score(self, region: Region) -> tuple[bool, float, int]:
+    def score(self, region: ColourRegion) -> tuple[bool, float, int]:
         """Greater is better: with depth before without, then by how near it comes to the expected size."""
         if region.depth_m is None:
             return False, 0.0, region.area_px
@@ -130,7 +132,7 @@ class _Fit:
         # Half-octave steps: among those of about the right size the larger, that is nearer, one wins.
         return True, -round(2 * abs(log(region.area_px / expected_px, 2))), region.area_px
 
-    def completed(self, best: Region, regions: list[Region]) -> Region:
+    def completed(self, best: ColourRegion, regions: list[ColourRegion]) -> ColourRegion:
         """With the other pieces of the same object, where something before it parts it in two."""
         for other in regions:
             if other is best or best.depth_m is None or other.depth_m is None:
@@ -144,7 +146,7 @@ class _Fit:
 
 def _clean_components(
     mask: MaskArray, origin: tuple[int, int], image: RgbdImage, min_area_px: float
-) -> list[tuple[MaskArray, Box]]:
+) -> list[tuple[MaskArray, PixelBox]]:
     """The mask's connected regions, after specks and threads of noise are opened away."""
     if cv2.countNonZero(mask) < min_area_px:
         return []
@@ -152,7 +154,7 @@ def _clean_components(
     return components(np.asarray(opened, dtype=np.uint8), origin, image, min_area_px)
 
 
-def _union(a: Region, b: Region) -> Region:
+def _union(a: ColourRegion, b: ColourRegion) -> ColourRegion:
     box = (
         min(a.box[0], b.box[0]),
         min(a.box[1], b.box[1]),
@@ -164,4 +166,4 @@ def _union(a: Region, b: Region) -> Region:
         left, top = region.box[0] - box[0], region.box[1] - box[1]
         height, width = region.mask.shape
         mask[top : top + height, left : left + width] |= region.mask
-    return Region(mask, box, a.image)
+    return ColourRegion(mask, box, a.image)

@@ -20,7 +20,7 @@ from services.perception.floor import FloorScanner
 from services.perception.image import RgbdImage
 from services.perception.localise import Localiser
 from services.perception.paper import PaperDetector
-from services.perception.sighting import Detector, Sighting
+from services.perception.sighting import Detector, ImageSighting
 
 NS = 1_000_000_000
 MAX_PENDING = 8
@@ -37,7 +37,7 @@ class _Pending:
     frame_seq: int
     frame_incarnation: int
     camera: Camera
-    sightings: tuple[Sighting, ...]
+    sightings: tuple[ImageSighting, ...]
     floor_depth_m: Float32Array | None
     """The depth on a coarse grid, where the floor is due to be scanned."""
     deadline_ns: int

@@ -11,7 +11,7 @@ from cocoro.arrays import CodeArray, Float32Array, ImageArray
 from cocoro.messages import Frame
 from cocoro.robot import Camera, Robot
 
-Box = tuple[int, int, int, int]
+PixelBox = tuple[int, int, int, int]
 """left, top, right, bottom in pixels; right and bottom exclusive."""
 
 
@@ -40,7 +40,7 @@ class RgbdImage:
         """Pixels a pixel of 640 x 480: 1.0 there, 0.5 at 320 x 240."""
         return sqrt(self.width * self.height / (640 * 480))
 
-    def clip(self, box: Box, margin: int = 0) -> Box:
+    def clip(self, box: PixelBox, margin: int = 0) -> PixelBox:
         """The box grown by a margin, within the image."""
         left, top, right, bottom = box
         return (
@@ -55,7 +55,7 @@ class RgbdImage:
         depth = float(self._robot.depth_m(self.raw_depth[v : v + 1, u : u + 1])[0, 0])
         return depth if np.isfinite(depth) else None
 
-    def depth_m(self, box: Box) -> Float32Array:
+    def depth_m(self, box: PixelBox) -> Float32Array:
         """Depth along the optical axis at the colour pixels of a box, shape (bottom - top, right - left).
 
         The depth camera stands beside the colour camera, so each depth pixel of the neighbourhood is carried to

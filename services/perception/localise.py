@@ -15,13 +15,13 @@ import numpy as np
 
 from cocoro.arrays import FloatArray
 from cocoro.messages import Detection
-from cocoro.objects import Catalogue, KnownObject
+from cocoro.objects import Catalogue, ObjectSpec
 from cocoro.robot import Camera, Robot
 from cocoro.units import Vec3
-from services.perception.image import Box
+from services.perception.image import PixelBox
 from services.perception.region import depth_doubt_m
 from services.perception.shapes import counted_px, distance_from, reach_m, seen_area_m2, signed_distance
-from services.perception.sighting import Evidence, Sighting
+from services.perception.sighting import Evidence, ImageSighting
 
 ITERATIONS = 12
 SETTLED_M = 1e-4
@@ -53,7 +53,9 @@ class Localiser:
         """4 x 4, camera frame (x right, y down, z forward) to body frame."""
         return self._chain.pose(dict(zip(self.joints, angles_rad, strict=True)))
 
-    def locate(self, sightings: Sequence[Sighting], camera: Camera, angles_rad: FloatArray | None) -> list[Detection]:
+    def locate(
+        self, sightings: Sequence[ImageSighting], camera: Camera, angles_rad: FloatArray | None
+    ) -> list[Detection]:
         """The detections as they are published: with the centre's position, or with a note of why there is none.
 
         Where two objects share a colour, both may have been sighted in one place: the one stays whose shape and size
@@ -75,7 +77,7 @@ class Localiser:
         bottom_m = z - self._catalogue[detection.label].size_m[2] / 2
         return bottom_m < -UNDER_FLOOR_M - UNDER_FLOOR_PER_M * hypot(x, y)
 
-    def _place(self, sighting: Sighting, camera: Camera, pose: FloatArray | None) -> _Placed:
+    def _place(self, sighting: ImageSighting, camera: Camera, pose: FloatArray | None) -> _Placed:
         position: Vec3 | None = None
         fit: _Fit | None = None
         note = ""
@@ -140,14 +142,14 @@ def _size_misfit(area_px: float, least_px: float, most_px: float) -> float:
     return 0.5 * (log(area_px / min(max(area_px, least_px), most_px)) / SIZE_DOUBT) ** 2
 
 
-def _overlap(a: Box, b: Box) -> float:
+def _overlap(a: PixelBox, b: PixelBox) -> float:
     """What two boxes have in common, as a share of what they cover together."""
     across, down = min(a[2], b[2]) - max(a[0], b[0]), min(a[3], b[3]) - max(a[1], b[1])
     common = max(across, 0) * max(down, 0)
     return common / ((a[2] - a[0]) * (a[3] - a[1]) + (b[2] - b[0]) * (b[3] - b[1]) - common)
 
 
-def first_guess(known: KnownObject, surface_m: FloatArray, pose: FloatArray) -> FloatArray:
+def first_guess(known: ObjectSpec, surface_m: FloatArray, pose: FloatArray) -> FloatArray:
     """The object's centre, body frame, from one point of its visible surface (camera frame), shape (3,).
 
     The point is pushed inwards by the radius: along the ray for a sphere, horizontally for what stands upright.
@@ -159,7 +161,7 @@ def first_guess(known: KnownObject, surface_m: FloatArray, pose: FloatArray) -> 
     return point + inwards * (known.planar_radius_m / max(float(np.linalg.norm(inwards)), 1e-9))
 
 
-def fit_centre(known: KnownObject, evidence: Evidence, pose: FloatArray, start: FloatArray) -> tuple[FloatArray, float]:
+def fit_centre(known: ObjectSpec, evidence: Evidence, pose: FloatArray, start: FloatArray) -> tuple[FloatArray, float]:
     """The centre, body frame, of the upright shape that goes best with the evidence, shape (3,), and its misfit.
 
     Gauss-Newton on signed distances, with Huber weights: surface points want distance 0, each against its
@@ -201,7 +203,7 @@ class _Rays:
     that was nearest before, which follows the centre as it moves.
     """
 
-    def __init__(self, known: KnownObject, evidence: Evidence, rotation: FloatArray, guess: FloatArray) -> None:
+    def __init__(self, known: ObjectSpec, evidence: Evidence, rotation: FloatArray, guess: FloatArray) -> None:
         self._known = known
         self.directions: FloatArray = np.concatenate([evidence.outline, evidence.beside]) @ rotation.T
         self._free_to = np.concatenate([np.full(len(evidence.outline), np.inf), evidence.free_to_m])[:, None]
@@ -223,7 +225,7 @@ class _Rays:
         return nearest
 
 
-def expected_area_px(known: KnownObject, centre: FloatArray, camera: Camera, pose: FloatArray) -> float:
+def expected_area_px(known: ObjectSpec, centre: FloatArray, camera: Camera, pose: FloatArray) -> float:
     """Pixels that the whole object covers from here: its silhouette's solid angle, over that of a pixel."""
     to_camera = pose[:3, 3] - centre
     distance = float(np.linalg.norm(to_camera))

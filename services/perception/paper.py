@@ -13,10 +13,10 @@ import cv2
 import numpy as np
 
 from cocoro.arrays import ImageArray
-from cocoro.objects import Catalogue, KnownObject
+from cocoro.objects import Catalogue, ObjectSpec
 from services.perception.config import Config
 from services.perception.image import RgbdImage
-from services.perception.sighting import Sighting
+from services.perception.sighting import ImageSighting
 
 
 class PaperDetector:
@@ -24,12 +24,12 @@ class PaperDetector:
         self._catalogue = catalogue
         self._config = config
 
-    def detect(self, image: RgbdImage) -> list[Sighting]:
+    def detect(self, image: RgbdImage) -> list[ImageSighting]:
         lab = np.asarray(cv2.cvtColor(image.colour, cv2.COLOR_RGB2Lab), dtype=np.uint8)
         found = (self._find(known, lab, image) for known in self._catalogue)
         return [sighting for sighting in found if sighting is not None]
 
-    def _find(self, known: KnownObject, lab: ImageArray, image: RgbdImage) -> Sighting | None:
+    def _find(self, known: ObjectSpec, lab: ImageArray, image: RgbdImage) -> ImageSighting | None:
         mask = np.zeros(lab.shape[:2], dtype=np.uint8)
         for box in known.lab:
             mask |= np.asarray(cv2.inRange(lab, _eight_bit(box.low), _eight_bit(box.high)), dtype=np.uint8)
@@ -37,7 +37,7 @@ class PaperDetector:
             return None
         rows, columns = np.nonzero(mask)
         u, v = float(np.median(columns)), float(np.median(rows))
-        return Sighting(
+        return ImageSighting(
             label=known.label,
             u_px=u,
             v_px=v,

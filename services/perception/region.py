@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from cocoro.arrays import BoolArray, Float32Array, FloatArray, MaskArray
-from services.perception.image import Box, RgbdImage
+from services.perception.image import PixelBox, RgbdImage
 from services.perception.sighting import Evidence
 
 MIN_DEPTH_PIXELS = 6
@@ -35,10 +35,10 @@ def depth_doubt_m(depth_m: Any) -> Any:
     return 0.003 + 0.0025 * depth_m**2
 
 
-class Region:
+class ColourRegion:
     """`mask` (uint8, non-zero inside) and `box`, its place in the image, have a margin around the region."""
 
-    def __init__(self, mask: MaskArray, box: Box, image: RgbdImage) -> None:
+    def __init__(self, mask: MaskArray, box: PixelBox, image: RgbdImage) -> None:
         self.mask = mask
         self.box = box
         self.image = image
@@ -48,7 +48,7 @@ class Region:
         self.v_px = moments["m01"] / moments["m00"] + box[1]
         left, top, width, height = cv2.boundingRect(mask)
         left, top = left + box[0], top + box[1]
-        self.bounds: Box = (left, top, left + width, top + height)
+        self.bounds: PixelBox = (left, top, left + width, top + height)
 
     @staticmethod
     def margin_px(image: RgbdImage) -> int:
@@ -112,7 +112,7 @@ class Region:
             unknown = 0
         return bool(nearer >= NEARER_SHARE * total or unknown >= UNKNOWN_SHARE * total)
 
-    def split_by_depth(self) -> list[tuple[MaskArray, Box]]:
+    def split_by_depth(self) -> list[tuple[MaskArray, PixelBox]]:
         """The region cut where its depth jumps: an object before a wall of its colour, one can before another."""
         depth = np.nan_to_num(self.depth, nan=0.0)
         far = np.asarray(cv2.dilate(depth, _AROUND))
@@ -153,7 +153,7 @@ class Region:
 
 def components(
     mask: MaskArray, origin: tuple[int, int], image: RgbdImage, min_area_px: float, at_most: int = 8
-) -> list[tuple[MaskArray, Box]]:
+) -> list[tuple[MaskArray, PixelBox]]:
     """The largest connected regions of a mask whose first pixel is the image's `origin`, each with a margin around."""
     _, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8, ltype=cv2.CV_32S)
     by_area = 1 + np.argsort(-stats[1:, cv2.CC_STAT_AREA], kind="stable")  # 0 is what is not in the mask
@@ -163,7 +163,7 @@ def components(
         if area < min_area_px:
             break
         own = (origin[0] + left, origin[1] + top, origin[0] + left + width, origin[1] + top + height)
-        box = image.clip(own, Region.margin_px(image))
+        box = image.clip(own, ColourRegion.margin_px(image))
         out = np.zeros((box[3] - box[1], box[2] - box[0]), dtype=np.uint8)
         inner = out[own[1] - box[1] : own[3] - box[1], own[0] - box[0] : own[2] - box[0]]
         inner[:] = labels[top : top + height, left : left + width] == i

@@ -7,10 +7,10 @@ from math import hypot, pi, sqrt
 import numpy as np
 
 from cocoro.arrays import FloatArray
-from cocoro.objects import KnownObject
+from cocoro.objects import ObjectSpec
 
 
-def distance_from(known: KnownObject, offsets_m: FloatArray) -> FloatArray:
+def distance_from(known: ObjectSpec, offsets_m: FloatArray) -> FloatArray:
     """Distance from the upright object's surface, negative inside, for points (..., 3) relative to its centre, z up.
 
     A box, whose yaw nobody knows, counts as the cylinder of equal base and height.
@@ -26,7 +26,7 @@ def distance_from(known: KnownObject, offsets_m: FloatArray) -> FloatArray:
     return outside + np.minimum(np.maximum(beside, above), 0.0)
 
 
-def signed_distance(known: KnownObject, offsets_m: FloatArray) -> tuple[FloatArray, FloatArray]:
+def signed_distance(known: ObjectSpec, offsets_m: FloatArray) -> tuple[FloatArray, FloatArray]:
     """`distance_from` for points (n, 3), with its gradient (n, 3)."""
     if known.shape == "sphere":
         length = np.sqrt((offsets_m * offsets_m).sum(axis=1))
@@ -49,14 +49,14 @@ def signed_distance(known: KnownObject, offsets_m: FloatArray) -> tuple[FloatArr
     return outside + np.minimum(within, 0.0), gradient
 
 
-def reach_m(known: KnownObject) -> float:
+def reach_m(known: ObjectSpec) -> float:
     """Radius of the ball around the object."""
     if known.shape == "sphere":
         return known.planar_radius_m
     return hypot(known.planar_radius_m, known.size_m[2] / 2)
 
 
-def seen_area_m2(known: KnownObject, elevation_sine: float) -> float:
+def seen_area_m2(known: ObjectSpec, elevation_sine: float) -> float:
     """Area of the object's silhouette (orthographic), seen from `elevation_sine` above the horizontal (0 to 1)."""
     radius = known.planar_radius_m
     if known.shape == "sphere":
@@ -71,7 +71,7 @@ def counted_px(area_px: float) -> float:
     return area_px - min(2.0 * sqrt(area_px), 0.5 * area_px)
 
 
-def area_range_m2(known: KnownObject) -> tuple[float, float]:
+def area_range_m2(known: ObjectSpec) -> tuple[float, float]:
     """Least and greatest silhouette between the level view and 60 degrees from above."""
     areas = [seen_area_m2(known, sine) for sine in (0.0, 0.3, 0.5, 0.7, 0.866)]
     return min(areas), max(areas)

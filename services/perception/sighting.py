@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from cocoro.arrays import FloatArray
-from services.perception.image import Box, RgbdImage
+from services.perception.image import PixelBox, RgbdImage
 
 
 @dataclass(frozen=True)
@@ -28,12 +28,12 @@ class Evidence:
 
 
 @dataclass(frozen=True)
-class Sighting:
+class ImageSighting:
     label: str
     u_px: float
     v_px: float
     area_px: int
-    box_px: Box
+    box_px: PixelBox
     depth_m: float | None
     """Of the visible surface, along the optical axis."""
     cut: bool = False
@@ -45,5 +45,5 @@ class Sighting:
 
 
 class Detector(Protocol):
-    def detect(self, image: RgbdImage) -> list[Sighting]:
+    def detect(self, image: RgbdImage) -> list[ImageSighting]:
         """The known objects in the image, at most one of each label, in the catalogue's order."""

@@ -16,7 +16,7 @@ import numpy as np
 from cocoro.arrays import FloatArray
 from cocoro.robot import Robot
 from services.planning.clearance import Clearance
-from services.planning.config import Arm
+from services.planning.config import ArmConfig
 from services.planning.reach import ARM, LEVEL_ROLL_RAD, HandPose, Reacher
 
 ROLL = "wrist_roll"
@@ -30,7 +30,7 @@ _ASTRAY_RAD = 0.6
 """At work the hand is never pitched so far off what it is to be, nor the elbow below it."""
 
 
-class Step(NamedTuple):
+class ArmStep(NamedTuple):
     """Goals for the arm's joints (order of ARM) and the wrist roll, with speeds."""
 
     goal_rad: FloatArray
@@ -43,7 +43,7 @@ class Step(NamedTuple):
 
 
 class ArmController:
-    def __init__(self, robot: Robot, config: Arm, reacher: Reacher) -> None:
+    def __init__(self, robot: Robot, config: ArmConfig, reacher: Reacher) -> None:
         self._config = config
         self._reacher = reacher
         self.clearance = Clearance(robot)
@@ -73,12 +73,12 @@ class ArmController:
     def parked(self, angles: Mapping[str, float]) -> bool:
         return all(abs(angles[name] - self._park[name]) < 0.08 for name in ARM)
 
-    def hold(self, measured: Mapping[str, float], dt_s: float) -> Step:
+    def hold(self, measured: Mapping[str, float], dt_s: float) -> ArmStep:
         reference = self._sync(measured, dt_s)
         goal = np.array([reference[name] for name in ARM])
-        return Step(goal, np.full(4, 0.5), reference[ROLL], 0.0, True)
+        return ArmStep(goal, np.full(4, 0.5), reference[ROLL], 0.0, True)
 
-    def park(self, measured: Mapping[str, float], dt_s: float) -> Step:
+    def park(self, measured: Mapping[str, float], dt_s: float) -> ArmStep:
         """Fold the arm up beside the camera mount."""
         reference = self._sync(measured, dt_s)
         if not self.folded(reference):
@@ -103,7 +103,7 @@ class ArmController:
             return self._joints(_OUT | {ROLL: 0.0}, dt_s)._replace(arrived=False)
         return self._joints(self._park | {ROLL: 0.0}, dt_s)
 
-    def reach(self, goal: HandPose, speed_mps: float, measured: Mapping[str, float], dt_s: float) -> Step:
+    def reach(self, goal: HandPose, speed_mps: float, measured: Mapping[str, float], dt_s: float) -> ArmStep:
         """Move the hand towards a pose in front of the robot; unfolds the arm first where it is folded."""
         reference = self._sync(measured, dt_s)
         stage: dict[str, float] | None = None
@@ -128,7 +128,7 @@ class ArmController:
 
     def towards(
         self, goals: Mapping[str, float], speed_radps: float, measured: Mapping[str, float], dt_s: float
-    ) -> Step:
+    ) -> ArmStep:
         """Move the named joints together to their goals along the straight way in joint space."""
         self._astray = True
         self._sync(measured, dt_s)
@@ -157,7 +157,7 @@ class ArmController:
         self._stalled_s = self._stalled_s + dt_s if behind else 0.0
         return self._reference
 
-    def _joints(self, goals: Mapping[str, float], dt_s: float, speed_radps: float | None = None) -> Step:
+    def _joints(self, goals: Mapping[str, float], dt_s: float, speed_radps: float | None = None) -> ArmStep:
         """Move the named joints together to their goals, the others stay."""
         assert self._reference is not None
         gaps = {name: goal - self._reference[name] for name, goal in goals.items()}
@@ -169,7 +169,7 @@ class ArmController:
             trial[name] += scale * gap
         return self._commit(trial, widest * (1 - scale), dt_s, arrived=widest * (1 - scale) < 0.02)
 
-    def _cartesian(self, goal: HandPose, speed_mps: float, dt_s: float) -> Step:
+    def _cartesian(self, goal: HandPose, speed_mps: float, dt_s: float) -> ArmStep:
         assert self._reference is not None
         have = self._reacher.pose(self._reference)
         waypoint = have.towards(goal, speed_mps * dt_s, 1.0 * dt_s)
@@ -185,7 +185,7 @@ class ArmController:
         arrived = left < 0.004 and abs(goal.pitch_rad - have.pitch_rad) < 0.05 and abs(roll_gap) < 0.05
         return self._commit(trial, left, dt_s, arrived=arrived)
 
-    def _commit(self, trial: dict[str, float], left: float, dt_s: float, *, arrived: bool) -> Step:
+    def _commit(self, trial: dict[str, float], left: float, dt_s: float, *, arrived: bool) -> ArmStep:
         """Take a step unless it brings the arm nearer to what it must not touch."""
         assert self._reference is not None
         clearance_m = self.clearance.of(trial)
@@ -199,4 +199,4 @@ class ArmController:
         speed = np.maximum(1.5 * moved / dt_s, 0.3)
         self._reference = trial
         self._clearance_m = before_m if blocked else clearance_m
-        return Step(goal, speed, trial[ROLL], left, arrived and not blocked, blocked)
+        return ArmStep(goal, speed, trial[ROLL], left, arrived and not blocked, blocked)

@@ -9,7 +9,7 @@ import msgspec
 from cocoro.units import Positive
 
 
-class Memory(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class MemoryConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Of the target memory's filter."""
 
     sigma_m: Positive = 0.004
@@ -27,7 +27,7 @@ class Memory(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     forget_s: Positive = 120.0
 
 
-class Head(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class HeadConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     sweep_speed_radps: Positive = 0.9
     sweep_pan_rad: Positive = 2.6
     sweep_ahead_rad: Positive = 1.05
@@ -41,7 +41,7 @@ class Head(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A remembered object is looked for at its place for so long before sweeping."""
 
 
-class Navigation(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class NavigationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_speed_mps: Positive = 0.35
     max_turn_radps: Positive = 0.9
     acceleration_mps2: Positive = 0.5
@@ -68,7 +68,7 @@ class Navigation(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     heading_tolerance_rad: Positive = 0.05
 
 
-class Arm(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class ArmConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     joint_speed_radps: Positive = 1.6
     hand_speed_mps: Positive = 0.25
     insert_speed_mps: Positive = 0.12
@@ -101,7 +101,7 @@ class Arm(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A joint's goal never runs further ahead of where the joint is."""
 
 
-class Hand(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class HandConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     open_rad: Positive = 0.42
     close_rad: Positive = 0.30
     """How far the claws close on nothing: well past where they would touch a target."""
@@ -114,7 +114,7 @@ class Hand(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     give_up_s: Positive = 2.0
 
 
-class Follow(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class FollowConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Of the pursuit of a moving target."""
 
     distance_m: Positive = 0.80
@@ -127,7 +127,7 @@ class Follow(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     give_up_s: Positive = 25.0
 
 
-class HandSight(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class HandSightConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Of seeing the own hand while reaching."""
 
     follow_s: Positive = 0.4
@@ -158,13 +158,13 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Sightings of the hand at work go on teaching a learned map."""
     see_hand: bool = False
     """Bring the rigid body's hand to where its marker is seen, too; with a learned map that is always done."""
-    sight: HandSight = HandSight()
-    memory: Memory = Memory()
-    head: Head = Head()
-    navigation: Navigation = Navigation()
-    arm: Arm = Arm()
-    hand: Hand = Hand()
-    follow: Follow = Follow()
+    sight: HandSightConfig = HandSightConfig()
+    memory: MemoryConfig = MemoryConfig()
+    head: HeadConfig = HeadConfig()
+    navigation: NavigationConfig = NavigationConfig()
+    arm: ArmConfig = ArmConfig()
+    hand: HandConfig = HandConfig()
+    follow: FollowConfig = FollowConfig()
     blind_periods: Positive = 2.0
     """As many of its own periods perception may be silent where that is longer than `Base.command_timeout_s`: one that
     is slow may be silent for longer."""

@@ -14,7 +14,7 @@ from cocoro.messages import BaseCommand, Intent, LearnedModel, PlannerStatus, Se
 from cocoro.messages.actions import Idle
 from cocoro.robot import Robot
 from cocoro.topics import Topic
-from services.planning.arm import Step
+from services.planning.arm import ArmStep
 from services.planning.behaviours import Actuators, Behaviour, Idling, Plan, Snapshot, behaviour_for
 from services.planning.config import Config
 from services.planning.head import PAN, TILT
@@ -229,7 +229,7 @@ class PlanningCore:
 
     def _commands(self, plan: Plan, snapshot: Snapshot) -> list[Output]:
         base: BaseCommand = plan.base
-        step: Step = plan.arm
+        step: ArmStep = plan.arm
         if plan.head is not None:
             self._head_goal = plan.head[:2]
         if self._head_goal is None:

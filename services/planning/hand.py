@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from cocoro.messages import ServoCommand, ServoState
 from cocoro.robot import Robot
-from services.planning.config import Hand
+from services.planning.config import HandConfig
 
 CLAWS = ("claw_left", "claw_right")
 
@@ -17,7 +17,7 @@ class Grip:
     is held stays where it was grasped instead of drifting with the pair.
     """
 
-    def __init__(self, robot: Robot, config: Hand) -> None:
+    def __init__(self, robot: Robot, config: HandConfig) -> None:
         self._config = config
         self._opens = robot.claw.open_sign
         self._goals: dict[str, float] | None = None

@@ -8,7 +8,7 @@ from math import atan2, cos
 import numpy as np
 
 from cocoro.robot import Robot
-from services.planning.config import Head
+from services.planning.config import HeadConfig
 
 PAN, TILT = "neck_pan", "neck_tilt"
 
@@ -16,7 +16,7 @@ PAN, TILT = "neck_pan", "neck_tilt"
 class Gaze:
     """Solves for the pan and tilt that bring a point of the body frame into the centre of the image."""
 
-    def __init__(self, robot: Robot, config: Head) -> None:
+    def __init__(self, robot: Robot, config: HeadConfig) -> None:
         self._chain = robot.chain("camera")
         self._limits = [robot.joints[PAN].limits_rad, config.tilt_range_rad]
 
@@ -45,7 +45,7 @@ class Sweep:
     What lies ahead comes first: a little to one side, all the way to the other, back at the near tilt, and last what is
     left of the first side."""
 
-    def __init__(self, config: Head, pan_rad: float) -> None:
+    def __init__(self, config: HeadConfig, pan_rad: float) -> None:
         self._config = config
         side = 1.0 if pan_rad >= 0 else -1.0
         reach, ahead = side * config.sweep_pan_rad, side * config.sweep_ahead_rad

@@ -14,13 +14,13 @@ from cocoro.errors import ConfigError
 from cocoro.learning import model as models
 from cocoro.learning.camera_tilt import CameraTilt
 from cocoro.learning.handmap import HandMap
-from cocoro.learning.model import Model
+from cocoro.learning.model import BodyModel
 from cocoro.learning.nominal_model import NominalModel
-from cocoro.learning.reachability import ReachMesh
 from cocoro.robot import Robot
-from services.planning.config import Config, HandSight
+from services.planning.config import Config, HandSightConfig
 from services.planning.reach import LEVEL_ROLL_RAD, HandModel
-from services.planning.state_estimator import Sighting
+from services.planning.reachability import ReachMesh
+from services.planning.state_estimator import PostureSighting
 from services.planning.teaching import Teacher
 from services.planning.teaching import arm_angles as _arm
 
@@ -71,7 +71,7 @@ class SeenHand:
     comes into view or is hidden, however far the two are apart; a correction that is not renewed fades.
     """
 
-    def __init__(self, felt: HandModel, marker: HandMap | NominalModel, config: HandSight) -> None:
+    def __init__(self, felt: HandModel, marker: HandMap | NominalModel, config: HandSightConfig) -> None:
         self._felt = felt
         self._marker = marker
         self._config = config
@@ -100,7 +100,7 @@ class SeenHand:
         """Whether the hand was seen lately."""
         return self._seen_ns is not None and now_ns - self._seen_ns < self._config.lately_s * NS
 
-    def step(self, sightings: Iterable[Sighting], now_ns: int) -> None:
+    def step(self, sightings: Iterable[PostureSighting], now_ns: int) -> None:
         """Take the marker's sightings of this step of the planner, and let the correction follow."""
         config = self._config
         dt_s = 0.0 if self._now_ns is None else min(max((now_ns - self._now_ns) / NS, 0.0), 0.1)
@@ -143,7 +143,7 @@ class Learned:
         text = f"{self._text}; {self._teacher.text}" if self._teacher is not None else self._text
         return f"{text} ({self._refusal})" if self._refusal else text
 
-    def step(self, sightings: Sequence[Sighting], now_ns: int) -> None:
+    def step(self, sightings: Sequence[PostureSighting], now_ns: int) -> None:
         """Take the marker's sightings of this step of the planner."""
         if self._teacher is not None:
             self._teacher.step(sightings)
@@ -176,7 +176,7 @@ class Learned:
         except ConfigError as error:
             self._refusal = str(error)
 
-    def _take(self, model: Model) -> None:
+    def _take(self, model: BodyModel) -> None:
         self._refusal = ""
         self.separation_m = model.wheels.separation_m if model.wheels is not None else None
         self.camera_tilt = CameraTilt(self._robot, model.wheels.eye_tilt_rad if model.wheels is not None else 0.0)

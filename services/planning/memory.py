@@ -15,7 +15,7 @@ from cocoro.arrays import FloatArray
 from cocoro.clock import NS
 from cocoro.frames import Pose2
 from cocoro.messages import TargetEstimate
-from services.planning.config import Memory
+from services.planning.config import MemoryConfig
 
 _SURE = 3
 """Sightings after which something is taken to be there."""
@@ -39,7 +39,7 @@ class Track:
 
 
 class TargetMemory:
-    def __init__(self, config: Memory) -> None:
+    def __init__(self, config: MemoryConfig) -> None:
         self._config = config
         self._tracks: dict[str, Track] = {}
 

@@ -14,7 +14,7 @@ from math import asin, atan2, copysign, hypot, sin, sqrt
 from cocoro.frames import Pose2, wrap_rad
 from cocoro.messages import BaseCommand
 from cocoro.robot import Base
-from services.planning.config import Navigation
+from services.planning.config import NavigationConfig
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ def offset_to(target_m: tuple[float, float], aim_m: tuple[float, float]) -> Offs
 class Driver:
     """Turns what is left of a drive into wheel speeds, with bounded acceleration."""
 
-    def __init__(self, config: Navigation, base: Base) -> None:
+    def __init__(self, config: NavigationConfig, base: Base) -> None:
         self._config = config
         self._base = base
         self._separation_m = base.wheel_separation_m

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 import numpy as np
+import scipy  # loads its parts lazily: `scipy.stats` takes half a second
 
 from cocoro.arrays import FloatArray
 from cocoro.robot import Robot
@@ -75,3 +76,18 @@ class Postures:
     @staticmethod
     def _angles(posture: FloatArray) -> dict[str, float]:
         return dict(zip(ARM, posture.tolist(), strict=True), wrist_roll=LEVEL_ROLL_RAD)
+
+
+def sobol(first: int, ranges: FloatArray) -> Iterator[tuple[int, FloatArray]]:
+    """(number, point) from the draw `first` on, for ever; points (n,) within `ranges` (n, 2). Equal numbers, equal
+    points. Number 0, the sequence's own first, is a corner of the box like any other."""
+    engine = scipy.stats.qmc.Sobol(len(ranges), scramble=False)
+    if first:
+        engine.fast_forward(first)
+    low, high = ranges.T
+    number = first
+    while True:
+        # Two at a time: the engine warns of a first draw alone, which would not be balanced.
+        for share in engine.random(2):
+            yield number, np.asarray(low + share * (high - low))
+            number += 1

@@ -31,7 +31,7 @@ FLOOR_M, FLOOR_PER_M = 0.040, 0.012
 for such an eye is likely to be rolled a little, too."""
 
 
-class Sight:
+class PerceptionWatch:
     """Whether perception lives, by when it is heard: also when it sees nothing, and however slow it is."""
 
     def __init__(self, least_s: float, periods: float) -> None:
@@ -69,7 +69,7 @@ class Sight:
         return max(self._least_ns, round(self._periods * period_ns))
 
 
-class Sighting(NamedTuple):
+class PostureSighting(NamedTuple):
     """One detection that nothing makes doubtful, with the posture at its frame's stamp."""
 
     label: str
@@ -103,12 +103,12 @@ class StateEstimator:
         self._looked_ns: int | None = None
         self._said_ns: dict[str, int] = {}
         """Per topic, when its newest message was said."""
-        self._sight = Sight(robot.base.command_timeout_s, config.blind_periods)
+        self._sight = PerceptionWatch(robot.base.command_timeout_s, config.blind_periods)
         self.turning = Turning()
         self.camera_tilt: CameraTilt | None = None
         """Where it is known to be tilted: what it sees standing on the floor may be the floor."""
         self._watched = {config.marker}
-        self._sightings: list[Sighting] = []
+        self._sightings: list[PostureSighting] = []
 
     def take(self, topic: Topic[Message], message: Message, now_ns: int) -> None:
         self._said_ns[topic.name] = min(message.stamp_ns, now_ns)
@@ -203,13 +203,15 @@ class StateEstimator:
     def _keep_sighting(self, detection: Detection, stamp_ns: int) -> None:
         angles = self._posture_at(stamp_ns)
         if angles is not None and detection.position_m is not None:
-            self._sightings.append(Sighting(detection.label, stamp_ns, detection.position_m, detection.area_px, angles))
+            self._sightings.append(
+                PostureSighting(detection.label, stamp_ns, detection.position_m, detection.area_px, angles)
+            )
 
     def watch(self, label: str) -> None:
         """Keep the sightings of a label as they are, beside what memory makes of them."""
         self._watched.add(label)
 
-    def sightings_of(self, label: str) -> list[Sighting]:
+    def sightings_of(self, label: str) -> list[PostureSighting]:
         """The watched label's sightings of the step that runs, in order."""
         return [sighting for sighting in self._sightings if sighting.label == label]
 

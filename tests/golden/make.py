@@ -9,14 +9,15 @@ from __future__ import annotations
 import tempfile
 from pathlib import Path
 
-from apps.captures.reexecute import rerun, words
+from apps.captures.reexecute import describe_result, reexecute
 from apps.captures.rewrite import rewrite
 from apps.rehearsal.rehearse import rehearse
 from apps.rehearsal.request import RehearsalRequest
 from cocoro.capture.reader import Capture
 from cocoro.clock import NS
 from services.capture.file import Packer
-from services.capture.keys import Choice
+from services.capture.keys import KeyFilter
+from services.executive.tasks import FetchTask
 
 GOLDEN = Path(__file__).with_name("fetch.mcap")
 LENGTH_S = 6.0
@@ -28,12 +29,12 @@ def main() -> None:
         whole = Path(folder) / "fetch.mcap"
         rehearse(
             RehearsalRequest(
-                task="fetch", label="red_can", width=160, height=120, frame_rate_hz=10.0, record=str(whole)
+                task=FetchTask(label="red_can"), width=160, height=120, frame_rate_hz=10.0, record=str(whole)
             )
         )
         GOLDEN.unlink(missing_ok=True)
         with Capture.open(whole) as capture:
-            choice = Choice(capture.robot, without=["sim/truth"])
+            choice = KeyFilter(capture.robot, without=["sim/truth"])
             done = rewrite(
                 capture,
                 GOLDEN,
@@ -45,7 +46,7 @@ def main() -> None:
     assert done.size_bytes < LARGEST_BYTES
     for service in ("perception", "planning"):
         with Capture.open(GOLDEN) as capture:
-            print("\n".join(words(rerun([capture], service))))
+            print("\n".join(describe_result(reexecute([capture], service))))
 
 
 if __name__ == "__main__":

@@ -35,12 +35,12 @@ from cocoro.messages import (
     TaskState,
     Truth,
 )
-from cocoro.objects import KnownObject
+from cocoro.objects import ObjectSpec
 from cocoro.picture import describe
 from cocoro.units import Vec3
 from services.capture.file import Packer
-from services.capture.keys import Entry, KeyInfo
-from services.capture.writer import Limits, Writer
+from services.capture.keys import KeyInfo, QueuedMessage
+from services.capture.writer import CaptureWriter, Limits
 
 ODOMETRY, BODY = "odometry", "body"
 """Names of frames; the links' are their own."""
@@ -70,12 +70,12 @@ def export(capture: Capture, out: Path, progress: Callable[[float], None] = lamb
 
 def _export(capture: Capture, out: Path, progress: Callable[[float], None]) -> int:
     translator = Translator(capture)
-    writer = Writer(lambda _: out, Packer("zstd"), Limits(), lambda *_: KeyInfo(JSON, None, {}))
+    writer = CaptureWriter(lambda _: out, Packer("zstd"), Limits(), lambda *_: KeyInfo(JSON, None, {}))
     newest_ns = 0
     for stamp_ns, said in _by_stamp(capture, translator, progress):
         newest_ns = max(newest_ns, stamp_ns)
         payload = msgspec.json.encode(said.message)
-        writer.put(Entry(said.topic, 0, newest_ns, newest_ns, payload, translator.info_of(said), said.channel))
+        writer.put(QueuedMessage(said.topic, 0, newest_ns, newest_ns, payload, translator.info_of(said), said.channel))
     writer.close()
     return writer.messages
 
@@ -271,7 +271,7 @@ class Translator:
         return fg.Color(*known.rgb) if known is not None else WHITE
 
 
-def _add_shape(entity: fg.SceneEntity, known: KnownObject | None, place: Vec3, colour: fg.Color) -> None:
+def _add_shape(entity: fg.SceneEntity, known: ObjectSpec | None, place: Vec3, colour: fg.Color) -> None:
     pose = fg.pose_of(place)
     size = fg.Vector3(*(known.size_m if known is not None else (0.06, 0.06, 0.06)))
     if known is not None and known.shape == "cylinder":

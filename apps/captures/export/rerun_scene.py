@@ -60,7 +60,7 @@ def export(capture: Capture, out: Path, progress: Callable[[float], None] = lamb
     with making(out):
         recording = rr.RecordingStream(APPLICATION)
         recording.save(str(out))
-        count = tell(capture, recording, progress)
+        count = log_capture(capture, recording, progress)
         recording.flush()
         return count
 
@@ -87,9 +87,9 @@ def no_viewer() -> Iterator[None]:
         ) from error
 
 
-def tell(capture: Capture, recording: Any, progress: Callable[[float], None] = lambda _: None) -> int:
+def log_capture(capture: Capture, recording: Any, progress: Callable[[float], None] = lambda _: None) -> int:
     """A capture to a recording, whatever that is connected to."""
-    teller = Teller(recording, robot_of(capture), catalogue_of(capture))
+    scene = RerunScene(recording, robot_of(capture), catalogue_of(capture))
     count = 0
     for record in capture.messages():
         try:
@@ -97,13 +97,13 @@ def tell(capture: Capture, recording: Any, progress: Callable[[float], None] = l
         except NotReadableError:
             continue
         if isinstance(message, Message):
-            teller.tell(record.key.removeprefix(f"{capture.robot}/"), message)
+            scene.log(record.key.removeprefix(f"{capture.robot}/"), message)
             count += 1
         progress((record.log_ns - capture.start_ns) / NS)
     return count
 
 
-class Teller:
+class RerunScene:
     """Tells a recording of each message, at the message's stamp."""
 
     def __init__(self, recording: Any, robot: Robot, catalogue: Catalogue) -> None:
@@ -116,7 +116,7 @@ class Teller:
         self._why = ""
         self._log("world", self._rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
 
-    def tell(self, topic: str, message: Message) -> None:
+    def log(self, topic: str, message: Message) -> None:
         """`topic` is the key without the robot."""
         self._to.set_time(TIMELINE, duration=message.stamp_ns / NS)
         if isinstance(message, Frame):

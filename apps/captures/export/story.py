@@ -23,7 +23,7 @@ from cocoro.units import Vec3
 M = TypeVar("M", bound=Message)
 
 
-class Track(Generic[M]):
+class TopicTrack(Generic[M]):
     """One topic's messages by log time."""
 
     def __init__(self) -> None:
@@ -44,8 +44,8 @@ class Story:
     """Reads a capture once, without its pictures."""
 
     def __init__(self, capture: Capture) -> None:
-        self.tasks: Track[TaskState] = _track(capture, TASK)
-        self.plans: Track[PlannerStatus] = _track(capture, PLAN)
+        self.tasks: TopicTrack[TaskState] = _track(capture, TASK)
+        self.plans: TopicTrack[PlannerStatus] = _track(capture, PLAN)
         self._seen: dict[tuple[int, int], Detections] = {}
         for _, seen in read(capture, DETECTIONS):
             self._seen[seen.frame_incarnation, seen.frame_seq] = seen
@@ -77,8 +77,8 @@ def catalogue_of(capture: Capture) -> Catalogue:
     return recorded_file(capture, "perception", "objects", Catalogue.load)
 
 
-def _track(capture: Capture, topic: Topic[M]) -> Track[M]:
-    track: Track[M] = Track()
+def _track(capture: Capture, topic: Topic[M]) -> TopicTrack[M]:
+    track: TopicTrack[M] = TopicTrack()
     for record, message in read(capture, topic):
         track.add(record.log_ns, message)
     return track

@@ -16,16 +16,16 @@ from cocoro.clock import NS
 LONGEST_LIST = 16
 """A list of more plain values than this is given by its length."""
 
-Row = dict[str, Any]
+TableRow = dict[str, Any]
 
 
-class Sink(Protocol):
+class TableFolder(Protocol):
     """Where a table goes."""
 
-    def write(self, name: str, rows: list[Row]) -> None: ...
+    def write(self, name: str, rows: list[TableRow]) -> None: ...
 
 
-def export(capture: Capture, sink: Sink) -> list[str]:
+def export(capture: Capture, sink: TableFolder) -> list[str]:
     """Write a table for each key that has any messages of maps (for each channel of it, where it has several), one for
     each list of maps in it, and `belief` where the simulator's truth was recorded. Returns their names. Raises
     CaptureError when it cannot be written."""
@@ -46,9 +46,9 @@ def export(capture: Capture, sink: Sink) -> list[str]:
     return written
 
 
-def _tables(capture: Capture, channel: int) -> dict[str, list[Row]]:
+def _tables(capture: Capture, channel: int) -> dict[str, list[TableRow]]:
     """By the name of the list that it is of; '' is the key's own."""
-    tables: dict[str, list[Row]] = {}
+    tables: dict[str, list[TableRow]] = {}
     for record in capture.messages(channels=[channel]):
         try:
             message = capture.decode(record)
@@ -56,7 +56,7 @@ def _tables(capture: Capture, channel: int) -> dict[str, list[Row]]:
             continue
         if not isinstance(message, Mapping):
             continue
-        head: Row = {
+        head: TableRow = {
             "time_s": (record.log_ns - capture.start_ns) / NS,
             "log_ns": record.log_ns,
             "stamp_ns": record.publish_ns,
@@ -76,7 +76,7 @@ def _tables(capture: Capture, channel: int) -> dict[str, list[Row]]:
     return tables
 
 
-def _flat(value: Any, name: str = "") -> Row:
+def _flat(value: Any, name: str = "") -> TableRow:
     """Maps and short lists as columns: 'odometry_m.0'."""
     if isinstance(value, Mapping):
         return _joined(((str(part), item) for part, item in value.items()), name)
@@ -89,14 +89,14 @@ def _flat(value: Any, name: str = "") -> Row:
     return {name: value}
 
 
-def _joined(parts: Iterator[tuple[str, Any]], name: str) -> Row:
-    found: Row = {}
+def _joined(parts: Iterator[tuple[str, Any]], name: str) -> TableRow:
+    found: TableRow = {}
     for part, item in parts:
         found.update(_flat(item, f"{name}.{part}" if name else part))
     return found
 
 
-def columns(rows: list[Row]) -> list[str]:
+def columns(rows: list[TableRow]) -> list[str]:
     """All that any row has, in the order in which they come up. What is nothing or a map or list ('target' or
     'target.label') has the columns of its parts alone."""
     names = dict.fromkeys(name for row in rows for name in row)
@@ -110,7 +110,7 @@ class CsvFolder:
     def __init__(self, folder: Path) -> None:
         self._folder = folder
 
-    def write(self, name: str, rows: list[Row]) -> None:
+    def write(self, name: str, rows: list[TableRow]) -> None:
         path = self._folder / f"{name}.csv"
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
@@ -136,7 +136,7 @@ class ParquetFolder:
         self._arrow = pyarrow
         self._folder = folder
 
-    def write(self, name: str, rows: list[Row]) -> None:
+    def write(self, name: str, rows: list[TableRow]) -> None:
         path = self._folder / f"{name}.parquet"
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
@@ -145,7 +145,7 @@ class ParquetFolder:
         except OSError as error:
             raise CaptureError(f"{path}: {error.strerror or error}") from error
 
-    def _column(self, rows: list[Row], name: str) -> Any:
+    def _column(self, rows: list[TableRow], name: str) -> Any:
         values = [row.get(name) for row in rows]
         try:
             return self._arrow.array(values)

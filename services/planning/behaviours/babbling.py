@@ -17,8 +17,7 @@ from cocoro.messages.actions import BabbleArm, BabbleWheels
 from cocoro.topics import HAND_SAMPLES, WHEEL_TRIALS
 from cocoro.units import Vec2, Vec3
 from services.planning.behaviours.base import Plan, Snapshot
-from services.planning.draws import sobol
-from services.planning.postures import Postures
+from services.planning.postures import Postures, sobol
 from services.planning.reach import ARM, LEVEL_ROLL_RAD, HandPose
 
 

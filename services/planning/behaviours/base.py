@@ -15,7 +15,7 @@ from cocoro.frames import Pose2
 from cocoro.learning.camera_tilt import CameraTilt
 from cocoro.messages import BaseCommand, TargetEstimate
 from cocoro.robot import Robot
-from services.planning.arm import ArmController, Step
+from services.planning.arm import ArmController, ArmStep
 from services.planning.config import Config
 from services.planning.hand import Grip
 from services.planning.head import Gaze
@@ -119,7 +119,7 @@ class Snapshot:
     def stand(self) -> BaseCommand:
         return self.actuators.driver.brake(self.dt_s)
 
-    def still(self) -> Step:
+    def still(self) -> ArmStep:
         return self.actuators.arm.hold(self.angles, self.dt_s)
 
     def look_at(self, point_m: tuple[float, float, float]) -> tuple[float, float, float]:
@@ -132,7 +132,7 @@ class Plan:
     """What a behaviour wants now."""
 
     base: BaseCommand
-    arm: Step
+    arm: ArmStep
     why: str
     head: tuple[float, float, float] | None = None
     """Pan, tilt, speed; None holds the head where it is."""
@@ -149,7 +149,7 @@ class Behaviour(Protocol):
 
     @property
     def needs_sight(self) -> bool:
-        """Whether it drives or looks for something, and so pauses while perception is silent. A class attribute does."""
+        """Whether it drives or looks for something, so that it pauses while perception is silent."""
 
     def step(self, snapshot: Snapshot) -> Plan: ...
 

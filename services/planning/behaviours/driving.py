@@ -9,7 +9,7 @@ from cocoro.clock import NS
 from cocoro.frames import Pose2
 from cocoro.messages import BaseState, TargetEstimate
 from cocoro.messages.actions import Approach, Carry, Follow
-from services.planning.arm import Step
+from services.planning.arm import ArmStep
 from services.planning.behaviours.base import Actuators, Plan, Snapshot, hand_place, planar_m
 from services.planning.course import Course, Move
 from services.planning.head import PAN, TILT, Sweep
@@ -144,7 +144,9 @@ class Approaching:
             return None
         return snapshot.unseen_under_swing()
 
-    def _ready_hand(self, snapshot: Snapshot, target: TargetEstimate, move: Move, fields: Fields) -> tuple[Step, Move]:
+    def _ready_hand(
+        self, snapshot: Snapshot, target: TargetEstimate, move: Move, fields: Fields
+    ) -> tuple[ArmStep, Move]:
         actuators, config = snapshot.actuators, snapshot.actuators.config.arm
         arm, angles, dt_s = actuators.arm, snapshot.angles, snapshot.dt_s
         reference = arm.reference or angles
@@ -280,7 +282,7 @@ class Following:
         base = actuators.driver.command(move.speed_mps, move.turn_radps, snapshot.dt_s, brisk=True)
         return Plan(base, arm, move.why, snapshot.look_at(target.position_m), distance_m=distance)
 
-    def _look_for(self, snapshot: Snapshot, target: TargetEstimate, arm: Step) -> Plan:
+    def _look_for(self, snapshot: Snapshot, target: TargetEstimate, arm: ArmStep) -> Plan:
         pan, tilt = snapshot.angles[PAN], snapshot.angles[TILT]
         if target.age_s < 3.0:
             head = snapshot.look_at(target.position_m)

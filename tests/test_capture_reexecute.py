@@ -13,7 +13,7 @@ import pytest
 from capture_rig import Room, drive, record
 
 from apps.captures.compare import difference
-from apps.captures.reexecute import Result, rerun
+from apps.captures.reexecute import ReexecutionResult, reexecute
 from apps.captures.rewrite import info_in, rewrite
 from apps.cli.main import main
 from cocoro import topics
@@ -23,8 +23,8 @@ from cocoro.clock import NS
 from cocoro.core import Core, Output, Sample, Schedule, Take
 from cocoro.messages import Detections, PlannerStatus
 from services.capture.file import Packer
-from services.capture.keys import Entry, lossy
-from services.capture.writer import Limits, Writer
+from services.capture.keys import QueuedMessage, lossy
+from services.capture.writer import CaptureWriter, Limits
 from services.perception import service as perception
 from services.planning import service as planning
 
@@ -34,9 +34,9 @@ TOLERANCE = 1e-3
 processor may add up in another order."""
 
 
-def again(path: Path, service: str, tolerance: float = 0.0) -> Result:
+def again(path: Path, service: str, tolerance: float = 0.0) -> ReexecutionResult:
     with Capture.open(path) as capture:
-        return rerun([capture], service, tolerance)
+        return reexecute([capture], service, tolerance)
 
 
 def without(path: Path, out: Path, keep: Callable[[Record], bool], start_ns: int | None = None) -> Path:
@@ -94,7 +94,7 @@ def test_the_first_difference_is_told_with_its_place_and_size(
     assert result.first.text.endswith("by 0.25")
     assert not result.first.after_missing
     assert again(GOLDEN, "perception", 0.1).differing == 0
-    assert main(["capture", "rerun", str(GOLDEN), "--service", "perception"]) == 1
+    assert main(["capture", "reexecute", str(GOLDEN), "--service", "perception"]) == 1
     assert "1 steps differ" in capsys.readouterr().out
 
 
@@ -124,7 +124,7 @@ def test_a_core_that_fails_now_differs(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_equal_outputs_exit_with_0_and_json_says_the_same(capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = ["capture", "rerun", str(GOLDEN), "--service", "planning", "--tolerance", str(TOLERANCE)]
+    arguments = ["capture", "reexecute", str(GOLDEN), "--service", "planning", "--tolerance", str(TOLERANCE)]
     assert main(arguments) == 0
     assert "every one equal" in capsys.readouterr().out
     assert main([*arguments, "--json"]) == 0
@@ -167,15 +167,34 @@ def test_lossy_frames_are_no_inputs(tmp_path: Path) -> None:
     path = tmp_path / "lossy.mcap"
     with Capture.open(GOLDEN) as capture:
         infos = {key: info_in(capture, capture.keys[key][0]) for key in capture.keys}
-        out = Writer(lambda _: path, Packer("lz4"), Limits(), lambda key, _: infos[key], prepare=lossy(80))
+        out = CaptureWriter(lambda _: path, Packer("lz4"), Limits(), lambda key, _: infos[key], prepare=lossy(80))
         for name, entries in capture.metadata.items():
             out.remember(name, entries)
         for each in capture.messages():
-            out.put(Entry(each.key, each.sequence, each.log_ns, each.publish_ns, bytes(each.payload)))
+            out.put(QueuedMessage(each.key, each.sequence, each.log_ns, each.publish_ns, bytes(each.payload)))
         out.close()
     result = again(path, "perception", TOLERANCE)
     assert result.reasons == {"the capture lacks an input of kinect/frame": result.not_executable}
     assert result.not_executable > 50
+
+
+def test_a_repeated_message_does_not_take_the_place_of_the_one_that_was_consumed(tmp_path: Path) -> None:
+    """Readers reject it by its number, whatever it says."""
+    path = tmp_path / "repeated.mcap"
+    with Capture.open(GOLDEN) as capture:
+        infos = {key: info_in(capture, capture.keys[key][0]) for key in capture.keys}
+        out = CaptureWriter(lambda _: path, Packer("lz4"), Limits(), lambda key, _: infos[key])
+        for name, entries in capture.metadata.items():
+            out.remember(name, entries)
+        for each in capture.messages():
+            message = QueuedMessage(each.key, each.sequence, each.log_ns, each.publish_ns, bytes(each.payload))
+            out.put(message)
+            if each.key.endswith("base/state"):
+                wrong = msgspec.msgpack.decode(each.payload) | {"odometry_m": (9.0, 9.0)}
+                out.put(message._replace(payload=msgspec.msgpack.encode(wrong)))
+        out.close()
+    result = again(path, "planning", TOLERANCE)
+    assert result.equal == result.steps > 200
 
 
 def of_an_older_version(out: Path, change: Callable[[dict[str, Any]], None] = lambda _: None) -> Path:
@@ -203,13 +222,13 @@ def of_an_older_version(out: Path, change: Callable[[dict[str, Any]], None] = la
         infos["calliope/planning/status"] = infos["calliope/planning/status"]._replace(
             schema=schema._replace(data=json.dumps(then).encode())
         )
-        written = Writer(lambda _: out, Packer("lz4"), Limits(), lambda key, _: infos[key])
+        written = CaptureWriter(lambda _: out, Packer("lz4"), Limits(), lambda key, _: infos[key])
         for name, entries in capture.metadata.items():
             written.remember(name, entries)
         for each in capture.messages():
             kind = infos[each.key].schema
             payload = older("" if kind is None else kind.name, bytes(each.payload))
-            written.put(Entry(each.key, each.sequence, each.log_ns, each.publish_ns, payload))
+            written.put(QueuedMessage(each.key, each.sequence, each.log_ns, each.publish_ns, payload))
         written.close()
     return out
 
@@ -226,7 +245,7 @@ def test_outputs_of_an_older_version_are_compared_by_the_fields_that_both_have(
         "calliope/planning/status: model is new: takes its default",
         "calliope/planning/status: TargetEstimate.sigma_m is new: takes its default",
     )
-    assert main(["capture", "rerun", str(path), "--service", "planning", "--tolerance", "0.001"]) == 0
+    assert main(["capture", "reexecute", str(path), "--service", "planning", "--tolerance", "0.001"]) == 0
     assert "changed since, calliope/planning/status: model is new" in capsys.readouterr().out
 
 
@@ -251,14 +270,14 @@ def test_what_differs_is_found_in_a_capture_of_an_older_version_too(tmp_path: Pa
 def test_a_capture_that_does_not_have_what_it_takes_is_told_of(service: str, words: str, tmp_path: Path) -> None:
     path = without(GOLDEN, tmp_path / "less.mcap", lambda each: not each.key.endswith("/steps"))
     with Capture.open(path) as capture, pytest.raises(CaptureError, match=words):
-        rerun([capture], service)
+        reexecute([capture], service)
 
 
 def started_otherwise(out: Path, change: Callable[[dict[str, Any]], object]) -> Path:
     """The golden capture as it were if the planner had had other settings."""
     with Capture.open(GOLDEN) as capture:
         infos = {key: info_in(capture, capture.keys[key][0]) for key in capture.keys}
-        written = Writer(lambda _: out, Packer("lz4"), Limits(), lambda key, _: infos[key])
+        written = CaptureWriter(lambda _: out, Packer("lz4"), Limits(), lambda key, _: infos[key])
         for name, entries in capture.metadata.items():
             if name == "service/planning":
                 config = json.loads(entries["config"])
@@ -266,7 +285,7 @@ def started_otherwise(out: Path, change: Callable[[dict[str, Any]], object]) -> 
                 entries["config"] = json.dumps(config)
             written.remember(name, entries)
         for each in capture.messages():
-            written.put(Entry(each.key, each.sequence, each.log_ns, each.publish_ns, bytes(each.payload)))
+            written.put(QueuedMessage(each.key, each.sequence, each.log_ns, each.publish_ns, bytes(each.payload)))
         written.close()
     return out
 
