@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from cocoro.capture.former import todays_name
+from cocoro.capture.former import todays_name, todays_payload
 from cocoro.capture.mcap import DamageError
 from cocoro.messages import Frame, Message
 from cocoro.topics import topic_named
@@ -37,7 +37,8 @@ def reader_of(name: str, schema: str | None) -> Read | None:
     if topic is None or (schema is not None and todays_name(schema) != topic.type.__name__):
         return None
     kind: type[Message] = topic.type
-    return msgspec.msgpack.Decoder(kind).decode
+    decode = msgspec.msgpack.Decoder(kind).decode
+    return lambda payload: decode(todays_payload(kind.__name__, payload))
 
 
 class LossyFrame(Message):
