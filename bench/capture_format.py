@@ -28,8 +28,8 @@ from mcap.data_stream import ReadDataStream
 from mcap.reader import make_reader
 from mcap.records import Chunk, Message, MessageIndex
 from mcap.stream_reader import breakup_chunk
-from mcap.writer import CaptureWriter as PackageWriter
 from mcap.writer import CompressionType
+from mcap.writer import Writer as PackageWriter
 
 from apps.rehearsal.rehearse import rehearse
 from apps.rehearsal.request import RehearsalRequest
@@ -213,7 +213,7 @@ def _frames(name: str, frames: list[bytes], times: int) -> None:
 
     def read() -> None:
         for content in contents:
-            unpacked(content)
+            unpacked(content, ours=True)
 
     def read_by_package() -> None:
         for content in contents:

@@ -7,7 +7,7 @@ from typing import Literal
 
 from cocoro.bus.base import Handle, OnAlive, OnLot, OnSample, Payload, Qos, Reply, Server, Subscription
 from cocoro.bus.local import LocalBus
-from cocoro.topics import HARDWARE
+from deploy.processes import hardware
 
 Way = Literal["dies", "silent", "hangs", "late"]
 """dies: says and hears nothing, and its token is gone. silent: says nothing. hangs: says and hears nothing, and its
@@ -60,7 +60,7 @@ class FaultyBus:
     def owner(self, key: str) -> str:
         """Who speaks, hears or answers at a key."""
         service = key.split("/")[1]
-        return service if self._name == "sim" and service in HARDWARE else self._name
+        return service if self._name == "sim" and service in hardware() else self._name
 
     def _deaf(self, owner: str) -> bool:
         return self._ways.get(owner) in ("dies", "hangs")

@@ -22,10 +22,9 @@ from cocoro.errors import CocoroError
 from cocoro.messages import CancelRequest, EstopRequest, TaskReply, TaskRequest
 from cocoro.node import Node
 from cocoro.robot import Robot
-from cocoro.topics import HARDWARE
-from deploy.processes import named
-from services.planning.config import Config as Planning
-from sim.motion import Motion, read_motion
+from deploy.processes import hardware, named, needs
+from services.planning.config import PlanningConfig
+from sim.motion import MotionRow, read_motion
 
 SERVICES = ("sim", "perception", "planning", "executive")
 STANDING_MPS = 0.01
@@ -38,7 +37,7 @@ FRAMES = {"width": 320, "height": 240, "frame_rate_hz": 30.0, "sensors": "real"}
 
 def full_speed_mps(drive: str) -> float:
     """The highest speed that the planner drives at, of itself, on an errand."""
-    planning = Planning()
+    planning = PlanningConfig()
     return planning.follow.max_speed_mps if drive == "follow" else planning.navigation.max_speed_mps
 
 
@@ -82,14 +81,15 @@ class FaultRobot:
         self._nodes: dict[str, Node] = {}
         self._runs: list[asyncio.Future[None]] = []
         self._stack = AsyncExitStack()
-        self._rows: list[Motion] = []
+        self._rows: list[MotionRow] = []
         self._said: dict[str, bytes] = {}
         self.operator = Node("operator", self._mesh.join(), self._clock, self._robot)
 
     async def __aenter__(self) -> FaultRobot:
         for name in SERVICES:
             component = load(named(name))
-            config = msgspec.convert(self._settings.get(name, {}), component.config)
+            needed = {"needed": needs(name)} if name == "executive" else {}
+            config = msgspec.convert(needed | self._settings.get(name, {}), component.config)
             bus = self._buses[name] = FaultyBus(self._mesh.join(), name)
             node = self._nodes[name] = Node(name, bus, self._clock, self._robot)
             await self._stack.enter_async_context(node)
@@ -111,7 +111,7 @@ class FaultRobot:
 
     # --- before -----------------------------------------------------------------------------------
 
-    async def drive(self, rng: random.Random) -> Motion:
+    async def drive(self, rng: random.Random) -> MotionRow:
         """Give the task, and be at full speed at a random moment; how the body moves then. Raises NotFastError."""
         await self._begin()
         full_mps = 0.97 * full_speed_mps(self._errand.task.name)
@@ -139,7 +139,7 @@ class FaultRobot:
     def _now_s(self) -> float:
         return self.operator.now_ns() / NS
 
-    def _newest(self) -> Motion:
+    def _newest(self) -> MotionRow:
         self._rows += read_motion(self._motion, len(self._rows))
         return self._rows[-1]
 
@@ -164,9 +164,9 @@ class FaultRobot:
         return (moving[-1].sim_ns - began_ns) / NS if moving else 0.0
 
     def _fail(self, service: str, way: Way) -> None:
-        bus = self._buses["sim" if service in HARDWARE else service]
+        bus = self._buses["sim" if service in hardware() else service]
         bus.fail(service, way)
-        if way == "dies" and service not in HARDWARE:
+        if way == "dies" and service not in hardware():
             bus.whole.kill()
             self._runs[SERVICES.index(service)].cancel()
 

@@ -34,11 +34,11 @@ from bench.fault_robot import FaultRobot, Happening, NotFastError
 from bench.fault_scenes import DRIVES, Drive, draw_errand
 from bench.faults_live import alarms, live
 from cocoro.robot import Robot
-from cocoro.topics import HARDWARE
 from cocoro.vloop import run_virtual
+from deploy.processes import hardware
 
 STAND_S = 0.3
-SERVICES = ("planning", "executive", "perception", *HARDWARE)
+SERVICES = ("planning", "executive", "perception", *hardware())
 HAPPENINGS: tuple[Happening, ...] = (
     *(Happening(service, way) for way in get_args(Way) for service in SERVICES),
     Happening(what="estop"),

@@ -33,7 +33,7 @@ from cocoro.node import Node
 from cocoro.robot import Robot
 from deploy.rundir import Target
 from services.executive.tasks import FetchTask, FollowTask
-from sim.motion import Motion, read_motion
+from sim.motion import MotionRow, read_motion
 
 VICTIMS = {"sim": ("planning", "executive", "perception"), "sim-wire": ("base", "arm")}
 """By profile, services whose processes are killed and stopped; 'arm' is that of all servos. With the simulator itself
@@ -66,14 +66,14 @@ class LiveRobot:
         self.whys: list[str] = []
         """The planner's word on its doings, status by status."""
         self._motion = motion
-        self.rows: list[Motion] = []
+        self.rows: list[MotionRow] = []
         node.on(topics.TASK, self.states.append)
         node.on(topics.PLAN, self._plan)
 
     def _plan(self, status: PlannerStatus) -> None:
         self.whys.append(status.why)
 
-    def read(self) -> Motion:
+    def read(self) -> MotionRow:
         """The newest step of the physics."""
         self.rows += read_motion(self._motion, len(self.rows))
         return self.rows[-1]
@@ -99,7 +99,7 @@ class LiveRobot:
                         return state
                 await asyncio.sleep(0.05)
 
-    async def at_speed(self, errand: Errand, rng: random.Random) -> Motion:
+    async def at_speed(self, errand: Errand, rng: random.Random) -> MotionRow:
         """Give the task, and be at full speed at a random moment. Raises TimeoutError."""
         await self.begin(TaskRequest(task=errand.task))
         full_mps = 0.97 * full_speed_mps(errand.task.name)
@@ -217,7 +217,7 @@ class Alarms:
         )
 
 
-def _deadman(rows: Sequence[Motion]) -> tuple[int, float, int]:
+def _deadman(rows: Sequence[MotionRow]) -> tuple[int, float, int]:
     """Events, the deepest loss of speed as a share, and how many ended in standing."""
     events, deepest, stood = 0, 0.0, 0
     began_mps: float | None = None

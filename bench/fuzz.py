@@ -12,9 +12,9 @@ import time
 from collections.abc import Callable
 
 from services.base import oi
-from services.base.keeper import LONG, MS, SHORT, Keeper
+from services.base.guard_logic import LONG, MS, SHORT, GuardLogic
 from services.servos import table
-from services.servos.packets import find_status
+from services.servos.bus import find_status
 
 NOISE = (0x13, 0xFF, 0x00, 0x23, 0x29)
 """Bytes that frames begin with, or have their lengths in."""
@@ -61,8 +61,8 @@ class Fuzzer:
             return body + bytes([-sum(body) & 0xFF])
 
         data = self.mutated(good)
-        keeper, now_ns = Keeper("safe", 200 * MS), 10**12
-        keeper.opened(now_ns)
+        logic, now_ns = GuardLogic("safe", 200 * MS), 10**12
+        logic.opened(now_ns)
         parser = oi.StreamParser((SHORT, LONG))
         frames, at = [], 0
         while at < len(data):
@@ -70,12 +70,10 @@ class Fuzzer:
             at += len(piece)
             now_ns += draws.randrange(1, 60) * MS
             frames += parser.feed(piece)
-            keeper.heard(piece, now_ns)
-            keeper.ask(
-                draws.randint(-900, 900), draws.randint(-900, 900), now_ns + draws.randint(-50, 400) * MS, now_ns
-            )
-            written = keeper.poll(now_ns)
-            assert keeper.wheels[:2] == (0, 0) or keeper.link == "up"
+            logic.heard(piece, now_ns)
+            logic.ask(draws.randint(-900, 900), draws.randint(-900, 900), now_ns + draws.randint(-50, 400) * MS, now_ns)
+            written = logic.poll(now_ns)
+            assert logic.wheels[:2] == (0, 0) or logic.link == "up"
             assert len(written) < 2 * 5 * oi.OVERRUN + 100
         for readings in frames:
             assert tuple(readings) in (SHORT, LONG)

@@ -20,9 +20,9 @@ from cocoro.errors import CocoroError
 from cocoro.messages import BaseCommand, BaseState, Health, Latch, RecoverRequest, ServoCommand, ServoRequest
 from cocoro.node import Node
 from cocoro.robot import Robot
-from services.base.service import Config as BaseConfig
+from services.base.service import BaseConfig
 from services.base.service import run as run_base
-from services.servos.service import Config as ServosConfig
+from services.servos.service import ServosConfig
 from services.servos.service import run as run_servos
 
 WHEELS = ((0.2, 0.2), (0.12, 0.06), (-0.06, 0.06))

@@ -28,12 +28,12 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from bench.hardware_driver import REACH_RAD, WHEELS
 from bench.hardware_rig import LINES, MS, NS, ROBOT, Hardware, Services
-from sim.wire.dynamixel import Servo
-from sim.wire.faults import KINDS, Fault
+from sim.wire.dynamixel import EmulatedServo
+from sim.wire.line import KINDS, LineFault
 
 STOP_NS = 300 * MS
 AGAIN_S = 40.0
@@ -208,10 +208,10 @@ class Campaign:
 
     def _line(self) -> Trial:
         draws, name, kind = self._draws, self._draws.choice(LINES), self._draws.choice(KINDS)
-        way = draws.choice(("to_device", "to_driver"))
+        way: Literal["to_device", "to_driver"] = draws.choice(("to_device", "to_driver"))
         share = draws.uniform(0.003, 0.05) if kind in ("lost", "corrupted") else draws.uniform(0.05, 0.4)
         line = self._hardware.emulator.lines[name]
-        fault = Fault(kind, share, way, FAR_NS, round(draws.uniform(5, 80) * MS))
+        fault = LineFault(kind, share, way, FAR_NS, round(draws.uniform(5, 80) * MS))
         cut = kind == "silent"
         shown: tuple[str, ...] = ("disturbed",)
         if cut:
@@ -244,7 +244,7 @@ class Campaign:
             self._draws.uniform(0.2, 1.0), ("plugged in",),
         )  # fmt: skip
 
-    def _servo(self) -> Servo:
+    def _servo(self) -> EmulatedServo:
         return self._hardware.servos[ROBOT.joints[self._draws.choice(list(REACH_RAD))].id]
 
     def _overload(self) -> Trial:
@@ -274,7 +274,8 @@ class Campaign:
         servo = self._servo()
 
         def end() -> None:
-            self._call(lambda: (servo.put(42, 120), servo.power_up()))
+            self._call(lambda: servo.put(42, 120))
+            self._call(servo.power_up)
 
         return Trial("servo: power lost", lambda: self._call(lambda: servo.put(42, 30)), end, 0.5, ("does not answer",))
 

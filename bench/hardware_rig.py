@@ -16,10 +16,9 @@ import psutil
 
 from bench.hardware_driver import REACH_RAD, SPEED_RADPS
 from cocoro.robot import Robot
-from sim.wire.body import SimpleBody
-from sim.wire.create import Create
-from sim.wire.dynamixel import Bus, Servo
-from sim.wire.emulator import Emulator
+from sim.wire.create import EmulatedCreate
+from sim.wire.dynamixel import EmulatedServo, EmulatedServoBus
+from sim.wire.emulator import Emulator, SimplePlant
 
 NS, MS = 1_000_000_000, 1_000_000
 SEEN_S = 8.0
@@ -32,13 +31,13 @@ class Hardware:
     """The emulated robot, and what is asked of it."""
 
     def __init__(self, folder: Path, seed: int) -> None:
-        self.create = Create()
+        self.create = EmulatedCreate()
         self.buses = {
-            "arm": Bus([Servo(number, 28) for number in range(1, 7)]),
-            "hand": Bus([Servo(number) for number in (7, 8, 9)]),
+            "arm": EmulatedServoBus([EmulatedServo(number, 28) for number in range(1, 7)]),
+            "hand": EmulatedServoBus([EmulatedServo(number) for number in (7, 8, 9)]),
         }
         self.servos = {servo.number: servo for bus in self.buses.values() for servo in bus.servos}
-        self.body = SimpleBody(self.create, *self.buses.values())
+        self.body = SimplePlant(self.create, *self.buses.values())
         self.emulator = Emulator(folder, {"create": self.create, **self.buses}, self.body, seed)
         self.limits = {}
         for name, joint in ROBOT.joints.items():

@@ -21,12 +21,12 @@ from cocoro.messages import Frame, ServoState
 from cocoro.objects import Catalogue
 from cocoro.robot import Robot
 from cocoro.topics import ARM_STATE, FRAME
-from services.perception.config import Config
+from services.perception.config import PerceptionConfig
 from services.perception.core import PerceptionCore
-from sim.camera import Kinect
+from sim.camera import SimKinect
 from sim.render import make_renderer
+from sim.render.interface import Visual
 from sim.scene import Light
-from sim.visual import Visual
 
 PLACES = {
     "red_can": (1.5, 0.0, 0.06),
@@ -50,7 +50,7 @@ def frames(robot: Robot, catalogue: Catalogue, size: tuple[int, int], count: int
         visuals.append(Visual(label, known.shape, shape_size, known.rgb))
         pose[:3, 3] = place
     renderer = make_renderer(visuals, robot.camera.scaled(*size))
-    kinect = Kinect(robot, renderer, sensors="real", seed=1, width=size[0], height=size[1])
+    kinect = SimKinect(robot, renderer, sensors="real", seed=1, width=size[0], height=size[1])
     head = robot.chain("camera").pose({"neck_pan": PAN, "neck_tilt": TILT})
     taken = [kinect.capture(poses, head, (number + 1) * PERIOD_NS, Light()) for number in range(count)]
     renderer.close()
@@ -80,7 +80,7 @@ def step_ms(core: PerceptionCore, frame: Frame) -> tuple[float, int]:
 def measure(size: tuple[int, int], count: int) -> dict[str, object]:
     robot, catalogue = Robot.load(), Catalogue.load()
     shown = frames(robot, catalogue, size, count + 3)
-    configs = {name: Config(detector=name, floor_rate_hz=1e-3) for name in ("blob", "paper")}  # objects alone
+    configs = {name: PerceptionConfig(detector=name, floor_rate_hz=1e-3) for name in ("blob", "paper")}  # objects alone
     cores = {name: PerceptionCore(robot, config, catalogue) for name, config in configs.items()}
     times: dict[str, list[float]] = {name: [] for name in cores}
     placed: dict[str, int] = dict.fromkeys(cores, 0)

@@ -16,7 +16,7 @@ from rich.table import Table
 
 from cocoro.errors import ConfigError
 from cocoro.robot import Robot
-from sim.camera import Kinect, moved
+from sim.camera import SimKinect, moved
 from sim.render import make_renderer
 from sim.scene import load_scene
 from sim.world import World
@@ -53,11 +53,11 @@ def parts_of(robot: Robot, world: World, width: int, height: int) -> dict[str, C
         )
     parts["render: colour and depth"] = partial(fast.render, poses, pose, depth_pose, light)
     parts["render: and infrared shadows"] = partial(fast.render, poses, pose, depth_pose, light, projector_pose)
-    ideal = Kinect(robot, fast, sensors="ideal", width=width, height=height)
+    ideal = SimKinect(robot, fast, sensors="ideal", width=width, height=height)
     parts["frame, ideal"] = partial(ideal.capture, poses, pose, 0, light)
-    still = Kinect(robot, fast, sensors="real", width=width, height=height)
+    still = SimKinect(robot, fast, sensors="real", width=width, height=height)
     parts["frame, real, camera at rest"] = still_frames(partial(still.capture, poses), pose, light)
-    turning = Kinect(robot, fast, sensors="real", width=width, height=height)
+    turning = SimKinect(robot, fast, sensors="real", width=width, height=height)
     parts["frame, real, camera turning"] = turning_frames(partial(turning.capture, poses), pose, light)
     slow = make_renderer(world.visuals, camera, "tiny")
     parts["render by TinyRenderer: colour and depth"] = partial(slow.render, poses, pose, depth_pose, light)

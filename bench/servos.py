@@ -23,10 +23,9 @@ from cocoro.clock import RealClock
 from cocoro.messages import BaseCommand, BaseState, Latch, ServoCommand, ServoState
 from cocoro.node import Node
 from cocoro.robot import Robot
-from services.base.service import Config as BaseConfig
+from services.base.service import BaseConfig
 from services.base.service import run as run_base
-from services.servos.service import Config as ServosConfig
-from services.servos.service import NetworkService
+from services.servos.service import NetworkService, ServosConfig
 
 REPLY_S = 0.1
 

@@ -37,6 +37,7 @@ from cocoro.clock import FollowedClock
 from cocoro.messages import TaskRequest
 from cocoro.node import Node
 from cocoro.robot import Robot
+from cocoro.topics import Topic
 from deploy.rundir import Target
 from services.executive.tasks import FetchTask
 
@@ -195,7 +196,7 @@ SITUATIONS: dict[str, str] = {
 
 
 async def measure(here: Place, situation: str, count: int) -> list[Stopped]:
-    env = {} if situation == "environment" else None
+    env: dict[str, str] | None = {} if situation == "environment" else None
     async with driving(here) as driver:
         await driver.reset()
         with ExitStack() as stack:
@@ -247,8 +248,9 @@ async def _still_latched(here: Place) -> str:
         node.on(topics.BASE_STATE, lambda state: states.update(base=state.latch))
         node.on(topics.ARM_STATE, lambda state: states.update(arm=state.latch))
         node.on(topics.HAND_STATE, lambda state: states.update(hand=state.latch))
-        for topic in (topics.BASE_STATE, topics.ARM_STATE, topics.HAND_STATE):
-            await asyncio.wait_for(node.latest(topic).next(), PATIENCE_S)  # type: ignore[arg-type]
+        reporting: tuple[Topic[Any], ...] = (topics.BASE_STATE, topics.ARM_STATE, topics.HAND_STATE)
+        for topic in reporting:
+            await asyncio.wait_for(node.latest(topic).next(), PATIENCE_S)
         await asyncio.sleep(1.5)  # longer than a cold start takes to be believed
         reply = await node.call(topics.RUN, TaskRequest(task=FetchTask(label="red_can")), 10.0)
         if reply.accepted or set(states.values()) != {"latched"}:

@@ -1,82 +1,153 @@
-"""What a component is, and the process that runs it.
+"""What a component is: a value that says what it speaks, what it needs and how it is run.
 
-A component is a module with a `Config` (a frozen msgspec struct, all fields with defaults, unknown fields
-forbidden) and `async def run(node, config)`, which never returns. One that drives a pure core also has
-`def core(robot, config)` that makes it, so that its captures can be executed again.
+A declaration is light: it names the module of the implementation, and only the process that runs the component imports
+that module. The declarations of this project are united in `deploy.processes`; third parties add theirs by entry point
+(`cocoro.installed`).
 """
 
 from __future__ import annotations
 
 import importlib
 import inspect
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterable, Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from types import ModuleType
+from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 
 import msgspec
 
+from cocoro.checks import Check
 from cocoro.errors import ConfigError
+from cocoro.topics import ESTOP, Request, Topic
 
 if TYPE_CHECKING:
     from cocoro.core import Core
     from cocoro.node import Node
     from cocoro.robot import Robot
 
+C = TypeVar("C", bound=msgspec.Struct)
+
 Restart = Literal["never", "on-failure", "always"]
-Run = Callable[["Node", Any], Awaitable[None]]
-MakeCore = Callable[["Robot", Any], "Core"]
+
+
+@dataclass(frozen=True)
+class Implementation(Generic[C]):
+    """What a component's module gives, under the name `implementation`."""
+
+    config: type[C]
+    """A frozen msgspec struct; all fields have defaults, unknown fields are forbidden."""
+    run: Callable[[Node, C], Awaitable[None]]
+    """An `async def` that never returns."""
+    core: Callable[[Robot, C], Core] | None = None
+    """Makes the pure core that `run` drives; with it a capture of the component can be re-executed."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Process:
-    """One row: what is started, when it counts as ready, what becomes of it when it ends, what it may cost."""
+class Component:
+    """One process: what it says and hears on the mesh, what it depends on, how it is run, what it may cost.
+
+    A topic or request with `{service}` in its name stands for each of this component's services where the component
+    publishes or serves it, and for any service where the component reads or calls it. What every node does (health,
+    records of steps and requests, `about`, following the clock) is not declared.
+    """
 
     name: str
+    """Of the process; also the name of its service unless `services` says otherwise."""
     module: str
-    """Imported by name, so that this package needs none of them."""
-    services: tuple[str, ...]
-    """It is ready when all of these have declared their liveliness."""
+    """Has `implementation = Implementation(...)`; imported by `load` alone."""
     doc: str
+    services: tuple[str, ...] = ()
+    """The services that it is; it is ready when all of them have declared their liveliness."""
+
+    reads: tuple[Topic[Any], ...] = ()
+    publishes: tuple[Topic[Any], ...] = ()
+    serves: tuple[Request[Any, Any], ...] = ()
+    calls: tuple[Request[Any, Any], ...] = ()
+    records: bool = False
+    """It hears every key of the robot, whatever `reads` says."""
+    needs: tuple[str, ...] = ()
+    """Services that it cannot work without; what these need in turn is not repeated here."""
+    moves: tuple[str, ...] = ()
+    """Those of its services that move something. Each must serve the emergency stop."""
+    hardware: bool = False
+    """It drives a device that the simulator impersonates."""
+
     settings: str = ""
-    """Whose `[service.NAME]` table it reads; its own where nothing is said."""
+    """The name of the `[service.NAME]` table that it is configured by, if that is not its own."""
     restart: Restart = "on-failure"
     backoff_s: float = 0.5
-    """Before the first restart; doubled for each further one, up to `BACKOFF_LIMIT_S`."""
+    """Before the first restart; doubled for each further one, up to `deploy.processes.BACKOFF_LIMIT_S`."""
     start_s: float = 30.0
     """It must be ready by then."""
     stop_s: float = 5.0
     """From SIGTERM to SIGKILL."""
     frames: Literal["", "reads", "publishes"] = ""
-    """Whether it publishes frames or reads them: these travel in shared memory then. For who does not say so, they are
-    copied, which costs more."""
+    """Whether it publishes or reads frames: these travel in shared memory then. Otherwise they are copied, which costs
+    more."""
     nice: int = 0
-    """Steps by which it yields the processor to others: what may be late must not make commands late. Below 0 the
-    others yield to it, where that is allowed (LimitNICE in the unit file)."""
+    """Scheduling priority relative to the others: above 0 it yields to them, below 0 they yield to it, where that is
+    allowed (LimitNICE in the unit file)."""
     cpu_share: float = 0.25
-    """Budget, of one core, on the machine that the project is measured on."""
+    """Budget, as a share of one core of the machine that the project is measured on."""
     rss_mb: float = 150.0
     """Budget of resident memory."""
 
+    libraries: tuple[str, ...] = ()
+    """Distributions that it needs beside those of the mesh; `cocoro doctor` looks for them."""
+    checks: str = ""
+    """A module with `check(config, robot, robot_name) -> list[Check]`, for `cocoro doctor`."""
 
-class Component(NamedTuple):
-    """A process's module, loaded."""
+    def __post_init__(self) -> None:
+        """Raises ConfigError for a declaration that contradicts itself."""
+        if not self.services:
+            object.__setattr__(self, "services", (self.name,))
+        if unknown := sorted(set(self.moves) - set(self.services)):
+            raise ConfigError(f"component {self.name}: it moves {unknown[0]}, which is none of its services")
+        served = {request.name for request in self.all_serves()}
+        if unstoppable := [service for service in self.moves if ESTOP.of(service).name not in served]:
+            raise ConfigError(f"component {self.name}: {unstoppable[0]} moves something, so it must serve ESTOP")
 
-    config: type[Any]
-    run: Run
-    core: MakeCore | None = None
+    def all_publishes(self) -> Iterator[Topic[Any]]:
+        """The published topics, those with `{service}` resolved for each service."""
+        for topic in self.publishes:
+            yield from (topic.of(service) for service in self.services) if topic.per_service else (topic,)
+
+    def all_serves(self) -> Iterator[Request[Any, Any]]:
+        """The served requests, those with `{service}` resolved for each service."""
+        for request in self.serves:
+            yield from (request.of(service) for service in self.services) if request.per_service else (request,)
+
+    def speaker(self, topic: Topic[Any]) -> str:
+        """The service of this component that publishes a topic: the one that the topic lies under, else the process."""
+        return topic.service if topic.service in self.services else self.name
 
 
-def load(process: Process) -> Component:
-    """Import a process's module. Raises ConfigError when it is missing or is not a component."""
+def load(component: Component) -> Implementation[Any]:
+    """Import a component's implementation. Raises ConfigError when its module is missing or has none."""
+    where = f"component {component.name}: {component.module}"
+    found = getattr(_module(component.module, f"component {component.name}"), "implementation", None)
+    if not isinstance(found, Implementation):
+        raise ConfigError(f"{where} has no `implementation = Implementation(CONFIG, run)`, see cocoro.component")
+    if not (isinstance(found.config, type) and issubclass(found.config, msgspec.Struct)):
+        raise ConfigError(f"{where}: its implementation's config is no class of msgspec.Struct")
+    if not inspect.iscoroutinefunction(found.run):
+        raise ConfigError(f"{where}: its implementation's run is no `async def run(node, config)`")
+    return found
+
+
+def machine_checks(component: Component, config: Any, robot: Robot, robot_name: str) -> Iterable[Check]:
+    """Run a component's own checks of the machine; none for a component without any. Raises ConfigError when its
+    module of checks is missing."""
+    if not component.checks:
+        return ()
+    found: Iterable[Check] = _module(component.checks, f"component {component.name}").check(config, robot, robot_name)
+    return found
+
+
+def _module(name: str, whose: str) -> ModuleType:
     try:
-        module = importlib.import_module(process.module)
+        return importlib.import_module(name)
     except ModuleNotFoundError as error:
-        if error.name and (process.module == error.name or process.module.startswith(f"{error.name}.")):
-            raise ConfigError(f"process {process.name}: there is no module {process.module}") from error
+        if error.name and (name == error.name or name.startswith(f"{error.name}.")):
+            raise ConfigError(f"{whose}: there is no module {name}") from error
         raise
-    config, run = getattr(module, "Config", None), getattr(module, "run", None)
-    if not (isinstance(config, type) and issubclass(config, msgspec.Struct)):
-        raise ConfigError(f"process {process.name}: {process.module} has no Config (a msgspec.Struct)")
-    if not inspect.iscoroutinefunction(run):
-        raise ConfigError(f"process {process.name}: {process.module} has no `async def run(node, config)`")
-    return Component(config, run, getattr(module, "core", None))

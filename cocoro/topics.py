@@ -1,12 +1,16 @@
-"""What travels on the mesh: one table. Recorder, health, access control and the documentation are derived
-from it; adding a message type means a class in `cocoro/messages/` and a row here.
+"""The project's own topics and requests: the messages on the mesh, with their rates, ages and quality of service.
+
+What exists on a robot is the union of these rows and those of installed third parties (`cocoro.installed`). To add a
+message: a class in `cocoro/messages/`, a row here, and the row's name in the declarations of the components that
+publish and read it (`services/<name>/component.py`).
 
 A key is `<robot>/<service>/<topic>`. Rows with `{service}` in their name stand for one topic per service.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from typing import Any, Generic, TypeVar
 
 import msgspec
@@ -18,27 +22,46 @@ M = TypeVar("M", bound=m.Message)
 Q = TypeVar("Q", bound=msgspec.Struct)
 R = TypeVar("R", bound=msgspec.Struct)
 
+ANY = "*"
+"""In place of a service's name: of every service."""
+_PER_SERVICE = "{service}"
+
 
 @dataclass(frozen=True)
 class Topic(Generic[M]):
+    """A kind of message that is published, under one key of each robot."""
+
     name: str
+    """Its key without the robot's name: `<service>/<topic>`."""
     type: type[M]
     qos: Qos
-    publisher: str
-    """The service that publishes it ('*' for the per-service rows, 'sim' for the simulator's own)."""
     rate_hz: float | None
     """Nominal; None when it is published on change."""
     max_age_s: float
-    """A reader must not act on a sample older than this; the row's doc says what it does instead."""
+    """A reader must not act on an older sample; `doc` says what it does instead."""
     doc: str
+    publisher: str = ""
+    """The service that publishes it. Derived from the name, except for a command: that lies under whom it commands."""
     recorded: bool = True
+    """Recorders leave it out when this is False."""
     max_bytes: int = 65_536
     """A larger payload is rejected unread."""
 
-    def of(self, service: str) -> Topic[M]:
-        """The row for one service, where the row is a per-service one."""
-        from dataclasses import replace
+    def __post_init__(self) -> None:
+        if not self.publisher:
+            object.__setattr__(self, "publisher", self.service)
 
+    @property
+    def service(self) -> str:
+        """The service under which it lies; `ANY` for a per-service row."""
+        return _service_of(self.name)
+
+    @property
+    def per_service(self) -> bool:
+        return self.service == ANY
+
+    def of(self, service: str) -> Topic[M]:
+        """A per-service row's topic of one service, or with `ANY` of all."""
         return replace(self, name=self.name.format(service=service), publisher=service)
 
     def key(self, robot: str) -> str:
@@ -47,112 +70,140 @@ class Topic(Generic[M]):
 
 @dataclass(frozen=True)
 class Request(Generic[Q, R]):
-    """A question with a typed answer."""
+    """A question to a service, with a typed answer."""
 
     name: str
+    """Its key without the robot's name: `<service>/<request>`."""
     request: type[Q]
     reply: type[R]
-    server: str
     doc: str
     timeout_s: float = 2.0
 
-    def of(self, service: str) -> Request[Q, R]:
-        from dataclasses import replace
+    @property
+    def server(self) -> str:
+        """The service that answers it; `ANY` for a per-service row."""
+        return _service_of(self.name)
 
-        return replace(self, name=self.name.format(service=service), server=service)
+    @property
+    def per_service(self) -> bool:
+        return self.server == ANY
+
+    def of(self, service: str) -> Request[Q, R]:
+        """A per-service row's request to one service, or with `ANY` to all."""
+        return replace(self, name=self.name.format(service=service))
 
     def key(self, robot: str) -> str:
         return f"{robot}/{self.name}"
 
 
+def find_topic(name: str, rows: Iterable[Topic[Any]]) -> Topic[Any] | None:
+    """The row of a topic's name (its key without the robot), per-service rows resolved; None when there is none."""
+    service, _, rest = name.partition("/")
+    general: Topic[Any] | None = None
+    for row in rows:
+        if row.name == name:
+            return row
+        if general is None and row.name == f"{_PER_SERVICE}/{rest}":
+            general = row
+    return None if general is None else general.of(service)
+
+
+def _service_of(name: str) -> str:
+    service = name.partition("/")[0]
+    return ANY if service == _PER_SERVICE else service
+
+
 FRAME = Topic(
-    "kinect/frame", m.Frame, Qos.FRAME, "kinect", 30.0, 0.5,
+    "kinect/frame", m.Frame, Qos.FRAME, 30.0, 0.5,
     "Colour and raw depth. Older frames are not looked at.", max_bytes=16 * 1024 * 1024,
 )  # fmt: skip
 BASE_STATE = Topic(
-    "base/state", m.BaseState, Qos.STATE, "base", 50.0, 0.15,
+    "base/state", m.BaseState, Qos.STATE, 50.0, 0.15,
     "Odometry, bumpers, battery. Beyond its age the planner stops the base; until then it drives the slower.",
 )  # fmt: skip
 BASE_COMMAND = Topic(
-    "base/command", m.BaseCommand, Qos.COMMAND, "planning", 50.0, 0.15,
+    "base/command", m.BaseCommand, Qos.COMMAND, 50.0, 0.15,
     "Wheel speeds. Beyond its age the base commands zero.",
+    publisher="planning",
 )  # fmt: skip
 ARM_STATE = Topic(
-    "arm/state", m.ServoState, Qos.STATE, "arm", 50.0, 0.15,
+    "arm/state", m.ServoState, Qos.STATE, 50.0, 0.15,
     "Neck and arm servos. Beyond its age the planner commands nothing and detections stay unlocalised.",
 )  # fmt: skip
 ARM_COMMAND = Topic(
-    "arm/command", m.ServoCommand, Qos.COMMAND, "planning", 50.0, 0.15,
+    "arm/command", m.ServoCommand, Qos.COMMAND, 50.0, 0.15,
     "Neck and arm goals. Beyond its age the joints hold where they are.",
+    publisher="planning",
 )  # fmt: skip
 HAND_STATE = Topic(
-    "hand/state", m.ServoState, Qos.STATE, "hand", 50.0, 0.15,
+    "hand/state", m.ServoState, Qos.STATE, 50.0, 0.15,
     "Wrist roll and claws. Beyond its age the planner does not start to grasp.",
 )  # fmt: skip
 HAND_COMMAND = Topic(
-    "hand/command", m.ServoCommand, Qos.COMMAND, "planning", 50.0, 0.15,
+    "hand/command", m.ServoCommand, Qos.COMMAND, 50.0, 0.15,
     "Wrist roll and claw goals. Beyond its age the hand keeps its goal: what is held stays held.",
+    publisher="planning",
 )  # fmt: skip
 DETECTIONS = Topic(
-    "perception/detections", m.Detections, Qos.STATE, "perception", 30.0, 1.0,
+    "perception/detections", m.Detections, Qos.STATE, 30.0, 1.0,
     "Known objects in one frame, stamped with the frame's time. Older ones only age the target memory.",
 )  # fmt: skip
 OBSTACLES = Topic(
-    "perception/obstacles", m.Obstacles, Qos.STATE, "perception", 10.0, 1.0,
+    "perception/obstacles", m.Obstacles, Qos.STATE, 10.0, 1.0,
     "What stands on the floor and where it is free, from the depth image. Older ones are not entered in the map.",
     max_bytes=262_144,
 )  # fmt: skip
 PLAN = Topic(
-    "planning/status", m.PlannerStatus, Qos.STATE, "planning", 50.0, 0.5,
+    "planning/status", m.PlannerStatus, Qos.STATE, 50.0, 0.5,
     "What the planner does and why. Beyond its age the running task fails: planner silent.",
 )  # fmt: skip
 HAND_SAMPLES = Topic(
-    "planning/hand-samples", m.HandSample, Qos.EVENT, "planning", None, 1.0,
+    "planning/hand-samples", m.HandSample, Qos.EVENT, None, 1.0,
     "What the arm's babbling saw: joint angles and the hand's marker at one time.",
 )  # fmt: skip
 WHEEL_TRIALS = Topic(
-    "planning/wheel-trials", m.WheelTrial, Qos.EVENT, "planning", None, 1.0,
+    "planning/wheel-trials", m.WheelTrial, Qos.EVENT, None, 1.0,
     "What each trial of the wheels' babbling saw.",
 )  # fmt: skip
 MODEL = Topic(
-    "planning/model", m.LearnedModel, Qos.EVENT, "planning", None, 1.0,
+    "planning/model", m.LearnedModel, Qos.EVENT, None, 1.0,
     "The learned model that the planner has taken over.", max_bytes=8 * 1024 * 1024,
 )  # fmt: skip
 INTENT = Topic(
-    "executive/intent", m.Intent, Qos.COMMAND, "executive", 50.0, 0.3,
+    "executive/intent", m.Intent, Qos.COMMAND, 50.0, 0.3,
     "The behaviour that is wanted. The wheels stand when it is 0.15 s old; beyond its age the planner goes idle.",
 )  # fmt: skip
 TASK = Topic(
-    "executive/task", m.TaskState, Qos.EVENT, "executive", 5.0, 2.0,
+    "executive/task", m.TaskState, Qos.EVENT, 5.0, 2.0,
     "The running task's phase and progress, and its outcome.",
 )  # fmt: skip
 LATCH = Topic(
-    "executive/latch", m.Latch, Qos.STATE, "executive", 5.0, 2.0,
+    "executive/latch", m.Latch, Qos.STATE, 5.0, 2.0,
     "The emergency stop's state, for hardware services that have just started.",
 )  # fmt: skip
 CLOCK = Topic(
-    "sim/clock", m.ClockTick, Qos.COMMAND, "sim", 120.0, 1.0,
+    "sim/clock", m.ClockTick, Qos.COMMAND, 120.0, 1.0,
     "Simulated time. When it stands, time stands.",
 )  # fmt: skip
 TRUTH = Topic(
-    "sim/truth", m.Truth, Qos.STATE, "sim", 30.0, 1.0,
+    "sim/truth", m.Truth, Qos.STATE, 30.0, 1.0,
     "Where everything really is: for tests, the judge and viewers alone.",
 )  # fmt: skip
 HEALTH = Topic(
-    "{service}/health", m.Health, Qos.STATE, "*", 1.0, 3.0,
+    "{service}/health", m.Health, Qos.STATE, 1.0, 3.0,
     "A service's rates, ages, losses, loops, CPU and memory.",
 )  # fmt: skip
 STEPS = Topic(
-    "{service}/steps", m.StepRecord, Qos.EVENT, "*", None, 1.0,
+    "{service}/steps", m.StepRecord, Qos.EVENT, None, 1.0,
     "What each step of a pure core consumed and gave (when recording of steps is on).",
 )  # fmt: skip
 
 EXCHANGES = Topic(
-    "{service}/requests", m.Exchange, Qos.EVENT, "*", None, 1.0,
+    "{service}/requests", m.Exchange, Qos.EVENT, None, 1.0,
     "Every request that a service was asked, with its answer: for the record.", max_bytes=4 * 1024 * 1024,
 )  # fmt: skip
 RECORDING = Topic(
-    "{service}/recording", m.Recording, Qos.STATE, "*", 1.0, 3.0,
+    "{service}/recording", m.Recording, Qos.STATE, 1.0, 3.0,
     "How a recorder is getting on: its file, what it dropped, why it stopped.",
 )  # fmt: skip
 
@@ -163,57 +214,40 @@ TOPICS: tuple[Topic[Any], ...] = (
 )  # fmt: skip
 
 RUN = Request(
-    "executive/run", m.TaskRequest, m.TaskReply, "executive",
+    "executive/run", m.TaskRequest, m.TaskReply,
     "Start a task; refused with a reason when it cannot be.",
 )  # fmt: skip
 CANCEL = Request(
-    "executive/cancel", m.CancelRequest, m.TaskReply, "executive",
+    "executive/cancel", m.CancelRequest, m.TaskReply,
     "End the running task; the robot stands still.",
 )  # fmt: skip
 OBJECTS = Request(
-    "executive/objects", m.ObjectsRequest, m.ObjectsReply, "executive",
+    "executive/objects", m.ObjectsRequest, m.ObjectsReply,
     "The known objects and where each was seen last.",
 )  # fmt: skip
 ESTOP = Request(
-    "{service}/estop", m.EstopRequest, m.EstopReply, "*",
+    "{service}/estop", m.EstopRequest, m.EstopReply,
     "Latch or release the emergency stop; answered by every hardware service and the executive.",
     timeout_s=1.0,
 )  # fmt: skip
 
 LEARNED = Request(
-    "planning/learned", m.ModelRequest, m.ModelReply, "planning",
+    "planning/learned", m.ModelRequest, m.ModelReply,
     "Take over a learned model; refused, with the reason, when it is damaged, foreign or of another version.",
 )  # fmt: skip
 RECOVER = Request(
-    "base/recover", m.RecoverRequest, m.RecoverReply, "base",
+    "base/recover", m.RecoverRequest, m.RecoverReply,
     "Put a Create that left its mode back into it; answered by the real base.",
     timeout_s=3.0,
 )  # fmt: skip
 SERVOS = Request(
-    "{service}/servos", m.ServoRequest, m.ServoReply, "*",
+    "{service}/servos", m.ServoRequest, m.ServoReply,
     "Clear faults, relax or hold joints; answered by each real servo network.",
     timeout_s=3.0,
 )  # fmt: skip
 ABOUT = Request(
-    "{service}/about", m.AboutRequest, m.AboutReply, "*",
+    "{service}/about", m.AboutRequest, m.AboutReply,
     "What a service is and what it was started with: answered by every service.",
 )  # fmt: skip
 
 REQUESTS: tuple[Request[Any, Any], ...] = (RUN, CANCEL, OBJECTS, ESTOP, LEARNED, RECOVER, SERVOS, ABOUT)
-
-HARDWARE = ("kinect", "base", "arm", "hand")
-"""The services whose keys the simulator impersonates."""
-STOPPABLE = ("base", "arm", "hand")
-"""The hardware services that move something, and so answer the emergency stop."""
-
-
-def topic_named(name: str) -> Topic[Any] | None:
-    """The row for a topic's name (key without the robot), per-service rows resolved; None when unknown."""
-    for topic in TOPICS:
-        if topic.name == name:
-            return topic
-    service, _, rest = name.partition("/")
-    for topic in TOPICS:
-        if topic.name == f"{{service}}/{rest}":
-            return topic.of(service)
-    return None

@@ -6,13 +6,13 @@ import asyncio
 import os
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Callable
 from contextlib import suppress
 from typing import IO
 
-from cocoro.component import Process
+from cocoro import child
+from cocoro.component import Component
 from cocoro.errors import ConfigError
 from cocoro.vigil import RECOVERY_S, Vigil
 from deploy.launch import CRASHED, MISCONFIGURED, REFUSED
@@ -43,7 +43,7 @@ class Child:
     """`start`, then `keep` for ever, then `stop`. `tell` gets what people should know, a line at a time."""
 
     def __init__(
-        self, row: Process, run_dir: RunDir, parent_fd: int, tell: Callable[[str], None], vigil: Vigil
+        self, row: Component, run_dir: RunDir, parent_fd: int, tell: Callable[[str], None], vigil: Vigil
     ) -> None:
         """`vigil` knows whether this process was itself asleep."""
         self.row = row
@@ -166,8 +166,6 @@ class Child:
     # --- the process ------------------------------------------------------------------------------
 
     def _spawn(self) -> None:
-        command = [sys.executable, "-P", "-m", "deploy.launch", self.row.name]
-        command += ["--run-dir", str(self._run_dir.path), "--parent-fd", str(self._parent_fd)]
         loop = asyncio.get_running_loop()
         self._alive.clear()
         self._ready.clear()
@@ -175,9 +173,13 @@ class Child:
         self._exit = loop.create_future()
         self._started_s = time.monotonic()
         with self._log() as log:
-            self._process = subprocess.Popen(
-                command,
-                stdin=subprocess.DEVNULL,
+            self._process = child.start(
+                "deploy.launch",
+                self.row.name,
+                "--run-dir",
+                str(self._run_dir.path),
+                "--parent-fd",
+                str(self._parent_fd),
                 stdout=log,
                 stderr=log,
                 env=ENVIRONMENT | os.environ,

@@ -1,104 +1,118 @@
-"""What runs: one table. Profiles name its rows, the supervisor, `top`, the unit files and the budget test read it.
+"""What runs: the union of the project's own components and of those that third parties have installed.
 
-Third parties add rows of their own by the entry point group `cocoro.processes`; the entry point is named as its process
-and points to a `Process` (see `cocoro.component`).
+Profiles name components, the supervisor starts each as a process, and everything else that depends on which components
+there are is derived from their declarations here.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from functools import cache
+from typing import Any
 
 from cocoro.bus.shared import need_bytes
-from cocoro.component import Process
+from cocoro.component import Component
 from cocoro.errors import ConfigError
+from cocoro.installed import third_parties
+from cocoro.topics import ANY, Topic
+from services.base.component import BASE
+from services.capture.component import CAPTURE
+from services.executive.component import EXECUTIVE
+from services.kinect.component import KINECT
+from services.perception.component import PERCEPTION
+from services.planning.component import PLANNING
+from services.servos.component import SERVOS
+from sim.component import SIM
+from sim.wire.component import WIRE
 
-GROUP = "cocoro.processes"
-"""The entry point group of third parties' rows."""
 BACKOFF_LIMIT_S = 10.0
 SETTLED_S = 30.0
-"""A process that has been ready for so long is forgiven its restarts."""
+"""A process that has been ready for this long starts again without the waits of its earlier restarts."""
 
-PROCESSES: tuple[Process, ...] = (
-    Process(
-        name="sim", module="sim.service", services=("kinect", "base", "arm", "hand"),
-        doc="The simulated robot: stands in for all hardware services, key for key.",
-        frames="publishes", start_s=60.0, cpu_share=1.0, rss_mb=600.0,
-    ),
-    Process(
-        name="kinect", module="services.kinect.service", services=("kinect",),
-        doc="The Kinect: colour and raw depth.",
-        frames="publishes", restart="always", cpu_share=0.3, rss_mb=200.0,
-    ),
-    Process(
-        name="base", module="services.base.service", services=("base",),
-        doc="The Create: wheels, bumpers, cliffs, battery. Small, because a Create keeps driving when its driver dies.",
-        restart="always", backoff_s=0.1, nice=-10, cpu_share=0.15,
-    ),
-    Process(
-        name="servos", module="services.servos.service", services=("arm", "hand"),
-        doc="Both Dynamixel networks: neck and arm, hand.",
-        restart="always", backoff_s=0.1, nice=-10, cpu_share=0.25,
-    ),
-    Process(
-        name="perception", module="services.perception.service", services=("perception",),
-        doc="Finds the known objects in each frame.",
-        frames="reads", nice=5, cpu_share=0.5, rss_mb=250.0,
-    ),
-    Process(
-        name="planning", module="services.planning.service", services=("planning",),
-        doc="Turns intent and the latest state into head, wheel, arm and hand commands, 50 times a second.",
-        cpu_share=0.4, rss_mb=200.0,
-    ),
-    Process(
-        name="executive", module="services.executive.service", services=("executive",),
-        doc="Runs the tasks: fetch, park, put-down; keeps the emergency stop's latch.",
-        cpu_share=0.2,
-    ),
-    Process(
-        name="capture", module="services.capture.service", services=("capture",),
-        doc="Records the mesh into MCAP files.",
-        frames="reads", nice=10, cpu_share=0.3, rss_mb=300.0,
-    ),
-    Process(
-        name="wire", module="sim.wire.service", services=("kinect",), settings="sim",
-        doc="The simulated robot behind wires: the camera, and ports with base and servos at their other ends.",
-        frames="publishes", start_s=60.0, cpu_share=1.0, rss_mb=600.0,
-    ),
-)  # fmt: skip
+COMPONENTS: tuple[Component, ...] = (SIM, KINECT, BASE, SERVOS, PERCEPTION, PLANNING, EXECUTIVE, CAPTURE, WIRE)
+"""The project's own."""
 
 
 @cache
-def table() -> dict[str, Process]:
-    """All rows by name, third parties' included. Raises ConfigError for a row that is no row or takes a taken name."""
-    from importlib.metadata import entry_points  # takes a while to import, and not everyone needs it
-
-    rows = {process.name: process for process in PROCESSES}
-    for point in entry_points(group=GROUP):
-        where = f"entry point {point.name!r} of {point.dist.name if point.dist else 'an unknown distribution'}"
-        if point.name in rows:
-            raise ConfigError(f"{where}: there is a process of that name already")
-        try:
-            row = point.load()
-        except Exception as error:
-            raise ConfigError(f"{where} cannot be loaded: {type(error).__name__}: {error}") from error
-        if not isinstance(row, Process) or row.name != point.name:
-            raise ConfigError(f"{where}: {point.value} is not a Process named {point.name!r}")
-        rows[row.name] = row
-    return rows
+def table() -> dict[str, Component]:
+    """All components by name. Raises ConfigError for a third party's that is faulty or takes a taken name."""
+    third_parties().check()
+    known = {component.name: component for component in COMPONENTS}
+    for name, component in third_parties().components.items():
+        if name in known:
+            raise ConfigError(f"{component.module} of a third party: there is a component named {name!r} already")
+        known[name] = component
+    return known
 
 
-def shared_bytes(rows: Iterable[Process]) -> int:
-    """The room in the machine's shared memory that these processes take for their frames."""
-    kinds = [row.frames for row in rows]
-    return need_bytes(publishers=kinds.count("publishes"), readers=kinds.count("reads"))
+def components() -> tuple[Component, ...]:
+    """All components that can be used; unlike `table` this leaves out third parties' faulty ones."""
+    own = {component.name for component in COMPONENTS}
+    return COMPONENTS + tuple(one for one in third_parties().components.values() if one.name not in own)
 
 
-def named(name: str) -> Process:
-    """A row. Raises ConfigError that lists the known ones."""
-    for process in PROCESSES:  # spares the search for entry points
-        if process.name == name:
-            return process
+def named(name: str) -> Component:
+    """The component of that name. Raises ConfigError that lists the known ones."""
+    for component in COMPONENTS:  # spares the search for entry points
+        if component.name == name:
+            return component
     if name not in table():
         raise ConfigError(f"there is no process {name!r}; known are {', '.join(table())}")
     return table()[name]
+
+
+def by_module(module: str) -> Component | None:
+    """The component whose implementation a capture names; None when there is none here."""
+    return next((component for component in components() if component.module == module), None)
+
+
+# --- derived from the declarations ----------------------------------------------------------------
+
+
+def hardware() -> tuple[str, ...]:
+    """The services that drive devices, whose keys the simulator impersonates."""
+    return _distinct(service for component in components() if component.hardware for service in component.services)
+
+
+def stoppable() -> tuple[str, ...]:
+    """The services that move something, and so answer the emergency stop."""
+    return _distinct(service for component in components() for service in component.moves)
+
+
+def publishers(topic: Topic[Any], among: Iterable[Component] | None = None) -> tuple[str, ...]:
+    """The services that publish a topic, by all components or `among` some; `ANY` for a per-service row."""
+    if topic.per_service:
+        return (ANY,)
+    found = ((one, declared) for one in among or components() for declared in one.all_publishes())
+    return _distinct(one.speaker(topic) for one, declared in found if declared.name == topic.name)
+
+
+def readers(topic: Topic[Any], among: Iterable[Component] | None = None) -> tuple[str, ...]:
+    """The components that read a topic, by name; a recorder reads everything, and is not among them."""
+    return _distinct(one.name for one in among or components() if topic.name in {read.name for read in one.reads})
+
+
+def needs(name: str, started: Iterable[Component] = ()) -> tuple[str, ...]:
+    """The services that a component cannot work without: those that it declares, and what these need in turn, each by
+    the component that provides it among `started`, else by any."""
+    providers = {service: one for one in (*reversed(components()), *started) for service in one.services}
+    needed: set[str] = set()
+    waiting = list(named(name).needs)
+    while waiting:
+        service = waiting.pop()
+        if service not in needed:
+            needed.add(service)
+            waiting += providers[service].needs if service in providers else ()
+    needed -= set(named(name).services)
+    in_order = (*(service for one in components() for service in one.services), *sorted(needed))
+    return tuple(service for service in _distinct(in_order) if service in needed)
+
+
+def shared_bytes(started: Iterable[Component]) -> int:
+    """The shared memory of the machine that these components take for their frames, bytes."""
+    kinds = [component.frames for component in started]
+    return need_bytes(publishers=kinds.count("publishes"), readers=kinds.count("reads"))
+
+
+def _distinct(names: Iterable[str]) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(names))

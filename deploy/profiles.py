@@ -23,9 +23,9 @@ from typing import Annotated, Any, Literal, TypeVar
 import msgspec
 from msgspec import Meta
 
-from cocoro.component import Process
+from cocoro.component import Component
 from cocoro.errors import ConfigError
-from deploy.processes import named
+from deploy.processes import named, needs
 from deploy.rundir import Mesh
 
 C = TypeVar("C")
@@ -61,7 +61,7 @@ class Profile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     mesh: Mesh = Mesh()
     service: dict[Name, dict[str, Any]] = {}
 
-    def rows(self) -> tuple[Process, ...]:
+    def rows(self) -> tuple[Component, ...]:
         return tuple(named(name) for name in self.processes)
 
     def services(self) -> tuple[str, ...]:
@@ -74,8 +74,11 @@ class Profile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     def config(self, process: str, kind: type[C]) -> C:
         """A process's table as its Config. Raises ConfigError that names profile, table and field."""
         table = {k: v for k, v in self._table(process).items() if k not in Launch.__struct_fields__}
-        if self.objects is not None and "objects" in getattr(kind, "__struct_fields__", ()):
+        fields = getattr(kind, "__struct_fields__", ())
+        if self.objects is not None and "objects" in fields:
             table = {"objects": self.objects} | table
+        if "needed" in fields:
+            table = {"needed": needs(process, self.rows())} | table
         return self._convert(process, table, kind)
 
     def _table(self, process: str) -> dict[str, Any]:

@@ -25,12 +25,11 @@ from cocoro.bus import shared
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.errors import CocoroError, ConfigError, RefusedError
 from cocoro.stop.record import latch_dir, prepare
-from cocoro.topics import STOPPABLE
 from cocoro.vigil import Vigil
 from deploy import robot_time, service_manager
 from deploy.child import Child, StartError
 from deploy.launch import CRASHED
-from deploy.processes import shared_bytes
+from deploy.processes import shared_bytes, stoppable
 from deploy.profiles import Profile, from_data
 from deploy.quit import quit_process
 from deploy.rundir import RunDir
@@ -162,7 +161,7 @@ class Supervisor:
 
     def _prepare_latches(self) -> None:
         """See to it that the emergency stop's latch has its place on the disk before anything moves."""
-        services = {*self._profile.services()} & {*STOPPABLE, "executive"}
+        services = {*self._profile.services()} & {*stoppable(), "executive"}
         folder = latch_dir(self._profile.robot)
         try:
             records = prepare(folder, services, by_hand=self._by_hand)

@@ -13,7 +13,7 @@ import numpy as np
 
 from cocoro.arrays import FloatArray
 from cocoro.robot import Robot
-from sim.visual import Shape
+from sim.render.interface import Shape
 
 PAD_GAP_M = 0.072
 """Between the pads at claw angle 0, where they are parallel: a can of 66 mm is held within 3 degrees of it."""
@@ -93,7 +93,7 @@ class Extra:
 
 
 @dataclass(frozen=True)
-class Body:
+class SimBody:
     """All parts by link, the links that the table lacks, and what rubs."""
 
     parts: dict[str, list[Part]]
@@ -105,7 +105,7 @@ class Body:
         return sum(part.mass_kg for parts in self.parts.values() for part in parts)
 
 
-def calliope_body(robot: Robot) -> Body:
+def calliope_body(robot: Robot) -> SimBody:
     """The Calliope's parts; the chassis takes what is left of the whole mass.
 
     The arm's masses give the static shoulder torque of the design: 1.6 N m at full reach, empty.
@@ -164,7 +164,7 @@ def calliope_body(robot: Robot) -> Body:
         Part("battery", "box", (0.08, 0.16, 0.05), (-0.10, 0, centre_z), _DARK, 0.9, solid=False, seen=False),
     ]
     arm_foot = (float(shoulder_x), float(arm_y), (top_m + arm_z - 0.028) / 2)
-    return Body(
+    return SimBody(
         parts,
         [
             Extra("mount", (middle[0], middle[1], middle[2])),

@@ -15,7 +15,7 @@ from cocoro.errors import ConfigError
 from cocoro.messages import Frame
 from cocoro.robot import Robot
 from sim.realism import Sensors
-from sim.render import Light, Renderer
+from sim.render import Lighting, Renderer
 from sim.seeds import stream
 from sim.sensor_effects import (
     ByteNoise,
@@ -43,7 +43,7 @@ DRIFT_S = 5.0
 """From one extreme to the other."""
 
 
-class Kinect:
+class SimKinect:
     """Takes frames of the world that a renderer draws.
 
     Args:
@@ -87,7 +87,7 @@ class Kinect:
             self._exposure = Drift(rng, EXPOSURE_DRIFT, DRIFT_S)
             self._white_balance = Drift(rng, WHITE_BALANCE_DRIFT, DRIFT_S)
 
-    def capture(self, poses: FloatArray, camera_pose: FloatArray, stamp_ns: int, light: Light) -> Frame:
+    def capture(self, poses: FloatArray, camera_pose: FloatArray, stamp_ns: int, light: Lighting) -> Frame:
         """The frame whose exposure has its middle at `stamp_ns`.
 
         Args:

@@ -19,18 +19,18 @@ BUMPER_OVERLAP_DEG = 20.0
 """Pressed within so much of straight ahead, both of its switches close."""
 ROLLS_ON_FLOOR = frozenset({"wheel_left", "wheel_right", "caster_front", "caster_rear"})
 
-Pair = tuple[str, str]
+ContactPair = tuple[str, str]
 
 
 def touching_pairs(
     points: Iterable[tuple[Any, ...]], robot_body: int, link_names: Mapping[int, str], names: Mapping[int, str]
-) -> tuple[frozenset[Pair], list[tuple[float, float, float]]]:
+) -> tuple[frozenset[ContactPair], list[tuple[float, float, float]]]:
     """The names that press on each other, robot links first (of two, the one further from the root), and where
     something presses on the chassis.
 
     A pair that is merely near is none: only contacts with a force count.
     """
-    pairs: set[Pair] = set()
+    pairs: set[ContactPair] = set()
     on_chassis: list[tuple[float, float, float]] = []
     for point in points:
         if point[9] <= 0.0:
@@ -58,7 +58,7 @@ def bumper(points_m: Iterable[tuple[float, float, float]], body_pose: FloatArray
     return Bumper(left, right)
 
 
-def collisions(pairs: Iterable[Pair], links: frozenset[str], objects: frozenset[str]) -> tuple[str, ...]:
+def collisions(pairs: Iterable[ContactPair], links: frozenset[str], objects: frozenset[str]) -> tuple[str, ...]:
     """The robot's contacts that are no part of its work: not wheels on the floor, not claws on an object,
     not the claws closed on each other. 'link~other', sorted."""
     claws = {link for link in links if link.startswith("claw_")}

@@ -15,7 +15,7 @@ from cocoro.robot import Robot
 from cocoro.units import Quaternion, Vec3
 from sim.body import CHASSIS
 from sim.bullet import Bullet
-from sim.model import WHEELS, Model, write_urdf
+from sim.model import WHEELS, RobotModel, write_urdf
 from sim.rigid import rotation, rotations
 from sim.scene import Start
 from sim.servos import Drive
@@ -41,7 +41,7 @@ class Mechanism:
     """Loads the robot with its wheels on the floor at the start pose, the servos at the given angles."""
 
     def __init__(
-        self, bullet: Bullet, robot: Robot, model: Model, start: Start, angles_rad: Mapping[str, float]
+        self, bullet: Bullet, robot: Robot, model: RobotModel, start: Start, angles_rad: Mapping[str, float]
     ) -> None:
         self._bullet = bullet
         half_turn = start.yaw_rad / 2
@@ -132,7 +132,7 @@ class Mechanism:
         poses[-1] = self.root_pose()
         return poses
 
-    def _prepare(self, model: Model, angles_rad: Mapping[str, float]) -> None:
+    def _prepare(self, model: RobotModel, angles_rad: Mapping[str, float]) -> None:
         bullet = self._bullet
         for link, friction in model.body.friction.items():
             bullet.changeDynamics(

@@ -12,8 +12,8 @@ import numpy as np
 from cocoro.arrays import FloatArray
 from cocoro.kinematics import Link, turn_z
 from cocoro.robot import Robot
-from sim.body import CHASSIS, Body, Extra, Part, calliope_body
-from sim.visual import Visual
+from sim.body import CHASSIS, Extra, Part, SimBody, calliope_body
+from sim.render.interface import Visual
 
 WHEELS = ("wheel_left", "wheel_right")
 
@@ -41,13 +41,13 @@ _FIXED = frozenset({CHASSIS, "mount", "riser", *WHEELS, "caster_front", "caster_
 
 
 @dataclass(frozen=True)
-class Model:
+class RobotModel:
     """What the simulator loads, and how its links carry the description's."""
 
     urdf: str
     links: tuple[str, ...]
     """The root first. PyBullet numbers them in its own way: ask it for the names."""
-    body: Body
+    body: SimBody
     carried: dict[str, tuple[str, FloatArray]]
     """For every link of the description: the URDF link that carries it and the fixed transform between."""
 
@@ -69,7 +69,7 @@ class Model:
         return found
 
 
-def build_model(robot: Robot) -> Model:
+def build_model(robot: Robot) -> RobotModel:
     """The URDF of the robot. Its forward kinematics are those of the description.
 
     Links without a joint of their own are merged into the link that carries them: fewer links, same poses.
@@ -100,10 +100,10 @@ def build_model(robot: Robot) -> Model:
         + joints
         + ["</robot>", ""]
     )
-    return Model(text, tuple(links), body, carried)
+    return RobotModel(text, tuple(links), body, carried)
 
 
-def write_urdf(model: Model, folder: Path) -> Path:
+def write_urdf(model: RobotModel, folder: Path) -> Path:
     """Write the file into a folder of the process's own: two processes must not share one."""
     path = folder / "robot.urdf"
     path.write_text(model.urdf)

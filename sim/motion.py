@@ -20,7 +20,7 @@ from sim.world import World
 _ROW = struct.Struct("<qqddd?")
 
 
-class Motion(NamedTuple):
+class MotionRow(NamedTuple):
     """One step of the physics."""
 
     sim_ns: int
@@ -87,10 +87,10 @@ class MotionWriter:
         return float(pose[0, 3]), float(pose[1, 3]), atan2(pose[1, 0], pose[0, 0])
 
 
-def read_motion(path: Path, after: int = 0) -> list[Motion]:
+def read_motion(path: Path, after: int = 0) -> list[MotionRow]:
     """The rows of a file from a row's number on, in order; what is being written when it is read is left out."""
     with path.open("rb") as file:
         file.seek(after * _ROW.size)
         data = file.read()
     whole = len(data) // _ROW.size * _ROW.size
-    return [Motion(*row) for row in _ROW.iter_unpack(data[:whole])]
+    return [MotionRow(*row) for row in _ROW.iter_unpack(data[:whole])]

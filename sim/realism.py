@@ -5,13 +5,15 @@ The camera's own noise is the camera's; latency is the service's.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from math import exp, sqrt
-from typing import Literal
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from math import exp, radians, sqrt
+from typing import Any, Literal
 
 import numpy as np
 
 from cocoro.arrays import FloatArray
+from cocoro.robot import Robot
 from sim.seeds import stream
 
 Sensors = Literal["ideal", "real"]
@@ -65,3 +67,97 @@ class Wander:
         """The next values, shape (channels,), `dt_s` later."""
         self.values = self._keep * self.values + self._add * self._draws.standard_normal(self.values.size)
         return self.values
+
+
+BodyKind = Literal["nominal", "worn"]
+
+LENGTH_M = 0.005
+"""Each length of the arm's links is off by up to so much."""
+ZERO_DEG = 2.0
+"""Each joint of neck, arm and wrist has its zero off by up to so much."""
+CAMERA_M, CAMERA_DEG = 0.005, 1.0
+"""The camera is mounted off its place, and turned about some axis, by up to so much."""
+MARKER_M = 0.005
+"""The marker is glued on exactly so far from its drawn place, in a direction of its own."""
+WHEELS_M = 0.008
+"""The wheels are up to so much nearer together or further apart."""
+LOOSENING_DEG_PER_MIN = 0.03
+"""Each arm joint's shaft slips on its servo at up to so much, always the same way."""
+BEND_RAD = 0.15
+"""A bent forearm: 3 cm at the marker, which is 0.2 m from the elbow."""
+
+ARM_LINKS = ("arm_base", "shoulder", "elbow", "wrist_pitch", "wrist_roll")
+LOOSE_JOINTS = ("arm_base", "shoulder", "elbow", "wrist_pitch")
+OFFSET_LINKS = ("neck_pan", "neck_tilt", *ARM_LINKS)
+
+
+@dataclass(frozen=True)
+class Wear:
+    """A body as it really is."""
+
+    robot: Robot
+    """The description that the drawing should have been."""
+    slip_radps: Mapping[str, float] = field(default_factory=dict)
+    """By joint: how fast the joint slips on its servo's shaft."""
+    bend_s: float | None = None
+    """When somebody bends the forearm; None is never."""
+
+    def slip_rad(self, joint: str, time_s: float) -> float:
+        """By how much a joint stands beyond the angle that its servo's shaft has."""
+        bent = self.bend_s is not None and time_s >= self.bend_s and joint == "elbow"
+        return self.slip_radps.get(joint, 0.0) * time_s + (BEND_RAD if bent else 0.0)
+
+
+def body_of(robot: Robot, kind: BodyKind, seed: int, bend_s: float | None = None) -> Wear:
+    """The body of a kind that a robot of this drawing has in the run of that seed."""
+    if kind == "nominal":
+        return Wear(robot, bend_s=bend_s)
+    rng = stream(seed, "loosening")
+    limit = radians(LOOSENING_DEG_PER_MIN) / 60.0
+    slips = {joint: float(rate) for joint, rate in zip(LOOSE_JOINTS, rng.uniform(-limit, limit, 4), strict=True)}
+    return Wear(_worn(robot, stream(seed, "wear")), slips, bend_s)
+
+
+def _worn(robot: Robot, rng: np.random.Generator) -> Robot:
+    data = robot.to_data()
+    rows = {row["name"]: row for row in data["link"]}
+    for name in ARM_LINKS:
+        for length in ("d_m", "r_m"):
+            if rows[name][length] != 0.0:
+                rows[name][length] += float(rng.uniform(-LENGTH_M, LENGTH_M))
+    for name in OFFSET_LINKS:
+        rows[name]["offset_deg"] += float(rng.uniform(-ZERO_DEG, ZERO_DEG))
+    shift_m = _direction(rng) * rng.uniform(0.0, CAMERA_M)
+    turn_rad = _direction(rng) * radians(rng.uniform(0.0, CAMERA_DEG))
+    camera = rows["camera"]
+    data["link"] = [row for row in data["link"] if row["name"] != "camera"]
+    for row in _displacement("camera_mount_worn", camera["parent"], shift_m, turn_rad):
+        data["link"].append(row)
+        camera["parent"] = row["name"]
+    data["link"].append(camera)
+    marker = np.array(data["marker"]["position_m"]) + MARKER_M * _direction(rng)
+    data["marker"]["position_m"] = tuple(marker.tolist())
+    data["base"]["wheel_separation_m"] += float(rng.uniform(-WHEELS_M, WHEELS_M))
+    return Robot.from_data(data, "worn body")
+
+
+def _direction(rng: np.random.Generator) -> FloatArray:
+    """A direction in space, all alike; shape (3,)."""
+    vector: FloatArray = rng.standard_normal(3)
+    return vector / float(np.linalg.norm(vector))
+
+
+def _displacement(name: str, parent: str, shift_m: FloatArray, turn_rad: FloatArray) -> Iterator[dict[str, Any]]:
+    """Fixed links that shift and turn what hangs on them, along and about x, y and z in turn. A row of the kinematic
+    table moves along its x and z alone, so y is the x of a row that is turned by a quarter, and then back."""
+    (x, y, z), (rx, ry, rz) = shift_m.tolist(), np.degrees(turn_rad).tolist()
+    for number, row in enumerate(
+        (
+            {"d_m": z, "r_m": x, "alpha_deg": rx},
+            {"theta_deg": 90.0 + rz, "r_m": y, "alpha_deg": ry},
+            {"theta_deg": -90.0},
+        )
+    ):
+        link = {"name": f"{name}_{number}", "parent": parent, "joint": None, "offset_deg": 0.0}
+        yield {**link, "theta_deg": 0.0, "d_m": 0.0, "alpha_deg": 0.0, "r_m": 0.0, **row}
+        parent = f"{name}_{number}"

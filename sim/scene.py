@@ -17,7 +17,7 @@ from cocoro.objects import Catalogue
 from cocoro.units import Vec3
 from sim.seeds import stream
 
-Place = Annotated[tuple[float, ...], Meta(min_length=2, max_length=3)]
+ScenePoint = Annotated[tuple[float, ...], Meta(min_length=2, max_length=3)]
 Shape = Literal["cylinder", "sphere", "box"]
 
 _COLOURS: dict[str, Vec3] = {
@@ -97,10 +97,10 @@ class SceneObject(_Body, frozen=True, kw_only=True):
     """Something to fetch, follow or knock over."""
 
     label: str
-    position_m: Place
+    position_m: ScenePoint
     """[x, y] stands on the floor, [x, y, z] has its centre at z; in the robot's frame at the start."""
     mass_kg: float = 0.2
-    path_m: tuple[Place, ...] = ()
+    path_m: tuple[ScenePoint, ...] = ()
     """Waypoints after `position_m`, in the same frame; with two numbers the height stays what it was."""
     speed_mps: float = 0.0
     path_loop: bool = False
@@ -303,7 +303,7 @@ def _numbers(value: Any) -> list[float]:
     return [float(value)] if isinstance(value, (int, float)) and not isinstance(value, bool) else []
 
 
-def _at(place: Place, height_m: float) -> Vec3:
+def _at(place: ScenePoint, height_m: float) -> Vec3:
     return place[0], place[1], place[2] if len(place) == 3 else height_m
 
 

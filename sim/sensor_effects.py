@@ -93,7 +93,7 @@ class Drift:
         return self._size * (0.7 * slow + 0.3 * fast)
 
 
-class Motion(NamedTuple):
+class CameraMotion(NamedTuple):
     """How the camera moves while the shutter is open, in its own frame."""
 
     rotation_rad: FloatArray
@@ -110,17 +110,17 @@ class Motion(NamedTuple):
         return pixels
 
 
-def motion_between(before: FloatArray, now: FloatArray, exposures: float) -> Motion:
+def motion_between(before: FloatArray, now: FloatArray, exposures: float) -> CameraMotion:
     """The motion of one exposure, from the camera's poses at the previous frame and at this one.
 
     `exposures` is the exposure's length as a share of the time between the two.
     """
     step = before[:3, :3].T @ now[:3, :3]
     shift = before[:3, :3].T @ (now[:3, 3] - before[:3, 3])
-    return Motion(exposures * _rodrigues(step).reshape(3), exposures * shift)
+    return CameraMotion(exposures * _rodrigues(step).reshape(3), exposures * shift)
 
 
-def blur_along_motion(image: ImageArray, motion: Motion, depth_m: Float32Array, camera: Camera) -> ImageArray:
+def blur_along_motion(image: ImageArray, motion: CameraMotion, depth_m: Float32Array, camera: Camera) -> ImageArray:
     """The mean of the picture over the exposure, each pixel smeared along its own path.
 
     The path is that of a plane facing the camera at the picture's median depth: exact for the camera's

@@ -15,20 +15,19 @@ from msgspec import Meta
 
 from cocoro import topics
 from cocoro.clock import NS, Clock, FollowedClock
+from cocoro.component import Implementation
 from cocoro.latch import LatchKeeper
 from cocoro.messages import BaseCommand, BaseState, ClockTick, LatchState, Message, ServoCommand
 from cocoro.node import Node
 from cocoro.publisher import Publisher
 from cocoro.robot import Robot
-from sim.camera import Kinect
+from sim.camera import SimKinect
+from sim.component import SIM
 from sim.motion import MotionWriter
 from sim.random_scene import find_scene
-from sim.realism import BodyRealism
+from sim.realism import BodyKind, BodyRealism, body_of
 from sim.render import make_renderer
-from sim.wear import BodyKind, body_of
 from sim.world import Motors, World, services_motors
-
-__all__ = ["Config", "run"]
 
 TICK_HZ = 120
 """The clock key's rate; the physics runs whole steps between ticks."""
@@ -39,7 +38,7 @@ LATE_S = 0.1
 """Further behind real time than this, simulated time slips instead of catching up."""
 
 
-class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class SimConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     scene: str = "paper"
     target: str = ""
     """An object that a random scene must have."""
@@ -100,7 +99,7 @@ class _Every:
 class Simulator:
     """Steps the world and exchanges its commands, states and frames with the mesh."""
 
-    def __init__(self, node: Node, config: Config, world: World, kinect: Kinect) -> None:
+    def __init__(self, node: Node, config: SimConfig, world: World, kinect: SimKinect) -> None:
         self._config = config
         self._world = world
         self._kinect = kinect
@@ -191,12 +190,12 @@ class Simulator:
             self._clock.tick(sent.stamp_ns, sent.incarnation, self.rate)
 
 
-async def run(node: Node, config: Config) -> None:
+async def run(node: Node, config: SimConfig) -> None:
     """Simulate for ever: in real time, or as the loop's virtual time goes."""
     with make_world(node.robot, config) as world:
         simulator = Simulator(node, config, world, make_kinect(node.robot, config, world))
         async with AsyncExitStack() as stack:
-            hardware = [await stack.enter_async_context(node.sibling(name)) for name in topics.HARDWARE]
+            hardware = [await stack.enter_async_context(node.sibling(name)) for name in SIM.services]
             simulator.connect(*hardware)
             simulator.tell_time()  # before anybody is ready, so that nobody begins anything in a time that is over
             for part in (node, *hardware):
@@ -204,9 +203,12 @@ async def run(node: Node, config: Config) -> None:
             await keep_going(node, config, simulator)
 
 
+implementation = Implementation(SimConfig, run)
+
+
 def make_world(
     robot: Robot,
-    config: Config,
+    config: SimConfig,
     motors: Callable[[Robot, Mapping[str, float], BodyRealism], Motors] = services_motors,
 ) -> World:
     """The scene with the robot in it."""
@@ -221,13 +223,15 @@ def make_world(
     )
 
 
-def make_kinect(robot: Robot, config: Config, world: World) -> Kinect:
+def make_kinect(robot: Robot, config: SimConfig, world: World) -> SimKinect:
     camera = robot.camera.scaled(config.width, config.height)
     renderer = make_renderer(world.visuals, camera, config.renderer)
-    return Kinect(robot, renderer, sensors=config.sensors, seed=config.seed, width=config.width, height=config.height)
+    return SimKinect(
+        robot, renderer, sensors=config.sensors, seed=config.seed, width=config.width, height=config.height
+    )
 
 
-async def keep_going(node: Node, config: Config, simulator: Simulator) -> None:
+async def keep_going(node: Node, config: SimConfig, simulator: Simulator) -> None:
     """Tick for ever, and with it the clock."""
     with ExitStack() as stack:
         if config.motion:

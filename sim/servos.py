@@ -1,6 +1,6 @@
 """The servos as the wire shows them: positions in counts, limits of speed and torque, expiry, overload.
 
-Pure: one `Servo` a joint, told the time, the joint's true angle and the motor's torque at every step, and asked
+Pure: one `SimServo` a joint, told the time, the joint's true angle and the motor's torque at every step, and asked
 what the motor is to do. Nothing here knows the physics engine.
 """
 
@@ -34,7 +34,7 @@ class Drive(NamedTuple):
     max_torque_nm: float
 
 
-class Play:
+class Backlash:
     """Backlash: the measured shaft follows the joint only where the joint pushes it along.
 
     Derived: the play (hysteresis) operator. With `width_rad` 0 the two are one.
@@ -51,7 +51,7 @@ class Play:
         return self.shaft_rad
 
 
-class Servo:
+class SimServo:
     """One servo: what it was told, what it measures, what its motor does."""
 
     def __init__(self, joint: Joint, angle_rad: float, backlash_rad: float = 0.0) -> None:
@@ -59,7 +59,7 @@ class Servo:
         self.goal_count = joint.to_count(angle_rad)
         self.speed_limit_radps = HOLD_SPEED_RADPS
         self.overloaded = False
-        self._play = Play(backlash_rad, angle_rad)
+        self._play = Backlash(backlash_rad, angle_rad)
         self.angle_rad = angle_rad
         """True angle of the joint."""
         self.slip_rad = 0.0
@@ -148,7 +148,7 @@ class Servo:
         self.goal_count = self.count
 
 
-class ServoNetwork:
+class SimServoNetwork:
     """One bus of servos: commands in, states out, the emergency stop and the expiry of commands.
 
     An arm or neck joint that was not named again for `timeout_s` holds where it is unless it has arrived; with
@@ -164,7 +164,7 @@ class ServoNetwork:
         timeout_s: float,
         backlash_deg: float = 0.0,
     ) -> None:
-        self.servos = {name: Servo(joint, angles_rad[name], radians(backlash_deg)) for name, joint in joints.items()}
+        self.servos = {name: SimServo(joint, angles_rad[name], radians(backlash_deg)) for name, joint in joints.items()}
         self.latch: LatchState = "released"
         self._keeps_goal = keeps_goal
         self._timeout_ns = round(timeout_s * 1e9)

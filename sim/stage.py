@@ -10,9 +10,9 @@ import numpy as np
 from cocoro.arrays import FloatArray
 from cocoro.units import Vec3
 from sim.bullet import Bullet
+from sim.render.interface import Visual
 from sim.rigid import rotations
 from sim.scene import Obstacle, Scene, SceneObject
-from sim.visual import Visual
 
 FLOOR = "floor"
 CAN_FRICTION = 0.9

@@ -14,16 +14,15 @@ from cocoro.messages import BaseCommand, BaseState, LatchState, ServoCommand, Se
 from cocoro.robot import Robot
 from sim.base import Bumper, MobileBase
 from sim.bullet import Bullet
-from sim.contacts import Pair, bumper, collisions, touching_pairs
+from sim.contacts import ContactPair, bumper, collisions, touching_pairs
 from sim.mechanism import Mechanism
 from sim.model import build_model
-from sim.realism import REALISM, BodyRealism, Sensors, Wander, wheel_scales
+from sim.realism import REALISM, BodyRealism, Sensors, Wander, Wear, wheel_scales
+from sim.render.interface import Visual
 from sim.scene import Light, Scene
 from sim.seeds import stream
-from sim.servos import Drive, ServoNetwork
+from sim.servos import Drive, SimServoNetwork
 from sim.stage import Stage
-from sim.visual import Visual
-from sim.wear import Wear
 
 SOLVER_ITERATIONS = 50
 SETTLE_S = 0.5
@@ -34,7 +33,7 @@ CONTACT_MEMORY = 2
 NETWORKS = ("arm", "hand")
 
 
-class Wheels(NamedTuple):
+class WheelMotion(NamedTuple):
     """How the base turns its wheels now."""
 
     speed_mps: float
@@ -47,13 +46,13 @@ class Motors(NamedTuple):
     """What the wheels and joints are driven by, and what measures them."""
 
     base: MobileBase
-    networks: dict[str, ServoNetwork]
+    networks: dict[str, SimServoNetwork]
 
 
 def services_motors(robot: Robot, angles_rad: Mapping[str, float], realism: BodyRealism) -> Motors:
     """Motors that understand messages, as the hardware services do."""
     networks = {
-        name: ServoNetwork(
+        name: SimServoNetwork(
             {joint: robot.joints[joint] for joint in robot.network_joints(name)},
             angles_rad,
             keeps_goal=name == "hand",
@@ -123,7 +122,7 @@ class World:
             sense_s,
         )
         self._rolled_m = [0.0, 0.0]
-        self._contacts: deque[frozenset[Pair]] = deque(maxlen=CONTACT_MEMORY)
+        self._contacts: deque[frozenset[ContactPair]] = deque(maxlen=CONTACT_MEMORY)
         self._pressed = Bumper()
         self._place_visuals()
         self.set_latch("unknown")
@@ -245,10 +244,10 @@ class World:
         """World pose of the body frame: 4 x 4."""
         return self._mechanism.root_pose()
 
-    def wheels(self) -> Wheels:
+    def wheels(self) -> WheelMotion:
         """How the wheels are turned, whatever the base says of it."""
         ramp = self._base.ramp
-        return Wheels(max(abs(ramp.left_mps), abs(ramp.right_mps)), self._base.stopped_by == "no command")
+        return WheelMotion(max(abs(ramp.left_mps), abs(ramp.right_mps)), self._base.stopped_by == "no command")
 
     @property
     def light(self) -> Light:

@@ -140,8 +140,12 @@ async def known(who: Bus, *by: Bus) -> None:
 
 async def appears(bus: Bus, key: str, alive: bool = True) -> None:
     seen = asyncio.Event()
-    with_state = {True: seen.set, False: lambda: None} if alive else {True: lambda: None, False: seen.set}
-    watch = bus.watch_alive(key, lambda _, state: with_state[state]())
+
+    def changed(_key: str, state: bool) -> None:
+        if state == alive:
+            seen.set()
+
+    watch = bus.watch_alive(key, changed)
     await seen.wait()
     watch.close()
 

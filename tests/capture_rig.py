@@ -24,7 +24,7 @@ from services.capture.keys import KeyInfo, QueuedMessage, info_of
 from services.capture.writer import CaptureWriter, Limits
 
 ROBOT = Robot.load()
-STILL = {"odometry_yaw_rad": 0.0, "speed_mps": 0.0, "turn_rate_radps": 0.0}
+STILL: dict[str, Any] = {"odometry_yaw_rad": 0.0, "speed_mps": 0.0, "turn_rate_radps": 0.0}
 
 FOR_EVER = Limits()
 

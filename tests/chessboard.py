@@ -60,7 +60,8 @@ class Painter:
         grey = np.where(inside, np.where(dark, 30.0, 225.0), 120.0)
         fine = grey.reshape(HEIGHT, FINE, WIDTH, FINE).mean(axis=(1, 3))
         noisy = fine[..., None] + self._rng.normal(0.0, 2.0, (HEIGHT, WIDTH, 3))
-        return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
+        picture: ImageArray = np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
+        return picture
 
     def depth(self, rotation: FloatArray, place: FloatArray) -> CodeArray:
         """Of the board before a wall, with a code's noise, as the depth camera sees it."""
@@ -81,7 +82,8 @@ class Painter:
         return points[:, :2] / self._board.square_m, away
 
     def _inside(self, squares: FloatArray) -> BoolArray:
-        return ((squares > -1) & (squares < [self._board.columns, self._board.rows])).all(axis=1)
+        inside: BoolArray = np.all((squares > -1) & (squares < [self._board.columns, self._board.rows]), axis=1)
+        return inside
 
 
 def _grid(fine: int) -> FloatArray:

@@ -230,9 +230,9 @@ def live(case: Case, kept: dict[str, int], narrow: int, counted: int) -> None:
         else:
             os.dup2(fd, number)
     os.closerange(3, counted)
-    sys.stdin = sys.__stdin__ = stream(0, "r", case)  # type: ignore[assignment,misc]
-    sys.stdout = sys.__stdout__ = stream(1, "w", case)  # type: ignore[assignment,misc]
-    sys.stderr = sys.__stderr__ = stream(2, "w", case)  # type: ignore[assignment,misc]
+    sys.stdin = sys.__stdin__ = stream(0, "r", case)  # type: ignore[misc]
+    sys.stdout = sys.__stdout__ = stream(1, "w", case)  # type: ignore[misc]
+    sys.stderr = sys.__stderr__ = stream(2, "w", case)  # type: ignore[misc]
     sys.argv = ["cocoro", *case.arguments]
     signal.signal(signal.SIGINT, signal.SIG_IGN if case.deaf else signal.default_int_handler)
     if case.instead is not None:
@@ -244,7 +244,7 @@ def live(case: Case, kept: dict[str, int], narrow: int, counted: int) -> None:
     from apps.cli.main import run
 
     if case.at_call is not None:
-        signal_at(case, counted)
+        signal_at(case, case.at_call, counted)
     run()
 
 
@@ -304,10 +304,10 @@ def log(*_: object) -> str:
     return ""
 
 
-def signal_at(case: Case, counted: int) -> None:
-    """Have a signal in the nth call of a Python function."""
+def signal_at(case: Case, at_call: int, counted: int) -> None:
+    """Raise a signal in the nth call of a Python function."""
     calls = 0
-    wanted = {case.at_call, case.at_call + LATER if case.again else case.at_call}
+    wanted = {at_call, at_call + LATER if case.again else at_call}
 
     def trace(_frame: FrameType, event: str, _argument: Any) -> None:
         nonlocal calls
@@ -318,7 +318,7 @@ def signal_at(case: Case, counted: int) -> None:
                 if not wanted:
                     sys.setprofile(None)
                 signal.raise_signal(case.number)
-            elif case.at_call < 0:
+            elif at_call < 0:
                 os.pwrite(counted, str(calls).encode(), 0)
 
     sys.setprofile(trace)

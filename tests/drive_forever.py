@@ -11,13 +11,13 @@ from cocoro.clock import RealClock
 from cocoro.messages import BaseCommand, Latch
 from cocoro.node import Node
 from cocoro.robot import Robot
-from services.base.service import Config, run
+from services.base.service import BaseConfig, run
 
 
 async def main(port: str) -> None:
     mesh, clock, robot = LocalMesh(), RealClock(), Robot.load()
     async with Node("base", mesh.join(), clock, robot) as node, Node("other", mesh.join(), clock, robot) as other:
-        other.spawn(run(node, Config(port=port)))
+        other.spawn(run(node, BaseConfig(port=port)))
         async for _ in other.every(50.0):
             other.publish(topics.LATCH, Latch(state="released"))
             other.publish(topics.BASE_COMMAND, BaseCommand(left_mps=0.2, right_mps=0.2))

@@ -25,7 +25,7 @@ from cocoro.messages import (
     TaskState,
 )
 from cocoro.testing import ServiceUnderTest
-from cocoro.topics import HARDWARE, STOPPABLE
+from deploy.processes import hardware, needs, stoppable
 
 
 class Robot:
@@ -39,7 +39,7 @@ class Robot:
         self.holding = False
         self.speed_mps = 0.0
         self.silent = False
-        self.says: dict[str, LatchState] = dict.fromkeys(STOPPABLE, "released")
+        self.says: dict[str, LatchState] = dict.fromkeys(stoppable(), "released")
         self.task_id = ""
         self.asked: list[str] = []
         """The behaviours that were wanted, each once."""
@@ -63,7 +63,7 @@ class Robot:
                 self.service.feed(topics.PLAN, self.status())
 
     def _tell_hardware(self) -> None:
-        for name in STOPPABLE:
+        for name in stoppable():
             if name == "base" and name in self.says:
                 here = {"odometry_m": (0.0, 0.0), "odometry_yaw_rad": 0.0, "turn_rate_radps": 0.0}
                 state = BaseState(**here, speed_mps=self.speed_mps, latch=self.says[name])  # type: ignore[arg-type]
@@ -129,13 +129,13 @@ async def robot(
     clock: Clock | None = None, ready: bool = True, contact: Contact | None = None, **config: Any
 ) -> AsyncIterator[Robot]:
     """A robot whose services all live and whose hardware is released, or (`ready=False`) nothing yet."""
-    under_test = ServiceUnderTest("services.executive.service", config, clock=clock)
+    under_test = ServiceUnderTest("services.executive.service", {"needed": needs("executive")} | config, clock=clock)
     if contact is not None:
         under_test.node.contact = contact
     async with under_test as service:
         robot = Robot(service)
         if ready:
-            service.others_live(*HARDWARE, "perception", "planning")
+            service.others_live(*hardware(), "perception", "planning")
             await service.advance(0.5)
         yield robot
 

@@ -28,11 +28,12 @@ from cocoro.bus.zenoh import ZenohBus
 from cocoro.clock import NS
 from cocoro.messages import AboutRequest, Exchange, Message, TaskReply, TaskRequest, TaskState, Truth
 from cocoro.topics import Topic
+from deploy.processes import hardware
 from deploy.rundir import RunDir, Target
 
 M = TypeVar("M", bound=Message)
 
-SERVICES = (*topics.HARDWARE, "perception", "planning", "executive")
+SERVICES = (*hardware(), "perception", "planning", "executive")
 WATCHED: tuple[Topic[Any], ...] = (
     topics.TRUTH, topics.BASE_STATE, topics.BASE_COMMAND, topics.INTENT, topics.DETECTIONS, topics.PLAN, topics.TASK,
     topics.EXCHANGES.of("base"), *(topics.HEALTH.of(service) for service in SERVICES),

@@ -45,6 +45,7 @@ def payload(topic: Topic[Any], seq: int = 0, incarnation: int = 1, stamp_ns: int
         topics.BASE_COMMAND.name: {"left_mps": 0.1, "right_mps": 0.1},
         topics.BASE_STATE.name: {"odometry_m": (0, 0), "odometry_yaw_rad": 0, "speed_mps": 0, "turn_rate_radps": 0},
     }
-    return msgpack.packb(
+    packed: bytes = msgpack.packb(
         goods.get(topic.name, {}) | {"seq": seq, "incarnation": incarnation, "stamp_ns": stamp_ns} | fields
     )
+    return packed

@@ -8,7 +8,7 @@ from apps.learning.study import Sightings
 from cocoro.arrays import FloatArray
 from cocoro.learning.nominal_model import NominalModel
 from cocoro.robot import Robot
-from sim.wear import body_of
+from sim.realism import body_of
 
 NOISE_M = 0.002
 

@@ -11,13 +11,13 @@ from cocoro.clock import RealClock
 from cocoro.messages import Latch, ServoCommand
 from cocoro.node import Node
 from cocoro.robot import Robot
-from services.servos.service import Config, run
+from services.servos.service import ServosConfig, run
 
 
 async def main(arm: str, hand: str) -> None:
     mesh, clock, robot = LocalMesh(), RealClock(), Robot.load()
     async with Node("servos", mesh.join(), clock, robot) as node, Node("other", mesh.join(), clock, robot) as other:
-        other.spawn(run(node, Config(arm_port=arm, hand_port=hand, reply_s=0.1)))
+        other.spawn(run(node, ServosConfig(arm_port=arm, hand_port=hand, reply_s=0.1)))
         async for _ in other.every(50.0):
             other.publish(topics.LATCH, Latch(state="released"))
             other.publish(topics.ARM_COMMAND, ServoCommand(joints=("elbow",), goal_rad=(2.5,), speed_radps=(0.5,)))

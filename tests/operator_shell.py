@@ -21,18 +21,20 @@ PARTS = """
 import asyncio, os, signal
 from pathlib import Path
 import msgspec
-from cocoro.component import Process
+from cocoro.component import Component
 
-good = Process(name="good", module="parts.good", services=("good",), doc="Does nothing, well.", backoff_s=0.01)
-pair = Process(name="pair", module="parts.good", services=("left", "right"), doc="Two services in one process.")
-dies = Process(name="dies", module="parts.dies", services=("dies",), doc="Crashes at its start.")
-mute = Process(name="mute", module="parts.mute", services=("mute",), doc="Never gets ready.", start_s=0.5)
-slow = Process(name="slow", module="parts.mute", services=("slow",), doc="Takes for ever to get ready.")
-deaf = Process(name="deaf", module="parts.deaf", services=("deaf",), doc="Does not end when told.", stop_s=0.3)
-once = Process(name="once", module="parts.good", services=("once",), doc="Is not restarted.", restart="never")
+good = Component(name="good", module="parts.good", services=("good",), doc="Does nothing, well.", backoff_s=0.01)
+pair = Component(name="pair", module="parts.good", services=("left", "right"), doc="Two services in one process.")
+dies = Component(name="dies", module="parts.dies", services=("dies",), doc="Crashes at its start.")
+mute = Component(name="mute", module="parts.mute", services=("mute",), doc="Never gets ready.", start_s=0.5)
+slow = Component(name="slow", module="parts.mute", services=("slow",), doc="Takes for ever to get ready.")
+deaf = Component(name="deaf", module="parts.deaf", services=("deaf",), doc="Does not end when told.", stop_s=0.3)
+planning = Component(name="planning", module="parts.good", doc="Takes a taken name.")
+once = Component(name="once", module="parts.good", services=("once",), doc="Is not restarted.", restart="never")
 """
 GOOD = """
 import asyncio, msgspec
+from cocoro.component import Implementation
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     pace_hz: float = 1.0
 async def run(node, config):
@@ -40,23 +42,29 @@ async def run(node, config):
     for part in (node, *siblings):
         part.ready()
     await asyncio.Event().wait()
+implementation = Implementation(Config, run)
 """
 DIES = """
 import msgspec
+from cocoro.component import Implementation
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     pass
 async def run(node, config):
     raise RuntimeError("the motor is on fire")
+implementation = Implementation(Config, run)
 """
 MUTE = """
 import asyncio, msgspec
+from cocoro.component import Implementation
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     pass
 async def run(node, config):
     await asyncio.Event().wait()
+implementation = Implementation(Config, run)
 """
 DEAF = """
 import asyncio, msgspec
+from cocoro.component import Implementation
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     pass
 async def run(node, config):
@@ -66,6 +74,7 @@ async def run(node, config):
             await asyncio.Event().wait()
         except asyncio.CancelledError:
             pass
+implementation = Implementation(Config, run)
 """
 
 
@@ -80,7 +89,7 @@ def install_parts(folder: Path) -> None:
     about.mkdir()
     (about / "METADATA").write_text("Metadata-Version: 2.1\nName: parts\nVersion: 1.0\n")
     rows = "".join(f"{name} = parts:{name}\n" for name in ("good", "pair", "dies", "mute", "slow", "deaf", "once"))
-    (about / "entry_points.txt").write_text(f"[deploy.processes]\n{rows}")
+    (about / "entry_points.txt").write_text(f"[cocoro.components]\n{rows}")
 
 
 class Shell:

@@ -12,12 +12,13 @@ from cocoro.messages import Detection, Detections, Frame, ServoState
 from cocoro.objects import Catalogue
 from cocoro.robot import Robot
 from cocoro.topics import ARM_STATE, FRAME
-from services.perception.config import Config
+from services.perception.config import PerceptionConfig
 from services.perception.core import PerceptionCore
-from sim.camera import Kinect, Sensors
+from sim.camera import SimKinect
+from sim.realism import Sensors
 from sim.render import make_renderer
+from sim.render.interface import Visual
 from sim.scene import Light
-from sim.visual import Visual
 
 ROBOT = Robot.load()
 CATALOGUE = Catalogue.load()
@@ -64,8 +65,8 @@ class Canvas:
             stamp_ns=stamp_ns,
             width=width,
             height=height,
-            colour=memoryview(self.colour.copy().reshape(-1)),
-            depth=memoryview(codes.astype("<u2").reshape(-1).view(np.uint8)),
+            colour=self.colour.copy().reshape(-1).data,
+            depth=codes.astype("<u2").reshape(-1).view(np.uint8).data,
             **more,
         )
 
@@ -113,7 +114,7 @@ class Scene:
     def __post_init__(self) -> None:
         visuals = [Visual(t.name, t.shape, t.size_m, t.rgb) for t in self.things]  # type: ignore[arg-type]
         self._renderer = make_renderer(visuals, ROBOT.camera.scaled(self.width, self.height))
-        self._kinect = Kinect(
+        self._kinect = SimKinect(
             ROBOT, self._renderer, sensors=self.sensors, seed=self.seed, width=self.width, height=self.height
         )
         self._chain = ROBOT.chain("camera")
@@ -132,7 +133,7 @@ class Scene:
 
 
 def perception(**config: object) -> PerceptionCore:
-    return PerceptionCore(ROBOT, Config(**config), CATALOGUE)  # type: ignore[arg-type]
+    return PerceptionCore(ROBOT, PerceptionConfig(**config), CATALOGUE)  # type: ignore[arg-type]
 
 
 def head_at(stamp_ns: int, pan: float = 0.0, tilt: float = 0.0, incarnation: int = 0) -> Sample:

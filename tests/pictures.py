@@ -13,7 +13,7 @@ from cocoro.errors import ConfigError
 from cocoro.robot import Camera, Robot
 from sim.camera import moved
 from sim.render import Images, Renderer, make_renderer
-from sim.visual import Visual
+from sim.render.interface import Visual
 
 ROBOT = Robot.load()
 CAMERA = ROBOT.camera.scaled(320, 240)
@@ -87,8 +87,8 @@ def pixel_of(point_m: tuple[float, ...], camera_pose: FloatArray, camera: Camera
 
 
 def reddish(colour: np.ndarray) -> np.ndarray:
-    r, g, b = np.moveaxis(colour.astype(int), -1, 0)
-    return (r > 2 * g + 20) & (r > 2 * b + 20)
+    r, g, b = (colour[..., channel].astype(int) for channel in range(3))
+    return np.logical_and(r > 2 * g + 20, r > 2 * b + 20)
 
 
 def floor_depth(camera: Camera, camera_pose: FloatArray) -> FloatArray:

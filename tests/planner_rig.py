@@ -21,7 +21,7 @@ from cocoro.messages import (
 from cocoro.robot import Robot
 from cocoro.testing import CoreUnderTest
 from cocoro.topics import Topic
-from services.planning.config import Config
+from services.planning.config import PlanningConfig
 from services.planning.core import PlanningCore
 
 ROBOT = Robot.load()
@@ -32,8 +32,8 @@ CAN_M = (1.5, 0.0, 0.06)
 class Planner:
     """A planning core on a robot that is perfectly obedient but for its wheels, and sees a can and free floor."""
 
-    def __init__(self, config: Config | None = None) -> None:
-        self.under_test = CoreUnderTest(PlanningCore(ROBOT, config or Config()))
+    def __init__(self, config: PlanningConfig | None = None) -> None:
+        self.under_test = CoreUnderTest(PlanningCore(ROBOT, config or PlanningConfig()))
         self.angles = dict.fromkeys(ROBOT.joints, 0.0) | ROBOT.poses["park"]
         self.base: dict[str, Any] = {}
         self.hand_load = 0.0
@@ -112,7 +112,7 @@ class Planner:
         return Detections(frame_seq=0, frame_incarnation=1, width=640, height=480, detections=found)
 
 
-def started(config: Config | None = None) -> Planner:
+def started(config: PlanningConfig | None = None) -> Planner:
     """A planner that has seen what there is."""
     planner = Planner(config)
     planner.run(0.2)

@@ -30,7 +30,7 @@ from cocoro.messages import (
 from cocoro.node import Node
 from cocoro.robot import Robot
 from cocoro.testing import Tap, settle
-from deploy.processes import named
+from deploy.processes import named, needs
 
 SERVICES = ("sim", "perception", "planning", "executive")
 HALTED_MPS = 0.01
@@ -94,7 +94,8 @@ class RobotRig:
 
     async def start(self, name: str) -> None:
         component = load(named(name))
-        config = msgspec.convert(self._settings.get(name, {}), component.config)
+        needed = {"needed": needs(name)} if name == "executive" else {}
+        config = msgspec.convert(needed | dict(self._settings.get(name, {})), component.config)
         bus = self.mesh.join()
         node = Node(
             name, bus, self._clock_of(name), self._robot,

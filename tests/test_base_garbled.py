@@ -1,5 +1,5 @@
 """Whatever garbled bytes have made of the Create before: on a line that is good again, its wheels stop when its service
-dies. The keeper and the emulated firmware face each other, in virtual time."""
+dies. The logic and the emulated firmware face each other, in virtual time."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from random import Random
 
 import pytest
 
-from services.base.keeper import MS, Keeper
-from sim.wire.body import SimpleBody
-from sim.wire.create import Create
-from sim.wire.faults import Disturbance, Fault, Kind
+from services.base.guard_logic import MS, GuardLogic
+from sim.wire.create import EmulatedCreate
+from sim.wire.emulator import SimplePlant
+from sim.wire.line import Disturbance, FaultKind, LineFault
 
 BAUD = 57600
 TURN_NS = 5 * MS
@@ -22,30 +22,30 @@ SPEEDS = ((200, 200), (120, -120), (250, 110), (-80, -80))
 
 
 class Line:
-    """Keeper and Create with a wire between them that takes its time, and that can be disturbed."""
+    """Guard logic and Create with a wire between them that takes its time, and that can be disturbed."""
 
     def __init__(self, seed: int) -> None:
         self.draws = Random(seed)
-        self.create = Create()
-        self.keeper = Keeper("safe", DEADMAN_NS)
+        self.create = EmulatedCreate()
+        self.logic = GuardLogic("safe", DEADMAN_NS)
         self.now_ns = 10**12
         self.disturbed = Disturbance("to_device", seed)
         self.wanted: tuple[int, int] | None = SPEEDS[0]
-        self._body = SimpleBody(self.create)
+        self._body = SimplePlant(self.create)
         self._sent = b""
-        self.keeper.opened(self.now_ns)
+        self.logic.opened(self.now_ns)
 
     def turn(self) -> None:
         self.now_ns += TURN_NS
         if self.wanted is not None:
-            self.keeper.ask(*self.wanted, self.now_ns + DEADMAN_NS, self.now_ns)
-            if self.keeper.link == "fallen":
-                self.keeper.recover(self.now_ns)
-        self._sent += self.disturbed.carry(self.keeper.poll(self.now_ns), self.now_ns)
+            self.logic.ask(*self.wanted, self.now_ns + DEADMAN_NS, self.now_ns)
+            if self.logic.link == "fallen":
+                self.logic.recover(self.now_ns)
+        self._sent += self.disturbed.carry(self.logic.poll(self.now_ns), self.now_ns)
         now, self._sent = self._sent[:BYTES_A_TURN], self._sent[BYTES_A_TURN:]
         self._body.advance(self.now_ns)
         self.create.receive(now, BAUD, self.now_ns)
-        self.keeper.heard(self.create.advance(BAUD, self.now_ns), self.now_ns)
+        self.logic.heard(self.create.advance(BAUD, self.now_ns), self.now_ns)
 
     def drives(self) -> bool:
         """It goes as it was asked to, within a time; False when it hears nobody any more."""
@@ -54,17 +54,17 @@ class Line:
             self.turn()
             if self.lost_to_the_world:
                 return False
-            if self.keeper.wheels[:2] == self.create.wheels_mmps != (0, 0):
+            if self.logic.wheels[:2] == self.create.wheels_mmps != (0, 0):
                 return True
-        raise AssertionError(f"stuck: {self.keeper.link}, mode {self.create.mode}, pending {self.create.pending.hex()}")
+        raise AssertionError(f"stuck: {self.logic.link}, mode {self.create.mode}, pending {self.create.pending.hex()}")
 
     @property
     def lost_to_the_world(self) -> bool:
         """A garbled byte has told the Create to wait for something, or to use another baud rate."""
         return self.create.deaf or self.create.baud != BAUD
 
-    def garble(self, kind: Kind, share: float, for_ns: int) -> None:
-        self.disturbed.add(Fault(kind, share, "to_device", self.now_ns + for_ns))
+    def garble(self, kind: FaultKind, share: float, for_ns: int) -> None:
+        self.disturbed.add(LineFault(kind, share, "to_device", self.now_ns + for_ns))
         end_ns = self.now_ns + for_ns
         while self.now_ns < end_ns:
             self.wanted = self.draws.choice(SPEEDS) if self.draws.random() < 0.05 else self.wanted
@@ -74,7 +74,7 @@ class Line:
     def stops_after_ns(self) -> int:
         """From the death of the service on."""
         self.wanted = None
-        self.keeper.end(self.now_ns)
+        self.logic.end(self.now_ns)
         began_ns = self.now_ns
         while self.create.wheels_mmps != (0, 0):
             self.turn()
@@ -83,7 +83,7 @@ class Line:
         return self.now_ns - began_ns
 
 
-def one(seed: int, kind: Kind) -> int | None:
+def one(seed: int, kind: FaultKind) -> int | None:
     """How long the wheels went on; None when nobody could have stopped them."""
     line = Line(seed)
     assert line.drives()
@@ -100,7 +100,7 @@ def one(seed: int, kind: Kind) -> int | None:
 
 
 @pytest.mark.parametrize("kind", ["corrupted", "lost", "truncated", "repeated"])
-def test_the_wheels_stop_in_time_unless_a_garbled_byte_has_made_the_create_deaf(kind: Kind) -> None:
+def test_the_wheels_stop_in_time_unless_a_garbled_byte_has_made_the_create_deaf(kind: FaultKind) -> None:
     took = [one(seed, kind) for seed in range(60)]
     heard = [each for each in took if each is not None]
     assert len(heard) > 40

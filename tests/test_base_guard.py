@@ -139,7 +139,12 @@ def test_the_bumper_lets_nothing_forward_and_turning_and_backing_pass(bench: Ben
 def test_a_bump_while_driving_stops_within_a_few_frames(bench: Bench, service: FakeService) -> None:
     service.keep_asking(200, 200)
     bench.until_wheels(200, 200)
-    pressed_ns = bench.emulator.call(lambda: setattr(bench.create.around, "bump_right", True) or bench.create._now_ns)
+
+    def bump() -> int:
+        bench.create.around.bump_right = True
+        return bench.create._now_ns
+
+    pressed_ns = bench.emulator.call(bump)
     assert bench.until_wheels(0, 0) - pressed_ns < PATIENCE_NS
 
 

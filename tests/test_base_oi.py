@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from wire_base import frame
 
 from services.base import oi
-from services.base.keeper import LONG, SHORT
+from services.base.guard_logic import LONG, SHORT
 
 
 def readings_of(packets: tuple[int, ...]) -> st.SearchStrategy[oi.Readings]:

@@ -8,9 +8,10 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
 from contextlib import asynccontextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 from wire_base import DEADMAN_NS, MS, PATIENCE_NS, Bench
@@ -19,8 +20,8 @@ from cocoro import topics
 from cocoro.clock import RealClock
 from cocoro.messages import BaseCommand, BaseState, EstopRequest, Latch, RecoverRequest
 from cocoro.testing import ServiceUnderTest
-from services.base.service import BaseService, Config
-from sim.wire.faults import Fault
+from services.base.service import BaseConfig, BaseService
+from sim.wire.line import LineFault
 
 pytestmark = pytest.mark.zenoh
 
@@ -94,9 +95,9 @@ async def driven(bench: Bench) -> AsyncIterator[Driven]:
         base.silence()
 
 
-def in_real_time(test: Callable[[Bench], AsyncIterator[None]]) -> Callable[[Bench], None]:
+def in_real_time(test: Callable[[Bench], Coroutine[Any, Any, None]]) -> Callable[[Bench], None]:
     def run(bench: Bench) -> None:
-        asyncio.run(asyncio.wait_for(test(bench), 60.0))  # type: ignore[arg-type]
+        asyncio.run(asyncio.wait_for(test(bench), 60.0))
 
     run.__name__ = test.__name__
     return run
@@ -202,7 +203,7 @@ def test_a_disturbed_line_is_told_and_stops_nothing_for_long(bench: Bench, way: 
     async def scenario(bench: Bench) -> None:
         async with driven(bench) as base:
             await base.roll()
-            fault = Fault("corrupted", 0.01, way, 10**19)  # type: ignore[arg-type]
+            fault = LineFault("corrupted", 0.01, way, 10**19)  # type: ignore[arg-type]
             bench.emulator.call(lambda: bench.line.disturb(fault))
             await base.fault("its line is disturbed, look after the cable")
             bench.emulator.call(bench.line.undisturb)
@@ -239,7 +240,7 @@ def test_a_guard_that_dies_or_hangs_is_replaced_and_the_wheels_stopped_meanwhile
     async def scenario(bench: Bench) -> None:
         async with driven(bench) as base:
             await base.roll()
-            pid = services[0].guardian.pid
+            pid = services[0].guard.pid
             assert pid is not None
             base.silence()
             killed_ns = time.monotonic_ns()
@@ -248,7 +249,7 @@ def test_a_guard_that_dies_or_hangs_is_replaced_and_the_wheels_stopped_meanwhile
             await asyncio.to_thread(bench.emulator.until, lambda: bench.create.mode == 1)  # woken by the next guard
             await asyncio.to_thread(bench.until_awake)
             await base.state(lambda state: state.mode == "safe")
-            assert services[0].guardian.pid != pid
+            assert services[0].guard.pid != pid
             base.drive(0.1, 0.1)
             await base.wheels(100, 100)
 
@@ -275,7 +276,7 @@ def test_wheels_stop_when_the_service_itself_is_killed_or_stopped(bench: Bench, 
 
 def test_a_service_without_its_port_says_so_and_lives(tmp_path: Path) -> None:
     async def scenario() -> None:
-        config = Config(port=str(tmp_path / "nothing"))
+        config = BaseConfig(port=str(tmp_path / "nothing"))
         async with ServiceUnderTest("services.base.service", config, clock=RealClock()) as service:
             async for health in service.tester.stream(topics.HEALTH.of("base")):
                 if any("is the adapter plugged in?" in fault for fault in health.faults):

@@ -16,7 +16,6 @@ from pathlib import Path
 import pytest
 from zenoh_rig import PATIENCE_S, child, left_in, local, scenario, who
 
-from cocoro import private
 from cocoro.bus.endpoints import ZenohConfig
 from cocoro.bus.members import Membership, members, new_identity
 from cocoro.bus.session import ACCEPT_PENDING
@@ -160,7 +159,7 @@ def takes_no_entries(monkeypatch: pytest.MonkeyPatch) -> None:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), path)
         return really(path, flags, mode, dir_fd=dir_fd)
 
-    monkeypatch.setattr(private.os, "open", open_)
+    monkeypatch.setattr(os, "open", open_)
 
 
 @scenario

@@ -4,27 +4,40 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from typing import Any
+from collections.abc import Callable
+from contextvars import Context
+from typing import TypeVarTuple
 
 from zenoh_rig import FRAME, PATIENCE_S
 
 from cocoro.bus.outbox import CAPACITY_BYTES, Outbox
-from cocoro.bus.pool import POOL_BYTES, SharedPool, read
+from cocoro.bus.pool import SharedPool, read
 from cocoro.bus.ring import Ring
+from cocoro.bus.shared import POOL_BYTES
+
+Args = TypeVarTuple("Args")
 
 
 def test_a_ring_keeps_the_newest_counts_the_rest_and_wakes_the_loop_once() -> None:
     wakes = []
 
     class Loop(asyncio.SelectorEventLoop):
-        def call_soon_threadsafe(self, *args: Any, **kwargs: Any) -> asyncio.Handle:
+        def call_soon_threadsafe(
+            self, callback: Callable[[*Args], object], *args: *Args, context: Context | None = None
+        ) -> asyncio.Handle:
             wakes.append(1)
-            return super().call_soon_threadsafe(*args, **kwargs)
+            return super().call_soon_threadsafe(callback, *args, context=context)
 
     async def test() -> None:
         got: list[tuple[str, int]] = []
         ring = Ring[int](asyncio.get_running_loop(), lambda key, item: got.append((key, item)), depth=2)
-        pushing = threading.Thread(target=lambda: [ring.push(key, n) for n in range(100) for key in "ab"])
+
+        def push() -> None:
+            for n in range(100):
+                for key in "ab":
+                    ring.push(key, n)
+
+        pushing = threading.Thread(target=push)
         pushing.start()
         pushing.join()
         await asyncio.sleep(0)
@@ -66,9 +79,12 @@ def test_a_ring_loses_no_count_between_threads() -> None:
 
         loop = asyncio.get_running_loop()
         ring = Ring(loop, deliver, depth=1)
-        threads = [
-            threading.Thread(target=lambda: [ring.push("x", n) for n in range(5000)], name=str(t)) for t in range(4)
-        ]
+
+        def push() -> None:
+            for n in range(5000):
+                ring.push("x", n)
+
+        threads = [threading.Thread(target=push, name=str(t)) for t in range(4)]
 
         def join() -> None:
             for thread in threads:
@@ -96,8 +112,14 @@ def test_a_ring_whose_loop_is_closed_takes_samples_in_silence() -> None:
 
 def test_an_outbox_never_keeps_the_sender_waiting_and_counts_what_it_cannot_take() -> None:
     outbox = Outbox("test")
-    go_on, sent = threading.Event(), []
-    outbox.put(lambda: (go_on.wait(), sent.append("first"))[0], 1)  # type: ignore[func-returns-value]
+    go_on = threading.Event()
+    sent: list[str] = []
+
+    def send_first() -> None:
+        go_on.wait()
+        sent.append("first")
+
+    outbox.put(send_first, 1)
     outbox.put(lambda: sent.append("second"), CAPACITY_BYTES - 1)
     outbox.put(lambda: sent.append("too much"), 1)
     assert outbox.lost == 1
@@ -108,7 +130,11 @@ def test_an_outbox_never_keeps_the_sender_waiting_and_counts_what_it_cannot_take
 
 def test_an_outbox_that_cannot_send_ends_all_the_same() -> None:
     outbox, never = Outbox("test"), threading.Event()
-    outbox.put(lambda: never.wait() and None, 1)
+
+    def send() -> None:
+        never.wait()
+
+    outbox.put(send, 1)
     outbox.close(0.01)
     never.set()
 

@@ -16,13 +16,13 @@ from cocoro.arrays import FloatArray
 from cocoro.errors import ConfigError
 from cocoro.messages import Frame
 from cocoro.robot import Camera
-from sim.camera import Kinect, moved
+from sim.camera import SimKinect, moved
 from sim.realism import Sensors
-from sim.render import Images, Light, make_renderer
+from sim.render import Images, Lighting, make_renderer
+from sim.render.interface import Visual
 from sim.sensor_effects import (
     NO_DATA,
 )
-from sim.visual import Visual
 
 WIDTH, HEIGHT = CAMERA.width, CAMERA.height
 FRAME_NS = 33_333_333
@@ -48,7 +48,7 @@ class Painted:
         poses: FloatArray,
         camera_pose: FloatArray,
         depth_camera_pose: FloatArray,
-        light: Light,
+        light: Lighting,
         projector_pose: FloatArray | None = None,
     ) -> Images:
         self.projected.append(projector_pose)
@@ -57,8 +57,8 @@ class Painted:
     def close(self) -> None: ...
 
 
-def kinect(renderer: Painted, sensors: Sensors = "real", seed: int = 0) -> Kinect:
-    return Kinect(ROBOT, renderer, sensors=sensors, seed=seed, width=WIDTH, height=HEIGHT)
+def kinect(renderer: Painted, sensors: Sensors = "real", seed: int = 0) -> SimKinect:
+    return SimKinect(ROBOT, renderer, sensors=sensors, seed=seed, width=WIDTH, height=HEIGHT)
 
 
 def colour_of(frame: Frame) -> np.ndarray:
@@ -69,7 +69,7 @@ def depth_of(frame: Frame) -> np.ndarray:
     return np.frombuffer(frame.depth, "<u2").reshape(frame.height, frame.width)
 
 
-def shoot(camera: Kinect, stamp_ns: int = 0, pose: FloatArray | None = None) -> Frame:
+def shoot(camera: SimKinect, stamp_ns: int = 0, pose: FloatArray | None = None) -> Frame:
     return camera.capture(NOTHING, np.eye(4) if pose is None else pose, stamp_ns, LAMP)
 
 
@@ -84,7 +84,7 @@ def test_ideal_colours_are_the_renderers_own() -> None:
 def test_ideal_depth_is_the_formulas_code() -> None:
     depth = np.linspace(0.3, 4.5, HEIGHT * WIDTH, dtype=np.float32).reshape(HEIGHT, WIDTH)
     codes = depth_of(shoot(kinect(Painted(depth_m=depth), "ideal"))).astype(int)
-    formula = ROBOT.depth_code(depth).astype(int)
+    formula = ROBOT.depth_code(depth.astype(float)).astype(int)
     agree = codes == formula
     assert agree.mean() > 0.99
     assert np.abs(codes - formula)[formula != NO_DATA].max() <= 1  # on the border between two codes
@@ -109,8 +109,10 @@ def test_an_ideal_frame_asks_for_no_projector_a_real_one_for_the_kinects_own() -
     pose[:3, :3] = Rotation.from_euler("z", 90, degrees=True).as_matrix()
     shoot(kinect(painted, "ideal"), 0, pose)
     shoot(kinect(painted, "real"), 0, pose)
-    assert painted.projected[0] is None
-    np.testing.assert_allclose(painted.projected[1][:3, 3], [0.0, ROBOT.kinect.projector_offset_m[0], 0.0], atol=1e-12)
+    none, projector = painted.projected
+    assert none is None
+    assert projector is not None
+    np.testing.assert_allclose(projector[:3, 3], [0.0, ROBOT.kinect.projector_offset_m[0], 0.0], atol=1e-12)
 
 
 def test_a_frame_is_the_message_with_its_stamp_and_keeps_its_pixels() -> None:
@@ -129,7 +131,7 @@ def test_a_frame_is_the_message_with_its_stamp_and_keeps_its_pixels() -> None:
 
 def test_the_renderers_size_must_be_the_kinects() -> None:
     with pytest.raises(ConfigError, match=r"320 x 240.*640 x 480"):
-        Kinect(ROBOT, Painted(), width=640, height=480)
+        SimKinect(ROBOT, Painted(), width=640, height=480)
 
 
 # --- colour, as a real sensor sees it -------------------------------------------------------------
@@ -212,7 +214,7 @@ def film(seed: int) -> list[str]:
     camera_ = ROBOT.camera.scaled(160, 120)
     can = Visual("can", "cylinder", (0.033, 0.12), (0.8, 0.04, 0.05))
     renderer = make_renderer([can], camera_)
-    camera = Kinect(ROBOT, renderer, sensors="real", seed=seed, width=160, height=120)
+    camera = SimKinect(ROBOT, renderer, sensors="real", seed=seed, width=160, height=120)
     poses = np.eye(4)[None].copy()
     poses[0, :3, 3] = [1.2, 0.0, 0.06]
     prints = []
@@ -249,7 +251,7 @@ def test_both_frame_sizes_show_the_can_where_it_is(size: tuple[int, int]) -> Non
     camera_: Camera = ROBOT.camera.scaled(*size)
     can = Visual("can", "cylinder", (0.033, 0.12), (0.8, 0.04, 0.05))
     renderer = make_renderer([can], camera_)
-    camera = Kinect(ROBOT, renderer, sensors="real", width=size[0], height=size[1])
+    camera = SimKinect(ROBOT, renderer, sensors="real", width=size[0], height=size[1])
     poses = np.eye(4)[None].copy()
     poses[0, :3, 3] = [1.2, 0.2, 0.06]
     pose = ROBOT.chain("camera").pose(dict.fromkeys(ROBOT.joints, 0.0) | {"neck_tilt": -0.45})

@@ -150,8 +150,9 @@ def test_belief_stands_beside_truth_in_the_body_frame(tmp_path: Path) -> None:
         async with room.node("sim") as sim, room.node("planning") as planning:
             can = TrueObject(label="red_can", kind="object", position_m=(2.0, 1.0, 0.06), orientation=(0, 0, 0, 1))
             for tick in range(11):
-                body = {"body_m": (1.0, tick / 10, 0.0), "body_orientation": about_z(pi / 2)}
-                sim.publish(topics.TRUTH, Truth(**body, joints_rad={}, objects=(can,)))
+                place, turn = (1.0, tick / 10, 0.0), about_z(pi / 2)
+                truth = Truth(body_m=place, body_orientation=turn, joints_rad={}, objects=(can,))
+                sim.publish(topics.TRUTH, truth)
                 if tick == 5:
                     await room.clock.sleep_until(room.clock.now_ns() + 10_000_000)
                     believed = TargetEstimate(label="red_can", position_m=(0.5, -1.0, 0.06))
@@ -187,6 +188,7 @@ def test_the_file_for_foxglove_has_its_schemas_in_the_robots_time(exported: Path
     last = 0
     with (exported / "fox.mcap").open("rb") as stream:
         for schema, channel, message in make_reader(stream, validate_crcs=True).iter_messages():
+            assert schema is not None
             assert channel.message_encoding == "json"
             assert last <= message.log_time < 10**10
             last = message.log_time

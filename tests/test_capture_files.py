@@ -79,9 +79,12 @@ def test_the_mcap_library_reads_it_as_a_whole_indexed_file(tmp_path: Path) -> No
         assert {channel.topic: channel.message_encoding for channel in summary.channels.values()} == {
             "calliope/base/state": "msgpack", "calliope/kinect/frame": "msgpack",
         }  # fmt: skip
-        told = [(schema.name, channel.topic, message.log_time) for schema, channel, message in reader.iter_messages()]
-        assert told[0][:2] == ("BaseState", "calliope/base/state")
-        assert [time for _, _, time in told] == sorted(time for _, _, time in told)
+        records = list(reader.iter_messages())
+        schema, channel, _ = records[0]
+        assert schema is not None
+        assert (schema.name, channel.topic) == ("BaseState", "calliope/base/state")
+        times = [message.log_time for _, _, message in records]
+        assert times == sorted(times)
         assert {record.name for record in reader.iter_metadata()} == {"run", "tally"}
         tally = next(record.metadata for record in reader.iter_metadata() if record.name == "tally")
         assert json.loads(tally["dropped"]) == {"calliope/kinect/frame": 3}
@@ -89,7 +92,8 @@ def test_the_mcap_library_reads_it_as_a_whole_indexed_file(tmp_path: Path) -> No
 
 def test_each_type_of_the_mesh_has_a_schema_that_is_an_object_with_binary_pixels() -> None:
     for topic in TOPICS:
-        schema = json.loads(schema_of(topic.type).data)
+        kind: type[Message] = topic.type
+        schema = json.loads(schema_of(kind).data)
         assert schema["type"] == "object"
         assert "stamp_ns" in schema["properties"]
     pixels = json.loads(schema_of(Frame).data)["properties"]["colour"]

@@ -38,6 +38,7 @@ def test_the_mcap_and_msgpack_libraries_read_everything_by_the_page(expected: di
         reader = make_reader(stream, validate_crcs=True)
         assert reader.get_header().profile == "cocoro"
         for schema, channel, message in reader.iter_messages():
+            assert schema is not None
             assert (schema.encoding, channel.message_encoding) == ("jsonschema", "msgpack")
             value = msgpack.unpackb(message.data)
             assert set(value) <= set(json.loads(schema.data)["properties"])

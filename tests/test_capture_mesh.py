@@ -25,14 +25,14 @@ from cocoro.bus.endpoints import default
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.capture.reader import Capture
 from cocoro.clock import NS, RealClock
-from cocoro.component import load
 from cocoro.messages import BaseState
 from cocoro.node import Node
 from cocoro.robot import Robot
 from cocoro.tokens import recorder_key
-from deploy.processes import named
+from services.capture.config import CaptureConfig
 from services.capture.file import Packer
 from services.capture.log_clock import WALL_CLOCK, LogClock
+from services.capture.service import run
 
 pytestmark = pytest.mark.zenoh
 
@@ -196,8 +196,7 @@ def test_a_recorder_whose_wall_clock_is_set_goes_on_as_if_it_had_not_been_and_no
     by_s: int, short_path: Path
 ) -> None:
     out, wall = short_path / "out", Wall()
-    component = load(named("capture"))
-    config = component.config(folder=str(out), rotate_s=0.5)
+    config = CaptureConfig(folder=str(out), rotate_s=0.5)
 
     async def scenario() -> None:
         async with (
@@ -205,7 +204,7 @@ def test_a_recorder_whose_wall_clock_is_set_goes_on_as_if_it_had_not_been_and_no
             await ZenohBus.open(default(ROBOT, "recorder", short_path)) as other,
             Node("capture", other, RealClock(), Robot.load(), config=config) as node,
         ):
-            recording = asyncio.ensure_future(component.run(node, config, LogClock(wall)))
+            recording = asyncio.ensure_future(run(node, config, LogClock(wall)))
             await heard_by_a_recorder(bus)
             count = len(await files_of(out, 2))
             wall.ahead_ns += by_s * NS

@@ -28,8 +28,9 @@ from cocoro.testing import settle
 from cocoro.vloop import run_virtual
 from deploy import profiles
 from deploy.processes import named
-from services.capture.config import Config, folder_of
-from services.capture.sink import LARGE_BYTES, RESERVE_BYTES, Syncer, ThreadedSink
+from services.capture.config import CaptureConfig, folder_of
+from services.capture.file import LARGE_BYTES
+from services.capture.sink import RESERVE_BYTES, Syncer, ThreadedSink
 from services.capture.writer import CaptureWriter
 
 
@@ -90,7 +91,9 @@ def test_requests_are_recorded_with_their_answers_refusals_and_errors(tmp_path: 
 def test_liveliness_is_recorded_as_it_changes_and_each_service_says_what_it_was_started_with(tmp_path: Path) -> None:
     async def come_and_go(room: Room) -> None:
         for _ in range(2):
-            async with room.node("base", module="parts.base", config=Config(keep_gb=3.0), latency_s=0.25) as base:
+            async with room.node(
+                "base", module="parts.base", config=CaptureConfig(keep_gb=3.0), latency_s=0.25
+            ) as base:
                 base.ready()
                 await asyncio.sleep(0.5)
             await asyncio.sleep(0.5)
@@ -284,7 +287,7 @@ def test_what_is_given_after_a_fault_is_forgotten(tmp_path: Path) -> None:
     sink.close()
 
 
-@pytest.mark.parametrize("sync_s", [0.2, Config().sync_s, 0.8])
+@pytest.mark.parametrize("sync_s", [0.2, CaptureConfig().sync_s, 0.8])
 def test_the_disk_is_made_sure_of_at_least_once_a_second(sync_s: float, tmp_path: Path) -> None:
     waited_s = 0.0
     at_s: list[float] = []
@@ -352,10 +355,10 @@ def test_the_recorder_is_part_of_every_profile_that_has_a_robot(name: str) -> No
 def test_captures_go_where_operator_or_environment_say(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.delenv("COCORO_CAPTURE_DIR", raising=False)
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
-    assert folder_of(Config()) == tmp_path / "state" / "cocoro" / "captures"
+    assert folder_of(CaptureConfig()) == tmp_path / "state" / "cocoro" / "captures"
     monkeypatch.setenv("COCORO_CAPTURE_DIR", str(tmp_path / "env"))
-    assert folder_of(Config()) == tmp_path / "env"
-    assert folder_of(Config(folder=str(tmp_path / "said"))) == tmp_path / "said"
+    assert folder_of(CaptureConfig()) == tmp_path / "env"
+    assert folder_of(CaptureConfig(folder=str(tmp_path / "said"))) == tmp_path / "said"
 
 
 def test_a_node_answers_what_it_was_started_with() -> None:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import asyncio
 import json
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import msgspec
@@ -27,6 +29,7 @@ from services.capture.keys import QueuedMessage, lossy
 from services.capture.writer import CaptureWriter, Limits
 from services.perception import service as perception
 from services.planning import service as planning
+from services.planning.config import PlanningConfig
 
 GOLDEN = Path(__file__).parent / "golden" / "fetch.mcap"
 TOLERANCE = 1e-3
@@ -42,6 +45,11 @@ def again(path: Path, service: str, tolerance: float = 0.0) -> ReexecutionResult
 def without(path: Path, out: Path, keep: Callable[[Record], bool], start_ns: int | None = None) -> Path:
     with Capture.open(path) as capture:
         return rewrite(capture, out, Packer("lz4"), keep=keep, start_ns=start_ns).path
+
+
+def use_core(monkeypatch: pytest.MonkeyPatch, service: ModuleType, make: Callable[..., Core]) -> None:
+    """Have another core made for a service."""
+    monkeypatch.setattr(service, "implementation", replace(service.implementation, core=make))
 
 
 @pytest.mark.parametrize("service", ["perception", "planning"])
@@ -85,7 +93,7 @@ def test_the_first_difference_is_told_with_its_place_and_size(
         seen.detections[0].u_px += 0.25
 
     make = perception.core
-    monkeypatch.setattr(perception, "core", lambda *args: Changed(make(*args), nudge, Detections, 20))
+    use_core(monkeypatch, perception, lambda *args: Changed(make(*args), nudge, Detections, 20))
     result = again(GOLDEN, "perception")
     assert (result.differing, result.not_executable) == (1, 0)
     assert result.equal == result.steps - 1
@@ -104,7 +112,7 @@ def test_outputs_that_are_missing_or_too_many_differ(monkeypatch: pytest.MonkeyP
             return [output for output in super().step(inputs, now_ns) if not isinstance(output.message, PlannerStatus)]
 
     make = planning.core
-    monkeypatch.setattr(planning, "core", lambda *args: Mute(make(*args), lambda _: None, PlannerStatus, 0))
+    use_core(monkeypatch, planning, lambda *args: Mute(make(*args), lambda _: None, PlannerStatus, 0))
     result = again(GOLDEN, "planning")
     assert result.equal == 0
     assert result.first is not None
@@ -116,7 +124,7 @@ def test_a_core_that_fails_now_differs(monkeypatch: pytest.MonkeyPatch) -> None:
         raise ZeroDivisionError("oh")
 
     make = planning.core
-    monkeypatch.setattr(planning, "core", lambda *args: Changed(make(*args), fail, PlannerStatus, 5))
+    use_core(monkeypatch, planning, lambda *args: Changed(make(*args), fail, PlannerStatus, 5))
     result = again(GOLDEN, "planning")
     assert result.differing >= 1
     assert result.first is not None
@@ -147,8 +155,9 @@ def test_a_step_whose_input_is_missing_is_counted_and_not_equal(tmp_path: Path) 
 
 
 def test_a_step_whose_output_is_missing_is_not_equal_either(tmp_path: Path) -> None:
-    lost = lambda each: each.key.endswith("planning/status") and each.sequence == 30  # noqa: E731
-    path = without(GOLDEN, tmp_path / "few.mcap", lambda each: not lost(each))
+    path = without(
+        GOLDEN, tmp_path / "few.mcap", lambda each: not (each.key.endswith("planning/status") and each.sequence == 30)
+    )
     result = again(path, "planning", TOLERANCE)
     assert (result.not_executable, result.equal) == (1, result.steps - 1)
     assert result.reasons == {"the capture lacks an output on planning/status": 1}
@@ -323,25 +332,25 @@ class Adder:
 def test_each_start_of_a_service_is_a_new_core(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     async def twice(room: Room) -> None:
         for _ in range(2):
-            node = room.node("planning", record_steps=True, module=planning.__name__, config=planning.Config())
+            node = room.node("planning", record_steps=True, module=planning.__name__, config=PlanningConfig())
             async with node:
                 driving = asyncio.ensure_future(node.drive(Adder()))
                 await drive(room, 1.0, frames=False)
                 driving.cancel()
 
     path = record(tmp_path / "twice.mcap", twice)
-    monkeypatch.setattr(planning, "core", lambda *_: Adder())
+    use_core(monkeypatch, planning, lambda *_: Adder())
     result = again(path, "planning")
     assert result.steps == result.equal > 80
     only = Adder()
-    monkeypatch.setattr(planning, "core", lambda *_: only)
+    use_core(monkeypatch, planning, lambda *_: only)
     assert again(path, "planning").differing > 40
 
 
 def test_the_latency_of_a_service_is_in_the_stamps_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     async def slow(room: Room) -> None:
         node = room.node(
-            "planning", record_steps=True, module=planning.__name__, config=planning.Config(), latency_s=0.05
+            "planning", record_steps=True, module=planning.__name__, config=PlanningConfig(), latency_s=0.05
         )
         async with node:
             driving = asyncio.ensure_future(node.drive(Adder()))
@@ -349,7 +358,7 @@ def test_the_latency_of_a_service_is_in_the_stamps_again(tmp_path: Path, monkeyp
             driving.cancel()
 
     path = record(tmp_path / "slow.mcap", slow)
-    monkeypatch.setattr(planning, "core", lambda *_: Adder())
+    use_core(monkeypatch, planning, lambda *_: Adder())
     assert again(path, "planning").differing == 0
 
 

@@ -20,7 +20,8 @@ from apps.cli.table import table
 from apps.rehearsal import rehearse as rehearsing
 from apps.rehearsal.request import RehearsalRequest
 from cocoro.errors import CocoroError, ConfigError
-from cocoro.topics import STOPPABLE, TOPICS
+from cocoro.topics import TOPICS
+from deploy.processes import stoppable
 
 COMMANDS = (
     "up", "down", "status", "fetch", "follow", "park", "put-down", "estop", "reset", "cancel", "objects", "snapshot",
@@ -151,7 +152,7 @@ def test_the_emergency_stop_imports_next_to_nothing() -> None:
 
 
 def test_the_emergency_stop_knows_what_can_be_stopped() -> None:
-    assert estop.STOPPABLE == STOPPABLE
+    assert stoppable() == estop.STOPPABLE
 
 
 # --- rehearse -------------------------------------------------------------------------------------

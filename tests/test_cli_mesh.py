@@ -10,6 +10,7 @@ import time
 from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -41,7 +42,8 @@ from cocoro.messages import (
 )
 from cocoro.node import Node
 from cocoro.robot import Robot
-from cocoro.topics import BASE_STATE, CANCEL, DETECTIONS, ESTOP, FRAME, LATCH, OBJECTS, PLAN, RUN, STOPPABLE, TASK
+from cocoro.topics import BASE_STATE, CANCEL, DETECTIONS, ESTOP, FRAME, LATCH, OBJECTS, PLAN, RUN, TASK
+from deploy.processes import stoppable
 from deploy.rundir import RunDir
 
 pytestmark = pytest.mark.zenoh
@@ -69,7 +71,7 @@ async def robot(*services: str, without_latch: tuple[str, ...] = ()) -> AsyncIte
         nodes = {name: Node(name, bus, clock, description, health_hz=20.0) for name in services}
         for node in nodes.values():
             await stack.enter_async_context(node)
-        keeping = [name for name in STOPPABLE if name in nodes and name not in without_latch]
+        keeping = [name for name in stoppable() if name in nodes and name not in without_latch]
         keepers = {name: LatchKeeper(nodes[name], lambda *_: None) for name in keeping}
         for node in nodes.values():
             node.ready("all is well")
@@ -281,7 +283,7 @@ def test_ctrl_c_on_a_running_fetch_cancels_the_task_on_the_robot(root: Path) -> 
 
             async def tell() -> None:
                 async for _ in node.every(20.0):
-                    outcome = "cancelled" if cancelled else None
+                    outcome: Literal["cancelled"] | None = "cancelled" if cancelled else None
                     node.publish(TASK, TaskState(task_id="fetch-1", phase="approach", outcome=outcome, elapsed_s=1.0))
 
             async def cancel(request: CancelRequest) -> TaskReply:

@@ -69,7 +69,8 @@ def test_a_cancelled_virtual_sleep_leaves_no_timer() -> None:
 @pytest.mark.parametrize("kind", [VirtualClock, RealClock, FollowedClock])
 def test_sleeping_until_the_past_gives_others_their_turn(kind: type[VirtualClock | RealClock | FollowedClock]) -> None:
     async def main() -> None:
-        clock, turns = kind(), []
+        clock = kind()
+        turns: list[str] = []
         if isinstance(clock, FollowedClock):
             clock.tick(5 * NS, 1)
         asyncio.get_running_loop().call_soon(turns.append, "other")

@@ -16,7 +16,7 @@ from cocoro import topics
 from cocoro.clock import NS
 from cocoro.messages import ObjectsRequest
 from cocoro.testing import JumpingClock, in_virtual_time
-from cocoro.topics import HARDWARE
+from deploy.processes import hardware
 
 FETCH = ("search", "approach", "reach", "grasp", "lift")
 
@@ -183,7 +183,7 @@ async def test_until_everyone_lives_no_task_begins() -> None:
     async with robot(ready=False) as it:
         await it.service.advance(1.0)
         assert (await it.ask()).refusal == "not_alive"
-        it.service.others_live(*HARDWARE, "perception")
+        it.service.others_live(*hardware(), "perception")
         await it.service.settle()
         assert (await it.ask()).text == "no contact with planning; see cocoro status"
         it.service.others_live("planning")

@@ -13,8 +13,8 @@ from cocoro.clock import NS
 from cocoro.contact import Contact
 from cocoro.messages import CancelRequest
 from cocoro.testing import JumpingClock, in_virtual_time
-from cocoro.topics import HARDWARE
 from cocoro.vigil import Vigil
+from deploy.processes import hardware
 from deploy.rundir import RunDir, hold
 from services.executive import executive
 
@@ -87,7 +87,7 @@ def test_whatever_ends_a_task_and_whenever_it_ends_once_and_another_can_follow(e
     scenario()
 
 
-@pytest.mark.parametrize("service", [*HARDWARE, "perception", "planning"])
+@pytest.mark.parametrize("service", [*hardware(), "perception", "planning"])
 def test_a_task_fails_when_a_service_that_it_needs_is_not_heard_any_more(service: str) -> None:
     @in_virtual_time
     async def scenario() -> None:
@@ -137,7 +137,8 @@ def test_only_of_one_that_is_known_to_be_dead_it_is_said_that_it_died(
 
     @in_virtual_time
     async def scenario() -> None:
-        clock, said = Sleepy(), []
+        clock = Sleepy()
+        said: list[str] = []
         async with robot(contact=Contact(run_dir.claimant_pid, Vigil(said.append, clock))) as it:
             it.script = {"search": ["never"]}
             await it.begin()

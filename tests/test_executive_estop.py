@@ -6,7 +6,7 @@ from executive_rig import idle_again, robot
 
 from cocoro import topics
 from cocoro.testing import ServiceUnderTest, in_virtual_time
-from cocoro.topics import STOPPABLE
+from deploy.processes import stoppable
 
 
 @in_virtual_time
@@ -19,7 +19,7 @@ async def test_it_knows_no_latch_until_it_has_heard_of_one() -> None:
 @in_virtual_time
 async def test_when_nobody_knows_the_latch_nobody_ever_latched_it() -> None:
     async with robot(ready=False) as it:
-        it.says = dict.fromkeys(STOPPABLE, "unknown")
+        it.says = dict.fromkeys(stoppable(), "unknown")
         await it.service.advance(0.4)
         assert it.latch() == "unknown"
         await it.service.advance(0.4)

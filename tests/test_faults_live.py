@@ -14,6 +14,7 @@ from faults_live import SERVICES, LiveRobot, live
 
 from cocoro import topics
 from cocoro.messages import TaskRequest
+from deploy.processes import hardware
 
 pytestmark = [pytest.mark.zenoh, pytest.mark.sim]
 
@@ -141,7 +142,7 @@ def test_a_simulator_that_is_killed_comes_back_and_all_others_work_with_it_as_be
             await robot.told("sim was killed by SIGKILL; restart in")
             state = await robot.outcome(task_id)
             assert state.outcome == "failed"
-            assert state.reason in {f"not_alive: {part} died" for part in topics.HARDWARE}
+            assert state.reason in {f"not_alive: {part} died" for part in hardware()}
             await robot.told("sim (kinect, base, arm, hand) ready in")
             robot.forget()
             code, said = await robot.command("fetch", "red_can")

@@ -9,6 +9,7 @@ from cocoro import topics
 from cocoro.messages import BaseState, PlannerStatus, ServoState, TaskName, TaskReply, TaskRequest
 from cocoro.testing import ServiceUnderTest, in_virtual_time
 from cocoro.units import Vec2
+from deploy.processes import hardware
 
 LOW = 0.15
 
@@ -17,7 +18,7 @@ async def executive(
     service: ServiceUnderTest, battery_fraction: float, *, holding: bool = False, body_m: Vec2 | None = (0.0, 0.0)
 ) -> None:
     """Have it know of a robot that is released and able, with so much in its battery."""
-    service.others_live(*topics.HARDWARE, "perception", "planning")
+    service.others_live(*hardware(), "perception", "planning")
     here = BaseState(
         odometry_m=(0.0, 0.0), odometry_yaw_rad=0.0, speed_mps=0.0, turn_rate_radps=0.0,
         battery_fraction=battery_fraction, latch="released",

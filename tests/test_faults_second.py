@@ -135,7 +135,12 @@ def test_of_two_that_start_at_once_one_runs_and_one_is_refused_in_a_line(
 
 def first_to_end(processes: list[subprocess.Popen[str]]) -> subprocess.Popen[str]:
     ended = threading.Event()
-    waiting = [threading.Thread(target=lambda p=p: (p.wait(), ended.set()), daemon=True) for p in processes]
+
+    def wait(process: subprocess.Popen[str]) -> None:
+        process.wait()
+        ended.set()
+
+    waiting = [threading.Thread(target=wait, args=(process,), daemon=True) for process in processes]
     for thread in waiting:
         thread.start()
     assert ended.wait(operator_shell.PATIENCE_S)

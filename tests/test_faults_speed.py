@@ -12,7 +12,7 @@ import pytest
 
 from bench.fault_robot import full_speed_mps
 from bench.faults import HAPPENINGS, STAND_S, Trial, happening_of, run_trial
-from cocoro.topics import HARDWARE
+from deploy.processes import hardware
 
 pytestmark = pytest.mark.sim
 
@@ -22,7 +22,7 @@ SEED = 7
 def telling(number: int) -> bool:
     """Whether a kind differs from the others enough to be tried at every change."""
     happening, _ = happening_of(number)
-    dies_with_its_task = happening.way == "dies" and happening.service in HARDWARE and happening.service != "base"
+    dies_with_its_task = happening.way == "dies" and happening.service in hardware() and happening.service != "base"
     return happening.way != "late" and not dies_with_its_task
 
 

@@ -6,6 +6,7 @@ import asyncio
 import socket
 from contextlib import AsyncExitStack
 from pathlib import Path
+from typing import Any
 
 import pytest
 from faults_live import LiveRobot, live
@@ -17,6 +18,7 @@ from cocoro.bus.local import LocalMesh
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.messages import TaskRequest, TaskState
 from cocoro.testing import in_virtual_time
+from cocoro.topics import Topic
 from cocoro.vloop import run_virtual
 
 pytestmark = pytest.mark.sim
@@ -73,8 +75,9 @@ async def test_an_emergency_stop_of_one_robot_is_acknowledged_by_its_own_service
         await rig.estop(latched=True)
         await rig.advance(1.0)
         assert rig.tap.messages(topics.BASE_STATE)[-1].latch == "latched"
-        for topic in (topics.BASE_STATE, topics.ARM_STATE, topics.HAND_STATE):
-            assert other.tap.messages(topic)[-1].latch == "released"  # type: ignore[union-attr]
+        reporting: tuple[Topic[Any], ...] = (topics.BASE_STATE, topics.ARM_STATE, topics.HAND_STATE)
+        for topic in reporting:
+            assert other.tap.messages(topic)[-1].latch == "released"
         assert (await other.ask("park")).accepted
 
 
@@ -90,7 +93,7 @@ def test_two_robots_behind_one_router_each_do_their_own(tmp_path: Path) -> None:
     async def scenario() -> None:
         endpoint = f"tcp/127.0.0.1:{free_port()}"
         mesh = f'[mesh]\nmode = "client"\nconnect = ["{endpoint}"]\n'
-        small = {"width": 160, "height": 120, "frame_rate_hz": 15.0}
+        small: dict[str, Any] = {"width": 160, "height": 120, "frame_rate_hz": 15.0}
         async with AsyncExitStack() as stack:
             await stack.enter_async_context(
                 await ZenohBus.open(ZenohConfig(name="router", mode="router", listen=(endpoint,)))

@@ -160,7 +160,8 @@ def test_states_from_the_future_are_rejected_and_nothing_after_them(
 
 
 def test_an_onlooker_whose_clock_is_wrong_sees_everything() -> None:
-    for topic in (topics.BASE_STATE, topics.BASE_COMMAND):
+    both: tuple[Topic[Any], ...] = (topics.BASE_STATE, topics.BASE_COMMAND)
+    for topic in both:
         inbox = Inbox(topic, KEY, StillClock(), onlooker=True)
         for seq, stamp_s in enumerate((1, 10_000)):
             inbox.deliver(KEY, payload(topic, seq, stamp_ns=stamp_s * NS))

@@ -15,8 +15,8 @@ from cocoro.arrays import FloatArray
 from cocoro.errors import CocoroError, ConfigError
 from cocoro.robot import Robot
 from services.kinect import tools
-from services.kinect.calibration import Board, Calibration, View, calibrate, find_corners
-from services.kinect.device import Shot
+from services.kinect.calibration import Board, BoardView, Calibration, calibrate, find_corners
+from services.kinect.device import RawFrame
 from services.kinect.lens import Lens, Straightener
 
 BOARD = Board(8, 6, 0.04)
@@ -54,17 +54,17 @@ def painter() -> Painter:
 
 
 @pytest.fixture(scope="module")
-def views(painter: Painter) -> list[View]:
+def views(painter: Painter) -> list[BoardView]:
     rng = np.random.default_rng(3)
     boards = [held(rng) for _ in range(VIEWS)]
     return [
-        View(corners_of(*board) + rng.normal(0.0, CORNER_PX, (len(BOARD.points_m), 2)), painter.depth(*board))
+        BoardView(corners_of(*board) + rng.normal(0.0, CORNER_PX, (len(BOARD.points_m), 2)), painter.depth(*board))
         for board in boards
     ]
 
 
 @pytest.fixture(scope="module")
-def found(views: list[View]) -> Calibration:
+def found(views: list[BoardView]) -> Calibration:
     return calibrate(views, BOARD, Robot.load())
 
 
@@ -103,7 +103,7 @@ def test_what_was_written_into_the_robots_file_straightens_its_pictures(
     write_values(file, "kinect", found.values())
     robot = Robot.load(None, file)
     rotation, origin = lying((0.3, -0.4, 0.1), (0.1, 0.05, 0.9), BOARD)
-    shot = Shot(7, painter.colour(rotation, origin), painter.depth(rotation, origin))
+    shot = RawFrame(7, painter.colour(rotation, origin), painter.depth(rotation, origin))
     straightener = Straightener(robot)
     assert not straightener.idle
     straight = straightener(shot)
@@ -127,27 +127,27 @@ def test_what_was_written_into_the_robots_file_straightens_its_pictures(
 def test_pictures_of_a_kinect_that_was_not_measured_are_passed_on_as_they_are() -> None:
     straightener = Straightener(Robot.load())
     assert straightener.idle
-    shot = Shot(0, np.zeros((480, 640, 3), np.uint8), np.zeros((480, 640), np.uint16))
+    shot = RawFrame(0, np.zeros((480, 640, 3), np.uint8), np.zeros((480, 640), np.uint16))
     assert straightener(shot).depth is shot.depth
     assert straightener(shot).colour is shot.colour
 
 
-def test_too_few_views_and_a_board_of_another_size_are_said(views: list[View]) -> None:
+def test_too_few_views_and_a_board_of_another_size_are_said(views: list[BoardView]) -> None:
     with pytest.raises(CocoroError, match="seen in 5 views; 6 are the least"):
         calibrate(views[:5], BOARD, Robot.load())
     with pytest.raises(CocoroError, match="there is depth on the board in 0 views; 6 are the least"):
         calibrate(views[:6], Board(8, 6, 0.05), Robot.load())
     rng = np.random.default_rng(5)
-    bent = [View(view.corners_px + rng.normal(0.0, 2.0, view.corners_px.shape), view.depth) for view in views[:6]]
+    bent = [BoardView(view.corners_px + rng.normal(0.0, 2.0, view.corners_px.shape), view.depth) for view in views[:6]]
     with pytest.raises(CocoroError, match=r"the corners miss a flat board's by .* is it 8 x 6 inner corners"):
         calibrate(bent, BOARD, Robot.load())
 
 
 def test_a_view_is_taken_when_the_board_is_held_still_somewhere_new(painter: Painter, tmp_path: Path) -> None:
-    collector = tools.Collector(BOARD, tmp_path)
+    collector = tools.ViewCollector(BOARD, tmp_path)
     places = [lying((0.2, 0.3, 0.0), (x, 0.0, 0.8), BOARD) for x in (-0.1, 0.05)]
-    shots = [Shot(0, painter.colour(*place), painter.depth(*place)) for place in places]
-    nothing = Shot(0, np.full((480, 640, 3), 90, np.uint8), shots[0].depth)
+    shots = [RawFrame(0, painter.colour(*place), painter.depth(*place)) for place in places]
+    nothing = RawFrame(0, np.full((480, 640, 3), 90, np.uint8), shots[0].depth)
     assert collector.take(nothing) == "the board is not seen whole"
     assert collector.take(shots[0]) == "hold it still"
     told = [collector.take(shots[0]) for _ in range(tools.STILL_SHOTS)]

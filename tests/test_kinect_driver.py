@@ -18,20 +18,19 @@ import pytest
 from cocoro.clock import RealClock
 from cocoro.errors import ConfigError
 from services.kinect import grabber as grabbing
-from services.kinect import recording
 from services.kinect.camera import FreenectCamera
-from services.kinect.config import Config
+from services.kinect.config import KinectConfig
 from services.kinect.freenect import (
     COLOUR_BYTES,
     DEPTH_BYTES,
     DeviceError,
     FrameMode,
-    Kinect,
+    FreenectDevice,
     MissingLibraryError,
+    check_recording,
     load,
 )
-from services.kinect.grabber import Grabber, grab
-from services.kinect.pairing import NS, PERIOD_NS, DeviceClock, Pairer, Picture
+from services.kinect.grabber import NS, PERIOD_NS, BufferedImage, DeviceClock, Grabber, Pairer, grab
 
 MS = 1_000_000
 TICKS_A_MS = 60_000
@@ -72,7 +71,7 @@ def test_each_colour_picture_goes_with_the_nearest_depth_picture(behind_ms: int)
     pictures += [("depth", n * PERIOD_NS + behind_ms * MS, n) for n in range(20)]
     pairs = []
     for kind, at_ns, buffer in sorted(pictures, key=lambda picture: picture[1]):
-        pair, _ = pairer.add(kind, Picture(at_ns, buffer))  # type: ignore[arg-type]
+        pair, _ = pairer.add(kind, BufferedImage(at_ns, buffer))  # type: ignore[arg-type]
         if pair is not None:
             pairs.append((pair.colour.buffer, pair.depth.buffer))
     assert pairs == [(n, n) for n in range(20)]
@@ -80,9 +79,9 @@ def test_each_colour_picture_goes_with_the_nearest_depth_picture(behind_ms: int)
 
 def test_a_picture_whose_partner_was_lost_is_given_up_and_its_buffer_with_it() -> None:
     pairer = Pairer()
-    assert pairer.add("colour", Picture(0, 1)) == (None, [])
-    assert pairer.add("colour", Picture(PERIOD_NS, 2)) == (None, [])
-    pair, free = pairer.add("depth", Picture(PERIOD_NS, 3))
+    assert pairer.add("colour", BufferedImage(0, 1)) == (None, [])
+    assert pairer.add("colour", BufferedImage(PERIOD_NS, 2)) == (None, [])
+    pair, free = pairer.add("depth", BufferedImage(PERIOD_NS, 3))
     assert pair is not None
     assert (pair.colour.buffer, pair.depth.buffer) == (2, 3)
     assert free == [("colour", 1)]
@@ -91,7 +90,7 @@ def test_a_picture_whose_partner_was_lost_is_given_up_and_its_buffer_with_it() -
 def test_of_a_stream_without_the_other_no_more_than_two_pictures_are_kept() -> None:
     pairer, freed = Pairer(), []
     for n in range(5):
-        freed += pairer.add("depth", Picture(n * PERIOD_NS, n))[1]
+        freed += pairer.add("depth", BufferedImage(n * PERIOD_NS, n))[1]
     assert freed == [("depth", 0), ("depth", 1), ("depth", 2)]
 
 
@@ -186,7 +185,8 @@ def test_pairs_come_with_tilt_and_light_set_and_the_light_goes_out_at_the_end(
     monkeypatch: pytest.MonkeyPatch, ends: tuple[socket.socket, Grabber]
 ) -> None:
     ours, grabber = ends
-    library, told = FakeLibrary(), []
+    library = FakeLibrary()
+    told: list[Any] = []
     colour, depth = (ctypes.c_char * COLOUR_BYTES)(), (ctypes.c_char * DEPTH_BYTES)()
 
     def process() -> int:
@@ -231,7 +231,7 @@ def test_what_nobody_reads_is_dropped_and_the_next_is_read_again(ends: tuple[soc
             break
     assert len(pairs) == grabbing.BUFFERS
     ours.send(json.dumps({"free": [pairs[0]["colour"], pairs[0]["depth"]]}).encode())
-    assert grabber.obey(Kinect(FakeLibrary(), lambda *_: None))  # type: ignore[arg-type]
+    assert grabber.obey(FreenectDevice(FakeLibrary(), lambda *_: None))  # type: ignore[arg-type]
     picture(20)
     again = json.loads(ours.recv(4096))
     assert (again["colour"], again["depth"]) == (pairs[0]["colour"], pairs[0]["depth"])
@@ -243,7 +243,12 @@ def test_a_kinect_whose_motor_cannot_be_opened_gives_pictures_all_the_same(
     ours, grabber = ends
     library = FakeLibrary()
     library.opens = lambda parts: 0 if parts == 2 else -1
-    library.process = lambda: ours.close() or 0
+
+    def process() -> int:
+        ours.close()
+        return 0
+
+    library.process = process
     run(monkeypatch, grabber, library, tilt=5.0)
     assert library.calls == [("shutdown", 0)]  # nothing was asked of the motor, which has the light
 
@@ -301,7 +306,7 @@ def test_a_library_that_is_not_there_or_is_another_is_said_with_the_package_to_i
         load("libc.so.6")
 
     async def open_it() -> None:
-        FreenectCamera(Config(library="/nowhere/libfreenect.so.0.5"), RealClock(), print)
+        FreenectCamera(KinectConfig(library="/nowhere/libfreenect.so.0.5"), RealClock(), print)
 
     with pytest.raises(ConfigError, match=r"kinect: libfreenect .*sudo apt install libfreenect0\.5"):
         asyncio.run(open_it())
@@ -313,13 +318,19 @@ def test_a_process_that_ends_by_itself_is_told_and_started_again(tmp_path: Path)
     async def scenario() -> tuple[list[str], int]:
         faults: list[str] = []
         twice = asyncio.Event()
-        config = Config(library="libc.so.6", recording=str(tmp_path))
+        config = KinectConfig(library="libc.so.6", recording=str(tmp_path))
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr("services.kinect.camera.freenect.load", lambda _: None)
             patch.setattr("services.kinect.camera.AGAIN_S", 0.01)
             camera = FreenectCamera(config, RealClock(), faults.append)
             starts = camera._start
-            patch.setattr(camera, "_start", lambda: starts() or (camera.starts > 1 and twice.set()))
+
+            def start() -> None:
+                starts()
+                if camera.starts > 1:
+                    twice.set()
+
+            patch.setattr(camera, "_start", start)
             with closing(camera):
                 async with asyncio.timeout(30.0):
                     await twice.wait()
@@ -343,7 +354,7 @@ def test_a_recording_is_checked_before_it_is_played(tmp_path: Path) -> None:
     def fault(*names: str) -> str:
         index.write_text("\n".join(names) + "\n")
         with pytest.raises(DeviceError) as error:
-            recording.check(str(tmp_path))
+            check_recording(str(tmp_path))
         return str(error.value)
 
     whole = (depth.name, colour.name)
@@ -353,6 +364,6 @@ def test_a_recording_is_checked_before_it_is_played(tmp_path: Path) -> None:
     assert "an empty line" in fault(depth.name, "", colour.name)
     assert "a-1.0-60.dump is empty" in fault(*whole, "a-1.0-60.dump")
     index.write_text("\n".join(whole) + "\n")
-    recording.check(str(tmp_path))
+    check_recording(str(tmp_path))
     depth.write_bytes(b"P5 640 480 65535" + bytes(DEPTH_BYTES))
     assert "is damaged" in fault(*whole)

@@ -22,14 +22,13 @@ from cocoro.topics import ARM_STATE, FRAME
 from services.kinect import doctor, tools
 from services.kinect.calibration import Board
 from services.kinect.camera import FreenectCamera
-from services.kinect.config import Config
-from services.kinect.device import Shot
-from services.kinect.service import as_frame
-from services.perception.config import Config as PerceptionConfig
+from services.kinect.config import KinectConfig
+from services.kinect.device import RawFrame
+from services.kinect.service import to_message
+from services.perception.config import PerceptionConfig
 from services.perception.core import PerceptionCore
-from sim.service import Config as SimConfig
-from sim.wire.record import RATE_HZ, record
-from sim.wire.recording import RecordingWriter
+from sim.service import SimConfig
+from sim.wire.record import RATE_HZ, RecordingWriter, record
 
 pytestmark = pytest.mark.sim
 
@@ -75,12 +74,14 @@ def pixels(recording: Path, kind: str) -> list[bytes]:
 
 @dataclass
 class Played:
-    shots: list[Shot] = field(default_factory=list)
+    shots: list[RawFrame] = field(default_factory=list)
     faults: list[str] = field(default_factory=list)
     took_s: float = 0.0
 
 
-def play(library: str, recording: Path, until: Callable[[Played], bool], on_fault: Callable[[], None] = int) -> Played:
+def play(
+    library: str, recording: Path, until: Callable[[Played], bool], on_fault: Callable[[], object] = int
+) -> Played:
     """Take pairs until it is enough. `on_fault` is called once, with the first real fault."""
 
     async def scenario() -> Played:
@@ -97,13 +98,13 @@ def play(library: str, recording: Path, until: Callable[[Played], bool], on_faul
                 enough.set()
 
         async def take() -> None:
-            async with aclosing(camera.shots()) as shots:
+            async with aclosing(camera.frames()) as shots:
                 async for shot in shots:
                     played.shots.append(shot)
                     if until(played):
                         enough.set()
 
-        config = Config(library=library, recording=str(recording))
+        config = KinectConfig(library=library, recording=str(recording))
         with closing(FreenectCamera(config, RealClock(), tell)) as camera:
             work = asyncio.create_task(take())
             began_s = loop.time()
@@ -117,7 +118,7 @@ def play(library: str, recording: Path, until: Callable[[Played], bool], on_faul
     return asyncio.run(scenario())
 
 
-def number_of(shot: Shot, colours: list[bytes], depths: list[bytes]) -> int:
+def number_of(shot: RawFrame, colours: list[bytes], depths: list[bytes]) -> int:
     """Which picture of the recording it is; both its halves must be whole, and of one moment."""
     number = colours.index(shot.colour.tobytes())
     assert shot.depth.astype("<u2").tobytes() == depths[number]
@@ -151,7 +152,7 @@ def test_a_damaged_recording_is_not_played_and_named_and_played_once_it_is_whole
     copy = copied(recording, tmp_path)
     cut = sorted(copy.glob("d-*"))[3]
     whole = damage(cut, 5000)
-    played = play(library, copy, lambda so_far: bool(so_far.shots), lambda: cut.write_bytes(whole) and None)
+    played = play(library, copy, lambda so_far: bool(so_far.shots), lambda: cut.write_bytes(whole))
     assert f"{cut} is damaged: its pixels take 4983 bytes, not 614400" in played.faults[1]
     assert played.faults[-1] == ""
 
@@ -189,7 +190,7 @@ def test_perception_finds_the_recorded_objects_where_they_stand(
             ServoState(stamp_ns=at_ns, joints=joints, position_rad=angles, speed_radps=(0.0, 0.0), load=(0.0, 0.0))
             for at_ns in (shot.stamp_ns - NS // 100, shot.stamp_ns + NS // 100)
         ]
-        samples = [*(Sample(ARM_STATE, head) for head in heads), Sample(FRAME, as_frame(shot))]
+        samples = [*(Sample(ARM_STATE, head) for head in heads), Sample(FRAME, to_message(shot))]
         for output in core.step(samples, shot.stamp_ns + NS // 50):
             if isinstance(output.message, Detections):
                 places += [seen.position_m for seen in output.message.detections if seen.label == label]
@@ -206,9 +207,9 @@ def test_views_of_a_chessboard_are_taken_from_the_device_and_kept(library: str, 
     pictures = [(painter.colour(*pose), painter.depth(*pose)) for pose in poses]
     with RecordingWriter(tmp_path / "recording") as writer:
         for number in range(40):
-            writer.add(as_frame(Shot(NS + number * NS // 30, *pictures[number // 20])))
+            writer.add(to_message(RawFrame(NS + number * NS // 30, *pictures[number // 20])))
     told: list[str] = []
-    config = Config(library=library, recording=str(tmp_path / "recording"))
+    config = KinectConfig(library=library, recording=str(tmp_path / "recording"))
     views = tools.capture(config, board, 2, tmp_path / "views", told.append)
     assert [text for text in told if text.startswith("view")] == ["view 1 of 2", "view 2 of 2"]
     assert {view.depth.tobytes() for view in views} == {depth.tobytes() for _, depth in pictures}
@@ -217,13 +218,13 @@ def test_views_of_a_chessboard_are_taken_from_the_device_and_kept(library: str, 
 
 def test_the_doctor_says_whether_pictures_come(library: str, recording: Path, tmp_path: Path) -> None:
     robot = Robot.load()
-    sends, lenses = doctor.check(Config(library=library, recording=str(recording)), robot, "calliope")
+    sends, lenses = doctor.check(KinectConfig(library=library, recording=str(recording)), robot, "calliope")
     assert (sends.state, sends.text[:30]) == ("ok", "sends pictures, 640 x 480, dep")
     assert (lenses.state, lenses.text) == ("note", "not measured: `cocoro kinect calibrate`")
-    nothing, _ = doctor.check(Config(library=library, recording=str(tmp_path)), robot, "calliope")
+    nothing, _ = doctor.check(KinectConfig(library=library, recording=str(tmp_path)), robot, "calliope")
     assert nothing.state == "bad"
     assert "is no recording" in nothing.text
-    missing, _ = doctor.check(Config(library="/nowhere/libfreenect.so"), robot, "calliope")
+    missing, _ = doctor.check(KinectConfig(library="/nowhere/libfreenect.so"), robot, "calliope")
     assert missing.text.endswith("sudo apt install libfreenect0.5")
 
 

@@ -15,10 +15,11 @@ from cocoro.errors import ConfigError
 from cocoro.node import Node
 from cocoro.robot import Robot
 from cocoro.vloop import run_virtual
-from services.kinect import device
-from services.kinect.device import Shot, Tell
+from services.kinect import camera
+from services.kinect.config import KinectConfig
+from services.kinect.device import OnFault, RawFrame
 from services.kinect.freenect import LED
-from services.kinect.service import Config, run
+from services.kinect.service import run
 
 
 class _Two:
@@ -28,12 +29,12 @@ class _Two:
         self.closed = False
         self._clock = clock
 
-    async def shots(self) -> AsyncIterator[Shot]:
+    async def frames(self) -> AsyncIterator[RawFrame]:
         for number in (1, 2):
             await self._clock.sleep_until(number * 33_000_000)
             # Strided, as a driver that flips or crops would give it.
             colour = np.full((4, 12, 3), number, dtype=np.uint8)[:, ::2]
-            yield Shot(self._clock.now_ns(), colour, np.full((4, 6), 700 + number, dtype=np.uint16))
+            yield RawFrame(self._clock.now_ns(), colour, np.full((4, 6), 700 + number, dtype=np.uint16))
         await asyncio.get_running_loop().create_future()
 
     def tilt(self, angle_rad: float) -> None: ...
@@ -47,11 +48,11 @@ class _Two:
 def test_every_pair_is_published_with_its_own_stamp_and_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
     cameras: list[_Two] = []
 
-    def open_two(config: Config, clock: Clock, tell: Tell) -> _Two:
+    def open_two(config: KinectConfig, clock: Clock, on_fault: OnFault) -> _Two:
         cameras.append(_Two(clock))
         return cameras[-1]
 
-    monkeypatch.setitem(device.DEVICES, "two", open_two)
+    monkeypatch.setattr(camera, "DRIVERS", {"two": open_two})
 
     async def scenario() -> list[tuple[int, int, int]]:
         mesh, clock, robot = LocalMesh(), VirtualClock(), Robot.load()
@@ -60,7 +61,7 @@ def test_every_pair_is_published_with_its_own_stamp_and_pixels(monkeypatch: pyte
             Node("viewer", mesh.join(), clock, robot) as viewer,
         ):
             stream = viewer.stream(topics.FRAME)
-            work = kinect.spawn(run(kinect, Config(device="two")))
+            work = kinect.spawn(run(kinect, KinectConfig(device="two")))
             frames = [await stream.next(), await stream.next()]
             work.cancel()
             await asyncio.wait([work])
@@ -74,4 +75,4 @@ def test_every_pair_is_published_with_its_own_stamp_and_pixels(monkeypatch: pyte
 
 def test_a_driver_that_is_not_there_is_said_with_what_to_do() -> None:
     with pytest.raises(ConfigError, match=r"no driver 'nonesuch' \(known: .*freenect"):
-        device.open_device(Config(device="nonesuch"), VirtualClock(), print)
+        camera.open_device(KinectConfig(device="nonesuch"), VirtualClock(), print)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import msgspec
 import numpy as np
 import pytest
@@ -155,7 +157,7 @@ def test_shading_does_not_split_a_thing() -> None:
     ],
     ids=["outside", "dark", "background", "speck", "inverted", "empty", "nothing"],
 )
-def test_where_there_is_no_thing_it_is_said_what_to_do(find, complaint) -> None:
+def test_where_there_is_no_thing_it_is_said_what_to_do(find: Callable[[], object], complaint: str) -> None:
     with pytest.raises(ConfigError, match=complaint):
         find()
 

@@ -10,7 +10,7 @@ from apps.learning.study import BEST, Sightings, errors_m, fit, rms, split
 from cocoro.learning.nominal_model import NominalModel
 from cocoro.robot import Robot
 from services.planning.teaching import Adapter
-from sim.wear import BEND_RAD
+from sim.realism import BEND_RAD
 
 
 @pytest.fixture(scope="module")

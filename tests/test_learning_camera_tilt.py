@@ -10,7 +10,7 @@ from cocoro.learning.dataset import WheelRow
 from cocoro.messages import Obstacles
 from cocoro.robot import Robot
 from cocoro.units import Vec3
-from services.planning.config import Config
+from services.planning.config import PlanningConfig
 from services.planning.state_estimator import StateEstimator
 
 
@@ -56,7 +56,7 @@ def test_an_eye_that_is_as_drawn_changes_nothing(robot: Robot) -> None:
 def test_the_floor_that_a_tilted_eye_lifts_is_no_obstacle(robot: Robot) -> None:
     floor, box = seen(robot, (1.9, 0.2, 0.0), 0.03), seen(robot, (1.9, -0.2, 0.2), 0.03)
     assert floor[2] > 0.05  # higher than what counts as floor so far off
-    estimator = StateEstimator(Config(), robot)
+    estimator = StateEstimator(PlanningConfig(), robot)
     obstacles = Obstacles(points_m=(floor, box), origin_m=(0.06, 0.0))
     assert estimator._standing(obstacles).points_m == (floor, box)
     estimator.camera_tilt = CameraTilt(robot, 0.03)

@@ -207,6 +207,7 @@ def test_every_wrong_model_is_refused_in_one_line_that_says_why(robot: Robot, le
     other = Robot.from_data(robot.to_data() | {"name": "robbie"})
     redrawn = robot.with_base(wheel_radius_m=0.04)
     assert learned.arm is not None
+    assert learned.wheels is not None
     short = msgspec.structs.replace(learned.arm, weights=learned.arm.weights[:-1])
     for data, who, text in (
         (b"", robot, "damaged, or no model"),

@@ -14,7 +14,7 @@ from cocoro.learning.network import HyperplaneRbf
 def network() -> HyperplaneRbf:
     rng = np.random.default_rng(1)
     made = HyperplaneRbf.spread([3, 2, 1, 3], [1.57, 1.0, 2.0, 1.2], np.tile([-2.62, 2.62], (4, 1)))
-    made.weights = rng.normal(size=made.weights.shape)
+    made.weights = np.asarray(rng.normal(size=made.weights.shape))
     return made
 
 
@@ -27,7 +27,7 @@ def test_the_papers_network_has_81_bases_and_1215_weights() -> None:
 
 def test_one_output_is_the_equation_written_out(network: HyperplaneRbf) -> None:
     x = np.array([0.3, -1.0, 0.7, 2.0])
-    total, given = 0.0, np.zeros(3)
+    total, given = np.zeros(()), np.zeros(3)
     for j, centre in enumerate(network.centres):
         c = (x - centre) / network.widths
         g = np.exp(-0.5 * c @ c)

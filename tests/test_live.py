@@ -24,7 +24,8 @@ from cocoro.inbox import Stream
 from cocoro.messages import Truth
 from cocoro.node import Node
 from cocoro.robot import Robot
-from cocoro.topics import HARDWARE, STOPPABLE, Topic
+from cocoro.topics import Topic
+from deploy.processes import hardware, stoppable
 from deploy.rundir import RunDir
 
 pytestmark = [pytest.mark.zenoh, pytest.mark.sim]
@@ -53,7 +54,7 @@ def test_a_robot_is_started_fetches_is_stopped_and_leaves_nothing_behind(shell: 
     up = shell("up", "sim", "--detach", "--frames", "320x240@15")
     assert up.returncode == exits.DONE, up.stdout + up.stderr
     claims = shell.run_dir.claims()
-    assert set(claims) >= {*HARDWARE, "perception", "planning", "executive"}
+    assert set(claims) >= {*hardware(), "perception", "planning", "executive"}
     supervisor = shell.run_dir.supervisor()
     assert supervisor is not None
     pids = {holder.pid for holder in (*claims.values(), supervisor)}
@@ -67,7 +68,7 @@ def test_a_robot_is_started_fetches_is_stopped_and_leaves_nothing_behind(shell: 
     estop = shell("estop", "--json", "--robot", "calliope")
     assert estop.returncode == exits.DONE, estop.stderr
     stopped = json.loads(estop.stdout)
-    assert set(stopped["acknowledged"]) >= {*STOPPABLE, "executive"}
+    assert set(stopped["acknowledged"]) >= {*stoppable(), "executive"}
     print(f"from Enter to all halted: {stopped['seconds']:.2f} s")
     refused = shell("put-down")
     assert refused.returncode == exits.REFUSED

@@ -4,9 +4,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from cocoro.errors import ConfigError
-from cocoro.objects import Catalogue
+from cocoro.objects import Catalogue, ObjectSpec
 from cocoro.robot import Robot
 from services.perception.colours import ColourTable, lab_of, matches
 from sim.render.views import lamp_tint
@@ -27,7 +28,7 @@ def load(tmp_path: Path, text: str) -> Catalogue:
     return Catalogue.load(path)
 
 
-def test_the_projects_own_objects_are_the_three_cans_two_balls_and_the_marker():
+def test_the_projects_own_objects_are_the_three_cans_two_balls_and_the_marker() -> None:
     catalogue = Catalogue.load()
     assert catalogue.labels == (
         "red_can", "green_can", "blue_can", "yellow_ball", "blue_ball", "hand_marker",
@@ -43,11 +44,11 @@ def test_the_projects_own_objects_are_the_three_cans_two_balls_and_the_marker():
     assert "hand_marker" not in [known.label for known in catalogue.targets]
 
 
-def test_the_marker_is_as_large_as_the_robot_description_says():
+def test_the_marker_is_as_large_as_the_robot_description_says() -> None:
     assert Catalogue.load()["hand_marker"].radius_m == Robot.load().marker.radius_m
 
 
-def test_a_label_that_is_not_there_is_told_apart_from_one_that_is():
+def test_a_label_that_is_not_there_is_told_apart_from_one_that_is() -> None:
     catalogue = Catalogue.load()
     assert "red_can" in catalogue
     assert "teapot" not in catalogue
@@ -56,7 +57,7 @@ def test_a_label_that_is_not_there_is_told_apart_from_one_that_is():
         catalogue["teapot"]
 
 
-def test_a_box_has_its_own_size_and_a_planar_radius_of_equal_area(tmp_path):
+def test_a_box_has_its_own_size_and_a_planar_radius_of_equal_area(tmp_path: Path) -> None:
     box = BALL.replace('"sphere"', '"box"').replace("radius_m = 0.03", "size_m = [0.1, 0.2, 0.3]")
     known = load(tmp_path, box)["ball"]
     assert known.size_m == (0.1, 0.2, 0.3)
@@ -81,7 +82,7 @@ def test_a_box_has_its_own_size_and_a_planar_radius_of_equal_area(tmp_path):
         ('label = "ball"', 'label = "a ball"', "label: Expected `str` matching regex"),
     ],
 )
-def test_an_error_names_file_table_and_field(tmp_path, was, becomes, complaint):
+def test_an_error_names_file_table_and_field(tmp_path: Path, was: str, becomes: str, complaint: str) -> None:
     assert was in BALL
     with pytest.raises(ConfigError) as caught:
         load(tmp_path, BALL.replace(was, becomes))
@@ -91,7 +92,7 @@ def test_an_error_names_file_table_and_field(tmp_path, was, becomes, complaint):
     assert "[[object]] 1" in text
 
 
-def test_a_label_and_the_marker_are_given_once(tmp_path):
+def test_a_label_and_the_marker_are_given_once(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"\[\[object\]\] 2 \(ball\): label: it is taken"):
         load(tmp_path, BALL + BALL)
     marker = BALL.replace("rgb", "marker = true\nrgb")
@@ -100,12 +101,12 @@ def test_a_label_and_the_marker_are_given_once(tmp_path):
 
 
 @pytest.mark.parametrize("text", ["", "object = 3", "[object]", "[[object]", "[[thing]]\nlabel = 'x'"])
-def test_a_file_without_object_tables_is_refused(tmp_path, text):
+def test_a_file_without_object_tables_is_refused(tmp_path: Path, text: str) -> None:
     with pytest.raises(ConfigError, match=r"things\.toml"):
         load(tmp_path, text)
 
 
-def test_a_missing_file_is_named(tmp_path):
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"nowhere\.toml"):
         Catalogue.load(tmp_path / "nowhere.toml")
 
@@ -113,7 +114,7 @@ def test_a_missing_file_is_named(tmp_path):
 # --- colours --------------------------------------------------------------------------------------
 
 
-def colours_in_changing_light(rgb: tuple[float, float, float], count: int = 4000) -> np.ndarray:
+def colours_in_changing_light(rgb: tuple[float, float, float], count: int = 4000) -> NDArray[np.uint8]:
     """The surface's colour as the camera gives it, 8-bit RGB, (count, 3): lit and in its own shade, under lamps of 4500
     to 8000 K, with exposure +-10%, white balance +-5% and the noise that is left after a 3 x 3 mean."""
     draws = np.random.default_rng(5)
@@ -121,11 +122,12 @@ def colours_in_changing_light(rgb: tuple[float, float, float], count: int = 4000
     light = draws.uniform(0.40, 1.0, (count, 1)) * draws.uniform(0.9, 1.1, (count, 1))
     balance = draws.uniform(-0.05, 0.05, (count, 1)) * np.array([1.0, 0.0, -1.0])
     values = 255 * np.array(rgb) * light * tints * (1 + balance) + draws.normal(0, 4 / 3, (count, 3))
-    return np.clip(np.rint(values), 0, 255).astype(np.uint8)
+    colours: NDArray[np.uint8] = np.clip(np.rint(values), 0, 255).astype(np.uint8)
+    return colours
 
 
 @pytest.mark.parametrize("known", Catalogue.load(), ids=lambda known: known.label)
-def test_a_colour_range_holds_in_changing_light_and_takes_no_other_objects_colour(known):
+def test_a_colour_range_holds_in_changing_light_and_takes_no_other_objects_colour(known: ObjectSpec) -> None:
     own = lab_of(colours_in_changing_light(known.rgb))
     assert matches(known, own).mean() > 0.99
     for other in Catalogue.load():
@@ -139,13 +141,13 @@ def test_a_colour_range_holds_in_changing_light_and_takes_no_other_objects_colou
      (0.55, 0.40, 0.25), (0.6, 0.3, 0.2), (0.85, 0.65, 0.55)],
     ids=["floor", "wall", "servo", "arm", "paper", "wood", "brick", "skin"],
 )  # fmt: skip
-def test_rooms_robots_and_people_have_no_objects_colour(rgb):
+def test_rooms_robots_and_people_have_no_objects_colour(rgb: tuple[float, float, float]) -> None:
     colours = lab_of(colours_in_changing_light(rgb))
     for known in Catalogue.load():
         assert matches(known, colours).mean() < 0.01, known.label
 
 
-def test_the_colour_table_says_what_the_ranges_say():
+def test_the_colour_table_says_what_the_ranges_say() -> None:
     catalogue = Catalogue.load()
     table = ColourTable(catalogue)
     for bit, known in enumerate(catalogue):
@@ -159,8 +161,8 @@ def test_the_colour_table_says_what_the_ranges_say():
             assert not int(found[0, 0]) & ~sum(1 << i for i in sharing), (known.label, shade)
 
 
-def test_a_colour_table_holds_more_than_eight_objects_and_refuses_what_it_cannot_hold(tmp_path):
-    def many(count):
+def test_a_colour_table_holds_more_than_eight_objects_and_refuses_what_it_cannot_hold(tmp_path: Path) -> None:
+    def many(count: int) -> Catalogue:
         return load(tmp_path, "".join(BALL.replace('"ball"', f'"ball_{i}"') for i in range(count)))
 
     red = np.full((4, 4, 3), (200, 20, 20), dtype=np.uint8)

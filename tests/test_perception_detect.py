@@ -6,7 +6,7 @@ import pytest
 from perception_scenes import CATALOGUE, ROBOT, Canvas, seen, the
 
 from cocoro.messages import Detections
-from services.perception.config import Config
+from services.perception.config import PerceptionConfig
 from services.perception.image import RgbdImage
 from services.perception.paper import PaperDetector
 
@@ -27,7 +27,7 @@ def beside(canvas: Canvas, right: float, down: float = 0.0) -> tuple[float, floa
 @SIZES
 @DETECTORS
 @pytest.mark.parametrize("label", CATALOGUE.labels)
-def test_every_known_object_is_found_where_it_is(label, detector, size):
+def test_every_known_object_is_found_where_it_is(label: str, detector: str, size: tuple[int, int]) -> None:
     canvas = Canvas(*size)
     canvas.rectangle(label, beside(canvas, 0.1, 0.05), 0.8)
     detections = seen(canvas.frame(), detector=detector)
@@ -39,12 +39,12 @@ def test_every_known_object_is_found_where_it_is(label, detector, size):
 
 
 @DETECTORS
-def test_an_empty_room_holds_nothing(detector):
+def test_an_empty_room_holds_nothing(detector: str) -> None:
     assert seen(Canvas().frame(), detector=detector).detections == ()
 
 
 @SIZES
-def test_the_box_and_the_area_are_those_of_the_object(size):
+def test_the_box_and_the_area_are_those_of_the_object(size: tuple[int, int]) -> None:
     canvas = Canvas(*size)
     canvas.rectangle("red_can", middle(canvas), 1.0)
     found = the("red_can", seen(canvas.frame()))
@@ -59,7 +59,7 @@ def test_the_box_and_the_area_are_those_of_the_object(size):
 
 @SIZES
 @pytest.mark.parametrize("depth_m", [0.6, 0.75, 1.5, 3.0])
-def test_depth_is_registered_to_the_colour_image(depth_m, size):
+def test_depth_is_registered_to_the_colour_image(depth_m: float, size: tuple[int, int]) -> None:
     """Twice as wide as its depth is shifted: read at the colour's own pixel, half of it would be the wall's."""
     canvas = Canvas(*size)
     canvas.rectangle("yellow_ball", middle(canvas), depth_m)
@@ -73,7 +73,7 @@ def test_depth_is_registered_to_the_colour_image(depth_m, size):
     assert np.abs(on_object[np.isfinite(on_object)] - depth_m).max() < step_m
 
 
-def test_registering_a_part_of_the_image_gives_that_part_of_the_whole():
+def test_registering_a_part_of_the_image_gives_that_part_of_the_whole() -> None:
     canvas = Canvas()
     canvas.rectangle("red_can", (200, 200), 0.9)
     canvas.rectangle("blue_can", (400, 300), 1.7)
@@ -94,13 +94,13 @@ def can_and_patch() -> Canvas:
     return canvas
 
 
-def test_a_patch_of_the_cans_colour_does_not_pull_the_blob():
+def test_a_patch_of_the_cans_colour_does_not_pull_the_blob() -> None:
     found = the("red_can", seen(can_and_patch().frame()))
     assert (found.u_px, found.v_px) == pytest.approx((200, 240), abs=1.0)
     assert found.depth_m == pytest.approx(1.0, abs=0.01)
 
 
-def test_the_papers_detector_points_between_two_regions_of_one_colour():
+def test_the_papers_detector_points_between_two_regions_of_one_colour() -> None:
     """Its known weakness, which the default does not share: the median of all matching pixels lies on neither."""
     canvas = Canvas()
     canvas.rectangle("red_can", (200, 100), 1.0)
@@ -112,7 +112,7 @@ def test_the_papers_detector_points_between_two_regions_of_one_colour():
     assert min(abs(better.u_px - 200), abs(better.u_px - 440)) < 1.0
 
 
-def test_a_larger_region_of_the_colour_is_not_preferred_to_one_of_the_right_size():
+def test_a_larger_region_of_the_colour_is_not_preferred_to_one_of_the_right_size() -> None:
     canvas = Canvas()
     canvas.rectangle("red_can", (440, 240), 1.6, size_m=(0.5, 0.5))
     canvas.rectangle("red_can", (150, 240), 1.6)
@@ -121,20 +121,20 @@ def test_a_larger_region_of_the_colour_is_not_preferred_to_one_of_the_right_size
 
 
 @pytest.mark.parametrize("size_m", [(0.5, 0.5), (0.02, 0.03), (0.6, 0.03)], ids=["wall", "speck", "strip"])
-def test_what_has_the_colour_but_no_objects_size_is_nothing(size_m):
+def test_what_has_the_colour_but_no_objects_size_is_nothing(size_m: tuple[float, float]) -> None:
     canvas = Canvas()
     canvas.rectangle("red_can", (320, 240), 1.2, size_m=size_m)
     assert seen(canvas.frame()).detections == ()
 
 
-def test_of_two_equal_objects_the_nearer_is_reported():
+def test_of_two_equal_objects_the_nearer_is_reported() -> None:
     canvas = Canvas()
     canvas.rectangle("red_can", (200, 240), 1.6)
     canvas.rectangle("red_can", (440, 240), 1.0)
     assert the("red_can", seen(canvas.frame())).depth_m == pytest.approx(1.0, abs=0.01)
 
 
-def test_a_can_before_a_wall_of_its_own_colour_is_told_from_it_by_depth():
+def test_a_can_before_a_wall_of_its_own_colour_is_told_from_it_by_depth() -> None:
     canvas = Canvas()
     canvas.rectangle("red_can", (320, 240), 2.5, size_m=(1.0, 1.0))
     canvas.rectangle("red_can", (300, 240), 1.2)
@@ -143,7 +143,7 @@ def test_a_can_before_a_wall_of_its_own_colour_is_told_from_it_by_depth():
     assert found.depth_m == pytest.approx(1.2, abs=0.02)
 
 
-def test_an_object_parted_in_two_by_a_bar_is_one_detection():
+def test_an_object_parted_in_two_by_a_bar_is_one_detection() -> None:
     canvas = Canvas()
     canvas.rectangle("red_can", (320, 240), 1.0)
     top, bottom = 236, 246
@@ -157,7 +157,7 @@ def test_an_object_parted_in_two_by_a_bar_is_one_detection():
 # --- noise, depth, edges --------------------------------------------------------------------------
 
 
-def test_single_wild_pixels_are_no_object():
+def test_single_wild_pixels_are_no_object() -> None:
     canvas = Canvas()
     draws = np.random.default_rng(1)
     wild = draws.random(canvas.depth_m.shape) < 0.02
@@ -166,7 +166,7 @@ def test_single_wild_pixels_are_no_object():
 
 
 @SIZES
-def test_an_object_is_found_in_the_sensors_noise_and_drift(size):
+def test_an_object_is_found_in_the_sensors_noise_and_drift(size: tuple[int, int]) -> None:
     draws = np.random.default_rng(2)
     for exposure, balance in ((0.9, 0.05), (1.1, -0.05), (1.1, 0.05), (0.9, -0.05)):
         canvas = Canvas(*size)
@@ -178,7 +178,7 @@ def test_an_object_is_found_in_the_sensors_noise_and_drift(size):
         assert tuple(d.label for d in seen(canvas.frame()).detections) == CATALOGUE.labels
 
 
-def test_colour_without_depth_is_refused_a_position():
+def test_colour_without_depth_is_refused_a_position() -> None:
     canvas = Canvas()
     canvas.rectangle("red_can", (320, 240), None, seen_at_m=0.45)
     found = the("red_can", seen(canvas.frame()))
@@ -188,7 +188,7 @@ def test_colour_without_depth_is_refused_a_position():
     assert found.u_px == pytest.approx(320, abs=1.0)
 
 
-def test_what_the_depth_camera_sees_past_a_near_object_is_not_its_depth():
+def test_what_the_depth_camera_sees_past_a_near_object_is_not_its_depth() -> None:
     """It stands beside the colour camera: of the wall behind the can it sees a strip that the can hides."""
     canvas = Canvas(wall_m=1.0)
     canvas.rectangle("red_can", (320, 240), None, seen_at_m=0.45)
@@ -197,7 +197,7 @@ def test_what_the_depth_camera_sees_past_a_near_object_is_not_its_depth():
     assert the("red_can", seen(canvas.frame())).note == "no depth"
 
 
-def test_an_infrared_shadow_over_a_part_does_not_change_the_depth():
+def test_an_infrared_shadow_over_a_part_does_not_change_the_depth() -> None:
     canvas = Canvas()
     canvas.rectangle("red_can", (320, 240), 1.0)
     canvas.depth_m[:, 300:335] = np.nan
@@ -206,7 +206,7 @@ def test_an_infrared_shadow_over_a_part_does_not_change_the_depth():
     assert found.u_px == pytest.approx(320, abs=1.0)
 
 
-def test_an_object_at_the_images_edge_is_noted_as_cut():
+def test_an_object_at_the_images_edge_is_noted_as_cut() -> None:
     canvas = Canvas()
     canvas.rectangle("red_can", (0, 240), 1.0)
     found = the("red_can", seen(canvas.frame()))
@@ -215,13 +215,13 @@ def test_an_object_at_the_images_edge_is_noted_as_cut():
     assert found.position_m is not None
 
 
-def test_at_the_right_edge_where_the_depth_camera_sees_past_an_object_no_position_is_claimed():
+def test_at_the_right_edge_where_the_depth_camera_sees_past_an_object_no_position_is_claimed() -> None:
     canvas = Canvas()
     canvas.rectangle("red_can", (640, 240), 1.0)
     assert all(found.position_m is None for found in seen(canvas.frame()).detections)
 
 
-def test_an_object_that_is_mostly_hidden_is_noted_as_occluded():
+def test_an_object_that_is_mostly_hidden_is_noted_as_occluded() -> None:
     canvas = Canvas()
     canvas.rectangle("red_can", (320, 240), 1.0)
     shift = round(canvas.camera.fx * 0.025 / 0.7)
@@ -232,7 +232,7 @@ def test_an_object_that_is_mostly_hidden_is_noted_as_occluded():
     assert found.position_m is not None
 
 
-def test_the_same_small_patch_with_nothing_before_it_is_no_can():
+def test_the_same_small_patch_with_nothing_before_it_is_no_can() -> None:
     canvas = Canvas()
     canvas.rectangle("red_can", (310, 240), 1.0, size_m=(0.022, 0.12))
     assert seen(canvas.frame()).detections == ()
@@ -240,7 +240,7 @@ def test_the_same_small_patch_with_nothing_before_it_is_no_can():
 
 @DETECTORS
 @pytest.mark.parametrize("size", [(1, 1), (3, 2), (17, 9), (160, 120), (641, 479)], ids=str)
-def test_no_frame_however_odd_is_an_error(size, detector):
+def test_no_frame_however_odd_is_an_error(size: tuple[int, int], detector: str) -> None:
     draws = np.random.default_rng(7)
     width, height = size
     for trial in range(6):
@@ -254,7 +254,7 @@ def test_no_frame_however_odd_is_an_error(size, detector):
                 canvas.colour[top : top + height // 3 + 1, left : left + width // 3 + 1] = np.array(known.rgb) * 200
         frame = canvas.frame()
         codes = draws.integers(0, 65536, height * width) if trial % 2 else np.full(height * width, 400 * trial)
-        frame.depth = memoryview(codes.astype("<u2").view(np.uint8))
+        frame.depth = codes.astype("<u2").view(np.uint8).data
         found = seen(frame, 0.3, -0.6, detector=detector)
         assert msgspec.msgpack.decode(msgspec.msgpack.encode(found), type=Detections) == found
 
@@ -263,7 +263,7 @@ def test_no_frame_however_odd_is_an_error(size, detector):
 
 
 def paper(canvas: Canvas) -> list[str]:
-    detector = PaperDetector(CATALOGUE, Config())
+    detector = PaperDetector(CATALOGUE, PerceptionConfig())
     return [sighting.label for sighting in detector.detect(RgbdImage.of(canvas.frame(), ROBOT))]
 
 
@@ -273,17 +273,17 @@ def painted(width: int, height: int, left: int = 20, top: int = 20) -> Canvas:
     return canvas
 
 
-def test_the_paper_wants_more_than_64_pixels_in_one_tile():
+def test_the_paper_wants_more_than_64_pixels_in_one_tile() -> None:
     assert paper(painted(8, 8)) == []
     assert paper(painted(13, 5)) == ["red_can"]
 
 
-def test_the_paper_counts_by_tile_not_by_image():
+def test_the_paper_counts_by_tile_not_by_image() -> None:
     across_four_tiles = painted(10, 10, left=123, top=91)
     assert paper(across_four_tiles) == []
 
 
-def test_the_paper_reads_depth_at_the_same_pixel_unregistered():
+def test_the_paper_reads_depth_at_the_same_pixel_unregistered() -> None:
     canvas = Canvas()
     canvas.rectangle("hand_marker", (320, 240), 0.6)
     canvas.depth_m[:] = 3.0

@@ -4,12 +4,14 @@ from math import cos, radians, sin
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from perception_scenes import CATALOGUE, MS, ROBOT, STAMP_NS, Scene, Thing, block, error_mm, facing, known, seen, the
 
-from services.perception.config import Config
+from services.perception.config import PerceptionConfig
 from services.perception.localise import Localiser
 from services.perception.shapes import distance_from, signed_distance
 from services.perception.sighting import ImageSighting
+from sim.realism import Sensors
 from sim.scene import Light
 
 pytestmark = pytest.mark.sim
@@ -20,9 +22,11 @@ AIMS = ((0.0, 0.0), (0.2, 0.1), (-0.25, -0.12))
 """Pan and tilt beside the object, rad."""
 
 
-def errors_mm(distance_m, sensors, size=(640, 480), label=CAN):
+def errors_mm(
+    distance_m: float, sensors: Sensors, size: tuple[int, int] = (640, 480), label: str = CAN
+) -> NDArray[np.float64]:
     """(horizontal, vertical) errors of one object at a distance, for three bearings and three aims of the head."""
-    errors = []
+    errors: list[tuple[float, float]] = []
     for number, bearing in enumerate((-0.4, 0.1, 0.6)):
         thing = known(label, distance_m * cos(bearing), distance_m * sin(bearing))
         pan, tilt = facing(thing)
@@ -50,19 +54,21 @@ def errors_mm(distance_m, sensors, size=(640, 480), label=CAN):
         (3.0, "real", 15.0, 30.0),
     ],
 )
-def test_a_cans_centre_is_known_to_millimetres(distance_m, sensors, mean_mm, most_mm):
+def test_a_cans_centre_is_known_to_millimetres(
+    distance_m: float, sensors: Sensors, mean_mm: float, most_mm: float
+) -> None:
     errors = errors_mm(distance_m, sensors)
     assert errors[:, 0].mean() < mean_mm
     assert errors.max() < most_mm
 
 
 @pytest.mark.parametrize(("distance_m", "most_mm"), [(0.75, 2.0), (1.5, 8.0), (3.0, 50.0)])
-def test_a_quarter_of_the_pixels_costs_little(distance_m, most_mm):
+def test_a_quarter_of_the_pixels_costs_little(distance_m: float, most_mm: float) -> None:
     assert errors_mm(distance_m, "real", (320, 240)).max() < most_mm
 
 
 @pytest.mark.parametrize("label", CATALOGUE.labels)
-def test_every_known_object_is_located(label):
+def test_every_known_object_is_located(label: str) -> None:
     assert errors_mm(0.9, "real", label=label).max() < 3.0
 
 
@@ -72,7 +78,7 @@ def test_every_known_object_is_located(label):
     Light(ambient=0.5, diffuse=0.5, temperature_k=8000),
     Light(ambient=0.4, diffuse=0.6, direction=(1.0, 1.0, -0.3)),
 ], ids=["contrast", "warm", "cold", "low side light"])  # fmt: skip
-def test_changing_light_leaves_all_objects_found_and_placed(light):
+def test_changing_light_leaves_all_objects_found_and_placed(light: Light) -> None:
     things = [
         known("red_can", 1.5, 0.0),
         known("green_can", 1.6, -0.5),
@@ -89,7 +95,7 @@ def test_changing_light_leaves_all_objects_found_and_placed(light):
 
 
 @pytest.mark.parametrize("speed_radps", [0.5, 1.0])
-def test_a_turning_heads_motion_blur_leaves_a_near_can_in_place(speed_radps):
+def test_a_turning_heads_motion_blur_leaves_a_near_can_in_place(speed_radps: float) -> None:
     can = known(CAN, 1.5, 0.1)
     pan, tilt = facing(can)
     with Scene([can], "real") as scene:
@@ -99,9 +105,11 @@ def test_a_turning_heads_motion_blur_leaves_a_near_can_in_place(speed_radps):
 
 
 @pytest.mark.parametrize(("area_px", "is_told"), [(300, False), (2500, True)], ids=["a part", "whole"])
-def test_what_seems_to_be_a_part_of_something_that_reaches_into_the_floor_is_no_such_thing(area_px, is_told):
+def test_what_seems_to_be_a_part_of_something_that_reaches_into_the_floor_is_no_such_thing(
+    area_px: int, is_told: bool
+) -> None:
     """Of a can that the arm hides in part, what is left may be as round as a ball."""
-    localiser = Localiser(ROBOT, CATALOGUE, Config().occluded_share)
+    localiser = Localiser(ROBOT, CATALOGUE, PerceptionConfig().occluded_share)
     camera = ROBOT.camera
     head_rad = np.array([0.3, -0.6])
     into_floor = np.linalg.inv(localiser.camera_pose(head_rad)) @ [1.05, 0.35, -0.07, 1.0]
@@ -129,7 +137,7 @@ NEAR = known(CAN, 0.75, 0.0)
     ],
     ids=["right finger", "left finger", "left half", "right half", "bottom", "bar across"],
 )
-def test_a_body_before_the_can_does_not_move_its_axis(cover, size):
+def test_a_body_before_the_can_does_not_move_its_axis(cover: Thing, size: tuple[int, int]) -> None:
     pan, tilt = 0.0, -0.7
     with Scene([NEAR], "real", 1, *size) as scene:
         free = the(CAN, seen(scene.frame(pan, tilt), pan, tilt))
@@ -140,7 +148,7 @@ def test_a_body_before_the_can_does_not_move_its_axis(cover, size):
     assert error_mm(hidden, NEAR)[0] < 4.0
 
 
-def test_the_papers_way_moves_where_the_shape_fit_does_not():
+def test_the_papers_way_moves_where_the_shape_fit_does_not() -> None:
     cover = block(0.62, 0.05, 0.10, (0.02, 0.10, 0.20), GREY)
     with Scene([NEAR, cover]) as scene:
         frame = scene.frame(0.0, -0.7)
@@ -150,7 +158,7 @@ def test_the_papers_way_moves_where_the_shape_fit_does_not():
     assert fitted < 2.0
 
 
-def test_an_object_cut_by_the_images_edge_is_placed_by_what_is_left():
+def test_an_object_cut_by_the_images_edge_is_placed_by_what_is_left() -> None:
     pan, tilt = 0.0, -0.42
     with Scene([NEAR], "real") as scene:
         found = the(CAN, seen(scene.frame(pan, tilt), pan, tilt))
@@ -173,14 +181,14 @@ RED = CATALOGUE[CAN].rgb
     ],
     ids=["small block", "patch in the air", "wall behind", "large box"],
 )
-def test_other_red_things_do_not_draw_the_can_away(other):
+def test_other_red_things_do_not_draw_the_can_away(other: Thing) -> None:
     can = known(CAN, 1.2, 0.1)
     with Scene([can, other], "real") as scene:
         found = the(CAN, seen(scene.frame(0.0, -0.45), 0.0, -0.45))
     assert max(error_mm(found, can)) < 3.0
 
 
-def test_a_red_patch_alone_is_no_can():
+def test_a_red_patch_alone_is_no_can() -> None:
     with Scene([block(1.8, -0.4, 0.3, (0.02, 0.05, 0.05), RED)], "real") as scene:
         assert seen(scene.frame(0.0, -0.45), 0.0, -0.45).detections == ()
 
@@ -197,7 +205,7 @@ def blue_ball(x: float, y: float, z: float = 0.04) -> Thing:
 
 @pytest.mark.parametrize("sensors", ["ideal", "real"])
 @pytest.mark.parametrize("distance_m", [0.6, 1.0, 1.5, 2.0])
-def test_a_ball_as_blue_as_the_can_is_known_by_its_shape(distance_m, sensors):
+def test_a_ball_as_blue_as_the_can_is_known_by_its_shape(distance_m: float, sensors: Sensors) -> None:
     for number, thing in enumerate(
         (blue_ball(distance_m, 0.1), blue_ball(distance_m, 0.1, 0.7), known("blue_can", distance_m, 0.1))
     ):
@@ -208,7 +216,7 @@ def test_a_ball_as_blue_as_the_can_is_known_by_its_shape(distance_m, sensors):
         assert error_mm(the(thing.name, detections), thing)[0] < 2.0 + 3.0 * distance_m**2
 
 
-def test_side_by_side_each_keeps_its_name():
+def test_side_by_side_each_keeps_its_name() -> None:
     things = [blue_ball(1.2, -0.2), known("blue_can", 1.2, 0.2)]
     with Scene(things, "real") as scene:
         detections = seen(scene.frame(0.0, -0.5), 0.0, -0.5)
@@ -217,7 +225,7 @@ def test_side_by_side_each_keeps_its_name():
 
 
 @pytest.mark.parametrize("left_m", [0.05, 0.04, 0.03])
-def test_a_half_hidden_can_is_not_taken_for_a_ball(left_m):
+def test_a_half_hidden_can_is_not_taken_for_a_ball(left_m: float) -> None:
     can = known("blue_can", 0.75, 0.0)
     cover = block(0.62, left_m, 0.10, (0.02, 0.10, 0.20), GREY)
     with Scene([can, cover], "real") as scene:
@@ -230,7 +238,7 @@ def test_a_half_hidden_can_is_not_taken_for_a_ball(left_m):
 
 
 @pytest.mark.parametrize("label", ["red_can", "yellow_ball"])
-def test_distances_are_zero_on_the_surface_and_grow_by_the_metre_outwards(label):
+def test_distances_are_zero_on_the_surface_and_grow_by_the_metre_outwards(label: str) -> None:
     shape = CATALOGUE[label]
     draws = np.random.default_rng(3)
     points = draws.uniform(-0.2, 0.2, (500, 3))
@@ -241,7 +249,7 @@ def test_distances_are_zero_on_the_surface_and_grow_by_the_metre_outwards(label)
     np.testing.assert_allclose(distance_from(shape, onto), 0.0, atol=1e-9)
 
 
-def test_a_can_is_inside_within_its_radius_and_half_height():
+def test_a_can_is_inside_within_its_radius_and_half_height() -> None:
     can = CATALOGUE[CAN]
     inside = np.array([[0.0, 0.0, 0.0], [0.03, 0.0, 0.0], [0.0, 0.0, 0.055], [0.0, 0.032, -0.059]])
     outside = np.array([[0.034, 0.0, 0.0], [0.0, 0.0, 0.061], [0.03, 0.03, 0.0]])
@@ -250,7 +258,7 @@ def test_a_can_is_inside_within_its_radius_and_half_height():
     assert distance_from(can, np.array([[0.043, 0.0, 0.06 + 0.01]])) == pytest.approx(np.hypot(0.01, 0.01))
 
 
-def test_the_first_guess_pushes_the_surface_inwards_by_the_radius():
+def test_the_first_guess_pushes_the_surface_inwards_by_the_radius() -> None:
     from services.perception.localise import first_guess
 
     pose = ROBOT.chain("camera").pose({"neck_pan": 0.0, "neck_tilt": radians(-50)})

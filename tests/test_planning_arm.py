@@ -15,12 +15,12 @@ from cocoro.arrays import FloatArray
 from cocoro.robot import Robot
 from services.planning.arm import ROLL, ArmController, ArmStep
 from services.planning.clearance import Clearance
-from services.planning.config import Config
+from services.planning.config import PlanningConfig
 from services.planning.reach import ARM, LEVEL_ROLL_RAD, HandPose, Reacher
 from services.planning.reachability import Reachability
 
 ROBOT = Robot.load()
-CONFIG = Config()
+CONFIG = PlanningConfig()
 REACHER = Reacher(ROBOT, CONFIG.arm.damping)
 REACHABILITY = Reachability(CONFIG.arm, REACHER)
 SHAPE = ArmShape(ROBOT)

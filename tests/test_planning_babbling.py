@@ -27,13 +27,13 @@ from cocoro.messages import (
 )
 from cocoro.robot import Robot
 from services.planning.arm import ROLL, ArmController
-from services.planning.config import Config
+from services.planning.config import PlanningConfig
 from services.planning.core import PlanningCore
 from services.planning.postures import Postures, sobol
 from services.planning.reach import ARM, LEVEL_ROLL_RAD, HandPose, Reacher
 
 TICK_NS = NS // 50
-CONFIG = Config()
+CONFIG = PlanningConfig()
 
 
 @pytest.fixture(scope="module")
@@ -123,7 +123,7 @@ class Body:
 
     def __init__(self, robot: Robot, separation_m: float) -> None:
         self.robot = robot
-        self.core = PlanningCore(robot, Config())
+        self.core = PlanningCore(robot, PlanningConfig())
         self.now_ns = NS
         self.angles = dict.fromkeys(robot.joints, 0.0) | robot.poses["park"]
         self.base = np.zeros(3)

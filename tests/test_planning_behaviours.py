@@ -6,7 +6,7 @@ import pytest
 from planner_rig import ROBOT, Planner, standing, started
 
 from cocoro import topics
-from services.planning.config import Config
+from services.planning.config import PlanningConfig
 from services.planning.core import PlanningCore
 
 
@@ -67,7 +67,7 @@ def test_claws_that_are_stopped_hold_something_and_push_on_a_little(planner: Pla
     planner.want("grasp")
     planner.run(0.1)
     stopped = {claw: sign * 0.05 for claw, sign in ROBOT.claw.open_sign.items()}
-    config = Config().hand
+    config = PlanningConfig().hand
     for _ in range(40):
         planner.angles |= stopped
         planner.hand_load = 0.5
@@ -80,10 +80,10 @@ def test_claws_that_are_stopped_hold_something_and_push_on_a_little(planner: Pla
 
 
 def test_in_lock_step_it_plans_once_a_cycle_and_keeps_the_arm_back(planner: Planner) -> None:
-    core = PlanningCore(ROBOT, Config(coordination="lockstep"))
+    core = PlanningCore(ROBOT, PlanningConfig(coordination="lockstep"))
     assert core.schedule.rate_hz is None
     assert core.schedule.triggers == (topics.DETECTIONS,)
-    lockstep = started(Config(coordination="lockstep"))
+    lockstep = started(PlanningConfig(coordination="lockstep"))
     lockstep.want("approach", "red_can")
     lockstep.run(3.0)
     planner.want("approach", "red_can")

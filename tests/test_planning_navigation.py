@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 from cocoro.frames import Pose2
 from cocoro.messages import BaseCommand
 from cocoro.robot import Robot
-from services.planning.config import Config
+from services.planning.config import PlanningConfig
 from services.planning.navigation import Driver, offset_to
 
 ROBOT = Robot.load()
-CONFIG = Config().navigation
+CONFIG = PlanningConfig().navigation
 AIM_M = (0.58, -0.10)
 TICK_S = 0.02
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,14 +19,14 @@ from cocoro.learning.nominal_model import NominalModel
 from cocoro.robot import Robot
 from services.executive.tasks import GoToTask, TouchTask
 from services.planning.behaviours.base import Actuators
-from services.planning.config import Config
+from services.planning.config import PlanningConfig
 from services.planning.learned import Learned
 from services.planning.reach import ARM, LEVEL_ROLL_RAD
 from services.planning.reachability import ReachMesh
 from services.planning.state_estimator import PostureSighting
 from services.planning.teaching import LUMP, Teacher
 
-QUICK = {"width": 160, "height": 120, "frame_rate_hz": 15.0}
+QUICK: dict[str, Any] = {"width": 160, "height": 120, "frame_rate_hz": 15.0}
 
 
 @pytest.mark.sim
@@ -98,7 +99,7 @@ def test_only_a_planner_that_is_told_to_goes_on_learning_and_it_says_so(robot: R
     base = empty(robot)
     content = encode(type(base)(robot=base.robot, drawing=base.drawing, arm=arm))
     for adapt in (False, True):
-        learned = Learned(robot, Config(adapt=adapt))
+        learned = Learned(robot, PlanningConfig(adapt=adapt))
         learned.take(content)
         learned.step([sighting(1, seen.angles_rad[0], seen.places_m[0])], NS // 5)
         assert ("taught by 1 sightings at work" in learned.text) is adapt
@@ -125,9 +126,9 @@ class LongerHand:
 
 
 def test_a_hand_that_is_learned_to_be_further_out_waits_where_the_arm_still_folds(robot: Robot) -> None:
-    actuators = Actuators(robot, Config())
+    actuators = Actuators(robot, PlanningConfig())
     drawn_m = actuators.reachability.retreat_m
-    assert drawn_m == Config().arm.retreat_radius_m
+    assert drawn_m == PlanningConfig().arm.retreat_radius_m
     actuators.reacher.use(LongerHand(robot, 0.03))
     actuators.reachability.use(None, None)
     assert drawn_m + 0.005 < actuators.reachability.retreat_m < drawn_m + 0.04

@@ -16,7 +16,7 @@ from cocoro import private
 from cocoro.bus.members import Membership, members
 from cocoro.errors import CocoroError, ConfigError
 from deploy.rundir import RunDir, robots
-from sim.wire.pty import Port
+from sim.wire.line import PseudoSerialPort
 
 NOBODY = 65534
 BEFORE = b"what the victim wrote"
@@ -84,7 +84,7 @@ def register(run_dir: RunDir) -> None:
 
 
 def plug(run_dir: RunDir) -> None:
-    Port(run_dir.path / "wire" / "create").close()
+    PseudoSerialPort(run_dir.path / "wire" / "create").close()
 
 
 WRITES: dict[str, tuple[Callable[[RunDir], None], tuple[str, ...]]] = {

@@ -16,9 +16,9 @@ from cocoro.errors import ConfigError
 from cocoro.objects import Catalogue
 from cocoro.robot import Robot
 from cocoro.testing import execute_again, in_virtual_time
-from services.perception.config import Config as PerceptionConfig
+from services.perception.config import PerceptionConfig
 from services.perception.core import PerceptionCore
-from services.planning.config import Config as PlanningConfig
+from services.planning.config import PlanningConfig
 from services.planning.core import PlanningCore
 
 pytestmark = pytest.mark.sim

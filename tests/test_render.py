@@ -26,9 +26,9 @@ from cocoro.arrays import FloatArray
 from cocoro.objects import Catalogue
 from sim.camera import moved
 from sim.render import Images, Renderer, make_renderer
+from sim.render.interface import Visual
 from sim.render.room import FLOOR_RGB, OTHER_TILE_RGB, walls
 from sim.render.views import lamp_tint
-from sim.visual import Visual
 
 # --- geometry -------------------------------------------------------------------------------------
 

@@ -71,7 +71,7 @@ def test_the_camera_has_the_papers_field_of_view() -> None:
 @given(width=st.sampled_from([160, 320, 1280]), share=st.floats(0, 1), down=st.floats(0, 1))
 def test_at_another_size_the_same_share_of_the_image_is_the_same_ray(width: int, share: float, down: float) -> None:
     def ray(camera: Camera) -> list[float]:
-        return camera.ray(share * camera.width - 0.5, down * camera.height - 0.5).tolist()
+        return list(camera.ray(share * camera.width - 0.5, down * camera.height - 0.5))
 
     assert ray(ROBOT.camera.scaled(width, width * 3 // 4)) == pytest.approx(ray(ROBOT.camera))
 

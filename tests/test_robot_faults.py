@@ -13,6 +13,7 @@ from cocoro import topics
 from cocoro.messages import BaseCommand, PlannerStatus, ServoCommand
 from cocoro.testing import in_virtual_time
 from cocoro.topics import Topic
+from deploy.processes import hardware
 
 pytestmark = pytest.mark.sim
 
@@ -190,7 +191,7 @@ async def test_when_the_robot_itself_dies_the_task_says_so() -> None:
         await rig.kill("sim")
         state = await rig.outcome(task_id, timeout_s=10.0)
         assert state.outcome == "failed"
-        assert state.reason in {f"not_alive: lost contact with {part}" for part in topics.HARDWARE}
+        assert state.reason in {f"not_alive: lost contact with {part}" for part in hardware()}
 
 
 # --- slow services --------------------------------------------------------------------------------

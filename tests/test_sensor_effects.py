@@ -12,21 +12,21 @@ from scipy.spatial.transform import Rotation
 from cocoro.arrays import FloatArray
 from sim.camera import COLOUR_SIGMA, EXPOSURE_S
 from sim.render import make_renderer
+from sim.render.interface import Visual
 from sim.seeds import stream
 from sim.sensor_effects import (
     EDGE_CODES,
     NO_DATA,
     ByteNoise,
+    CameraMotion,
     DepthCoder,
     DepthNoise,
     Drift,
-    Motion,
     blur_along_motion,
     drop_edges,
     motion_between,
     scale_channels,
 )
-from sim.visual import Visual
 
 WIDTH, HEIGHT = CAMERA.width, CAMERA.height
 
@@ -68,7 +68,7 @@ def test_gains_scale_each_channel_and_saturate() -> None:
 @pytest.mark.parametrize("length_px", [3, 5, 10, 18, 30])
 def test_a_turning_camera_smears_along_its_turn_as_far_as_the_picture_moved(length_px: int) -> None:
     turn_rad = length_px / CAMERA.fx
-    motion = Motion(np.array([0.0, turn_rad, 0.0]), np.zeros(3))
+    motion = CameraMotion(np.array([0.0, turn_rad, 0.0]), np.zeros(3))
     smeared = profile(blur_along_motion(stripe(160), motion, np.ones((HEIGHT, WIDTH), np.float32), CAMERA))
     lit = np.flatnonzero(smeared)
     assert np.ptp(lit) + 1 == pytest.approx(length_px, abs=2)
@@ -77,13 +77,13 @@ def test_a_turning_camera_smears_along_its_turn_as_far_as_the_picture_moved(leng
 
 
 def test_the_path_across_the_turn_is_not_smeared() -> None:
-    motion = Motion(np.array([16 / CAMERA.fy, 0.0, 0.0]), np.zeros(3))  # nodding: up and down
+    motion = CameraMotion(np.array([16 / CAMERA.fy, 0.0, 0.0]), np.zeros(3))  # nodding: up and down
     smeared = profile(blur_along_motion(stripe(160), motion, np.ones((HEIGHT, WIDTH), np.float32), CAMERA))
     assert np.ptp(np.flatnonzero(smeared)) <= 1
 
 
 def test_driving_forward_smears_the_margin_and_not_the_middle() -> None:
-    motion = Motion(np.zeros(3), np.array([0.0, 0.0, 0.06]))
+    motion = CameraMotion(np.zeros(3), np.array([0.0, 0.0, 0.06]))
     near = np.full((HEIGHT, WIDTH), 1.0, np.float32)
     middle = profile(blur_along_motion(stripe(160), motion, near, CAMERA))
     margin = profile(blur_along_motion(stripe(300), motion, near, CAMERA))
@@ -92,7 +92,7 @@ def test_driving_forward_smears_the_margin_and_not_the_middle() -> None:
 
 
 def test_what_is_farther_is_smeared_less_by_driving() -> None:
-    motion = Motion(np.zeros(3), np.array([0.03, 0.0, 0.0]))
+    motion = CameraMotion(np.zeros(3), np.array([0.03, 0.0, 0.0]))
     widths = [
         np.count_nonzero(
             profile(blur_along_motion(stripe(160), motion, np.full((HEIGHT, WIDTH), far_m, np.float32), CAMERA))
@@ -134,7 +134,7 @@ def test_the_exposure_is_a_share_of_the_time_between_frames() -> None:
 
 
 def test_the_number_of_samples_is_bounded_however_fast_the_head_turns() -> None:
-    motion = Motion(np.array([0.0, 1.2, 0.0]), np.zeros(3))
+    motion = CameraMotion(np.array([0.0, 1.2, 0.0]), np.zeros(3))
     picture = np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)
     blurred = blur_along_motion(picture, motion, np.ones((HEIGHT, WIDTH), np.float32), CAMERA)
     assert blurred.shape == picture.shape

@@ -8,9 +8,9 @@ from collections.abc import Callable, Mapping
 from types import TracebackType
 
 from services.servos.bus import SilentError
-from services.servos.line import ServoLine, Setting
+from services.servos.line import ServoLine, ServoSettings
 from services.servos.motion import HOLD_RADPS
-from services.servos.table import SPEED_RADPS, Reading
+from services.servos.table import SPEED_RADPS, ServoReading
 
 PATIENCE_S = 60.0
 FAR = {5: (900, 30)}
@@ -42,12 +42,12 @@ class Wire:
             self.written.append(dict(orders))
             self._news.notify_all()
 
-    def reading(self, number: int) -> Reading:
+    def reading(self, number: int) -> ServoReading:
         if self.misses:
             self.misses -= 1
             raise SilentError(number)
         self.position += 1
-        return Reading(0, self.position, 0, 0, 12.0, 38, 0)
+        return ServoReading(0, self.position, 0, 0, 12, 38, 0)
 
     def read_block(self, _number: int, _first: int, _length: int) -> tuple[bytes, int]:
         return b"", 0
@@ -62,7 +62,7 @@ def scenario(keeps_goal: bool, test: Callable[[ServoLine, Wire], None]) -> None:
 
     async def run() -> None:
         wire = Wire()
-        line = ServoLine("nowhere", 1, {5: Setting(32, 1023)}, 200.0, 0.1, lambda _: None, keeps_goal)
+        line = ServoLine("nowhere", 1, {5: ServoSettings(32, 1023)}, 200.0, 0.1, lambda _: None, keeps_goal)
         line._open = lambda: wire  # type: ignore[assignment, return-value]
         line.start()
         try:

@@ -11,8 +11,8 @@ from cocoro.messages import ServoCommand
 from cocoro.robot import SERVO_COUNT_RAD, Joint, Robot
 from services.servos import table
 from services.servos.motion import LEAD_S, REACH_RAD, JointMotion
-from services.servos.network import MISSES, Met, Network, Task
-from services.servos.table import Reading
+from services.servos.network import MISSES, ServoNetwork, ServoStatus, ServoTask
+from services.servos.table import ServoReading
 
 ROBOT = Robot.load()
 MS = 1_000_000
@@ -132,8 +132,8 @@ def test_goals_stay_within_the_limits_and_speeds_within_the_servos() -> None:
 # --- networks --------------------------------------------------------------------------------------
 
 
-def reading(position: int = 512, *, error: int = 0, temperature_c: int = 40, voltage_v: float = 12.0) -> Reading:
-    return Reading(position, 0, 0, voltage_v, temperature_c, error, 0)
+def reading(position: int = 512, *, error: int = 0, temperature_c: int = 40, voltage_v: float = 12.0) -> ServoReading:
+    return ServoReading(position, 0, 0, voltage_v, temperature_c, error, 0)
 
 
 class Net:
@@ -141,10 +141,10 @@ class Net:
 
     def __init__(self, name: str = "arm") -> None:
         joints = [ROBOT.joints[joint] for joint in ROBOT.network_joints(name)]
-        self.net = Network(joints, keeps_goal=name == "hand", timeout_s=0.2)
+        self.net = ServoNetwork(joints, keeps_goal=name == "hand", timeout_s=0.2)
         self.net.port_fault = ""
         self.now_ns = NS
-        self.tasks: list[Task] = []
+        self.tasks: list[ServoTask] = []
 
     def cycle(self, ms: int = 20, **errors: int) -> None:
         """All are read, and what is to be done is done."""
@@ -154,7 +154,9 @@ class Net:
         while (task := self.net.next_task()) is not None:
             self.tasks.append(task)
             if task.what == "meet":
-                self.net.met(task.number, Met(torque_enabled=False, goal=512, position=512, error=0), self.now_ns)
+                self.net.met(
+                    task.number, ServoStatus(torque_enabled=False, goal=512, position=512, error=0), self.now_ns
+                )
             else:
                 self.net.done(task, 512, self.now_ns)
 
@@ -193,11 +195,11 @@ def test_nothing_is_made_to_hold_before_the_emergency_stops_state_is_known() -> 
 def test_a_servo_that_holds_already_goes_on_holding_what_it_holds() -> None:
     hand = Net("hand")
     hand.net.heard(8, reading(500), hand.now_ns)
-    hand.net.met(8, Met(torque_enabled=True, goal=600, position=500, error=0), hand.now_ns)
+    hand.net.met(8, ServoStatus(torque_enabled=True, goal=600, position=500, error=0), hand.now_ns)
     assert hand.net.orders(hand.now_ns)[8][0] == pytest.approx(600, abs=20)
     arm = Net()
     arm.net.heard(5, reading(500), arm.now_ns)
-    arm.net.met(5, Met(torque_enabled=True, goal=600, position=500, error=0), arm.now_ns)
+    arm.net.met(5, ServoStatus(torque_enabled=True, goal=600, position=500, error=0), arm.now_ns)
     assert arm.net.orders(arm.now_ns)[5][0] == 500
 
 
@@ -248,9 +250,9 @@ def test_a_servo_that_was_shut_down_before_the_service_started_is_a_fault_too() 
     arm = Net()
     arm.net.set_latch("released")
     arm.net.heard(5, reading(error=0x20), arm.now_ns)
-    arm.net.met(5, Met(torque_enabled=False, goal=512, position=512, error=0x20), arm.now_ns)
+    arm.net.met(5, ServoStatus(torque_enabled=False, goal=512, position=512, error=0x20), arm.now_ns)
     assert arm.net.latched_faults() == ("elbow: overload",)
-    assert arm.net.next_task() == Task("meet", 5)
+    assert arm.net.next_task() == ServoTask("meet", 5)
     assert arm.net.next_task() is None
 
 
@@ -258,7 +260,7 @@ def test_a_servo_that_lost_its_settings_gets_them_again_and_it_is_told(arm: Net)
     arm.net.checked(5, as_set=True, now_ns=arm.now_ns)
     assert arm.net.next_task() is None
     arm.net.checked(5, as_set=False, now_ns=arm.now_ns)
-    assert arm.net.next_task() == Task("enable", 5)
+    assert arm.net.next_task() == ServoTask("enable", 5)
     assert "elbow lost its settings" in arm.faults()
     assert arm.net.latched_faults() == ()
 
@@ -266,7 +268,7 @@ def test_a_servo_that_lost_its_settings_gets_them_again_and_it_is_told(arm: Net)
 def test_a_servo_that_shuts_down_just_after_it_was_enabled_is_not_taken_for_one_that_lost_its_settings(
     arm: Net,
 ) -> None:
-    arm.net.done(Task("enable", 5), 512, arm.now_ns)
+    arm.net.done(ServoTask("enable", 5), 512, arm.now_ns)
     arm.cycle(elbow=0x20)  # not believed so soon: it may be the word of the last shutdown
     assert arm.net.latched_faults() == ()
     arm.net.checked(5, as_set=False, now_ns=arm.now_ns)  # but that its torque is gone is
@@ -293,7 +295,7 @@ def test_a_servo_that_was_silent_and_has_held_all_the_while_is_nothing_to_tell_o
     for _ in range(MISSES):
         arm.net.missed(5)
     arm.net.heard(5, reading(), arm.now_ns)
-    arm.net.met(5, Met(torque_enabled=True, goal=512, position=512, error=0), arm.now_ns)
+    arm.net.met(5, ServoStatus(torque_enabled=True, goal=512, position=512, error=0), arm.now_ns)
     assert arm.faults() == ""
     assert 5 in arm.net.orders(arm.now_ns)
 
@@ -345,8 +347,8 @@ def test_a_clock_that_begins_anew_ends_what_was_commanded(arm: Net) -> None:
 
 def test_direction_and_centre_of_a_joint_are_its_own() -> None:
     joint = Joint("elbow", "arm", 5, (-150.0, 150.0), 2.5, 6.0, direction=-1, centre_count=600.0)
-    net = Network([joint], keeps_goal=False, timeout_s=0.2)
-    net.heard(5, Reading(500, 10, 100, 12.0, 40, 0, 0), NS)
+    net = ServoNetwork([joint], keeps_goal=False, timeout_s=0.2)
+    net.heard(5, ServoReading(500, 10, 100, 12.0, 40, 0, 0), NS)
     state = net.state(NS)
     assert state is not None
     assert state.position_rad[0] == pytest.approx(100 * COUNT)

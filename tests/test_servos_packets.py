@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from services.servos import table
-from services.servos.packets import asked, find_status
+from services.servos.bus import asked, find_status
 
 
 def status(number: int, error: int, data: bytes) -> bytes:
@@ -98,7 +98,7 @@ def test_rubbish_is_no_answer(rubbish: bytes, number: int, length: int) -> None:
 def test_a_reading_is_what_the_registers_say() -> None:
     data = bytes([0x20, 0x01, 0x0A, 0x00, 0x64, 0x04, 120, 45])
     reading = table.reading(data, 0, 7)
-    assert reading == table.Reading(0x120, 10, -100, 12.0, 45, 0, 7)
+    assert reading == table.ServoReading(0x120, 10, -100, 12.0, 45, 0, 7)
 
 
 @pytest.mark.parametrize("at", [1, 3, 5])

@@ -17,10 +17,10 @@ from cocoro.errors import ConfigError, RemoteError
 from cocoro.messages import EstopRequest, ServoRequest
 from cocoro.robot import SERVO_COUNT_RAD, Robot
 from cocoro.testing import ServiceUnderTest
-from services.servos.bus import Bus, PortError, RefusedWriteError, SilentError
+from services.servos.bus import PortError, RefusedWriteError, ServoBus, SilentError
 from services.servos.line import STATE
 from services.servos.motion import LEAD_S, REACH_RAD
-from sim.wire.faults import Fault
+from sim.wire.line import LineFault
 
 pytestmark = pytest.mark.zenoh
 
@@ -46,7 +46,7 @@ def in_real_time(test: Callable[[ServoBench], Coroutine[None, None, None]]) -> C
 
 
 def test_registers_are_read_and_written_over_the_wire(bench: ServoBench) -> None:
-    with Bus(bench.port("arm"), 1_000_000, REPLY_S) as bus:
+    with ServoBus(bench.port("arm"), 1_000_000, REPLY_S) as bus:
         assert bus.ping(ELBOW) == 28
         assert bus.ping(99) is None
         bus.write(ELBOW, "torque_limit", 700)
@@ -59,46 +59,46 @@ def test_registers_are_read_and_written_over_the_wire(bench: ServoBench) -> None
 
 
 def test_several_goals_go_in_one_packet(bench: ServoBench) -> None:
-    with Bus(bench.port("arm"), 1_000_000, REPLY_S) as bus:
+    with ServoBus(bench.port("arm"), 1_000_000, REPLY_S) as bus:
         bus.go({4: (400, 30), 5: (500, 40)})
         assert bus.read(5, "goal_position") == 500
         assert (bench.servo(4).get(30), bench.servo(4).get(32)) == (400, 30)
 
 
 def test_at_a_wrong_baud_rate_nobody_answers(bench: ServoBench) -> None:
-    with Bus(bench.port("arm"), 57_600, 0.02) as bus:
+    with ServoBus(bench.port("arm"), 57_600, 0.02) as bus:
         assert bus.ping(ELBOW) is None
 
 
 def test_a_damaged_answer_is_no_answer_and_the_next_is_read(bench: ServoBench) -> None:
     line = bench.emulator.lines["arm"]
-    with Bus(bench.port("arm"), 1_000_000, 0.02) as bus:
-        bench.call(lambda: line.disturb(Fault("corrupted", 0.5, "to_driver", FOREVER_NS)))
+    with ServoBus(bench.port("arm"), 1_000_000, 0.02) as bus:
+        bench.call(lambda: line.disturb(LineFault("corrupted", 0.5, "to_driver", FOREVER_NS)))
         for _ in range(10):
             with pytest.raises(SilentError):
                 bus.reading(ELBOW)
         assert bus.strays > 0
         bench.call(line.undisturb)
-        assert Bus.reading(bus, ELBOW).position == bench.servo(ELBOW).get(36)
+        assert ServoBus.reading(bus, ELBOW).position == bench.servo(ELBOW).get(36)
 
 
 def test_a_port_that_is_not_there_or_goes_away_is_said(bench: ServoBench, tmp_path: Path) -> None:
     with pytest.raises(PortError, match="is the adapter plugged in"):
-        Bus(str(tmp_path / "nothing"), 1_000_000)
-    with Bus(bench.port("arm"), 1_000_000, REPLY_S) as bus:
+        ServoBus(str(tmp_path / "nothing"), 1_000_000)
+    with ServoBus(bench.port("arm"), 1_000_000, REPLY_S) as bus:
         with pytest.raises(PortError, match="another program has it open"):
-            Bus(bench.port("arm"), 1_000_000)
+            ServoBus(bench.port("arm"), 1_000_000)
         bench.call(bench.emulator.lines["arm"].port.unplug)
         with pytest.raises(PortError):
             bus.reading(ELBOW)
 
 
 def test_an_answer_that_comes_late_is_not_taken_for_that_to_another_question(bench: ServoBench) -> None:
-    line, servo = bench.emulator.lines["arm"], bench.servo(ELBOW)
-    bench.call(lambda: (servo.put(28, 2), servo.put(29, 2)))  # in a reading's place these would be a load
-    with Bus(bench.port("arm"), 1_000_000, 0.3) as bus:
+    line = bench.emulator.lines["arm"]
+    bench.put(ELBOW, {28: 2, 29: 2})  # in a reading's place these would be a load
+    with ServoBus(bench.port("arm"), 1_000_000, 0.3) as bus:
         for _ in range(3):
-            bench.call(lambda: line.disturb(Fault("late", 1.0, "to_driver", FOREVER_NS, 450 * MS)))
+            bench.call(lambda: line.disturb(LineFault("late", 1.0, "to_driver", FOREVER_NS, 450 * MS)))
             with pytest.raises(SilentError):
                 bus.read_block(ELBOW, *STATE)
             bench.call(line.undisturb)
@@ -123,7 +123,7 @@ async def test_joints_go_where_they_are_told_and_tell_where_they_are(bench: Serv
 @in_real_time
 async def test_torque_comes_on_without_a_snap(bench: ServoBench) -> None:
     servo = bench.servo(ELBOW)
-    bench.call(lambda: (servo.put(30, 1000), servo.put(36, 512)))
+    bench.put(ELBOW, {30: 1000, 36: 512})
     async with moved(bench):
         written = [(address, value) for _, address, value in bench.call(servo.acted.copy)]
         first = [address for address, _ in written]
@@ -208,7 +208,7 @@ async def test_a_disturbed_line_is_told_and_obeyed_no_wrong_way(bench: ServoBenc
     async with moved(bench, reply_s=0.03) as servos:
         servos.move("arm", elbow=0.4)
         bench.call(bench.servo(ELBOW).acted.clear)
-        bench.call(lambda: line.disturb(Fault("corrupted", 0.02, "both", FOREVER_NS)))
+        bench.call(lambda: line.disturb(LineFault("corrupted", 0.02, "both", FOREVER_NS)))
         await servos.fault("arm", "the line is disturbed, look after its cables")
         bench.call(line.undisturb)
         await servos.state("arm", lambda state: "elbow" in state.joints and angle(state, "elbow") > 0.35)
@@ -223,9 +223,10 @@ async def test_a_servo_whose_power_comes_back_holds_again_where_it_is(bench: Ser
         servos.move("arm", elbow=0.5)
         await servos.state("arm", lambda state: abs(angle(state, "elbow") - 0.5) < 2 * SERVO_COUNT_RAD)
         servos.silence()
-        bench.call(lambda: bench.servo(ELBOW).put(42, 40))
+        bench.put(ELBOW, {42: 40})
         await servos.fault("arm", "elbow (ID 5) does not answer")
-        bench.call(lambda: (bench.servo(ELBOW).put(42, 120), bench.servo(ELBOW).power_up()))
+        bench.put(ELBOW, {42: 120})
+        bench.call(bench.servo(ELBOW).power_up)
         state = await servos.state("arm", lambda state: len(state.joints) == 6 and all(state.torque_enabled))
         assert angle(state, "elbow") == pytest.approx(0.5, abs=3 * SERVO_COUNT_RAD)
         assert bench.servo(ELBOW).get(28) == 2  # its slopes were lost, too

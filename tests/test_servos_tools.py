@@ -14,12 +14,12 @@ from apps.cli.main import main
 from cocoro.errors import RefusedError
 from cocoro.robot import SERVO_COUNT_RAD, Robot
 from services.base.doctor import check as check_base
-from services.base.service import Config as BaseConfig
+from services.base.service import BaseConfig
 from services.servos import tools
-from services.servos.bus import Bus
+from services.servos.bus import ServoBus
 from services.servos.doctor import check as check_servos
-from services.servos.service import Config as ServoConfig
-from sim.wire.create import Create
+from services.servos.service import ServosConfig
+from sim.wire.create import EmulatedCreate
 from sim.wire.emulator import Emulator
 
 ROBOT = Robot.load()
@@ -33,8 +33,8 @@ def bench(tmp_path: Path) -> Iterator[ServoBench]:
 
 
 @pytest.fixture
-def line(bench: ServoBench) -> Iterator[Bus]:
-    with Bus(bench.port("arm"), 1_000_000, REPLY_S) as line:
+def line(bench: ServoBench) -> Iterator[ServoBus]:
+    with ServoBus(bench.port("arm"), 1_000_000, REPLY_S) as line:
         yield line
 
 
@@ -44,9 +44,8 @@ def told(text: str) -> None:
 
 def test_a_scan_finds_servos_at_every_baud_rate(bench: ServoBench, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tools, "SCAN_S", 0.1)
-    servo = bench.servo(4)
-    bench.call(lambda: (servo.put(4, 16), servo.put(5, 250)))  # 117647 baud is 115200 to a port, nearly
-    bench.call(lambda: servo.put(4, 3))  # 500000
+    bench.put(4, {4: 16, 5: 250})  # 117647 baud is 115200 to a port, nearly
+    bench.put(4, {4: 3})  # 500000
     lines: list[str] = []
     found = list(tools.scan([bench.port("arm"), "/dev/nothing"], [1_000_000, 500_000], range(3, 6), lines.append))
     assert [(one.number, one.baud, one.model) for one in found] == [
@@ -58,7 +57,7 @@ def test_a_scan_finds_servos_at_every_baud_rate(bench: ServoBench, monkeypatch: 
     assert any("/dev/nothing: there is no such port" in line for line in lines)
 
 
-def test_a_servo_gets_another_number_and_no_delay(bench: ServoBench, line: Bus) -> None:
+def test_a_servo_gets_another_number_and_no_delay(bench: ServoBench, line: ServoBus) -> None:
     bench.call(lambda: bench.servo(5).put(5, 250))
     tools.set_number(line, 5, 50)
     assert bench.call(lambda: (bench.servo(50).get(3), bench.servo(50).get(5))) == (50, 0)
@@ -83,7 +82,7 @@ def by_hand(bench: ServoBench, *counts: int) -> Callable[[str], None]:
 
 @pytest.mark.parametrize(("turned", "direction", "centre"), [(700, 1, 600), (500, -1, 600)])
 def test_zero_and_direction_come_from_two_turns_by_hand(
-    bench: ServoBench, line: Bus, turned: int, direction: int, centre: float
+    bench: ServoBench, line: ServoBus, turned: int, direction: int, centre: float
 ) -> None:
     values = tools.calibrate(line, ELBOW, 0.0, by_hand(bench, 600, turned))
     assert values == {"direction": direction, "centre_count": centre}
@@ -91,24 +90,24 @@ def test_zero_and_direction_come_from_two_turns_by_hand(
     assert values["centre_count"] == pytest.approx(600 - direction * 30.0 / degrees(SERVO_COUNT_RAD), abs=0.01)
 
 
-def test_a_joint_that_was_not_turned_has_no_direction(bench: ServoBench, line: Bus) -> None:
+def test_a_joint_that_was_not_turned_has_no_direction(bench: ServoBench, line: ServoBus) -> None:
     with pytest.raises(RefusedError, match=r"was turned by 1\.5 degrees only"):
         tools.calibrate(line, ELBOW, 0.0, by_hand(bench, 600, 605))
 
 
-def test_limits_are_felt_from_end_to_end_and_written_into_the_servo(bench: ServoBench, line: Bus) -> None:
+def test_limits_are_felt_from_end_to_end_and_written_into_the_servo(bench: ServoBench, line: ServoBus) -> None:
     turn = by_hand(bench, 300, 800)
-    steps = iter([lambda: turn(""), lambda: turn(""), lambda: None])
+    turns = iter([True, True, False])  # two ends, then a pause before Return is pressed
 
     def done() -> bool:
-        step = next(steps, None)
-        if step is not None:
-            step()
-        return step is None
+        turned = next(turns, None)
+        if turned:
+            turn("")
+        return turned is None
 
     limits = tools.feel_limits(line, ELBOW, done, told)
     first, last = (degrees(ELBOW.to_angle(count)) for count in (300, 800))
-    assert limits == (pytest.approx(first + 2.0, abs=0.1), pytest.approx(last - 2.0, abs=0.1))
+    assert limits == pytest.approx((first + 2.0, last - 2.0), abs=0.1)
     low, high = tools.write_limits(line, ELBOW, limits)
     assert (bench.servo(5).get(6), bench.servo(5).get(8)) == (low, high)
     assert 300 < low < high < 800
@@ -178,10 +177,11 @@ def test_mistakes_get_one_line(
 
 
 def test_the_doctor_looks_at_every_servo(bench: ServoBench) -> None:
-    config = ServoConfig(arm_port=bench.port("arm"), hand_port=bench.port("hand"), reply_s=REPLY_S)
+    config = ServosConfig(arm_port=bench.port("arm"), hand_port=bench.port("hand"), reply_s=REPLY_S)
     assert {check.state for check in check_servos(config, ROBOT, "robbie")} == {"ok"}
     bench.call(lambda: setattr(bench.servo(9), "mute", True))
-    bench.call(lambda: (bench.servo(5).put(5, 250), bench.servo(4).put(43, 75), bench.servo(3).put(42, 70)))
+    for number, registers in {5: {5: 250}, 4: {43: 75}, 3: {42: 70}}.items():
+        bench.put(number, registers)
     texts = {check.name: check.text for check in check_servos(config, ROBOT, "robbie") if check.state == "bad"}
     assert "waits 500 us" in texts["servo 5, elbow"]
     assert "let it cool" in texts["servo 4, shoulder"]
@@ -190,7 +190,7 @@ def test_the_doctor_looks_at_every_servo(bench: ServoBench) -> None:
 
 
 def test_the_doctor_talks_to_the_create(tmp_path: Path) -> None:
-    create = Create()
+    create = EmulatedCreate()
     config = BaseConfig(port=str(tmp_path / "create"))
     still = type("Still", (), {"advance": lambda self, now_ns: None, "fileno": lambda self: -1})()
     with Emulator(tmp_path, {"create": create}, still) as emulator:

@@ -21,10 +21,10 @@ from cocoro.bus import shared
 from cocoro.bus.base import Payload, Qos
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.checks import Check
-from cocoro.component import Process
+from cocoro.component import Component
 from cocoro.topics import FRAME as FRAME_TOPIC
 from deploy import profiles
-from deploy.processes import PROCESSES, shared_bytes
+from deploy.processes import COMPONENTS, shared_bytes
 from deploy.rundir import RunDir
 
 
@@ -57,13 +57,13 @@ def test_what_a_profile_needs_comes_from_who_publishes_and_who_reads_frames() ->
         assert shared_bytes(profiles.read(name).rows()) == publisher + 2 * shared.SESSION_BYTES
     assert shared_bytes(profiles.read("replay").rows()) == shared.SESSION_BYTES
     assert shared_bytes([]) == 0
-    other = Process(name="stereo", module="x", services=("stereo",), doc="Another camera.", frames="publishes")
+    other = Component(name="stereo", module="x", services=("stereo",), doc="Another camera.", frames="publishes")
     assert shared_bytes([*profiles.read("sim").rows(), other]) == 2 * publisher + 2 * shared.SESSION_BYTES
 
 
 def test_who_publishes_the_frames_says_so_in_the_process_table() -> None:
-    assert [row for row in PROCESSES if FRAME_TOPIC.publisher in row.services] == [
-        row for row in PROCESSES if row.frames == "publishes"
+    assert [row for row in COMPONENTS if FRAME_TOPIC.publisher in row.services] == [
+        row for row in COMPONENTS if row.frames == "publishes"
     ]
 
 

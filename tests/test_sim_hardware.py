@@ -14,7 +14,7 @@ from cocoro.robot import SERVO_COUNT_RAD, Robot
 from sim.base import Bumper, MobileBase
 from sim.realism import Wander
 from sim.seeds import stream
-from sim.servos import Play, Servo, ServoNetwork
+from sim.servos import Backlash, SimServo, SimServoNetwork
 
 ROBOT = Robot.load()
 HZ = 240
@@ -24,14 +24,14 @@ MS = 1_000_000
 # --- servos ---------------------------------------------------------------------------------------
 
 
-def servo(joint: str = "elbow", angle_rad: float = 0.0, backlash_rad: float = 0.0) -> Servo:
-    return Servo(ROBOT.joints[joint], angle_rad, backlash_rad)
+def servo(joint: str = "elbow", angle_rad: float = 0.0, backlash_rad: float = 0.0) -> SimServo:
+    return SimServo(ROBOT.joints[joint], angle_rad, backlash_rad)
 
 
-def network(name: str = "arm", backlash_deg: float = 0.0) -> ServoNetwork:
+def network(name: str = "arm", backlash_deg: float = 0.0) -> SimServoNetwork:
     joints = {joint: ROBOT.joints[joint] for joint in ROBOT.network_joints(name)}
     angles = dict.fromkeys(joints, 0.0)
-    return ServoNetwork(joints, angles, keeps_goal=name == "hand", timeout_s=0.2, backlash_deg=backlash_deg)
+    return SimServoNetwork(joints, angles, keeps_goal=name == "hand", timeout_s=0.2, backlash_deg=backlash_deg)
 
 
 def order(goal_rad: float, speed_radps: float = 1.0, joint: str = "elbow") -> ServoCommand:
@@ -167,7 +167,7 @@ def test_a_claw_pushes_harder_the_further_it_is_from_its_goal() -> None:
 
 
 def test_backlash_makes_the_reading_depend_on_where_the_joint_came_from() -> None:
-    play = Play(radians(0.5))
+    play = Backlash(radians(0.5))
     up = [play.follow(radians(angle)) for angle in (0.0, 0.2, 1.0)]
     assert degrees(up[0]) == 0.0
     assert degrees(up[1]) == 0.0  # within the play

@@ -10,7 +10,7 @@ import msgspec
 import pytest
 
 from cocoro import topics
-from cocoro.component import Component
+from cocoro.component import Implementation
 from cocoro.core import Output, Sample, Schedule, Take
 from cocoro.errors import CocoroError
 from cocoro.messages import BaseCommand, CancelRequest, Intent, Message, PlannerStatus, TaskReply
@@ -51,7 +51,7 @@ async def run(node: Node, config: Config) -> None:
         await node.drive(Answer(config.honest))
 
 
-ANSWERER = Component(Config, run)
+ANSWERER = Implementation(Config, run)
 
 
 @in_virtual_time

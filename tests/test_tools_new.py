@@ -37,7 +37,7 @@ def test_a_new_service_has_core_shell_settings_messages_row_and_test(written: Pa
     assert not any(re.search(r"\{\{|\}\}", path.read_text()) for path in written.rglob("*.*"))
     project = tomllib.loads((written / "pyproject.toml").read_text())["project"]
     assert project["name"] == "cocoro-depth-watch"
-    assert project["entry-points"]["deploy.processes"] == {"depth-watch": "depth_watch:process"}
+    assert project["entry-points"]["cocoro.components"] == {"depth-watch": "depth_watch:component"}
 
 
 def test_its_tests_pass_and_it_is_clean(written: Path) -> None:

@@ -10,8 +10,9 @@ import pytest
 from cocoro import topics
 from cocoro.bus.base import Qos
 from cocoro.bus.keys import matches
+from cocoro.installed import topic_named
 from cocoro.messages import Message
-from cocoro.topics import HARDWARE, REQUESTS, STOPPABLE, TOPICS, topic_named
+from cocoro.topics import REQUESTS, TOPICS
 
 
 def test_no_name_is_taken_twice() -> None:
@@ -64,10 +65,6 @@ def test_a_topic_is_found_by_its_name() -> None:
     assert topic_named("base/health") == topics.HEALTH.of("base")
     assert topic_named("base/nonsense") is None
     assert topic_named("") is None
-
-
-def test_what_moves_something_is_hardware() -> None:
-    assert set(STOPPABLE) < set(HARDWARE)
 
 
 @pytest.mark.parametrize("request_row", REQUESTS, ids=lambda row: row.name)

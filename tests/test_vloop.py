@@ -36,7 +36,8 @@ def test_time_starts_at_zero_and_does_not_pass_by_computing() -> None:
 
 def test_timers_of_equal_deadline_run_in_the_order_of_their_making() -> None:
     async def main() -> list[int]:
-        loop, order = asyncio.get_running_loop(), []
+        loop = asyncio.get_running_loop()
+        order: list[int] = []
         for number in range(500):
             loop.call_at(1.0, order.append, number)
         await asyncio.sleep(2.0)
@@ -47,7 +48,8 @@ def test_timers_of_equal_deadline_run_in_the_order_of_their_making() -> None:
 
 def test_order_survives_the_cancelling_of_most_timers() -> None:
     async def main() -> list[int]:
-        loop, order = asyncio.get_running_loop(), []
+        loop = asyncio.get_running_loop()
+        order: list[int] = []
         timers = [loop.call_at(1.0, order.append, number) for number in range(1000)]
         for number, timer in enumerate(timers):
             if number % 10:

@@ -9,7 +9,7 @@ import pytest
 from world_operator import EMPTY, Operator
 
 from cocoro.robot import Robot
-from sim.wear import BEND_RAD, LOOSENING_DEG_PER_MIN, body_of
+from sim.realism import BEND_RAD, LOOSENING_DEG_PER_MIN, body_of
 from sim.world import World
 
 SEEDS = range(20)

@@ -6,7 +6,7 @@ from math import pi
 
 import pytest
 
-from sim.wire.create import FULL, OFF, PASSIVE, SAFE, Create
+from sim.wire.create import FULL, OFF, PASSIVE, SAFE, EmulatedCreate
 
 MS = 1_000_000
 BAUD = 57600
@@ -16,7 +16,7 @@ class Wire:
     """A Create in passive mode at one's fingertips."""
 
     def __init__(self) -> None:
-        self.create = Create()
+        self.create = EmulatedCreate()
         self.now_ns = 0
         self.say(128)
 
@@ -33,7 +33,7 @@ class Wire:
 
 
 def test_a_create_that_is_off_hears_nothing_but_start() -> None:
-    create = Create()
+    create = EmulatedCreate()
     create.receive(bytes([131, 145, 0, 100, 0, 100]), BAUD, 0)
     assert (create.mode, create.wheels_mmps) == (OFF, (0, 0))
     create.receive(bytes([128]), BAUD, 0)

@@ -12,7 +12,7 @@ import pytest
 
 from cocoro.errors import ConfigError
 from cocoro.messages import Frame
-from sim.wire.recording import RecordingWriter
+from sim.wire.record import RecordingWriter
 
 COLOUR = np.arange(480 * 640 * 3, dtype=np.uint32).astype(np.uint8)
 DEPTH = (np.arange(480 * 640) % 2048).astype("<u2")

@@ -10,10 +10,9 @@ import pytest
 
 from cocoro.robot import SERVO_COUNT_RAD, Robot
 from sim.scene import Scene, load_scene
-from sim.service import Config
-from sim.wire.link import Channel, LinkedBody, MotorOrder, Orders, Senses, ServoSetup, Setup, firmware
-from sim.wire.motors import WireMotors
-from sim.wire.service import setup_of
+from sim.service import SimConfig
+from sim.wire.firmware import Channel, LinkedPlant, MotorOrder, MotorOrders, PlantState, ServoSetup, Setup, firmware
+from sim.wire.service import WireMotors, setup_of
 from sim.world import World
 
 pytestmark = pytest.mark.sim
@@ -97,18 +96,24 @@ def test_the_setup_tells_the_firmware_how_the_robot_stands(world: World, motors:
     assert elbow.get(36) == elbow.get(30) == motors.servos[ELBOW].count
     assert elbow.motor.on
     assert create.mode == 0
-    assert Config() is not None
+    assert SimConfig() is not None
 
 
 def test_firmware_and_physics_tell_each_other_the_newest_and_notice_the_end() -> None:
     ours, theirs = (Channel(end) for end in socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET))
     create, lines = firmware(Setup(261.0, {"arm": [ServoSetup(5, 28, 5.0, 512)]}, 0))
-    body = LinkedBody(theirs, create, lines)
+    body = LinkedPlant(theirs, create, lines)
     create.receive(bytes([128, 131, 145, 0, 100, 0, 50]), 57600, 0)
     for left_m in (0.0, 0.5, 1.0):
-        ours.send(Senses(0, left_m, left_m, True, False, {5: (600, -20, 0.25)}))
+        ours.send(PlantState(0, left_m, left_m, True, False, {5: (600, -20, 0.25)}))
         body.advance(0)
-    assert ours.newest(Orders) == Orders(50, 100, {5: MotorOrder(True, 512, 0, 1.0, 32, pytest.approx(32 / 1023))})
+    orders = ours.newest(MotorOrders)
+    assert isinstance(orders, MotorOrders)
+    assert (orders.left_mmps, orders.right_mmps) == (50, 100)
+    motor = orders.motors.pop(5)
+    assert not orders.motors
+    assert motor == MotorOrder(True, 512, 0, 1.0, 32, motor.punch)
+    assert motor.punch == pytest.approx(32 / 1023)
     assert create.mode == DRIVING
     servo = lines["arm"].servos[0]
     assert (servo.get(36), servo.get(38), servo.get(40)) == (600, 1024 + 20, 256)

@@ -3,10 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import socket
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -14,11 +10,11 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+from cocoro.child import ChildProcess
 from services.base import oi
-from services.base.guardian import _PACKAGES
-from sim.wire.body import SimpleBody
-from sim.wire.create import Create
-from sim.wire.emulator import Emulator
+from services.base.guard_supervisor import PYSERIAL
+from sim.wire.create import EmulatedCreate
+from sim.wire.emulator import Emulator, SimplePlant
 
 MS = 1_000_000
 SAFE = 2
@@ -41,8 +37,8 @@ class Bench:
     """An emulated Create, its line and its body; `with` it."""
 
     def __init__(self, folder: Path, seed: int = 0) -> None:
-        self.create = Create()
-        self.body = SimpleBody(self.create)
+        self.create = EmulatedCreate()
+        self.body = SimplePlant(self.create)
         self.emulator = Emulator(folder, {"create": self.create}, self.body, seed)
         self.line = self.emulator.lines["create"]
         self.port = str(folder / "create")
@@ -71,13 +67,10 @@ class FakeService:
     """Stands in for the service: the other end of a guard's socket."""
 
     def __init__(self, port: str, mode: str = "safe", robot: str = "") -> None:
-        self.channel, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        arguments = [port, "--mode", mode, *(["--robot", robot] if robot else [])]
+        child = ChildProcess("services.base.guard", *arguments, packages=(PYSERIAL,), site_packages=False)
+        self.guard, self.channel = child.process, child.channel
         self.channel.settimeout(30.0)
-        environment = os.environ | {"PYTHONPATH": os.pathsep.join(_PACKAGES)}
-        command = [sys.executable, "-S", "-P", "-m", "services.base.guard", port, "--fd", str(theirs.fileno())]
-        arguments = ["--mode", mode, *(["--robot", robot] if robot else [])]
-        with theirs:
-            self.guard = subprocess.Popen(command + arguments, env=environment, pass_fds=(theirs.fileno(),))
         self._asking = threading.Event()
         self._thread: threading.Thread | None = None
         self.asked_ns = 0

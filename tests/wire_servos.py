@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import TypeVar
@@ -14,9 +14,8 @@ from cocoro.clock import RealClock
 from cocoro.messages import Latch, ServoCommand, ServoState
 from cocoro.testing import ServiceUnderTest
 from cocoro.topics import Topic
-from sim.wire.body import SimpleBody
-from sim.wire.dynamixel import Bus, Servo
-from sim.wire.emulator import Emulator
+from sim.wire.dynamixel import EmulatedServo, EmulatedServoBus
+from sim.wire.emulator import Emulator, SimplePlant
 
 T = TypeVar("T")
 
@@ -33,9 +32,9 @@ class ServoBench:
     """Two emulated lines with the Calliope's servos and a body without physics; `with` it."""
 
     def __init__(self, folder: Path, seed: int = 0, overload_s: float = 5.0) -> None:
-        self.arm = Bus([Servo(number, 28, overload_s) for number in ARM])
-        self.hand = Bus([Servo(number, 12, overload_s) for number in HAND])
-        self.body = SimpleBody(None, self.arm, self.hand)
+        self.arm = EmulatedServoBus([EmulatedServo(number, 28, overload_s) for number in ARM])
+        self.hand = EmulatedServoBus([EmulatedServo(number, 12, overload_s) for number in HAND])
+        self.body = SimplePlant(None, self.arm, self.hand)
         self.emulator = Emulator(folder, {"arm": self.arm, "hand": self.hand}, self.body, seed)
         self.folder = folder
 
@@ -49,8 +48,17 @@ class ServoBench:
     def port(self, name: str) -> str:
         return str(self.folder / name)
 
-    def servo(self, number: int) -> Servo:
+    def servo(self, number: int) -> EmulatedServo:
         return next(servo for bus in (self.arm, self.hand) for servo in bus.servos if servo.number == number)
+
+    def put(self, number: int, registers: Mapping[int, int]) -> None:
+        """Set registers of a servo, by address, between two of the line's packets."""
+
+        def put() -> None:
+            for address, value in registers.items():
+                self.servo(number).put(address, value)
+
+        self.emulator.call(put)
 
     def call(self, job: Callable[[], T]) -> T:
         return self.emulator.call(job)

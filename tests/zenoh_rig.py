@@ -117,7 +117,8 @@ def scenario(test: Callable[..., Coroutine[Any, Any, None]]) -> Callable[..., No
     def run(**fixtures: Any) -> None:
         asyncio.run(asyncio.wait_for(test(**fixtures), PATIENCE_S))
 
-    return pytest.mark.zenoh(run)
+    marked: Callable[..., None] = pytest.mark.zenoh(run)
+    return marked
 
 
 def local(directory: Path, name: str = "test", **options: Any) -> ZenohConfig:

@@ -16,8 +16,9 @@ from cocoro.capture.mcap import DamageError
 from cocoro.capture.reader import Capture
 from cocoro.capture.types import MADE_HERE, LossyFrame, schema_of
 from cocoro.clock import NS
+from cocoro.installed import topic_named
 from cocoro.messages import Message
-from cocoro.topics import RECORDING, topic_named
+from cocoro.topics import RECORDING
 from services.capture.file import packed
 
 MESSAGE_HEAD_BYTES = mcap.MESSAGE_HEAD.size

@@ -20,7 +20,7 @@ from cocoro.capture.conventions import CaptureError
 from cocoro.capture.reader import Capture, Record
 from cocoro.capture.types import LossyFrame, MessageHead, NotReadableError
 from cocoro.clock import NS
-from cocoro.component import Component
+from cocoro.component import Implementation
 from cocoro.component import load as load_component
 from cocoro.core import Core
 from cocoro.errors import ConfigError
@@ -132,15 +132,15 @@ class Origin:
     """One start of a service."""
 
     service: str
-    component: Component
+    implementation: Implementation[Any]
     robot: Robot
     config: Any
     latency_s: float
 
     def core(self) -> Core:
         """A new core, as it was at the start."""
-        assert self.component.core is not None
-        return self.component.core(self.robot, self.config)
+        assert self.implementation.core is not None
+        return self.implementation.core(self.robot, self.config)
 
 
 @contextmanager
@@ -179,21 +179,21 @@ def recorded_file(capture: Capture, service: str, field: str, load: Callable[[Pa
 
 def _origin(service: str, entries: Mapping[str, str], folder: Path) -> Origin:
     module = entries["module"]
-    rows = [row for row in processes.table().values() if row.module == module]
-    if not rows:
-        raise ConfigError(f"there is no process of module {module!r} here")
-    component = load_component(rows[0])
-    if component.core is None:
+    component = processes.by_module(module)
+    if component is None:
+        raise ConfigError(f"no component that is installed here has the module {module!r}")
+    implementation = load_component(component)
+    if implementation.core is None:
         raise CaptureError(f"{service} cannot be executed again: {module} has no pure core")
     settings = json.loads(entries["config"])
     for file in json.loads(entries["files"]):
         settings[file["field"]] = _same_file(file, folder, settings.get(file["field"]))
     try:
-        config = msgspec.convert(settings, component.config)
+        config = msgspec.convert(settings, implementation.config)
     except msgspec.ValidationError as error:
         raise ConfigError(f"it was configured for another version: {error}") from error
     robot = Robot.from_data(json.loads(entries["description"]), "the recorded robot description")
-    return Origin(service, component, robot, config, float(entries["latency_s"]))
+    return Origin(service, implementation, robot, config, float(entries["latency_s"]))
 
 
 def _same_file(file: Mapping[str, str], folder: Path, configured: str | None) -> str | None:

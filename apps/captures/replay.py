@@ -17,7 +17,8 @@ from cocoro.capture.types import MADE_HERE, LossyFrame, NotReadableError
 from cocoro.errors import ConfigError, RefusedError
 from cocoro.messages import ClockTick
 from cocoro.tokens import alive_key
-from cocoro.topics import ARM_STATE, BASE_STATE, CLOCK, FRAME, HAND_STATE, HARDWARE, RECORDING
+from cocoro.topics import ARM_STATE, BASE_STATE, CLOCK, FRAME, HAND_STATE, RECORDING
+from deploy import processes
 from services.capture.keys import KeyFilter
 
 SIMULATOR = "sim"
@@ -60,7 +61,7 @@ def services_of(keys: Iterable[str]) -> frozenset[str]:
 async def refuse_if_alive(bus: Bus, robot: str, services: frozenset[str]) -> None:
     """Raises RefusedError when a robot of that name is there, or anyone whose keys are to be played."""
     alive = {key.split("/")[1] for key in await bus.alive(f"{robot}/*/alive")}
-    hardware = sorted(alive & {*HARDWARE, SIMULATOR})
+    hardware = sorted(alive & {*processes.hardware(), SIMULATOR})
     if hardware:
         raise RefusedError(
             f"a robot named {robot} is alive ({', '.join(hardware)}), and a capture is not played into its mesh; "
@@ -99,7 +100,9 @@ class Replay:
         for key in self._player.keys:
             self._publisher(key)
         if self._hardware:
-            self._handles += [self._bus.declare_alive(alive_key(self._capture.robot, name)) for name in HARDWARE]
+            self._handles += [
+                self._bus.declare_alive(alive_key(self._capture.robot, name)) for name in processes.hardware()
+            ]
         ticking = None
         if self._hardware and self._clock_key not in self._player.keys:
             ticking = asyncio.create_task(self._tick_for_ever())

@@ -36,7 +36,7 @@ from cocoro.messages import Message, Recording
 from cocoro.node import Node
 from cocoro.objects import Catalogue
 from cocoro.robot import Robot
-from cocoro.topics import HARDWARE, RECORDING, TOPICS, Topic
+from cocoro.topics import RECORDING, TOPICS, Topic
 from deploy import processes, robot_time
 from deploy.rundir import RunDir
 from services.capture.writer import describe_disturbance
@@ -161,7 +161,7 @@ async def replay(file: Path, only: list[str], hardware: bool, options: dict[str,
         check_span(capture, options["start_s"], options["end_s"])
         keys = played_keys(capture, only, hardware)
         player = Player(capture, keys.__contains__, **options)
-        services = services_of(keys) | (set(HARDWARE) if hardware else set())
+        services = services_of(keys) | (set(processes.hardware()) if hardware else set())
         run_dir = RunDir(capture.robot)
         run_dir.make()
         claims = run_dir.claim("replay", services)
@@ -186,7 +186,7 @@ async def _play(bus: ZenohBus, capture: Capture, player: Player, hardware: bool,
 
     def on_alive(key: str, alive: bool) -> None:
         service = key.split("/")[1]
-        if alive and service in ({SIMULATOR} if hardware else services | {*HARDWARE, SIMULATOR}):
+        if alive and service in ({SIMULATOR} if hardware else services | {*processes.hardware(), SIMULATOR}):
             intruder.append(service)
             end.set()
 

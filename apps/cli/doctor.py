@@ -7,40 +7,21 @@ import os
 import shutil
 import socket
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
 
 from apps.cli import doctor_stop, exits
 from cocoro.bus import shared
 from cocoro.checks import Check, bad, note, ok
-from cocoro.component import Process, load
+from cocoro.component import Component, load, machine_checks
 from cocoro.errors import ConfigError
 from cocoro.robot import Robot
 from deploy import profiles
 from deploy.processes import shared_bytes
 from deploy.profiles import Profile
 from deploy.rundir import Holder, RunDir
-from services.base import doctor as base_doctor
-from services.kinect import doctor as kinect_doctor
-from services.servos import doctor as servos_doctor
 
-LIBRARIES = {
-    "base": ("pyserial",),
-    "servos": ("pyserial", "dynamixel-sdk"),
-    "kinect": ("numpy", "opencv-python-headless"),
-    "perception": ("numpy", "opencv-python-headless"),
-    "sim": ("pybullet", "moderngl"),
-    "wire": ("pybullet", "moderngl"),
-}
-"""What a process needs beyond the mesh, by distribution."""
-DOCTORS: dict[str, Callable[[Any, Robot, str], list[Check]]] = {
-    "base": base_doctor.check,
-    "kinect": kinect_doctor.check,
-    "servos": servos_doctor.check,
-}
-"""The checks that a process's own package makes, by the process's name."""
 RULES = Path("/etc/udev/rules.d/99-cocoro.rules")
 ENOUGH_GB = 1.0
 MARKS = {"ok": "ok  ", "note": "note", "bad": "BAD "}
@@ -81,7 +62,7 @@ def examine(profile: Profile) -> Iterator[Check]:
         if running:
             yield note(row.name, f"runs (pid {claims[running[0]].pid}): `cocoro status` tells how it is")
         else:
-            yield from _hardware(row, profile, robot)
+            yield from _own_checks(row, profile, robot)
     yield _clock(profile)
     yield _shared_memory(profile, claims)
     yield from _disk(run_dir)
@@ -105,18 +86,19 @@ def _robot(profile: Profile) -> tuple[Robot, Check | None]:
 
 
 def _libraries(profile: Profile) -> Iterator[Check]:
-    for name in dict.fromkeys(library for row in profile.rows() for library in LIBRARIES.get(row.name, ())):
+    for name in dict.fromkeys(library for row in profile.rows() for library in row.libraries):
         try:
             yield ok(name, version(name))
         except PackageNotFoundError:
             yield bad(name, f"is not installed: pip install {name}")
 
 
-def _hardware(row: Process, profile: Profile, robot: Robot) -> Iterator[Check]:
-    """What the process's own package looks at."""
-    if row.name in DOCTORS:
-        config = profile.config(row.name, load(row).config)
-        yield from DOCTORS[row.name](config, robot, profile.robot)
+def _own_checks(component: Component, profile: Profile, robot: Robot) -> Iterable[Check]:
+    """The checks that a component declares."""
+    if not component.checks:
+        return ()
+    config = profile.config(component.name, load(component).config)
+    return machine_checks(component, config, robot, profile.robot)
 
 
 def _rules() -> Check:

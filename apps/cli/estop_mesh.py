@@ -10,12 +10,12 @@ from dataclasses import replace
 
 import msgspec
 
-from apps.cli.estop import StopResult
+from apps.cli.estop import STOPPABLE, StopResult
 from cocoro.bus.endpoints import ZenohConfig
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.errors import CallTimeoutError, CocoroError, MeshError
 from cocoro.messages import EstopReply, EstopRequest
-from cocoro.topics import ESTOP, STOPPABLE
+from cocoro.topics import ESTOP
 from deploy.rundir import RunDir, robots
 
 ROUND_S = 0.3

@@ -10,7 +10,7 @@ import msgpack
 import msgspec
 
 from cocoro.bus.base import Payload
-from cocoro.topics import topic_named
+from cocoro.installed import topic_named
 
 SHOWN = 12
 """Elements of a list that are shown unless all are wanted."""

@@ -23,8 +23,8 @@ from apps.cli.listening import Ear, keyexpr_of, takes_frames
 from apps.cli.options import RobotChoice
 from apps.cli.table import table
 from cocoro.bus.base import Payload
+from cocoro.installed import topic_named
 from cocoro.source import ANY_HZ, Source
-from cocoro.topics import topic_named
 
 SHOW_S = 1.0
 SILENT_PERIODS = 3.0

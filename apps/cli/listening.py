@@ -11,7 +11,7 @@ from typing import NamedTuple
 from apps.cli.link import Link
 from cocoro.bus.base import Payload, Qos
 from cocoro.errors import ConfigError
-from cocoro.topics import topic_named
+from cocoro.installed import topic_named
 
 DEPTH = 64
 """Samples of one key that may wait for this process's loop."""

@@ -14,7 +14,7 @@ from apps.cli import exits
 from apps.cli.ending import passed, told_to_end
 from cocoro.bus.endpoints import default_run_dir
 from cocoro.errors import ConfigError
-from deploy.processes import PROCESSES
+from deploy.processes import components
 from deploy.rundir import RunDir, folders
 
 LOOK_S = 0.2
@@ -67,7 +67,7 @@ def _process_of(run_dir: RunDir, service: str) -> str:
     if service in (claims := run_dir.claims()):
         return claims[service].name
     started = run_dir.resolved().get("processes", ())
-    rows = [row for row in PROCESSES if service in row.services]
+    rows = [row for row in components() if service in row.services]
     return next((row.name for row in rows if row.name in started), rows[0].name if rows else service)
 
 

@@ -9,7 +9,8 @@ from apps.cli.link import Answer, joined
 from apps.cli.options import RobotChoice
 from cocoro.errors import MeshError
 from cocoro.messages import EstopReply, EstopRequest
-from cocoro.topics import ESTOP, STOPPABLE
+from cocoro.topics import ESTOP
+from deploy.processes import stoppable
 
 
 async def reset(where: RobotChoice) -> int:
@@ -17,7 +18,7 @@ async def reset(where: RobotChoice) -> int:
     question = EstopRequest(latched=False, by="operator")
     async with joined(where) as link:
         alive = await link.alive()
-        moving = {service for service in STOPPABLE if service in alive}
+        moving = {service for service in stoppable() if service in alive}
         if not moving:
             raise MeshError(f"nothing that moves is alive on {link.robot}: `cocoro status` tells more")
         if "executive" in alive and _refused({"executive"}, await link.call_all(ESTOP.of("executive"), question)):

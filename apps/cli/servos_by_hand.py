@@ -22,7 +22,7 @@ from deploy import profiles
 from deploy.processes import named
 from deploy.profiles import Profile
 from services.servos import tools
-from services.servos.bus import Bus
+from services.servos.bus import ServoBus
 
 
 @dataclass
@@ -54,8 +54,8 @@ class ServoWorkbench:
         return self.robot.joints[name]
 
     @contextmanager
-    def line(self, joint: Joint, port: str | None, baud: int | None) -> Iterator[Bus]:
-        with Bus(port or self.ports[joint.network], baud or self.robot.networks[joint.network].baud, 0.05) as line:
+    def line(self, joint: Joint, port: str | None, baud: int | None) -> Iterator[ServoBus]:
+        with ServoBus(port or self.ports[joint.network], baud or self.robot.networks[joint.network].baud, 0.05) as line:
             yield line
 
     def write(self, joint: Joint, values: dict[str, Any]) -> None:
@@ -123,7 +123,7 @@ def _write_ports(shop: ServoWorkbench, found: list[Any], names: dict[int, Joint]
 
 
 def set_id(port: str, baud: int, old: int, new: int) -> int:
-    with Bus(port, baud, 0.05) as line:
+    with ServoBus(port, baud, 0.05) as line:
         tools.set_number(line, old, new)
     print(f"the servo on {port} is {new} and answers without delay")
     return exits.DONE

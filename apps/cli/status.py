@@ -47,7 +47,7 @@ class Survey:
         for topic in NEWS:
             self._link.inbox(topic).add(partial(self._on_news, topic.name))
         alive = set(await self._link.alive())
-        wanted_news = {topic.name for topic in NEWS if topic.publisher in alive}
+        wanted_news = {topic.name for topic in NEWS if topic.service in alive}
         await within(HEALTH_S, lambda: alive <= set(self._health) and wanted_news <= set(self._newest), self._changed)
         return self._report(alive)
 

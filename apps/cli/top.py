@@ -19,10 +19,10 @@ from apps.cli.link import Link, joined, within
 from apps.cli.options import RobotChoice
 from apps.cli.status import expected
 from cocoro.bus.keys import matches
-from cocoro.component import Process
-from cocoro.errors import ConfigError
+from cocoro.component import Component
+from cocoro.installed import topic_named
 from cocoro.messages import Health, Message, TopicHealth
-from cocoro.topics import BASE_STATE, CLOCK, HEALTH, LATCH, PLAN, TASK, Topic, topic_named
+from cocoro.topics import BASE_STATE, CLOCK, HEALTH, LATCH, PLAN, TASK, Topic
 from deploy import processes
 
 FIRST_S = 2.5
@@ -117,7 +117,7 @@ class MeshWatch:
             "topics": self._topics(),
         }
 
-    def _service(self, name: str, row: Process | None) -> dict[str, Any]:
+    def _service(self, name: str, row: Component | None) -> dict[str, Any]:
         health, heard_s = self._health.get(name), self._heard_s.get(name)
         silent_s = None if heard_s is None else time.monotonic() - heard_s
         alive = name in self._alive
@@ -168,7 +168,7 @@ class MeshWatch:
             }
             for service, health in read if matches(health.key, key) or health.key == key
         ]  # fmt: skip
-        publisher = sent[0] if sent is not None else topic.publisher if topic is not None else ""
+        publisher = sent[0] if sent is not None else ", ".join(processes.publishers(topic)) if topic is not None else ""
         return {
             "topic": name,
             "publisher": publisher,
@@ -194,7 +194,7 @@ def _machine() -> dict[str, Any]:
     return {"cores": os.cpu_count() or 1, "cpu_share": used}
 
 
-def _place(name: str, rows: dict[str, Process], names: list[str]) -> tuple[int, bool, int]:
+def _place(name: str, rows: dict[str, Component], names: list[str]) -> tuple[int, bool, int]:
     """Services of one process stand together, behind the one that has the process's own name."""
     row = rows.get(name)
     first = min((names.index(other) for other in names if row is not None and rows.get(other) is row), default=0)
@@ -207,14 +207,11 @@ def _without_topics(health: Health) -> dict[str, Any]:
     return data
 
 
-def _rows(resolved: dict[str, Any]) -> dict[str, Process]:
-    """The process of each service: of the profile's first, then of all others that are installed."""
-    try:
-        known = processes.table()
-    except ConfigError:  # somebody's entry point is broken, which must not blind this command
-        known = {row.name: row for row in processes.PROCESSES}
+def _rows(resolved: dict[str, Any]) -> dict[str, Component]:
+    """The component of each service: the profile's, else another installed one."""
+    known = {row.name: row for row in processes.components()}
     started = [known[name] for name in resolved.get("processes", ()) if name in known]
-    found: dict[str, Process] = {}
+    found: dict[str, Component] = {}
     for row in (*started, *known.values()):
         for service in (row.name, *row.services):  # a process may be a service beside those that it is started for
             found.setdefault(service, row)

@@ -10,7 +10,10 @@ from typing import Any, NamedTuple
 
 from apps.cli.table import table as plain_table
 from cocoro.bus.base import Qos
+from cocoro.component import Component
+from cocoro.installed import all_requests, all_topics
 from cocoro.topics import REQUESTS, TOPICS, Request, Topic
+from deploy.processes import COMPONENTS, publishers, readers
 
 QOS = {
     Qos.FRAME: "newest wins; shared memory, lowest priority",
@@ -20,14 +23,18 @@ QOS = {
 }
 
 
+HEADS = ("topic", "type", "rate", "max age", "qos", "publisher", "recorded")
+
+
 def table() -> str:
-    heads = ("topic", "type", "rate", "max age", "qos", "publisher", "recorded")
-    topics = plain_table(heads, [_row(topic) for topic in TOPICS])
+    """What is published and what can be asked on a robot with all that is installed here, as text."""
+    topics = plain_table(HEADS, [_row(topic) for topic in all_topics()])
     request_heads = ("request", "question", "answer", "server", "time-out")
-    return f"{topics}\n{plain_table(request_heads, [_request_row(request) for request in REQUESTS])}"
+    return f"{topics}\n{plain_table(request_heads, [_request_row(request) for request in all_requests()])}"
 
 
 def as_json() -> str:
+    """The topics as JSON, one object each."""
     rows: list[dict[str, Any]] = [
         {
             "topic": topic.name,
@@ -35,20 +42,21 @@ def as_json() -> str:
             "rate_hz": topic.rate_hz,
             "max_age_s": topic.max_age_s,
             "qos": topic.qos.value,
-            "publisher": topic.publisher,
+            "publisher": ", ".join(publishers(topic)),
+            "readers": list(readers(topic)),
             "recorded": topic.recorded,
             "max_bytes": topic.max_bytes,
             "doc": topic.doc,
         }
-        for topic in TOPICS
+        for topic in all_topics()
     ]
     return json.dumps(rows) + "\n"
 
 
-def _row(topic: Topic[Any]) -> tuple[str, ...]:
+def _row(topic: Topic[Any], among: Iterable[Component] | None = None) -> tuple[str, ...]:
     rate = "on change" if topic.rate_hz is None else f"{topic.rate_hz:g} Hz"
-    recorded = "yes" if topic.recorded else "no"
-    return topic.name, topic.type.__name__, rate, f"{topic.max_age_s:g} s", topic.qos.value, topic.publisher, recorded
+    age, recorded = f"{topic.max_age_s:g} s", "yes" if topic.recorded else "no"
+    return topic.name, topic.type.__name__, rate, age, topic.qos.value, ", ".join(publishers(topic, among)), recorded
 
 
 def _request_row(request: Request[Any, Any]) -> tuple[str, ...]:
@@ -60,18 +68,19 @@ def _request_row(request: Request[Any, Any]) -> tuple[str, ...]:
 
 
 def markdown() -> str:
-    """docs/topics.md; a test holds it up to date."""
+    """The text of docs/topics.md: the project's own topics, whatever else is installed."""
     types = _types()
     mentioned = [*(topic.type.__name__ for topic in TOPICS)]
     mentioned += [name for request in REQUESTS for name in (request.request.__name__, request.reply.__name__)]
     parts = [
         "# Topics\n",
-        "Made by `cocoro topics --markdown` from `cocoro/topics.py` and `cocoro/messages/`; change those.\n",
+        "Made by `cocoro topics --markdown` from `cocoro/topics.py`, `cocoro/messages/` and the declarations of the\n"
+        "components (`services/*/component.py`, `sim/`); change those. A recorder reads everything that is recorded.\n",
         "A key is `<robot>/<topic>`. A payload is one MessagePack map, its fields named as below; a reader ignores\n"
         "fields that it does not know. SI units, in the names. What arrives malformed, wrongly typed, oversized or\n"
         "out of order is counted in the reader's health and dropped.\n",
         "## What is published\n",
-        _markdown_table(("topic", "type", "rate", "max age", "QoS", "publisher", "recorded"), map(_row, TOPICS)),
+        _markdown_table((*HEADS, "readers"), (_row_with_readers(topic) for topic in TOPICS)),
         *(f"- `{topic.name}`: {topic.doc}" for topic in TOPICS),
         "\nQuality of service: "
         + "; ".join(f"**{qos.value}**: {text.replace(';', ',')}" for qos, text in QOS.items())
@@ -83,6 +92,10 @@ def markdown() -> str:
         *(_type_section(types[name]) for name in _with_parts(dict.fromkeys(mentioned), types)),
     ]
     return "\n".join(parts).rstrip() + "\n"
+
+
+def _row_with_readers(topic: Topic[Any]) -> tuple[str, ...]:
+    return *_row(topic, COMPONENTS), ", ".join(readers(topic, COMPONENTS))
 
 
 class _Field(NamedTuple):

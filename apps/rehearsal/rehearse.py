@@ -32,13 +32,11 @@ from cocoro.robot import Robot
 from cocoro.stepper import Stepper
 from cocoro.tasks import Task
 from cocoro.vloop import run_virtual
-from deploy.processes import named
-from sim.judge import Judge
-from sim.pursuit import PursuitJudge
+from deploy.processes import named, needs
+from sim.judge import Judge, PursuitJudge
 from sim.random_scene import find_scene
-from sim.realism import REALISM, wheel_scales
+from sim.realism import REALISM, body_of, wheel_scales
 from sim.trace import Trace
-from sim.wear import body_of
 
 RECORDER = "capture"
 PROCESSES = ("sim", "perception", "planning", "executive")
@@ -144,6 +142,8 @@ class _Rehearsal:
                 settings = self._settings(name)
                 if request.objects is not None and "objects" in component.config.__struct_fields__:
                     settings["objects"] = request.objects
+                if "needed" in component.config.__struct_fields__:
+                    settings["needed"] = needs(name)
                 config = msgspec.convert(settings, component.config)
                 lockstep = request.lockstep and name in LockstepCycle.ORDER
                 kind = LockstepNode if lockstep else Node

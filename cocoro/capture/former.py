@@ -80,9 +80,7 @@ def _intent(message: dict[str, Any]) -> dict[str, Any] | None:
     name = message.get("behaviour")
     if "action" in message or not isinstance(name, str):
         return None
-    kept = {
-        field: message[field] for field in ("stamp_ns", "seq", "incarnation", "task_id", "step") if field in message
-    }
+    kept: dict[str, Any] = {field: value for field, value in message.items() if field in _INTENT_FIELDS}
     kept["action"] = {"action": name, **_fields(message, _ACTION_FIELDS.get(name, {}))}
     return kept
 

@@ -14,8 +14,8 @@ from msgspec import Meta
 
 from cocoro.capture.former import todays_name, todays_payload
 from cocoro.capture.mcap import DamageError
+from cocoro.installed import topic_named
 from cocoro.messages import Frame, Message
-from cocoro.topics import topic_named
 
 Read = Callable[[bytes | memoryview], msgspec.Struct]
 

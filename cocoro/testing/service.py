@@ -13,7 +13,7 @@ import msgspec
 from cocoro.bus.base import Handle
 from cocoro.bus.local import LocalMesh
 from cocoro.clock import NS, Clock, VirtualClock
-from cocoro.component import Component, Process, load
+from cocoro.component import Component, Implementation, load
 from cocoro.messages import Message, TopicHealth
 from cocoro.node import Node
 from cocoro.robot import Robot
@@ -32,7 +32,7 @@ class ServiceUnderTest:
 
     def __init__(
         self,
-        component: str | Component,
+        component: str | Component | Implementation[Any],
         config: Mapping[str, Any] | msgspec.Struct | None = None,
         *,
         name: str | None = None,
@@ -43,19 +43,21 @@ class ServiceUnderTest:
         record_steps: bool = False,
         latches: Path | None = None,
     ) -> None:
-        """`component` is a module's name ('services.planning.service') or a loaded component; `config` its settings
-        (defaults where there are none). The service's name is that of the module's folder unless one is given."""
-        module = component if isinstance(component, str) else component.run.__module__
-        self.name = name or _service_name(module)
+        """`component` is a declaration, a module with an implementation ('services.planning.service'), or an
+        implementation; `config` its settings, defaults where there are none. The service's name is the declared one,
+        else that of the module's folder, unless one is given."""
         if isinstance(component, str):
-            component = load(Process(name=self.name, module=component, services=(self.name,), doc="under test"))
+            component = Component(name=name or _service_name(component), module=component, doc="Under test.")
+        implementation = component if isinstance(component, Implementation) else load(component)
+        module = component.run.__module__ if isinstance(component, Implementation) else component.module
+        self.name = name or (component.name if isinstance(component, Component) else _service_name(module))
         self.robot = robot or Robot.load()
         self.mesh = mesh or LocalMesh()
-        self._component = component
+        self._run = implementation.run
         if isinstance(config, msgspec.Struct):
             self._config = config
         else:
-            self._config = msgspec.convert(config or {}, component.config)
+            self._config = msgspec.convert(config or {}, implementation.config)
         self._clock = clock or VirtualClock()
         self._bus = self.mesh.join()
         self.node = Node(
@@ -71,7 +73,7 @@ class ServiceUnderTest:
     async def __aenter__(self) -> ServiceUnderTest:
         await self.tester.__aenter__()
         await self.node.__aenter__()
-        self._work = asyncio.ensure_future(self._component.run(self.node, self._config))
+        self._work = asyncio.ensure_future(self._run(self.node, self._config))
         await self.settle()
         return self
 

@@ -8,9 +8,10 @@ import msgspec
 
 from cocoro.bus.base import Payload, Qos
 from cocoro.bus.local import LocalBus
+from cocoro.installed import topic_named
 from cocoro.messages import Message
 from cocoro.tokens import recorder_key
-from cocoro.topics import Topic, topic_named
+from cocoro.topics import Topic
 
 M = TypeVar("M", bound=Message)
 

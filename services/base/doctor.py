@@ -11,7 +11,7 @@ from cocoro.ports import check_port, port_path
 from cocoro.robot import Robot
 from services.base import oi
 from services.base.driver import BATTERY_LOW
-from services.base.service import Config
+from services.base.service import BaseConfig
 
 __all__ = ["check"]
 
@@ -19,7 +19,7 @@ ASKED = (oi.MODE, oi.VOLTAGE, oi.CHARGE, oi.CAPACITY, oi.CHARGING, oi.BUMPS)
 ANSWER_S = 0.5
 
 
-def check(config: Config, robot: Robot, robot_name: str) -> list[Check]:
+def check(config: BaseConfig, robot: Robot, robot_name: str) -> list[Check]:
     checks = check_port("Create", config.port, robot_name, quick=False)
     return checks if checks[0].state != "ok" else [*checks, *_talk(port_path(config.port, robot_name))]
 

@@ -11,7 +11,7 @@ from cocoro.recent import WINDOW_S, Recent
 from cocoro.robot import Base
 from cocoro.topics import BASE_COMMAND
 from services.base import oi
-from services.base.keeper import Link
+from services.base.guard_logic import LinkState
 
 FRESH_NS = 180_000_000
 """The state is told as long as the Create was heard within this time."""
@@ -20,12 +20,12 @@ LONGEST_S = 0.25
 BATTERY_LOW = 0.15
 
 
-class Report(msgspec.Struct):
+class GuardReport(msgspec.Struct):
     """What the guard tells: a frame of the Create's, or that there is none."""
 
     t: int
     """CLOCK_MONOTONIC, ns."""
-    link: Link
+    link: LinkState
     why: str
     """What keeps the wheels from turning as they were asked to, or the port from working."""
     left: int
@@ -44,7 +44,7 @@ class BaseDriver:
 
     def __init__(self, base: Base) -> None:
         self.latch: LatchState = "unknown"
-        self.link: Link = "closed"
+        self.link: LinkState = "closed"
         self.why = "the guard has not reported yet"
         self._base = base
         self._timeout_ns = round(base.command_timeout_s * NS)
@@ -93,7 +93,7 @@ class BaseDriver:
 
     # --- reports ------------------------------------------------------------------------------------
 
-    def take(self, report: Report, now_ns: int) -> None:
+    def take(self, report: GuardReport, now_ns: int) -> None:
         """A report that was made at `now_ns`."""
         self.link, self.why = report.link, report.why
         self._damaged.add(report.damage - self._damage, report.t)

@@ -7,7 +7,7 @@ the base service: it passes on what the service asks of the wheels while the ser
 - at once when the service's end of the socket closes (it crashed, it was killed),
 - at once on SIGTERM, and on any error of its own,
 - at once when somebody says stop to its own address of the stop path, `ROBOT/wheels` (`cocoro.stop.path`),
-- by the reflexes of `services.base.keeper`: bumpers, cliffs, wheel drops, a Create that left its mode.
+- by the reflexes of `services.base.guard_logic`: bumpers, cliffs, wheel drops, a Create that left its mode.
 
     python -m services.base.guard PORT --fd N --robot NAME --mode safe --deadman-ms 200
 
@@ -36,7 +36,7 @@ import serial
 
 from cocoro.stop.path import Asked, StopPoint
 from services.base import oi
-from services.base.keeper import MS, Keeper
+from services.base.guard_logic import MS, GuardLogic
 
 TURN_S = 0.005
 """How long it sleeps at most between two looks at the clock."""
@@ -55,11 +55,11 @@ SENTENCES = {
 
 
 class Guard:
-    """Keeps one port by one `Keeper`."""
+    """Keeps one port by one `GuardLogic`."""
 
-    def __init__(self, path: str, keeper: Keeper, channel: socket.socket, point: StopPoint | None = None) -> None:
+    def __init__(self, path: str, logic: GuardLogic, channel: socket.socket, point: StopPoint | None = None) -> None:
         self._path = path
-        self._keeper = keeper
+        self._logic = logic
         self._channel = channel
         self._point = point
         self._port: serial.Serial | None = None
@@ -81,7 +81,7 @@ class Guard:
             try:
                 if self._port in readable:
                     self._take_bytes(self._port, now_ns)
-                self._write(self._port, self._keeper.poll(now_ns))
+                self._write(self._port, self._logic.poll(now_ns))
             except OSError as error:  # pyserial's own errors are such, too
                 self._lose(_plain(error, self._path))
         for asked in stops:
@@ -96,14 +96,14 @@ class Guard:
         if self._port is None:
             return
         began_ns = now_ns = time.monotonic_ns()
-        self._keeper.end(began_ns)
+        self._logic.end(began_ns)
         with suppress(OSError):
-            while now_ns < began_ns + STOPPING_NS and not self._keeper.stands:
-                self._write(self._port, self._keeper.poll(now_ns))
+            while now_ns < began_ns + STOPPING_NS and not self._logic.stands:
+                self._write(self._port, self._logic.poll(now_ns))
                 readable = select.select([self._port], [], [], TURN_S)[0]
                 now_ns = time.monotonic_ns()
                 if readable:
-                    self._keeper.heard(os.read(self._port.fileno(), 4096), now_ns)
+                    self._logic.heard(os.read(self._port.fileno(), 4096), now_ns)
             self._port.flush()
         with suppress(OSError):
             self._port.close()
@@ -120,7 +120,7 @@ class Guard:
             return
         self._port = port
         self._why = ""
-        self._keeper.opened(now_ns)
+        self._logic.opened(now_ns)
 
     def _lose(self, why: str) -> None:
         if self._port is not None:
@@ -128,13 +128,13 @@ class Guard:
                 self._port.close()
         self._port = None
         self._why = why
-        self._keeper.closed()
+        self._logic.closed()
 
     def _take_bytes(self, port: serial.Serial, now_ns: int) -> None:
         data = os.read(port.fileno(), 4096)
         if not data:
             raise OSError(errno.EIO, "end of file")
-        for readings in self._keeper.heard(data, now_ns):
+        for readings in self._logic.heard(data, now_ns):
             self._report(now_ns, readings)
 
     def _write(self, port: serial.Serial, data: bytes) -> None:
@@ -148,7 +148,7 @@ class Guard:
         assert self._point is not None
         stops: list[Asked] = []
         while len(stops) < 16 and (asked := self._point.take(wait=False)) is not None:
-            self._keeper.stop()
+            self._logic.stop()
             stops.append(asked)
         return stops
 
@@ -177,26 +177,26 @@ class Guard:
         try:
             command = json.loads(message)
             if "until" in command:
-                self._keeper.reset(int(command.get("reset", 0)))
-                self._keeper.ask(int(command["left"]), int(command["right"]), int(command["until"]), now_ns)
+                self._logic.reset(int(command.get("reset", 0)))
+                self._logic.ask(int(command["left"]), int(command["right"]), int(command["until"]), now_ns)
             elif command.get("recover"):
-                self._keeper.recover(now_ns)
+                self._logic.recover(now_ns)
         except (ValueError, TypeError, KeyError, AttributeError, OverflowError):
             return  # not understood, so not obeyed
 
     def _report(self, now_ns: int, readings: oi.Readings | None = None) -> None:
         self._reported_ns = now_ns
-        wheels = self._keeper.wheels
+        wheels = self._logic.wheels
         report = {
             "t": now_ns,
-            "link": self._keeper.link,
-            "why": self._why or self._keeper.allowed(now_ns).why,
+            "link": self._logic.link,
+            "why": self._why or self._logic.allowed(now_ns).why,
             "left": wheels.left_mmps,
             "right": wheels.right_mmps,
-            "stops": self._keeper.stops,
-            "damage": self._keeper.damage,
+            "stops": self._logic.stops,
+            "damage": self._logic.damage,
             "readings": readings,
-            "counts_lost": self._keeper.take_counts_lost() if readings is not None else False,
+            "counts_lost": self._logic.take_counts_lost() if readings is not None else False,
         }
         with suppress(BlockingIOError, ConnectionError):
             self._channel.send(json.dumps(report).encode())
@@ -226,7 +226,7 @@ def main() -> int:
     channel.setblocking(False)
     fcntl.fcntl(channel, fcntl.F_SETFD, fcntl.FD_CLOEXEC)
     point = StopPoint(options.robot, "wheels") if options.robot else None
-    guard = Guard(options.port, Keeper(options.mode, options.deadman_ms * MS), channel, point)
+    guard = Guard(options.port, GuardLogic(options.mode, options.deadman_ms * MS), channel, point)
     try:
         while not told and guard.turn():
             pass

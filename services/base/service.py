@@ -10,21 +10,23 @@ import msgspec
 from msgspec import Meta
 
 from cocoro import topics
+from cocoro.component import Implementation
+from cocoro.faults import FaultReporter
 from cocoro.latch import LatchKeeper
 from cocoro.messages import BaseCommand, LatchState, RecoverReply, RecoverRequest
 from cocoro.node import Node
 from cocoro.ports import port_path
-from services.base.driver import BaseDriver, Report
-from services.base.guardian import Guardian
-
-__all__ = ["Config", "run"]
+from services.base.driver import BaseDriver, GuardReport
+from services.base.guard_supervisor import GuardSupervisor
 
 BEAT_S = 0.02
 """How often the guard is asked anew; a tenth of the time after which it stops the wheels."""
 RECOVERY_S = 2.0
+DEGRADED = {"up": "", "waking": "waking the Create", "fallen": "not obeying"}
+"""What the service says of itself by the link to the Create; without any, 'no Create'."""
 
 
-class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class BaseConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     port: str = "/dev/cocoro-create"
     """The serial port: a device, or wire:NAME for an emulated one."""
     mode: Literal["safe", "full"] = "safe"
@@ -34,12 +36,13 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class BaseService:
-    def __init__(self, node: Node, config: Config) -> None:
+    def __init__(self, node: Node, config: BaseConfig) -> None:
         self._node = node
+        self._reporter = FaultReporter(node)
         self._driver = BaseDriver(node.robot.base)
         port = port_path(config.port, node.robot_name)
         robot = node.robot_name if node.latches is not None else None
-        self.guardian = Guardian(port, config.mode, config.guard_timeout_s, self._heard, robot)
+        self.guard = GuardSupervisor(port, config.mode, config.guard_timeout_s, self._heard, robot)
         self._stops = self._reset_stops = 0
         """Emergency stops that the guard has heard by itself, and those of them that were reset."""
         self._epoch = node.clock.epoch
@@ -49,7 +52,7 @@ class BaseService:
         node.serve(topics.RECOVER, self._recover)
 
     async def run(self) -> None:
-        async with self.guardian:
+        async with self.guard:
             self._tell()
             self._node.spawn(self._beat())
             async for now_ns in self._node.every(self._node.robot.base.state_rate_hz, "state"):
@@ -60,7 +63,7 @@ class BaseService:
     async def _beat(self) -> None:
         """The pulse that keeps the wheels turning. It goes by real time, as the guard does."""
         while True:
-            self.guardian.check()
+            self.guard.check()
             self._ask()
             await asyncio.sleep(BEAT_S)
 
@@ -70,7 +73,7 @@ class BaseService:
             self._driver.new_epoch()
         left_mmps, right_mmps, for_ns = self._driver.wheels(self._node.now_ns())
         patience_s = self._node.robot.base.patience_s(max(abs(left_mmps), abs(right_mmps)) / 1000.0)
-        self.guardian.ask(left_mmps, right_mmps, for_ns, self._reset_stops, patience_s)
+        self.guard.ask(left_mmps, right_mmps, for_ns, self._reset_stops, patience_s)
 
     def _commanded(self, command: BaseCommand) -> None:
         self._driver.command(command, self._node.now_ns())
@@ -85,9 +88,9 @@ class BaseService:
     def _halt(self) -> None:
         """In the stop path's thread."""
         self._driver.set_latch("latched")
-        self.guardian.halt()
+        self.guard.halt()
 
-    def _heard(self, report: Report) -> None:
+    def _heard(self, report: GuardReport) -> None:
         age_ns = max(time.monotonic_ns() - report.t, 0)
         stops, self._stops = self._stops, report.stops
         if report.stops > stops:
@@ -103,7 +106,7 @@ class BaseService:
     async def _recover(self, _: RecoverRequest) -> RecoverReply:
         driver = self._driver
         if driver.link == "fallen":
-            self.guardian.recover()
+            self.guard.recover()
         try:
             async with asyncio.timeout(RECOVERY_S):
                 while driver.link != "up":
@@ -119,18 +122,12 @@ class BaseService:
 
     def _tell(self) -> None:
         """Health, as people read it."""
-        node, faults = self._node, self._driver.faults()
-        told = {fault.partition(":")[0] for fault in node.faults}  # what follows may be a measured value
-        for fault in faults:
-            if fault.partition(":")[0] not in told:
-                node.log.warning("%s", fault)
-        node.faults = faults
-        if self._driver.link == "up":
-            node.ready()
-        else:
-            node.degraded({"waking": "waking the Create", "fallen": "not obeying"}.get(self._driver.link, "no Create"))
+        self._reporter.report(self._driver.faults(), degraded=DEGRADED.get(self._driver.link, "no Create"))
 
 
-async def run(node: Node, config: Config) -> None:
+async def run(node: Node, config: BaseConfig) -> None:
     """Serve for ever."""
     await BaseService(node, config).run()
+
+
+implementation = Implementation(BaseConfig, run)

@@ -16,7 +16,7 @@ FOLDER = "COCORO_CAPTURE_DIR"
 """Environment variable: where captures go when the configuration does not say."""
 
 
-class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class CaptureConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     folder: str | None = None
     """Where the files go, one after another; made when it is not there. By default $COCORO_CAPTURE_DIR, else
     `cocoro/captures` in $XDG_STATE_HOME (~/.local/state)."""
@@ -50,7 +50,7 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """A loss of power loses what came in this long, and what the disk took to sync before."""
 
 
-def folder_of(config: Config) -> Path:
+def folder_of(config: CaptureConfig) -> Path:
     if config.folder is not None:
         return Path(config.folder)
     if explicit := os.environ.get(FOLDER):

@@ -308,7 +308,7 @@ def packed(*records: McapRecord) -> bytes:
 
 def ended(builder: RecordBuilder) -> bytes:
     """Take the bytes that a builder has gathered."""
-    data: bytes = builder.end()  # type: ignore[no-untyped-call]
+    data: bytes = builder.end()
     return data
 
 

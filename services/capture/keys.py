@@ -14,8 +14,9 @@ from cocoro.bus.base import Qos
 from cocoro.bus.keys import matches
 from cocoro.capture.types import JSON, MADE_HERE, MSGPACK, OTHER, Alive, LossyFrame, TypeSchema, schema_of
 from cocoro.errors import ConfigError
+from cocoro.installed import topic_named
 from cocoro.messages import Frame, Message
-from cocoro.topics import FRAME, TOPICS, topic_named
+from cocoro.topics import FRAME, TOPICS
 
 FRAMES = "frames"
 """In place of a key expression: all that carries pictures."""

@@ -17,11 +17,12 @@ from cocoro.bus.base import Handle, Heard, Payload
 from cocoro.capture.types import Alive, MessageHead
 from cocoro.clock import NS, FollowedClock
 from cocoro.errors import MeshError, RemoteError
+from cocoro.installed import topic_named
 from cocoro.messages import AboutReply, AboutRequest, ClockTick, DisturbedFile, Recording
 from cocoro.node import Node
 from cocoro.source import ANY_HZ, Source
 from cocoro.tokens import alive_key, recorder_key
-from cocoro.topics import ABOUT, CLOCK, RECORDING, topic_named
+from cocoro.topics import ABOUT, CLOCK, RECORDING
 from services.capture.keys import ALIVE_INFO, KeyFilter, KeyInfo, QueuedMessage
 from services.capture.log_clock import WALL_CLOCK, LogClock, describe_step
 from services.capture.sink import RecordingProgress, RecordingSink

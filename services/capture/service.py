@@ -12,8 +12,9 @@ from functools import partial
 from pathlib import Path
 
 from cocoro.clock import NS, VirtualClock
+from cocoro.component import Implementation
 from cocoro.node import Node
-from services.capture.config import Config, folder_of
+from services.capture.config import CaptureConfig, folder_of
 from services.capture.file import Packer
 from services.capture.keys import KeyFilter, info_of, lossy
 from services.capture.log_clock import LogClock
@@ -21,10 +22,8 @@ from services.capture.recorder import Ledger, Recorder
 from services.capture.sink import DirectSink, ThreadedSink
 from services.capture.writer import MB, CaptureWriter, Limits, sync_and_close
 
-__all__ = ["Config", "run"]
 
-
-async def run(node: Node, config: Config, log_clock: LogClock | None = None) -> None:
+async def run(node: Node, config: CaptureConfig, log_clock: LogClock | None = None) -> None:
     """Record until cancelled. A disk that does not take it is a fault that the mesh hears of, not the end. `log_clock`
     is of use in real time alone, and made when there is none."""
     ledger = Ledger(node.robot_name, KeyFilter(node.robot_name, config.only, config.without))
@@ -54,8 +53,11 @@ async def run(node: Node, config: Config, log_clock: LogClock | None = None) -> 
         recorder.end()
 
 
+implementation = Implementation(CaptureConfig, run)
+
+
 def _writer(
-    robot: str, config: Config, ledger: Ledger, started: datetime, release: Callable[[int], None] | None
+    robot: str, config: CaptureConfig, ledger: Ledger, started: datetime, release: Callable[[int], None] | None
 ) -> CaptureWriter:
     limits = Limits(min_free_bytes=round(config.min_free_mb * MB))
     if config.file is None:
@@ -71,7 +73,7 @@ def _writer(
     )
 
 
-def _place(robot: str, config: Config, started: datetime) -> Callable[[int], Path]:
+def _place(robot: str, config: CaptureConfig, started: datetime) -> Callable[[int], Path]:
     """Where the nth file goes."""
     if config.file is not None:
         path = Path(config.file)

@@ -8,13 +8,15 @@ from msgspec import Meta
 
 from cocoro.tasks import Limits
 from cocoro.units import Positive
+from services.executive.component import EXECUTIVE
 
 
-class Config(Limits, frozen=True, forbid_unknown_fields=True):
+class ExecutiveConfig(Limits, frozen=True, forbid_unknown_fields=True):
     objects: str = ""
     """A catalogue of known objects; empty is the project's own."""
-    needed: tuple[str, ...] = ("kinect", "base", "arm", "hand", "perception", "planning")
-    """Services without which no task starts, and at whose death a running one fails."""
+    needed: tuple[str, ...] = EXECUTIVE.needs
+    """Services without which no task starts, and at whose death a running one fails. A profile fills in those that
+    the declarations of its components give."""
     battery_low: Annotated[float, Meta(ge=0, le=1)] = 0.15
     """With less in the base's battery only tasks start that do without (`Task.needs_battery`)."""
     intent_hz: Positive = 50.0

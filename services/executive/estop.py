@@ -3,16 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
+from typing import Any
 
 from cocoro import topics
 from cocoro.clock import NS
 from cocoro.latch import LatchKeeper
-from cocoro.messages import Latch, LatchState
+from cocoro.messages import BaseState, Latch, LatchState, ServoState
 from cocoro.node import Node
+from cocoro.topics import Topic
 
 _COLD_START_NS = NS // 2
 """When every hardware service has been heard for so long, none knows the latch and no record on disk says that it is
 latched, then it is released."""
+
+_STATES: dict[str, Topic[Any]] = {
+    topic.service: topic for topic in (topics.BASE_STATE, topics.ARM_STATE, topics.HAND_STATE)
+}
+"""By service, where each service that moves something reports its latch."""
 
 
 class Estop:
@@ -27,9 +35,8 @@ class Estop:
         self._all_unknown_since_ns: int | None = None
         self._said: LatchState = "unknown"
         self._keeper = LatchKeeper(node, self._turned, follows=False)
-        node.on(topics.BASE_STATE, lambda state: self._hardware("base", state.latch))
-        node.on(topics.ARM_STATE, lambda state: self._hardware("arm", state.latch))
-        node.on(topics.HAND_STATE, lambda state: self._hardware("hand", state.latch))
+        for service, topic in _STATES.items():
+            node.on(topic, partial(self._hardware, service))
         node.spawn(self._tell(rate_hz))
 
     @property
@@ -41,11 +48,12 @@ class Estop:
         """The state and by whom it is so, for people."""
         return f"{self._said} by {self._by}" if self._said == "latched" and self._by else self._said
 
-    def _hardware(self, service: str, latch: LatchState) -> None:
+    def _hardware(self, service: str, state: BaseState | ServoState) -> None:
+        latch = state.latch
         self._heard[service] = latch
         if latch == "latched":
             self._keeper.word("latched", f"{service}, which was latched already")
-        elif self._said == "unknown" and set(self._heard) == set(topics.STOPPABLE):
+        elif self._said == "unknown" and set(self._heard) == set(_STATES):
             said = set(self._heard.values())
             if said == {"unknown"}:
                 self._nobody_knows()

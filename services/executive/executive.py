@@ -27,7 +27,7 @@ from cocoro.node import Node
 from cocoro.objects import Catalogue
 from cocoro.tagged import added_by
 from cocoro.tasks import Task, TaskFailedError
-from services.executive.config import Config
+from services.executive.config import ExecutiveConfig
 from services.executive.estop import Estop
 from services.executive.skills import PlannerSkills
 from services.executive.tasks import TASKS
@@ -39,7 +39,7 @@ _CLOCK_STANDS_S = 1.0
 
 
 class Executive:
-    def __init__(self, node: Node, config: Config, catalogue: Catalogue) -> None:
+    def __init__(self, node: Node, config: ExecutiveConfig, catalogue: Catalogue) -> None:
         self._node = node
         self._config = config
         self._catalogue = catalogue

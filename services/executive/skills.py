@@ -14,7 +14,7 @@ from cocoro.node import Node
 from cocoro.objects import Catalogue
 from cocoro.tasks import Limits, TaskFailedError
 from cocoro.units import Vec2, Vec3
-from services.executive.config import Config
+from services.executive.config import ExecutiveConfig
 
 LOOSE_S = 0.5
 """A hand that feels nothing for longer has lost what it held. When the arm comes to rest the claws may feel nothing for
@@ -27,7 +27,7 @@ LISTEN_S = 0.25
 class PlannerSkills:
     """Publishes intents and waits for the planner's answers. Calls `phase(name)` at the begin of each step."""
 
-    def __init__(self, node: Node, config: Config, catalogue: Catalogue, phase: Callable[[str], None]) -> None:
+    def __init__(self, node: Node, config: ExecutiveConfig, catalogue: Catalogue, phase: Callable[[str], None]) -> None:
         self._node = node
         self._config = config
         self._catalogue = catalogue

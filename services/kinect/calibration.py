@@ -72,7 +72,7 @@ class Board:
         return np.asarray(((squares > -BORDER) & (squares < ends)).all(axis=1))
 
 
-class View(NamedTuple):
+class BoardView(NamedTuple):
     corners_px: FloatArray
     """In the colour picture, in the order of the board's points: (n, 2)."""
     depth: CodeArray
@@ -119,7 +119,7 @@ def find_corners(colour: ImageArray, board: Board, *, quick: bool = False) -> Fl
     return np.asarray(corners, float).reshape(-1, 2)
 
 
-def calibrate(views: Sequence[View], board: Board, robot: Robot) -> Calibration:
+def calibrate(views: Sequence[BoardView], board: Board, robot: Robot) -> Calibration:
     """Raises CocoroError where the views are too few or do not go together, with what to do."""
     if len(views) < LEAST_VIEWS:
         raise CocoroError(f"the whole board is seen in {len(views)} views; {LEAST_VIEWS} are the least, 15 are good")
@@ -223,7 +223,7 @@ class _Guess(NamedTuple):
 
 
 class _DepthFit:
-    def __init__(self, views: Sequence[View], boards: Sequence[_Lying], board: Board, robot: Robot) -> None:
+    def __init__(self, views: Sequence[BoardView], boards: Sequence[_Lying], board: Board, robot: Robot) -> None:
         self._views, self._boards, self._board = views, boards, board
         kinect = robot.kinect
         a, b, c = kinect.depth_curve

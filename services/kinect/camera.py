@@ -1,4 +1,4 @@
-"""The Kinect through libfreenect: starts the process that has it open, takes its pairs, starts it again if it ends."""
+"""The Kinect's driver: runs `services.kinect.grabber`, which has the device open, and starts it again when it ends."""
 
 from __future__ import annotations
 
@@ -7,42 +7,40 @@ import json
 import logging
 import mmap
 import os
-import socket
 import subprocess
-import sys
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncGenerator, Mapping
 from contextlib import suppress
 from math import degrees
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from cocoro.arrays import ImageArray
+from cocoro.child import ChildProcess, wait_or_kill
 from cocoro.clock import NS, Clock
 from cocoro.errors import ConfigError
 from services.kinect import freenect, grabber
-from services.kinect.config import Config
-from services.kinect.device import Shot, Tell
-from services.kinect.freenect import HEIGHT, LED, WIDTH, Kind
+from services.kinect.config import KinectConfig
+from services.kinect.device import DepthCamera, DriverFactory, OnFault, RawFrame
+from services.kinect.freenect import HEIGHT, LED, WIDTH, ImageKind
 
 log = logging.getLogger("cocoro.kinect")
 
 AGAIN_S = 1.0
-"""Between two attempts to open the device."""
+"""Time between two attempts to open the device."""
 FIRST_S, HANGS_S = 6.0, 2.0
-"""A process that neither sends pictures (the first takes a while) nor ends within this time is killed: longer than it
-waits itself."""
+"""A grabber that sends no frame for this long (the first one takes longer) and does not end either hangs, and is
+killed. Both are longer than the grabber's own limits."""
 END_S = 1.0
-SAID_BYTES = 4096
-_PACKAGE = str(Path(__file__).parents[2])
+OUTPUT_BYTES = 4096
 
 
 class FreenectCamera:
-    """Needs a running event loop. `tell(fault)` is called in it, whenever what is wrong has changed."""
+    """The Kinect v1 through libfreenect. Calls `on_fault(fault)` in the running event loop whenever the fault
+    changes."""
 
-    def __init__(self, config: Config, clock: Clock, tell: Tell) -> None:
+    def __init__(self, config: KinectConfig, clock: Clock, on_fault: OnFault) -> None:
         try:
             freenect.load(freenect.find(config.library, bool(config.recording)))
         except freenect.MissingLibraryError as error:
@@ -51,7 +49,7 @@ class FreenectCamera:
         self.motor = False
         self._config = config
         self._clock = clock
-        self._tell = tell
+        self._on_fault = on_fault
         self._fault = "the Kinect is being opened"
         self._led: LED = "green"
         self._tilt_deg = config.tilt_deg
@@ -60,29 +58,28 @@ class FreenectCamera:
         os.ftruncate(memory, grabber.MEMORY_BYTES)
         self._memory_fd = memory
         self._memory = mmap.mmap(memory, grabber.MEMORY_BYTES, prot=mmap.PROT_READ)
-        self._channel: socket.socket | None = None
-        self._process: subprocess.Popen[bytes] | None = None
+        self._grabber: ChildProcess | None = None
         self._newest: dict[str, int] | None = None
         self._came = asyncio.Event()
-        self._heard_s = 0.0
-        self._said = b""
+        self._received_s = 0.0
+        self._output = b""
         self._again = self._loop.call_soon(self._start)
-        tell(self._fault)
+        on_fault(self._fault)
 
-    async def shots(self) -> AsyncIterator[Shot]:
+    async def frames(self) -> AsyncGenerator[RawFrame, None]:
         while True:
             limit_s = FIRST_S if self._fault else HANGS_S
             try:
                 async with asyncio.timeout(limit_s):
                     await self._came.wait()
             except TimeoutError:
-                if self._process is not None and time.monotonic() - self._heard_s > limit_s:
-                    self._lost("the Kinect's library hangs")
+                if self._grabber is not None and time.monotonic() - self._received_s > limit_s:
+                    self._restart("the Kinect's library hangs")
                 continue
             self._came.clear()
             if self._newest is not None:
                 pair, self._newest = self._newest, None
-                yield self._shot(pair)
+                yield self._frame(pair)
 
     def tilt(self, angle_rad: float) -> None:
         self._tilt_deg = degrees(angle_rad)
@@ -97,24 +94,26 @@ class FreenectCamera:
         process = self._let_go()
         os.close(self._memory_fd)
         if process is not None:
-            _end(process)
+            wait_or_kill(process, END_S)
 
-    # --- pictures -----------------------------------------------------------------------------------
+    # --- frames -------------------------------------------------------------------------------------
 
-    def _shot(self, pair: dict[str, int]) -> Shot:
-        """A copy of a pair, whose buffers are free then."""
+    def _frame(self, pair: dict[str, int]) -> RawFrame:
+        """Copy a pair out of the shared memory and give its buffers back."""
         colour = self._view("colour", pair["colour"]).reshape(HEIGHT, WIDTH, 3).copy()
         depth = self._view("depth", pair["depth"]).view("<u2").reshape(HEIGHT, WIDTH).astype(np.uint16)
         self._send(free=(pair["colour"], pair["depth"]))
         age_ns = time.monotonic_ns() - pair["t"] + round(self._config.latency_s * NS)
-        return Shot(self._clock.now_ns() - age_ns, colour, depth)
+        return RawFrame(self._clock.now_ns() - age_ns, colour, depth)
 
-    def _view(self, kind: Kind, buffer: int) -> ImageArray:
+    def _view(self, kind: ImageKind, buffer: int) -> ImageArray:
         return np.frombuffer(self._memory, np.uint8, grabber.size(kind), grabber.offset(kind, buffer))
 
-    def _take(self, message: dict[str, Any]) -> None:
+    def _receive(self, data: bytes) -> None:
+        self._received_s = time.monotonic()
+        message: dict[str, Any] = json.loads(data)
         if "fault" in message:
-            self._lost(message["fault"])
+            self._restart(message["fault"])
         elif "open" in message:
             self.motor = message["motor"]
         else:
@@ -122,102 +121,77 @@ class FreenectCamera:
                 self._send(free=(self._newest["colour"], self._newest["depth"]))
             self._newest = message
             self._came.set()
-            self._say("")
+            self._report("")
 
-    # --- its process --------------------------------------------------------------------------------
+    # --- the grabber's process ----------------------------------------------------------------------
 
     def _start(self) -> None:
-        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        ours.setblocking(False)
-        environment = os.environ | {"PYTHONPATH": _PACKAGE}
-        if self._config.recording:
-            environment[grabber.RECORDING] = self._config.recording
-        # No site packages: it needs none, and is there quickly.
-        command = [
-            sys.executable, "-S", "-P", "-m", "services.kinect.grabber", "--fd", str(theirs.fileno()),
-            "--memory", str(self._memory_fd), "--library", self._config.library,
+        # Without site packages, of which it needs none, it starts within milliseconds.
+        child = ChildProcess(
+            "services.kinect.grabber", "--memory", str(self._memory_fd), "--library", self._config.library,
             "--tilt", str(self._tilt_deg), "--led", self._led,
-        ]  # fmt: skip
-        with theirs:
-            process = subprocess.Popen(
-                command, env=environment, pass_fds=(theirs.fileno(), self._memory_fd), stdin=subprocess.DEVNULL,
-                stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-            )  # fmt: skip
-        assert process.stdout is not None
-        os.set_blocking(process.stdout.fileno(), False)
-        self._process, self._channel, self._said = process, ours, b""
+            environment={grabber.RECORDING: self._config.recording} if self._config.recording else None,
+            site_packages=False, pass_fds=(self._memory_fd,), stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+        )  # fmt: skip
+        assert child.process.stdout is not None
+        os.set_blocking(child.process.stdout.fileno(), False)
+        self._grabber, self._output = child, b""
         self._newest = None
-        self._heard_s = time.monotonic()
+        self._received_s = time.monotonic()
         self.starts += 1
-        self._loop.add_reader(ours, self._read, ours)
-        self._loop.add_reader(process.stdout, self._listen, process)
+        child.watch(self._receive, lambda: self._restart(self._last_words()))
+        self._loop.add_reader(child.process.stdout, self._read_output, child.process)
 
-    def _read(self, channel: socket.socket) -> None:
-        while channel is self._channel:
-            try:
-                message = channel.recv(4096)
-            except BlockingIOError:
-                return
-            except ConnectionError:
-                message = b""
-            if not message:
-                self._lost(self._last_words())
-                return
-            self._heard_s = time.monotonic()
-            self._take(json.loads(message))
-
-    def _listen(self, process: subprocess.Popen[bytes]) -> None:
-        """What the libraries print: their last words are told when they end their process."""
+    def _read_output(self, process: subprocess.Popen[bytes]) -> None:
+        """Keep the end of what the libraries print: it says why, when they end their process."""
         assert process.stdout is not None
         with suppress(BlockingIOError):
-            heard = os.read(process.stdout.fileno(), SAID_BYTES)
-            self._said = (self._said + heard)[-SAID_BYTES:]
-            if not heard:
+            output = os.read(process.stdout.fileno(), OUTPUT_BYTES)
+            self._output = (self._output + output)[-OUTPUT_BYTES:]
+            if not output:
                 self._loop.remove_reader(process.stdout)
 
     def _last_words(self) -> str:
-        if self._process is not None:
-            self._listen(self._process)
-        lines = self._said.decode(errors="replace").split("\n")
+        if self._grabber is not None:
+            self._read_output(self._grabber.process)
+        lines = self._output.decode(errors="replace").split("\n")
         words = next((line.strip() for line in reversed(lines) if line.strip()), "")
         return f"the Kinect's library ended its process{f': {words}' if words else ''}"
 
-    def _lost(self, why: str) -> None:
-        """Say so, and try again."""
-        self._say(why)
+    def _restart(self, why: str) -> None:
+        """Report the fault, end the grabber, and start another one in a while."""
+        self._report(why)
         process = self._let_go()
         if process is not None:
-            self._loop.run_in_executor(None, _end, process)
+            self._loop.run_in_executor(None, wait_or_kill, process, END_S)
             self._again = self._loop.call_later(AGAIN_S, self._start)
 
-    def _say(self, fault: str) -> None:
+    def _report(self, fault: str) -> None:
         if fault != self._fault:
             self._fault = fault
-            self._tell(fault)
+            self._on_fault(fault)
 
     def _let_go(self) -> subprocess.Popen[bytes] | None:
-        """What came last is still there to be taken."""
-        channel, self._channel = self._channel, None
-        process, self._process = self._process, None
-        if channel is not None:
-            self._loop.remove_reader(channel)
-            channel.close()
-        if process is not None and process.stdout is not None:
-            self._loop.remove_reader(process.stdout)
-        return process
+        """Ask the grabber to end. The newest pair stays valid in the shared memory."""
+        child, self._grabber = self._grabber, None
+        if child is None:
+            return None
+        child.close()
+        if child.process.stdout is not None:
+            self._loop.remove_reader(child.process.stdout)
+        return child.process
 
     def _send(self, **message: object) -> None:
-        if self._channel is not None:
-            with suppress(BlockingIOError, ConnectionError):
-                self._channel.send(json.dumps(message).encode())
+        if self._grabber is not None:
+            self._grabber.send(json.dumps(message).encode())
 
 
-def _end(process: subprocess.Popen[bytes]) -> None:
-    """It ends by itself when its channel is closed, unless it hangs."""
-    try:
-        process.wait(END_S)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()
-    if process.stdout is not None:
-        process.stdout.close()
+DRIVERS: Mapping[str, DriverFactory] = {"freenect": FreenectCamera}
+"""Drivers by the name that `device` in the service's settings chooses."""
+
+
+def open_device(config: KinectConfig, clock: Clock, on_fault: OnFault) -> DepthCamera:
+    """Open the configured device. Raises ConfigError when there is no such driver, or its library is missing."""
+    if config.device not in DRIVERS:
+        raise ConfigError(f"kinect: there is no driver {config.device!r} (known: {', '.join(DRIVERS)})")
+    return DRIVERS[config.device](config, clock, on_fault)

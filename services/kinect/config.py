@@ -8,7 +8,7 @@ import msgspec
 from msgspec import Meta
 
 
-class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class KinectConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     device: str = "freenect"
     """The driver's name."""
     library: str = ""

@@ -1,4 +1,4 @@
-"""What a depth camera's driver has to offer; a driver is one entry in `DEVICES`."""
+"""The interface of a depth camera's driver."""
 
 from __future__ import annotations
 
@@ -7,50 +7,37 @@ from typing import NamedTuple, Protocol
 
 from cocoro.arrays import CodeArray, ImageArray
 from cocoro.clock import Clock
-from cocoro.errors import ConfigError
-from services.kinect.config import Config
+from services.kinect.config import KinectConfig
 from services.kinect.freenect import LED
 
-Tell = Callable[[str], None]
-"""Called with what keeps pictures from coming, in a sentence; with '' when they come again."""
+OnFault = Callable[[str], None]
+"""Called with a sentence that says why no frames come, and with '' when they come again."""
 
 
-class Shot(NamedTuple):
-    """One colour and depth pair."""
+class RawFrame(NamedTuple):
+    """A colour image and a depth image of the same moment, as the device delivers them."""
 
     stamp_ns: int
-    """Of the middle of the exposure, by the robot's clock."""
+    """Middle of the exposure, robot's clock."""
     colour: ImageArray
     """RGB, (height, width, 3)."""
     depth: CodeArray
-    """Raw 11-bit codes as the depth camera sees them, (height, width); 2047 is no data."""
+    """Raw 11-bit codes from the depth camera's viewpoint, (height, width); 2047 is no data."""
 
 
 class DepthCamera(Protocol):
-    """A device that is open. It may lose its cable: `shots` then waits until it is back."""
+    """A device that is open. When its cable is pulled, `frames` waits until it is back."""
 
-    def shots(self) -> AsyncIterator[Shot]:
-        """Every pair as it comes; a pair that nobody took in time is dropped for the next."""
+    def frames(self) -> AsyncIterator[RawFrame]:
+        """Yield each frame as it comes; a frame that nobody takes in time is replaced by the next."""
 
     def tilt(self, angle_rad: float) -> None:
-        """Move the device's own tilt motor (the Calliope's stays at 0: its neck tilts)."""
+        """Move the device's own tilt motor. The Calliope's stays at 0, since its neck tilts."""
 
     def led(self, led: LED) -> None: ...
 
     def close(self) -> None: ...
 
 
-Open = Callable[[Config, Clock, Tell], DepthCamera]
-
-DEVICES: dict[str, Open] = {}
-"""Drivers by name. Raise ConfigError, naming the package to install, when their library is missing."""
-
-
-def open_device(config: Config, clock: Clock, tell: Tell) -> DepthCamera:
-    """Raises ConfigError for a driver that is not there."""
-    from services.kinect import camera  # enters the real one
-
-    DEVICES.setdefault("freenect", camera.FreenectCamera)
-    if config.device not in DEVICES:
-        raise ConfigError(f"kinect: there is no driver {config.device!r} (known: {', '.join(DEVICES)})")
-    return DEVICES[config.device](config, clock, tell)
+DriverFactory = Callable[[KinectConfig, Clock, OnFault], DepthCamera]
+"""Opens a device. Raises ConfigError that names the package to install when the driver's library is missing."""

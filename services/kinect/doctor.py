@@ -9,15 +9,15 @@ from cocoro.checks import Check, bad, note, ok
 from cocoro.clock import RealClock
 from cocoro.errors import ConfigError
 from cocoro.robot import Robot
-from services.kinect.config import Config
-from services.kinect.device import open_device
+from services.kinect.camera import open_device
+from services.kinect.config import KinectConfig
 
 __all__ = ["check"]
 
 LOOK_S = 4.0
 
 
-def check(config: Config, robot: Robot, robot_name: str) -> list[Check]:
+def check(config: KinectConfig, robot: Robot, robot_name: str) -> list[Check]:
     """Whether pictures come of it."""
     checks = [asyncio.run(_look(config))]
     if robot.kinect.depth_lens is None:
@@ -27,7 +27,7 @@ def check(config: Config, robot: Robot, robot_name: str) -> list[Check]:
     return checks
 
 
-async def _look(config: Config) -> Check:
+async def _look(config: KinectConfig) -> Check:
     faults: list[str] = []
     try:
         camera = open_device(config, RealClock(), faults.append)
@@ -36,9 +36,9 @@ async def _look(config: Config) -> Check:
     with closing(camera):
         try:
             async with asyncio.timeout(LOOK_S):
-                async for shot in camera.shots():
-                    height, width = shot.depth.shape
-                    seen = float((shot.depth < 2047).mean())
+                async for frame in camera.frames():
+                    height, width = frame.depth.shape
+                    seen = float((frame.depth < 2047).mean())
                     return ok("Kinect", f"sends pictures, {width} x {height}, depth in {100 * seen:.0f}% of them")
         except TimeoutError:
             pass

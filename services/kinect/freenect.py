@@ -7,7 +7,8 @@ too. Needs nothing but Python, so that the process that talks to the device stay
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Iterator
 from ctypes import CFUNCTYPE, POINTER, byref, c_char_p, c_double, c_int, c_int8, c_int16, c_int32, c_uint32, c_void_p
 from glob import glob
 from typing import Literal, NamedTuple
@@ -29,8 +30,8 @@ LED = Literal["off", "green", "red", "yellow", "blink_green", "blink_red_yellow"
 LEDS: dict[LED, int] = {"off": 0, "green": 1, "red": 2, "yellow": 3, "blink_green": 4, "blink_red_yellow": 6}
 
 
-Kind = Literal["colour", "depth"]
-Heard = Callable[[Kind, int, int], None]
+ImageKind = Literal["colour", "depth"]
+ImageCallback = Callable[[ImageKind, int, int], None]
 
 
 class MissingLibraryError(Exception):
@@ -70,7 +71,7 @@ class _Seconds(ctypes.Structure):
     _fields_ = (("seconds", ctypes.c_long), ("microseconds", ctypes.c_long))
 
 
-class Tilt(NamedTuple):
+class TiltReading(NamedTuple):
     """What the device feels: its tilt motor's angle, and the acceleration of rest (m/s^2; x right, y up, z back)."""
 
     angle_deg: float
@@ -136,14 +137,14 @@ def load(path: str) -> ctypes.CDLL:
     return library
 
 
-class Kinect:
+class FreenectDevice:
     """The first device that is found, open and streaming. `heard(kind, address, ticks)` is called from `process` with
     each picture, kind colour or depth; the pixels are good until it returns.
 
     Raises DeviceError where there is none, or where it will not open or stream.
     """
 
-    def __init__(self, library: ctypes.CDLL, heard: Heard) -> None:
+    def __init__(self, library: ctypes.CDLL, heard: ImageCallback) -> None:
         self._library = library
         self.log = ""
         """The library's newest complaint."""
@@ -210,13 +211,13 @@ class Kinect:
         if self.has_motor:
             self._library.freenect_set_led(self._device, LEDS[led])
 
-    def feel(self) -> Tilt | None:
+    def feel(self) -> TiltReading | None:
         """None where the motor, which feels it, cannot be asked."""
         if not self.has_motor or self._library.freenect_update_tilt_state(self._device) < 0:
             return None
         state = self._library.freenect_get_tilt_state(self._device).contents
         x, y, z = (count * 9.80665 / 819.0 for count in (state.x, state.y, state.z))  # FREENECT_COUNTS_PER_G
-        return Tilt(state.angle / 2.0, (x, y, z))
+        return TiltReading(state.angle / 2.0, (x, y, z))
 
     def close(self) -> None:
         library = self._library
@@ -236,3 +237,58 @@ class Kinect:
     def _logged(self, _: int, level: int, text: bytes) -> None:
         if level <= LOG_ERROR:
             self.log = text.decode(errors="replace").strip()
+
+
+INDEX = "INDEX.txt"
+BYTES = {"r": COLOUR_BYTES, "d": DEPTH_BYTES}
+LONGEST_HEADER = 64
+"""One line of a PPM or PGM."""
+
+
+def check_recording(folder: str) -> None:
+    """Raises DeviceError that names the file, and says what to do."""
+    index = os.path.join(folder, INDEX)  # noqa: PTH118 # as in all of this process: pathlib is slow to import
+    try:
+        with open(index, encoding="utf-8") as file:  # noqa: PTH123
+            names = file.read().splitlines()
+    except (OSError, UnicodeDecodeError):
+        raise DeviceError(f"{folder} is no recording: there is no readable {INDEX} in it") from None
+    if not {"r", "d"} <= {name[:1] for name in names}:
+        raise DeviceError(f"{index} names no colour or no depth pictures: the recording holds nothing to play")
+    for fault in _faults(folder, names):
+        raise DeviceError(f"{fault}: record anew, or take its line out of {index}")
+
+
+def _faults(folder: str, names: list[str]) -> Iterator[str]:
+    for name in names:
+        path = os.path.join(folder, name)  # noqa: PTH118
+        if not name:
+            yield f"{folder}: an empty line stands in {INDEX}"
+        elif not _is_named_well(name):
+            yield f"{path} has no name of a recording's"
+        else:
+            yield from _wrong_size(path, name[0])
+
+
+def _is_named_well(name: str) -> bool:
+    """TYPE-SECONDS-TICKS.anything."""
+    parts = name.split(".pgm")[0].split(".ppm")[0].split(".dump")[0].split("-")
+    try:
+        return len(parts) == 3 and parts[0] in ("r", "d", "a") and float(parts[1]) >= 0 and int(parts[2]) >= 0
+    except ValueError:
+        return False
+
+
+def _wrong_size(path: str, kind: str) -> Iterator[str]:
+    try:
+        with open(path, "rb") as file:  # noqa: PTH123
+            header = file.readline(LONGEST_HEADER)
+            size = file.seek(0, os.SEEK_END)
+    except OSError as error:
+        yield f"{path} cannot be read ({error.strerror})"
+        return
+    if kind not in BYTES:
+        if size == 0:
+            yield f"{path} is empty"
+    elif not header.endswith(b"\n") or size != len(header) + BYTES[kind]:
+        yield f"{path} is damaged: its pixels take {size - len(header)} bytes, not {BYTES[kind]}"

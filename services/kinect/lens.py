@@ -15,7 +15,7 @@ import numpy as np
 
 from cocoro.arrays import Float32Array, FloatArray
 from cocoro.robot import Camera, Robot
-from services.kinect.device import Shot
+from services.kinect.device import RawFrame
 
 Maps = tuple[cv2.typing.MatLike, cv2.typing.MatLike]
 NO_DATA = 2047
@@ -76,7 +76,7 @@ class Straightener:
         """Nothing was measured."""
         return self._colour is None and self._depth is None
 
-    def __call__(self, shot: Shot) -> Shot:
+    def __call__(self, shot: RawFrame) -> RawFrame:
         """Colour smoothly, depth from the nearest pixel: two depths have no mean."""
         colour, depth = shot.colour, shot.depth
         if self._colour is not None:
@@ -89,7 +89,7 @@ class Straightener:
                 gain, shift = self._move
                 moved = (depth * gain + shift).astype(np.uint16)
                 depth = np.where(depth >= NO_DATA, np.uint16(NO_DATA), moved)
-        return Shot(shot.stamp_ns, colour, depth)
+        return RawFrame(shot.stamp_ns, colour, depth)
 
 
 def _maps(

@@ -1,4 +1,4 @@
-"""The Kinect as a service."""
+"""The Kinect service: publishes the driver's frames, straightened."""
 
 from __future__ import annotations
 
@@ -8,41 +8,38 @@ from contextlib import closing
 import numpy as np
 
 from cocoro import topics
+from cocoro.faults import FaultReporter
 from cocoro.messages import Frame
 from cocoro.node import Node
-from services.kinect.config import Config
-from services.kinect.device import Shot, open_device
+from services.kinect.camera import open_device
+from services.kinect.config import KinectConfig
+from services.kinect.device import RawFrame
 from services.kinect.lens import Straightener
 
-__all__ = ["Config", "run"]
 
-
-async def run(node: Node, config: Config) -> None:
-    """Publish every pair for ever. Raises ConfigError when the driver or its library is missing."""
+async def run(node: Node, config: KinectConfig) -> None:
+    """Publish every frame for ever. Raises ConfigError when the driver or its library is missing."""
     straighten = Straightener(node.robot)
+    reporter = FaultReporter(node)
 
-    def tell(fault: str) -> None:
-        node.faults = (fault,) if fault else ()
-        if fault:
-            node.log.warning("no pictures: %s", fault)
-            node.degraded("no pictures")
-        else:
-            node.ready(f"plays {config.recording}" if config.recording else config.device)
+    def on_fault(fault: str) -> None:
+        works = f"plays {config.recording}" if config.recording else config.device
+        reporter.report((fault,) if fault else (), degraded="no pictures" if fault else "", ready=works)
 
-    with closing(open_device(config, node.clock, tell)) as camera:
-        async for shot in camera.shots():
-            # A few milliseconds of arithmetic, which the loop does not wait for.
-            straight = shot if straighten.idle else await asyncio.to_thread(straighten, shot)
-            node.publish(topics.FRAME, as_frame(straight))
+    with closing(open_device(config, node.clock, on_fault)) as camera:
+        async for frame in camera.frames():
+            # In a thread: it takes a few milliseconds, for which the event loop must not wait.
+            straight = frame if straighten.idle else await asyncio.to_thread(straighten, frame)
+            node.publish(topics.FRAME, to_message(straight))
 
 
-def as_frame(shot: Shot) -> Frame:
-    """The message of a pair; the pixels are not copied where they lie in order."""
-    height, width = shot.depth.shape
+def to_message(frame: RawFrame) -> Frame:
+    """The message of a frame. Pixels are copied only when they are not contiguous."""
+    height, width = frame.depth.shape
     return Frame(
-        stamp_ns=shot.stamp_ns,
+        stamp_ns=frame.stamp_ns,
         width=width,
         height=height,
-        colour=np.ascontiguousarray(shot.colour).reshape(-1).data,
-        depth=np.ascontiguousarray(shot.depth, dtype="<u2").reshape(-1).view(np.uint8).data,
+        colour=np.ascontiguousarray(frame.colour).reshape(-1).data,
+        depth=np.ascontiguousarray(frame.depth, dtype="<u2").reshape(-1).view(np.uint8).data,
     )

@@ -19,9 +19,10 @@ from cocoro.clock import RealClock
 from cocoro.errors import CocoroError, ConfigError
 from cocoro.picture import load as load_picture
 from cocoro.picture import save as save_picture
-from services.kinect.calibration import Board, View, find_corners
-from services.kinect.config import Config
-from services.kinect.device import DepthCamera, Shot, open_device
+from services.kinect.calibration import Board, BoardView, find_corners
+from services.kinect.camera import open_device
+from services.kinect.config import KinectConfig
+from services.kinect.device import DepthCamera, RawFrame
 from services.kinect.lens import NO_DATA
 
 STILL_PX = 0.7
@@ -35,18 +36,18 @@ PATIENCE_S = 60.0
 Tell = Callable[[str], None]
 
 
-class Collector:
+class ViewCollector:
     """Told of every shot; keeps one view each time that the board is held still somewhere new. Pure."""
 
     def __init__(self, board: Board, folder: Path | None = None) -> None:
-        self.views: list[View] = []
+        self.views: list[BoardView] = []
         self._board = board
         self._folder = folder
-        self._still: list[Shot] = []
+        self._still: list[RawFrame] = []
         self._before: FloatArray | None = None
         self._places: list[FloatArray] = []
 
-    def take(self, shot: Shot) -> str:
+    def take(self, shot: RawFrame) -> str:
         """What there is to tell of a shot: '' when nothing."""
         rough = find_corners(shot.colour, self._board, quick=True)
         before, self._before = self._before, rough
@@ -69,7 +70,7 @@ class Collector:
         corners = find_corners(shots[-1].colour, self._board)
         if corners is None:
             return "the board is not seen whole"
-        view = View(corners, mean_depth([shot.depth for shot in shots]))
+        view = BoardView(corners, mean_depth([shot.depth for shot in shots]))
         self.views.append(view)
         self._places.append(place)
         if self._folder is not None:
@@ -84,14 +85,14 @@ def mean_depth(depths: list[CodeArray]) -> CodeArray:
     return np.where((stack >= NO_DATA).any(axis=0), np.uint16(NO_DATA), middle)
 
 
-def capture(config: Config, board: Board, wanted: int, folder: Path | None, tell: Tell) -> list[View]:
+def capture(config: KinectConfig, board: Board, wanted: int, folder: Path | None, tell: Tell) -> list[BoardView]:
     """Views from the device. Raises ConfigError where its library is missing, CocoroError where nothing comes of it."""
     if folder is not None:
         _prepare(folder)
-    return asyncio.run(_capture(config, Collector(board, folder), wanted, tell))
+    return asyncio.run(_capture(config, ViewCollector(board, folder), wanted, tell))
 
 
-async def _capture(config: Config, collector: Collector, wanted: int, tell: Tell) -> list[View]:
+async def _capture(config: KinectConfig, collector: ViewCollector, wanted: int, tell: Tell) -> list[BoardView]:
     told = ""
 
     def say(text: str) -> None:
@@ -119,10 +120,10 @@ async def _capture(config: Config, collector: Collector, wanted: int, tell: Tell
     return collector.views
 
 
-async def _shots(camera: DepthCamera) -> AsyncGenerator[Shot | None, None]:
+async def _shots(camera: DepthCamera) -> AsyncGenerator[RawFrame | None, None]:
     """The camera's, and None once a second while it has none."""
-    shots = camera.shots()
-    coming: asyncio.Future[Shot] | None = None
+    shots = camera.frames()
+    coming: asyncio.Future[RawFrame] | None = None
     try:
         while True:
             coming = coming or asyncio.ensure_future(anext(shots))
@@ -137,12 +138,12 @@ async def _shots(camera: DepthCamera) -> AsyncGenerator[Shot | None, None]:
             coming.cancel()
 
 
-def tilt(config: Config, angle_rad: float) -> None:
+def tilt(config: KinectConfig, angle_rad: float) -> None:
     """Move the device's own tilt motor. Raises CocoroError where there is no device."""
     asyncio.run(_tilt(config, angle_rad))
 
 
-async def _tilt(config: Config, angle_rad: float) -> None:
+async def _tilt(config: KinectConfig, angle_rad: float) -> None:
     faults: list[str] = []
     with closing(open_device(config, RealClock(), faults.append)) as camera:
         camera.tilt(angle_rad)
@@ -167,7 +168,7 @@ def save(folder: Path, number: int, colour: ImageArray, depth: CodeArray) -> Non
             raise ConfigError(f"{file} cannot be written: {error.strerror}; choose another place") from error
 
 
-def read(folder: Path, board: Board, tell: Tell) -> list[View]:
+def read(folder: Path, board: Board, tell: Tell) -> list[BoardView]:
     """The views that `save` has put there; those without a whole board are told of and left out. Raises ConfigError."""
     views = []
     for file, colour, depth in _pictures(folder):
@@ -175,7 +176,7 @@ def read(folder: Path, board: Board, tell: Tell) -> list[View]:
         if corners is None:
             tell(f"{file.name}: the board is not seen whole")
         else:
-            views.append(View(corners, depth))
+            views.append(BoardView(corners, depth))
     return views
 
 

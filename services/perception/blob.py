@@ -15,7 +15,7 @@ import numpy as np
 from cocoro.arrays import MaskArray
 from cocoro.objects import Catalogue, ObjectSpec
 from services.perception.colours import ColourTable
-from services.perception.config import Config
+from services.perception.config import PerceptionConfig
 from services.perception.image import PixelBox, RgbdImage
 from services.perception.region import ColourRegion, components
 from services.perception.shapes import area_range_m2, counted_px, reach_m
@@ -28,7 +28,7 @@ MAX_STRETCH = 1.5
 
 
 class BlobDetector:
-    def __init__(self, catalogue: Catalogue, config: Config) -> None:
+    def __init__(self, catalogue: Catalogue, config: PerceptionConfig) -> None:
         self._catalogue = catalogue
         self._config = config
         self._table = ColourTable(catalogue)
@@ -88,7 +88,7 @@ class BlobDetector:
 class _Fit:
     """How well a region's size goes with one known object at the region's own distance."""
 
-    def __init__(self, known: ObjectSpec, image: RgbdImage, config: Config) -> None:
+    def __init__(self, known: ObjectSpec, image: RgbdImage, config: PerceptionConfig) -> None:
         camera = image.camera
         self._config = config
         self._focal2 = camera.fx * camera.fy

@@ -10,7 +10,7 @@ from msgspec import Meta
 from cocoro.units import Positive, PositiveShare
 
 
-class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class PerceptionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Pixel counts are for a frame of 640 x 480 and are scaled with the frame's area."""
 
     detector: Literal["blob", "paper"] = "blob"

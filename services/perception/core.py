@@ -15,7 +15,7 @@ from cocoro.objects import Catalogue
 from cocoro.robot import Camera, Robot
 from cocoro.topics import ARM_STATE, DETECTIONS, FRAME, OBSTACLES, Topic
 from services.perception.blob import BlobDetector
-from services.perception.config import Config
+from services.perception.config import PerceptionConfig
 from services.perception.floor import FloorScanner
 from services.perception.image import RgbdImage
 from services.perception.localise import Localiser
@@ -26,7 +26,7 @@ NS = 1_000_000_000
 MAX_PENDING = 8
 """Frames that wait for head angles; one more and the oldest goes out without."""
 
-DETECTORS: dict[str, Callable[[Catalogue, Config], Detector]] = {"blob": BlobDetector, "paper": PaperDetector}
+DETECTORS: dict[str, Callable[[Catalogue, PerceptionConfig], Detector]] = {"blob": BlobDetector, "paper": PaperDetector}
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class PerceptionCore:
     steps' now; then its detections go out without positions. Detections go out in the order of their frames.
     """
 
-    def __init__(self, robot: Robot, config: Config, catalogue: Catalogue) -> None:
+    def __init__(self, robot: Robot, config: PerceptionConfig, catalogue: Catalogue) -> None:
         self._robot = robot
         self._config = config
         self._detector: Detector = DETECTORS[config.detector](catalogue, config)

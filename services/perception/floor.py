@@ -11,7 +11,7 @@ import numpy as np
 from cocoro.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from cocoro.messages import Obstacles
 from cocoro.robot import Robot
-from services.perception.config import Config
+from services.perception.config import PerceptionConfig
 from services.perception.image import RgbdImage
 
 CELL_M = 0.04
@@ -25,7 +25,7 @@ _RAYS = round(360 / _RAY_DEG)
 
 
 class FloorScanner:
-    def __init__(self, robot: Robot, config: Config) -> None:
+    def __init__(self, robot: Robot, config: PerceptionConfig) -> None:
         self._robot = robot
         self._config = config
         self._offset_m = np.array(robot.kinect.depth_offset_m)

@@ -14,13 +14,13 @@ import numpy as np
 
 from cocoro.arrays import ImageArray
 from cocoro.objects import Catalogue, ObjectSpec
-from services.perception.config import Config
+from services.perception.config import PerceptionConfig
 from services.perception.image import RgbdImage
 from services.perception.sighting import ImageSighting
 
 
 class PaperDetector:
-    def __init__(self, catalogue: Catalogue, config: Config) -> None:
+    def __init__(self, catalogue: Catalogue, config: PerceptionConfig) -> None:
         self._catalogue = catalogue
         self._config = config
 

@@ -144,7 +144,7 @@ class HandSightConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The marker's place is known while the claws lie level, within so much."""
 
 
-class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class PlanningConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     rate_hz: Positive = 50.0
     coordination: Literal["concurrent", "lockstep"] = "concurrent"
     """Lockstep: the arm waits until the base stands, as the paper has it."""

@@ -16,7 +16,7 @@ from cocoro.robot import Robot
 from cocoro.topics import Topic
 from services.planning.arm import ArmStep
 from services.planning.behaviours import Actuators, Behaviour, Idling, Plan, Snapshot, behaviour_for
-from services.planning.config import Config
+from services.planning.config import PlanningConfig
 from services.planning.head import PAN, TILT
 from services.planning.learned import Learned
 from services.planning.reach import ARM
@@ -29,7 +29,7 @@ _STALE_NS = NS
 class PlanningCore:
     """See `cocoro.core.Core`. Stands still, and says why, whenever it is not sure."""
 
-    def __init__(self, robot: Robot, config: Config) -> None:
+    def __init__(self, robot: Robot, config: PlanningConfig) -> None:
         self._config = config
         self._estimator = StateEstimator(config, robot)
         self._actuators = Actuators(robot, config)

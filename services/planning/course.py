@@ -16,7 +16,7 @@ from cocoro.arrays import FloatArray
 from cocoro.clock import NS
 from cocoro.frames import Pose2, wrap_rad
 from cocoro.robot import Robot
-from services.planning.config import Config
+from services.planning.config import PlanningConfig
 from services.planning.navigation import Driver, Offset, offset_to
 from services.planning.surroundings import Fields, Surroundings, placed
 
@@ -54,7 +54,7 @@ class Course:
     def __init__(
         self,
         robot: Robot,
-        config: Config,
+        config: PlanningConfig,
         aim_m: tuple[float, float],
         *,
         arm: Literal["last", "out", "folded"],

@@ -17,7 +17,7 @@ from cocoro.learning.handmap import HandMap
 from cocoro.learning.model import BodyModel
 from cocoro.learning.nominal_model import NominalModel
 from cocoro.robot import Robot
-from services.planning.config import Config, HandSightConfig
+from services.planning.config import HandSightConfig, PlanningConfig
 from services.planning.reach import LEVEL_ROLL_RAD, HandModel
 from services.planning.reachability import ReachMesh
 from services.planning.state_estimator import PostureSighting
@@ -122,7 +122,7 @@ class SeenHand:
 class Learned:
     """What is known beyond the drawing, and the sentence that says so."""
 
-    def __init__(self, robot: Robot, config: Config) -> None:
+    def __init__(self, robot: Robot, config: PlanningConfig) -> None:
         self._robot = robot
         self._config = config
         self._text = NOTHING_LEARNED

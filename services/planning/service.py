@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
+from cocoro.component import Implementation
 from cocoro.errors import ConfigError
 from cocoro.learning.model import decode
 from cocoro.messages import LearnedModel, ModelReply, ModelRequest
 from cocoro.node import Node
 from cocoro.robot import Robot
 from cocoro.topics import LEARNED, MODEL
-from services.planning.config import Config
+from services.planning.config import PlanningConfig
 from services.planning.core import PlanningCore
 
-__all__ = ["Config", "core", "run"]
 
-
-def core(robot: Robot, config: Config) -> PlanningCore:
+def core(robot: Robot, config: PlanningConfig) -> PlanningCore:
     """The planner's maths."""
     return PlanningCore(robot, config)
 
 
-async def run(node: Node, config: Config) -> None:
+async def run(node: Node, config: PlanningConfig) -> None:
     """Plan for ever: at a fixed rate, and at once when a new detection arrives."""
     planner = core(node.robot, config)
     if config.model:
@@ -36,3 +35,6 @@ async def run(node: Node, config: Config) -> None:
 
     node.serve(LEARNED, take)
     await node.drive(planner)
+
+
+implementation = Implementation(PlanningConfig, run, core)

@@ -20,7 +20,7 @@ from cocoro.messages import BaseState, Detection, Detections, Intent, Message, O
 from cocoro.robot import Robot
 from cocoro.topics import Topic
 from cocoro.units import Vec3
-from services.planning.config import Config
+from services.planning.config import PlanningConfig
 from services.planning.memory import TargetMemory
 from services.planning.surroundings import Surroundings
 from services.planning.turning import Turning
@@ -83,7 +83,7 @@ class PostureSighting(NamedTuple):
 class StateEstimator:
     """Takes every input of the planner; answers by time."""
 
-    def __init__(self, config: Config, robot: Robot) -> None:
+    def __init__(self, config: PlanningConfig, robot: Robot) -> None:
         self._joints = tuple(robot.joints)
         self.memory = TargetMemory(config.memory)
         self.base: BaseState | None = None
@@ -271,7 +271,7 @@ class StateEstimator:
         among them with `sight`."""
         ages = {"the executive": self.intent_age_s(now_ns)}
         for topic in (topics.BASE_STATE, topics.ARM_STATE, topics.HAND_STATE):
-            ages[topic.publisher] = self._age_s(topic, now_ns)
+            ages[topic.service] = self._age_s(topic, now_ns)
         if sight:
             ages["perception"] = self._sight.age_s(now_ns)
         who = max(ages, key=ages.__getitem__)

@@ -1,20 +1,143 @@
-"""One serial line with servos on it, by the Dynamixel SDK. It blocks: call it from a thread."""
+"""Status packets of Protocol 1.0, found in whatever comes over the wire. Pure.
+
+`FF FF ID LENGTH ERROR data CHECKSUM`, LENGTH = bytes of data + 2, CHECKSUM = inverted sum from ID on (ROBOTIS AX-12
+manual). Instructions are written by the SDK; what it is given to read has been through here.
+"""
 
 from __future__ import annotations
 
 import errno
+import select
 import termios
 import time
 from collections.abc import Mapping
 from contextlib import suppress
+from typing import NamedTuple
 
+import serial
+from dynamixel_sdk.port_handler import PortHandler
 from dynamixel_sdk.protocol1_packet_handler import Protocol1PacketHandler
 from dynamixel_sdk.robotis_def import COMM_SUCCESS
 
 from cocoro.errors import CocoroError
 from services.servos import table
-from services.servos.port import CheckedPort
-from services.servos.table import REFUSALS, REGISTERS, Reading
+from services.servos.table import REFUSALS, REGISTERS, ServoReading
+
+HEADER = b"\xff\xff"
+BROADCAST = 254
+READ = 2
+
+
+class Status(NamedTuple):
+    packet: bytes
+    error: int
+    data: bytes
+
+
+def find_status(stream: bytes, number: int, length: int) -> Status | None:
+    """The answer of servo `number` to what asks for `length` bytes; None while there is none.
+
+    A packet counts only when everything in it is right: its number, its length, its checksum. An answer without data
+    counts where data were asked for only when it says that it refuses. All else is passed over, byte by byte, so that
+    a broken packet cannot hide a good one.
+    """
+    at = stream.find(HEADER)
+    while at >= 0:
+        for size in (length, 0):
+            packet = stream[at : at + size + 6]
+            if len(packet) < size + 6 or packet[2] != number or packet[3] != size + 2 or packet[4] & 0x80:
+                continue
+            if ~sum(packet[2:-1]) & 0xFF != packet[-1]:
+                continue
+            if size == length or packet[4] & REFUSALS:
+                return Status(packet, packet[4], packet[5:-1])
+        at = stream.find(HEADER, at + 1)
+    return None
+
+
+def asked(instruction: bytes) -> tuple[int, int] | None:
+    """Of an instruction packet: who is asked, and for how many bytes; None when nobody is to answer."""
+    number = instruction[2]
+    if number == BROADCAST:
+        return None
+    return number, instruction[6] if instruction[4] == READ else 0
+
+
+class CheckedPort(PortHandler):  # type: ignore[misc] # the SDK has no types
+    """The SDK's own port polls without rest, by the wall clock, and its reader takes what looks like a packet.
+
+    This one sleeps until bytes arrive, measures time by the monotonic clock, and hands on nothing but the whole,
+    checked answer of the servo that was asked, of the length that was asked for.
+    """
+
+    is_open: bool
+
+    def __init__(self, path: str, baud: int, timeout_s: float) -> None:
+        super().__init__(path)
+        self.baudrate = baud
+        self.timeout_s = timeout_s
+        self.strays = 0
+        """Bytes that were no part of an answer."""
+        self._stream = bytearray()
+        self._ready = b""
+        self._asked: tuple[int, int] | None = None
+        self._deadline_s = 0.0
+
+    def setupPort(self, cflag_baud: int) -> bool:  # noqa: N802 # the SDK's name
+        if self.is_open:
+            self.closePort()
+        self.ser = serial.Serial(self.port_name, self.baudrate, timeout=0, write_timeout=0.1, exclusive=True)
+        self.is_open = True
+        self.clearPort()
+        return True
+
+    def clearPort(self) -> None:  # noqa: N802
+        try:
+            termios.tcflush(self.ser.fd, termios.TCIFLUSH)
+        except termios.error as error:  # which is no OSError
+            raise OSError(*error.args) from error
+        self.strays += len(self._stream)
+        self._stream.clear()
+        self._ready = b""
+
+    def writePort(self, packet: list[int]) -> int:  # noqa: N802
+        data = bytes(packet)
+        self._asked = asked(data)
+        written: int = self.ser.write(data)
+        return written
+
+    def readPort(self, length: int) -> bytes:  # noqa: N802
+        """Bytes of the awaited answer; waits for it, and gives none when the time is over."""
+        if not self._ready and self._asked is not None:
+            self._await(*self._asked)
+        data, self._ready = self._ready[:length], self._ready[length:]
+        return data
+
+    def setPacketTimeout(self, packet_length: int) -> None:  # noqa: N802
+        self._deadline_s = time.monotonic() + self.timeout_s
+
+    def setPacketTimeoutMillis(self, msec: float) -> None:  # noqa: N802
+        self._deadline_s = time.monotonic() + msec / 1000.0
+
+    def isPacketTimeout(self) -> bool:  # noqa: N802
+        return time.monotonic() >= self._deadline_s
+
+    def _await(self, number: int, length: int) -> None:
+        fd = self.ser.fd
+        while (left_s := self._deadline_s - time.monotonic()) > 0:
+            if not select.select([fd], [], [], left_s)[0]:
+                return
+            data = self.ser.read(4096)
+            if not data:
+                raise serial.SerialException("the adapter is gone")
+            self._stream += data
+            found: Status | None = find_status(bytes(self._stream), number, length)
+            if found is not None:
+                self._ready = found.packet
+                self.strays += len(self._stream) - len(found.packet)
+                self._stream.clear()
+                return
+
 
 REPLY_S = 0.015
 """So long an answer may take: what a servo and an FTDI adapter at 1 ms take, ten times over."""
@@ -43,7 +166,7 @@ class PortError(CocoroError):
     """The line itself: no such port, no permission, the adapter was pulled."""
 
 
-class Bus:
+class ServoBus:
     """Use it with `with`. Raises PortError whenever the line fails; then it is of no use any more."""
 
     def __init__(self, path: str, baud: int, timeout_s: float = REPLY_S) -> None:
@@ -55,7 +178,7 @@ class Bus:
         except (OSError, ValueError, termios.error) as error:
             raise PortError(f"{path}: {_plain(error)}") from error
 
-    def __enter__(self) -> Bus:
+    def __enter__(self) -> ServoBus:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -95,7 +218,7 @@ class Bus:
             raise SilentError(number)
         return bytes(data), error
 
-    def reading(self, number: int) -> Reading:
+    def reading(self, number: int) -> ServoReading:
         """What the servo measures now. Raises SilentError."""
         data, error = self.read_block(number, table.FIRST, table.LENGTH)
         found = table.reading(data, error, time.monotonic_ns()) if len(data) == table.LENGTH else None

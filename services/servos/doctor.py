@@ -6,14 +6,14 @@ from cocoro.checks import Check, bad, note, ok
 from cocoro.ports import check_port, port_path
 from cocoro.robot import Joint, Robot
 from services.servos import tools
-from services.servos.bus import Bus, PortError, SilentError
+from services.servos.bus import PortError, ServoBus, SilentError
 from services.servos.network import HIGH_V, HOT_C, LOW_V
-from services.servos.service import NETWORKS, Config
+from services.servos.service import NETWORKS, ServosConfig
 
 __all__ = ["check"]
 
 
-def check(config: Config, robot: Robot, robot_name: str) -> list[Check]:
+def check(config: ServosConfig, robot: Robot, robot_name: str) -> list[Check]:
     checks: list[Check] = []
     for name in NETWORKS:
         port = config.arm_port if name == "arm" else config.hand_port
@@ -28,13 +28,13 @@ def check(config: Config, robot: Robot, robot_name: str) -> list[Check]:
 
 def _servos(name: str, path: str, baud: int, joints: list[Joint], reply_s: float) -> list[Check]:
     try:
-        with Bus(path, baud, max(reply_s, tools.SCAN_S)) as bus:
+        with ServoBus(path, baud, max(reply_s, tools.SCAN_S)) as bus:
             return [_servo(bus, baud, joint) for joint in joints]
     except PortError as error:
         return [note(f"{name} servos", f"{error}: does their service run? `cocoro status` tells more")]
 
 
-def _servo(bus: Bus, baud: int, joint: Joint) -> Check:
+def _servo(bus: ServoBus, baud: int, joint: Joint) -> Check:
     what = f"servo {joint.id}, {joint.name}"
     try:
         found = tools.look_at(bus, baud, joint.id)

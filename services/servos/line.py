@@ -1,7 +1,7 @@
 """The thread that talks to one servo line, so that the event loop never waits for a wire.
 
 Each cycle it writes the newest orders by one sync write, reads every servo, and does at most one task. What it finds
-goes to the event loop as an `Event`; nothing else is shared but the newest orders and the tasks' queue.
+goes to the event loop as an `CycleResult`; nothing else is shared but the newest orders and the tasks' queue.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from queue import Empty, SimpleQueue
 from typing import NamedTuple
 
 from services.servos import table
-from services.servos.bus import Bus, PortError, RefusedWriteError, SilentError
+from services.servos.bus import PortError, RefusedWriteError, ServoBus, SilentError
 from services.servos.motion import HOLD_RADPS
-from services.servos.network import MISSES, Met, Task
-from services.servos.table import Reading, Register
+from services.servos.network import MISSES, ServoStatus, ServoTask
+from services.servos.table import Register, ServoReading
 
 log = logging.getLogger("cocoro.servos")
 
@@ -48,18 +48,18 @@ class _State(NamedTuple):
 
 
 @dataclass
-class Event:
+class CycleResult:
     """What one cycle found."""
 
-    readings: dict[int, Reading] = field(default_factory=dict)
+    readings: dict[int, ServoReading] = field(default_factory=dict)
     missed: list[int] = field(default_factory=list)
-    met: dict[int, Met] = field(default_factory=dict)
+    met: dict[int, ServoStatus] = field(default_factory=dict)
     checked: dict[int, bool] = field(default_factory=dict)
     """Whether a servo's torque is on and its settings are those that were written into it."""
-    done: list[tuple[Task, int]] = field(default_factory=list)
+    done: list[tuple[ServoTask, int]] = field(default_factory=list)
     """With the position."""
-    failed: list[Task] = field(default_factory=list)
-    refused: list[tuple[Task, str]] = field(default_factory=list)
+    failed: list[ServoTask] = field(default_factory=list)
+    refused: list[tuple[ServoTask, str]] = field(default_factory=list)
     port_fault: str = ""
     busy_s: float = 0.0
     """How long the cycle took."""
@@ -67,7 +67,7 @@ class Event:
 
 
 @dataclass(frozen=True)
-class Setting:
+class ServoSettings:
     """What is written into a servo before it holds."""
 
     slope: int
@@ -81,21 +81,21 @@ class ServoLine:
         self,
         path: str,
         baud: int,
-        settings: Mapping[int, Setting],
+        settings: Mapping[int, ServoSettings],
         rate_hz: float,
         reply_s: float,
-        heard: Callable[[Event], None],
+        heard: Callable[[CycleResult], None],
         keeps_goal: bool = False,
     ) -> None:
         """`keeps_goal`: halted, its servos go on to where they were told to (a hand that holds something)."""
-        self._open: Callable[[], Bus] = lambda: Bus(path, baud, reply_s)
+        self._open: Callable[[], ServoBus] = lambda: ServoBus(path, baud, reply_s)
         self._settings = settings
         self._period_s = 1.0 / rate_hz
         self._heard = heard
         self._keeps_goal = keeps_goal
         self._loop = asyncio.get_running_loop()
         self._ended = threading.Event()
-        self._tasks: SimpleQueue[Task] = SimpleQueue()
+        self._tasks: SimpleQueue[ServoTask] = SimpleQueue()
         self._orders: tuple[float, Mapping[int, tuple[int, int]]] = (0.0, {})
         self._halted = False
         self._held: dict[int, tuple[int, int]] = {}
@@ -126,7 +126,7 @@ class ServoLine:
         """Orders are written again: the newest were made by who knows of the emergency stop."""
         self._halted = False
 
-    def do(self, task: Task) -> None:
+    def do(self, task: ServoTask) -> None:
         self._tasks.put(task)
 
     # --- in the thread ------------------------------------------------------------------------------
@@ -146,14 +146,14 @@ class ServoLine:
     def _start_over(self, why: str) -> None:
         while not self._tasks.empty():
             self._tasks.get()
-        self._tell(Event(port_fault=why))
+        self._tell(CycleResult(port_fault=why))
         self._ended.wait(REOPEN_S)
 
-    def _talk(self, bus: Bus) -> None:
+    def _talk(self, bus: ServoBus) -> None:
         due_s = time.monotonic()
         while not self._ended.wait(max(due_s - time.monotonic(), 0.0)):
             started_s = time.monotonic()
-            event = Event()
+            event = CycleResult()
             self._order(bus, started_s)
             for number in self._to_read(started_s):
                 self._read(bus, number, event)
@@ -166,7 +166,7 @@ class ServoLine:
             self._tell(event)
             due_s = max(due_s + self._period_s, time.monotonic())
 
-    def _order(self, bus: Bus, now_s: float) -> None:
+    def _order(self, bus: ServoBus, now_s: float) -> None:
         """Write the newest orders; of a halted line, where its servos were when it was halted."""
         if not self._halted:
             self._held = {}
@@ -176,7 +176,7 @@ class ServoLine:
         else:
             bus.go(self._held)
 
-    def _hold(self, bus: Bus, readings: Mapping[int, Reading]) -> None:
+    def _hold(self, bus: ServoBus, readings: Mapping[int, ServoReading]) -> None:
         """Have what is under orders hold where it has just been read, which may take some cycles where one does not
         answer; a line that keeps its goals only takes no new ones."""
         speed = round(HOLD_RADPS / table.SPEED_RADPS)
@@ -196,7 +196,7 @@ class ServoLine:
             return [*alive, silent[self._next_probe % len(silent)]]
         return alive
 
-    def _read(self, bus: Bus, number: int, event: Event) -> None:
+    def _read(self, bus: ServoBus, number: int, event: CycleResult) -> None:
         try:
             event.readings[number] = bus.reading(number)
             self._misses[number] = 0
@@ -204,7 +204,7 @@ class ServoLine:
             event.missed.append(number)
             self._misses[number] += 1
 
-    def _do_task(self, bus: Bus, event: Event) -> None:
+    def _do_task(self, bus: ServoBus, event: CycleResult) -> None:
         try:
             task = self._tasks.get_nowait()
         except Empty:
@@ -220,20 +220,20 @@ class ServoLine:
         except RefusedWriteError as error:
             event.refused.append((task, str(error)))
 
-    def _meet(self, bus: Bus, number: int) -> Met:
+    def _meet(self, bus: ServoBus, number: int) -> ServoStatus:
         state = self._state(bus, number)
         reading = bus.reading(number)
         if state.torque and not reading.error & table.SHUTDOWNS:  # it holds already, but perhaps by another's settings
             self._set(bus, number)
-        return Met(state.torque, state.goal, reading.position, reading.error)
+        return ServoStatus(state.torque, state.goal, reading.position, reading.error)
 
-    def _set(self, bus: Bus, number: int) -> None:
+    def _set(self, bus: ServoBus, number: int) -> None:
         setting = self._settings[number]
         bus.write(number, "cw_slope", setting.slope)
         bus.write(number, "ccw_slope", setting.slope)
         bus.write(number, "torque_limit", setting.torque_limit)  # after a shutdown it is 0
 
-    def _enable(self, bus: Bus, number: int) -> int:
+    def _enable(self, bus: ServoBus, number: int) -> int:
         """Have a servo hold where it is. The order matters: what decides how it would move comes before what might
         make it move, and its goal is where it is before its torque is on. That this was written is read, too: a
         confirmation that came late may be another's."""
@@ -246,24 +246,24 @@ class ServoLine:
         bus.write(number, "torque_enable", 1)
         return position
 
-    def _relax(self, bus: Bus, number: int) -> int:
+    def _relax(self, bus: ServoBus, number: int) -> int:
         bus.write(number, "torque_enable", 0)
         return bus.reading(number).position
 
-    def _check(self, bus: Bus, event: Event) -> None:
+    def _check(self, bus: ServoBus, event: CycleResult) -> None:
         self._cycles += 1
         number = list(self._misses)[self._cycles // CHECK_CYCLES % len(self._misses)]
         if self._cycles % CHECK_CYCLES == 0 and self._misses[number] == 0 and number not in event.missed:
             with suppress(SilentError, RefusedWriteError):
                 event.checked[number] = self._is_as_set(bus, number)
 
-    def _is_as_set(self, bus: Bus, number: int) -> bool:
+    def _is_as_set(self, bus: ServoBus, number: int) -> bool:
         state, setting = self._state(bus, number), self._settings[number]
         return (state.torque, state.slope, state.limit) == (True, setting.slope, setting.torque_limit)
 
-    def _state(self, bus: Bus, number: int) -> _State:
+    def _state(self, bus: ServoBus, number: int) -> _State:
         """What was written into a servo. Always this whole block: an answer says nothing of what it answers, and one
-        that comes late must not be taken for that to another question, such as `Bus.reading`."""
+        that comes late must not be taken for that to another question, such as `ServoBus.reading`."""
         data, _ = bus.read_block(number, *STATE)
         if len(data) < STATE[1]:
             raise SilentError(number)
@@ -274,6 +274,6 @@ class ServoLine:
 
         return _State(bool(value(_TORQUE)), value(_SLOPE), value(_GOAL), value(_LIMIT))
 
-    def _tell(self, event: Event) -> None:
+    def _tell(self, event: CycleResult) -> None:
         with suppress(RuntimeError):  # the loop has ended
             self._loop.call_soon_threadsafe(self._heard, event)

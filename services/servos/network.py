@@ -17,7 +17,7 @@ from cocoro.robot import Joint
 from cocoro.topics import ARM_COMMAND
 from services.servos import table
 from services.servos.motion import AT_GOAL_COUNTS, JointMotion
-from services.servos.table import Reading
+from services.servos.table import ServoReading
 
 MISSES = 3
 """A servo that does not answer so often in a row is silent."""
@@ -30,19 +30,19 @@ GRACE_NS = NS // 2
 INTERRUPTED_NS = 30 * NS
 """A loss of power is told for so long, though the servo holds again at once."""
 
-What = Literal["meet", "enable", "relax"]
+ServoAction = Literal["meet", "enable", "relax"]
 
 
 @dataclass(frozen=True)
-class Task:
+class ServoTask:
     """Something to do once: see what state a servo is in, make it hold where it is, let it go limp."""
 
-    what: What
+    what: ServoAction
     number: int
 
 
 @dataclass(frozen=True)
-class Met:
+class ServoStatus:
     """What a servo said when it was met."""
 
     torque_enabled: bool
@@ -57,7 +57,7 @@ class ServoJoint:
     def __init__(self, joint: Joint, *, keeps_goal: bool) -> None:
         self.joint = joint
         self.motion = JointMotion(joint, keeps_goal=keeps_goal)
-        self.reading: Reading | None = None
+        self.reading: ServoReading | None = None
         self.read_ns = 0
         """By the robot's clock."""
         self.misses = 0
@@ -85,7 +85,7 @@ class ServoJoint:
         return self.met and self.enabled and not self.relaxed and not self.fault and not self.silent
 
 
-class Network:
+class ServoNetwork:
     """Told the robot's time with every call."""
 
     def __init__(self, joints: Iterable[Joint], *, keeps_goal: bool, timeout_s: float) -> None:
@@ -95,7 +95,7 @@ class Network:
         self._by_name = {one.joint.name: one for one in self.joints.values()}
         self._keeps_goal = keeps_goal
         self._timeout_ns = round(timeout_s * NS)
-        self._tasks: dict[int, Task] = {}
+        self._tasks: dict[int, ServoTask] = {}
         self._strays = 0
         self._disturbed = Recent()
 
@@ -150,7 +150,7 @@ class Network:
         for one in (chosen := self._named(names)):
             one.relaxed = True
             one.motion.goal_rad = None
-            self._tasks[one.joint.id] = Task("relax", one.joint.id)
+            self._tasks[one.joint.id] = ServoTask("relax", one.joint.id)
         return [one.joint.name for one in chosen]
 
     def hold(self, names: Iterable[str]) -> list[str]:
@@ -159,7 +159,7 @@ class Network:
             one.relaxed = False
             one.motion.goal_rad = None
             if one.met and not one.fault:
-                self._tasks[one.joint.id] = Task("enable", one.joint.id)
+                self._tasks[one.joint.id] = ServoTask("enable", one.joint.id)
         return [one.joint.name for one in chosen]
 
     def unknown(self, names: Iterable[str]) -> list[str]:
@@ -176,15 +176,15 @@ class Network:
 
     def _enable_if_due(self, one: ServoJoint) -> None:
         if one.met and not one.enabled and not one.relaxed and not one.fault and self.latch == "released":
-            self._tasks[one.joint.id] = Task("enable", one.joint.id)
+            self._tasks[one.joint.id] = ServoTask("enable", one.joint.id)
 
     # --- what was heard -----------------------------------------------------------------------------
 
-    def heard(self, number: int, reading: Reading, now_ns: int) -> None:
+    def heard(self, number: int, reading: ServoReading, now_ns: int) -> None:
         one = self.joints[number]
         one.reading, one.read_ns, one.misses = reading, now_ns, 0
         if not one.met:
-            self._tasks.setdefault(number, Task("meet", number))
+            self._tasks.setdefault(number, ServoTask("meet", number))
         if one.enabled and now_ns - one.enabled_ns > GRACE_NS:
             self._shut_down(one, reading.error)
 
@@ -204,7 +204,7 @@ class Network:
         self._disturbed.add(max(strays - self._strays, 0) + missed, now_ns)
         self._strays = strays
 
-    def met(self, number: int, met: Met, now_ns: int) -> None:
+    def met(self, number: int, met: ServoStatus, now_ns: int) -> None:
         """What a servo was found to be like. One that holds already goes on holding: the hand what it holds, the arm
         where it is unless it was there for long."""
         one = self.joints[number]
@@ -229,9 +229,9 @@ class Network:
             self._shut_down(one, one.reading.error)
             return
         one.interrupted_ns = now_ns
-        self._tasks[number] = Task("enable", number)
+        self._tasks[number] = ServoTask("enable", number)
 
-    def done(self, task: Task, position: int, now_ns: int) -> None:
+    def done(self, task: ServoTask, position: int, now_ns: int) -> None:
         """A task was done, with the servo there."""
         one = self.joints[task.number]
         one.enabled, one.enabled_ns = task.what == "enable", now_ns
@@ -244,7 +244,7 @@ class Network:
             one.misses = max(one.misses, MISSES - 1)
             self.missed(number)
 
-    def refused(self, task: Task, why: str) -> None:
+    def refused(self, task: ServoTask, why: str) -> None:
         """A servo would not do what a task asks."""
         self._fault(self.joints[task.number], why)
 
@@ -260,11 +260,11 @@ class Network:
 
     # --- what to do ---------------------------------------------------------------------------------
 
-    def next_task(self) -> Task | None:
+    def next_task(self) -> ServoTask | None:
         """The next thing to do once; it is forgotten here, and comes again when it did not succeed."""
         return self._tasks.pop(next(iter(self._tasks))) if self._tasks else None
 
-    def again(self, task: Task) -> None:
+    def again(self, task: ServoTask) -> None:
         """A task did not succeed."""
         if not self.joints[task.number].silent:
             self._tasks.setdefault(task.number, task)

@@ -12,7 +12,9 @@ import msgspec
 from msgspec import Meta
 
 from cocoro import topics
+from cocoro.component import Implementation
 from cocoro.errors import CocoroError, ConfigError
+from cocoro.faults import FaultReporter
 from cocoro.latch import LatchKeeper
 from cocoro.messages import LatchState, ServoCommand, ServoReply, ServoRequest, ServoState
 from cocoro.node import Node
@@ -21,10 +23,8 @@ from cocoro.robot import SERVO_COUNT_RAD
 from cocoro.topics import Topic
 from cocoro.units import PositiveShare
 from services.servos import table
-from services.servos.line import Event, ServoLine, Setting
-from services.servos.network import Network
-
-__all__ = ["Config", "run"]
+from services.servos.line import CycleResult, ServoLine, ServoSettings
+from services.servos.network import ServoNetwork
 
 NETWORKS: dict[str, tuple[Topic[ServoState], Topic[ServoCommand]]] = {
     "arm": (topics.ARM_STATE, topics.ARM_COMMAND),
@@ -33,7 +33,7 @@ NETWORKS: dict[str, tuple[Topic[ServoState], Topic[ServoCommand]]] = {
 DONE_S = 2.0
 
 
-class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class ServosConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     arm_port: str = "/dev/cocoro-arm"
     """The serial port of neck and arm: a device, or wire:NAME for an emulated one."""
     hand_port: str = "/dev/cocoro-hand"
@@ -46,15 +46,16 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class NetworkService:
     """One network: one line, one thread, one participant of the mesh."""
 
-    def __init__(self, node: Node, config: Config) -> None:
+    def __init__(self, node: Node, config: ServosConfig) -> None:
         self._node = node
+        self._reporter = FaultReporter(node)
         robot = node.robot
         joints = [robot.joints[name] for name in robot.network_joints(node.name)]
         keeps_goal = node.name == "hand"
-        self._network = Network(joints, keeps_goal=keeps_goal, timeout_s=robot.base.command_timeout_s)
+        self._network = ServoNetwork(joints, keeps_goal=keeps_goal, timeout_s=robot.base.command_timeout_s)
         row = robot.networks[node.name]  # type: ignore[index] # one of the two names
         settings = {
-            joint.id: Setting(
+            joint.id: ServoSettings(
                 slope=table.slope_of(radians(joint.compliance_deg) / SERVO_COUNT_RAD),
                 torque_limit=round(config.torque.get(joint.name, 1.0) * table.FULL_TORQUE),
             )
@@ -87,7 +88,7 @@ class NetworkService:
         self._line.order(self._network.orders(self._node.now_ns()))
         self._line.go_on()  # these orders know of the latch
 
-    def _heard(self, event: Event) -> None:
+    def _heard(self, event: CycleResult) -> None:
         """What a cycle found. The line's thread goes by the monotonic clock, the network by the robot's."""
         network, now_ns = self._network, self._node.now_ns()
         if self._node.clock.epoch != self._epoch:
@@ -147,21 +148,13 @@ class NetworkService:
 
     def _tell(self) -> None:
         """Health, as people read it."""
-        node, faults = self._node, self._network.faults(self._node.now_ns())
-        told = {fault.partition(":")[0] for fault in node.faults}  # what follows may be a measured value
-        for fault in faults:
-            if fault.partition(":")[0] not in told:
-                node.log.warning("%s", fault)
-        node.faults = faults
-        if self._network.port_fault:
-            node.degraded("no line")
-        elif self._network.silent_joints():
-            node.degraded("servos do not answer")
-        else:
-            node.ready()
+        network = self._network
+        silent = "servos do not answer" if network.silent_joints() else ""
+        degraded = "no line" if network.port_fault else silent
+        self._reporter.report(network.faults(self._node.now_ns()), degraded=degraded)
 
 
-async def run(node: Node, config: Config) -> None:
+async def run(node: Node, config: ServosConfig) -> None:
     """Serve both networks for ever."""
     unknown = sorted(set(config.torque) - set(node.robot.joints))
     if unknown:
@@ -172,3 +165,6 @@ async def run(node: Node, config: Config) -> None:
         async with asyncio.TaskGroup() as group:
             for one in nodes:
                 group.create_task(NetworkService(one, config).run())
+
+
+implementation = Implementation(ServosConfig, run)

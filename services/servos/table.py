@@ -91,7 +91,7 @@ def signed(value: int) -> int:
     return -(value & (SIGN - 1)) if value & SIGN else value & (SIGN - 1)
 
 
-class Reading(NamedTuple):
+class ServoReading(NamedTuple):
     """Registers 36 to 43 of one servo, and the error byte that came with them."""
 
     position: int
@@ -108,13 +108,13 @@ FIRST, LENGTH = 36, 8
 """What a reading reads."""
 
 
-def reading(data: bytes, error: int, at_ns: int) -> Reading | None:
+def reading(data: bytes, error: int, at_ns: int) -> ServoReading | None:
     """From eight bytes; None when they cannot be what a servo measures."""
     position = int.from_bytes(data[0:2], "little")
     speed, load = int.from_bytes(data[2:4], "little"), int.from_bytes(data[4:6], "little")
     if position > 1023 or speed > 2047 or load > 2047:
         return None
-    return Reading(position, signed(speed), signed(load), data[6] / 10, data[7], error, at_ns)
+    return ServoReading(position, signed(speed), signed(load), data[6] / 10, data[7], error, at_ns)
 
 
 def errors_in(bits: int) -> tuple[str, ...]:

@@ -16,7 +16,7 @@ from serial.tools import list_ports
 from cocoro.errors import CocoroError, RefusedError
 from cocoro.robot import SERVO_COUNT_RAD, Joint
 from services.servos import table
-from services.servos.bus import Bus, PortError, RefusedWriteError, SilentError
+from services.servos.bus import PortError, RefusedWriteError, ServoBus, SilentError
 
 BAUDS = (1_000_000, 57_600, 115_200, 500_000, 2_000_000, 9_600)
 """In the order in which one meets them."""
@@ -32,7 +32,7 @@ Ask = Callable[[str], None]
 """Shows a sentence, and returns when the operator has done what it says."""
 
 
-class Found(NamedTuple):
+class FoundServo(NamedTuple):
     """A servo on a port."""
 
     port: str
@@ -52,13 +52,13 @@ def candidates() -> list[str]:
     return sorted(ports)
 
 
-def scan(ports: Iterable[str], bauds: Iterable[int], numbers: Iterable[int], tell: Tell) -> Iterator[Found]:
+def scan(ports: Iterable[str], bauds: Iterable[int], numbers: Iterable[int], tell: Tell) -> Iterator[FoundServo]:
     """Ask every number at every rate. A port that cannot be opened is told of and passed over."""
     wanted = list(numbers)
     for port in ports:
         for baud in bauds:
             try:
-                with Bus(port, baud, SCAN_S) as bus:
+                with ServoBus(port, baud, SCAN_S) as bus:
                     tell(f"{port} at {baud} baud ...")
                     for number in wanted:
                         if bus.ping(number) is not None:
@@ -68,11 +68,11 @@ def scan(ports: Iterable[str], bauds: Iterable[int], numbers: Iterable[int], tel
                 break
 
 
-def look_at(bus: Bus, baud: int, number: int) -> Found:
+def look_at(bus: ServoBus, baud: int, number: int) -> FoundServo:
     """Everything that one wants to know first of a servo. Raises SilentError."""
     model = bus.read(number, "model")
     reading = bus.reading(number)
-    return Found(
+    return FoundServo(
         bus.path,
         baud,
         number,
@@ -85,7 +85,7 @@ def look_at(bus: Bus, baud: int, number: int) -> Found:
     )
 
 
-def set_number(bus: Bus, old: int, new: int) -> None:
+def set_number(bus: ServoBus, old: int, new: int) -> None:
     """Give a servo another ID, and no return delay. Raises RefusedError when the new one is taken, or the old one is
     silent (or there are two of it: then they talk over each other)."""
     if bus.ping(old) is None:
@@ -100,14 +100,14 @@ def set_number(bus: Bus, old: int, new: int) -> None:
     bus.write(new, "return_delay", 0)
 
 
-def relax(bus: Bus, joint: Joint) -> None:
+def relax(bus: ServoBus, joint: Joint) -> None:
     try:
         bus.write(joint.id, "torque_enable", 0)
     except SilentError as error:
         raise RefusedError(f"{joint.name} (ID {joint.id}) does not answer on {bus.path}") from error
 
 
-def position_of(bus: Bus, joint: Joint) -> float:
+def position_of(bus: ServoBus, joint: Joint) -> float:
     """Its mean position over a moment. Raises RefusedError when it moves meanwhile."""
     positions = []
     for _ in range(READINGS):
@@ -118,7 +118,7 @@ def position_of(bus: Bus, joint: Joint) -> float:
     return sum(positions) / len(positions)
 
 
-def calibrate(bus: Bus, joint: Joint, at_deg: float, ask: Ask) -> dict[str, float | int]:
+def calibrate(bus: ServoBus, joint: Joint, at_deg: float, ask: Ask) -> dict[str, float | int]:
     """Where a joint's zero is and which way it turns: guided by hand to a known angle, then towards greater angles.
     The values of its [[joint]] row. Raises RefusedError."""
     relax(bus, joint)
@@ -133,7 +133,7 @@ def calibrate(bus: Bus, joint: Joint, at_deg: float, ask: Ask) -> dict[str, floa
     return {"direction": direction, "centre_count": round(centre, 2)}
 
 
-def feel_limits(bus: Bus, joint: Joint, done: Callable[[], bool], tell: Tell) -> tuple[float, float]:
+def feel_limits(bus: ServoBus, joint: Joint, done: Callable[[], bool], tell: Tell) -> tuple[float, float]:
     """The ends between which somebody turns a limp joint until `done`, in degrees, with a margin. Raises
     RefusedError when it was hardly turned."""
     relax(bus, joint)
@@ -153,7 +153,7 @@ def feel_limits(bus: Bus, joint: Joint, done: Callable[[], bool], tell: Tell) ->
     return round(first + MARGIN_DEG, 1), round(last - MARGIN_DEG, 1)
 
 
-def write_limits(bus: Bus, joint: Joint, limits_deg: tuple[float, float]) -> tuple[int, int]:
+def write_limits(bus: ServoBus, joint: Joint, limits_deg: tuple[float, float]) -> tuple[int, int]:
     """Put a joint's limits into its servo too, which then refuses goals beyond them; the two positions."""
     ends = sorted(joint.to_count(radians(limit)) for limit in limits_deg)
     try:

@@ -4,7 +4,6 @@
 PyBullet's TinyRenderer (some 100 ms a view, needs nothing).
 """
 
-from sim.render.choose import make_renderer
-from sim.render.interface import Images, Light, Renderer
+from sim.render.interface import Images, Lighting, Renderer, make_renderer
 
-__all__ = ["Images", "Light", "Renderer", "make_renderer"]
+__all__ = ["Images", "Lighting", "Renderer", "make_renderer"]

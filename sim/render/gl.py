@@ -19,8 +19,8 @@ from numpy.typing import ArrayLike
 
 from cocoro.arrays import FloatArray
 from cocoro.robot import Camera
-from sim.render.batch import batches_of, floor_batch, wall_batch
-from sim.render.interface import Images, Light
+from sim.render.interface import Images, Lighting, Visual
+from sim.render.meshes import batches_of, floor_batch, wall_batch
 from sim.render.room import FLOOR_RGB, OTHER_TILE_RGB, TILE_M
 from sim.render.views import (
     PROJECTOR_BIAS_PER_M,
@@ -31,7 +31,6 @@ from sim.render.views import (
     projector_camera,
     rigid_inverse,
 )
-from sim.visual import Visual
 
 LIBRARIES = {"libgl": "libGL.so.1", "libegl": "libEGL.so.1"}
 """By the names that a machine without development packages has."""
@@ -87,7 +86,7 @@ class GlRenderer:
         poses: FloatArray,
         camera_pose: FloatArray,
         depth_camera_pose: FloatArray,
-        light: Light,
+        light: Lighting,
         projector_pose: FloatArray | None = None,
     ) -> Images:
         self._ctx.enable_only(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
@@ -108,7 +107,7 @@ class GlRenderer:
 
     # --- passes -----------------------------------------------------------------------------------
 
-    def _draw_colour(self, pose: FloatArray, light: Light) -> None:
+    def _draw_colour(self, pose: FloatArray, light: Lighting) -> None:
         direction = np.asarray(light.direction) / np.linalg.norm(light.direction)
         lamp = lamp_view(direction, _floor_ahead(pose), LAMP_HALF_WIDTH_M, LAMP_TEXELS)
         # The sides away from the lamp go into its map: a lit surface is then never behind itself.

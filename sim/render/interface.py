@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, NamedTuple, Protocol
 
 from cocoro.arrays import Float32Array, FloatArray, ImageArray
+from cocoro.errors import ConfigError
 from cocoro.robot import Camera
 
 
-class Light(Protocol):
+class Lighting(Protocol):
     """One lamp far away and the light that the room throws back."""
 
     @property
@@ -57,10 +61,59 @@ class Renderer(Protocol):
         poses: FloatArray,
         camera_pose: FloatArray,
         depth_camera_pose: FloatArray,
-        light: Light,
+        light: Lighting,
         projector_pose: FloatArray | None = None,
     ) -> Images:
         """One frame. `poses` is (n, 4, 4) in the order of the visuals."""
 
     def close(self) -> None:
         """Give back what was taken; the renderer must not be used after it."""
+
+
+Shape = Literal["box", "cylinder", "sphere"]
+
+
+@dataclass(frozen=True)
+class Visual:
+    """One primitive, centred on its own frame; where that frame stands is said by `World.visual_poses`."""
+
+    name: str
+    shape: Shape
+    size_m: tuple[float, ...]
+    """box: full x, y, z; cylinder: radius, height (its axis is z); sphere: radius."""
+    rgb: tuple[float, float, float]
+    """Surface colour, 0 to 1 a channel."""
+
+
+_log = logging.getLogger(__name__)
+
+MISSING_EGL = (
+    "slow pictures: no OpenGL on EGL here (%s), so PyBullet's TinyRenderer draws;"
+    " for the fast one: apt install libegl1 libgl1 libgl1-mesa-dri"
+)
+
+RendererChoice = Literal["auto", "moderngl", "tiny"]
+
+
+def make_renderer(visuals: Sequence[Visual], camera: Camera, choice: RendererChoice = "auto") -> Renderer:
+    """The fast renderer, or by `auto` the slow one where that cannot run, with one logged warning.
+
+    Raises ConfigError when `moderngl` is demanded and cannot run.
+    """
+    if choice != "tiny":
+        try:
+            from sim.render.gl import GlRenderer
+
+            renderer: Renderer = GlRenderer(visuals, camera)
+            return renderer
+        except Exception as error:  # moderngl and glcontext raise plain Exception for a missing library
+            reason = " ".join(str(error).split()) or type(error).__name__
+            if choice == "moderngl":
+                raise ConfigError(
+                    f"the moderngl renderer cannot run here ({reason}): apt install libegl1 libgl1"
+                    " libgl1-mesa-dri, or let the renderer be chosen (auto)"
+                ) from error
+            _log.warning(MISSING_EGL, reason)
+    from sim.render.tiny import TinyRenderer
+
+    return TinyRenderer(visuals, camera)

@@ -7,7 +7,7 @@ stand out of the depth camera's range of anything near the middle of the room.
 from __future__ import annotations
 
 from cocoro.units import Vec3
-from sim.visual import Visual
+from sim.render.interface import Visual
 
 HALF_WIDTH_M = 10.0
 HEIGHT_M = 3.0

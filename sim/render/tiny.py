@@ -16,10 +16,9 @@ from scipy.spatial.transform import Rotation
 from cocoro.arrays import BoolArray, Float32Array, FloatArray, ImageArray
 from cocoro.robot import Camera
 from sim.bullet import Bullet
-from sim.render.interface import Images, Light
+from sim.render.interface import Images, Lighting, Visual
 from sim.render.room import FLOOR_RGB, HALF_WIDTH_M, walls
 from sim.render.views import PROJECTOR_BIAS_PER_M, lamp_tint, projection, projector_camera, rigid_inverse
-from sim.visual import Visual
 
 NEAR_M, FAR_M = 0.05, 30.0
 """Closer together than the other renderer's, for its depth is what is left of a 32 bit float after division."""
@@ -65,7 +64,7 @@ class TinyRenderer:
         poses: FloatArray,
         camera_pose: FloatArray,
         depth_camera_pose: FloatArray,
-        light: Light,
+        light: Lighting,
         projector_pose: FloatArray | None = None,
     ) -> Images:
         quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
@@ -80,7 +79,7 @@ class TinyRenderer:
             depth[_shaded(depth, self.camera, lit, wide, baseline_m)] *= -1
         return Images(colour, depth)
 
-    def _view(self, camera: Camera, pose: FloatArray, light: Light) -> tuple[ImageArray, Float32Array]:
+    def _view(self, camera: Camera, pose: FloatArray, light: Lighting) -> tuple[ImageArray, Float32Array]:
         view = _TO_OPENGL @ rigid_inverse(pose)
         camera = replace(camera, cx=camera.cx + _SAMPLE_OFFSET_PX[0], cy=camera.cy + _SAMPLE_OFFSET_PX[1])
         flip_rows = np.diag([1.0, -1.0, 1.0, 1.0])

@@ -12,11 +12,10 @@ from contextlib import suppress
 from pathlib import Path
 
 from cocoro.robot import Robot
-from sim.wire.body import SimpleBody
 from sim.wire.control import Control, ControlServer
-from sim.wire.create import Create
-from sim.wire.dynamixel import Bus, Servo
-from sim.wire.emulator import Emulator
+from sim.wire.create import EmulatedCreate
+from sim.wire.dynamixel import EmulatedServo, EmulatedServoBus
+from sim.wire.emulator import Emulator, SimplePlant
 
 MODELS = {"arm": 28, "hand": 12}
 
@@ -26,12 +25,12 @@ def main() -> int:
     parser.add_argument("folder", type=Path, help="where the ports are to be")
     folder: Path = parser.parse_args().folder
     robot = Robot.load()
-    create = Create()
+    create = EmulatedCreate()
     buses = {
-        name: Bus([Servo(robot.joints[joint].id, model) for joint in robot.network_joints(name)])
+        name: EmulatedServoBus([EmulatedServo(robot.joints[joint].id, model) for joint in robot.network_joints(name)])
         for name, model in MODELS.items()
     }
-    emulator = Emulator(folder, {"create": create, **buses}, SimpleBody(create, *buses.values()))
+    emulator = Emulator(folder, {"create": create, **buses}, SimplePlant(create, *buses.values()))
     with ControlServer(folder, Control(emulator)), suppress(KeyboardInterrupt):
         print("\n".join(str(folder / name) for name in emulator.lines), flush=True)
         emulator.run()

@@ -1,6 +1,6 @@
 """Ask emulated hardware for faults and for what it does: JSON lines over a socket beside its ports.
 
-Each line is one `Ask` by its "do"; each answer is {"ok": ...} or {"error": "..."}.
+Each line is one `ControlRequest` by its "do"; each answer is {"ok": ...} or {"error": "..."}.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ import msgspec
 
 from cocoro.clock import NS
 from cocoro.units import Share
-from sim.wire.create import Create
-from sim.wire.dynamixel import Bus, Servo
+from sim.wire.create import EmulatedCreate
+from sim.wire.dynamixel import EmulatedServo, EmulatedServoBus
 from sim.wire.emulator import Emulator, Line
-from sim.wire.faults import Fault, Kind, Way
+from sim.wire.line import Direction, FaultKind, LineFault
 
 SOCKET = "control"
 
@@ -28,10 +28,10 @@ class Disturb(msgspec.Struct, tag_field="do", tag="disturb", forbid_unknown_fiel
     """Let something happen to the bytes of a line."""
 
     line: str
-    kind: Kind
+    kind: FaultKind
     share: Share = 0.1
     for_s: float = 1.0
-    way: Way = "both"
+    way: Direction = "both"
     delay_ms: float = 30.0
 
 
@@ -45,14 +45,14 @@ class Plug(msgspec.Struct, tag_field="do", tag="plug", forbid_unknown_fields=Tru
     line: str
 
 
-class Feel(msgspec.Struct, tag_field="do", tag="feel", forbid_unknown_fields=True):
+class SetSensor(msgspec.Struct, tag_field="do", tag="feel", forbid_unknown_fields=True):
     """Have the Create's sensors feel something: a field of `sim.wire.create.Surroundings`."""
 
     field: str
     value: bool | int | list[bool]
 
 
-class Restart(msgspec.Struct, tag_field="do", tag="restart", forbid_unknown_fields=True):
+class PowerCycle(msgspec.Struct, tag_field="do", tag="restart", forbid_unknown_fields=True):
     """A brown-out: the Create's, or that of the servo with this ID."""
 
     servo: int | None = None
@@ -76,7 +76,7 @@ class Trip(msgspec.Struct, tag_field="do", tag="trip", forbid_unknown_fields=Tru
     error: int = 32
 
 
-class Put(msgspec.Struct, tag_field="do", tag="put", forbid_unknown_fields=True):
+class SetRegister(msgspec.Struct, tag_field="do", tag="put", forbid_unknown_fields=True):
     """Set a servo's register, whatever it is."""
 
     servo: int
@@ -84,11 +84,11 @@ class Put(msgspec.Struct, tag_field="do", tag="put", forbid_unknown_fields=True)
     value: int
 
 
-class Look(msgspec.Struct, tag_field="do", tag="look", forbid_unknown_fields=True):
+class Inspect(msgspec.Struct, tag_field="do", tag="look", forbid_unknown_fields=True):
     """What the devices do, and when the wheels were asked for what since the last look."""
 
 
-Ask = Disturb | Unplug | Plug | Feel | Restart | Demo | Mute | Trip | Put | Look
+ControlRequest = Disturb | Unplug | Plug | SetSensor | PowerCycle | Demo | Mute | Trip | SetRegister | Inspect
 
 
 class Control:
@@ -97,31 +97,33 @@ class Control:
     def __init__(self, emulator: Emulator) -> None:
         self._emulator = emulator
         devices = [line.device for line in emulator.lines.values()]
-        self._create = next((device for device in devices if isinstance(device, Create)), None)
-        buses = [device for device in devices if isinstance(device, Bus)]
+        self._create = next((device for device in devices if isinstance(device, EmulatedCreate)), None)
+        buses = [device for device in devices if isinstance(device, EmulatedServoBus)]
         self._servos = [servo for bus in buses for servo in bus.servos]
 
-    def do(self, ask: Ask) -> Any:
+    def do(self, ask: ControlRequest) -> Any:
         """The answer. Raises ValueError with what is wrong with the question."""
         return self._emulator.call(lambda: self._do(ask))
 
-    def _do(self, ask: Ask) -> Any:
+    def _do(self, ask: ControlRequest) -> Any:
         now_ns = time.monotonic_ns()
         match ask:
             case Disturb():
                 until_ns = now_ns + round(ask.for_s * NS)
-                self._line(ask.line).disturb(Fault(ask.kind, ask.share, ask.way, until_ns, round(ask.delay_ms * 1e6)))
+                self._line(ask.line).disturb(
+                    LineFault(ask.kind, ask.share, ask.way, until_ns, round(ask.delay_ms * 1e6))
+                )
             case Unplug():
                 self._line(ask.line).port.unplug()
             case Plug():
                 self._line(ask.line).port.plug()
-            case Feel():
+            case SetSensor():
                 if not hasattr(self._base.around, ask.field):
                     raise ValueError(f"a Create feels no {ask.field}")
                 setattr(self._base.around, ask.field, ask.value)
-            case Restart(servo=None):
+            case PowerCycle(servo=None):
                 self._base.power_cycle()
-            case Restart(servo=int(number)):
+            case PowerCycle(servo=int(number)):
                 self._servo(number).power_up()
             case Demo():
                 self._base.receive(bytes([135]), self._base.baud, now_ns)
@@ -129,9 +131,9 @@ class Control:
                 self._servo(ask.servo).mute = ask.value
             case Trip():
                 self._servo(ask.servo).trip(ask.error)
-            case Put():
+            case SetRegister():
                 self._servo(ask.servo).put(ask.address, ask.value)
-            case Look():
+            case Inspect():
                 return self._look(now_ns)
         return True
 
@@ -156,7 +158,7 @@ class Control:
         return told
 
     @property
-    def _base(self) -> Create:
+    def _base(self) -> EmulatedCreate:
         if self._create is None:
             raise ValueError("there is no Create here")
         return self._create
@@ -166,7 +168,7 @@ class Control:
             raise ValueError(f"there is no line {name!r}; known are {', '.join(self._emulator.lines)}")
         return self._emulator.lines[name]
 
-    def _servo(self, number: int) -> Servo:
+    def _servo(self, number: int) -> EmulatedServo:
         for servo in self._servos:
             if servo.number == number:
                 return servo
@@ -179,7 +181,7 @@ class ControlServer:
     def __init__(self, folder: Path, control: Control) -> None:
         self._path = folder / SOCKET
         self._path.unlink(missing_ok=True)
-        decoder = msgspec.json.Decoder(Ask)
+        decoder = msgspec.json.Decoder(ControlRequest)
 
         class Answer(socketserver.StreamRequestHandler):
             def handle(self) -> None:

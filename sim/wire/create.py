@@ -38,7 +38,7 @@ STRAIGHT = (-32768, 32767)
 
 
 @dataclass
-class Surroundings:
+class CreateSensors:
     """What the Create's sensors feel; set by whoever has it drive about."""
 
     bump_left: bool = False
@@ -60,14 +60,14 @@ class Surroundings:
     temperature_c: int = 25
 
 
-class Create:
+class EmulatedCreate:
     """`receive` bytes, `advance` time (monotonic, ns), `roll` the wheels; `wheels_mmps` is what its motors are to do.
 
     The device at the end of a `sim.wire.emulator.Line`.
     """
 
     def __init__(self, wheel_base_mm: float = WHEEL_BASE_MM) -> None:
-        self.around = Surroundings()
+        self.around = CreateSensors()
         self.powered = True
         self.wheels_mmps = (0, 0)
         """Left, right."""

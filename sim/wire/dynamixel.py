@@ -63,7 +63,7 @@ class Motor:
     punch: float
 
 
-class Servo:
+class EmulatedServo:
     """One servo: its control table and what makes it shut down."""
 
     def __init__(self, number: int, model: int = 12, overload_s: float = 5.0) -> None:
@@ -219,17 +219,17 @@ class Servo:
         return 0
 
 
-class Bus:
+class EmulatedServoBus:
     """Servos on one line; the device at the end of a `sim.wire.emulator.Line`."""
 
-    def __init__(self, servos: Iterable[Servo]) -> None:
+    def __init__(self, servos: Iterable[EmulatedServo]) -> None:
         self.servos = list(servos)
         self._in = bytearray()
         self._heard_ns = 0
         self._out: list[tuple[int, int, bytes]] = []
         """(when, baud, bytes) of answers."""
 
-    def by_number(self, number: int) -> Servo:
+    def by_number(self, number: int) -> EmulatedServo:
         return next(servo for servo in self.servos if servo.number == number)
 
     def receive(self, data: bytes, baud: int, now_ns: int) -> None:
@@ -289,7 +289,7 @@ class Bus:
             answers.append((servo, _status(number, error, answer)))
         self._answer(answers, baud, now_ns)
 
-    def _answer(self, answers: list[tuple[Servo, bytes]], baud: int, now_ns: int) -> None:
+    def _answer(self, answers: list[tuple[EmulatedServo, bytes]], baud: int, now_ns: int) -> None:
         if answers:
             delay_ns = answers[0][0].get(5) * 2000
             shortest = min(len(data) for _, data in answers)
@@ -297,7 +297,7 @@ class Bus:
             data += max((data for _, data in answers), key=len)[shortest:]
             self._out.append((now_ns + delay_ns, baud, data))
 
-    def _broadcast(self, servos: list[Servo], instruction: int, data: bytes, now_ns: int) -> None:
+    def _broadcast(self, servos: list[EmulatedServo], instruction: int, data: bytes, now_ns: int) -> None:
         if instruction == SYNC_WRITE and len(data) >= 2:
             address, length = data[0], data[1]
             for at in range(2, len(data) - length, length + 1):

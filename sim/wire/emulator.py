@@ -9,13 +9,16 @@ import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from contextlib import suppress
+from math import copysign
 from pathlib import Path
 from queue import SimpleQueue
 from types import TracebackType
 from typing import Protocol, TypeVar
 
-from sim.wire.faults import Disturbance, Fault
-from sim.wire.pty import Port
+from cocoro.clock import NS
+from sim.wire.create import EmulatedCreate
+from sim.wire.dynamixel import EmulatedServo, EmulatedServoBus
+from sim.wire.line import Disturbance, LineFault, PseudoSerialPort
 
 T = TypeVar("T")
 
@@ -32,7 +35,7 @@ class Device(Protocol):
         """What it sends by now, to a listener at this baud rate."""
 
 
-class Body(Protocol):
+class Plant(Protocol):
     """What the devices' motors move and their sensors feel."""
 
     def advance(self, now_ns: int) -> None: ...
@@ -45,12 +48,12 @@ class Line:
     """A port, the device behind it, and what happens to the bytes in between."""
 
     def __init__(self, path: Path, device: Device, seed: int = 0) -> None:
-        self.port = Port(path)
+        self.port = PseudoSerialPort(path)
         self.device = device
         self._to_device = Disturbance("to_device", seed)
         self._to_driver = Disturbance("to_driver", seed)
 
-    def disturb(self, fault: Fault) -> None:
+    def disturb(self, fault: LineFault) -> None:
         self._to_device.add(fault)
         self._to_driver.add(fault)
 
@@ -69,7 +72,7 @@ class Line:
 class Emulator:
     """Devices by name, on ports of these names in a folder. `run` it, or use it as a context manager: a thread."""
 
-    def __init__(self, folder: Path, devices: Mapping[str, Device], body: Body, seed: int = 0) -> None:
+    def __init__(self, folder: Path, devices: Mapping[str, Device], body: Plant, seed: int = 0) -> None:
         self.lines = {
             name: Line(folder / name, device, seed + number) for number, (name, device) in enumerate(devices.items())
         }
@@ -159,3 +162,68 @@ class Emulator:
                 return False
             job()
         return True
+
+
+WHEEL_MPS2 = 2.0
+FULL_SPEED = 530
+"""What a servo without load reaches, in counts of 0.111 rpm: 59 rpm."""
+COUNTS_A_SPEED_COUNT = 0.111 * 360 / 60 / 300 * 1023
+"""Position counts a second for each count of speed."""
+STEP_NS = 50_000_000
+
+
+class SimplePlant:
+    """For tests and first steps. `blocked` servos do not turn, and strain."""
+
+    def __init__(self, create: EmulatedCreate | None = None, *buses: EmulatedServoBus) -> None:
+        self.wheels_mps = [0.0, 0.0]
+        self.rolled_m = [0.0, 0.0]
+        self.blocked: set[int] = set()
+        self._create = create
+        self._shafts = [(servo, _Shaft(servo)) for bus in buses for servo in bus.servos]
+        self._then_ns: int | None = None
+
+    def turn_by_hand(self, number: int, count: int) -> None:
+        """Somebody turns a limp servo."""
+        for servo, shaft in self._shafts:
+            if servo.number == number and not servo.motor.on:
+                shaft.count = float(count)
+
+    def fileno(self) -> int:
+        return -1
+
+    def advance(self, now_ns: int) -> None:
+        dt_s = 0.0 if self._then_ns is None else min(now_ns - self._then_ns, STEP_NS) / NS
+        self._then_ns = now_ns
+        if self._create is not None:
+            self._roll(self._create, dt_s)
+        for servo, shaft in self._shafts:
+            shaft.turn(dt_s, servo.number in self.blocked, now_ns)
+
+    def _roll(self, create: EmulatedCreate, dt_s: float) -> None:
+        for side, wanted_mmps in enumerate(create.wheels_mmps):
+            change = wanted_mmps / 1000.0 - self.wheels_mps[side]
+            self.wheels_mps[side] += copysign(min(abs(change), WHEEL_MPS2 * dt_s), change)
+        rolled = [speed * dt_s for speed in self.wheels_mps]
+        self.rolled_m = [way + more for way, more in zip(self.rolled_m, rolled, strict=True)]
+        create.roll(*rolled)
+
+
+class _Shaft:
+    def __init__(self, servo: EmulatedServo) -> None:
+        self._servo = servo
+        self.count = float(servo.get(36))
+
+    def turn(self, dt_s: float, blocked: bool, now_ns: int) -> None:
+        motor = self._servo.motor
+        speed = load = 0.0
+        error = motor.goal - self.count
+        if motor.on and motor.limit > 0.0 and abs(error) >= 0.5:
+            share = min(max(abs(error) / motor.slope, motor.punch), 1.0)
+            load = copysign(motor.limit * share if blocked else 0.05 * motor.limit, error)
+            if not blocked and dt_s > 0.0:
+                fastest = motor.speed or FULL_SPEED
+                step = min(abs(error), min(fastest, FULL_SPEED) * COUNTS_A_SPEED_COUNT * dt_s)
+                speed = copysign(step / COUNTS_A_SPEED_COUNT / dt_s, error)
+                self.count += copysign(step, error)
+        self._servo.sense(round(self.count), round(speed), load, now_ns)

@@ -1,32 +1,104 @@
-"""The simulator as the hardware itself: camera and clock on the mesh, base and servos at the ends of emulated wires.
-
-The services of base and servos are the real ones; they open the ports that this puts into the robot's run directory.
-"""
+"""The PyBullet robot's motors as firmware drives them: by registers and wheel speeds instead of messages."""
 
 from __future__ import annotations
 
 import asyncio
-import os
 import select
-import socket
-import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from math import radians
 from pathlib import Path
 
+from cocoro.child import ChildProcess, wait_or_kill
+from cocoro.component import Implementation
 from cocoro.errors import CocoroError
 from cocoro.node import Node
 from cocoro.ports import wire_dir
-from cocoro.robot import Robot
-from sim.camera import Kinect
-from sim.service import Config, Simulator, keep_going, make_kinect, make_world
+from cocoro.robot import Base, Joint, Robot
+from sim.base import MobileBase
+from sim.camera import SimKinect
+from sim.realism import BodyRealism
+from sim.service import SimConfig, Simulator, keep_going, make_kinect, make_world
+from sim.servos import LOAD_COUNTS, SPEED_COUNT_RADPS, Drive, SimServo, SimServoNetwork
 from sim.wire.dynamixel import Motor
-from sim.wire.link import Channel, Orders, Senses, ServoSetup, Setup
-from sim.wire.motors import WireMotors
-from sim.world import World
+from sim.wire.firmware import Channel, MotorOrders, PlantState, ServoSetup, Setup
+from sim.world import NETWORKS, Motors, World
 
-__all__ = ["Config", "run"]
+LIMP_SHARE = 0.05
+"""What the gears of a limp servo resist with, as a share of its stall torque."""
+LIMP_RADPS = 1.0
+
+
+class WireServo(SimServo):
+    """Does what its registers say."""
+
+    def __init__(self, joint: Joint, angle_rad: float, backlash_rad: float) -> None:
+        super().__init__(joint, angle_rad, backlash_rad)
+        # Stiff until the firmware speaks, so that the robot stands as it was left.
+        self.motor = Motor(on=True, goal=self.goal_count, speed=0, limit=1.0, slope=1, punch=1.0)
+
+    def drive(self, speed_factor: float = 1.0) -> Drive:
+        motor, joint = self.motor, self.joint
+        if not motor.on or motor.limit <= 0.0:
+            return Drive(self.angle_rad, LIMP_RADPS, LIMP_SHARE * joint.torque_nm)
+        error_counts = motor.goal - self.count
+        share = min(max(abs(error_counts) / motor.slope, motor.punch), 1.0)
+        speed_radps = min((motor.speed or LOAD_COUNTS) * SPEED_COUNT_RADPS * speed_factor, joint.max_speed_radps)
+        error_rad = joint.to_angle(motor.goal) - self._play.shaft_rad
+        return Drive(self.angle_rad + error_rad, speed_radps, joint.torque_nm * motor.limit * share)
+
+    @property
+    def senses(self) -> tuple[int, int, float]:
+        """Position, speed (counts) and load (share), in the servo's own sense of turning."""
+        sign = self.joint.direction
+        return self.count, round(sign * self.speed_radps / SPEED_COUNT_RADPS), sign * self.load
+
+
+class WireNetwork(SimServoNetwork):
+    """Servos that hear nothing but their registers: commands, expiry and the emergency stop are the driver's."""
+
+    def __init__(self, joints: Mapping[str, Joint], angles_rad: Mapping[str, float], backlash_deg: float) -> None:
+        super().__init__(joints, angles_rad, keeps_goal=True, timeout_s=0.0, backlash_deg=backlash_deg)
+        self.wired = {
+            joint.id: WireServo(joint, angles_rad[name], radians(backlash_deg)) for name, joint in joints.items()
+        }
+        self.servos.update({servo.joint.name: servo for servo in self.wired.values()})
+
+
+class WireBase(MobileBase):
+    """Wheels that turn as the Create's firmware asks, ramped as it does."""
+
+    def __init__(self, base: Base) -> None:
+        super().__init__(base, exact=True)
+        self.asked_mps = (0.0, 0.0)
+        self.counted_m = [0.0, 0.0]
+        """What each wheel's encoder has counted since the start."""
+
+    def rolled(self, left_m: float, right_m: float, now_ns: int, dt_s: float) -> None:
+        self.counted_m = [self.counted_m[0] + left_m, self.counted_m[1] + right_m]
+
+    def _obeyed(self, now_ns: int) -> tuple[float, float]:
+        return self.asked_mps
+
+
+class WireMotors:
+    """Makes a world's motors, and keeps hold of them. Give `make` to the world."""
+
+    base: WireBase
+    servos: dict[int, WireServo]
+
+    def make(self, robot: Robot, angles_rad: Mapping[str, float], realism: BodyRealism) -> Motors:
+        networks: dict[str, SimServoNetwork] = {}
+        self.base = WireBase(robot.base)
+        self.servos = {}
+        for name in NETWORKS:
+            joints = {joint: robot.joints[joint] for joint in robot.network_joints(name)}
+            network = WireNetwork(joints, angles_rad, realism.backlash_deg)
+            networks[name] = network
+            self.servos |= network.wired
+        return Motors(self.base, networks)
+
 
 MODELS = {"arm": 28, "hand": 12}
 START_S, END_S = 30.0, 3.0
@@ -36,14 +108,14 @@ class WireSimulator(Simulator):
     """A simulator whose motors are driven by firmware in another process."""
 
     def __init__(
-        self, node: Node, config: Config, world: World, kinect: Kinect, motors: WireMotors, channel: Channel
+        self, node: Node, config: SimConfig, world: World, kinect: SimKinect, motors: WireMotors, channel: Channel
     ) -> None:
         super().__init__(node, config, world, kinect)
         self._motors = motors
         self._channel = channel
 
     def tick(self) -> None:
-        orders = self._channel.newest(Orders)
+        orders = self._channel.newest(MotorOrders)
         if orders is not None:
             self._obey(orders)
         if not self._channel.open:
@@ -51,7 +123,7 @@ class WireSimulator(Simulator):
         super().tick()
         self._tell()
 
-    def _obey(self, orders: Orders) -> None:
+    def _obey(self, orders: MotorOrders) -> None:
         self._motors.base.asked_mps = orders.left_mmps / 1000.0, orders.right_mmps / 1000.0
         for number, order in orders.motors.items():
             self._motors.servos[number].motor = Motor(
@@ -62,7 +134,7 @@ class WireSimulator(Simulator):
         base = self._motors.base
         left_m, right_m = base.counted_m
         self._channel.send(
-            Senses(
+            PlantState(
                 self._world.time_ns,
                 left_m,
                 right_m,
@@ -86,26 +158,18 @@ def setup_of(robot: Robot, motors: WireMotors, seed: int) -> Setup:
 
 @contextmanager
 def firmware_process(folder: Path, setup: Setup) -> Iterator[Channel]:
-    """Start the firmware's process; it has ended when this context has."""
-    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    command = [sys.executable, "-P", "-m", "sim.wire.process", str(folder), "--fd", str(theirs.fileno())]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[2]), *sys.path[1:]])}
-    with theirs:
-        process = subprocess.Popen(command, env=environment, pass_fds=(theirs.fileno(),), stdin=subprocess.DEVNULL)
-    channel = Channel(ours)
+    """Start the firmware's process, which makes its ports in `folder`; it has ended when this context is left."""
+    child = ChildProcess("sim.wire.firmware", str(folder), packages=sys.path[1:])
+    channel = Channel(child.channel)
     try:
         channel.send(setup)
         yield channel
     finally:
         channel.close()
-        try:
-            process.wait(END_S)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
+        wait_or_kill(child.process, END_S)
 
 
-async def run(node: Node, config: Config) -> None:
+async def run(node: Node, config: SimConfig) -> None:
     """Simulate for ever."""
     motors = WireMotors()
     folder = wire_dir(node.robot_name)
@@ -120,3 +184,6 @@ async def run(node: Node, config: Config) -> None:
                 for part in (node, camera):
                     part.ready(f"simulated behind wires, scene {world.scene.name}, {config.sensors} sensors")
                 await keep_going(node, config, simulator)
+
+
+implementation = Implementation(SimConfig, run)

@@ -16,7 +16,7 @@ from cocoro.learning.camera_tilt import CameraTilt
 from cocoro.messages import BaseCommand, TargetEstimate
 from cocoro.robot import Robot
 from services.planning.arm import ArmController, ArmStep
-from services.planning.config import Config
+from services.planning.config import PlanningConfig
 from services.planning.hand import Grip
 from services.planning.head import Gaze
 from services.planning.navigation import Driver
@@ -34,7 +34,7 @@ class Actuators:
     behaviour to the next."""
 
     robot: Robot
-    config: Config
+    config: PlanningConfig
     driver: Driver = field(init=False)
     reacher: Reacher = field(init=False)
     arm: ArmController = field(init=False)

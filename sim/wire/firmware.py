@@ -5,15 +5,23 @@ They are processes of their own: firmware answers within a millisecond, and a fr
 
 from __future__ import annotations
 
+import argparse
+import os
+import select
+import signal
 import socket
+import sys
 from collections.abc import Mapping
 from contextlib import suppress
+from pathlib import Path
 from typing import TypeVar
 
 import msgspec
 
-from sim.wire.create import Create
-from sim.wire.dynamixel import Bus, Motor, Servo
+from sim.wire.control import Control, ControlServer
+from sim.wire.create import EmulatedCreate
+from sim.wire.dynamixel import EmulatedServo, EmulatedServoBus, Motor
+from sim.wire.emulator import Device, Emulator
 
 S = TypeVar("S", bound=msgspec.Struct)
 
@@ -42,7 +50,7 @@ class MotorOrder(msgspec.Struct, array_like=True):
     punch: float
 
 
-class Orders(msgspec.Struct, array_like=True):
+class MotorOrders(msgspec.Struct, array_like=True):
     """From the firmware: what wheels and servos are to do."""
 
     left_mmps: int
@@ -50,7 +58,7 @@ class Orders(msgspec.Struct, array_like=True):
     motors: dict[int, MotorOrder]
 
 
-class Senses(msgspec.Struct, array_like=True):
+class PlantState(msgspec.Struct, array_like=True):
     """From the physics: what they did."""
 
     time_ns: int
@@ -98,15 +106,15 @@ class Channel:
         self._end.close()
 
 
-class LinkedBody:
+class LinkedPlant:
     """The firmware's side: a body whose motions are made elsewhere."""
 
-    def __init__(self, channel: Channel, create: Create, lines: Mapping[str, Bus]) -> None:
+    def __init__(self, channel: Channel, create: EmulatedCreate, lines: Mapping[str, EmulatedServoBus]) -> None:
         self._channel = channel
         self._create = create
         self._servos = {servo.number: servo for bus in lines.values() for servo in bus.servos}
         self._rolled_m: tuple[float, float] | None = None
-        self._told: Orders | None = None
+        self._told: MotorOrders | None = None
 
     def fileno(self) -> int:
         return self._channel.fileno()
@@ -116,7 +124,7 @@ class LinkedBody:
         return self._channel.open
 
     def advance(self, now_ns: int) -> None:
-        senses = self._channel.newest(Senses)
+        senses = self._channel.newest(PlantState)
         if senses is not None:
             self._feel(senses)
         orders = self._orders()
@@ -124,7 +132,7 @@ class LinkedBody:
             self._told = orders
             self._channel.send(orders)
 
-    def _feel(self, senses: Senses) -> None:
+    def _feel(self, senses: PlantState) -> None:
         rolled_m = senses.left_m, senses.right_m
         before_m = self._rolled_m or rolled_m
         self._rolled_m = rolled_m
@@ -134,26 +142,65 @@ class LinkedBody:
         for number, shaft in senses.shafts.items():
             self._servos[number].sense(*shaft, senses.time_ns)
 
-    def _orders(self) -> Orders:
+    def _orders(self) -> MotorOrders:
         left, right = self._create.wheels_mmps
         motors = {number: _order(servo.motor) for number, servo in self._servos.items()}
-        return Orders(left, right, motors)
+        return MotorOrders(left, right, motors)
 
 
 def _order(motor: Motor) -> MotorOrder:
     return MotorOrder(motor.on, motor.goal, motor.speed, motor.limit, motor.slope, motor.punch)
 
 
-def firmware(setup: Setup) -> tuple[Create, dict[str, Bus]]:
+def firmware(setup: Setup) -> tuple[EmulatedCreate, dict[str, EmulatedServoBus]]:
     """The devices of a setup, as somebody left them: the Create off, the servos holding where they are."""
     lines = {}
     for name, rows in setup.lines.items():
         servos = []
         for row in rows:
-            servo = Servo(row.number, row.model, row.overload_s)
+            servo = EmulatedServo(row.number, row.model, row.overload_s)
             servo.put(36, row.position)
             servo.put(30, row.position)
             servo.put(24, 1)
             servos.append(servo)
-        lines[name] = Bus(servos)
-    return Create(setup.wheel_base_mm), lines
+        lines[name] = EmulatedServoBus(servos)
+    return EmulatedCreate(setup.wheel_base_mm), lines
+
+
+PREFERRED = -10
+
+
+class _Ending(Emulator):
+    """Ends when its body is gone."""
+
+    linked: LinkedPlant
+
+    def _take_jobs(self) -> bool:
+        return super()._take_jobs() and self.linked.connected
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(prog="python -m sim.wire.firmware", description="Emulated firmware on wires.")
+    parser.add_argument("folder", type=Path, help="where the ports are to be")
+    parser.add_argument("--fd", type=int, required=True, help="this process's end of a socket pair")
+    options = parser.parse_args()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for who started it
+    with suppress(PermissionError):
+        os.nice(PREFERRED)  # firmware answers at once
+    channel = Channel(socket.socket(fileno=options.fd))
+    select.select([channel], [], [], 30.0)
+    setup = channel.newest(Setup)
+    if setup is None:
+        return 1
+    create, lines = firmware(setup)
+    devices: dict[str, Device] = {"create": create, **lines}
+    body = LinkedPlant(channel, create, lines)
+    emulator = _Ending(options.folder, devices, body, setup.seed)
+    emulator.linked = body
+    with ControlServer(options.folder, Control(emulator)):
+        emulator.run()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

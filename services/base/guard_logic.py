@@ -10,7 +10,7 @@ from typing import Literal, NamedTuple
 
 from services.base import oi
 
-Link = Literal["closed", "silent", "waking", "up", "fallen"]
+LinkState = Literal["closed", "silent", "waking", "up", "fallen"]
 """closed: no port. silent: nothing good is heard. waking: being put into its mode. fallen: the Create left the mode by
 itself, and waits for somebody to say that it may go on."""
 
@@ -38,39 +38,39 @@ LONG = (*SHORT, oi.DISTANCE, oi.ANGLE)
 one frame every `COUNTS_NS`, by changing the list for just that long; a checksum protects them there as it does all."""
 
 
-class Wheels(NamedTuple):
+class WheelSpeeds(NamedTuple):
     left_mmps: int
     right_mmps: int
     why: str = ""
     """What keeps them from turning as they were asked to."""
 
 
-STILL = Wheels(0, 0)
+STILL = WheelSpeeds(0, 0)
 
 
-def reflex(wanted: Wheels, readings: oi.Readings) -> Wheels:
+def reflex(wanted: WheelSpeeds, readings: oi.Readings) -> WheelSpeeds:
     """What of the wanted speeds the robot's own sensors let through.
 
     Against a bumper or at a cliff there is no way forward, but a round base may turn on the spot and back away.
     """
     left, right, _ = wanted
     if readings[oi.BUMPS] & oi.WHEEL_DROPS:
-        return Wheels(0, 0, "wheel drop")
+        return WheelSpeeds(0, 0, "wheel drop")
     if readings[oi.OVERCURRENTS] & oi.WHEEL_OVERCURRENTS:
-        return Wheels(0, 0, "overcurrent")
+        return WheelSpeeds(0, 0, "overcurrent")
     cliff = any(readings[packet] for packet in oi.CLIFFS)
     bump = readings[oi.BUMPS] & (oi.BUMP_LEFT | oi.BUMP_RIGHT)
     if (cliff or bump) and left + right > 0:
         half = (left - right) // 2
-        return Wheels(oi.harmless(half), oi.harmless(-half), "cliff" if cliff else "bump")
+        return WheelSpeeds(oi.harmless(half), oi.harmless(-half), "cliff" if cliff else "bump")
     return wanted
 
 
-class Keeper:
+class GuardLogic:
     """Told the time (monotonic, ns) with every call. `mode` is safe or full."""
 
     def __init__(self, mode: str, deadman_ns: int) -> None:
-        self.link: Link = "closed"
+        self.link: LinkState = "closed"
         self.readings: oi.Readings = {}
         """The newest frame."""
         self.wheels = STILL
@@ -113,7 +113,7 @@ class Keeper:
 
     def ask(self, left_mmps: int, right_mmps: int, until_ns: int, now_ns: int) -> None:
         """Wheel speeds, until then and never for longer than the deadman."""
-        self._wanted = Wheels(oi.harmless(left_mmps), oi.harmless(right_mmps))
+        self._wanted = WheelSpeeds(oi.harmless(left_mmps), oi.harmless(right_mmps))
         self._until_ns = min(until_ns, now_ns + self._deadman_ns)
 
     def stop(self) -> None:
@@ -187,14 +187,14 @@ class Keeper:
                 self.link = "silent"
         return self._waking(now_ns) + self._counts(now_ns) + self._drive(now_ns)
 
-    def allowed(self, now_ns: int) -> Wheels:
+    def allowed(self, now_ns: int) -> WheelSpeeds:
         """What the wheels may do now, and why not more."""
         if self.link != "up":
-            return Wheels(0, 0, "mode" if self.link == "fallen" else "link")
+            return WheelSpeeds(0, 0, "mode" if self.link == "fallen" else "link")
         if self.stops > self._reset_stops:
-            return Wheels(0, 0, "estop")
+            return WheelSpeeds(0, 0, "estop")
         if now_ns > self._until_ns:
-            return Wheels(0, 0, "no command")
+            return WheelSpeeds(0, 0, "no command")
         return reflex(self._wanted, self.readings)
 
     def _drive(self, now_ns: int) -> bytes:

@@ -7,7 +7,10 @@ import pty
 import termios
 import tty
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
+from random import Random
+from typing import Literal
 
 from cocoro import private
 
@@ -17,7 +20,7 @@ BAUDS = {
 }
 
 
-class Port:
+class PseudoSerialPort:
     """A driver opens `path`; this end reads and writes what goes over the wire."""
 
     def __init__(self, path: Path) -> None:
@@ -76,3 +79,68 @@ class Port:
         if self._ends is not None and data:
             with suppress(BlockingIOError, OSError):
                 os.write(self._ends[0], data)
+
+
+FaultKind = Literal["lost", "corrupted", "truncated", "late", "repeated", "silent"]
+Direction = Literal["to_device", "to_driver", "both"]
+KINDS: tuple[FaultKind, ...] = ("lost", "corrupted", "truncated", "late", "repeated", "silent")
+
+
+@dataclass(frozen=True)
+class LineFault:
+    """A share of the bytes (lost, corrupted) or of the bursts (the others) suffers it, until a time."""
+
+    kind: FaultKind
+    share: float
+    way: Direction
+    until_ns: int
+    delay_ns: int = 30_000_000
+    """For late ones."""
+
+
+class Disturbance:
+    """One direction of one line."""
+
+    def __init__(self, way: Direction, seed: int) -> None:
+        self._way = way
+        self._draws = Random(f"{way} {seed}")
+        self._faults: list[LineFault] = []
+        self._late: list[tuple[int, bytes]] = []
+
+    def add(self, fault: LineFault) -> None:
+        if fault.way in (self._way, "both"):
+            self._faults.append(fault)
+
+    def clear(self) -> None:
+        self._faults.clear()
+
+    def carry(self, data: bytes, now_ns: int) -> bytes:
+        """What arrives now, of what is sent now and of what was held up. In order: nothing overtakes."""
+        self._faults = [fault for fault in self._faults if fault.until_ns > now_ns]
+        due_ns = now_ns
+        for fault in self._faults if data else ():
+            hit = self._draws.random() < fault.share
+            if fault.kind == "late" and hit:
+                due_ns = now_ns + fault.delay_ns
+            else:
+                data = self._suffer(fault, data, hit)
+        if data:
+            self._late.append((max(due_ns, self._late[-1][0] if self._late else 0), data))
+        arrived = b""
+        while self._late and self._late[0][0] <= now_ns:
+            arrived += self._late.pop(0)[1]
+        return arrived
+
+    def _suffer(self, fault: LineFault, data: bytes, hit: bool) -> bytes:
+        draws = self._draws
+        if fault.kind == "lost":
+            return bytes(byte for byte in data if draws.random() >= fault.share)
+        if fault.kind == "corrupted":
+            return bytes(byte ^ draws.randrange(1, 256) if draws.random() < fault.share else byte for byte in data)
+        if fault.kind == "silent":
+            return b""
+        if fault.kind == "truncated" and hit:
+            return data[: draws.randrange(len(data))]
+        if fault.kind == "repeated" and hit:
+            return data + data
+        return data

@@ -2,30 +2,32 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from wire_base import frame
 
 from services.base import oi
-from services.base.keeper import LONG, MS, SHORT, Keeper, Wheels, reflex
+from services.base.guard_logic import LONG, MS, SHORT, GuardLogic, WheelSpeeds, reflex
 
 QUIET = dict.fromkeys(SHORT, 0) | {oi.MODE: 2}
 
 
 class Rig:
-    """A keeper, a clock, and a Create that does what it is told."""
+    """A logic, a clock, and a Create that does what it is told."""
 
     def __init__(self) -> None:
-        self.keeper = Keeper("safe", 200 * MS)
+        self.logic = GuardLogic("safe", 200 * MS)
         self.now_ns = 10**12
         self.written = b""
         self.readings = dict(QUIET)
         self.streams: tuple[int, ...] = ()
-        self.keeper.opened(self.now_ns)
+        self.logic.opened(self.now_ns)
 
     def frames(self, count: int, **changes: int) -> list[oi.Readings]:
-        """So many frames of 15 ms, and what the keeper wrote meanwhile in `written`."""
+        """So many frames of 15 ms, and what the logic wrote meanwhile in `written`."""
         self.written = b""
         heard = []
         for _ in range(count):
@@ -33,12 +35,12 @@ class Rig:
             self.poll()
             if self.streams:
                 readings = {packet: self.readings.get(packet, 0) for packet in self.streams}
-                heard += self.keeper.heard(frame(readings), self.now_ns)
+                heard += self.logic.heard(frame(readings), self.now_ns)
         self.poll()
         return heard
 
     def poll(self) -> None:
-        data = self.keeper.poll(self.now_ns)
+        data = self.logic.poll(self.now_ns)
         self.written += data
         for packets in (SHORT, LONG):
             if oi.stream(packets) in data:
@@ -53,7 +55,7 @@ class Rig:
 def rig() -> Rig:
     rig = Rig()
     rig.frames(12)
-    assert rig.keeper.link == "up"
+    assert rig.logic.link == "up"
     return rig
 
 
@@ -69,7 +71,7 @@ def test_way_and_turn_are_asked_for_five_times_a_second_and_for_one_frame_each(r
     counted = sum(oi.DISTANCE in readings for readings in heard)
     assert 8 <= counted <= 10
     assert rig.written.count(oi.stream(LONG)) == pytest.approx(counted, abs=1)
-    assert not rig.keeper.take_counts_lost()
+    assert not rig.logic.take_counts_lost()
 
 
 def test_a_frame_that_is_broken_while_counts_are_asked_for_loses_them(rig: Rig) -> None:
@@ -78,57 +80,57 @@ def test_a_frame_that_is_broken_while_counts_are_asked_for_loses_them(rig: Rig) 
         rig.poll()
         if rig.streams == LONG:
             break
-        rig.keeper.heard(frame({packet: rig.readings[packet] for packet in SHORT}), rig.now_ns)
-    assert not rig.keeper.take_counts_lost()
-    rig.keeper.heard(b"\x13\x07rubbish", rig.now_ns)
+        rig.logic.heard(frame({packet: rig.readings[packet] for packet in SHORT}), rig.now_ns)
+    assert not rig.logic.take_counts_lost()
+    rig.logic.heard(b"\x13\x07rubbish", rig.now_ns)
     rig.frames(2)
-    assert rig.keeper.take_counts_lost()
-    assert not rig.keeper.take_counts_lost()
+    assert rig.logic.take_counts_lost()
+    assert not rig.logic.take_counts_lost()
 
 
 def test_a_wheel_command_is_repeated_though_nothing_changes(rig: Rig) -> None:
-    rig.keeper.ask(100, 50, rig.now_ns + 200 * MS, rig.now_ns)
+    rig.logic.ask(100, 50, rig.now_ns + 200 * MS, rig.now_ns)
     rig.frames(10)
     assert rig.written.count(oi.drive_direct(100, 50)) >= 3
 
 
 def test_a_command_that_the_create_took_for_another_is_repeated_at_once(rig: Rig) -> None:
-    rig.keeper.ask(100, 100, rig.now_ns + 200 * MS, rig.now_ns)
+    rig.logic.ask(100, 100, rig.now_ns + 200 * MS, rig.now_ns)
     rig.frames(2)
     rig.readings[oi.LEFT_SPEED] = 400
     rig.written = b""
     rig.now_ns += 15 * MS
-    rig.keeper.heard(frame({packet: rig.readings[packet] for packet in SHORT}), rig.now_ns)
-    assert rig.keeper.poll(rig.now_ns).endswith(oi.drive_direct(100, 100))
+    rig.logic.heard(frame({packet: rig.readings[packet] for packet in SHORT}), rig.now_ns)
+    assert rig.logic.poll(rig.now_ns).endswith(oi.drive_direct(100, 100))
 
 
 def test_a_create_that_takes_commands_for_the_rest_of_another_gets_more_than_it_can_take(rig: Rig) -> None:
     """A garbled byte may have become the head of a script, which takes up to 255 bytes that follow."""
-    rig.keeper.ask(100, 100, rig.now_ns + 200 * MS, rig.now_ns)
+    rig.logic.ask(100, 100, rig.now_ns + 200 * MS, rig.now_ns)
     rig.frames(2)
-    rig.keeper.ask(0, 0, rig.now_ns + 200 * MS, rig.now_ns)
+    rig.logic.ask(0, 0, rig.now_ns + 200 * MS, rig.now_ns)
     written, taken = [], dict(rig.readings)
     for _ in range(8):
         rig.now_ns += 15 * MS
-        rig.keeper.heard(frame({packet: taken[packet] for packet in SHORT}), rig.now_ns)
-        written.append(rig.keeper.poll(rig.now_ns))
+        rig.logic.heard(frame({packet: taken[packet] for packet in SHORT}), rig.now_ns)
+        written.append(rig.logic.poll(rig.now_ns))
     assert max(len(data) for data in written) > 255
     assert set(b"".join(written)) == set(oi.drive_direct(0, 0))
 
 
 def test_a_silent_create_gets_no_wheel_speeds_and_is_woken_again_and_again(rig: Rig) -> None:
     rig.streams = ()
-    rig.keeper.ask(100, 100, rig.now_ns + 200 * MS, rig.now_ns)
+    rig.logic.ask(100, 100, rig.now_ns + 200 * MS, rig.now_ns)
     written = []
     for _ in range(100):
         rig.now_ns += 15 * MS
-        rig.keeper.ask(100, 100, rig.now_ns + 200 * MS, rig.now_ns)
-        written.append(rig.keeper.poll(rig.now_ns))
+        rig.logic.ask(100, 100, rig.now_ns + 200 * MS, rig.now_ns)
+        written.append(rig.logic.poll(rig.now_ns))
     silent = b"".join(written[12:])
     assert oi.drive_direct(100, 100) not in silent
     assert oi.drive_direct(0, 0) in silent
     assert b"".join(written).count(oi.start()) >= 2
-    assert rig.keeper.link in ("silent", "waking")
+    assert rig.logic.link in ("silent", "waking")
 
 
 READINGS = st.fixed_dictionaries(
@@ -145,7 +147,7 @@ SPEED = st.integers(-500, 500).map(oi.harmless)
 def test_reflexes_never_let_the_robot_forward_against_what_they_feel(
     left: int, right: int, readings: oi.Readings
 ) -> None:
-    allowed = reflex(Wheels(left, right), readings)
+    allowed = reflex(WheelSpeeds(left, right), readings)
     felt = readings[oi.BUMPS] & 3 or any(readings[packet] for packet in oi.CLIFFS)
     if felt:
         assert allowed.left_mmps + allowed.right_mmps <= 0 or abs(allowed.left_mmps + allowed.right_mmps) <= 32
@@ -169,29 +171,28 @@ STEPS = st.one_of(
 @settings(max_examples=200)
 @given(st.lists(STEPS, max_size=40))
 def test_whatever_comes_wheels_turn_only_for_a_fresh_command_and_an_awake_create(
-    steps: list[tuple[str, object]],
+    steps: list[tuple[str, Any]],
 ) -> None:
-    keeper, now_ns, until_ns = Keeper("safe", 200 * MS), 10**12, 0
-    keeper.opened(now_ns)
+    logic, now_ns, until_ns = GuardLogic("safe", 200 * MS), 10**12, 0
+    logic.opened(now_ns)
     for step, value in steps:
         if step == "bytes":
-            assert isinstance(value, bytes)
-            keeper.heard(value, now_ns)
+            logic.heard(value, now_ns)
         elif step == "frame":
-            keeper.heard(frame(QUIET | {oi.MODE: value}), now_ns)  # type: ignore[dict-item]
+            logic.heard(frame(QUIET | {oi.MODE: value}), now_ns)
         elif step == "ask":
-            left, right, for_ms = value  # type: ignore[misc]
+            left, right, for_ms = value
             until_ns = min(now_ns + for_ms * MS, now_ns + 200 * MS)
-            keeper.ask(left, right, now_ns + for_ms * MS, now_ns)
+            logic.ask(left, right, now_ns + for_ms * MS, now_ns)
         elif step == "wait":
-            now_ns += value * MS  # type: ignore[operator]
+            now_ns += value * MS
         elif step == "recover":
-            keeper.recover(now_ns)
+            logic.recover(now_ns)
         else:
-            keeper.closed()
-            keeper.opened(now_ns)
-        keeper.poll(now_ns)
-        if keeper.wheels[:2] != (0, 0):
+            logic.closed()
+            logic.opened(now_ns)
+        logic.poll(now_ns)
+        if logic.wheels[:2] != (0, 0):
             assert now_ns <= until_ns
-            assert keeper.link == "up"
-            assert keeper.readings[oi.MODE] == 2
+            assert logic.link == "up"
+            assert logic.readings[oi.MODE] == 2

@@ -1,0 +1,103 @@
+"""What third parties have installed: their components, and with these the topics and requests beyond the project's own.
+
+A distribution adds a component by an entry point of the group `cocoro.components`: named as the component, with its
+`Component` as the value. A faulty entry point is a problem for whoever starts components (`ThirdParties.check`), and is
+left out for everyone else, so that it cannot stop a recorder or blind an operator's command.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from functools import cache
+from typing import Any, NamedTuple
+
+from cocoro.component import Component
+from cocoro.errors import ConfigError
+from cocoro.topics import REQUESTS, TOPICS, Request, Topic, find_topic
+
+GROUP = "cocoro.components"
+
+
+class ThirdParties(NamedTuple):
+    components: dict[str, Component]
+    """By name; without those that are faulty."""
+    topics: tuple[Topic[Any], ...]
+    """What they publish or read beyond the project's own topics."""
+    requests: tuple[Request[Any, Any], ...]
+    problems: tuple[str, ...]
+    """One for each faulty entry point."""
+
+    def check(self) -> None:
+        """Raises ConfigError for the first faulty entry point."""
+        if self.problems:
+            raise ConfigError(self.problems[0])
+
+
+@cache
+def third_parties() -> ThirdParties:
+    """All installed components of third parties; found once in a process."""
+    from importlib.metadata import entry_points  # takes a while to import, and not everyone needs it
+
+    components: dict[str, Component] = {}
+    topics: dict[str, Topic[Any]] = {}
+    requests: dict[str, Request[Any, Any]] = {}
+    problems: list[str] = []
+    for point in entry_points(group=GROUP):
+        where = f"entry point {point.name!r} of {point.dist.name if point.dist else 'an unknown distribution'}"
+        try:
+            component = point.load()
+            if not isinstance(component, Component) or component.name != point.name:
+                raise ConfigError(f"{point.value} is not a Component named {point.name!r}")
+            if component.name in components:
+                raise ConfigError("there is a component of that name already")
+            new_topics = _new((*component.publishes, *component.reads), TOPICS, topics)
+            new_requests = _new((*component.serves, *component.calls), REQUESTS, requests)
+        except ConfigError as error:
+            problems.append(f"{where}: {error}")
+        except Exception as error:  # it is their code that runs here
+            problems.append(f"{where} cannot be loaded: {type(error).__name__}: {error}")
+        else:
+            components[component.name] = component
+            topics |= new_topics
+            requests |= new_requests
+    return ThirdParties(components, tuple(topics.values()), tuple(requests.values()), tuple(problems))
+
+
+def topic_named(name: str) -> Topic[Any] | None:
+    """The topic of a name (its key without the robot), the project's own or a third party's; None when unknown."""
+    return find_topic(name, TOPICS) or find_topic(name, third_parties().topics)
+
+
+def all_topics() -> tuple[Topic[Any], ...]:
+    """The project's own topics, then those of third parties."""
+    return TOPICS + third_parties().topics
+
+
+def all_requests() -> tuple[Request[Any, Any], ...]:
+    """The project's own requests, then those of third parties."""
+    return REQUESTS + third_parties().requests
+
+
+Row = Topic[Any] | Request[Any, Any]
+
+
+def _new(declared: Iterable[Any], own: Iterable[Any], theirs: dict[str, Any]) -> dict[str, Any]:
+    """Those of the declared rows that are not known yet, by name. Raises ConfigError for one whose name means something
+    else already."""
+    known = {row.name: row for row in own} | theirs
+    found: dict[str, Any] = {}
+    for row in declared:
+        before = _known(row, known | found)
+        if before is None:
+            found[row.name] = row
+        elif before != row:
+            raise ConfigError(f"its {type(row).__name__.lower()} {row.name} differs from the one that is known already")
+    return found
+
+
+def _known(row: Any, known: dict[str, Any]) -> Any:
+    """The known row that a row's name means, if any: a per-service row means the names of all services."""
+    if row.name in known:
+        return known[row.name]
+    general = known.get("{service}/" + row.name.partition("/")[2])
+    return None if general is None else general.of(row.name.partition("/")[0])

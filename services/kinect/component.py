@@ -1,0 +1,18 @@
+"""The declaration of the Kinect: see `cocoro.component`."""
+
+from cocoro.component import Component
+from cocoro.topics import FRAME
+
+KINECT = Component(
+    name="kinect",
+    module="services.kinect.service",
+    doc="The Kinect: colour and raw depth.",
+    publishes=(FRAME,),
+    hardware=True,
+    frames="publishes",
+    restart="always",
+    cpu_share=0.3,
+    rss_mb=200.0,
+    libraries=("numpy", "opencv-python-headless"),
+    checks="services.kinect.doctor",
+)

@@ -1,0 +1,31 @@
+"""The declaration of the planner: see `cocoro.component`."""
+
+from cocoro.component import Component
+from cocoro.topics import (
+    ARM_COMMAND,
+    ARM_STATE,
+    BASE_COMMAND,
+    BASE_STATE,
+    DETECTIONS,
+    HAND_COMMAND,
+    HAND_SAMPLES,
+    HAND_STATE,
+    INTENT,
+    LEARNED,
+    MODEL,
+    OBSTACLES,
+    PLAN,
+    WHEEL_TRIALS,
+)
+
+PLANNING = Component(
+    name="planning",
+    module="services.planning.service",
+    doc="Turns intent and the latest state into head, wheel, arm and hand commands, 50 times a second.",
+    reads=(INTENT, BASE_STATE, ARM_STATE, HAND_STATE, DETECTIONS, OBSTACLES, MODEL),
+    publishes=(BASE_COMMAND, ARM_COMMAND, HAND_COMMAND, PLAN, HAND_SAMPLES, WHEEL_TRIALS, MODEL),
+    serves=(LEARNED,),
+    needs=("base", "arm", "hand", "perception"),
+    cpu_share=0.4,
+    rss_mb=200.0,
+)
