@@ -23,7 +23,7 @@ ARGUMENTS: dict[str, str] = {
     "follow": "{name}",
     "touch": "{name}",
     "go-to": "{name}",
-    "rehearse": "dance",
+    "rehearse fetch": "{name} --seed -1",
     "snapshot": "{name}.png",
     "record": "--out {name}",
     "replay": "{capture} --paused",
@@ -64,7 +64,11 @@ def commands(command: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[str, An
         yield from commands(sub, (*path, name))
 
 
-COMMANDS = dict(commands(typer.main.get_command(app)))
+COMMANDS = {
+    name: command
+    for name, command in commands(typer.main.get_command(app))
+    if not name.startswith("rehearse ") or name == "rehearse fetch"  # the others are made in the same way
+}
 
 
 @dataclass(frozen=True)

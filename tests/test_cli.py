@@ -22,6 +22,7 @@ from apps.rehearsal.request import RehearsalRequest
 from cocoro.errors import CocoroError, ConfigError
 from cocoro.topics import TOPICS
 from deploy.processes import stoppable
+from services.executive.tasks import FetchTask
 
 COMMANDS = (
     "up", "down", "status", "fetch", "follow", "park", "put-down", "estop", "reset", "cancel", "objects", "snapshot",
@@ -172,7 +173,7 @@ def simulator(monkeypatch: pytest.MonkeyPatch) -> list[RehearsalRequest]:
     def run(request: RehearsalRequest) -> dict[str, Any]:
         asked.append(request)
         print("pybullet build time: today", flush=True)
-        return RESULT | {"outcome": "failed" if request.label == "blue_can" else "done"}
+        return RESULT | {"outcome": "failed" if request.task.label == "blue_can" else "done"}
 
     monkeypatch.setattr(rehearsing, "rehearse", run)
     return asked
@@ -186,7 +187,7 @@ def test_every_option_of_rehearse_reaches_the_request(simulator: list[RehearsalR
     assert code == 0
     assert simulator == [
         RehearsalRequest(
-            task="fetch", label="red_can", bring=True, scene="paper", seed=3, sensors="real",
+            task=FetchTask(label="red_can", bring=True), scene="paper", seed=3, sensors="real",
             latency={"perception": 0.1, "planning": 0.02}, lockstep=True,
             width=320, height=240, frame_rate_hz=15.0, timeout_s=60.0,
         )

@@ -35,8 +35,9 @@ from cocoro.robot import Robot
 from cocoro.topics import CANCEL, LATCH, RUN, TASK
 from cocoro.vloop import run_virtual
 from deploy.rundir import RunDir
+from services.executive.tasks import FetchTask
 
-REQUEST = TaskRequest(task="fetch", label="red_can")
+REQUEST = TaskRequest(task=FetchTask(label="red_can"))
 ID = "fetch-1"
 
 
