@@ -12,6 +12,7 @@ from apps.cli.table import table as plain_table
 from cocoro.bus.base import Qos
 from cocoro.component import Component
 from cocoro.installed import all_requests, all_topics
+from cocoro.messages.actions import ACTIONS
 from cocoro.topics import REQUESTS, TOPICS, Request, Topic
 from deploy.processes import COMPONENTS, publishers, readers
 
@@ -90,6 +91,9 @@ def markdown() -> str:
         *(f"- `{request.name}`: {request.doc}" for request in REQUESTS),
         "\n## Types\n",
         *(_type_section(types[name]) for name in _with_parts(dict.fromkeys(mentioned), types)),
+        "## Actions\n",
+        "What the `action` of an `Intent` can be: a map with the action's name in `action`, and these fields.\n",
+        *(_type_section(types[kind.__name__]._replace(name=name)) for name, kind in ACTIONS.own.items()),
     ]
     return "\n".join(parts).rstrip() + "\n"
 
