@@ -1,9 +1,11 @@
-"""The robot description: one TOML file that the simulator, the models and the drivers all read."""
+"""The robot description: one TOML file that the simulator, the models and the drivers all read.
+
+`calliope.toml` describes the Calliope. A robot's own file (`override`) has only the values that were measured on it.
+"""
 
 from __future__ import annotations
 
 import tomllib
-from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 from importlib import resources
@@ -20,8 +22,10 @@ from cocoro.errors import ConfigError
 from cocoro.kinematics import Chain, Link, Tree
 from cocoro.units import Positive, Vec3
 
+OWN_FILE = "calliope.toml"
+
 LensValues = tuple[float, float, float, float, float, float, float, float, float]
-"""fx, fy, cx, cy in pixels, then k1, k2, p1, p2, k3 as OpenCV has them."""
+"""fx, fy, cx, cy in pixels, then OpenCV's distortion coefficients k1, k2, p1, p2, k3."""
 
 SERVO_COUNTS = 1024
 SERVO_RANGE_RAD = radians(300.0)
@@ -38,22 +42,22 @@ class Base(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_wheel_speed_mps: Positive
     wheel_acceleration_mps2: Positive
     command_timeout_s: Positive
-    """No word counts for longer, however slow the wheels turn."""
+    """Upper bound for how long a wheel command counts, at any speed."""
     state_rate_hz: Positive
     stand_within_s: Positive = 0.3
-    """Whoever falls silent: within so long the wheels stand, from whatever speed."""
+    """The wheels stand within this time after the last command, from any speed."""
     stand_reserve_s: Positive = 0.03
-    """The part of that which is kept for the way of a word, a turn of the loop that acts on its absence, and the body
-    behind the ramp of its wheels."""
+    """The part of `stand_within_s` reserved for the delivery of a command, one period of the loop that notices the
+    silence, and the body's lag behind the ramp of its wheels."""
 
     def patience_s(self, speed_mps: float) -> float:
-        """How old a word may be on which the faster wheel turns at this speed. What is left of `stand_within_s` is the
-        ramp down to standing."""
+        """The age up to which a command counts when it turns the faster wheel at this speed; the ramp down to standing
+        takes the rest of `stand_within_s`."""
         ramp_s = abs(speed_mps) / self.wheel_acceleration_mps2
         return max(min(self.command_timeout_s, self.stand_within_s - self.stand_reserve_s - ramp_s), 0.0)
 
     def speed_at_age_mps(self, age_s: float) -> float:
-        """The fastest that a wheel may turn on a word of this age, so that it stands in time if that was the last."""
+        """The highest wheel speed from which the base still stands in time when the last command has this age."""
         ramp_s = self.stand_within_s - self.stand_reserve_s - age_s
         return max(ramp_s, 0.0) * self.wheel_acceleration_mps2
 
@@ -73,14 +77,14 @@ class Kinect(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     mount_max_m: Vec3
     colour_lens: LensValues | None = None
     depth_lens: LensValues | None = None
-    """What was measured of the two lenses; the driver straightens its pictures by it, so that readers of frames may
-    reckon with the fields of view above."""
+    """Calibration of the two lenses. The driver rectifies its images by it, so readers of frames use the fields of view
+    above."""
     depth_rotation_rad: Vec3 = (0.0, 0.0, 0.0)
-    """How the depth camera is turned against the colour camera (rotation vector): from its frame into the latter's."""
+    """Rotation vector from the depth camera's frame to the colour camera's."""
 
 
 class Marker(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The ball on the hand that babbling looks at; `position_m` in the link's frame."""
+    """The ball on the hand that babbling looks at; `position_m` is in the link's frame."""
 
     link: str
     radius_m: Positive
@@ -88,13 +92,48 @@ class Marker(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Network(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One bus of servos."""
+
     baud: int
     rate_hz: Positive
+    command_timeout_s: Positive
+    """How long a command to these joints counts."""
 
 
 class Claw(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     pad_length_m: Positive
+    """Length of a finger and of the pad along it."""
     open_sign: dict[str, float]
+    """By joint, the sign of the angles towards which it opens."""
+    level_roll_deg: float
+    """The wrist roll at which the claws lie level, for upright targets; the marker then stands above the hand."""
+
+    @property
+    def level_roll_rad(self) -> float:
+        return radians(self.level_roll_deg)
+
+
+class Tube(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A stretch of the arm's hull: balls evenly spaced from one link's origin to another's, both ends included."""
+
+    name: str
+    start: str
+    end: str
+    radius_m: Positive
+    balls: Annotated[int, Meta(ge=2)]
+
+
+class Hull(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The space that arm and hand take up, and the Kinect's housing, for keeping them apart."""
+
+    kinect_min_m: Vec3
+    kinect_max_m: Vec3
+    """A box, body frame, that holds the Kinect's housing at every head angle."""
+    finger_radius_m: Positive
+    finger_turn_deg: dict[str, float]
+    """By claw link, the angle in its x-y plane from its x axis to its finger."""
+    tube: Annotated[list[Tube], Meta(min_length=1)]
+    """From the chassis out. The first one turns on the chassis and is not checked against it."""
 
 
 class Joint(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -105,9 +144,10 @@ class Joint(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     torque_nm: Positive
     max_speed_radps: Positive
     compliance_deg: Annotated[float, Meta(ge=0)] = 0.0
-    """How far from its goal the servo pushes with all of `torque_nm`, and with less when nearer; 0: always."""
+    """Distance from the goal beyond which the servo pushes with all of `torque_nm`; nearer it pushes less. 0: always
+    all of it."""
     overload_s: Positive = 5.0
-    """Pushing at its limit for so long is an overload."""
+    """A servo that pushes at its limit for this long is overloaded."""
     direction: Literal[-1, 1] = 1
     centre_count: float = (SERVO_COUNTS - 1) / 2
 
@@ -120,12 +160,12 @@ class Joint(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return radians(self.limits_deg[0]), radians(self.limits_deg[1])
 
     def to_count(self, angle_rad: float) -> int:
-        """The servo position nearest to a joint angle, clipped to 0..1023."""
+        """The servo position nearest to a joint angle (radians), clipped to 0..1023."""
         count = round(self.centre_count + self.direction * angle_rad / SERVO_COUNT_RAD)
         return min(max(count, 0), SERVO_COUNTS - 1)
 
     def to_angle(self, count: float) -> float:
-        """The joint angle in radians that a servo position stands for."""
+        """The joint angle, radians, of a servo position."""
         return self.direction * (count - self.centre_count) * SERVO_COUNT_RAD
 
 
@@ -149,27 +189,32 @@ class _DescriptionFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     network: dict[Literal["arm", "hand"], Network]
     joint: list[Joint]
     claw: Claw
+    hull: Hull
     pose: dict[str, dict[str, float]]
 
     def __post_init__(self) -> None:
-        """Names must mean something: a link's parent and joint, and whatever else refers to one of them."""
+        """Refuses references to links and joints that the description does not have, and circles of links."""
         parents = {row.name: row.parent for row in self.link}
         joints = {joint.name for joint in self.joint}
         for row in self.link:
             above, passed = row.parent, {row.name}
             while above != "body":
                 if above not in parents:
-                    raise ValueError(f"link {row.name}: there is no link {above!r} to stand on")
+                    raise ValueError(f"link {row.name}: its parent {above!r} is not a link")
                 if above in passed:
                     raise ValueError(f"link {row.name}: its parents go in a circle at {above!r}")
                 passed.add(above)
                 above = parents[above]
             if row.joint is not None and row.joint not in joints:
                 raise ValueError(f"link {row.name}: there is no joint {row.joint!r}")
-        if self.marker.link not in parents:
-            raise ValueError(f"marker: there is no link {self.marker.link!r}")
+        hull = [("hull.finger_turn_deg", name) for name in self.hull.finger_turn_deg]
+        hull += [(f"hull.tube {tube.name}", name) for tube in self.hull.tube for name in (tube.start, tube.end)]
+        for where, name in [("marker", self.marker.link), *hull]:
+            if name not in parents:
+                raise ValueError(f"{where}: there is no link {name!r}")
         poses = [(f"pose {name}", set(angles)) for name, angles in self.pose.items()]
-        for where, named in [*poses, ("claw", set(self.claw.open_sign))]:
+        claws = [("claw", set(self.claw.open_sign)), ("hull.finger_turn_deg", set(self.hull.finger_turn_deg))]
+        for where, named in [*poses, *claws]:
             if unknown := sorted(named - joints):
                 raise ValueError(f"{where}: there is no joint {unknown[0]!r}")
 
@@ -190,19 +235,19 @@ class Camera:
     cy: float
 
     def ray(self, u_px: float, v_px: float) -> FloatArray:
-        """Direction of a pixel, camera frame, with z = 1; shape (3,)."""
+        """Direction of a pixel in the camera frame with z = 1 (no unit), shape (3,)."""
         return np.array([(u_px - self.cx) / self.fx, (v_px - self.cy) / self.fy, 1.0])
 
     def scaled(self, width: int, height: int) -> Camera:
         """The same camera at another resolution."""
         sx, sy = width / self.width, height / self.height
-        cx = (self.cx + 0.5) * sx - 0.5  # what scales is the distance from the image's edge, at -0.5
+        cx = (self.cx + 0.5) * sx - 0.5  # distances scale from the image's edge, which is at -0.5
         cy = (self.cy + 0.5) * sy - 0.5
         return Camera(width, height, self.fx * sx, self.fy * sy, cx, cy)
 
 
 class Robot:
-    """The description, ready to compute with. Make it with `Robot.load()`."""
+    """The description, ready for computing. Make it with `Robot.load()`."""
 
     def __init__(self, spec: _DescriptionFile) -> None:
         self._spec = spec
@@ -210,8 +255,9 @@ class Robot:
         self.base = spec.base
         self.kinect = spec.kinect
         self.marker = spec.marker
-        self.networks = spec.network
+        self.networks: dict[str, Network] = {str(name): row for name, row in spec.network.items()}
         self.claw = spec.claw
+        self.hull = spec.hull
         self.poses = spec.pose
         self.joints = {joint.name: joint for joint in spec.joint}
         self.links = {
@@ -230,15 +276,14 @@ class Robot:
 
     @classmethod
     def load(cls, path: Path | None = None, override: Path | None = None) -> Robot:
-        """Read the Calliope's own description, or another one.
+        """Read the Calliope's description, or the one in `path`.
 
-        `override` is a robot's own file with just the values that were measured on that robot; tables are
-        merged, and `[[link]]` and `[[joint]]` rows by their name. Raises ConfigError naming file and field.
+        `override` has only the values that were measured on one robot: tables are merged, and rows of `[[link]]`,
+        `[[joint]]` and `[[hull.tube]]` by their name. Raises ConfigError naming file and field.
         """
-        file = path or resources.files("cocoro").joinpath("calliope.toml")
-        where = str(path or "calliope.toml")
+        where = str(path or OWN_FILE)
         try:
-            data = tomllib.loads(file.read_text(encoding="utf-8"))
+            data = tomllib.loads(path.read_text(encoding="utf-8") if path else _own_text())
             if override is not None:
                 where = str(override)
                 _merge(data, tomllib.loads(override.read_text(encoding="utf-8")))
@@ -248,22 +293,29 @@ class Robot:
 
     @classmethod
     def from_data(cls, data: Any, where: str = "robot description") -> Robot:
-        """From what `to_data` gave. Raises ConfigError naming the field."""
+        """The robot that `to_data` described. Raises ConfigError naming the field.
+
+        Captures carry the description as data. Those from before the description had `[hull]`, `claw.level_roll_deg`
+        and the networks' `command_timeout_s` get the Calliope's hull and level roll, and the timeout of their base.
+        """
         try:
-            return cls(msgspec.convert(data, _DescriptionFile))
+            return cls(msgspec.convert(_completed(data), _DescriptionFile))
         except msgspec.ValidationError as error:
             raise ConfigError(f"{where}: {error}") from error
 
     def to_data(self) -> dict[str, Any]:
-        """The description as plain data, everything resolved."""
-        data: dict[str, Any] = msgspec.to_builtins(msgspec.structs.replace(self._spec, base=self.base))
+        """The whole description as plain data."""
+        data: dict[str, Any] = msgspec.to_builtins(self._spec)
         return data
 
     def with_base(self, **changes: float) -> Robot:
         """The same robot with other values in its `[base]` table."""
-        other = copy(self)
-        other.base = msgspec.structs.replace(self.base, **changes)
-        return other
+        return Robot(msgspec.structs.replace(self._spec, base=msgspec.structs.replace(self.base, **changes)))
+
+    def with_networks(self, **changes: float) -> Robot:
+        """The same robot with other values in both of its `[network]` tables."""
+        networks = {name: msgspec.structs.replace(row, **changes) for name, row in self._spec.network.items()}
+        return Robot(msgspec.structs.replace(self._spec, network=networks))
 
     def network_joints(self, network: str) -> tuple[str, ...]:
         """The joints of one servo network, in the order of their servo IDs."""
@@ -271,9 +323,11 @@ class Robot:
         return tuple(joint.name for joint in sorted(rows, key=lambda joint: joint.id))
 
     def chain(self, tip: str) -> Chain:
+        """The links from the body to the tip. Raises KeyError naming a link that is missing."""
         return Chain(self.links, tip)
 
     def tree(self, *tips: str) -> Tree:
+        """The links from the body to the tips. Raises KeyError naming a link that is missing."""
         return Tree(self.links, tips)
 
     @cached_property
@@ -289,11 +343,12 @@ class Robot:
         )
 
     def depth_m(self, raw: CodeArray) -> Float32Array:
-        """Raw 11-bit depth codes to metres along the optical axis; no data (2047 and beyond) becomes NaN."""
+        """Metres along the optical axis for raw 11-bit depth codes, in their shape; no data (2047 and above) is NaN."""
         return self._depth_table[np.minimum(raw, 2047)]
 
     def depth_code(self, depth_m: FloatArray) -> CodeArray:
-        """Metres to raw codes, 2047 outside of the range; the inverse of `depth_m` up to quantisation."""
+        """Raw codes for metres along the optical axis, in their shape: the inverse of `depth_m` up to quantisation.
+        Outside of the sensor's range it is 2047."""
         a, b, c = self.kinect.depth_curve
         inside = (depth_m >= self.kinect.min_range_m) & (depth_m <= self.kinect.max_range_m)
         codes = np.rint(b * (np.arctan(np.where(inside, depth_m, 1.0) / a) - c))
@@ -307,6 +362,25 @@ class Robot:
         table[2047] = np.nan
         table[table > 2 * self.kinect.max_range_m] = np.nan
         return table.astype(np.float32)
+
+
+def _own_text() -> str:
+    return resources.files("cocoro").joinpath(OWN_FILE).read_text(encoding="utf-8")
+
+
+def _completed(data: Any) -> Any:
+    """Recorded data with the fields that descriptions did not have yet when it was recorded."""
+    if not isinstance(data, dict):
+        return data
+    own = tomllib.loads(_own_text())
+    claw, base, networks = (data.get(name) for name in ("claw", "base", "network"))
+    data = {"hull": own["hull"], **data}
+    if isinstance(claw, dict):
+        data["claw"] = {"level_roll_deg": own["claw"]["level_roll_deg"], **claw}
+    if isinstance(networks, dict) and isinstance(base, dict) and "command_timeout_s" in base:
+        timeout = {"command_timeout_s": base["command_timeout_s"]}
+        data["network"] = {name: timeout | row if isinstance(row, dict) else row for name, row in networks.items()}
+    return data
 
 
 def _merge(into: dict[str, Any], extra: dict[str, Any]) -> None:

@@ -1,1 +1,1 @@
-"""The simulated Calliope and its world: it publishes and obeys exactly the hardware's keys."""
+"""The simulated Calliope and its world. It uses the topics of the real hardware, so services cannot tell them apart."""

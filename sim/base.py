@@ -1,6 +1,6 @@
-"""The Create as its driver finds it: reflexes at the hardware, ramped wheels, counters in whole units.
+"""The simulated base: the Create's reflexes, wheel ramp and counters, and the base service's deadman and odometry.
 
-Pure: told the time and what its wheels and bumper did, asked how its wheels are to turn.
+Pure. The world passes in the time and what the wheels and the bumper did, and asks for the wheel speeds to drive.
 """
 
 from __future__ import annotations
@@ -14,22 +14,23 @@ from cocoro.robot import Base
 
 
 class CreateCounters:
-    """Way and turn since they were last asked for, whole millimetres and degrees; the rest is forgotten."""
+    """Distance and angle since the last reading, in whole millimetres and degrees; the remainder is lost, as on a
+    Create."""
 
     def __init__(self, separation_m: float) -> None:
         self._separation_m = separation_m
-        self._way_m = 0.0
+        self._distance_m = 0.0
         self._turn_rad = 0.0
 
     def roll(self, left_m: float, right_m: float) -> None:
-        """Count what the wheels' encoders measured."""
-        self._way_m += (left_m + right_m) / 2
+        """Add what the wheel encoders measured."""
+        self._distance_m += (left_m + right_m) / 2
         self._turn_rad += (right_m - left_m) / self._separation_m
 
     def take(self) -> tuple[int, int]:
-        """distance in mm and angle in degrees, rounded towards zero; both counters start anew."""
-        report = int(self._way_m * 1000.0), int(degrees(self._turn_rad))
-        self._way_m = self._turn_rad = 0.0
+        """Distance in mm and angle in degrees, rounded towards zero. Resets both counters."""
+        report = int(self._distance_m * 1000.0), int(degrees(self._turn_rad))
+        self._distance_m = self._turn_rad = 0.0
         return report
 
 
@@ -44,9 +45,9 @@ class Bumper:
 
 
 class MobileBase:
-    """The base service: deadman, emergency stop, bump reflex, ramp and odometry.
+    """The base service and its Create: deadman, emergency stop, bump reflex, ramp and odometry.
 
-    With `exact` the odometry is that of perfect encoders, otherwise what a driver makes of the Create's reports.
+    With `exact` the odometry comes from perfect encoders, otherwise from the Create's reports, as in a real driver.
     """
 
     def __init__(self, base: Base, *, exact: bool) -> None:
@@ -61,35 +62,35 @@ class MobileBase:
         self._valid_until_ns = -1
         self._next_report_ns = 0
         self.stopped_by = ""
-        """Why the wheels do not turn as they were asked to; '' when they do."""
+        """Why the wheels do not turn as commanded; '' when they do."""
 
     def command(self, command: BaseCommand, now_ns: int) -> str:
-        """Take wheel speeds, valid for as long as `Base.patience_s` has it from when they were said (without a stamp:
-        from now). Returns '' when taken, otherwise why not."""
+        """Accept wheel speeds. They expire `Base.patience_s` after the command's stamp (without a stamp: after now).
+        Returns '' when accepted, otherwise the reason for refusing."""
         if self.latch != "released":
             return _latch_text(self.latch)
         self._wanted = command.left_mps, command.right_mps
-        said_ns = min(command.stamp_ns or now_ns, now_ns)
-        self._valid_until_ns = said_ns + round(self._base.patience_s(self._faster_mps()) * 1e9)
+        sent_ns = min(command.stamp_ns or now_ns, now_ns)
+        self._valid_until_ns = sent_ns + round(self._base.patience_s(self._faster_mps()) * 1e9)
         return ""
 
     def _faster_mps(self) -> float:
-        """The faster wheel's speed, of what is wanted."""
+        """Commanded speed of the faster wheel."""
         return min(max(abs(speed) for speed in self._wanted), self._base.max_wheel_speed_mps)
 
     def set_latch(self, state: LatchState) -> None:
-        """Latched and unknown command zero; a command from before counts no more after the release. From any thread."""
+        """Latched and unknown stop the wheels; a release does not revive an earlier command. Thread-safe."""
         self.latch = state
         self._valid_until_ns = -1
 
     def wheels(self, now_ns: int, dt_s: float) -> tuple[float, float]:
-        """Advance the ramp by one step. Returns the wheel speeds that the motors are to turn at, left and right."""
-        left, right = self._obeyed(now_ns)
+        """Advance the ramp by one step. Returns the speeds to drive the left and the right wheel at, m/s."""
+        left, right = self._allowed_mps(now_ns)
         self.ramp.advance(left, right, dt_s)
         return self.ramp.left_mps, self.ramp.right_mps
 
     def rolled(self, left_m: float, right_m: float, now_ns: int, dt_s: float) -> None:
-        """What the encoders measured in the step that ended now."""
+        """Take what the encoders measured in the step that ended now."""
         if self._exact:
             self.odometry.advance(left_m, right_m, dt_s)
             return
@@ -113,8 +114,8 @@ class MobileBase:
             stopped_by=self.stopped_by,
         )
 
-    def _obeyed(self, now_ns: int) -> tuple[float, float]:
-        """The commanded speeds as far as the reflexes let them through."""
+    def _allowed_mps(self, now_ns: int) -> tuple[float, float]:
+        """The part of the commanded speeds that deadman, emergency stop and bump reflex allow; left, right."""
         self.stopped_by = ""
         if self.latch != "released":
             self.stopped_by = _latch_text(self.latch)
@@ -124,10 +125,10 @@ class MobileBase:
             return 0.0, 0.0
         left, right = self._wanted
         if self.bumper.pressed and left + right > 0.0:
-            # Forward is forbidden, turning on the spot is not: a round base may turn away.
+            # A round base may still turn on the spot.
             self.stopped_by = "bump"
-            ahead = (left + right) / 2
-            return left - ahead, right - ahead
+            forward = (left + right) / 2
+            return left - forward, right - forward
         return left, right
 
 

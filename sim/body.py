@@ -1,8 +1,8 @@
-"""The simulated robot's solid parts: shapes, masses and colours, on the links of the one robot description.
+"""The solid parts of the simulated robot: shapes, masses and colours, attached to the links of the robot description.
 
-The kinematics, the chassis, the mounting box, the pads' length and the marker come from the description. What
-is ours is here: how thick a link is, what it weighs, and the claws' flat parallel pads at equal height (the
-maker's drawing has them 32 mm apart, which tips a can).
+The kinematics, the chassis, the mounting box, the pads' length and the marker come from the description. This module
+adds what the description lacks: the thickness and mass of each link. It also puts the claws' pads at equal height; in
+the maker's drawing they are 32 mm apart, which would tip a can over.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from cocoro.robot import Robot
 from sim.render.interface import Shape
 
 PAD_GAP_M = 0.072
-"""Between the pads at claw angle 0, where they are parallel: a can of 66 mm is held within 3 degrees of it."""
+"""Distance of the pads at claw angle 0, where they are parallel. They hold a 66 mm can at less than 3 degrees."""
 PAD_HEIGHT_M = 0.030
 PAD_THICKNESS_M = 0.008
 CASTER_RADIUS_M = 0.010
 CASTER_X_M = 0.135
 CHASSIS = "chassis"
-"""The root link; its frame is the body frame of the description."""
+"""Name of the root link. Its frame is the description's body frame."""
 
 _WHITE = (0.82, 0.82, 0.80)
 _GREY = (0.45, 0.45, 0.46)
@@ -33,7 +33,7 @@ _MAGENTA = (0.85, 0.05, 0.65)
 
 @dataclass(frozen=True)
 class Friction:
-    """Coefficients of a link; a contact has the product of the two bodies'. Spinning and rolling in metres."""
+    """Friction coefficients of a link (spinning and rolling in metres). A contact has the product of both bodies'."""
 
     lateral: float = 0.6
     spinning: float = 0.0
@@ -42,24 +42,22 @@ class Friction:
 
 @dataclass(frozen=True)
 class Part:
-    """One primitive, rigid on a link of the description. Sizes as in `Visual`."""
+    """One primitive, rigidly attached to a link of the description. Sizes as in `Visual`."""
 
     name: str
     shape: Shape
     size_m: tuple[float, ...]
     position_m: tuple[float, float, float]
-    """Its centre in the link's frame."""
+    """Centre, in the link's frame."""
     rgb: tuple[float, float, float]
     mass_kg: float = 0.0
     axis: str = "z"
-    """Along which axis of the link a cylinder lies."""
+    """Axis of the link along which a cylinder lies."""
     solid: bool = True
-    """False for what is only seen, or only weighs."""
-    seen: bool = True
-    """False for what is only touched, or only weighs."""
+    """Whether it collides."""
 
     def pose(self) -> FloatArray:
-        """4 x 4 transform from the part's frame to its link's."""
+        """Transform from the part's frame to its link's, (4, 4)."""
         total = np.eye(4)
         if self.axis == "x":
             total[:3, :3] = [[0, 0, 1], [0, 1, 0], [-1, 0, 0]]
@@ -69,7 +67,7 @@ class Part:
         return total
 
     def inertia(self) -> FloatArray:
-        """Of the part's mass, evenly filled, about its own centre in the link's axes; 3 x 3, kg m2."""
+        """Inertia of the homogeneous part about its centre, in the link's axes; (3, 3), kg m^2."""
         if self.shape == "box":
             x, y, z = self.size_m
             diagonal = [(y * y + z * z) / 12, (x * x + z * z) / 12, (x * x + y * y) / 12]
@@ -85,7 +83,7 @@ class Part:
 
 @dataclass(frozen=True)
 class Extra:
-    """A link that the kinematic table does not have: fixed on the chassis, or a wheel that turns about y."""
+    """A link that is not in the description: fixed on the chassis, or a wheel that turns about y."""
 
     name: str
     position_m: tuple[float, float, float]
@@ -94,7 +92,7 @@ class Extra:
 
 @dataclass(frozen=True)
 class SimBody:
-    """All parts by link, the links that the table lacks, and what rubs."""
+    """Everything solid: parts by link, the links that the description lacks, and friction by link."""
 
     parts: dict[str, list[Part]]
     extras: list[Extra]
@@ -106,9 +104,9 @@ class SimBody:
 
 
 def calliope_body(robot: Robot) -> SimBody:
-    """The Calliope's parts; the chassis takes what is left of the whole mass.
+    """Build the Calliope's parts. The chassis gets the rest of the robot's mass.
 
-    The arm's masses give the static shoulder torque of the design: 1.6 N m at full reach, empty.
+    The arm's masses give a static shoulder torque of 1.6 N m at full reach with an empty hand, as designed.
     """
     base, mount = robot.base, robot.kinect
     low, high = np.array(mount.mount_min_m), np.array(mount.mount_max_m)
@@ -160,8 +158,8 @@ def calliope_body(robot: Robot) -> SimBody:
     centre_z = CASTER_RADIUS_M + height / 2
     parts[CHASSIS] = [
         Part("chassis", "cylinder", (radius, height), (0, 0, centre_z), _METAL, rest - 0.9),
-        # The battery stands behind the axle, against the arm.
-        Part("battery", "box", (0.08, 0.16, 0.05), (-0.10, 0, centre_z), _DARK, 0.9, solid=False, seen=False),
+        # The battery sits behind the axle, as a counterweight to the arm.
+        Part("battery", "box", (0.08, 0.16, 0.05), (-0.10, 0, centre_z), _DARK, 0.9, solid=False),
     ]
     arm_foot = (float(shoulder_x), float(arm_y), (top_m + arm_z - 0.028) / 2)
     return SimBody(
@@ -185,21 +183,21 @@ def calliope_body(robot: Robot) -> SimBody:
 
 
 def _wheel(name: str, radius_m: float) -> list[Part]:
-    """A wheel that touches the floor in one point, in the middle of its tread: where in a tread's width a wheel
-    pivots is not the solver's to choose."""
+    """A wheel that touches the floor in one point, the middle of its tread: the solver then cannot choose where within
+    the tread's width the wheel pivots."""
     return [
         Part(name, "cylinder", (radius_m, 0.02), (0, 0, 0), _DARK, 0.15, "y", solid=False),
-        Part(f"{name}_tread", "sphere", (radius_m,), (0, 0, 0), _DARK, seen=False),
+        Part(f"{name}_tread", "sphere", (radius_m,), (0, 0, 0), _DARK),
     ]
 
 
 def _claw(robot: Robot, claw: str) -> list[Part]:
-    """One claw in its own link's frame, whose x points away from the roll axis: pad and bracket."""
+    """Pad and bracket of one claw, in the claw link's frame, whose x points away from the roll axis."""
     hand = dict.fromkeys(robot.joints, 0.0)
     root, tip = robot.chain("wrist_roll").pose(hand), robot.chain("pad_centre").pose(hand)
     to_claw = np.linalg.inv(robot.chain(claw).pose(hand))
-    reach = float((to_claw @ tip)[1, 3])  # along the roll axis, from the claw's own axis
-    offset = -float((to_claw @ root)[0, 3])  # of the claw's axis from the roll axis
+    reach = float((to_claw @ tip)[1, 3])  # from the claw's axis to the pad, along the roll axis
+    offset = -float((to_claw @ root)[0, 3])  # from the roll axis to the claw's axis
     face = PAD_GAP_M / 2 - offset
     middle = face + PAD_THICKNESS_M / 2
     length = robot.claw.pad_length_m

@@ -1,4 +1,4 @@
-"""PyBullet, imported without its banner, one client object a world."""
+"""PyBullet, imported without its banner; one client object for each world."""
 
 from __future__ import annotations
 
@@ -13,8 +13,7 @@ from typing import Any
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Send what is written to file descriptors 1 and 2 to nowhere, whether Python or C code writes it: a tool's
-    `--json` must hold nothing else, and a log file no banner."""
+    """Discard what Python or C code writes to file descriptors 1 and 2, so that no banner gets into JSON or logs."""
     libc = ctypes.CDLL(None)
     sys.stdout.flush()
     sys.stderr.flush()
@@ -43,8 +42,8 @@ with _quiet():
 
 
 class Bullet:
-    """One PyBullet client without a window. Every function and constant of `pybullet` is an attribute; the
-    functions are bound to this client, so that worlds in one process do not meet."""
+    """A PyBullet client without a window. Its attributes are the functions and constants of `pybullet`; the functions
+    are bound to this client, so that several worlds can live in one process."""
 
     def __init__(self) -> None:
         self.client: int = pybullet.connect(pybullet.DIRECT)
@@ -57,7 +56,7 @@ class Bullet:
         return value
 
     def close(self) -> None:
-        """Free the world. Closing twice is harmless."""
+        """Free the world. May be called twice."""
         if self.client >= 0:
             pybullet.disconnect(physicsClientId=self.client)
             self.client = -1

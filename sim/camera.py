@@ -1,9 +1,8 @@
-"""The simulated Kinect: from a perfect look at the world to what the sensor would have delivered.
+"""The simulated Kinect: turns rendered images into what the sensor would deliver.
 
-`ideal` quantises and nothing else. `real` adds what a rendered picture lacks; each effect is one function here
-or in `sensor_effects`, its strength a constant with its source. Every draw depends on the run's seed and the
-frame's stamp alone, so a frame does not depend on how many were taken before it (but for the motion blur,
-which needs the pose of the frame before).
+`ideal` sensors only quantise. `real` ones add the sensor's errors: each is one function here or in `sensor_effects`,
+its strength a constant with its source. Random draws depend only on the run's seed and the frame's stamp, so a frame
+does not depend on the number of frames before it. Motion blur is the exception: it needs the previous frame's pose.
 """
 
 from __future__ import annotations
@@ -29,28 +28,28 @@ from sim.sensor_effects import (
 )
 
 EXPOSURE_S = 1 / 30
-"""The Kinect's colour camera exposes for the whole of its frame period in a room's light."""
+"""In indoor light the Kinect's colour camera exposes for its whole frame period."""
 MAX_FRAME_GAP_S = 0.5
-"""Two poses further apart than this say nothing about the motion while the shutter was open."""
+"""Two poses further apart in time than this do not tell the motion during the exposure."""
 COLOUR_SIGMA = 4.0
-"""Of 255, a pixel and channel. Decided for the simulated robot."""
+"""Standard deviation of each pixel and channel, of 255. Chosen for the simulated robot."""
 DEPTH_SIGMA_PER_M = 0.0015
-"""Depth noise grows with z squared, as it must where disparity has constant noise (Khoshelham and Oude Elberink
-2012 measured 0.00143 for this sensor)."""
+"""Standard deviation of depth divided by z squared: constant noise of the disparity (Khoshelham and Oude Elberink 2012
+measured 0.00143 for this sensor)."""
 EXPOSURE_DRIFT = 0.10
 WHITE_BALANCE_DRIFT = 0.05
 DRIFT_S = 5.0
-"""From one extreme to the other."""
+"""Time from one extreme to the other."""
 
 
 class SimKinect:
     """Takes frames of the world that a renderer draws.
 
     Args:
-        robot: whose Kinect it is: range, depth curve, where depth camera and projector stand.
+        robot: gives the Kinect's range and depth curve, and the places of its depth camera and projector.
         renderer: made for `robot.camera.scaled(width, height)`.
-        sensors: `ideal` for a perfect camera, `real` for this one's faults.
-        seed: of the run; every random draw comes from it.
+        sensors: `ideal` for a perfect camera, `real` for one with this sensor's errors.
+        seed: seed of the run, from which every random draw comes.
 
     Raises ConfigError when the renderer draws pictures of another size.
     """
@@ -88,11 +87,11 @@ class SimKinect:
             self._white_balance = Drift(rng, WHITE_BALANCE_DRIFT, DRIFT_S)
 
     def capture(self, poses: FloatArray, camera_pose: FloatArray, stamp_ns: int, light: Lighting) -> Frame:
-        """The frame whose exposure has its middle at `stamp_ns`.
+        """Take the frame whose exposure has its middle at `stamp_ns`.
 
         Args:
-            poses: of the visuals in the world, (n, 4, 4).
-            camera_pose: of the colour camera's optical frame in the world, (4, 4).
+            poses: world poses of the visuals, (n, 4, 4).
+            camera_pose: world pose of the colour camera's optical frame, (4, 4).
         """
         images = self._renderer.render(
             poses,
@@ -125,8 +124,7 @@ class SimKinect:
         stamp_ns: int,
         rng: np.random.Generator,
     ) -> ImageArray:
-        """What the colour sensor makes of the light: smeared by the motion, scaled by exposure and white
-        balance, with noise."""
+        """Apply the colour camera's errors: motion blur, exposure, white balance and noise. (height, width, 3), RGB."""
         if self._before is not None:
             gap_s = (stamp_ns - self._before[0]) / 1e9
             if 0 < gap_s <= MAX_FRAME_GAP_S:
@@ -138,21 +136,21 @@ class SimKinect:
         return self._colour_noise.add(scale_channels(colour, gains), rng)
 
     def _measure(self, depth_m: Float32Array, rng: np.random.Generator) -> CodeArray:
-        """What the depth camera reports: noise before quantising; nothing out of range, in the projector's
-        shadow (negative metres) and here and there on edges."""
+        """Convert depth (height, width), m, to the depth camera's codes: noise is added before quantising; there is no
+        data out of range, in the projector's shadow (negative metres) and for some pixels on edges."""
         return drop_edges(self._coder.codes(self._depth_noise.add(depth_m, rng)), rng)
 
 
 def moved(camera_pose: FloatArray, offset_m: FloatArray) -> FloatArray:
-    """The pose of something that looks the same way as the camera from `offset_m` (3,) in its frame."""
+    """Camera pose (4, 4), shifted by `offset_m` (3,) in the camera's frame."""
     pose = camera_pose.copy()
     pose[:3, 3] += camera_pose[:3, :3] @ offset_m
     return pose
 
 
 def _keep_freed_memory() -> None:
-    """Have the C library keep what is freed for the next frame, instead of giving it back to the system and
-    faulting in fresh pages 30 times a second, which would cost as much as the depth picture does. glibc raises its
-    limit to the size of the largest block that was freed; elsewhere this does nothing."""
+    """Make glibc keep freed memory for the next frame. Returning it to the system and faulting in fresh pages 30 times
+    a second would cost as much as the depth picture. glibc raises its limit to the largest block that was freed; with
+    another C library this does nothing."""
     largest = np.empty(31 * 1024 * 1024, np.uint8)
     del largest

@@ -1,4 +1,4 @@
-"""Who touches whom: PyBullet's contact points under the names of the description and the scene."""
+"""Contacts: PyBullet's contact points by the names of the description and the scene."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from sim.body import CHASSIS
 from sim.stage import FLOOR
 
 BUMPER_HALF_DEG = 90.0
-"""The bumper spans the front half of the chassis."""
+"""The bumper covers the front half of the chassis."""
 BUMPER_OVERLAP_DEG = 20.0
-"""Pressed within so much of straight ahead, both of its switches close."""
+"""A contact within this angle of straight ahead closes both switches."""
 ROLLS_ON_FLOOR = frozenset({"wheel_left", "wheel_right", "caster_front", "caster_rear"})
 
 ContactPair = tuple[str, str]
@@ -25,10 +25,10 @@ ContactPair = tuple[str, str]
 def touching_pairs(
     points: Iterable[tuple[Any, ...]], robot_body: int, link_names: Mapping[int, str], names: Mapping[int, str]
 ) -> tuple[frozenset[ContactPair], list[tuple[float, float, float]]]:
-    """The names that press on each other, robot links first (of two, the one further from the root), and where
-    something presses on the chassis.
+    """Pairs of names in contact, and the world points (m) at which something touches the chassis.
 
-    A pair that is merely near is none: only contacts with a force count.
+    A robot link comes first in a pair; of two links, the one further from the root. Only contacts with a force count,
+    not bodies that are merely near.
     """
     pairs: set[ContactPair] = set()
     on_chassis: list[tuple[float, float, float]] = []
@@ -47,7 +47,8 @@ def touching_pairs(
 
 
 def bumper(points_m: Iterable[tuple[float, float, float]], body_pose: FloatArray) -> Bumper:
-    """Which of the bumper's switches the contact points on the chassis close."""
+    """The bumper's switches that these contact points on the chassis close. `points_m`: world points; `body_pose`: (4,
+    4)."""
     left = right = False
     for point in points_m:
         x, y, _ = body_pose[:3, :3].T @ (np.array(point) - body_pose[:3, 3])
@@ -59,8 +60,8 @@ def bumper(points_m: Iterable[tuple[float, float, float]], body_pose: FloatArray
 
 
 def collisions(pairs: Iterable[ContactPair], links: frozenset[str], objects: frozenset[str]) -> tuple[str, ...]:
-    """The robot's contacts that are no part of its work: not wheels on the floor, not claws on an object,
-    not the claws closed on each other. 'link~other', sorted."""
+    """Unwanted contacts of the robot as 'link~other', sorted: all except wheels and casters on the floor, claws on an
+    object, and the claws on each other."""
     claws = {link for link in links if link.startswith("claw_")}
     return tuple(
         sorted(

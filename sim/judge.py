@@ -1,4 +1,4 @@
-"""What really became of a task, by the simulator's truth and never by the robot's own belief."""
+"""Judges tasks and pursuits by the simulator's truth, never by the robot's own belief."""
 
 from __future__ import annotations
 
@@ -24,31 +24,31 @@ CLAWS = frozenset({"claw_left", "claw_right"})
 
 
 class Verdict(msgspec.Struct, frozen=True, kw_only=True):
-    """Of the run up to the newest truth."""
+    """The outcome of a run up to the newest truth."""
 
     lifted_m: float
-    """How much higher the target's lowest point is than at the start."""
+    """Height gained by the target's lowest point since the start."""
     held: bool
-    """The target's lowest point at least 0.10 m above the floor for the last 2 s, touching both claws and nothing
-    else in all that time."""
+    """For the last 2 s the target's lowest point was at least 0.10 m above the floor, and the target touched both claws
+    and nothing else."""
     knocked_over: tuple[str, ...]
-    """Objects that tilted by more than 30 degrees (not balls) or moved by more than 5 cm; the target only until
-    both claws first touched it. What moves by itself does not count."""
+    """Objects that tilted by more than 30 degrees (balls excepted) or moved by more than 5 cm; the target counts only
+    until both claws first touched it, and objects that move by themselves never count."""
     collisions: tuple[str, ...]
-    """Contacts of the robot that are no part of its work ('elbow~green_can'), each once, in order of appearance."""
+    """Unwanted contacts of the robot ('elbow~green_can'), each once, in order of appearance."""
     target_moved_m: float
-    """How far the target was from its first place, level, at most, until both claws first touched it."""
+    """Largest horizontal distance of the target from its first place, until both claws first touched it."""
     target_from_start_m: float | None = None
-    """How far the target is, level, from where the robot stood at first; None without a target."""
+    """Horizontal distance of the target from the robot's first place; None without a target."""
     target_standing: bool | None = None
-    """The target stands on the floor, upright, and touches nothing else."""
+    """Whether the target stands upright on the floor and touches nothing else; None without a target."""
 
 
 class Judge:
-    """Feed it every truth, 30 to 60 a second, from the start of the task on.
+    """Judges a task. Feed it every truth (30 to 60 a second) from the start of the task on.
 
-    `target` is the label of what is to be fetched, or '' for a task without one. Raises KeyError for a label
-    that the scene has not.
+    `target` is the label of the object to fetch, or '' for a task without one. Raises KeyError for a label that is not
+    in the scene.
     """
 
     def __init__(self, scene: Scene, target: str = "") -> None:
@@ -115,7 +115,7 @@ class Judge:
             self._knocked[item.label] = None
 
     def _feed_target(self, item: TrueObject, known: SceneObject, *, fresh: bool) -> None:
-        self._bottom_m = item.position_m[2] - _reach_down_m(known, item)
+        self._bottom_m = item.position_m[2] - _bottom_depth_m(known, item)
         if fresh:
             self._first_bottom_m = self._bottom_m
         self._grasped |= set(item.touching) >= CLAWS
@@ -126,7 +126,7 @@ class Judge:
 
 
 def _upright(item: TrueObject) -> tuple[float, float, float]:
-    """The world's z in the object's axes."""
+    """The world's z axis in the object's frame."""
     x, y, z, w = item.orientation
     return 2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)
 
@@ -135,8 +135,8 @@ def _tilt_deg(item: TrueObject) -> float:
     return degrees(acos(min(max(_upright(item)[2], -1.0), 1.0)))
 
 
-def _reach_down_m(known: SceneObject, item: TrueObject) -> float:
-    """From the object's centre down to its lowest point."""
+def _bottom_depth_m(known: SceneObject, item: TrueObject) -> float:
+    """Height of the object's centre above its lowest point."""
     sizes = known.dimensions_m
     if known.shape == "sphere":
         return sizes[0]
@@ -148,20 +148,21 @@ def _reach_down_m(known: SceneObject, item: TrueObject) -> float:
 
 
 class Pursuit(msgspec.Struct, frozen=True, kw_only=True):
-    """Of a follow task, from the moment that following began."""
+    """How a follow task went, from the moment at which following began."""
 
     mean_gap_m: float
-    """From the robot's centre to the target's nearest edge, level."""
+    """Horizontal distance from the robot's centre to the target's nearest edge."""
     max_gap_m: float
     min_gap_m: float
     lost_s: float
-    """The longest time in which the camera did not have the target's centre in its picture."""
+    """Longest time for which the target's centre was outside the camera's picture."""
     contacts: int
-    """Times that the robot began to touch anything but the floor."""
+    """How many times the robot began to touch anything except the floor."""
 
 
 class PursuitJudge:
-    """Feed it every truth; `begin` when following begins. Raises KeyError for a target that the scene has not."""
+    """Judges a pursuit. Feed it every truth, and call `begin` when following begins. Raises KeyError for a target that
+    is not in the scene."""
 
     def __init__(self, robot: Robot, scene: Scene, target: str) -> None:
         self._camera = robot.camera
@@ -182,8 +183,8 @@ class PursuitJudge:
         if not self._begun:
             return
         target = next(item for item in truth.objects if item.label == self._target)
-        level = hypot(target.position_m[0] - truth.body_m[0], target.position_m[1] - truth.body_m[1])
-        self._gaps_m.append(level - self._radius_m)
+        distance_m = hypot(target.position_m[0] - truth.body_m[0], target.position_m[1] - truth.body_m[1])
+        self._gaps_m.append(distance_m - self._radius_m)
         if self._seen_ns is None or self._in_picture(truth, target):
             self._seen_ns = truth.stamp_ns
         self._longest_ns = max(self._longest_ns, truth.stamp_ns - self._seen_ns)

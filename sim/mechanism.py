@@ -1,4 +1,4 @@
-"""The robot's body in PyBullet: its motors, its joints and where its links are."""
+"""The robot's body in PyBullet: its motors, joints and link poses."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from sim.scene import Start
 from sim.servos import Drive
 
 WHEEL_TORQUE_NM = 1.0
-"""At the rim 33 N a wheel: a third of the robot's weight. Ours; the maker gives none."""
+"""Torque of a wheel: 33 N at its rim, a third of the robot's weight. Chosen; the maker publishes none."""
 WHEEL_LAG_RAD = 0.05
-"""A blocked wheel is not wound up further behind its goal than this."""
+"""Upper bound for how far a blocked wheel lags behind its goal."""
 REST_LAG_RAD = 0.0005
-"""A wheel that is to stand, but is blocked before its goal, gives up what is more than this: it does not go on
-pressing against what stopped it. Enough against creep."""
+"""Upper bound for the lag of a wheel that is commanded to stand: a blocked wheel then stops pressing against the
+obstacle, while the wheel still does not creep."""
 WHEEL_GAIN = 0.2
-"""Share of a wheel's lag that is made up for in one step."""
+"""Share of a wheel's lag that one step corrects."""
 
 
 class JointReading(NamedTuple):
@@ -38,7 +38,7 @@ class JointReading(NamedTuple):
 
 
 class Mechanism:
-    """Loads the robot with its wheels on the floor at the start pose, the servos at the given angles."""
+    """The robot, loaded with its wheels on the floor at the start pose and its servos at `angles_rad`."""
 
     def __init__(
         self, bullet: Bullet, robot: Robot, model: RobotModel, start: Start, angles_rad: Mapping[str, float]
@@ -58,7 +58,7 @@ class Mechanism:
         self.index: dict[str, int] = {CHASSIS: -1} | {info[12].decode(): info[0] for info in infos}
         self.link_names: dict[int, str] = {index: name for name, index in self.index.items()}
         self.joints = tuple(robot.joints)
-        """The order of `read()`'s servo joints."""
+        """Servo joints, in the order of `read()`."""
         joint_of_link = {link.name: link.joint for link in robot.links.values() if link.joint}
         link_of_joint = {joint: link for link, joint in joint_of_link.items()}
         self._motors = {joint: self.index[link_of_joint[joint]] for joint in self.joints}
@@ -66,7 +66,7 @@ class Mechanism:
         self._wheel_rad = [0.0, 0.0]
         self._wheel_goal_rad = [0.0, 0.0]
         self._read_indices = [*self._motors.values(), *self._wheels]
-        # PyBullet tells the root's pose at its centre of mass.
+        # PyBullet gives the pose of the root's centre of mass.
         self._root_offset = np.array(bullet.getDynamicsInfo(self.body, -1)[3])
         self._link_indices = list(range(len(infos)))
         self._prepare(model, angles_rad)
@@ -82,8 +82,8 @@ class Mechanism:
         )
 
     def spin(self, left_radps: float, right_radps: float, dt_s: float) -> None:
-        """Turn the wheels at these speeds for the next step, as a controller with encoders does: what a wheel
-        lags or creeps in one step is made up for in the next."""
+        """Turn the wheels at these speeds for the next step, as a controller with encoders does: the lag of one step is
+        corrected in the next."""
         for number, speed_radps in enumerate((left_radps, right_radps)):
             lag = self._wheel_goal_rad[number] - self._wheel_rad[number]
             lag = min(max(lag, -WHEEL_LAG_RAD), WHEEL_LAG_RAD)
@@ -103,19 +103,19 @@ class Mechanism:
             )
 
     def read(self) -> list[JointReading]:
-        """All servo joints in the order of `joints`, then the left and the right wheel."""
+        """Readings of the servo joints in the order of `joints`, then of the left and the right wheel."""
         states = self._bullet.getJointStates(self.body, self._read_indices)
         self._wheel_rad = [state[0] for state in states[-2:]]
         return [JointReading(angle, speed, torque) for angle, speed, _, torque in states]
 
     def root(self) -> tuple[Vec3, Quaternion]:
-        """Origin and orientation of the body frame in the world."""
+        """World position (m) and orientation (x, y, z, w) of the body frame."""
         pose = self.root_pose()
         x, y, z = (float(value) for value in pose[:3, 3])
         return (x, y, z), self._bullet.getBasePositionAndOrientation(self.body)[1]
 
     def root_pose(self) -> FloatArray:
-        """4 x 4 transform from the body frame to the world."""
+        """World pose of the body frame, (4, 4)."""
         position, orientation = self._bullet.getBasePositionAndOrientation(self.body)
         pose = np.eye(4)
         pose[:3, :3] = rotation(orientation)
@@ -123,7 +123,7 @@ class Mechanism:
         return pose
 
     def link_poses(self) -> FloatArray:
-        """Of every link in the world, shape (links + 1, 4, 4): row i is PyBullet's link i, the last the root."""
+        """World poses of all links, (links + 1, 4, 4): row i is PyBullet's link i, the last row the root."""
         states = self._bullet.getLinkStates(self.body, self._link_indices, computeForwardKinematics=1)
         poses = np.zeros((len(states) + 1, 4, 4))
         poses[:-1, :3, :3] = rotations(np.array([state[5] for state in states]))

@@ -1,4 +1,4 @@
-"""The robot as a URDF, written from the robot description and the table of its parts."""
+"""Writes the robot as a URDF, from the robot description and the table of its parts."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from sim.render.interface import Visual
 WHEELS = ("wheel_left", "wheel_right")
 
 _NEIGHBOURS = {
-    # Links that touch where they are joined, or that turn inside one another. Every other pair may collide.
+    # Pairs of links that touch at their joint or turn inside each other. Every other pair may collide.
     frozenset(pair)
     for pair in (
         (CHASSIS, "arm_base"),
@@ -42,24 +42,24 @@ _FIXED = frozenset({CHASSIS, "mount", "riser", *WHEELS, "caster_front", "caster_
 
 @dataclass(frozen=True)
 class RobotModel:
-    """What the simulator loads, and how its links carry the description's."""
+    """The URDF that the simulator loads, and how its links carry those of the description."""
 
     urdf: str
     links: tuple[str, ...]
-    """The root first. PyBullet numbers them in its own way: ask it for the names."""
+    """The root first. PyBullet numbers them differently: get the numbers from it by name."""
     body: SimBody
     carried: dict[str, tuple[str, FloatArray]]
-    """For every link of the description: the URDF link that carries it and the fixed transform between."""
+    """For each link of the description: the URDF link that carries it, and its pose (4, 4) in that link."""
 
     def collision_pairs(self) -> Iterator[tuple[str, str]]:
-        """The pairs of the robot's own links that are to collide."""
+        """Pairs of the robot's own links that can collide."""
         for i, one in enumerate(self.links):
             for other in self.links[i + 1 :]:
                 if frozenset((one, other)) not in _NEIGHBOURS and not {one, other} <= _FIXED:
                     yield one, other
 
     def visuals(self) -> list[tuple[str, FloatArray, Visual]]:
-        """Every part: the URDF link that carries it, its 4 x 4 pose there, and how it looks."""
+        """For each part: the URDF link that carries it, its pose (4, 4) in that link, and its visual."""
         found = []
         for link, parts in self.body.parts.items():
             carrier, offset = self.carried.get(link, (link, np.eye(4)))
@@ -70,9 +70,9 @@ class RobotModel:
 
 
 def build_model(robot: Robot) -> RobotModel:
-    """The URDF of the robot. Its forward kinematics are those of the description.
+    """Build the robot's URDF. Its forward kinematics equal those of the description.
 
-    Links without a joint of their own are merged into the link that carries them: fewer links, same poses.
+    Links without a joint are merged into the link that carries them: fewer links, the same poses.
     """
     body = calliope_body(robot)
     carried = {"body": (CHASSIS, np.eye(4))}
@@ -104,7 +104,7 @@ def build_model(robot: Robot) -> RobotModel:
 
 
 def write_urdf(model: RobotModel, folder: Path) -> Path:
-    """Write the file into a folder of the process's own: two processes must not share one."""
+    """Write the file into `folder`, which must belong to this process alone. Returns its path."""
     path = folder / "robot.urdf"
     path.write_text(model.urdf)
     return path
@@ -121,7 +121,7 @@ def _parents_first(links: dict[str, Link]) -> Iterator[tuple[str, Link]]:
             yield name, waiting.pop(name)
 
 
-# One element a line: PyBullet reads a URDF that is one long line wrongly, by chance.
+# Each element has its own line: PyBullet sometimes misreads a URDF that is one long line.
 
 
 def _link_xml(name: str, placed: list[tuple[FloatArray, Part]]) -> str:
@@ -203,7 +203,7 @@ def _origin_xml(place: FloatArray) -> str:
     pitch = asin(max(-1.0, min(1.0, -turn[2, 0])))
     if abs(turn[2, 0]) < 1.0 - 1e-12:
         roll, yaw = atan2(turn[2, 1], turn[2, 2]), atan2(turn[1, 0], turn[0, 0])
-    else:  # straight up or down: roll and yaw turn about the same axis, so roll does it all
+    else:  # gimbal lock: roll and yaw turn about the same axis, so yaw is set to 0
         roll, yaw = atan2(-turn[0, 1] * (1 if pitch < 0 else -1), turn[1, 1]), 0.0
         pitch = pi / 2 if pitch > 0 else -pi / 2
     return f'<origin xyz="{_numbers(*place[:3, 3])}" rpy="{_numbers(roll, pitch, yaw)}"/>'

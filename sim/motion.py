@@ -1,7 +1,7 @@
-"""How the body truly moved, at every step of the physics: a file for benches and tests, which no service can read.
+"""A file with the true motion of the body at every physics step, for benches and tests.
 
-The simulator writes it when its setting `motion` names a file. Each row is fixed-size binary, so a run that is killed
-leaves a file that is whole up to its last flush, a few milliseconds before.
+The simulator writes it when its setting `motion` names a file. Rows have a fixed size, so a run that is killed leaves a
+file that is complete up to its last flush, a few milliseconds earlier.
 """
 
 from __future__ import annotations
@@ -21,29 +21,29 @@ _ROW = struct.Struct("<qqddd?")
 
 
 class MotionRow(NamedTuple):
-    """One step of the physics."""
+    """The body's motion in one physics step."""
 
     sim_ns: int
     """Simulated time at the end of the step."""
     real_ns: int
-    """CLOCK_MONOTONIC at that moment: the same clock in every process of the machine."""
+    """CLOCK_MONOTONIC at the end of the step; all processes of a machine share this clock."""
     speed_mps: float
-    """Speed of the body's centre over the floor, by the way it came in this step."""
+    """Speed of the body's centre over the floor in this step."""
     rim_mps: float
-    """Speed of the wheels' places about the body's centre, by how far the body turned in this step."""
+    """Speed of a wheel's contact point about the body's centre, from how far the body turned in this step."""
     asked_mps: float
-    """Speed of the faster wheel, as the base's ramp has it."""
+    """Speed of the faster wheel by the base's ramp."""
     no_command: bool
-    """The base's own deadman held the wheels."""
+    """Whether the base's deadman had stopped the wheels."""
 
     @property
     def moves_mps(self) -> float:
-        """The faster of going and turning."""
+        """The larger of the speeds of driving and turning."""
         return max(self.speed_mps, self.rim_mps)
 
 
 class MotionWriter:
-    """Told of every step. Raises ConfigError when the file cannot be written."""
+    """Writes the file; call `step` after every physics step. Raises ConfigError when it cannot be written."""
 
     def __init__(self, path: Path, world: World) -> None:
         try:
@@ -64,22 +64,22 @@ class MotionWriter:
         self._file.close()
 
     def step(self) -> None:
-        """Write a row for the step that has just ended."""
+        """Write the row of the step that has just ended."""
         world = self._world
         x, y, yaw = self._place()
         dt_s = (world.time_ns - self._before_ns) / 1e9
         moved_m = hypot(x - self._before[0], y - self._before[1])
         turned_rad = abs(wrap_rad(yaw - self._before[2]))
-        asked = world.wheels()
+        wheels = world.wheels()
         row = (
             world.time_ns, time.monotonic_ns(), moved_m / dt_s, turned_rad * self._separation_m / 2 / dt_s,
-            asked.speed_mps, asked.no_command,
+            wheels.speed_mps, wheels.no_command,
         )  # fmt: skip
         self._file.write(_ROW.pack(*row))
         self._before, self._before_ns = (x, y, yaw), world.time_ns
 
     def flush(self) -> None:
-        """Let readers have what was written."""
+        """Make what was written visible to readers."""
         self._file.flush()
 
     def _place(self) -> tuple[float, float, float]:
@@ -88,9 +88,9 @@ class MotionWriter:
 
 
 def read_motion(path: Path, after: int = 0) -> list[MotionRow]:
-    """The rows of a file from a row's number on, in order; what is being written when it is read is left out."""
+    """Read the rows of a file from number `after` on, without a row that is only half written."""
     with path.open("rb") as file:
         file.seek(after * _ROW.size)
         data = file.read()
-    whole = len(data) // _ROW.size * _ROW.size
-    return [MotionRow(*row) for row in _ROW.iter_unpack(data[:whole])]
+    complete = len(data) // _ROW.size * _ROW.size
+    return [MotionRow(*row) for row in _ROW.iter_unpack(data[:complete])]

@@ -1,4 +1,4 @@
-"""Scenes that nobody has rehearsed: known objects and obstacles strewn around the robot, drawn from the seed."""
+"""Random scenes: known objects and obstacles around the robot, drawn from the run's seed."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ DISTANCE_M = (0.8, 2.0)
 BEARING_DEG = 120.0
 APART_M = 0.25
 _SIGHT_M = 0.06
-"""An obstacle's edge keeps so far from the line from the robot to each object."""
+"""Least distance of an obstacle's edge from the line of sight between robot and object."""
 _BESIDE_M = 0.22
-"""An obstacle's edge keeps so far from an object's centre."""
+"""Least distance of an obstacle's edge from an object's centre."""
 _BY_ROBOT_M = 0.30
-"""An obstacle's edge keeps so far from the middle of the robot."""
+"""Least distance of an obstacle's edge from the robot's centre."""
 _TRIES = 2000
 
 
 def random_scene(seed: int, target: str = "") -> Scene:
-    """1 to 4 known objects 0.8 to 2.0 m away within 120 degrees either side, at least 0.25 m apart, and in half of the
-    seeds 1 or 2 obstacles beside the straight lines of sight.
+    """Draw a scene: 1 to 4 known objects, 0.8 to 2.0 m away, within 120 degrees to either side and at least 0.25 m
+    apart; for half of the seeds also 1 or 2 obstacles beside the lines of sight.
 
-    One object at least fits into the hand. `target`, when it is a known object, is among them: it takes the first
-    one's place, so that the places do not depend on what is asked for. Raises ConfigError for an unknown target.
+    At least one object fits into the hand. `target` is always among them: it takes the place of the first object, so
+    that the places do not depend on the target. Raises ConfigError for a target that is no known object.
     """
     rng = stream(seed, "random scene")
     catalogue = Catalogue.load()
@@ -55,7 +55,7 @@ def random_scene(seed: int, target: str = "") -> Scene:
 
 
 def find_scene(name_or_path: str, seed: int, target: str = "") -> Scene:
-    """`random`, or what `load_scene` finds."""
+    """The random scene for the name `random`, otherwise the scene that `load_scene` finds. Raises ConfigError."""
     return random_scene(seed, target) if name_or_path == NAME else load_scene(name_or_path, seed)
 
 
@@ -104,12 +104,12 @@ def _obstacle(rng: np.random.Generator, objects: list[tuple[float, float]], othe
                 position_m=(x, y),
                 yaw_rad=float(rng.uniform(-pi, pi)),
             )
-    # Four objects around the robot can leave no room; a small post fits somewhere.
+    # Four objects around the robot may leave no room for a box; a thin post behind it always fits.
     return Obstacle(shape="cylinder", radius_m=0.05, height_m=0.4, rgb=(0.5, 0.45, 0.4), position_m=(-1.2, 0.0))
 
 
 def _off_line(point: tuple[float, float], end: tuple[float, float]) -> float:
-    """Distance of a point from the segment between the origin and `end`."""
+    """Distance of a point from the segment between the origin and `end`, m."""
     length2 = end[0] ** 2 + end[1] ** 2
     share = min(max((point[0] * end[0] + point[1] * end[1]) / length2, 0.0), 1.0)
     return hypot(point[0] - share * end[0], point[1] - share * end[1])

@@ -1,6 +1,7 @@
-"""How a real body differs from a perfect one: figures and their noise (the design's 'Real sensors').
+"""How the simulated body differs from a perfect one: errors of servos and wheels, and errors of making and wear.
 
-The camera's own noise is the camera's; latency is the service's.
+The camera's errors are in `sim.camera`, the latencies in `sim.service`. Everything is drawn from the run's seed, so the
+same seed gives the same body.
 """
 
 from __future__ import annotations
@@ -21,16 +22,19 @@ Sensors = Literal["ideal", "real"]
 
 @dataclass(frozen=True)
 class BodyRealism:
+    """Errors of servos, wheels and odometry."""
+
     backlash_deg: float = 0.0
     servo_speed_scatter: float = 0.0
-    """Standard deviation of a servo's speed about what it was told, as a share of it."""
+    """Standard deviation of a servo's speed about the commanded one, as a share of it."""
     wheel_scale_error: float = 0.0
-    """Each wheel rolls longer or shorter than its nominal radius says, evenly within +- this share, the whole run."""
+    """A wheel's distance differs from the nominal one by a share drawn uniformly within +- this, constant for the
+    run."""
     wheel_slip: float = 0.0
-    """Standard deviation of what a wheel slips, as a share of its way."""
+    """Standard deviation of a wheel's slip, as a share of its distance."""
     scatter_time_s: float = 0.5
     slip_time_s: float = 0.2
-    """For how long scatter and slip stay about the same."""
+    """Correlation times of servo speed scatter and of wheel slip."""
     exact_odometry: bool = True
 
 
@@ -47,14 +51,14 @@ REALISM: dict[Sensors, BodyRealism] = {
 
 
 def wheel_scales(seed: int, realism: BodyRealism) -> FloatArray:
-    """How far the left and the right wheel of a run roll for a metre that they are told to; shape (2,)."""
+    """Distance that the left and the right wheel roll per nominal metre in the run `seed`, (2,)."""
     return np.asarray(1.0 + stream(seed, "wheel scale").uniform(-1.0, 1.0, 2) * realism.wheel_scale_error)
 
 
 class Wander:
-    """Numbers that wander about 0 with a given spread: a first-order autoregressive process, one a channel.
+    """A first-order autoregressive process of mean 0 and standard deviation `sigma` in each channel.
 
-    White noise at the rate of the physics would average out to nothing; this lasts for about `time_s`.
+    White noise at the rate of the physics would average out; this noise is correlated over about `time_s`.
     """
 
     def __init__(self, draws: np.random.Generator, channels: int, sigma: float, time_s: float, dt_s: float) -> None:
@@ -64,7 +68,7 @@ class Wander:
         self.values: FloatArray = sigma * draws.standard_normal(channels)
 
     def step(self) -> FloatArray:
-        """The next values, shape (channels,), `dt_s` later."""
+        """The next values, (channels,), `dt_s` later."""
         self.values = self._keep * self.values + self._add * self._draws.standard_normal(self.values.size)
         return self.values
 
@@ -72,19 +76,19 @@ class Wander:
 BodyKind = Literal["nominal", "worn"]
 
 LENGTH_M = 0.005
-"""Each length of the arm's links is off by up to so much."""
+"""Largest error of each length of the arm's links."""
 ZERO_DEG = 2.0
-"""Each joint of neck, arm and wrist has its zero off by up to so much."""
+"""Largest error of the zero of each joint of neck, arm and wrist."""
 CAMERA_M, CAMERA_DEG = 0.005, 1.0
-"""The camera is mounted off its place, and turned about some axis, by up to so much."""
+"""Largest error of the camera's place and orientation."""
 MARKER_M = 0.005
-"""The marker is glued on exactly so far from its drawn place, in a direction of its own."""
+"""Distance of the marker from its nominal place, in a random direction."""
 WHEELS_M = 0.008
-"""The wheels are up to so much nearer together or further apart."""
+"""Largest error of the distance between the wheels."""
 LOOSENING_DEG_PER_MIN = 0.03
-"""Each arm joint's shaft slips on its servo at up to so much, always the same way."""
+"""Largest rate at which an arm joint slips on its servo's shaft, always in one direction."""
 BEND_RAD = 0.15
-"""A bent forearm: 3 cm at the marker, which is 0.2 m from the elbow."""
+"""Angle of a bent forearm: 3 cm at the marker, which is 0.2 m from the elbow."""
 
 ARM_LINKS = ("arm_base", "shoulder", "elbow", "wrist_pitch", "wrist_roll")
 LOOSE_JOINTS = ("arm_base", "shoulder", "elbow", "wrist_pitch")
@@ -93,23 +97,23 @@ OFFSET_LINKS = ("neck_pan", "neck_tilt", *ARM_LINKS)
 
 @dataclass(frozen=True)
 class Wear:
-    """A body as it really is."""
+    """The true body, as opposed to the nominal description that services, drivers and firmware use."""
 
     robot: Robot
-    """The description that the drawing should have been."""
+    """The description of the true body."""
     slip_radps: Mapping[str, float] = field(default_factory=dict)
-    """By joint: how fast the joint slips on its servo's shaft."""
+    """By joint, how fast it slips on its servo's shaft."""
     bend_s: float | None = None
-    """When somebody bends the forearm; None is never."""
+    """Time at which the forearm is bent; None is never."""
 
     def slip_rad(self, joint: str, time_s: float) -> float:
-        """By how much a joint stands beyond the angle that its servo's shaft has."""
+        """How far a joint's angle exceeds that of its servo's shaft."""
         bent = self.bend_s is not None and time_s >= self.bend_s and joint == "elbow"
         return self.slip_radps.get(joint, 0.0) * time_s + (BEND_RAD if bent else 0.0)
 
 
 def body_of(robot: Robot, kind: BodyKind, seed: int, bend_s: float | None = None) -> Wear:
-    """The body of a kind that a robot of this drawing has in the run of that seed."""
+    """The true body in the run `seed`: as the nominal description, or worn. `bend_s`: when its forearm is bent."""
     if kind == "nominal":
         return Wear(robot, bend_s=bend_s)
     rng = stream(seed, "loosening")
@@ -142,14 +146,18 @@ def _worn(robot: Robot, rng: np.random.Generator) -> Robot:
 
 
 def _direction(rng: np.random.Generator) -> FloatArray:
-    """A direction in space, all alike; shape (3,)."""
+    """A random direction, uniform on the sphere; unit vector, (3,)."""
     vector: FloatArray = rng.standard_normal(3)
     return vector / float(np.linalg.norm(vector))
 
 
 def _displacement(name: str, parent: str, shift_m: FloatArray, turn_rad: FloatArray) -> Iterator[dict[str, Any]]:
-    """Fixed links that shift and turn what hangs on them, along and about x, y and z in turn. A row of the kinematic
-    table moves along its x and z alone, so y is the x of a row that is turned by a quarter, and then back."""
+    """Rows of fixed links that shift their children by `shift_m` (3,) and turn them by `turn_rad` (3,) about x, y and
+    z.
+
+    A row of the kinematic table moves only along and about its x and z axes. For y, a row turns by 90 degrees about z,
+    so that its x is y, and the next row turns back.
+    """
     (x, y, z), (rx, ry, rz) = shift_m.tolist(), np.degrees(turn_rad).tolist()
     for number, row in enumerate(
         (

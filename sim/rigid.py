@@ -1,4 +1,4 @@
-"""Rigid transforms in bulk."""
+"""Rotation matrices of quaternions."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from cocoro.arrays import FloatArray
 
 
 def rotation(quaternion: Sequence[float]) -> FloatArray:
-    """Rotation matrix (3, 3) of one unit quaternion (x, y, z, w)."""
+    """Rotation matrix, (3, 3), of one unit quaternion (x, y, z, w)."""
     x, y, z, w = quaternion
     return np.array(
         (
@@ -22,7 +22,7 @@ def rotation(quaternion: Sequence[float]) -> FloatArray:
 
 
 def rotations(quaternions: FloatArray) -> FloatArray:
-    """Rotation matrices of unit quaternions (x, y, z, w); shape (n, 4) to (n, 3, 3)."""
+    """Rotation matrices, (n, 3, 3), of unit quaternions (x, y, z, w), (n, 4)."""
     x, y, z, w = quaternions.T
     rows = np.empty((len(quaternions), 3, 3))
     rows[:, 0, 0] = 1 - 2 * (y * y + z * z)

@@ -1,4 +1,4 @@
-"""The scene file: what stands around the robot, in which light, and where the robot starts."""
+"""Scene files: the objects and obstacles around the robot, the light, and where the robot starts."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from functools import cache
 from importlib import resources
 from math import cos, hypot, isfinite, pi, sin
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import msgspec
 from msgspec import Meta
@@ -15,10 +15,10 @@ from msgspec import Meta
 from cocoro.errors import ConfigError
 from cocoro.objects import Catalogue
 from cocoro.units import Vec3
+from sim.render.interface import Shape
 from sim.seeds import stream
 
 ScenePoint = Annotated[tuple[float, ...], Meta(min_length=2, max_length=3)]
-Shape = Literal["cylinder", "sphere", "box"]
 
 _COLOURS: dict[str, Vec3] = {
     "red": (0.80, 0.04, 0.05),
@@ -40,22 +40,22 @@ def _known() -> Catalogue:
 
 
 class _Table(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A table of the file."""
+    """A table of a scene file."""
 
     def problem(self) -> str | None:
-        """What is wrong with its values, beginning with the field's name; None when nothing is."""
+        """The first invalid value, in a sentence that begins with the field's name; None when all are valid."""
         return None
 
 
-class _Body(_Table, frozen=True, kw_only=True):
-    """Something with a primitive shape. Sizes in metres."""
+class _Solid(_Table, frozen=True, kw_only=True):
+    """A thing with a primitive shape."""
 
     shape: Shape
     radius_m: float | None = None
     height_m: float | None = None
     size_m: Vec3 | None = None
     rgb: Vec3 | None = None
-    """0 to 1 a channel."""
+    """0 to 1 per channel."""
 
     def problem(self) -> str | None:
         wanted = _SIZES[self.shape]
@@ -82,31 +82,31 @@ class _Body(_Table, frozen=True, kw_only=True):
 
     @property
     def half_width_m(self) -> float:
-        """From the centre to the edge, over the floor."""
+        """Horizontal distance from the centre to the edge."""
         return max(self.dimensions_m[:2]) / 2 if self.shape == "box" else self.dimensions_m[0]
 
     @property
     def standing_height_m(self) -> float:
-        """From the floor to the centre when it stands."""
+        """Height of the centre above the floor when it stands."""
         if self.shape == "sphere":
             return self.dimensions_m[0]
         return self.dimensions_m[-1] / 2
 
 
-class SceneObject(_Body, frozen=True, kw_only=True):
-    """Something to fetch, follow or knock over."""
+class SceneObject(_Solid, frozen=True, kw_only=True):
+    """An object that the robot can fetch, follow or knock over."""
 
     label: str
     position_m: ScenePoint
-    """[x, y] stands on the floor, [x, y, z] has its centre at z; in the robot's frame at the start."""
+    """In the robot's frame at the start: [x, y] for an object on the floor, [x, y, z] with the height of its centre."""
     mass_kg: float = 0.2
     path_m: tuple[ScenePoint, ...] = ()
-    """Waypoints after `position_m`, in the same frame; with two numbers the height stays what it was."""
+    """Waypoints after `position_m`, in the same frame; with two numbers the height does not change."""
     speed_mps: float = 0.0
     path_loop: bool = False
-    """After the last waypoint go back to the start and round again; else it stops there."""
+    """Whether it returns from the last waypoint to the start and repeats; otherwise it stops there."""
     floating: bool = False
-    """Stays in the air where it is put."""
+    """Whether it stays in the air at its position."""
 
     def problem(self) -> str | None:
         if not self.label or any(char in self.label for char in " ~,/"):
@@ -119,11 +119,12 @@ class SceneObject(_Body, frozen=True, kw_only=True):
             return "speed_mps must be > 0 for an object with a path_m"
         if self.speed_mps and not self.path_m:
             return "path_m is missing: an object with a speed_mps needs its waypoints"
-        return _Body.problem(self)
+        return _Solid.problem(self)
 
     @property
     def colour(self) -> Vec3:
-        """Its own, or that of the known object of its label, or the one that the label names ('red_box'), or grey."""
+        """`rgb`, else the colour of the known object with this label, else the colour in the label ('red_box'), else
+        grey."""
         if self.rgb is not None:
             return self.rgb
         known = _known().get(self.label)
@@ -131,17 +132,17 @@ class SceneObject(_Body, frozen=True, kw_only=True):
 
     @property
     def kinematic(self) -> bool:
-        """Carried by an unseen hand: nothing that touches it moves it."""
+        """Whether it moves or floats by itself, so that no contact moves it."""
         return self.floating or bool(self.path_m)
 
     @property
     def centre_m(self) -> Vec3:
-        """At the start, in the robot's frame at the start."""
+        """Centre at the start, in the robot's frame at the start."""
         return _at(self.position_m, self.standing_height_m)
 
 
-class Obstacle(_Body, frozen=True, kw_only=True):
-    """Something that stands fast."""
+class Obstacle(_Solid, frozen=True, kw_only=True):
+    """A fixed obstacle."""
 
     position_m: tuple[float, float]
     """In the robot's frame at the start."""
@@ -153,12 +154,12 @@ class Obstacle(_Body, frozen=True, kw_only=True):
 
 
 class Light(_Table, frozen=True, kw_only=True):
-    """One far lamp and what comes from everywhere."""
+    """A distant lamp and ambient light; see `sim.render.interface.Lighting`."""
 
     ambient: float = 0.55
     diffuse: float = 0.45
     direction: Vec3 = (-0.4, 0.3, -1.0)
-    """The way the light travels, world frame; any length but zero."""
+    """Direction in which the lamp's light travels, world frame; any length except zero."""
     temperature_k: float = 5500.0
 
     def problem(self) -> str | None:
@@ -173,24 +174,24 @@ class Light(_Table, frozen=True, kw_only=True):
 
 
 class Start(_Table, frozen=True, kw_only=True):
-    """Where the robot starts, in the world."""
+    """The robot's pose at the start, in the world."""
 
     position_m: tuple[float, float] = (0.0, 0.0)
     yaw_rad: float = 0.0
 
 
 class Scatter(_Table, frozen=True, kw_only=True):
-    """What no two set-ups of one scene share; drawn from the run's seed."""
+    """Random differences between two runs of one scene, drawn from the run's seed."""
 
     position_m: float = 0.0
-    """Each object that stands stands up to this far from its place, evenly over the disc."""
+    """Largest distance of each standing object from its place in the file, uniform over the disc."""
 
     def problem(self) -> str | None:
         return "position_m must be >= 0" if self.position_m < 0 else None
 
 
 class Scene(msgspec.Struct, frozen=True, kw_only=True):
-    """A scene, checked, with the seed's scatter applied."""
+    """A valid scene, with the seed's scatter applied."""
 
     name: str
     objects: tuple[SceneObject, ...] = ()
@@ -199,21 +200,21 @@ class Scene(msgspec.Struct, frozen=True, kw_only=True):
     robot: Start = Start()
 
     def object(self, label: str) -> SceneObject:
-        """The object of that label. Raises KeyError naming those there are."""
+        """The object with this label. Raises KeyError that names the existing labels."""
         for item in self.objects:
             if item.label == label:
                 return item
         raise KeyError(f"{label!r}; the scene has {', '.join(o.label for o in self.objects) or 'no objects'}")
 
     def to_world(self, point_m: Vec3) -> Vec3:
-        """A point of the robot's frame at the start in the world's."""
+        """Transform a point from the robot's frame at the start to the world frame, m."""
         x, y, z = point_m
         c, s = cos(self.robot.yaw_rad), sin(self.robot.yaw_rad)
         return self.robot.position_m[0] + c * x - s * y, self.robot.position_m[1] + s * x + c * y, z
 
 
 def load_scene(name_or_path: str | Path, seed: int = 0) -> Scene:
-    """Read a scene: one of the project's by name (`paper`), or a TOML file by its path.
+    """Read a scene: one that comes with the project by its name (`paper`), or a TOML file by its path.
 
     Raises ConfigError that names the file, the table and the field.
     """
@@ -242,7 +243,7 @@ def load_scene(name_or_path: str | Path, seed: int = 0) -> Scene:
 
 
 def scene_names() -> list[str]:
-    """The scenes that come with the project."""
+    """Names of the scenes that come with the project."""
     folder = resources.files("sim").joinpath("scenes")
     return sorted(file.name.removesuffix(".toml") for file in folder.iterdir() if file.name.endswith(".toml"))
 

@@ -1,4 +1,4 @@
-"""The faults of a real Kinect, one function or small class each. Pixels in, pixels out."""
+"""The errors of a real Kinect, each in one function or small class. Pictures are (height, width[, 3]) arrays."""
 
 from __future__ import annotations
 
@@ -14,18 +14,19 @@ from cocoro.robot import Camera, Robot
 
 NO_DATA = 2047
 STEPS_PER_M = 16_000
-"""Resolution of the coder's table: a twelfth of the finest depth code (0.75 mm at 0.5 m)."""
+"""Resolution of the coder's table: a twelfth of the smallest step of the depth codes (0.75 mm at 0.5 m)."""
 EDGE_CODES = 8
-"""Depth codes between neighbours that make an edge. A plane seen from the Kinect's height changes by under 1 code
-a row at any distance, since codes run with 1 / z as a plane's pixels do; 8 codes are 5 cm at 1.5 m."""
+"""Difference of neighbouring depth codes that makes an edge: 8 codes are 5 cm at 1.5 m. The floor seen from the
+Kinect's height changes by less than 1 code per row at any distance, since both the codes and the rows of a plane are
+linear in 1 / z."""
 EDGE_LOSS = 0.02
-"""Share of edge pixels without data."""
+"""Share of edge pixels that have no data."""
 MOST_STAGES = 6
-"""Of the blur, for 64 samples along the path of a pixel; on a path of more pixels they come apart."""
+"""Upper bound for the stages of the blur: 64 samples along a pixel's path. On longer paths the samples come apart."""
 
 
 class DepthCoder:
-    """Metres to raw 11-bit codes by a table of the robot's own formula: equal to it within a tenth of a code."""
+    """Converts metres to raw 11-bit codes by a table of the robot's formula; the error is below a tenth of a code."""
 
     def __init__(self, robot: Robot) -> None:
         last = np.iinfo(np.uint16).max
@@ -33,7 +34,7 @@ class DepthCoder:
         self._top_m = np.float32(last / STEPS_PER_M)
 
     def codes(self, depth_m: Float32Array) -> CodeArray:
-        """Codes of the same shape; 2047 out of range, for infinity and for negative metres."""
+        """Codes of the same shape; 2047 for depths out of range, infinity and negative metres."""
         steps = np.clip(depth_m, np.float32(0), self._top_m)
         steps *= np.float32(STEPS_PER_M)
         steps += np.float32(0.5)
@@ -41,12 +42,12 @@ class DepthCoder:
 
 
 NOISE_OFFSETS = 1 << 18
-"""Noise is drawn once, this much more than a frame of it, and each frame takes a window at a place of its own:
-drawing 1.2 million normals for every frame would cost more than rendering it."""
+"""Number of places in the noise bank where a frame's noise may begin. The bank is drawn once, since drawing 1.2 million
+normals for every frame would cost more than rendering it."""
 
 
 class DepthNoise:
-    """Gaussian noise that grows with the square of the distance, as it does where disparity is what is measured."""
+    """Gaussian noise that grows with the square of the depth, as it does when disparity is measured."""
 
     def __init__(self, rng: np.random.Generator, shape: tuple[int, int], sigma_per_m: float) -> None:
         self._shape = shape
@@ -54,20 +55,20 @@ class DepthNoise:
         self._bank = np.float32(sigma_per_m) * rng.standard_normal(self._size + NOISE_OFFSETS, dtype=np.float32)
 
     def add(self, depth_m: Float32Array, rng: np.random.Generator) -> Float32Array:
-        """z + sigma z^2 times a normal draw a pixel; negative metres (no light there) become 0."""
+        """Add sigma z^2 times a normal draw to each pixel (m); negative metres (no light there) become 0."""
         start = int(rng.integers(NOISE_OFFSETS))
         noise = self._bank[start : start + self._size].reshape(self._shape)
-        z = np.clip(depth_m, np.float32(0), np.float32(10))  # beyond any range; infinity has no square
+        z = np.clip(depth_m, np.float32(0), np.float32(10))  # 10 m is out of range; infinity has no square
         return z + z * z * noise
 
 
 class ByteNoise:
-    """Gaussian noise on every byte of a picture, rounded; bytes stop at 0 and 255, as a sensor saturates."""
+    """Rounded Gaussian noise on every byte of a picture; values saturate at 0 and 255."""
 
     def __init__(self, rng: np.random.Generator, pixels: int, sigma: float) -> None:
         self._size = 3 * pixels
         bank = np.rint(sigma * rng.standard_normal(self._size + NOISE_OFFSETS, dtype=np.float32))
-        # Apart, what is added and what is taken away fit in bytes, and OpenCV's saturating sums do the rest.
+        # Positive and negative parts are kept apart as bytes, for OpenCV's saturating addition and subtraction.
         self._more = np.maximum(bank, 0).astype(np.uint8)
         self._less = np.maximum(-bank, 0).astype(np.uint8)
 
@@ -79,8 +80,8 @@ class ByteNoise:
 
 
 class Drift:
-    """A value that wanders smoothly within +-`size`: two sines whose periods have no common multiple near, the
-    slower one going from end to end in `swing_s`; phases drawn from the run's seed."""
+    """A value that varies smoothly within +-`size`: the sum of two sines with incommensurate periods. The slower one
+    goes from one extreme to the other in `swing_s`. The phases are random."""
 
     def __init__(self, rng: np.random.Generator, size: float, swing_s: float) -> None:
         self._size = size
@@ -94,15 +95,15 @@ class Drift:
 
 
 class CameraMotion(NamedTuple):
-    """How the camera moves while the shutter is open, in its own frame."""
+    """The camera's motion during the exposure, in its own frame."""
 
     rotation_rad: FloatArray
     """Rotation vector, (3,)."""
     translation_m: FloatArray
 
     def homography(self, share: float, plane_m: float, camera: Camera) -> FloatArray:
-        """Where in the picture at mid-exposure the pixels are that the camera sees `share` of the exposure later
-        (-0.5 to 0.5): 3 x 3, on pixel coordinates. Exact for a plane that faces the camera at `plane_m`."""
+        """Homography (3, 3) from pixels `share` of the exposure later than its middle (-0.5 to 0.5) to pixels at the
+        middle. Exact for a plane that faces the camera at `plane_m`."""
         move = _rodrigues(share * self.rotation_rad)
         move[:, 2] += share * self.translation_m / plane_m
         k = np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
@@ -111,9 +112,9 @@ class CameraMotion(NamedTuple):
 
 
 def motion_between(before: FloatArray, now: FloatArray, exposures: float) -> CameraMotion:
-    """The motion of one exposure, from the camera's poses at the previous frame and at this one.
+    """The motion during an exposure, from the camera's poses (4, 4) at the previous frame and at this one.
 
-    `exposures` is the exposure's length as a share of the time between the two.
+    `exposures` is the length of the exposure as a share of the time between the two frames.
     """
     step = before[:3, :3].T @ now[:3, :3]
     shift = before[:3, :3].T @ (now[:3, 3] - before[:3, 3])
@@ -121,14 +122,14 @@ def motion_between(before: FloatArray, now: FloatArray, exposures: float) -> Cam
 
 
 def blur_along_motion(image: ImageArray, motion: CameraMotion, depth_m: Float32Array, camera: Camera) -> ImageArray:
-    """The mean of the picture over the exposure, each pixel smeared along its own path.
+    """Blur a picture by averaging it over the exposure along each pixel's path.
 
-    The path is that of a plane facing the camera at the picture's median depth: exact for the camera's
-    turning, which makes nearly all of the blur, and right for its translation where things stand near that
-    distance. Objects that move by themselves are not blurred, nor is depth.
+    The path is that of a plane facing the camera at the picture's median depth. That is exact for the camera's
+    rotation, which makes nearly all of the blur, and good for its translation where things are near that depth. Objects
+    that move by themselves are not blurred.
 
-    A mean of n samples along the path takes log2(n) steps: each averages the picture with itself moved by twice
-    as far as the step before.
+    The mean of n samples along the path takes log2(n) stages: each averages the picture with a copy of itself that is
+    moved twice as far as in the stage before.
     """
     plane_m = _median_depth(depth_m)
 
@@ -142,14 +143,14 @@ def blur_along_motion(image: ImageArray, motion: CameraMotion, depth_m: Float32A
     samples = 2**stages
     for stage in range(stages - 1):
         image = _mean(image, _warped(image, at(2**stage / samples)))
-    # So far the mean runs from 0 to half of the path; two copies of it, placed about the middle, are the whole.
+    # The mean now covers half of the path, starting at 0; two copies placed about the middle cover all of it.
     first = -(samples - 1) / (2 * samples)
     return _mean(_warped(image, at(first)), _warped(image, at(first + 0.5)))
 
 
 def drop_edges(codes: CodeArray, rng: np.random.Generator) -> CodeArray:
-    """The codes with 2 percent of the pixels at depth edges (next to something much nearer or farther, or to no
-    data) gone. Changes and returns its argument."""
+    """Remove the data of 2 percent of the pixels at depth edges (next to a much nearer or farther pixel, or to one
+    without data). Changes and returns its argument."""
     spread = cv2.morphologyEx(codes, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8))
     edges = np.flatnonzero(spread > EDGE_CODES)
     codes.reshape(-1)[edges[rng.random(edges.size) < EDGE_LOSS]] = NO_DATA
@@ -157,17 +158,17 @@ def drop_edges(codes: CodeArray, rng: np.random.Generator) -> CodeArray:
 
 
 def scale_channels(image: ImageArray, gains: FloatArray) -> ImageArray:
-    """Each channel times its gain (3,), rounded, saturating."""
+    """Multiply each channel by its gain (3,); rounds and saturates."""
     return _bytes(cv2.transform(image, np.diag(gains)))
 
 
 def _rodrigues(rotation: FloatArray) -> FloatArray:
-    """A rotation vector (3,) to its matrix, or a matrix to its vector (3, 1)."""
+    """Convert a rotation vector (3,) to its matrix (3, 3), or a matrix to its vector (3, 1)."""
     return np.asarray(cv2.Rodrigues(rotation)[0], np.float64)
 
 
 def _bytes(image: NDArray[Any]) -> ImageArray:
-    """OpenCV's own types do not say that bytes stay bytes."""
+    """Cast: OpenCV's type hints do not say that these functions keep the element type."""
     return cast(ImageArray, image)
 
 
@@ -176,17 +177,17 @@ def _mean(one: ImageArray, other: ImageArray) -> ImageArray:
 
 
 def _warped(image: ImageArray, homography: FloatArray) -> ImageArray:
-    """Each pixel takes the one that is nearest to its place under the homography; the margin repeats the border.
+    """Warp a picture by a homography (3, 3) with the nearest pixel; the margin repeats the border.
 
-    Interpolating would triple the time for a mean that is smooth anyway: against pictures rendered at 64 moments of
-    the exposure the error is 0.5 of 255 with and 0.4 without the rounding, 2.3 for no blur at all.
+    Interpolation would triple the time for a mean that is smooth anyway: compared with pictures rendered at 64 moments
+    of the exposure the error is 0.5 of 255 without and 0.4 with interpolation, and 2.3 without any blur.
     """
     size, flags = (image.shape[1], image.shape[0]), cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
     return _bytes(cv2.warpPerspective(image, homography, size, flags=flags, borderMode=cv2.BORDER_REPLICATE))
 
 
 def _longest_path(first: FloatArray, last: FloatArray, camera: Camera) -> float:
-    """Pixels between where two homographies put the middle and the corners of the picture."""
+    """Largest distance (pixels) between where two homographies put the picture's centre and corners."""
     w, h = camera.width - 1.0, camera.height - 1.0
     points = np.array([[w / 2, h / 2, 1], [0, 0, 1], [w, 0, 1], [0, h, 1], [w, h, 1]]).T
     a, b = first @ points, last @ points
@@ -194,6 +195,6 @@ def _longest_path(first: FloatArray, last: FloatArray, camera: Camera) -> float:
 
 
 def _median_depth(depth_m: Float32Array) -> float:
-    """Of a coarse grid; far away where the picture has nothing."""
+    """Median depth of a coarse grid of pixels, clipped to 0.3 to 100 m."""
     grid = np.abs(depth_m[::16, ::16])
     return float(np.clip(np.median(grid), 0.3, 100.0))

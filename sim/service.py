@@ -27,7 +27,7 @@ from sim.motion import MotionWriter
 from sim.random_scene import find_scene
 from sim.realism import BodyKind, BodyRealism, body_of
 from sim.render import make_renderer
-from sim.world import Motors, World, services_motors
+from sim.world import Motors, World, message_motors
 
 TICK_HZ = 120
 """The clock key's rate; the physics runs whole steps between ticks."""
@@ -209,7 +209,7 @@ implementation = Implementation(SimConfig, run)
 def make_world(
     robot: Robot,
     config: SimConfig,
-    motors: Callable[[Robot, Mapping[str, float], BodyRealism], Motors] = services_motors,
+    motors: Callable[[Robot, Mapping[str, float], BodyRealism], Motors] = message_motors,
 ) -> World:
     """The scene with the robot in it."""
     return World(
@@ -274,4 +274,5 @@ def _with_timeout(robot: Robot, timeout_s: float | None) -> Robot:
     """The robot with another deadman, which is the same at all speeds."""
     if timeout_s is None:
         return robot
-    return robot.with_base(command_timeout_s=timeout_s, stand_within_s=timeout_s + 1.0)
+    slow = robot.with_base(command_timeout_s=timeout_s, stand_within_s=timeout_s + 1.0)
+    return slow.with_networks(command_timeout_s=timeout_s)

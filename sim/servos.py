@@ -1,7 +1,7 @@
-"""The servos as the wire shows them: positions in counts, limits of speed and torque, expiry, overload.
+"""The simulated servos: positions in counts, limits of speed and torque, expiry of commands, overload.
 
-Pure: one `SimServo` a joint, told the time, the joint's true angle and the motor's torque at every step, and asked
-what the motor is to do. Nothing here knows the physics engine.
+Pure. At every step the world passes the time, the joint's true angle and the motor's torque to each `SimServo`, and
+asks it what its motor does. This module does not know the physics engine.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ SPEED_COUNT_RADPS = 0.111 * 2 * 3.141592653589793 / 60
 """The unit of speed registers (ROBOTIS AX-12 manual)."""
 LOAD_COUNTS = 1023
 AT_GOAL_COUNTS = 2
-"""A joint that near to its goal has arrived: it is not stopped when the command expires."""
+"""A joint this close to its goal has arrived: it is not stopped when its command expires."""
 PUNCH = 0.1
-"""Least share of the torque limit that a compliant servo pushes with."""
+"""Least share of its torque limit with which a compliant servo pushes."""
 OVERLOAD_SHARE = 0.98
 HOLD_SPEED_RADPS = 1.0
 TEMPERATURE_C = 38.0
@@ -27,7 +27,7 @@ VOLTAGE_V = 12.0
 
 
 class Drive(NamedTuple):
-    """What the joint's motor is to do from now on."""
+    """The target of a joint's motor."""
 
     target_rad: float
     max_speed_radps: float
@@ -35,9 +35,9 @@ class Drive(NamedTuple):
 
 
 class Backlash:
-    """Backlash: the measured shaft follows the joint only where the joint pushes it along.
+    """Backlash: the measured shaft follows the joint only when the joint pushes it.
 
-    Derived: the play (hysteresis) operator. With `width_rad` 0 the two are one.
+    The play (hysteresis) operator; with `width_rad` 0 both angles are equal.
     """
 
     def __init__(self, width_rad: float, angle_rad: float = 0.0) -> None:
@@ -45,14 +45,14 @@ class Backlash:
         self.shaft_rad = angle_rad
 
     def follow(self, angle_rad: float) -> float:
-        """The measured shaft's angle once the joint is at `angle_rad`."""
+        """Move the joint to `angle_rad`; returns the shaft's angle."""
         half = self._half_rad
         self.shaft_rad = min(max(self.shaft_rad, angle_rad - half), angle_rad + half)
         return self.shaft_rad
 
 
 class SimServo:
-    """One servo: what it was told, what it measures, what its motor does."""
+    """One servo: its command, its measurements and its motor."""
 
     def __init__(self, joint: Joint, angle_rad: float, backlash_rad: float = 0.0) -> None:
         self.joint = joint
@@ -63,7 +63,7 @@ class SimServo:
         self.angle_rad = angle_rad
         """True angle of the joint."""
         self.slip_rad = 0.0
-        """By how much the joint has slipped on the shaft: it stands so far beyond what the shaft says."""
+        """How far the joint's angle exceeds the shaft's because it has slipped."""
         self._speed_radps = 0.0
         self._torque_nm = 0.0
         self._valid_until_ns: int | None = None
@@ -71,7 +71,7 @@ class SimServo:
 
     @property
     def count(self) -> int:
-        """Present position."""
+        """Present position, counts."""
         return self.joint.to_count(self._play.shaft_rad)
 
     @property
@@ -101,16 +101,17 @@ class SimServo:
 
     @property
     def commanded(self) -> bool:
-        """Whether a command's time is not over."""
+        """Whether there is a command that has not expired."""
         return self._valid_until_ns is not None
 
     def hold(self) -> None:
-        """Stay at the present position, once, whatever was commanded."""
+        """Drop the command and stay at the present position."""
         self._valid_until_ns = None
         self._hold_here()
 
     def expire(self, now_ns: int) -> bool:
-        """Hold where the joint is if the last command's time is over and it has not arrived; was it so?"""
+        """Hold the joint where it is when the last command has expired before the joint arrived. Returns whether it
+        had."""
         if self._valid_until_ns is None or now_ns <= self._valid_until_ns:
             return False
         self._valid_until_ns = None
@@ -120,7 +121,7 @@ class SimServo:
         return True
 
     def sense(self, angle_rad: float, speed_radps: float, torque_nm: float, now_ns: int) -> None:
-        """What the joint did in the step that ended now."""
+        """Take what the joint did in the step that ended now."""
         self.angle_rad = angle_rad
         self._speed_radps = speed_radps
         self._torque_nm = torque_nm
@@ -133,8 +134,8 @@ class SimServo:
             self.overloaded = True
 
     def drive(self, speed_factor: float = 1.0) -> Drive:
-        """What the motor does now: the servo closes its loop on the shaft that it measures, so the joint itself
-        ends up to half the backlash beside the goal."""
+        """The motor's target. The servo closes its loop on the measured shaft, so the joint stops up to half the
+        backlash beside the goal."""
         goal_rad = self.joint.to_angle(self.goal_count)
         error_rad = goal_rad - self._play.shaft_rad
         torque_nm = self.joint.torque_nm
@@ -149,10 +150,10 @@ class SimServo:
 
 
 class SimServoNetwork:
-    """One bus of servos: commands in, states out, the emergency stop and the expiry of commands.
+    """A network of servos: commands, states, the emergency stop and the expiry of commands.
 
-    An arm or neck joint that was not named again for `timeout_s` holds where it is unless it has arrived; with
-    `keeps_goal` (the hand) it keeps its goal, so that a held object stays held, also while stopped.
+    A joint of arm or neck that is not commanded again within `timeout_s` holds where it is unless it has arrived. With
+    `keeps_goal` (the hand) joints keep their goals, also during an emergency stop, so that a held object stays held.
     """
 
     def __init__(
@@ -174,7 +175,7 @@ class SimServoNetwork:
         return {"released": "", "latched": "estop", "unknown": "latch unknown"}[self.latch]
 
     def command(self, command: ServoCommand, now_ns: int) -> str:
-        """Take the goals, all or none. Returns '' when taken, otherwise why not."""
+        """Accept all goals or none. Returns '' when accepted, otherwise the reason for refusing."""
         if self.stopped_by:
             return self.stopped_by
         if unknown := [name for name in command.joints if name not in self.servos]:
@@ -184,7 +185,7 @@ class SimServoNetwork:
         return ""
 
     def set_latch(self, state: LatchState) -> None:
-        """Latched and unknown hold the arm and neck where they are; a reset by hand clears the overloads."""
+        """Latched and unknown hold the arm and neck where they are; a reset from latched clears the overloads."""
         if state != "released" and self.latch == "released" and not self._keeps_goal:
             for servo in self.servos.values():
                 servo.hold()
@@ -194,12 +195,12 @@ class SimServoNetwork:
         self.latch = state
 
     def expire(self, now_ns: int) -> None:
-        """Hold the joints whose commands are over, by their time or by the emergency stop, which may come from another
-        thread just while a command is taken. To be called at every step."""
+        """Hold the joints whose commands have expired, or all during an emergency stop. Call it at every step: a stop
+        may come from another thread while a command is being accepted."""
         if not self._keeps_goal:
-            over = self.latch != "released"
+            stopped = self.latch != "released"
             for servo in self.servos.values():
-                if over and servo.commanded:
+                if stopped and servo.commanded:
                     servo.hold()
                 servo.expire(now_ns)
 

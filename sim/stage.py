@@ -1,4 +1,4 @@
-"""The scene's bodies in PyBullet: what stands, what moves by itself, and where everything is."""
+"""The scene in PyBullet: floor, objects and obstacles, their poses and movements."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ CAN_FRICTION = 0.9
 CAN_SPINNING_M = 0.01
 ROLLING_M = 0.0005
 BALL_ROLLING_M = 0.002
-"""Keeps a ball where it was put on a level floor."""
+"""Keeps a ball at rest on a level floor."""
 
 
 class Stage:
@@ -29,7 +29,7 @@ class Stage:
         self._bullet = bullet
         self._movers: list[tuple[int, Mover]] = []
         self.labels: list[str] = []
-        """Of the objects first, then of the obstacles, in the order of `visuals`."""
+        """Objects first, then obstacles, in the order of `visuals`."""
         self.bodies: dict[str, int] = {
             FLOOR: bullet.createMultiBody(0.0, bullet.createCollisionShape(bullet.GEOM_PLANE))
         }
@@ -38,26 +38,29 @@ class Stage:
         for item in scene.objects:
             self._add(item.label, item, scene, 0.0, 0.0 if item.kinematic else item.mass_kg)
             if item.path_m:
-                points = [scene.to_world(_full(point, item.centre_m[2])) for point in (item.position_m, *item.path_m)]
+                points = [
+                    scene.to_world(_with_height(point, item.centre_m[2])) for point in (item.position_m, *item.path_m)
+                ]
                 self._movers.append((self.bodies[item.label], Mover(points, item.speed_mps, item.path_loop)))
         for number, obstacle in enumerate(scene.obstacles, 1):
             self._add(f"obstacle_{number}", obstacle, scene, obstacle.yaw_rad, 0.0)
         self.object_count = len(scene.objects)
 
     def move(self, time_s: float, dt_s: float) -> None:
-        """Set what moves by itself on its way from where it is at a time to where it is `dt_s` later."""
+        """Place the objects that move by themselves for `time_s`, with the velocity that takes them along for
+        `dt_s`."""
         for body, mover in self._movers:
             here, there = mover.at(time_s), mover.at(time_s + dt_s)
             self._bullet.resetBasePositionAndOrientation(body, here, (0.0, 0.0, 0.0, 1.0))
             self._bullet.resetBaseVelocity(body, (there - here) / dt_s, (0.0, 0.0, 0.0))
 
     def pose(self, label: str) -> tuple[Vec3, tuple[float, float, float, float]]:
-        """Centre and orientation (x, y, z, w) in the world."""
+        """World position of the centre, m, and orientation (x, y, z, w)."""
         position, orientation = self._bullet.getBasePositionAndOrientation(self.bodies[label])
         return position, orientation
 
     def poses(self) -> FloatArray:
-        """4 x 4 poses of all bodies but the floor, in the order of `visuals`; shape (n, 4, 4)."""
+        """World poses of all bodies except the floor, (n, 4, 4), in the order of `visuals`."""
         poses = np.zeros((len(self.labels), 4, 4))
         poses[:, 3, 3] = 1.0
         if self.labels:
@@ -96,7 +99,7 @@ class Stage:
 
 
 class Mover:
-    """A point that goes along waypoints at a constant speed."""
+    """A point that moves along waypoints at a constant speed."""
 
     def __init__(self, points: list[Vec3], speed_mps: float, loop: bool) -> None:
         corners = [np.array(point) for point in points]
@@ -114,7 +117,7 @@ class Mover:
         self._loop = loop
 
     def at(self, time_s: float) -> FloatArray:
-        """Position in the world, shape (3,)."""
+        """World position at `time_s`, (3,), m."""
         if self._loop and self._end_s:
             time_s %= self._end_s
         if time_s >= self._end_s:
@@ -123,5 +126,5 @@ class Mover:
         return origin + velocity * (time_s - start_s)
 
 
-def _full(place: tuple[float, ...], height_m: float) -> Vec3:
+def _with_height(place: tuple[float, ...], height_m: float) -> Vec3:
     return place[0], place[1], place[2] if len(place) == 3 else height_m

@@ -1,4 +1,4 @@
-"""How everything moved in a rehearsal, by the truth and by the robot's own belief: what plots are drawn from."""
+"""Records how robot and objects moved in a rehearsal, by the truth and by the robot's belief, for plots and figures."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from cocoro.units import Vec3
 from sim.rigid import rotation
 
 STALL_M = 0.005
-"""A hand that moves less than this stands still."""
+"""A hand that stays within this distance stands still."""
 
 
 class Trace:
-    """Feed it every truth, and what the planner and the executive say. `robot` is the body as it really is."""
+    """Feed it every truth, planner status and task state. `robot` is the description of the true body."""
 
     def __init__(self, robot: Robot, target: str) -> None:
         self._hand = robot.chain("pad_centre")
@@ -31,21 +31,21 @@ class Trace:
         self._phase = ""
         self._objects: dict[str, Vec3] = {}
         self._place_m: Vec3 | None = None
-        """Of the hand, body frame."""
+        """Newest place of the hand, body frame."""
         self._moves: list[tuple[float, Vec3]] = []
-        """Of the hand since its reaching began: time and place."""
+        """Time and place of the hand since it began to reach."""
 
     def begin(self, target: str) -> None:
-        """A task with this target begins."""
+        """Start the recording of a task with this target."""
         self._target = target
         self._moves = []
 
-    def said(self, status: PlannerStatus) -> None:
+    def status(self, status: PlannerStatus) -> None:
         self._status = status
 
     @property
     def model(self) -> str:
-        """With what the planner says that it reaches."""
+        """The body model that the planner reports to reach with."""
         return self._status.model
 
     def state(self, state: TaskState) -> None:
@@ -78,7 +78,8 @@ class Trace:
         )
 
     def hand_gap(self) -> dict[str, float] | None:
-        """How far the true hand is from the true target now: metres, and egocentric: rho, azimuth, elevation."""
+        """Distance of the true hand from the true target, m, and their difference in egocentric spherical coordinates
+        (rho, azimuth, elevation). None when either is unknown."""
         hand = self._place_m
         if self._target not in self._objects or hand is None:
             return None
@@ -92,13 +93,13 @@ class Trace:
         }
 
     def edge_m(self, radius_m: float) -> float | None:
-        """From the robot's centre to the target's nearest edge, over the floor."""
+        """Horizontal distance from the robot's centre to the target's nearest edge, m. None without a target."""
         place = self._objects.get(self._target)
         return hypot(place[0], place[1]) - radius_m if place is not None else None
 
     def longest_stall_s(self) -> float:
-        """While touching, the longest time in which the hand stayed within `STALL_M` of one place, up to when it came
-        to its last one: standing at the goal is no stall."""
+        """Longest time for which the hand stayed within `STALL_M` of one place while reaching. The time after it came
+        to its last place does not count: standing at the goal is no stall."""
         if not self._moves:
             return 0.0
         times = np.array([time_s for time_s, _ in self._moves])
@@ -114,7 +115,7 @@ class Trace:
         return longest
 
     def data(self) -> dict[str, list[Any]]:
-        """Column by column."""
+        """The recorded columns by name."""
         return {name: [row[name] for row in self._rows] for name in (self._rows[0] if self._rows else ())}
 
 

@@ -1,4 +1,5 @@
-"""The simulated robot in its scene: physics, motors and sensors of the body, stepped by hand, no clock of its own."""
+"""The simulated robot in its scene: physics, motors and body sensors. The caller steps it; it has no clock of its
+own."""
 
 from __future__ import annotations
 
@@ -27,36 +28,36 @@ from sim.stage import Stage
 SOLVER_ITERATIONS = 50
 SETTLE_S = 0.5
 SENSE_HZ = 60.0
-"""How often contacts are looked at and the bodies' imperfections drawn anew."""
+"""How often contacts are read and new errors of the body are drawn."""
 CONTACT_MEMORY = 2
-"""What touched at one of the last so many looks touches: the solver lets go of a contact for a step at times."""
+"""A contact counts when it was there at one of this many last readings: the solver sometimes drops one for a step."""
 NETWORKS = ("arm", "hand")
 
 
 class WheelMotion(NamedTuple):
-    """How the base turns its wheels now."""
+    """How the base drives its wheels now."""
 
     speed_mps: float
-    """The faster one's, as the ramp has it."""
+    """Speed of the faster wheel by the base's ramp."""
     no_command: bool
-    """They are stopped because nobody has commanded them of late."""
+    """Whether the wheels are stopped because the last command has expired."""
 
 
 class Motors(NamedTuple):
-    """What the wheels and joints are driven by, and what measures them."""
+    """Drives and sensors of wheels and joints."""
 
     base: MobileBase
     networks: dict[str, SimServoNetwork]
 
 
-def services_motors(robot: Robot, angles_rad: Mapping[str, float], realism: BodyRealism) -> Motors:
-    """Motors that understand messages, as the hardware services do."""
+def message_motors(robot: Robot, angles_rad: Mapping[str, float], realism: BodyRealism) -> Motors:
+    """Motors that take commands as messages, as the hardware services do."""
     networks = {
         name: SimServoNetwork(
             {joint: robot.joints[joint] for joint in robot.network_joints(name)},
             angles_rad,
             keeps_goal=name == "hand",
-            timeout_s=robot.base.command_timeout_s,
+            timeout_s=robot.networks[name].command_timeout_s,
             backlash_deg=realism.backlash_deg,
         )
         for name in NETWORKS
@@ -65,10 +66,9 @@ def services_motors(robot: Robot, angles_rad: Mapping[str, float], realism: Body
 
 
 class World:
-    """One PyBullet world with one robot in it. Deterministic: the same arguments and commands, the same states.
+    """A PyBullet world with one robot in it. Deterministic: the same arguments and commands give the same states.
 
-    It starts as hardware does, with the emergency stop's state unknown: `set_latch("released")` makes it obey.
-    Use it with `with`, or close it.
+    As real hardware it starts with an unknown latch, and obeys after `set_latch("released")`. A context manager.
     """
 
     def __init__(
@@ -80,10 +80,10 @@ class World:
         sensors: Sensors = "ideal",
         physics_hz: int = 240,
         wear: Wear | None = None,
-        motors: Callable[[Robot, Mapping[str, float], BodyRealism], Motors] = services_motors,
+        motors: Callable[[Robot, Mapping[str, float], BodyRealism], Motors] = message_motors,
     ) -> None:
-        """`robot` is the drawing, which base and servos go by; `wear` the body as it really is (None: as drawn);
-        `motors` makes what drives it."""
+        """`robot` is the nominal description, which base and servos use; `wear` is the true body (None: the nominal
+        one); `motors` makes the drives."""
         self.robot = robot
         self.scene = scene
         self._hz = physics_hz
@@ -141,21 +141,22 @@ class World:
 
     @property
     def time_ns(self) -> int:
-        """Simulated time since the start."""
+        """Simulated time since the start, ns."""
         return self._steps * 1_000_000_000 // self._hz
 
     # --- commands and states ----------------------------------------------------------------------
 
     def command_base(self, command: BaseCommand) -> str:
-        """Wheel speeds. Returns '' when they are taken, otherwise why not."""
+        """Command wheel speeds. Returns '' when they are accepted, otherwise the reason for refusing."""
         return self._base.command(command, self.time_ns)
 
     def command_servos(self, network: str, command: ServoCommand) -> str:
-        """Goals for joints of 'arm' or 'hand', all or none. Returns '' when they are taken, otherwise why not."""
+        """Command joints of 'arm' or 'hand', all or none. Returns '' when accepted, otherwise the reason for
+        refusing."""
         return self._networks[network].command(command, self.time_ns)
 
     def set_latch(self, state: LatchState, service: str | None = None) -> None:
-        """The emergency stop of one of base, arm and hand, or of all. From any thread."""
+        """Set the latch of one of base, arm and hand, or of all. Thread-safe."""
         if service in (None, "base"):
             self._base.set_latch(state)
         for name, network in self._networks.items():
@@ -171,10 +172,10 @@ class World:
     # --- time -------------------------------------------------------------------------------------
 
     def step(self) -> None:
-        """One step of the physics, 1 / `physics_hz` seconds."""
+        """Advance the physics by one step, 1 / `physics_hz` seconds."""
         now_ns, dt_s = self.time_ns, self._dt_s
         if self._steps % self._sense_every == 0:
-            self._look_at_contacts()
+            self._read_contacts()
             self._slip.step()
             self._scatter.step()
             for joint, servo in zip(self._mechanism.joints, self._servos, strict=True):
@@ -196,7 +197,7 @@ class World:
         for servo, reading in zip(self._servos, readings, strict=False):
             servo.sense(*reading, now_ns)
         rolled = [wheel.angle_rad * radius_m for wheel in readings[-2:]]
-        # The encoders count turns of the wheel; how far it came with them is not theirs to know.
+        # The encoders count turns of the wheel, not the distance that it made with them.
         left_m, right_m = (
             float((new - old) / share) for new, old, share in zip(rolled, self._rolled_m, stretch, strict=True)
         )
@@ -206,7 +207,7 @@ class World:
     # --- truth, and what the renderer draws ---------------------------------------------------------
 
     def truth(self) -> Truth:
-        """Where everything really is."""
+        """The true poses and contacts."""
         pairs = frozenset().union(*self._contacts)
         touched: dict[str, set[str]] = {label: set() for label in self._stage.labels}
         for one, other in pairs:
@@ -241,11 +242,11 @@ class World:
         )
 
     def body_pose(self) -> FloatArray:
-        """World pose of the body frame: 4 x 4."""
+        """World pose of the body frame, (4, 4)."""
         return self._mechanism.root_pose()
 
     def wheels(self) -> WheelMotion:
-        """How the wheels are turned, whatever the base says of it."""
+        """How the wheels are driven, independent of what the base reports."""
         ramp = self._base.ramp
         return WheelMotion(max(abs(ramp.left_mps), abs(ramp.right_mps)), self._base.stopped_by == "no command")
 
@@ -255,11 +256,11 @@ class World:
 
     @property
     def visuals(self) -> Sequence[Visual]:
-        """Everything to draw but the floor."""
+        """Everything to draw except the room."""
         return self._visuals
 
     def visual_poses(self) -> FloatArray:
-        """World poses of `visuals` now, in their order: shape (n, 4, 4)."""
+        """World poses of `visuals` now, in their order, (n, 4, 4)."""
         links = self._mechanism.link_poses()
         poses = np.empty((len(self._visuals), 4, 4))
         on_robot = len(self._carriers)
@@ -268,11 +269,11 @@ class World:
         return poses
 
     def camera_pose(self) -> FloatArray:
-        """World pose of the camera: 4 x 4, x right, y down, z forward."""
+        """World pose of the camera, (4, 4); its frame is x right, y down, z forward."""
         return self.link_pose("camera")
 
     def link_pose(self, link: str) -> FloatArray:
-        """World pose of a link of the robot description: 4 x 4."""
+        """World pose of a link of the robot description, (4, 4)."""
         carrier, offset = self._model.carried[link]
         pose: FloatArray = self._mechanism.link_poses()[self._mechanism.index[carrier]] @ offset
         return pose
@@ -286,7 +287,7 @@ class World:
         self._visuals = [visual for _, _, visual in rows] + self._stage.visuals
 
     def _settle(self) -> None:
-        """Let everything come to rest on the floor before time begins."""
+        """Let everything come to rest on the floor before simulated time begins."""
         self._mechanism.spin(0.0, 0.0, self._dt_s)
         self._drive_servos()
         for _ in range(round(SETTLE_S * self._hz)):
@@ -295,20 +296,20 @@ class World:
         for servo, reading in zip(self._servos, readings, strict=False):
             servo.sense(*reading, 0)
         self._rolled_m = [wheel.angle_rad * self.robot.base.wheel_radius_m for wheel in readings[-2:]]
-        self._look_at_contacts()
+        self._read_contacts()
 
     def _angles(self) -> list[float]:
         return [servo.angle_rad for servo in self._servos]
 
     def _drive_servos(self) -> None:
-        """Tell the motors whose orders have changed."""
+        """Send new targets to the motors whose targets have changed."""
         for number, (joint, servo) in enumerate(zip(self._mechanism.joints, self._servos, strict=True)):
             drive = servo.drive(1.0 + self._scatter.values[number])
             if drive != self._driven[number]:
                 self._driven[number] = drive
                 self._mechanism.drive(joint, drive)
 
-    def _look_at_contacts(self) -> None:
+    def _read_contacts(self) -> None:
         pairs, on_chassis = touching_pairs(
             self._bullet.getContactPoints(), self._mechanism.body, self._mechanism.link_names, self._names
         )

@@ -29,6 +29,8 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+from cocoro.errors import CocoroError
+
 PATIENCE_S = 60.0
 """Far more than any of the commands takes, on however busy a machine: it hangs."""
 NEW_MOUNTS, PRIVATE, RECURSIVE, READ_ONLY = 0x20000, 1 << 18, 1 << 14, 1
@@ -149,13 +151,15 @@ def preload() -> None:
     import typer.main
 
     typer.main.get_command = functools.cache(typer.main.get_command)  # to make them is most of what a command costs
+    typer.main.get_group = functools.cache(typer.main.get_group)
     from apps import cli
     from apps.cli.main import main
 
     for module in pkgutil.iter_modules(cli.__path__, "apps.cli."):
         importlib.import_module(module.name)
     for name in OFTEN:
-        importlib.import_module(name)
+        with contextlib.suppress(CocoroError):  # an extra that is not installed
+            importlib.import_module(name)
     with (
         Path(os.devnull).open("w") as nowhere,
         contextlib.redirect_stdout(nowhere),

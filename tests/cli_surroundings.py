@@ -9,11 +9,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import typer.main
 from cli_forks import Case, Ending
 
 from apps.cli import exits
-from apps.cli.app import app
+from apps.cli.app import COMMANDS as LISTED
+from apps.cli.app import load
+from apps.cli.task_app import task_command, task_names
 
 GOLDEN = Path(__file__).parent / "golden" / "fetch.mcap"
 CODES = (exits.DONE, exits.FAILED, exits.USAGE, exits.REFUSED, exits.NO_MESH)
@@ -64,11 +65,12 @@ def commands(command: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[str, An
         yield from commands(sub, (*path, name))
 
 
-COMMANDS = {
-    name: command
-    for name, command in commands(typer.main.get_command(app))
-    if not name.startswith("rehearse ") or name == "rehearse fetch"  # the others are made in the same way
+LOADED: dict[str, Any] = {
+    **{row.name: load(row.name) for row in LISTED if row.name != "rehearse"},
+    **{name: task_command(name) for name in task_names()},
+    "rehearse fetch": task_command("fetch"),  # the other rehearsals are made in the same way
 }
+COMMANDS = dict(found for name, command in LOADED.items() for found in commands(command, tuple(name.split())))
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,6 @@ from mcap.reader import make_reader
 from mcap.records import Attachment
 from mcap.writer import CompressionType, IndexType, Writer
 
-from apps.captures.export import foxglove
 from apps.captures.export.files import file_name
 from apps.captures.info import report
 from apps.captures.player import Player
@@ -244,6 +243,9 @@ def test_two_channels_of_one_topic_stay_two_in_tables_and_for_foxglove(
     assert sorted(path.name for path in (tmp_path / "csv").iterdir()) == ["arm2_x#1.csv", "arm2_x#2.csv"]
     with (tmp_path / "csv" / "arm2_x#1.csv").open(newline="") as file:
         assert [row["n"] for row in csv.DictReader(file)] == ["0", "4", "8", "12", "16"]
+    pytest.importorskip("foxglove", reason="foxglove-sdk is an extra, and not installed here")
+    from apps.captures.export import foxglove
+
     with Capture.open(twofold) as capture:
         foxglove.export(capture, tmp_path / "fox.mcap")
     with (tmp_path / "fox.mcap").open("rb") as stream:

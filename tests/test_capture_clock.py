@@ -10,7 +10,7 @@ import pytest
 from capture_rig import all_of, entry, writer
 
 from apps.captures.info import report
-from apps.cli import capture_files
+from apps.cli import capture as capture_command
 from cocoro.boottime import boottime_ns
 from cocoro.capture.reader import Capture
 from cocoro.clock import NS
@@ -132,8 +132,8 @@ def test_a_capture_tells_in_each_of_its_files_how_the_clock_was_set(machine: Mac
     for found in reports:
         (step,) = found.metadata[WALL_CLOCK]["steps"]
         assert step["by_s"] == pytest.approx(-3600.0, abs=1e-4)
-    assert "set back by 3600.000 s at 50.500 s" in capture_files.text(reports[0])
-    assert "set back by 3600.000 s 69.500 s before this file began" in capture_files.text(reports[2])
+    assert "set back by 3600.000 s at 50.500 s" in capture_command.text(reports[0])
+    assert "set back by 3600.000 s 69.500 s before this file began" in capture_command.text(reports[2])
     times = [record.log_ns for path in files for record in all_of(path)]
     assert times == sorted(times)
 
@@ -143,7 +143,7 @@ def test_info_passes_by_what_another_program_calls_so(tmp_path: Path) -> None:
     written.remember(WALL_CLOCK, {"steps": "many"})
     written.close()
     with Capture.open(written.file.path) as capture:
-        assert "clock " not in capture_files.text(report(capture))
+        assert "clock " not in capture_command.text(report(capture))
 
 
 def test_the_run_that_goes_on_is_the_newest_though_the_clock_was_set_back_before_it_began(tmp_path: Path) -> None:

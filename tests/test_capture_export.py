@@ -18,11 +18,10 @@ import pytest
 from capture_rig import ROBOT, Room, drive, record
 from mcap.reader import make_reader
 
-from apps.captures.export import foxglove, rerun_scene, tables, video
-from apps.captures.export.foxglove_types import SceneUpdate, schema_of
+from apps.captures.export import rerun_scene, tables, video
 from apps.captures.export.geometry import Posture, about_z, conjugate, points, quaternion, rotated
 from apps.captures.export.story import catalogue_of, robot_of
-from apps.cli.capture_mesh import watch
+from apps.cli.export import watch
 from apps.cli.main import main
 from cocoro import topics
 from cocoro.bus.base import Qos
@@ -40,7 +39,7 @@ GOLDEN = Path(__file__).parent / "golden" / "fetch.mcap"
 def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The golden capture, in all forms that need nothing more."""
     folder = tmp_path_factory.mktemp("exported")
-    forms = {"--video": "film.mp4", "--foxglove": "fox.mcap", "--csv": "csv"}
+    forms = {"--video": "film.mp4", "--csv": "csv"}
     assert (
         main(["export", str(GOLDEN), *(word for form, name in forms.items() for word in (form, str(folder / name)))])
         == 0
@@ -102,6 +101,8 @@ def test_a_film_that_the_disk_did_not_take_whole_is_no_film(tmp_path: Path, caps
 def test_a_place_where_nothing_can_be_written_is_told_in_one_line(
     form: str, name: str, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    if form == "--foxglove":
+        pytest.importorskip("foxglove", reason="foxglove-sdk is an extra, and not installed here")
     (tmp_path / "file").write_text("no folder")
     assert main(["export", str(GOLDEN), form, str(tmp_path / name)]) == 1
     err = capsys.readouterr().err
@@ -183,47 +184,58 @@ def test_parquet_needs_pyarrow_or_says_how_to_get_it(tmp_path: Path, capsys: pyt
 # --- Foxglove -------------------------------------------------------------------------------------
 
 
-def test_the_file_for_foxglove_has_its_schemas_in_the_robots_time(exported: Path) -> None:
-    found: dict[str, list[Any]] = {}
+@pytest.fixture(scope="module")
+def fox(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    pytest.importorskip("foxglove", reason="foxglove-sdk is an extra, and not installed here")
+    out = tmp_path_factory.mktemp("fox") / "fox.mcap"
+    assert main(["export", str(GOLDEN), "--foxglove", str(out)]) == 0
+    return out
+
+
+def test_the_file_for_foxglove_has_its_schemas_in_the_robots_time(fox: Path) -> None:
+    """tests/test_capture_foreign.py has the npm packages decode and check each message."""
+    shown: dict[str, list[bytes]] = {}
+    recorded: dict[str, list[Any]] = {}
     last = 0
-    with (exported / "fox.mcap").open("rb") as stream:
+    with fox.open("rb") as stream:
         for schema, channel, message in make_reader(stream, validate_crcs=True).iter_messages():
             assert schema is not None
-            assert channel.message_encoding == "json"
             assert last <= message.log_time < 10**10
             last = message.log_time
-            value = json.loads(message.data)
             if schema.name.startswith("foxglove."):
-                assert set(value) == set(json.loads(schema.data)["properties"])
-                found.setdefault(schema.name, []).append(value)
+                assert schema.encoding == channel.message_encoding == "protobuf"
+                shown.setdefault(schema.name, []).append(message.data)
             else:
-                found.setdefault(channel.topic, []).append(value)
+                assert channel.message_encoding == "json"
+                recorded.setdefault(channel.topic, []).append(json.loads(message.data))
     assert {
         "foxglove.CompressedImage", "foxglove.CameraCalibration", "foxglove.PointCloud", "foxglove.FrameTransforms",
         "foxglove.SceneUpdate", "foxglove.ImageAnnotations", "foxglove.Log",
-    } <= set(found)  # fmt: skip
-    assert len(found["foxglove.CompressedImage"]) == len(found["foxglove.PointCloud"]) == 60
-    assert len(found["calliope/base/state"]) == 300
-    frames = {each["child_frame_id"] for update in found["foxglove.FrameTransforms"] for each in update["transforms"]}
-    assert {"body", "camera", "gripper"} <= frames
-    assert any("approach" in log["message"] for log in found["foxglove.Log"])
+    } == set(shown)  # fmt: skip
+    assert len(shown["foxglove.CompressedImage"]) == len(shown["foxglove.PointCloud"]) == 60
+    assert len(recorded["calliope/base/state"]) == 300
+    transforms = b"".join(shown["foxglove.FrameTransforms"])
+    assert all(frame in transforms for frame in (b"body", b"camera", b"gripper"))
+    assert any(b"approach" in log for log in shown["foxglove.Log"])
 
 
-def test_foxglove_schemas_have_foxgloves_names_and_no_references() -> None:
-    schema = schema_of(SceneUpdate)
-    assert schema.name == "foxglove.SceneUpdate"
-    assert b"$ref" not in schema.data
-    entity = json.loads(schema.data)["properties"]["entities"]["items"]
-    assert entity["title"] == "foxglove.SceneEntity"
-    assert entity["properties"]["timestamp"]["title"] == "time"
+def test_without_foxglove_one_line_says_how_to_install_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "foxglove", None)
+    monkeypatch.delitem(sys.modules, "apps.captures.export.foxglove", raising=False)
+    assert main(["export", str(GOLDEN), "--foxglove", str(tmp_path / "fox.mcap")]) == 1
+    assert "pip install 'cocoro-mesh[foxglove]'" in capsys.readouterr().err
+    assert not (tmp_path / "fox.mcap").exists()
 
 
 def test_an_export_does_not_write_over_a_file(exported: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """It might be the capture."""
-    with Capture.open(GOLDEN) as capture:
-        for export, name in ((foxglove.export, "fox.mcap"), (video.export, "film.mp4")):
-            with pytest.raises(CaptureError, match="is there already"):
-                export(capture, exported / name)
+    with Capture.open(GOLDEN) as capture, pytest.raises(CaptureError, match="is there already"):
+        video.export(capture, exported / "film.mp4")
+    for form in ("--video", "--foxglove", "--rrd"):
+        assert main(["export", str(GOLDEN), form, str(exported / "film.mp4")]) == 1
+        assert "is there already" in capsys.readouterr().err
     before = GOLDEN.read_bytes()
     assert main(["export", str(GOLDEN), "--csv", str(exported / "more"), "--rrd", str(GOLDEN)]) == 1
     assert "is there already" in capsys.readouterr().err

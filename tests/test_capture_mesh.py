@@ -18,7 +18,7 @@ from capture_rig import STILL, all_of, drive, record
 
 from apps.captures.info import report
 from apps.captures.rewrite import rewrite
-from apps.cli import capture_files
+from apps.cli import capture as capture_command
 from cocoro import topics
 from cocoro.bus.base import Qos
 from cocoro.bus.endpoints import default
@@ -225,7 +225,7 @@ def test_a_recorder_whose_wall_clock_is_set_goes_on_as_if_it_had_not_been_and_no
         found = report(capture)
     (step,) = found.metadata[WALL_CLOCK]["steps"]
     assert step["by_s"] == pytest.approx(by_s, abs=0.01)
-    assert f"clock     set {'forward' if by_s > 0 else 'back'} by {abs(step['by_s']):.3f} s" in capture_files.text(
+    assert f"clock     set {'forward' if by_s > 0 else 'back'} by {abs(step['by_s']):.3f} s" in capture_command.text(
         found
     )
 

@@ -12,11 +12,11 @@ from typing import Any
 
 import pytest
 
-from apps.cli import estop
+from apps.cli import app, estop
 from apps.cli.main import PACKAGES, main
 from apps.cli.options import frames_of, latencies_of
 from apps.cli.running import overrides
-from apps.cli.table import table
+from apps.cli.terminal import table
 from apps.rehearsal import rehearse as rehearsing
 from apps.rehearsal.request import RehearsalRequest
 from cocoro.errors import CocoroError, ConfigError
@@ -139,6 +139,20 @@ def test_the_topics_page_of_the_documentation_is_up_to_date(capsys: pytest.Captu
     assert main(["topics", "--markdown"]) == 0
     page = (ROOT / "docs" / "topics.md").read_text(encoding="utf-8")
     assert capsys.readouterr().out == page, "make it anew: cocoro topics --markdown > docs/topics.md"
+
+
+def test_help_imports_no_command() -> None:
+    code = "import sys; from apps.cli.main import main; main(['--help']); print(*sys.modules, file=sys.stderr)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
+    heavy = {"msgspec", "numpy", "zenoh", "psutil", "rich.live", "cocoro.messages", "apps.cli.link", "apps.cli.status"}
+    assert heavy & set(done.stderr.split()) == set()
+
+
+@pytest.mark.parametrize("row", app.COMMANDS, ids=lambda row: row.name)
+def test_a_commands_own_help_begins_with_its_line_of_the_list(row: app.CommandRow) -> None:
+    command = app.load(row.name)
+    assert " ".join((command.help or "").split()).startswith(row.summary)
+    assert command.hidden == row.hidden
 
 
 def test_the_emergency_stop_imports_next_to_nothing() -> None:

@@ -16,7 +16,7 @@ from apps.learning.collector import Coverage, HandCollector, WheelCollector, col
 from apps.learning.study import BEST
 from cocoro.learning import model
 from cocoro.learning.dataset import HandRow, SampleFile, WheelRow, hand_header, wheel_header
-from cocoro.learning.nominal_model import LEVEL_ROLL_RAD, NominalModel
+from cocoro.learning.nominal_model import NominalModel
 from cocoro.messages import HandSample, TaskState, WheelTrial
 from cocoro.robot import Robot
 from cocoro.topics import HAND_SAMPLES
@@ -28,7 +28,8 @@ JOINTS = ("arm_base", "shoulder", "elbow", "wrist_pitch")
 def arm_file(tmp_path: Path, robot: Robot) -> Path:
     path = tmp_path / "arm.jsonl"
     seen = sightings(robot, draws=60)
-    with SampleFile(path, HandRow, robot, hand_header(robot, NominalModel(robot).joints, LEVEL_ROLL_RAD)) as writer:
+    header = hand_header(robot, NominalModel(robot).joints, robot.claw.level_roll_rad)
+    with SampleFile(path, HandRow, robot, header) as writer:
         writer.append(
             HandRow(
                 stamp_ns=number, draw=int(draw), angles_rad=tuple(angles), head_rad=(0.0, -0.5), seen_m=tuple(place),

@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 import pytest
 
-from apps.cli import estop_mesh, exits, objects, reset, snapshot, status
+from apps.cli import estop_mesh, exits, objects, safety, snapshot, status
 from apps.cli.estop import StopResult
 from apps.cli.options import RobotChoice
 from cocoro.bus.endpoints import default
@@ -145,7 +145,7 @@ def test_reset_releases_what_was_stopped(root: Path, capsys: pytest.CaptureFixtu
         async with robot("base", "arm", "hand", "executive") as calliope:
             answering(calliope.nodes["executive"], "released")
             await stop()
-            assert await reset.reset(ANY) == exits.DONE
+            assert await safety.release(ANY) == exits.DONE
             assert calliope.latches == {"released"}
 
     asyncio.run(scenario())
@@ -159,7 +159,7 @@ def test_when_the_executive_refuses_a_reset_everything_stays_latched(
         async with robot("base", "arm", "hand", "executive") as calliope:
             answering(calliope.nodes["executive"], "latched", "a servo is overloaded")
             await stop()
-            assert await reset.reset(ANY) == exits.REFUSED
+            assert await safety.release(ANY) == exits.REFUSED
             assert calliope.latches == {"latched"}
 
     asyncio.run(scenario())
@@ -187,7 +187,7 @@ def test_status_tells_of_services_task_and_plan(root: Path, capsys: pytest.Captu
     async def scenario(as_json: bool) -> int:
         async with robot("base", "planning", "executive") as calliope:
             calliope.nodes["base"].spawn(tell(calliope))
-            return await status.status(ANY, as_json)
+            return await status.show_status(ANY, as_json)
 
     assert asyncio.run(scenario(as_json=False)) == exits.FAILED  # perception should run, and does not
     text = capsys.readouterr().out
@@ -263,7 +263,7 @@ def test_a_snapshot_is_a_frame_with_what_was_detected_in_that_frame(
     async def scenario() -> None:
         async with robot("kinect", "perception") as calliope:
             calliope.nodes["kinect"].spawn(see(calliope, detect))
-            assert await snapshot.snapshot(ANY, out) == exits.DONE
+            assert await snapshot.take_snapshot(ANY, out) == exits.DONE
 
     asyncio.run(scenario())
     assert capsys.readouterr().out == f"{out}: {words}\n"
@@ -310,6 +310,6 @@ def test_of_several_robots_one_must_be_named(root: Path) -> None:
     async def scenario() -> None:
         async with robot("executive"), await ZenohBus.open(default("robbie", "robot")):
             with pytest.raises(ConfigError, match=r"say which: --robot calliope, --robot robbie"):
-                await status.status(ANY, as_json=False)
+                await status.show_status(ANY, as_json=False)
 
     asyncio.run(scenario())

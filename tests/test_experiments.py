@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 from math import cos, isnan, sin
 from pathlib import Path
@@ -22,7 +23,7 @@ from apps.experiments.stats import summarise
 from apps.learning.study import BEST
 from apps.rehearsal.request import RehearsalRequest
 from cocoro.learning.dataset import HandRow, SampleFile, WheelRow, hand_header, wheel_header
-from cocoro.learning.nominal_model import LEVEL_ROLL_RAD, NominalModel
+from cocoro.learning.nominal_model import NominalModel
 from cocoro.robot import Robot
 
 # --- statistics ---------------------------------------------------------------------------------------
@@ -87,7 +88,7 @@ def test_what_cannot_be_run_fails_with_its_reason_and_so_does_what_needs_it(tmp_
 
 def arm_and_wheels(settings: ExperimentSettings, robot: Robot) -> None:
     seen = sightings(robot, draws=60)
-    header = hand_header(robot, NominalModel(robot).joints, LEVEL_ROLL_RAD)
+    header = hand_header(robot, NominalModel(robot).joints, robot.claw.level_roll_rad)
     with SampleFile(settings.arm_file(0), HandRow, robot, header) as writer:
         writer.append(
             HandRow(
@@ -219,17 +220,34 @@ def test_an_unknown_experiment_is_refused_with_those_there_are(capsys: pytest.Ca
 
 def test_a_wrong_body_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["experiment", "E1", "--body", "bent"]) == 2
-    assert "nominal or worn" in capsys.readouterr().err
+    assert "nominal and worn" in capsys.readouterr().err
 
 
-def test_progress_tells_what_runs_and_what_could_not_be(capsys: pytest.CaptureFixture[str]) -> None:
-    import sys
-
-    progress = RunProgress(sys.stdout)
+def test_progress_without_a_terminal_is_a_line_for_each_finished_run() -> None:
+    out = io.StringIO()
+    progress = RunProgress(out)
     progress.begin(4, 1)
     progress.started("learn-0")
     progress.ended("babble-arm-0", {"error": "it broke"})
-    assert "2 of 4" in progress.text()
-    assert "1 could not be" in progress.text()
-    assert "learn-0" in progress.text()
-    assert "babble-arm-0: it broke" in capsys.readouterr().out
+    progress.end()
+    assert out.getvalue().splitlines() == ["4 runs; 1 of them have a result already", "2 of 4 babble-arm-0: it broke"]
+    assert progress.text() == "1 failed; learn-0"
+
+
+def test_progress_on_a_terminal_is_a_bar_and_the_runs_in_work(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TERM", "xterm")
+    out = Terminal()
+    progress = RunProgress(out)
+    progress.begin(4, 1)
+    progress.started("learn-0")
+    progress.ended("babble-arm-0", {"outcome": "done"})
+    progress.end()
+    shown = out.getvalue()
+    assert "2/4" in shown
+    assert "learn-0" in shown
+    assert "babble-arm-0" not in shown  # a run that succeeded is counted, not listed
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True

@@ -172,7 +172,7 @@ def test_the_command_calibrates_from_kept_views_and_writes_the_robots_file(
     for number in range(1, 8):
         board = held(rng)
         tools.save(tmp_path, number, painter.colour(*board), painter.depth(*board))
-    assert command.calibrate("robot", "8x6", 40.0, 30, tmp_path, None, None) == 0
+    assert command.calibrate_from_views("robot", "8x6", 40.0, 30, tmp_path, None, None) == 0
     out = capsys.readouterr().out
     assert "7 views" in out
     assert 'measured = "calliope-measured.toml"' in out
@@ -180,12 +180,12 @@ def test_the_command_calibrates_from_kept_views_and_writes_the_robots_file(
     assert kinect.colour_lens is not None
     assert kinect.colour_lens[0] == pytest.approx(EYES.colour[0], rel=0.02)
     assert kinect.depth_lens is not None
-    with pytest.raises(ConfigError, match="write the inner corners as 9x6"):
-        command.calibrate("robot", "8 by 6", 40.0, 30, tmp_path, None, None)
+    with pytest.raises(ConfigError, match="inner corners as 9x6"):
+        command.calibrate_from_views("robot", "8 by 6", 40.0, 30, tmp_path, None, None)
     with pytest.raises(ConfigError, match="side of a square in mm"):
-        command.calibrate("robot", "8x6", 0.04, 30, tmp_path, None, None)
+        command.calibrate_from_views("robot", "8x6", 0.04, 30, tmp_path, None, None)
     with pytest.raises(ConfigError, match="holds views already"):
-        command.calibrate("robot", "8x6", 40.0, 30, None, tmp_path, None)
+        command.calibrate_from_views("robot", "8x6", 40.0, 30, None, tmp_path, None)
 
 
 def test_depths_of_a_still_view_are_their_middle_and_none_where_one_is_missing() -> None:

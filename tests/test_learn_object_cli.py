@@ -143,7 +143,7 @@ def test_what_is_known_is_only_replaced_or_added_to_when_that_is_said(
         (["cup", "--from", "photo.png", "--box", "1,2,3"], "LEFT,TOP,RIGHT,BOTTOM"),
         (["cup", "--from", "photo.png", "--at", "1,2", "--box", "1,2,3,4"], "say one of them"),
         (["cup", "--from", "photo.png", "--shape", "cone"], "cylinder, sphere or box"),
-        (["cup", "--from", "photo.png", "--picture", "cup.jpg"], "let its name end with .png"),
+        (["cup", "--from", "photo.png", "--picture", "cup.jpg"], "name must end with .png"),
         (["cup", "--from", "photo.png", "--size", "0.1", "--catalogue", "words.png"], "words.png"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",

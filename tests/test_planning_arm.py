@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from math import hypot, pi
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from cocoro.robot import Robot
 from services.planning.arm import ROLL, ArmController, ArmStep
 from services.planning.clearance import Clearance
 from services.planning.config import PlanningConfig
-from services.planning.reach import ARM, LEVEL_ROLL_RAD, HandPose, Reacher
+from services.planning.reach import ARM, HandPose, Reacher
 from services.planning.reachability import Reachability
 
 ROBOT = Robot.load()
@@ -27,7 +28,8 @@ SHAPE = ArmShape(ROBOT)
 TICK_S = 0.02
 CLAWS_OPEN = {claw: sign * CONFIG.hand.open_rad for claw, sign in ROBOT.claw.open_sign.items()}
 PARKED = dict.fromkeys(ROBOT.joints, 0.0) | ROBOT.poses["park"] | CLAWS_OPEN
-READY = PARKED | {"arm_base": -0.087, "shoulder": 0.66, "elbow": -1.6, "wrist_pitch": 0.77, ROLL: LEVEL_ROLL_RAD}
+LEVEL = {ROLL: ROBOT.claw.level_roll_rad}
+READY = PARKED | LEVEL | {"arm_base": -0.087, "shoulder": 0.66, "elbow": -1.6, "wrist_pitch": 0.77}
 
 in_reach = st.builds(
     HandPose,
@@ -53,8 +55,8 @@ def within_limits(angles: FloatArray) -> bool:
 class Arm:
     """An arm that does exactly what it is told."""
 
-    def __init__(self, angles: dict[str, float]) -> None:
-        self.controller = ArmController(ROBOT, CONFIG.arm, REACHER)
+    def __init__(self, angles: dict[str, float], robot: Robot = ROBOT) -> None:
+        self.controller = ArmController(robot, CONFIG.arm, REACHER)
         self.angles = angles
         self.path = [angles]
         self.steps: list[ArmStep] = []
@@ -203,6 +205,18 @@ def test_what_the_planner_calls_clear_of_the_mount_is_clear_of_it(angles: dict[s
     posture = PARKED | angles
     if Clearance(ROBOT).of(posture) >= CONFIG.arm.clearance_m:
         assert SHAPE.depth_in_mount_m(posture) == 0.0
+
+
+def test_a_measured_longer_finger_stops_the_arm_where_it_would_touch_the_floor(tmp_path: Path) -> None:
+    own = tmp_path / "own.toml"
+    own.write_text("[claw]\npad_length_m = 0.16\n")
+    measured = Robot.load(override=own)
+    pitched = HandPose(0.40, 0.0, 0.05, -0.5)
+    arms = [Arm(dict(READY), robot) for robot in (ROBOT, measured)]
+    steps = [arm.reach(pitched) for arm in arms]
+    assert [step.blocked for step in steps] == [False, True]
+    assert Clearance(measured).of(arms[0].angles) < 0.0, "with longer fingers that would be in the floor"
+    assert Clearance(measured).of(arms[1].angles) >= CONFIG.arm.clearance_m
 
 
 def test_the_arm_moves_smoothly_and_no_faster_than_it_may() -> None:

@@ -30,7 +30,7 @@ from services.planning.arm import ROLL, ArmController
 from services.planning.config import PlanningConfig
 from services.planning.core import PlanningCore
 from services.planning.postures import Postures, sobol
-from services.planning.reach import ARM, LEVEL_ROLL_RAD, HandPose, Reacher
+from services.planning.reach import ARM, HandPose, Reacher
 
 TICK_NS = NS // 50
 CONFIG = PlanningConfig()
@@ -104,7 +104,7 @@ def test_from_wherever_babbling_ended_the_arm_gets_ready_and_is_folded_again(
         for park in (False, True):
             arm = ArmController(robot, CONFIG.arm, Reacher(robot, CONFIG.arm.damping))
             angles = dict.fromkeys(robot.joints, 0.0) | dict(zip(ARM, posture.tolist(), strict=True))
-            angles[ROLL] = LEVEL_ROLL_RAD
+            angles[ROLL] = robot.claw.level_roll_rad
             for _ in range(700):
                 step = arm.park(angles, 0.02) if park else arm.reach(goal, 0.25, angles, 0.02)
                 assert not step.blocked

@@ -153,6 +153,41 @@ def test_a_description_from_before_there_was_a_time_to_stand_has_one() -> None:
     assert Robot.from_data(data).base.stand_within_s == ROBOT.base.stand_within_s
 
 
+def test_a_description_from_before_it_had_a_hull_gets_the_calliopes_and_its_own_deadman() -> None:
+    data = ROBOT.with_base(command_timeout_s=9.0).to_data()
+    del data["hull"], data["claw"]["level_roll_deg"]
+    for row in data["network"].values():
+        del row["command_timeout_s"]
+    robot = Robot.from_data(data)
+    assert robot.hull == ROBOT.hull
+    assert robot.claw == ROBOT.claw
+    assert {row.command_timeout_s for row in robot.networks.values()} == {9.0}
+
+
+def test_a_measured_tube_of_the_hull_changes_that_one_alone(tmp_path: Path) -> None:
+    robot = Robot.load(override=written(tmp_path, '[[hull.tube]]\nname = "forearm"\nradius_m = 0.04\n'))
+    assert [tube.radius_m for tube in robot.hull.tube] == [0.025, 0.04, 0.025, 0.03]
+    assert robot.hull.tube[1].balls == ROBOT.hull.tube[1].balls
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ('[[hull.tube]]\nname = "forearm"\nend = "nowhere"\n', "hull.tube forearm: there is no link 'nowhere'"),
+        ("[hull]\nfinger_turn_deg = { claw_middle = 1.0 }\n", "hull.finger_turn_deg: there is no link 'claw_middle'"),
+    ],
+)
+def test_a_hull_on_links_that_are_not_there_is_refused(tmp_path: Path, text: str, named: str) -> None:
+    with pytest.raises(ConfigError, match=named):
+        Robot.load(override=written(tmp_path, text))
+
+
+def test_the_two_networks_have_deadmen_of_their_own(tmp_path: Path) -> None:
+    robot = Robot.load(override=written(tmp_path, "[network.hand]\ncommand_timeout_s = 0.5\n"))
+    assert {name: row.command_timeout_s for name, row in robot.networks.items()} == {"arm": 0.15, "hand": 0.5}
+    assert {row.command_timeout_s for row in ROBOT.with_networks(command_timeout_s=2.0).networks.values()} == {2.0}
+
+
 def test_another_deadman_leaves_the_robot_itself_alone() -> None:
     assert ROBOT.with_base(command_timeout_s=9.0).base.command_timeout_s == 9.0
     assert ROBOT.base.command_timeout_s == 0.15

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from math import radians
+from pathlib import Path
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -141,7 +144,7 @@ class Net:
 
     def __init__(self, name: str = "arm") -> None:
         joints = [ROBOT.joints[joint] for joint in ROBOT.network_joints(name)]
-        self.net = ServoNetwork(joints, keeps_goal=name == "hand", timeout_s=0.2)
+        self.net = ServoNetwork(joints, keeps_goal=name == "hand", timeout_s=0.2, max_age_s=0.15)
         self.net.port_fault = ""
         self.now_ns = NS
         self.tasks: list[ServoTask] = []
@@ -345,9 +348,28 @@ def test_a_clock_that_begins_anew_ends_what_was_commanded(arm: Net) -> None:
     assert arm.net.orders(arm.now_ns)[5][0] == 512
 
 
+def test_a_command_is_refused_by_the_age_of_its_own_topic() -> None:
+    joint = ROBOT.joints["wrist_roll"]
+    for max_age_s, answer in ((0.05, "too old"), (0.15, "")):
+        net = ServoNetwork([joint], keeps_goal=True, timeout_s=0.2, max_age_s=max_age_s)
+        net.set_latch("released")
+        command = ServoCommand(stamp_ns=NS, joints=(joint.name,), goal_rad=(0.1,), speed_radps=(1.0,))
+        assert net.command(command, NS + 100 * MS) == answer
+
+
+def test_measured_joint_limits_are_what_the_servo_line_keeps(tmp_path: Path) -> None:
+    own = tmp_path / "own.toml"
+    own.write_text('[[joint]]\nname = "elbow"\nlimits_deg = [-20.0, 10.0]\n')
+    joint = Robot.load(override=own).joints["elbow"]
+    motion = JointMotion(joint, keeps_goal=False)
+    motion.command(1.0, 6.0, 0.0, until_ns=10 * NS)
+    orders = [motion.order(0.17, now_ns) for now_ns in range(NS, 3 * NS, 20 * MS)]
+    assert max(order[0] for order in orders if order is not None) == joint.to_count(radians(10.0))
+
+
 def test_direction_and_centre_of_a_joint_are_its_own() -> None:
     joint = Joint("elbow", "arm", 5, (-150.0, 150.0), 2.5, 6.0, direction=-1, centre_count=600.0)
-    net = ServoNetwork([joint], keeps_goal=False, timeout_s=0.2)
+    net = ServoNetwork([joint], keeps_goal=False, timeout_s=0.2, max_age_s=0.15)
     net.heard(5, ServoReading(500, 10, 100, 12.0, 40, 0, 0), NS)
     state = net.state(NS)
     assert state is not None

@@ -157,7 +157,7 @@ def test_a_scan_names_what_is_missing_and_writes_ports_where_it_is_told(
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["calibrate", "elbo"], "there is no joint 'elbo'; there are neck_pan,"),
+        (["calibrate", "elbo"], "there is no joint 'elbo'; known are neck_pan,"),
         (["calibrate", "elbow", "--port", "/dev/nothing"], "/dev/nothing: there is no such port"),
         (["set-id", "5", "4", "--port", "PORT"], "there is a servo 4 on this line already"),
     ],

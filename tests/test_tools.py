@@ -246,7 +246,7 @@ def test_logs_of_one_process_or_service_or_of_a_level(
     ("arguments", "words"),
     [
         (["teapot"], "no log of teapot; there are sim, supervisor"),
-        (["--level", "loud"], "it is one of debug"),
+        (["--level", "loud"], "known are debug"),
         (["--robot", "robbie"], "no logs of robbie"),
     ],
 )
@@ -358,7 +358,7 @@ def test_a_dead_and_a_silent_service_are_red() -> None:
     )
     assert f"{RED}not alive" in text
     assert f"{RED}silent" in text
-    assert "no sign for 8 s" in text
+    assert "silent for 8 s" in text
 
 
 def test_a_slow_late_topic_and_what_is_lost_or_rejected_stand_out_and_what_is_skipped_does_not() -> None:

@@ -93,7 +93,7 @@ def test_echo_of_a_silent_key_says_so_and_exits_with_1_when_its_time_is_over(
 
 
 def test_hz_measures_every_key_that_it_hears(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert on_mesh(lambda: hz.hz(ANY, "**", 0.5, True, True)) == exits.DONE
+    assert on_mesh(lambda: hz.show_rates(ANY, "**", 0.5, True, True)) == exits.DONE
     found = {report["key"]: report for report in json.loads(capsys.readouterr().out)}
     assert {"calliope/guest/wave", "calliope/base/command", "calliope/base/health"} <= set(found)
     wave = found["calliope/guest/wave"]
@@ -104,7 +104,7 @@ def test_hz_measures_every_key_that_it_hears(root: Path, capsys: pytest.CaptureF
 
 
 def test_hz_of_a_silent_key_exits_with_1(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert on_mesh(lambda: hz.hz(ANY, "no/thing", 0.5, True, False)) == exits.FAILED
+    assert on_mesh(lambda: hz.show_rates(ANY, "no/thing", 0.5, True, False)) == exits.FAILED
     assert "nothing on calliope/no/thing yet" in capsys.readouterr().out
 
 
@@ -124,7 +124,7 @@ def test_top_tells_who_lives_what_it_costs_and_what_each_reader_misses(
     async def after_a_while() -> int:
         async with asyncio.timeout(30.0):  # until something was rejected, and told in a health message
             while True:
-                code = await top.top(ANY, True, True, 1.0)
+                code = await top.show_top(ANY, True, True, 1.0)
                 out = capsys.readouterr().out
                 readers = [r for t in json.loads(out)["topics"] if t["topic"] == "base/command" for r in t["readers"]]
                 if any(reader["rejected"] for reader in readers):
@@ -147,7 +147,7 @@ def test_top_tells_who_lives_what_it_costs_and_what_each_reader_misses(
 
 
 def test_top_for_people_has_a_line_for_each_service_and_topic(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert on_mesh(lambda: top.top(ANY, True, False, 1.0)) == exits.DONE
+    assert on_mesh(lambda: top.show_top(ANY, True, False, 1.0)) == exits.DONE
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[1] for line in lines if line.startswith(("base ", "planning "))] == ["ready", "ready"]
     assert any(line.startswith("base/command ") and "planning" in line for line in lines)

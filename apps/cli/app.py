@@ -1,32 +1,171 @@
-"""The commands and their options. What they do is imported when they are called, so that `--help` is quick."""
+"""The commands of `cocoro`, in the order in which its help lists them.
+
+`cocoro --help` needs this file alone. A command's own file has its options and what it does; it is imported when the
+command is called, so it may import whatever it needs.
+"""
 
 from __future__ import annotations
 
-import asyncio
-import sys
-from pathlib import Path
-from typing import Annotated
+from typing import Any, NamedTuple
 
 import typer
+from typer.core import TyperCommand, TyperGroup
+from typer.main import get_group
 
-from apps.cli import capture_app, hardware_app, learning_app, objects_app, task_app, tools_app
-from apps.cli.options import (
-    AdaptOption,
-    FramesOption,
-    JsonOption,
-    LatencyOption,
-    MeshOption,
-    ModelOption,
-    ObjectsOption,
-    ProfileArgument,
-    ReachOption,
-    RobotChoice,
-    RobotOption,
-    SetOption,
+TASKS, WATCH, RUNNING, SAFETY = "Tasks", "Watching", "Starting and stopping", "Safety"
+CAPTURES, TOOLS, HARDWARE, LEARNING = "Captures", "Tools", "Hardware", "Learning"
+
+
+class CommandRow(NamedTuple):
+    """A command as `cocoro --help` lists it. The summary begins the command's own help, too."""
+
+    name: str
+    panel: str
+    summary: str
+    hidden: bool = False
+
+
+COMMANDS = (
+    CommandRow("cancel", TASKS, "End the running task; the robot stands still."),
+    CommandRow("rehearse", TASKS, "Try a task in simulation: the whole robot in one process, in virtual time."),
+    CommandRow("status", WATCH, "What runs, its health, what the robot does and why."),
+    CommandRow("objects", WATCH, "The objects that the robot knows, and where it saw each last; `learn` adds one."),
+    CommandRow("snapshot", WATCH, "Write a picture of what the robot sees now, with its detections drawn in."),
+    CommandRow(
+        "topics", WATCH, "What travels on the mesh: every key, its type, rate, quality of service and publisher."
+    ),
+    CommandRow("capture", CAPTURES, "Look at capture files, repair them, re-execute services on them."),
+    CommandRow("record", CAPTURES, "Record what travels on the mesh into MCAP files, until Ctrl-C."),
+    CommandRow("replay", CAPTURES, "Send a capture into the mesh again."),
+    CommandRow(
+        "export",
+        CAPTURES,
+        "Turn a capture into a film, tables, or a file for Foxglove or Rerun; or extract its attachments.",
+    ),
+    CommandRow("view", CAPTURES, "Open Rerun on a capture, or live on the mesh."),
+    CommandRow(
+        "top",
+        TOOLS,
+        "What runs and what travels, live: cpu, memory, rates against nominal, ages, what was skipped, lost, rejected.",
+    ),
+    CommandRow(
+        "echo",
+        TOOLS,
+        "What travels on a key, decoded, of whatever type it is; what a reader would reject is marked with its reason.",
+    ),
+    CommandRow("hz", TOOLS, "Rate, jitter and amount of data on a key, as it arrives here, over the last seconds."),
+    CommandRow("logs", TOOLS, "What the robot's processes on this machine wrote since their start, merged by time."),
+    CommandRow("new", TOOLS, "Write a component from a template: `cocoro new service NAME`."),
+    CommandRow(
+        "base", HARDWARE, "Show the base: mode, battery, bumpers, odometry; `recover` puts it back into its mode."
+    ),
+    CommandRow("servos", HARDWARE, "Find, set up, calibrate, hold and relax the servos; clear their faults."),
+    CommandRow("kinect", HARDWARE, "Calibrate the Kinect; tilt it."),
+    CommandRow(
+        "doctor", HARDWARE, "Look over a machine and its robot before a run; each line is well, or says what to do."
+    ),
+    CommandRow("babble", LEARNING, "Move to learn: the arm before the eyes, the wheels before a target."),
+    CommandRow("learn", LEARNING, "Learn from what babbling saw: a model that the planner loads."),
+    CommandRow(
+        "experiment",
+        LEARNING,
+        "Run the paper's experiments in virtual time and report them beside the paper's text and baselines.",
+    ),
+    CommandRow(
+        "up", RUNNING, "Start a robot's processes and stay until Ctrl-C (or, with --detach, until they are ready)."
+    ),
+    CommandRow("down", RUNNING, "Stop a robot's processes."),
+    CommandRow("run", RUNNING, "Run one process in this terminal, on the mesh of the profile."),
+    CommandRow("estop", SAFETY, "Emergency stop, now: everything that moves stands still until `reset`."),
+    CommandRow("stop", SAFETY, "The same as estop.", hidden=True),
+    CommandRow("reset", SAFETY, "Release the emergency stop."),
 )
 
+
+def load(name: str) -> TyperCommand | TyperGroup:
+    """Imports the file of a command and returns the command."""
+    match name:
+        case "cancel" | "rehearse":
+            from apps.cli.task_app import app
+        case "status":
+            from apps.cli.status import app
+        case "objects":
+            from apps.cli.objects_app import app
+        case "snapshot":
+            from apps.cli.snapshot import app
+        case "topics":
+            from apps.cli.topics import app
+        case "capture":
+            from apps.cli.capture import app
+        case "record":
+            from apps.cli.record import app
+        case "replay":
+            from apps.cli.replay import app
+        case "export" | "view":
+            from apps.cli.export import app
+        case "top":
+            from apps.cli.top import app
+        case "echo" | "new":
+            from apps.cli.tools_app import app
+        case "hz":
+            from apps.cli.hz import app
+        case "logs":
+            from apps.cli.logs import app
+        case "base":
+            from apps.cli.base import app
+        case "servos":
+            from apps.cli.servos import app
+        case "kinect":
+            from apps.cli.kinect import app
+        case "doctor":
+            from apps.cli.hardware_app import app
+        case "babble" | "learn":
+            from apps.cli.learning_app import app
+        case "experiment":
+            from apps.cli.experiment import app
+        case "up" | "down" | "run":
+            from apps.cli.running import app
+        case "estop" | "stop" | "reset":
+            from apps.cli.safety import app
+        case _:
+            raise KeyError(name)
+    command = get_group(app).commands[name]
+    assert isinstance(command, TyperCommand | TyperGroup)
+    return command
+
+
+class CommandGroup(TyperGroup):
+    """The group of all commands: help comes from COMMANDS, and a command is loaded when it is called. Further commands
+    are made from the types of tasks."""
+
+    def __init__(self, **attributes: Any) -> None:
+        super().__init__(**attributes)
+        for row in COMMANDS:
+            listed = TyperCommand(row.name, help=row.summary, rich_help_panel=row.panel, hidden=row.hidden)
+            self.add_command(listed)
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        from apps.cli.task_app import task_names
+
+        return [*task_names(), *super().list_commands(ctx)]
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        command = super().get_command(ctx, cmd_name)
+        if command is not None:
+            return command
+        from apps.cli.task_app import task_command
+
+        return task_command(cmd_name)
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        name, command, rest = super().resolve_command(ctx, args)
+        return name, command if name is None or name not in _NAMES else load(name), rest
+
+
+_NAMES = frozenset(row.name for row in COMMANDS)
+
 app = typer.Typer(
-    cls=task_app.group_of(task_app.operate),
+    cls=CommandGroup,
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -35,155 +174,3 @@ app = typer.Typer(
     "First `cocoro up sim --detach`, then `cocoro fetch red_can`, at last `cocoro down`.",
     epilog="Exit codes: 0 done, 1 the task failed, 2 bad usage, 3 refused or cancelled, 4 the mesh is not there.",
 )
-
-TASKS, WATCH, RUNNING, SAFETY = task_app.PANEL, "Watching", "Starting and stopping", "Safety"
-
-
-# --- tasks ----------------------------------------------------------------------------------------
-
-
-task_app.add_to(app)
-
-
-@app.command(rich_help_panel=TASKS)
-def cancel(robot: RobotOption = None, profile: MeshOption = None) -> None:
-    """End the running task; the robot stands still."""
-    from apps.cli import tasks
-
-    sys.exit(asyncio.run(tasks.cancel(RobotChoice(robot, profile))))
-
-
-# --- watching -------------------------------------------------------------------------------------
-
-
-@app.command(rich_help_panel=WATCH)
-def status(robot: RobotOption = None, profile: MeshOption = None, json: JsonOption = False) -> None:
-    """What runs, how it is, what it does and why. Exit code 1 when something that should run does not."""
-    from apps.cli import status as telling
-
-    sys.exit(asyncio.run(telling.status(RobotChoice(robot, profile), json)))
-
-
-objects_app.add_to(app, WATCH)
-
-
-@app.command(rich_help_panel=WATCH)
-def snapshot(
-    out: Annotated[Path, typer.Argument(metavar="OUT.png", help="The picture's file.")],
-    robot: RobotOption = None,
-    profile: MeshOption = None,
-) -> None:
-    """What the robot sees now, with its detections drawn in."""
-    from apps.cli import snapshot as taking
-
-    sys.exit(asyncio.run(taking.snapshot(RobotChoice(robot, profile), out)))
-
-
-@app.command(rich_help_panel=WATCH)
-def topics(
-    markdown: Annotated[bool, typer.Option("--markdown", help="The whole page of the documentation.")] = False,
-    json: JsonOption = False,
-) -> None:
-    """What travels on the mesh: every key, its type, rate, quality of service and publisher."""
-    from apps.cli import topics as listing
-
-    print(listing.markdown() if markdown else listing.as_json() if json else listing.table(), end="")
-
-
-# --- captures -------------------------------------------------------------------------------------
-
-capture_app.add_to(app)
-
-# --- tools ----------------------------------------------------------------------------------------
-
-tools_app.add_to(app)
-
-hardware_app.add_to(app)
-
-# --- learning -------------------------------------------------------------------------------------
-
-learning_app.add_to(app)
-
-# --- starting and stopping ------------------------------------------------------------------------
-
-
-@app.command(rich_help_panel=RUNNING)
-def up(
-    profile: ProfileArgument = "sim",
-    detach: Annotated[bool, typer.Option("--detach", "-d", help="Return when the robot is up.")] = False,
-    scene: Annotated[str | None, typer.Option(help="Simulator: a scene's name, or its file.")] = None,
-    seed: Annotated[int | None, typer.Option(min=0, help="Simulator: the seed of all that is drawn.")] = None,
-    sensors: Annotated[str | None, typer.Option(metavar="ideal|real", help="Simulator: perfect or real.")] = None,
-    body: Annotated[
-        str | None, typer.Option(metavar="nominal|worn", help="Simulator: a body as drawn, or not.")
-    ] = None,
-    model: ModelOption = None,
-    reach: ReachOption = None,
-    adapt: AdaptOption = False,
-    frames: FramesOption = None,
-    latency: LatencyOption = None,
-    objects: ObjectsOption = None,
-    set_: SetOption = None,
-    unattended: Annotated[
-        bool, typer.Option("--unattended", help="No person starts it: its first start comes up stopped.")
-    ] = False,
-) -> None:
-    """Start a robot's processes and stay until Ctrl-C (or, with --detach, until they are ready)."""
-    from apps.cli import running
-    from deploy import profiles
-
-    overrides = running.overrides(scene, seed, sensors, body, frames, latency or [], set_ or [])
-    if objects is not None:
-        overrides.insert(0, running.objects_of(objects))
-    overrides[:0] = running.model_of(model, reach, adapt)
-    read = profiles.read(profile, overrides)
-    sys.exit(running.up_detached(read, unattended) if detach else running.up(read, unattended))
-
-
-@app.command(rich_help_panel=RUNNING)
-def down(robot: RobotOption = None) -> None:
-    """Stop a robot's processes. Nothing running is no error."""
-    from apps.cli import running
-
-    sys.exit(running.down(robot))
-
-
-@app.command(rich_help_panel=RUNNING)
-def run(
-    process: Annotated[str, typer.Argument(help="A process of the profile, or any other that is installed.")],
-    profile: Annotated[
-        str | None, typer.Option(metavar="PROFILE", help="By default that of the robot that is up here, else sim.")
-    ] = None,
-    set_: SetOption = None,
-) -> None:
-    """One process in this terminal, on the mesh of the profile. Ctrl-C ends it."""
-    from apps.cli import running
-
-    sys.exit(running.run(process, profile, set_ or []))
-
-
-# --- safety ---------------------------------------------------------------------------------------
-
-_CONTEXT = {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}
-
-
-@app.command(rich_help_panel=SAFETY, context_settings=_CONTEXT)
-def estop(context: typer.Context) -> None:
-    """Emergency stop, now: all that moves holds still until `reset`. (`stop` is the same.)"""
-    from apps.cli import estop as stopping
-
-    sys.exit(stopping.main("estop", context.args))
-
-
-@app.command(hidden=True, context_settings=_CONTEXT)
-def stop(context: typer.Context) -> None:
-    """The same as estop."""
-    estop(context)
-
-
-@app.command(rich_help_panel=SAFETY)
-def reset(robot: RobotOption = None, profile: MeshOption = None) -> None:
-    """Release the emergency stop. The executive may refuse, and says why."""
-    from apps.cli import reset as releasing
-
-    sys.exit(asyncio.run(releasing.reset(RobotChoice(robot, profile))))

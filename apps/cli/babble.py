@@ -9,11 +9,11 @@ from typing import Any
 
 from msgspec.structs import replace
 
-from apps.cli.ending import on_end
+from apps.cli.interrupt import on_interrupt
 from apps.cli.link import Link, joined
 from apps.cli.options import RobotChoice
 from apps.cli.output import going_on
-from apps.cli.progress import TaskDisplay, view
+from apps.cli.progress import TaskDisplay, task_display
 from apps.cli.tasks import Follower
 from apps.learning.collector import SampleCollector, collector
 from cocoro.errors import CocoroError, MeshError
@@ -45,6 +45,9 @@ class BabbleDisplay:
 
     def result(self, text: str) -> None:
         self._view.result(f"{text}; {self._kept.said}")
+
+    def close(self) -> None:
+        self._view.close()
 
     def text(self, elapsed_s: float) -> str:
         count = len(self._kept)
@@ -80,7 +83,7 @@ async def babble(
         robot = await description(link)
         height_m = await _standing_height(link, task.target) if task.target else None
         with collector(task.samples, file, robot, height_m) as kept:
-            shown = BabbleDisplay(view(as_json), kept, wanted)
+            shown = BabbleDisplay(task_display(as_json), kept, wanted)
             if len(kept) >= wanted:
                 shown.result(f"{file} holds enough already")
                 return 0
@@ -91,7 +94,7 @@ async def babble(
             follower = Follower(link, TaskRequest(task=task), shown, None)
             keeper = SampleWriter(kept, follower.cancel)
             samples.add(lambda _key, message: keeper.take(message))
-            with on_end(follower.interrupt), going_on():
+            with on_interrupt(follower.interrupt), going_on():
                 code, result = await follower.run()
             if keeper.failure is not None:
                 raise CocoroError(

@@ -1,44 +1,67 @@
-"""`cocoro base`: what the base is like, and its way back into the mode in which it obeys."""
+"""`cocoro base`: the state of the base, and how it returns to the mode in which it obeys."""
 
 from __future__ import annotations
 
 import asyncio
 import json
+import sys
 from math import degrees
 
 import msgspec
+import typer
 
 from apps.cli import exits
 from apps.cli.link import joined, within
-from apps.cli.options import RobotChoice
+from apps.cli.options import JsonOption, MeshOption, RobotChoice, RobotOption
 from cocoro.errors import MeshError
-from cocoro.messages import BaseState, Health, RecoverRequest
+from cocoro.messages import BaseState, RecoverRequest
 from cocoro.topics import BASE_STATE, HEALTH, RECOVER
 
-HEARD_S = 2.5
+WAIT_S = 2.5
+"""Longest wait for the base's state and health."""
 
 
-async def show(where: RobotChoice, as_json: bool) -> int:
-    """Exit code 1 when it is not well."""
-    async with joined(where) as link:
+app = typer.Typer()
+base = typer.Typer(invoke_without_command=True)
+app.add_typer(base, name="base")
+
+
+@base.callback()
+def show_base(
+    context: typer.Context, robot: RobotOption = None, profile: MeshOption = None, json: JsonOption = False
+) -> None:
+    """Show the base: mode, battery, bumpers, odometry; `recover` puts it back into its mode."""
+    if context.invoked_subcommand is None:
+        sys.exit(asyncio.run(show(RobotChoice(robot, profile), json)))
+
+
+@base.command()
+def recover(robot: RobotOption = None, profile: MeshOption = None) -> None:
+    """Put a Create that left its mode (a cliff, a wheel drop, the charger) back into it."""
+    sys.exit(asyncio.run(recover_base(RobotChoice(robot, profile))))
+
+
+async def show(choice: RobotChoice, as_json: bool) -> int:
+    """Prints the base's state and faults; the exit code is 1 when it has faults or is silent."""
+    async with joined(choice) as link:
         if "base" not in await link.alive():
-            raise MeshError(f"{link.robot} has no base running: `cocoro status` tells more")
+            raise MeshError(f"{link.robot} has no base running: see `cocoro status`")
         state, health = link.latest(BASE_STATE), link.latest(HEALTH.of("base"))
         changed = asyncio.Event()
         link.inbox(BASE_STATE).add(lambda _key, _message: changed.set())
         link.inbox(HEALTH.of("base")).add(lambda _key, _message: changed.set())
-        await within(HEARD_S, lambda: state.value is not None and health.value is not None, changed)
-        told, well = state.value, health.value
+        await within(WAIT_S, lambda: state.value is not None and health.value is not None, changed)
+        newest, faults = state.value, None if health.value is None else health.value.faults
     if as_json:
-        print(json.dumps({"state": msgspec.to_builtins(told), "faults": list(well.faults) if well else []}))
+        print(json.dumps({"state": msgspec.to_builtins(newest), "faults": list(faults or ())}))
     else:
-        _print(told, well)
-    return exits.DONE if told is not None and well is not None and not well.faults else exits.FAILED
+        _print(newest, faults or ())
+    return exits.DONE if newest is not None and faults == () else exits.FAILED
 
 
-def _print(state: BaseState | None, health: Health | None) -> None:
+def _print(state: BaseState | None, faults: tuple[str, ...]) -> None:
     if state is None:
-        print("base       nothing is heard of it")
+        print(f"base       publishes nothing (waited {WAIT_S:g} s)")
     else:
         pressed = [
             name
@@ -59,12 +82,13 @@ def _print(state: BaseState | None, health: Health | None) -> None:
         print(f"battery    {100 * state.battery_fraction:.0f}%, {state.battery_v:.1f} V{charging}")
         print(f"sensors    {', '.join(pressed) or 'nothing'}")
         print(f"odometry   {x_m:.2f} m, {y_m:.2f} m, {degrees(state.odometry_yaw_rad):.0f} deg since its start")
-    for fault in health.faults if health else ():
+    for fault in faults:
         print(f"fault      {fault}")
 
 
-async def recover(where: RobotChoice) -> int:
-    async with joined(where) as link:
+async def recover_base(choice: RobotChoice) -> int:
+    """Asks the base to recover; the exit code is 3 when it cannot."""
+    async with joined(choice) as link:
         reply = await link.call(RECOVER, RecoverRequest())
         robot = link.robot
     if not reply.recovered:

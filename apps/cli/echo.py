@@ -9,8 +9,8 @@ import time
 from typing import Any
 
 from apps.cli import exits
-from apps.cli.ending import told_to_end
 from apps.cli.foreign import HEAD, DecodedPayload, jsonable, lines, read
+from apps.cli.interrupt import interrupt_event
 from apps.cli.link import joined
 from apps.cli.listening import Ear, Heard, keyexpr_of, takes_frames
 from apps.cli.options import RobotChoice
@@ -26,7 +26,7 @@ async def echo(
     nothing, or fewer than were wanted."""
     async with joined(where, frames=takes_frames(text)) as link:
         ear = Ear(link, keyexpr_of(text, link.robot))
-        with told_to_end() as end:
+        with interrupt_event() as end:
             printed = await _print(ear, link.robot, end, count, seconds, as_json, everything)
             interrupted = end.is_set()
         if ear.dropped:

@@ -1,7 +1,8 @@
-"""`cocoro hz KEY`: how often, how evenly and how much travels on a key."""
+"""`cocoro hz KEY`: rate, jitter and amount of data on a key."""
 
 from __future__ import annotations
 
+import asyncio
 import json
 import sys
 import time
@@ -10,29 +11,30 @@ from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from statistics import fmean, pstdev
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import msgspec
+import typer
 from rich.live import Live
 from rich.text import Text
 
 from apps.cli import exits
-from apps.cli.ending import told_to_end
+from apps.cli.interrupt import interrupt_event
 from apps.cli.link import joined
 from apps.cli.listening import Ear, keyexpr_of, takes_frames
-from apps.cli.options import RobotChoice
-from apps.cli.table import table
+from apps.cli.options import JsonOption, KeyArgument, MeshOption, RobotChoice, RobotOption
+from apps.cli.terminal import table
 from cocoro.bus.base import Payload
 from cocoro.installed import topic_named
 from cocoro.source import ANY_HZ, Source
 
 SHOW_S = 1.0
 SILENT_PERIODS = 3.0
-"""A key that is silent for so many of its periods has stopped, as far as its rate goes."""
+"""A key that is silent for this many of its periods counts as stopped."""
 
 
 class MessageHeader(msgspec.Struct, gc=False):
-    """What every message of ours says of itself; others may say none of it."""
+    """The fields that every message has; a foreign payload may have none of them."""
 
     stamp_ns: int = 0
     seq: int = 0
@@ -47,15 +49,15 @@ class Arrival(NamedTuple):
 
 @dataclass(frozen=True)
 class RateReport:
-    """Of one key over the last window."""
+    """Figures of one key over the last window."""
 
     key: str
     nominal_hz: float | None
-    """As the table of topics has it, in the robot's time."""
+    """Nominal rate by the table of topics, in the robot's time."""
     rate_hz: float
-    """As it arrives here."""
+    """Rate of arrival here."""
     stamped_hz: float | None
-    """By the messages' own stamps: in the robot's time, which a slow simulator makes another. None without stamps."""
+    """Rate by the messages' stamps, in the robot's time, which a slow simulator stretches; None without stamps."""
     period_ms: float | None
     jitter_ms: float | None
     """Standard deviation of the periods between arrivals."""
@@ -63,17 +65,17 @@ class RateReport:
     max_ms: float | None
     bytes_per_s: float
     size_bytes: float
-    """Mean, of one message."""
+    """Mean size of a message."""
     messages: int
-    """In the window."""
+    """Messages in the window."""
     lost: int
-    """Gaps in the sequence, since the start."""
+    """Missing sequence numbers since the start."""
     silent_s: float
-    """Since the newest."""
+    """Time since the newest message."""
 
 
 class RateMeter:
-    """One key, as it is heard. `window_s`: what the figures are of."""
+    """Measures one key from its messages' arrivals, over the last `window_s`."""
 
     def __init__(self, key: str, nominal_hz: float | None, window_s: float) -> None:
         self.key = key
@@ -86,12 +88,12 @@ class RateMeter:
         try:
             head = msgspec.msgpack.decode(payload, type=MessageHeader)
         except (msgspec.MsgspecError, ValueError, RecursionError, OverflowError):
-            head = MessageHeader()  # nothing of ours; it has a rate all the same
+            head = MessageHeader()  # a foreign payload has a rate, too
         self._count(head)
         self._arrivals.append(Arrival(at_s, len(payload), head.stamp_ns))
 
     def _count(self, head: MessageHeader) -> None:
-        """Losses, as a reader counts them: a number that cannot be traffic is none."""
+        """Counts losses as a reader does; an impossible sequence number counts as none."""
         source = self._source
         if head.incarnation != source.incarnation:
             source.begin(head.incarnation)
@@ -104,7 +106,7 @@ class RateMeter:
         source.settle()
 
     def report(self, now_s: float) -> RateReport | None:
-        """None before the first message."""
+        """The figures at a time of the monotonic clock; None before the first message."""
         if not self._arrivals:
             return None
         newest = self._arrivals[-1]
@@ -136,12 +138,30 @@ class RateMeter:
         )
 
 
-async def hz(where: RobotChoice, text: str, window_s: float, once: bool, as_json: bool) -> int:
-    """Measure until interrupted, or with `once` over one window. Exit code 1 when that heard nothing."""
+app = typer.Typer()
+
+
+@app.command()
+def hz(
+    key: KeyArgument,
+    window: Annotated[
+        float, typer.Option(min=0.5, max=600.0, metavar="S", help="The figures are over this last time.")
+    ] = 5.0,
+    once: Annotated[bool, typer.Option("--once", help="Measure one window and end.")] = False,
+    robot: RobotOption = None,
+    profile: MeshOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Rate, jitter and amount of data on a key, as it arrives here, over the last seconds."""
+    sys.exit(asyncio.run(show_rates(RobotChoice(robot, profile), key, window, once, json)))
+
+
+async def show_rates(choice: RobotChoice, text: str, window_s: float, once: bool, as_json: bool) -> int:
+    """Measures until interrupted, or with `once` over one window; the exit code is 1 when nothing arrived in it."""
     meters: dict[str, RateMeter] = {}
-    async with joined(where, frames=takes_frames(text)) as link:
+    async with joined(choice, frames=takes_frames(text)) as link:
         ear = Ear(link, keyexpr_of(text, link.robot))
-        with told_to_end() as end, _view(as_json, once) as view:
+        with interrupt_event() as end, _view(as_json, once) as view:
             show_s = time.monotonic() + (window_s if once else SHOW_S)
             while not end.is_set():
                 await ear.wait(end, max(show_s - time.monotonic(), 0.0))
@@ -155,7 +175,10 @@ async def hz(where: RobotChoice, text: str, window_s: float, once: bool, as_json
                     if once:
                         break
         if ear.dropped:
-            print(f"cocoro: {ear.dropped} came faster than this command could count", file=sys.stderr)
+            print(
+                f"cocoro: {ear.dropped} messages came faster than this command could count, and are not in the figures",
+                file=sys.stderr,
+            )
         if end.is_set() and not once:
             return exits.DONE
     return exits.DONE if meters else exits.FAILED
@@ -173,7 +196,7 @@ def _nominal_hz(key: str, robot: str) -> float | None:
 
 
 class _RateDisplay:
-    """Lines of JSON; a table that is written over, where somebody watches; tables one after the other elsewhere."""
+    """Prints JSON lines, a table that is rewritten in place on a terminal, or one table after the other elsewhere."""
 
     def __init__(self, as_json: bool, live: Live | None) -> None:
         self._as_json = as_json
@@ -226,7 +249,7 @@ def _row(report: RateReport) -> tuple[str, ...]:
 
 
 def size_text(size: float) -> str:
-    """Bytes for people, in powers of 1000."""
+    """A number of bytes with its unit, in powers of 1000."""
     for unit, factor in (("MB", 1e6), ("kB", 1e3)):
         if size >= factor:
             return f"{size / factor:.1f} {unit}"

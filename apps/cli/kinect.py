@@ -1,4 +1,4 @@
-"""`cocoro kinect calibrate` and `tilt`: done with the device itself, while its service is down."""
+"""`cocoro kinect`: tools on the device itself, while its service is down."""
 
 from __future__ import annotations
 
@@ -6,9 +6,12 @@ import re
 import sys
 from math import radians
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+import typer
 
 from apps.cli import exits
+from apps.cli.options import ProfileOption
 from apps.cli.robot_file import write_values
 from cocoro.component import load
 from cocoro.errors import ConfigError, RefusedError
@@ -22,34 +25,69 @@ from services.kinect import calibration, tools
 LARGEST_SQUARE_MM = 500.0
 
 
+app = typer.Typer()
+kinect = typer.Typer(no_args_is_help=True, help="Calibrate the Kinect; tilt it.")
+app.add_typer(kinect, name="kinect")
+
+
+@kinect.command()
 def calibrate(
+    board: Annotated[
+        str, typer.Option(metavar="CxR", help="Inner corners of the chessboard, across and down.")
+    ] = "9x6",
+    square: Annotated[float, typer.Option(metavar="MM", help="The side of one square.")] = 25.0,
+    views: Annotated[int, typer.Option(min=6, max=200, help="Number of views to take.")] = 30,
+    source: Annotated[
+        Path | None, typer.Option("--from", metavar="FOLDER", help="Views that were kept, instead of the device.")
+    ] = None,
+    keep: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="Keep the views here, to calibrate from them again.")
+    ] = None,
+    profile: ProfileOption = "robot",
+    write: Annotated[
+        Path | None,
+        typer.Option("--write", metavar="FILE", help="Write the result into this file, not the robot's measured file."),
+    ] = None,
+) -> None:
+    """Measure lenses, registration and depth curve from views of a chessboard. The robot must be down."""
+    sys.exit(calibrate_from_views(profile, board, square, views, source, keep, write))
+
+
+@kinect.command()
+def tilt(
+    angle: Annotated[float, typer.Argument(metavar="DEG", min=-30.0, max=30.0, help="Upward is positive.")],
+    profile: ProfileOption = "robot",
+) -> None:
+    """Move the Kinect's own tilt motor. The robot's description expects it at 0, since the neck tilts."""
+    tools.tilt(_config(profiles.read(profile)), radians(angle))
+
+
+def calibrate_from_views(
     profile_name: str, size: str, square_mm: float, views: int, source: Path | None, keep: Path | None,
     write: Path | None,
 ) -> int:  # fmt: skip
-    """Take views or read them, calibrate, and write what came of it into the robot's own file."""
+    """Takes views or reads them from `source`, calibrates, and writes the result into the robot's measured file.
+
+    Raises ConfigError for an impossible board or square, RefusedError while the Kinect's service runs.
+    """
     profile = profiles.read(profile_name)
     robot, file = _robot(profile, write)
     board = calibration.Board(*_board(size), _square_m(square_mm))
 
-    def tell(text: str) -> None:
+    def report(text: str) -> None:
         print(text, file=sys.stderr, flush=True)
 
     if source is not None:
-        taken = tools.read(source, board, tell)
+        taken = tools.read(source, board, report)
     else:
-        tell(f"show the board ({size} inner corners), 0.6 to 2 m away, in every part of the picture, tilted every way")
-        taken = tools.capture(_config(profile), board, views, keep, tell)
+        report(f"show the board ({size} inner corners) 0.6 to 2 m away, in every part of the picture, tilted every way")
+        taken = tools.capture(_config(profile), board, views, keep, report)
     found = calibration.calibrate(taken, board, robot)
     write_values(file, "kinect", found.values())
     _print(found)
     print(f"written to {file}")
     if profile.measured is None:
-        print(f'Name it in the profile: measured = "{file}"')
-    return exits.DONE
-
-
-def tilt(profile_name: str, angle_deg: float) -> int:
-    tools.tilt(_config(profiles.read(profile_name)), radians(angle_deg))
+        print(f'Name the file in the profile: measured = "{file}"')
     return exits.DONE
 
 
@@ -61,18 +99,18 @@ def _print(found: Any) -> None:
     fx, fy, cx, cy = found.depth_lens[:4]
     print(f"depth   fx {fx:.1f}, fy {fy:.1f}, middle {cx:.1f}, {cy:.1f}; within {found.depth_misfit_codes:.2f} codes")
     places = zip(found.depth_offset_m, found.offset_doubt_m, strict=True)
-    told = ", ".join(f"{1000 * place:.1f} +- {1000 * doubt:.1f}" for place, doubt in places)
-    print(f"place   {told} mm (x, y, z, in the colour camera's frame); {found.views} views")
+    offsets = ", ".join(f"{1000 * place:.1f} +- {1000 * doubt:.1f}" for place, doubt in places)
+    print(f"place   {offsets} mm (x, y, z, in the colour camera's frame); {found.views} views")
 
 
 def _config(profile: Profile) -> Any:
     if "kinect" in RunDir(profile.robot).claims():
-        raise RefusedError("the Kinect's service runs: `cocoro down` first")
+        raise RefusedError(f"the Kinect's service of {profile.robot} is running: stop it with `cocoro down`")
     return profile.config("kinect", load(named("kinect")).config)
 
 
 def _robot(profile: Profile, write: Path | None) -> tuple[Robot, Path]:
-    """As it is described, without what was measured of its Kinect before; and its own file."""
+    """The robot by its description, without earlier measurements of its Kinect; and its measured file."""
     measured = None if profile.measured is None else Path(profile.measured)
     description = None if profile.description is None else Path(profile.description)
     return Robot.load(description), write or measured or Path(f"{profile.robot}-measured.toml")
@@ -82,7 +120,7 @@ def _board(size: str) -> tuple[int, int]:
     match = re.fullmatch(r"(\d+)x(\d+)", size)
     columns, rows = (int(match[1]), int(match[2])) if match else (0, 0)
     if not (3 <= columns <= 40 and 3 <= rows <= 40):
-        raise ConfigError(f"--board {size!r}: write the inner corners as 9x6, three or more each way")
+        raise ConfigError(f"--board {size!r}: write the number of inner corners as 9x6, 3 to 40 each way")
     return columns, rows
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from apps.cli.link import joined
 from apps.cli.options import RobotChoice
-from apps.cli.table import table
+from apps.cli.terminal import table
 from apps.learning import lesson, study
 from apps.learning.lesson import ArmReport
 from apps.learning.wheels import WheelFit

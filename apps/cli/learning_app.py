@@ -11,7 +11,6 @@ import typer
 
 from apps.cli.options import (
     DescriptionOption,
-    FramesOption,
     JsonOption,
     MeasuredOption,
     MeshOption,
@@ -27,16 +26,11 @@ if TYPE_CHECKING:
     from cocoro.learning.model import BodyModel
     from services.executive.tasks import BabbleArmTask, BabbleWheelsTask
 
-PANEL = "Learning"
-
+app = typer.Typer()
 babble = typer.Typer(no_args_is_help=True, help="Move to learn: the arm before the eyes, the wheels before a target.")
 learn = typer.Typer(no_args_is_help=True, help="Learn from what babbling saw: a model that the planner loads.")
-
-
-def add_to(app: typer.Typer) -> None:
-    app.add_typer(babble, name="babble", rich_help_panel=PANEL)
-    app.add_typer(learn, name="learn", rich_help_panel=PANEL)
-    app.command(rich_help_panel=PANEL)(experiment)
+app.add_typer(babble, name="babble")
+app.add_typer(learn, name="learn")
 
 
 @babble.command("arm")
@@ -139,28 +133,3 @@ def _send(wanted: bool, made: BodyModel, robot: str | None, profile: str | None,
 
         text = asyncio.run(learning.send(RobotChoice(robot, profile), made))
         print(text, file=sys.stderr if as_json else sys.stdout)
-
-
-def experiment(
-    which: Annotated[str, typer.Argument(metavar="E1|E2|E3|E4|E5|E6|all", help="Which of the paper's experiments.")],
-    seeds: Annotated[int, typer.Option(min=1, max=1000, metavar="N", help="So many, from 0 on: a body each.")] = 10,
-    out: Annotated[
-        Path, typer.Option(metavar="DIR", help="Report, plots, samples, models; what is there is not run again.")
-    ] = Path("experiments"),
-    sensors: Annotated[str, typer.Option(metavar="ideal|real", help="Perfect or real sensors.")] = "real",
-    body: Annotated[str, typer.Option(metavar="nominal|worn", help="A body as drawn, or not.")] = "worn",
-    frames: FramesOption = None,
-    samples: Annotated[
-        int, typer.Option(min=100, max=100_000, metavar="N", help="Of each body's babbling; a fifth is held out.")
-    ] = 2600,
-    jobs: Annotated[int | None, typer.Option(min=1, metavar="N", help="Runs at once; by default one a core.")] = None,
-    no_plots: Annotated[bool, typer.Option("--no-plots", help="Tables alone, without matplotlib.")] = False,
-) -> None:
-    """Run the paper's experiments in virtual time and report them beside the paper's text and baselines.
-
-    E1 hand-eye map, E2 reaching, E3 wheel distance, E4 navigation, E5 following, E6 fetching. Ctrl-C ends it; the same
-    command goes on.
-    """
-    from apps.cli import experiment as experimenting
-
-    sys.exit(experimenting.experiment(which, seeds, out, sensors, body, frames, samples, jobs, not no_plots))

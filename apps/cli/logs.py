@@ -1,42 +1,47 @@
-"""`cocoro logs`: what the processes of a robot wrote, in the order in which they wrote it."""
+"""`cocoro logs`: the log files of a robot's processes, merged by time."""
 
 from __future__ import annotations
 
+import asyncio
 import heapq
 import os
 import re
+import sys
 from collections import deque
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import NamedTuple, TextIO
+from typing import Annotated, NamedTuple, TextIO
+
+import typer
 
 from apps.cli import exits
-from apps.cli.ending import passed, told_to_end
+from apps.cli.interrupt import elapsed, interrupt_event
+from apps.cli.options import RobotOption
 from cocoro.bus.endpoints import default_run_dir
 from cocoro.errors import ConfigError
 from deploy.processes import components
 from deploy.rundir import RunDir, folders
 
 LOOK_S = 0.2
-"""How often it looks for more."""
+"""Time between two looks for new lines."""
 LEVELS = ("debug", "info", "warning", "error", "critical")
 _STAMP = re.compile(r"(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d:\d\d)[.,](\d{3}) +(\w+) ")
 _CRASHES = ("Traceback (most recent call last)", "Fatal Python error")
-"""Written without a level, by Python itself, and worth one."""
+"""First lines of crashes, which Python writes without a level; they count as critical."""
 
 
 class LogEntry(NamedTuple):
-    """What was written at once: a line with a time, and those without one that follow it (a traceback, say)."""
+    """A line with a time, and the lines without one that follow it (a traceback, for example)."""
 
     stamp: str
-    """Sorts by time; that of the line before when the first lines of a file have none."""
+    """Time as text that sorts; the previous entry's when the first lines of a file have none."""
     level: str
-    """Empty for lines that have none."""
+    """Lower case; empty for lines without a level."""
     lines: tuple[str, ...]
 
 
 def robot_of(robot: str | None) -> RunDir:
-    """The robot whose logs are meant, up or not. Raises ConfigError when that is not clear, or there are none."""
+    """Run directory of the robot, up or not. Raises ConfigError when several have logs, or none."""
     if robot is not None:
         run_dir = RunDir(robot)
         if not run_dir.logs.is_dir():
@@ -52,7 +57,7 @@ def robot_of(robot: str | None) -> RunDir:
 
 
 def files_of(run_dir: RunDir, name: str | None) -> list[Path]:
-    """The logs of all processes, or that of one, by its own name or a service's. Raises ConfigError for no such one."""
+    """Log files of all processes, or of the process or service `name`. Raises ConfigError for an unknown name."""
     known = {path.name.removesuffix(".log"): path for path in sorted(run_dir.logs.glob("*.log"))}
     if name is None:
         return list(known.values())
@@ -63,7 +68,7 @@ def files_of(run_dir: RunDir, name: str | None) -> list[Path]:
 
 
 def _process_of(run_dir: RunDir, service: str) -> str:
-    """The process that is a service: now, or by the last start's profile."""
+    """Name of the process that is a service: the one that runs now, else by the profile of the last start."""
     if service in (claims := run_dir.claims()):
         return claims[service].name
     started = run_dir.resolved().get("processes", ())
@@ -72,7 +77,7 @@ def _process_of(run_dir: RunDir, service: str) -> str:
 
 
 def entries(lines: Iterable[str], stamp: str = "") -> Iterator[LogEntry]:
-    """Lines as entries; `stamp` is that of what was before them."""
+    """Groups lines into entries; `stamp` is the time of the entry before them."""
     level, gathered = "", list[str]()
     for line in lines:
         match = _STAMP.match(line)
@@ -88,7 +93,7 @@ def entries(lines: Iterable[str], stamp: str = "") -> Iterator[LogEntry]:
 
 
 class LogTail:
-    """One log, read on as it grows, and in the file that takes its place when the process starts again."""
+    """Reads one log file as it grows, and the file that replaces it when the process starts again."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -97,7 +102,7 @@ class LogTail:
         self._part = ""
 
     def read(self) -> list[LogEntry]:
-        """What is new. A last line that has no end yet waits for it."""
+        """The entries that are new. A last line without its newline waits for the next call."""
         text = self._rest()
         if self._replaced():
             self.close()
@@ -128,18 +133,38 @@ class LogTail:
             self._file.close()
 
 
-async def logs(robot: str | None, name: str | None, follow: bool, count: int, level: str | None) -> int:
-    """Print the newest entries, and with `follow` those that come, until interrupted."""
+app = typer.Typer()
+
+
+@app.command()
+def logs(
+    service: Annotated[str | None, typer.Argument(help="A process or a service; all by default.")] = None,
+    follow: Annotated[bool, typer.Option("--follow", "-f", help="Print new entries, too, until Ctrl-C.")] = False,
+    lines: Annotated[int, typer.Option("--lines", "-n", min=0, help="Number of newest entries to begin with.")] = 100,
+    level: Annotated[
+        str | None, typer.Option(metavar="LEVEL", help="Only this level and above: debug, info, warning, error.")
+    ] = None,
+    robot: RobotOption = None,
+) -> None:
+    """What the robot's processes on this machine wrote since their start, merged by time. Works when it is down."""
+    sys.exit(asyncio.run(print_logs(robot, service, follow, lines, level)))
+
+
+async def print_logs(robot: str | None, name: str | None, follow: bool, count: int, level: str | None) -> int:
+    """Prints the newest `count` entries, and with `follow` new ones until interrupted; returns the exit code.
+
+    Raises ConfigError for an unknown level, robot or name.
+    """
     if level is not None and level not in LEVELS:
-        raise ConfigError(f"--level {level}: it is one of {', '.join(LEVELS)}")
+        raise ConfigError(f"--level {level}: known are {', '.join(LEVELS)}")
     run_dir = robot_of(robot)
     wanted = {*LEVELS, ""} if level is None else set(LEVELS[LEVELS.index(level) :])
     tails = {path: LogTail(path) for path in files_of(run_dir, name)}
     try:
         _print(deque(_chosen(tails.values(), wanted), maxlen=count))
         if follow:
-            with told_to_end() as end:
-                while await passed(end, LOOK_S):
+            with interrupt_event() as end:
+                while await elapsed(end, LOOK_S):
                     if name is None:
                         tails |= {path: LogTail(path) for path in files_of(run_dir, None) if path not in tails}
                     _print(_chosen(tails.values(), wanted))
@@ -150,7 +175,7 @@ async def logs(robot: str | None, name: str | None, follow: bool, count: int, le
 
 
 def _chosen(tails: Iterable[LogTail], wanted: set[str]) -> Iterator[LogEntry]:
-    """What is new in all of them, by time."""
+    """New entries of all logs that have a wanted level, in the order of time."""
     merged = heapq.merge(*(tail.read() for tail in tails), key=lambda entry: entry.stamp)
     return (entry for entry in merged if entry.level in wanted)
 

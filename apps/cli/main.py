@@ -51,7 +51,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _command(arguments: list[str]) -> int:
-    from typer.main import get_command
+    from typer.main import get_group
 
     from apps.cli import log_lines
     from apps.cli.app import app
@@ -59,7 +59,7 @@ def _command(arguments: list[str]) -> int:
     if output.taken_over():
         log_lines.take_over()
     try:
-        get_command(app)(args=arguments, prog_name="cocoro")  # not app itself, which hooks itself into sys.excepthook
+        get_group(app)(args=arguments, prog_name="cocoro")  # not app itself, which hooks itself into sys.excepthook
     except SystemExit as end:
         if _interrupted(end):  # the command line library has an exit code of its own for it
             return _cancelled()

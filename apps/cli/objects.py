@@ -9,7 +9,7 @@ import msgspec
 from apps.cli import exits
 from apps.cli.link import joined
 from apps.cli.options import RobotChoice
-from apps.cli.table import print_table
+from apps.cli.terminal import print_table
 from cocoro.messages import KnownObject, ObjectsRequest
 from cocoro.topics import OBJECTS
 

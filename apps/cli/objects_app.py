@@ -11,11 +11,9 @@ import typer
 
 from apps.cli.options import JsonOption, MeshOption, RobotChoice, RobotOption
 
+app = typer.Typer()
 objects = typer.Typer(invoke_without_command=True)
-
-
-def add_to(app: typer.Typer, panel: str) -> None:
-    app.add_typer(objects, name="objects", rich_help_panel=panel)
+app.add_typer(objects, name="objects")
 
 
 @objects.callback()

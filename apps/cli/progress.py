@@ -1,29 +1,34 @@
-"""A task's progress, as it is shown: one live line where a person watches, a line a phase elsewhere, nothing for
-scripts that want JSON."""
+"""How a command shows the progress of a task: one line rewritten in place on a terminal, lines for each phase
+elsewhere, and nothing with `--json`."""
 
 from __future__ import annotations
 
-import shutil
 import sys
 from typing import Protocol, TextIO
 
+from apps.cli.terminal import StatusLine
 from cocoro.messages import TaskState
 
 EVERY_S = 2.0
-"""How often a long phase gets a further line, where lines are not written over."""
+"""Time of a phase between two of its lines, where no line can be rewritten."""
 
 
 class TaskDisplay(Protocol):
-    def show(self, state: TaskState) -> None: ...
+    def show(self, state: TaskState) -> None:
+        """Shows a state of the task."""
 
     def say(self, text: str) -> None:
-        """Something beside the progress."""
+        """Prints a line beside the progress."""
 
     def result(self, text: str) -> None:
-        """The last line."""
+        """Prints the last line."""
+
+    def close(self) -> None:
+        """Leaves the terminal as it was; needed when the command ends without a result."""
 
 
-def view(as_json: bool, out: TextIO | None = None) -> TaskDisplay:
+def task_display(as_json: bool, out: TextIO | None = None) -> TaskDisplay:
+    """The display for `out`, standard output by default."""
     out = out or sys.stdout
     if as_json:
         return SilentDisplay()
@@ -36,6 +41,8 @@ def line(state: TaskState) -> str:
 
 
 class SilentDisplay:
+    """Shows nothing on standard output, which is for JSON."""
+
     def show(self, state: TaskState) -> None:
         pass
 
@@ -45,9 +52,12 @@ class SilentDisplay:
     def result(self, text: str) -> None:
         pass
 
+    def close(self) -> None:
+        pass
+
 
 class LineDisplay:
-    """A line for each phase, and one now and then while it lasts."""
+    """Prints a line for each phase, and one every EVERY_S while it lasts."""
 
     def __init__(self, out: TextIO) -> None:
         self._out = out
@@ -58,7 +68,7 @@ class LineDisplay:
     def show(self, state: TaskState) -> None:
         phase = (len(state.phases), state.phase)
         begins, self._begun = phase != self._begun, phase
-        if begins:  # what a phase begins with is still the last one's reason and distance
+        if begins:  # the first state of a phase still has the reason and distance of the phase before
             return
         if phase != self._shown or state.elapsed_s - self._shown_s >= EVERY_S:
             self._shown, self._shown_s = phase, state.elapsed_s
@@ -70,34 +80,35 @@ class LineDisplay:
     def result(self, text: str) -> None:
         self.say(text)
 
+    def close(self) -> None:
+        pass
+
 
 class LiveDisplay:
-    """A line that is written over; what a phase came to stays above it."""
+    """Rewrites one line in place; the last line of each finished phase stays above it."""
 
     def __init__(self, out: TextIO) -> None:
-        self._out = out
+        self._line = StatusLine(out)
         self._last: TaskState | None = None
 
     def show(self, state: TaskState) -> None:
         before = self._last
         if before is not None and (len(before.phases), before.phase) != (len(state.phases), state.phase):
-            self._write(line(before) + "\n")
+            self._line.print(line(before))
         self._last = state
-        self._write(line(state))
+        self._line.show(line(state))
 
     def say(self, text: str) -> None:
-        self._write(text + "\n")
+        self._line.print(text)
         if self._last is not None:
-            self._write(line(self._last))
+            self._line.show(line(self._last))
 
     def result(self, text: str) -> None:
+        self._line.close()
         if self._last is not None:
-            self._write(line(self._last) + "\n")
+            self._line.print(line(self._last))
             self._last = None
-        self._write(text + "\n")
+        self._line.print(text)
 
-    def _write(self, text: str) -> None:
-        width = shutil.get_terminal_size().columns - 1
-        end = "\n" if text.endswith("\n") else ""
-        self._out.write(f"\r\x1b[K{text.rstrip()[:width]}{end}")
-        self._out.flush()
+    def close(self) -> None:
+        self._line.close()

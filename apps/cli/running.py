@@ -1,4 +1,4 @@
-"""`up`, `down` and `run`: what starts and ends processes."""
+"""`cocoro up`, `down` and `run`: start and stop a robot's processes."""
 
 from __future__ import annotations
 
@@ -9,12 +9,25 @@ import subprocess
 import sys
 from contextlib import closing
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Annotated, Any
 
 import msgspec
+import typer
 
 from apps.cli import exits
-from apps.cli.options import frames_of, latencies_of
+from apps.cli.options import (
+    AdaptOption,
+    FramesOption,
+    LatencyOption,
+    ModelOption,
+    ObjectsOption,
+    ProfileArgument,
+    ReachOption,
+    RobotOption,
+    SetOption,
+    frames_of,
+    latencies_of,
+)
 from apps.cli.output import going_on
 from cocoro import private
 from cocoro.bus import shared
@@ -26,7 +39,65 @@ from deploy.rundir import RunDir, Target, robots, targets
 ERRORS = "supervisor.err"
 ERRORS_BYTES = 64 * 1024
 STOP_S = 60.0
-"""How long a supervisor may take to stop everything."""
+"""Longest wait for a supervisor to stop everything."""
+
+
+app = typer.Typer()
+
+
+@app.command()
+def up(
+    profile: ProfileArgument = "sim",
+    detach: Annotated[bool, typer.Option("--detach", "-d", help="Return when the robot is up.")] = False,
+    scene: Annotated[str | None, typer.Option(help="Simulator: a scene's name, or its file.")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Simulator: seed of all random numbers.")] = None,
+    sensors: Annotated[
+        str | None, typer.Option(metavar="ideal|real", help="Simulator: sensors without or with errors.")
+    ] = None,
+    body: Annotated[
+        str | None,
+        typer.Option(metavar="nominal|worn", help="Simulator: a body that equals the nominal model, or differs."),
+    ] = None,
+    model: ModelOption = None,
+    reach: ReachOption = None,
+    adapt: AdaptOption = False,
+    frames: FramesOption = None,
+    latency: LatencyOption = None,
+    objects: ObjectsOption = None,
+    set_: SetOption = None,
+    unattended: Annotated[
+        bool,
+        typer.Option("--unattended", help="No person is present: the robot's first start has the emergency stop set."),
+    ] = False,
+) -> None:
+    """Start a robot's processes and stay until Ctrl-C (or, with --detach, until they are ready)."""
+    settings = overrides(scene, seed, sensors, body, frames, latency or [], set_ or [])
+    if objects is not None:
+        settings.insert(0, objects_of(objects))
+    settings[:0] = model_of(model, reach, adapt)
+    read = profiles.read(profile, settings)
+    sys.exit(supervise_detached(read, unattended) if detach else supervise(read, unattended))
+
+
+@app.command()
+def down(robot: RobotOption = None) -> None:
+    """Stop a robot's processes. It is no error when none run."""
+    sys.exit(stop_robots(robot))
+
+
+@app.command()
+def run(
+    process: Annotated[str, typer.Argument(help="A process of the profile, or any other that is installed.")],
+    profile: Annotated[
+        str | None, typer.Option(metavar="PROFILE", help="By default that of the robot that is up here, else sim.")
+    ] = None,
+    set_: SetOption = None,
+) -> None:
+    """Run one process in this terminal, on the mesh of the profile. Ctrl-C ends it."""
+    sys.exit(run_process(process, profile, set_ or []))
+
+
+# --- options as settings of the profile -------------------------------------------------------------
 
 
 def overrides(
@@ -38,7 +109,7 @@ def overrides(
     latency: list[str],
     settings: list[str],
 ) -> list[str]:
-    """The options of `up` as settings of the profile. Raises ConfigError."""
+    """The options of `up` as settings of the profile, KEY=VALUE. Raises ConfigError for an unreadable option."""
     sim: dict[str, Any] = {}
     if scene is not None:
         sim["scene"] = scene_of(scene)
@@ -50,13 +121,15 @@ def overrides(
         sim["body"] = body
     if frames is not None:
         sim.update(frames_of(frames))
-    found = [f"service.sim.{name}={json.dumps(value)}" for name, value in sim.items()]  # JSON's values are TOML's here
+    found = [
+        f"service.sim.{name}={json.dumps(value)}" for name, value in sim.items()
+    ]  # these JSON values are TOML values, too
     found += [f"service.{name}.latency_s={seconds}" for name, seconds in latencies_of(latency).items()]
     return found + settings
 
 
 def objects_of(file: Path) -> str:
-    """A file of known objects as a setting of the profile; read once here, so that a mistake in it is said at once."""
+    """A file of known objects as a setting of the profile. Reads it, so that a mistake in it is reported here."""
     from cocoro.objects import Catalogue
 
     Catalogue.load(file)
@@ -64,34 +137,39 @@ def objects_of(file: Path) -> str:
 
 
 def model_of(file: Path | None, reach: str | None, adapt: bool = False) -> list[str]:
-    """A learned model, whether to reach with it, and whether to go on teaching it, as settings of the profile. Raises
-    ConfigError."""
+    """`--model`, `--reach` and `--adapt` as settings of the profile. Raises ConfigError for a missing model file."""
     if file is not None and not file.is_file():
-        raise ConfigError(f"there is no model {file}")
+        raise ConfigError(f"--model {file}: no such file; `cocoro learn` writes one")
     found = [] if file is None else [f"service.planning.model={json.dumps(str(file.resolve()))}"]
     found += [] if reach is None else [f"service.planning.reach={json.dumps(reach)}"]
     return found + (["service.planning.adapt=true"] if adapt else [])
 
 
 def scene_of(scene: str) -> str:
-    """A scene's name as it is; a file's name so that it means the same file from anywhere."""
+    """A scene's name unchanged; the path of a scene file made absolute. Raises ConfigError for a missing file."""
     if not scene.endswith(".toml") and os.sep not in scene:
         return scene
     if not Path(scene).is_file():
-        raise ConfigError(f"there is no scene file {scene}")
+        raise ConfigError(f"--scene {scene}: no such file; docs/scenes.md lists the scenes that have a name")
     return str(Path(scene).resolve())
 
 
-def up(profile: Profile, unattended: bool) -> int:
-    """Supervise a robot in the foreground."""
+# --- up -------------------------------------------------------------------------------------------
+
+
+def supervise(profile: Profile, unattended: bool) -> int:
+    """Supervises a robot in the foreground until Ctrl-C; returns the exit code."""
     run_dir = RunDir(profile.robot)
-    from deploy import supervisor  # takes its time to import, and `up --detach` has no need of it
+    from deploy import supervisor  # slow to import; `up --detach` does not need it
 
-    return supervisor.supervise(profile, run_dir, _say, lambda: _say("Ctrl-C stops it"), by_hand=not unattended)
+    return supervisor.supervise(profile, run_dir, _print, lambda: _print("Ctrl-C stops it"), by_hand=not unattended)
 
 
-def up_detached(profile: Profile, unattended: bool) -> int:
-    """Start a supervisor of its own, and return when the robot is up or could not be started."""
+def supervise_detached(profile: Profile, unattended: bool) -> int:
+    """Starts a supervisor in a session of its own; returns when the robot is up, or with the exit code of its failure.
+
+    Raises CocoroError when the supervisor dies.
+    """
     run_dir = RunDir(profile.robot)
     run_dir.make()
     reader_fd, writer_fd = os.pipe()
@@ -123,7 +201,7 @@ def up_detached(profile: Profile, unattended: bool) -> int:
         try:
             for report in map(json.loads, reports):
                 if "line" in report:
-                    _say(report["line"])
+                    _print(report["line"])
                 else:
                     code = report["code"]
         except KeyboardInterrupt:
@@ -139,7 +217,7 @@ def up_detached(profile: Profile, unattended: bool) -> int:
 
 
 def _errors_file(run_dir: RunDir) -> IO[bytes]:
-    """Where a supervisor writes what it could not say otherwise; nowhere where nothing can be written."""
+    """The file for a supervisor's standard error; /dev/null when the run directory's disk is full."""
     try:
         return os.fdopen(private.open_file(run_dir.logs / ERRORS, os.O_CREAT | os.O_WRONLY | os.O_TRUNC), "wb")
     except private.FullError:
@@ -147,7 +225,7 @@ def _errors_file(run_dir: RunDir) -> IO[bytes]:
 
 
 def _last_error(run_dir: RunDir) -> str:
-    """What a supervisor wrote last, to be put after a sentence."""
+    """The last line that the supervisor wrote, with the file's name, to be appended to a sentence."""
     try:
         lines = private.read(run_dir.logs / ERRORS, ERRORS_BYTES).decode(errors="replace").splitlines()
     except (FileNotFoundError, CocoroError):
@@ -155,45 +233,50 @@ def _last_error(run_dir: RunDir) -> str:
     return f"{f': {lines[-1]}' if lines else ''}; see {run_dir.logs / ERRORS}"
 
 
-def down(robot: str | None) -> int:
-    """Stop one robot, or all that are up on this machine."""
+# --- down and run -----------------------------------------------------------------------------------
+
+
+def stop_robots(robot: str | None) -> int:
+    """Stops one robot, or all that are up on this machine; returns the exit code."""
     chosen = [RunDir(robot)] if robot is not None else [r for r in robots() if r.supervisor() or r.claims()]
     stopped = [_stop(run_dir) for run_dir in chosen]
-    shared.sweep()  # what killed processes left
+    shared.sweep()  # shared memory that killed processes left
     if not any(stopped):
-        _say(f"{robot or 'nothing'} was not up" if robot else "nothing was up")
+        _print(f"{robot} was not up" if robot else "nothing was up")
     return exits.DONE
 
 
 def _stop(run_dir: RunDir) -> bool:
-    """Whether there was something to stop."""
+    """Stops one robot; returns whether anything was running."""
     found = False
     with closing(Target(run_dir.path / "supervisor")) as supervisor:
         if supervisor.pid is not None:
             found = True
             supervisor.signal(signal.SIGTERM)
             if not supervisor.wait(STOP_S):
-                _say(f"{run_dir.robot}: the supervisor (pid {supervisor.pid}) does not end: killed")
+                _print(f"{run_dir.robot}: the supervisor (pid {supervisor.pid}) does not end; killing it")
                 supervisor.signal(signal.SIGKILL)
                 supervisor.wait(STOP_S)
-    for target in targets(run_dir):  # what a killed supervisor left, or was started by `run`
+    for target in targets(run_dir):  # left by a killed supervisor, or started by `run`
         with closing(target):
             found = found or target.pid is not None
             target.signal(signal.SIGTERM)
-            target.signal(signal.SIGCONT)  # a stopped process could not obey
+            target.signal(signal.SIGCONT)  # a stopped process handles no signal
             if not target.wait(launch.ORPHAN_S):
                 target.signal(signal.SIGKILL)
                 target.wait(launch.ORPHAN_S)
     if found:
-        _say(f"{run_dir.robot} is down")
+        _print(f"{run_dir.robot} is down")
     return found
 
 
-def run(process: str, profile: str | None, settings: list[str]) -> int:
-    """One process in the foreground."""
+def run_process(process: str, profile: str | None, settings: list[str]) -> int:
+    """Runs one process in the foreground; returns its exit code. Raises ConfigError when the profile is not clear."""
     if profile is None and not settings and (up_here := robots()):
         if len(up_here) > 1:
-            raise ConfigError(f"several robots are up ({', '.join(r.robot for r in up_here)}): say --profile")
+            raise ConfigError(
+                f"several robots are up ({', '.join(r.robot for r in up_here)}): choose one with --profile"
+            )
         data = up_here[0].resolved()
         read = profiles.from_data(data, data.get("name", "")) if data else profiles.read("sim")
     else:
@@ -205,6 +288,6 @@ def run(process: str, profile: str | None, settings: list[str]) -> int:
         return launch.run(process, run_dir, msgspec.to_builtins(read), read.name, raise_crashes=True)
 
 
-def _say(text: str) -> None:
-    with going_on():  # when nobody reads any more, as with `cocoro up | head`, the robot must not mind
+def _print(text: str) -> None:
+    with going_on():  # a closed standard output, as in `cocoro up | head`, must not stop the robot
         print(text, flush=True)

@@ -1,43 +1,114 @@
-"""`cocoro servos clear`, `relax` and `hold`: what the running service is asked."""
+"""`cocoro servos`: commands to the running service, and tools at the serial line while the service is down."""
 
 from __future__ import annotations
 
+import asyncio
+import json as json_module
+import select
 import sys
-from typing import cast
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, cast
+
+import typer
 
 from apps.cli import exits
 from apps.cli.link import Link, joined
-from apps.cli.options import RobotChoice
-from cocoro.errors import ConfigError, MeshError
+from apps.cli.options import JsonOption, MeshOption, ProfileOption, RobotChoice, RobotOption
+from apps.cli.robot_file import write_values
+from apps.cli.terminal import StatusLine, print_table
+from cocoro.component import load
+from cocoro.errors import CocoroError, ConfigError, MeshError, RefusedError
 from cocoro.messages import ServoRequest
-from cocoro.robot import Robot
+from cocoro.ports import port_path
+from cocoro.robot import Joint, Robot
 from cocoro.topics import SERVOS
+from deploy import profiles
+from deploy.processes import named
+from deploy.profiles import Profile
+from services.servos import tools
+from services.servos.bus import ServoBus
 
 NETWORKS = ("arm", "hand")
-DID = {"clear": "cleared", "relax": "limp", "hold": "holding"}
+DONE_WORDS = {"clear": "cleared", "relax": "limp", "hold": "holding"}
+REPLY_S = 0.05
+"""Longest wait for one servo's reply on the serial line."""
+
+JointsArgument = Annotated[
+    list[str] | None, typer.Argument(metavar="[JOINT]...", help="Names of joints; all joints by default.")
+]
+JointArguments = Annotated[
+    list[str], typer.Argument(metavar="JOINT...", help="Names of joints, worked on one after the other.")
+]
+PortOption = Annotated[
+    str | None, typer.Option("--port", metavar="DEVICE", help="Serial port, instead of the profile's.")
+]
+PortsOption = Annotated[
+    list[str] | None,
+    typer.Option("--port", metavar="DEVICE", help="Serial port, instead of the profile's. Repeatable."),
+]
+BaudOption = Annotated[
+    int | None, typer.Option("--baud", metavar="RATE", help="Baud rate, instead of the robot description's.")
+]
+WriteOption = Annotated[
+    Path | None,
+    typer.Option("--write", metavar="FILE", help="Write the result into this file, not the robot's measured file."),
+]
+
+app = typer.Typer()
+servos = typer.Typer(
+    no_args_is_help=True, help="Find, set up, calibrate, hold and relax the servos; clear their faults."
+)
+app.add_typer(servos, name="servos")
 
 
-async def ask(where: RobotChoice, action: str, joints: list[str]) -> int:
-    """Ask the networks that have these joints. Exit code 3 when something could not be done."""
+# --- requests to the running service ----------------------------------------------------------------
+
+
+@servos.command()
+def clear(joints: JointsArgument = None, robot: RobotOption = None, profile: MeshOption = None) -> None:
+    """Clear latched faults, such as an overload; the joints then hold where they are."""
+    sys.exit(asyncio.run(request(RobotChoice(robot, profile), "clear", joints or [])))
+
+
+@servos.command()
+def relax(joints: JointsArgument = None, robot: RobotOption = None, profile: MeshOption = None) -> None:
+    """Make joints limp, so that they can be turned by hand. The arm sinks: hold it."""
+    sys.exit(asyncio.run(request(RobotChoice(robot, profile), "relax", joints or [])))
+
+
+@servos.command()
+def hold(joints: JointsArgument = None, robot: RobotOption = None, profile: MeshOption = None) -> None:
+    """Make joints hold where they are."""
+    sys.exit(asyncio.run(request(RobotChoice(robot, profile), "hold", joints or [])))
+
+
+async def request(choice: RobotChoice, action: str, joints: list[str]) -> int:
+    """Sends an action to the networks that have these joints; the exit code is 3 when one could not do it.
+
+    Raises MeshError when a network's service is not running, ConfigError for an unknown joint.
+    """
     networks = _networks_of(joints)
     code = exits.DONE
-    async with joined(where) as link:
+    async with joined(choice) as link:
         alive = await link.alive()
         missing = [network for network in networks if network not in alive]
         if missing:
-            raise MeshError(f"{link.robot} has no {missing[0]} running: `cocoro status` tells more")
-        for network, named in networks.items():
-            code = max(code, await _ask_one(link, network, action, named))
+            raise MeshError(f"{link.robot} has no {missing[0]} running: see `cocoro status`")
+        for network, names in networks.items():
+            code = max(code, await _request_one(link, network, action, names))
     return code
 
 
-async def _ask_one(link: Link, network: str, action: str, joints: list[str]) -> int:
-    request = ServoRequest(action=action, joints=tuple(joints))  # type: ignore[arg-type] # one of three, by the command
+async def _request_one(link: Link, network: str, action: str, joints: list[str]) -> int:
+    question = ServoRequest(action=action, joints=tuple(joints))  # type: ignore[arg-type] # one of three, by the command
     try:
-        reply = await link.call(SERVOS.of(network), request)
+        reply = await link.call(SERVOS.of(network), question)
     except MeshError as error:
-        raise MeshError(f"{network} does not answer this: is it simulated? Only real servos have it") from error
-    print(f"{network}: {DID[action]}: {', '.join(reply.joints) or 'none'}")
+        raise MeshError(f"{network} does not answer `{action}`; only real servos do, not simulated ones") from error
+    print(f"{network}: {DONE_WORDS[action]}: {', '.join(reply.joints) or 'none'}")
     if reply.text:
         print(f"cocoro: {network}: {reply.text}", file=sys.stderr)
         return exits.REFUSED
@@ -45,13 +116,198 @@ async def _ask_one(link: Link, network: str, action: str, joints: list[str]) -> 
 
 
 def _networks_of(joints: list[str]) -> dict[str, list[str]]:
-    """Which joints to name to which network; none is all of both. Raises ConfigError for one that there is not."""
+    """Joints by network; no joints stand for all of both networks. Raises ConfigError for an unknown joint."""
     known = Robot.load().joints
     if unknown := [joint for joint in joints if joint not in known]:
-        raise ConfigError(f"there is no joint {unknown[0]!r}; there are {', '.join(known)}")
+        raise ConfigError(f"there is no joint {unknown[0]!r}; known are {', '.join(known)}")
     if not joints:
         return {network: [] for network in NETWORKS}
     found: dict[str, list[str]] = {}
     for joint in joints:
         found.setdefault(cast(str, known[joint].network), []).append(joint)
     return found
+
+
+# --- tools at the serial line -----------------------------------------------------------------------
+
+
+@dataclass
+class ServoWorkbench:
+    """A robot with the serial ports and the measured file that a profile names."""
+
+    profile: Profile
+    robot: Robot
+    ports: dict[str, str]
+    """Serial port by network."""
+    file: Path
+
+    @classmethod
+    def of(cls, profile_name: str, write: Path | None) -> ServoWorkbench:
+        """Raises ConfigError for a profile or a robot description that cannot be read."""
+        profile = profiles.read(profile_name)
+        description = None if profile.description is None else Path(profile.description)
+        measured = None if profile.measured is None else Path(profile.measured)
+        existing = measured if measured is not None and measured.exists() else None
+        robot = Robot.load(description, existing)
+        config = profile.config("servos", load(named("servos")).config)
+        ports: dict[str, str] = {
+            name: port_path(getattr(config, f"{name}_port"), profile.robot) for name in robot.networks
+        }
+        return cls(profile, robot, ports, write or measured or Path(f"{profile.robot}-measured.toml"))
+
+    def joint(self, name: str) -> Joint:
+        if name not in self.robot.joints:
+            raise ConfigError(f"there is no joint {name!r}; known are {', '.join(self.robot.joints)}")
+        return self.robot.joints[name]
+
+    @contextmanager
+    def line(self, joint: Joint, port: str | None, baud: int | None) -> Iterator[ServoBus]:
+        """Opens the serial line that the joint's servo is on."""
+        with ServoBus(
+            port or self.ports[joint.network], baud or self.robot.networks[joint.network].baud, REPLY_S
+        ) as line:
+            yield line
+
+    def write(self, joint: Joint, values: dict[str, Any]) -> None:
+        write_values(self.file, "joint", values, joint.name)
+        text = ", ".join(f"{key} = {value}" for key, value in values.items())
+        print(f"{joint.name}: {text}; written to {self.file}")
+        if self.profile.measured is None:
+            print(f'Name the file in the profile: measured = "{self.file}"')
+
+
+@servos.command()
+def scan(
+    profile: ProfileOption = "robot",
+    port: PortsOption = None,
+    baud: Annotated[list[int] | None, typer.Option(metavar="RATE", help="Only these baud rates. Repeatable.")] = None,
+    last: Annotated[int, typer.Option(min=1, max=253, help="The highest ID to ask for.")] = 20,
+    write: Annotated[
+        Path | None, typer.Option("--write", metavar="FILE", help="Write the ports that were found into this profile.")
+    ] = None,
+    json: JsonOption = False,
+) -> None:
+    """Find servos on every serial port, at every baud rate. The robot must be down."""
+    sys.exit(scan_ports(profile, port or [], baud or [], last, write, json))
+
+
+def scan_ports(profile: str, ports: list[str], bauds: list[int], last: int, write: Path | None, as_json: bool) -> int:
+    """Prints the servos that answer; the exit code is 1 when one of the robot's servos does not."""
+    bench = ServoWorkbench.of(profile, None)
+    known = [port for port in dict.fromkeys(bench.ports.values()) if Path(port).exists()]
+    resolved = {str(Path(port).resolve()) for port in known}
+    wanted = ports or known + [port for port in tools.candidates() if str(Path(port).resolve()) not in resolved]
+    if not wanted:
+        raise ConfigError("no serial port found: plug in the servos' adapters, or name a port with --port")
+
+    def report(text: str) -> None:
+        print(text, file=sys.stderr)
+
+    found = list(tools.scan(wanted, bauds or tools.BAUDS, range(1, last + 1), report))
+    names = {joint.id: joint for joint in bench.robot.joints.values()}
+    if as_json:
+        print(json_module.dumps([one._asdict() for one in found]))
+    else:
+        _print_found(found, names)
+    missing = [joint for number, joint in names.items() if number not in {one.number for one in found}]
+    if missing and not as_json:
+        print(f"not found: {', '.join(f'{joint.name} (ID {joint.id})' for joint in missing)}")
+    if write is not None:
+        _write_ports(bench, found, names, write)
+    return exits.FAILED if missing else exits.DONE
+
+
+def _print_found(found: list[Any], names: dict[int, Joint]) -> None:
+    rows = []
+    for one in found:
+        joint = names[one.number].name if one.number in names else "?"
+        errors = ", ".join(one.errors)
+        delay = f"{one.return_delay_us} us" if one.return_delay_us else ""
+        rows.append(
+            (one.port, str(one.baud), str(one.number), joint, one.model, str(one.position), f"{one.voltage_v:.1f} V",
+             f"{one.temperature_c} C", delay, errors)
+        )  # fmt: skip
+    heads = ("port", "baud", "id", "joint", "model", "position", "voltage", "heat", "delay", "errors")
+    print_table(heads, rows) if rows else print("no servo answers")
+
+
+def _write_ports(bench: ServoWorkbench, found: list[Any], names: dict[int, Joint], file: Path) -> None:
+    """Writes each network's port into a profile, and a baud rate that differs into the robot's measured file."""
+    for network, row in bench.robot.networks.items():
+        places = {(one.port, one.baud) for one in found if one.number in names and names[one.number].network == network}
+        if not places:
+            continue
+        if len(places) > 1:
+            raise RefusedError(
+                f"the servos of {network} are on several lines ({sorted(places)}), so no port was written; connect"
+                " them to one line, or write the profile by hand"
+            )
+        port, baud = places.pop()
+        write_values(file, "service.servos", {f"{network}_port": port})
+        print(f"{network}_port = {port}; written to {file}")
+        if baud != row.baud:
+            write_values(bench.file, f"network.{network}", {"baud": baud})
+            print(f"{network}: {baud} baud; written to {bench.file}")
+
+
+@servos.command("set-id")
+def set_id(
+    old: Annotated[int, typer.Argument(min=0, max=253, help="The servo's ID now.")],
+    new: Annotated[int, typer.Argument(min=0, max=253, help="Its new ID.")],
+    port: Annotated[str, typer.Option(metavar="DEVICE", help="The serial port that it is connected to.")],
+    baud: Annotated[int, typer.Option(metavar="RATE", help="The servo's baud rate.")] = 1_000_000,
+) -> None:
+    """Give a servo another ID, and set its return delay to 0. Best with no other servo on the line."""
+    with ServoBus(port, baud, REPLY_S) as line:
+        tools.set_number(line, old, new)
+    print(f"the servo on {port} has ID {new} and return delay 0")
+
+
+@servos.command()
+def calibrate(
+    joints: JointArguments,
+    at: Annotated[float, typer.Option(metavar="DEG", help="The angle to which you will turn the joint.")] = 0.0,
+    profile: ProfileOption = "robot",
+    port: PortOption = None,
+    baud: BaudOption = None,
+    write: WriteOption = None,
+) -> None:
+    """Measure a joint's zero and direction while you turn it by hand. The robot must be down."""
+    bench = ServoWorkbench.of(profile, write)
+    for joint in [bench.joint(name) for name in joints]:
+        with bench.line(joint, port, baud) as line:
+            bench.write(joint, tools.calibrate(line, joint, at, _wait_for_enter))
+
+
+@servos.command()
+def limits(
+    joints: JointArguments,
+    profile: ProfileOption = "robot",
+    port: PortOption = None,
+    baud: BaudOption = None,
+    write: WriteOption = None,
+) -> None:
+    """Measure a joint's limits while you turn it by hand from end to end. The robot must be down."""
+    bench = ServoWorkbench.of(profile, write)
+    for joint in [bench.joint(name) for name in joints]:
+        with bench.line(joint, port, baud) as line:
+            print(f"{joint.name} is limp: turn it from end to end, then press Enter")
+            with StatusLine() as status:
+                ends_deg = tools.feel_limits(line, joint, _was_entered, status.show)
+            bench.write(joint, {"limits_deg": ends_deg})
+            tools.write_limits(line, joint, ends_deg)
+
+
+def _wait_for_enter(text: str) -> None:
+    try:
+        input(f"{text}, then press Enter ")
+    except EOFError:
+        raise CocoroError("this command waits for a person at a terminal, but standard input has ended") from None
+
+
+def _was_entered() -> bool:
+    """Whether a line was entered since the last call; does not wait."""
+    if not select.select([sys.stdin], [], [], 0)[0]:
+        return False
+    sys.stdin.readline()
+    return True

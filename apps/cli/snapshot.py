@@ -1,30 +1,48 @@
-"""A picture of what the robot sees: a frame with the detections that were made in that very frame."""
+"""`cocoro snapshot`: a picture of what the robot sees, with the detections of that very frame drawn in."""
 
 from __future__ import annotations
 
 import asyncio
+import sys
 from collections import OrderedDict
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+import typer
 
 from apps.cli import exits
 from apps.cli.link import Link, joined, within
-from apps.cli.options import RobotChoice
+from apps.cli.options import MeshOption, RobotChoice, RobotOption
 from cocoro.errors import ConfigError, MeshError
 from cocoro.inbox import Inbox
 from cocoro.messages import Detections, Frame
 from cocoro.topics import DETECTIONS, FRAME
 
 KEPT_FRAMES = 45
-"""Frames that wait for their detections: perception may be that far behind."""
+"""Frames that are kept until their detections arrive; perception may be this many frames late."""
 FRAME_S = 5.0
+"""Longest wait for the first frame."""
 DETECTIONS_S = 3.0
-"""How long to wait for a frame at all, and for what was detected in one."""
+"""Longest wait for the detections of a frame."""
 
 
-async def snapshot(where: RobotChoice, out: Path) -> int:
+app = typer.Typer()
+
+
+@app.command()
+def snapshot(
+    out: Annotated[Path, typer.Argument(metavar="OUT.png", help="The picture's file.")],
+    robot: RobotOption = None,
+    profile: MeshOption = None,
+) -> None:
+    """Write a picture of what the robot sees now, with its detections drawn in."""
+    sys.exit(asyncio.run(take_snapshot(RobotChoice(robot, profile), out)))
+
+
+async def take_snapshot(choice: RobotChoice, out: Path) -> int:
+    """Writes the picture and returns the exit code. Raises ConfigError for a name that is not OUT.png, MeshError."""
     check(out)
-    async with joined(where, frames=True) as link:
+    async with joined(choice, frames=True) as link:
         camera = SnapshotTaker(link)
         camera.open()
         print(await camera.write(out))
@@ -32,13 +50,13 @@ async def snapshot(where: RobotChoice, out: Path) -> int:
 
 
 def check(out: Path) -> None:
-    """Raises ConfigError when that cannot be a picture's file."""
+    """Raises ConfigError when the name does not end with .png."""
     if out.suffix.lower() != ".png":
-        raise ConfigError(f"{out}: the picture is a PNG, so let its name end with .png")
+        raise ConfigError(f"{out}: the picture is a PNG file, so its name must end with .png")
 
 
 class SnapshotTaker:
-    """The newest frame whose detections are known, from `open` on; `write` it when the moment has come."""
+    """Keeps the newest frame whose detections are known, from `open` on, until `write` saves it."""
 
     def __init__(self, link: Link) -> None:
         self._link = link
@@ -54,10 +72,10 @@ class SnapshotTaker:
         self._inboxes = [frames, detections]
 
     async def write(self, out: Path) -> str:
-        """Write the picture and close; says in words what it shows. Raises MeshError when the robot sends no frames."""
+        """Writes the picture, closes, and returns a line about it. Raises MeshError when the robot sends no frames."""
         try:
             if not await within(FRAME_S, lambda: bool(self._frames or self._pair), self._changed):
-                raise MeshError(f"no frame from the camera within {FRAME_S:g} s: `cocoro status` tells more")
+                raise MeshError(f"no frame from the camera within {FRAME_S:g} s: see `cocoro status`")
             await within(DETECTIONS_S, lambda: self._pair is not None, self._changed)
         finally:
             for inbox in self._inboxes:
@@ -81,14 +99,14 @@ class SnapshotTaker:
         if of not in self._frames:
             return
         self._pair = (self._frames[of], detections)
-        while next(iter(self._frames)) != of:  # older ones are of no use any more
+        while next(iter(self._frames)) != of:  # older frames are no longer needed
             self._frames.popitem(last=False)
         del self._frames[of]
         self._changed.set()
 
 
 def _write(out: Path, frame: Frame, detections: Detections | None) -> None:
-    from cocoro import picture  # brings the image library
+    from cocoro import picture  # imports the image library
     from cocoro.objects import Catalogue
 
     picture.save_png(picture.draw(frame, detections, Catalogue.load()), out)

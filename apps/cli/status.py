@@ -1,18 +1,20 @@
-"""`cocoro status`: what should run and does, how it is, what the robot does and why."""
+"""`cocoro status`: the services that should run, their health, the task and the planner's reason."""
 
 from __future__ import annotations
 
 import asyncio
 import json
+import sys
 from functools import partial
 from typing import Any
 
 import msgspec
+import typer
 
 from apps.cli import exits
 from apps.cli.link import Link, joined, within
-from apps.cli.options import RobotChoice
-from apps.cli.table import print_table
+from apps.cli.options import JsonOption, MeshOption, RobotChoice, RobotOption
+from apps.cli.terminal import print_table
 from cocoro.errors import ConfigError
 from cocoro.messages import Health, Message, TaskState
 from cocoro.topics import BASE_STATE, HEALTH, LATCH, PLAN, TASK, Topic
@@ -20,11 +22,21 @@ from deploy import profiles
 
 NEWS: tuple[Topic[Any], ...] = (PLAN, TASK, LATCH, BASE_STATE)
 HEALTH_S = 2.5
-"""How long to wait for those that are alive to tell their health; they do so once a second of the robot's time."""
+"""Longest wait for the health of every live service; each publishes it once a second of the robot's time."""
 
 
-async def status(where: RobotChoice, as_json: bool) -> int:
-    async with joined(where) as link:
+app = typer.Typer()
+
+
+@app.command()
+def status(robot: RobotOption = None, profile: MeshOption = None, json: JsonOption = False) -> None:
+    """What runs, its health, what the robot does and why. Exit code 1 when something that should run does not."""
+    sys.exit(asyncio.run(show_status(RobotChoice(robot, profile), json)))
+
+
+async def show_status(choice: RobotChoice, as_json: bool) -> int:
+    """Prints the report and returns the exit code. Raises MeshError when the robot's mesh is not there."""
+    async with joined(choice) as link:
         report = await Survey(link).take()
     if as_json:
         print(json.dumps(report))
@@ -34,7 +46,7 @@ async def status(where: RobotChoice, as_json: bool) -> int:
 
 
 class Survey:
-    """Listens until everyone who lives has been heard."""
+    """Collects the health of every live service and the newest state of task, plan, latch and base."""
 
     def __init__(self, link: Link) -> None:
         self._link = link
@@ -70,10 +82,10 @@ class Survey:
                 | ({"health": msgspec.to_builtins(self._health[name])} if name in self._health else {})
                 for name in names
             ],
-            "task": self._told(TASK.name),
-            "plan": self._told(PLAN.name),
-            "latch": self._told(LATCH.name),
-            "base": self._told(BASE_STATE.name),
+            "task": self._newest_of(TASK.name),
+            "plan": self._newest_of(PLAN.name),
+            "latch": self._newest_of(LATCH.name),
+            "base": self._newest_of(BASE_STATE.name),
         }
 
     def _state(self, service: str, alive: bool) -> str:
@@ -81,12 +93,12 @@ class Survey:
             return self._link.unheard(service)
         return self._health[service].state if service in self._health else "silent"
 
-    def _told(self, topic: str) -> Any:
+    def _newest_of(self, topic: str) -> Any:
         return msgspec.to_builtins(self._newest[topic]) if topic in self._newest else None
 
 
 def expected(resolved: dict[str, Any]) -> tuple[str, ...]:
-    """What the last start's profile says should be alive."""
+    """Services that should be alive by `resolved`, the profile of the robot's last start."""
     try:
         return profiles.from_data(resolved, resolved.get("name", "")).services() if resolved else ()
     except ConfigError:  # a component has been uninstalled since

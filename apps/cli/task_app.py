@@ -1,4 +1,7 @@
-"""The commands of tasks, made from their types: `cocoro NAME` on a robot, and `cocoro rehearse NAME`."""
+"""The commands of tasks, made from their types: `cocoro NAME` on a robot, and `cocoro rehearse NAME`.
+
+`cocoro --help` needs this file, so the functions import what they need themselves.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,8 @@ from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 import msgspec
 import typer
 from msgspec import NODEFAULT, Meta
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
+from typer.main import get_group
 
 from apps.cli.options import (
     AdaptOption,
@@ -110,41 +114,53 @@ def _text(path: Path | None) -> str | None:
 # --- commands from types --------------------------------------------------------------------------
 
 
-def add_to(app: typer.Typer) -> None:
-    """Add a command for each of the project's tasks, and the group `rehearse`."""
-    for kind in TASKS.own.values():
-        if kind.samples is None:  # `cocoro babble` runs the others: it keeps their samples
-            app.command(kind.tag(), rich_help_panel=PANEL)(command_of(kind, operate))
-    rehearsals = typer.Typer(
-        cls=group_of(rehearse),
+def task_names() -> list[str]:
+    """The tasks that are commands of their own. `cocoro babble` runs those of the project's tasks that report samples,
+    because it keeps the samples."""
+    return [name for name, kind in TASKS.all().items() if kind.samples is None or name not in TASKS.own]
+
+
+def task_command(name: str) -> TyperCommand | None:
+    """The command of a task; None for a name that is none."""
+    return _command(name, operate) if name in task_names() else None
+
+
+class RehearsalGroup(TyperGroup):
+    """A command for each task."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        return list(TASKS.all())
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        return _command(cmd_name, rehearse) if cmd_name in TASKS.all() else None
+
+
+app = typer.Typer()
+app.add_typer(
+    typer.Typer(
+        cls=RehearsalGroup,
         no_args_is_help=True,
         help="Try a task in simulation: the whole robot in one process, in virtual time.",
-    )
-    for kind in TASKS.own.values():
-        rehearsals.command(kind.tag())(command_of(kind, rehearse))
-    app.add_typer(rehearsals, name="rehearse", rich_help_panel=PANEL)
+    ),
+    name="rehearse",
+)
 
 
-def group_of(shared: Shared) -> type[TyperGroup]:
-    """A group of commands that has third parties' tasks too. Their entry points are looked for only when a name is not
-    one of the project's commands, or when all commands are listed."""
+@app.command()
+def cancel(robot: RobotOption = None, profile: MeshOption = None) -> None:
+    """End the running task; the robot stands still."""
+    from apps.cli import tasks
 
-    class Group(TyperGroup):
-        def get_command(self, ctx: Any, cmd_name: str) -> Any:
-            found = super().get_command(ctx, cmd_name)
-            kind = None if found is not None else TASKS.all().get(cmd_name)
-            return found if kind is None else _third_partys(kind, shared)
-
-        def list_commands(self, ctx: Any) -> list[str]:
-            return [*super().list_commands(ctx), *(name for name in TASKS.all() if name not in TASKS.own)]
-
-    return Group
+    sys.exit(asyncio.run(tasks.cancel(RobotChoice(robot, profile))))
 
 
-def _third_partys(kind: type[Task], shared: Shared) -> Any:
-    app = typer.Typer(add_completion=False)
-    app.command(kind.tag(), rich_help_panel=PANEL)(command_of(kind, shared))
-    return typer.main.get_command(app)
+def _command(name: str, shared: Shared) -> TyperCommand:
+    made = typer.Typer()
+    made.command(name, rich_help_panel=PANEL)(command_of(TASKS.kind(name), shared))
+    made.callback()(lambda: None)
+    command = get_group(made).commands[name]
+    assert isinstance(command, TyperCommand)
+    return command
 
 
 def command_of(kind: type[Task], shared: Shared) -> Callable[..., None]:

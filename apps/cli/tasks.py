@@ -11,11 +11,11 @@ from pathlib import Path
 import msgspec
 
 from apps.cli import exits
-from apps.cli.ending import on_end
+from apps.cli.interrupt import on_interrupt
 from apps.cli.link import Link, joined
 from apps.cli.options import RobotChoice
 from apps.cli.output import going_on
-from apps.cli.progress import TaskDisplay, view
+from apps.cli.progress import TaskDisplay, task_display
 from apps.cli.snapshot import SnapshotTaker, check
 from cocoro.contact import Contact
 from cocoro.errors import CallTimeoutError, CocoroError
@@ -43,8 +43,8 @@ async def run(where: RobotChoice, request: TaskRequest, as_json: bool, picture: 
     if picture is not None:
         check(picture)
     async with joined(where, frames=picture is not None) as link:
-        follower = Follower(link, request, view(as_json), picture, Contact(link.run_dir.claimant_pid, Vigil()))
-        with on_end(follower.interrupt), going_on():
+        follower = Follower(link, request, task_display(as_json), picture, Contact(link.run_dir.claimant_pid, Vigil()))
+        with on_interrupt(follower.interrupt), going_on():
             code, result = await follower.run()
     if as_json:
         print(json.dumps(result))
@@ -105,6 +105,7 @@ class Follower:
         try:
             state = await self._follow()
         finally:
+            self._view.close()
             alive.close()
             for task in beside:
                 task.cancel()

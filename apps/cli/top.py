@@ -1,4 +1,4 @@
-"""`cocoro top`: what runs, what it costs, what travels, how fast and how well. Gathered here, shown by `top_view`."""
+"""`cocoro top`: services, their cost, topics, rates and losses, live. Collected here, drawn by `top_view`."""
 
 from __future__ import annotations
 
@@ -8,16 +8,18 @@ import os
 import sys
 import time
 from functools import partial
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
 import psutil
+import typer
 
 from apps.cli import exits
-from apps.cli.ending import passed, told_to_end
+from apps.cli.interrupt import elapsed, interrupt_event
 from apps.cli.link import Link, joined, within
-from apps.cli.options import RobotChoice
+from apps.cli.options import JsonOption, MeshOption, RobotChoice, RobotOption
 from apps.cli.status import expected
+from apps.cli.top_view import Screen, print_report
 from cocoro.bus.keys import matches
 from cocoro.component import Component
 from cocoro.installed import topic_named
@@ -26,33 +28,49 @@ from cocoro.topics import BASE_STATE, CLOCK, HEALTH, LATCH, PLAN, TASK, Topic
 from deploy import processes
 
 FIRST_S = 2.5
-"""How long to wait for those that live to tell their health; they do so once a second of the robot's time."""
+"""Longest wait for the health of every live service; each publishes it once a second of the robot's time."""
 SILENT_S = 3.0
-"""Who lives and tells no health for so long hangs, or the clock stands."""
+"""A live service that publishes no health for this long hangs, or the robot's clock is paused."""
 NEWS: dict[str, Topic[Any]] = {"clock": CLOCK, "task": TASK, "plan": PLAN, "latch": LATCH, "base": BASE_STATE}
 
 
-async def top(where: RobotChoice, once: bool, as_json: bool, every_s: float) -> int:
-    """Show until interrupted, or once. Exit code 1, with `once`, when something that should run does not."""
-    async with joined(where) as link:
+app = typer.Typer()
+
+
+@app.command()
+def top(
+    once: Annotated[bool, typer.Option("--once", help="Show it once; exit code 1 when something is missing.")] = False,
+    every: Annotated[float, typer.Option(min=0.1, max=60.0, metavar="S", help="Time between updates.")] = 1.0,
+    robot: RobotOption = None,
+    profile: MeshOption = None,
+    json: JsonOption = False,
+) -> None:
+    """What runs and what travels, live: cpu, memory, rates against nominal, ages, what was skipped, lost, rejected.
+
+    Ctrl-C ends it. Counts are since the start; a value that is wrong now, or grows and should not, is red.
+    """
+    sys.exit(asyncio.run(show_top(RobotChoice(robot, profile), once, json, every)))
+
+
+async def show_top(choice: RobotChoice, once: bool, as_json: bool, every_s: float) -> int:
+    """Shows the report until interrupted, or once; the exit code of `once` is 1 when an expected service is missing."""
+    async with joined(choice) as link:
         watch = MeshWatch(link)
         await watch.first()
         if once:
             report = watch.report()
             _print(report, as_json)
             return exits.DONE if all(service["alive"] for service in report["services"]) else exits.FAILED
-        with told_to_end() as end:
+        with interrupt_event() as end:
             if as_json or not sys.stdout.isatty():
                 while not end.is_set():
                     _print(watch.report(), as_json)
-                    await passed(end, every_s)
+                    await elapsed(end, every_s)
             else:
-                from apps.cli.top_view import Screen
-
                 with Screen() as screen:
                     while not end.is_set():
                         screen.show(watch.report())
-                        await passed(end, every_s)
+                        await elapsed(end, every_s)
     return exits.DONE
 
 
@@ -60,13 +78,11 @@ def _print(report: dict[str, Any], as_json: bool) -> None:
     if as_json:
         print(json.dumps(report), flush=True)
     else:
-        from apps.cli.top_view import print_report
-
         print_report(report)
 
 
 class MeshWatch:
-    """Listens to everyone's health; `report` is what is known now, as data."""
+    """Collects the health of all services; `report` returns the newest as data."""
 
     def __init__(self, link: Link) -> None:
         self._link = link
@@ -75,16 +91,16 @@ class MeshWatch:
         self._heard_s: dict[str, float] = {}
         self._news: dict[str, Message] = {}
         self._before: dict[tuple[str, str, str], int] = {}
-        """Counts of the last report, by reader, key and what is counted."""
+        """Counts of the last report, by reader, key and name of the count."""
         self._changed = asyncio.Event()
-        _machine()  # the first of these calls has nothing to compare with
+        _machine()  # the CPU share is measured between two calls
         link.inbox(HEALTH.of("*")).add(lambda _key, health: self._on_health(health))
         for what, topic in NEWS.items():
             link.inbox(topic).add(partial(self._on_news, what))
         link.bus.watch_alive(f"{link.robot}/*/alive", self._on_alive)
 
     async def first(self) -> None:
-        """Wait until everyone who lives has told its health, but not for long."""
+        """Waits for the health of every live service, at most FIRST_S."""
         self._alive |= set(await self._link.alive())
         await within(FIRST_S, lambda: self._alive <= set(self._health), self._changed)
 
@@ -134,7 +150,7 @@ class MeshWatch:
         }
 
     def _topics(self) -> list[dict[str, Any]]:
-        """Every key that somebody publishes, and every one that somebody waits for in vain; with its readers."""
+        """Every key that a service publishes, or reads although nothing publishes it; each with its readers."""
         sent: dict[str, tuple[str, TopicHealth]] = {}
         read: list[tuple[str, TopicHealth]] = []
         for service, health in self._health.items():
@@ -186,7 +202,7 @@ COUNTS = ("skipped", "lost", "rejected")
 
 
 def _machine() -> dict[str, Any]:
-    """Its cores, and the share of them that is used since the last call; None where /proc does not tell it."""
+    """Number of cores, and their used share since the last call; None where /proc is not readable."""
     try:
         used = psutil.cpu_percent() / 100
     except (psutil.Error, OSError):
@@ -195,7 +211,7 @@ def _machine() -> dict[str, Any]:
 
 
 def _place(name: str, rows: dict[str, Component], names: list[str]) -> tuple[int, bool, int]:
-    """Services of one process stand together, behind the one that has the process's own name."""
+    """Sort key: services of one process stand together, after the one that has the process's name."""
     row = rows.get(name)
     first = min((names.index(other) for other in names if row is not None and rows.get(other) is row), default=0)
     return (names.index(name) if row is None else first), row is not None and row.name != name, names.index(name)
@@ -208,11 +224,11 @@ def _without_topics(health: Health) -> dict[str, Any]:
 
 
 def _rows(resolved: dict[str, Any]) -> dict[str, Component]:
-    """The component of each service: the profile's, else another installed one."""
+    """The component of each service, from the profile's components first, then from all that are installed."""
     known = {row.name: row for row in processes.components()}
     started = [known[name] for name in resolved.get("processes", ()) if name in known]
     found: dict[str, Component] = {}
     for row in (*started, *known.values()):
-        for service in (row.name, *row.services):  # a process may be a service beside those that it is started for
+        for service in (row.name, *row.services):  # a process may be a service besides its own
             found.setdefault(service, row)
     return found

@@ -1,4 +1,4 @@
-"""How `cocoro top` looks: a line of what matters, a table of services, a table of topics."""
+"""Draws the report of `cocoro top`: a headline, a table of services, a table of topics."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from rich.table import Table
 from rich.text import Text
 
 SLOW, STALLED = 0.85, 0.4
-"""Of the nominal rate: below the one a rate is marked, below the other it is marked red."""
+"""Shares of the nominal rate: a rate below SLOW is yellow, one below STALLED red."""
 BAD, DOUBTFUL, GOOD, FAINT = "bold red", "yellow", "green", "dim"
 COUNTED = ("skipped", "lost", "rejected")
 PLAIN_WIDTH = 200
-"""Columns where nobody watches: nothing is cut."""
+"""Columns where the output is no terminal; nothing is cut."""
 
 
 class Screen:
-    """The whole terminal, while it is open."""
+    """Shows reports on the whole terminal while the context lasts."""
 
     def __init__(self) -> None:
         self._live = Live(auto_refresh=False, screen=True, vertical_overflow="crop")
@@ -45,7 +45,7 @@ def render(report: dict[str, Any]) -> RenderableType:
     return Group(_headline(report), Text(), _services(report["services"]), Text(), _topics(report["topics"]))
 
 
-# --- what matters ---------------------------------------------------------------------------------
+# --- headline -------------------------------------------------------------------------------------
 
 
 def _headline(report: dict[str, Any]) -> Text:
@@ -104,10 +104,10 @@ def _service(service: dict[str, Any], shown: dict[int, str]) -> list[RenderableT
     loop = max(health["loops"], key=lambda loop: loop["rate_hz"], default=None)
     text = "; ".join(filter(None, (health["text"], *health["faults"])))
     if service["state"] == "silent" and service["silent_s"] is not None:
-        text = f"no sign for {service['silent_s']:.0f} s"
+        text = f"silent for {service['silent_s']:.0f} s"
     pid = health["pid"]
     costs: list[RenderableType]
-    if pid in shown:  # several services in one process: what it costs is told once
+    if pid in shown:  # several services in one process: its cost is shown once
         costs = [Text(str(pid), FAINT), Text(f"as {shown[pid]}", FAINT), ""]
     else:
         shown[pid] = service["service"]
@@ -179,7 +179,7 @@ def _rate(rate_hz: float, nominal_hz: float | None) -> Text:
 
 
 def _age(topic: dict[str, Any]) -> Text:
-    """Of the newest message when its publisher last told; red when a reader would no longer act on it."""
+    """Age of the newest message when its publisher last reported; red when it is too old for a reader to act on."""
     age_s = topic["age_s"]
     if age_s is None:
         return Text("")
@@ -189,7 +189,7 @@ def _age(topic: dict[str, Any]) -> Text:
 
 
 def _count(readers: list[dict[str, Any]], what: str) -> Text:
-    """Of all readers together, since they started. To skip state that has been overtaken is no fault."""
+    """Sum over all readers since they started; red when it grows. Skipping outdated state is no fault, so never red."""
     total = sum(reader[what] for reader in readers)
     if not total:
         return Text("0" if readers else "", FAINT)
@@ -198,7 +198,7 @@ def _count(readers: list[dict[str, Any]], what: str) -> Text:
 
 
 def _read_by(readers: list[dict[str, Any]]) -> Text:
-    """Who reads it; of those that miss something how much, and what the last rejected one was."""
+    """The readers; with several, what each missed; and why the last message was rejected."""
     text = Text(no_wrap=True, overflow="ellipsis")
     for number, reader in enumerate(readers):
         text.append(", " if number else "")

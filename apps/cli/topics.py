@@ -6,9 +6,12 @@ import ast
 import json
 from collections.abc import Iterable
 from importlib import resources
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
-from apps.cli.table import table as plain_table
+import typer
+
+from apps.cli.options import JsonOption
+from apps.cli.terminal import table as plain_table
 from cocoro.bus.base import Qos
 from cocoro.component import Component
 from cocoro.installed import all_requests, all_topics
@@ -25,6 +28,18 @@ QOS = {
 
 
 HEADS = ("topic", "type", "rate", "max age", "qos", "publisher", "recorded")
+
+
+app = typer.Typer()
+
+
+@app.command()
+def topics(
+    as_page: Annotated[bool, typer.Option("--markdown", help="The whole page of the documentation.")] = False,
+    json: JsonOption = False,
+) -> None:
+    """What travels on the mesh: every key, its type, rate, quality of service and publisher."""
+    print(markdown() if as_page else as_json() if json else table(), end="")
 
 
 def table() -> str:

@@ -11,7 +11,7 @@ from typing import Any, Generic, Self
 
 from cocoro.errors import ConfigError
 from cocoro.learning.dataset import HandRow, SampleFile, SampleRow, WheelRow, hand_header, wheel_header
-from cocoro.learning.nominal_model import LEVEL_ROLL_RAD, arm_joints
+from cocoro.learning.nominal_model import arm_joints
 from cocoro.messages import HandSample, Message, WheelTrial
 from cocoro.robot import Robot
 from cocoro.topics import HAND_SAMPLES, WHEEL_TRIALS, Topic
@@ -77,7 +77,7 @@ class HandCollector(SampleCollector[HandRow]):
 
     def __init__(self, path: Path, robot: Robot) -> None:
         self._joints = arm_joints(robot)
-        super().__init__(SampleFile(path, HandRow, robot, hand_header(robot, self._joints, LEVEL_ROLL_RAD)))
+        super().__init__(SampleFile(path, HandRow, robot, hand_header(robot, self._joints, robot.claw.level_roll_rad)))
         self._coverage = Coverage()
         for row in self._writer.rows:
             self._coverage.add(row.seen_m)

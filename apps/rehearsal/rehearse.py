@@ -158,7 +158,7 @@ class _Rehearsal:
             operator = await stack.enter_async_context(Node("operator", mesh.join(), clock, robot))
             operator.on(topics.TRUTH, self._judge.feed)
             operator.on(topics.TRUTH, self._trace.feed)
-            operator.on(topics.PLAN, self._trace.said)
+            operator.on(topics.PLAN, self._trace.status)
             operator.on(topics.TASK, self._trace.state)
             operator.on(topics.RECORDING.of(RECORDER), self._keep_recording)
             samples = self._task.samples

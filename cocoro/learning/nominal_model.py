@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from math import pi
-
 import numpy as np
 
 from cocoro.arrays import FloatArray
 from cocoro.kinematics import turn_z
 from cocoro.robot import Robot
 
-LEVEL_ROLL_RAD = pi / 2
-"""The wrist roll at which the claws lie level and the marker stands above the hand: the one that babbling keeps."""
 PRIMING_A_JOINT = 10
 """10 values a joint: the paper's 10,000 rigid-body points for the arm's four."""
 
@@ -27,7 +23,10 @@ _NEXT, _LAST = [1, 2, 0], [2, 0, 1]
 class NominalModel:
     """Rigid-body forward kinematics of the marker; angles are in the order of `joints`."""
 
-    def __init__(self, robot: Robot, roll_rad: float = LEVEL_ROLL_RAD) -> None:
+    def __init__(self, robot: Robot, roll_rad: float | None = None) -> None:
+        """`roll_rad`: the wrist roll; None is the one at which the claws lie level, which babbling keeps."""
+        roll_rad = robot.claw.level_roll_rad if roll_rad is None else roll_rad
+        self.roll_rad = roll_rad
         self.joints = arm_joints(robot)
         self.limits_rad = np.array([robot.joints[name].limits_rad for name in self.joints])
         self._chain = robot.chain(robot.marker.link)

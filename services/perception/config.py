@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
+from cocoro.topics import ARM_STATE
 from cocoro.units import Positive, PositiveShare
 
 
@@ -21,7 +22,7 @@ class PerceptionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
     """An older frame is not looked at."""
     bracket_wait_s: Annotated[float, Meta(ge=0)] = 0.05
     """How long a frame's detections wait for the head angles around its stamp; then they go out without position."""
-    max_head_gap_s: Positive = 0.15
+    max_head_gap_s: Positive = ARM_STATE.max_age_s
     """Head angles are not interpolated across a longer silence of the arm's state."""
 
     min_area_px: Positive = 32.0

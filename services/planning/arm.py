@@ -17,7 +17,7 @@ from cocoro.arrays import FloatArray
 from cocoro.robot import Robot
 from services.planning.clearance import Clearance
 from services.planning.config import ArmConfig
-from services.planning.reach import ARM, LEVEL_ROLL_RAD, HandPose, Reacher
+from services.planning.reach import ARM, HandPose, Reacher
 
 ROLL = "wrist_roll"
 _OUT = {"shoulder": 1.9, "elbow": -2.3, "wrist_pitch": 0.4}
@@ -47,6 +47,7 @@ class ArmController:
         self._config = config
         self._reacher = reacher
         self.clearance = Clearance(robot)
+        self._roll_rad = robot.claw.level_roll_rad
         self._park = {name: robot.poses["park"][name] for name in ARM}
         self._reference: dict[str, float] | None = None
         self._stalled_s = 0.0
@@ -93,8 +94,8 @@ class ArmController:
                     pose.pitch_rad,
                 )
                 return self._cartesian(rise, self._config.hand_speed_mps, dt_s)._replace(arrived=False)
-            if not out or abs(reference[ROLL] - LEVEL_ROLL_RAD) > _NEAR_RAD:
-                return self._joints(_OUT | {ROLL: LEVEL_ROLL_RAD}, dt_s)._replace(arrived=False)
+            if not out or abs(reference[ROLL] - self._roll_rad) > _NEAR_RAD:
+                return self._joints(_OUT | {ROLL: self._roll_rad}, dt_s)._replace(arrived=False)
             return self._joints(_OUT | {"arm_base": self._park["arm_base"]}, dt_s)._replace(arrived=False)
         self._astray = False
         if abs(reference["arm_base"] - self._park["arm_base"]) > _NEAR_RAD:
@@ -112,14 +113,14 @@ class ArmController:
             in_park_plane = reference["arm_base"] > self._park["arm_base"] - 0.2
             if not out and in_park_plane:
                 stage = _OUT | {ROLL: 0.0}
-            elif abs(reference[ROLL] - LEVEL_ROLL_RAD) > _NEAR_RAD:
-                stage = _OUT | {ROLL: LEVEL_ROLL_RAD}
+            elif abs(reference[ROLL] - self._roll_rad) > _NEAR_RAD:
+                stage = _OUT | {ROLL: self._roll_rad}
             else:
                 stage = _OUT | {"arm_base": _FRONT_RAD}
         elif reference["arm_base"] > 0.35 and goal.azimuth_rad < 0.3:
-            stage = _OUT | {"arm_base": _FRONT_RAD, ROLL: LEVEL_ROLL_RAD}
+            stage = _OUT | {"arm_base": _FRONT_RAD, ROLL: self._roll_rad}
         elif self._is_astray(reference, self._reacher.pose(reference)):
-            stage = _OUT | {"arm_base": _FRONT_RAD, ROLL: LEVEL_ROLL_RAD}
+            stage = _OUT | {"arm_base": _FRONT_RAD, ROLL: self._roll_rad}
             self._astray = any(abs(reference[name] - angle) > _NEAR_RAD for name, angle in stage.items())
         if stage is None:
             return self._cartesian(goal, speed_mps, dt_s)
@@ -179,7 +180,7 @@ class ArmController:
         for name in ARM:
             change = trial[name] - self._reference[name]
             trial[name] = self._reference[name] + min(max(change, -limit), limit)
-        roll_gap = LEVEL_ROLL_RAD - self._reference[ROLL]
+        roll_gap = self._roll_rad - self._reference[ROLL]
         trial[ROLL] += min(max(roll_gap, -limit), limit)
         left = float(np.linalg.norm(self._reacher.point(goal) - self._reacher.point(have)))
         arrived = left < 0.004 and abs(goal.pitch_rad - have.pitch_rad) < 0.05 and abs(roll_gap) < 0.05

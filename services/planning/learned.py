@@ -18,7 +18,7 @@ from cocoro.learning.model import BodyModel
 from cocoro.learning.nominal_model import NominalModel
 from cocoro.robot import Robot
 from services.planning.config import HandSightConfig, PlanningConfig
-from services.planning.reach import LEVEL_ROLL_RAD, HandModel
+from services.planning.reach import HandModel
 from services.planning.reachability import ReachMesh
 from services.planning.state_estimator import PostureSighting
 from services.planning.teaching import Teacher
@@ -74,6 +74,7 @@ class SeenHand:
     def __init__(self, felt: HandModel, marker: HandMap | NominalModel, config: HandSightConfig) -> None:
         self._felt = felt
         self._marker = marker
+        self._roll_rad = (marker.drawing if isinstance(marker, HandMap) else marker).roll_rad
         self._config = config
         self._correction = np.zeros(3)
         self._wanted = np.zeros(3)
@@ -106,7 +107,7 @@ class SeenHand:
         dt_s = 0.0 if self._now_ns is None else min(max((now_ns - self._now_ns) / NS, 0.0), 0.1)
         self._now_ns = now_ns
         for sighting in sightings:
-            if abs(sighting.angles_rad["wrist_roll"] - LEVEL_ROLL_RAD) > config.roll_rad:
+            if abs(sighting.angles_rad["wrist_roll"] - self._roll_rad) > config.roll_rad:
                 continue
             gap = np.array(sighting.position_m) - self._marker.at(_arm(sighting.angles_rad))
             if float(np.linalg.norm(gap)) <= config.wild_m:

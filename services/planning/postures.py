@@ -9,8 +9,8 @@ import scipy  # loads its parts lazily: `scipy.stats` takes half a second
 
 from cocoro.arrays import FloatArray
 from cocoro.robot import Robot
-from services.planning.clearance import TUBES, Clearance
-from services.planning.reach import ARM, LEVEL_ROLL_RAD
+from services.planning.clearance import Clearance
+from services.planning.reach import ARM
 
 RANGE_RAD = 2.62
 """The paper's, a joint."""
@@ -18,11 +18,8 @@ MARGIN_M = 0.03
 """The body may differ from its drawing by a centimetre or two."""
 WAY_RAD = 0.12
 """A way is checked this often, by its widest joint."""
-_HAND_FROM = sum(count for _, end, _, count in TUBES if end in ("elbow", "wrist_pitch", "wrist_roll"))
-"""The hull's balls from here on are the hand's; before, those of upper arm, forearm and wrist."""
-_UPPER_ARM_M = 0.03
-_HEAD_MIN_M, _HEAD_MAX_M = np.array([-0.06, -0.16, 0.64]), np.array([0.13, 0.16, 0.79])
-"""Where the Kinect's housing is, however the head looks."""
+OWN_ARM_M = 0.02
+"""Least distance of the hand from the hull of the own upper arm."""
 
 
 class Postures:
@@ -32,6 +29,12 @@ class Postures:
         limits = np.array([robot.joints[name].limits_rad for name in ARM])
         self.ranges = np.clip(limits, -RANGE_RAD, RANGE_RAD)
         self._clearance = Clearance(robot)
+        hull = robot.hull
+        self._hand_from = sum(tube.balls for tube in hull.tube if tube.start != "wrist_roll")
+        """Index of the hull's first ball that belongs to the hand."""
+        self._from_upper_arm_m = hull.tube[0].radius_m + OWN_ARM_M
+        self._kinect_min, self._kinect_max = np.array(hull.kinect_min_m), np.array(hull.kinect_max_m)
+        self._roll_rad = robot.claw.level_roll_rad
         self._upper = robot.chain("shoulder"), robot.chain("elbow")
         self._head = robot.chain("camera").position({"neck_pan": 0.0, "neck_tilt": 0.0})
         self._marker = robot.chain(robot.marker.link), np.array([*robot.marker.position_m, 1.0])
@@ -49,15 +52,15 @@ class Postures:
         if self._clearance.of(angles) < MARGIN_M:
             return False
         centres, radii = self._clearance.hull(angles)
-        apart = np.linalg.norm(centres - np.clip(centres, _HEAD_MIN_M, _HEAD_MAX_M), axis=1) - radii
+        apart = np.linalg.norm(centres - np.clip(centres, self._kinect_min, self._kinect_max), axis=1) - radii
         if float(apart.min()) < MARGIN_M:
             return False
         shoulder, elbow = (chain.position(angles) for chain in self._upper)
         along = elbow - shoulder
-        hand = centres[_HAND_FROM:] - shoulder
+        hand = centres[self._hand_from :] - shoulder
         share = np.clip(hand @ along / (along @ along), -0.3, 1.0)  # the shoulder's bracket stands behind it
-        away = np.linalg.norm(hand - share[:, None] * along, axis=1) - radii[_HAND_FROM:]
-        return float(away.min()) > _UPPER_ARM_M + MARGIN_M / 2
+        away = np.linalg.norm(hand - share[:, None] * along, axis=1) - radii[self._hand_from :]
+        return float(away.min()) > self._from_upper_arm_m
 
     def seeable(self, posture: FloatArray) -> bool:
         """The drawing has the marker where the camera might see it: not too near, and not behind the hand."""
@@ -73,9 +76,8 @@ class Postures:
         count = int(np.ceil(float(np.abs(end - start).max()) / WAY_RAD))
         return all(self.safe(start + (end - start) * step / count) for step in range(1, count + 1))
 
-    @staticmethod
-    def _angles(posture: FloatArray) -> dict[str, float]:
-        return dict(zip(ARM, posture.tolist(), strict=True), wrist_roll=LEVEL_ROLL_RAD)
+    def _angles(self, posture: FloatArray) -> dict[str, float]:
+        return dict(zip(ARM, posture.tolist(), strict=True), wrist_roll=self._roll_rad)
 
 
 def sobol(first: int, ranges: FloatArray) -> Iterator[tuple[int, FloatArray]]:

@@ -4,7 +4,7 @@ of the Jacobian, within the joint limits (the paper's 'Motor planning for reachi
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from math import asin, atan2, cos, hypot, pi, sin
+from math import asin, atan2, cos, hypot, sin
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -14,8 +14,6 @@ from cocoro.frames import wrap_rad
 from cocoro.robot import Robot
 
 ARM = ("arm_base", "shoulder", "elbow", "wrist_pitch")
-LEVEL_ROLL_RAD = pi / 2
-"""The wrist roll at which the claws lie level, for upright targets."""
 
 
 class HandPose(NamedTuple):
@@ -64,6 +62,7 @@ class Reacher:
         self._axis = robot.chain("arm_base").position({"arm_base": 0.0})
         self._limits = np.array([robot.joints[name].limits_rad for name in ARM])
         self._damping = damping * damping * np.eye(4)
+        self.level_roll_rad = robot.claw.level_roll_rad
 
     def use(self, hand: HandModel | None) -> None:
         """Reach with this from now on; None is the rigid body."""

@@ -20,7 +20,7 @@ from cocoro.arrays import BoolArray, FloatArray, IntArray
 from cocoro.learning.handmap import HandMap
 from cocoro.units import Vec3
 from services.planning.config import ArmConfig
-from services.planning.reach import ARM, LEVEL_ROLL_RAD, HandPose, Reacher
+from services.planning.reach import ARM, HandPose, Reacher
 
 GAP_FACTOR = 3.0
 """A ball is small while its radius is at most so many times the distance within which sightings have neighbours."""
@@ -36,7 +36,7 @@ RETREAT_STEP_M, RETREAT_STEPS = 0.005, 8
 RETREAT_ROOM_M = 0.01
 """The arm must fold in further than to where it waits, lest it waits at its limits."""
 RETREAT_HEIGHTS_M = (0.045, 0.08)
-_UPRIGHT = {"arm_base": -0.087, "shoulder": 0.66, "elbow": -1.6, "wrist_pitch": 0.77, "wrist_roll": LEVEL_ROLL_RAD}
+_UPRIGHT = {"arm_base": -0.087, "shoulder": 0.66, "elbow": -1.6, "wrist_pitch": 0.77}
 """Elbow up, hand before the robot: where the search for joint angles starts, so that it stays in that family."""
 
 
@@ -165,6 +165,7 @@ class Reachability:
     def __init__(self, config: ArmConfig, reacher: Reacher) -> None:
         self._config = config
         self._reacher = reacher
+        self._upright = _UPRIGHT | {"wrist_roll": reacher.level_roll_rad}
         self._seen: tuple[HandMap, ReachMesh] | None = None
         self._retreat_m: float | None = None
 
@@ -187,7 +188,7 @@ class Reachability:
         for more in range(RETREAT_STEPS):
             radius = config.retreat_radius_m + more * RETREAT_STEP_M
             poses = [HandPose(radius - RETREAT_ROOM_M, 0.0, height, config.pitch_rad) for height in RETREAT_HEIGHTS_M]
-            if all(self._reacher.solve(_UPRIGHT, pose) is not None for pose in poses):
+            if all(self._reacher.solve(self._upright, pose) is not None for pose in poses):
                 return radius
         return config.retreat_radius_m
 
@@ -214,7 +215,7 @@ class Reachability:
         if height > config.grasp_height_range_m[1]:
             return f"it is {height:.2f} m high, reachable is up to {config.grasp_height_range_m[1]:.2f}"
         grasp = self.grasp(target_m)
-        start = _UPRIGHT | {"arm_base": _UPRIGHT["arm_base"] + azimuth}
+        start = self._upright | {"arm_base": _UPRIGHT["arm_base"] + azimuth}
         around = self._reacher.solve(start, grasp.around)
         if around is None or self._reacher.solve(start, grasp.behind) is None:
             return "the joint limits do not let the hand there"

@@ -16,7 +16,7 @@ from cocoro.arrays import FloatArray
 from cocoro.clock import NS
 from cocoro.learning.fitting import LeastSquares
 from cocoro.learning.handmap import HandMap
-from services.planning.reach import ARM, LEVEL_ROLL_RAD
+from services.planning.reach import ARM
 from services.planning.reachability import ReachMesh
 from services.planning.state_estimator import PostureSighting
 
@@ -84,6 +84,7 @@ class Teacher:
     def __init__(self, learned: HandMap, usual_m: float, mesh: ReachMesh) -> None:
         self._adapter = Adapter(learned, usual_m)
         self._mesh = mesh
+        self._roll_rad = learned.drawing.roll_rad
         self._places: list[FloatArray] = []
         self._last_ns: int | None = None
 
@@ -100,7 +101,7 @@ class Teacher:
     def step(self, sightings: Iterable[PostureSighting]) -> None:
         for sighting in sightings:
             new = self._last_ns is None or not 0 <= sighting.stamp_ns - self._last_ns < EVERY_NS
-            if new and abs(sighting.angles_rad["wrist_roll"] - LEVEL_ROLL_RAD) <= ROLL_RAD:
+            if new and abs(sighting.angles_rad["wrist_roll"] - self._roll_rad) <= ROLL_RAD:
                 self._last_ns = sighting.stamp_ns
                 self._take(arm_angles(sighting.angles_rad), np.array(sighting.position_m))
 

@@ -21,7 +21,7 @@ def check(config: ServosConfig, robot: Robot, robot_name: str) -> list[Check]:
         checks += checked
         if checked[0].state == "ok":
             joints = [robot.joints[joint] for joint in robot.network_joints(name)]
-            baud = robot.networks[name].baud  # type: ignore[index] # one of the two names
+            baud = robot.networks[name].baud
             checks += _servos(name, port_path(port, robot_name), baud, joints, config.reply_s)
     return checks
 

@@ -14,7 +14,6 @@ from cocoro.clock import NS, is_fresh
 from cocoro.messages import LatchState, ServoCommand, ServoState
 from cocoro.recent import WINDOW_S, Recent
 from cocoro.robot import Joint
-from cocoro.topics import ARM_COMMAND
 from services.servos import table
 from services.servos.motion import AT_GOAL_COUNTS, JointMotion
 from services.servos.table import ServoReading
@@ -88,13 +87,15 @@ class ServoJoint:
 class ServoNetwork:
     """Told the robot's time with every call."""
 
-    def __init__(self, joints: Iterable[Joint], *, keeps_goal: bool, timeout_s: float) -> None:
+    def __init__(self, joints: Iterable[Joint], *, keeps_goal: bool, timeout_s: float, max_age_s: float) -> None:
+        """A command counts for `timeout_s` from its stamp, and is refused once it is older than `max_age_s`."""
         self.joints = {joint.id: ServoJoint(joint, keeps_goal=keeps_goal) for joint in joints}
         self.latch: LatchState = "unknown"
         self.port_fault = "the port was not opened yet"
         self._by_name = {one.joint.name: one for one in self.joints.values()}
         self._keeps_goal = keeps_goal
         self._timeout_ns = round(timeout_s * NS)
+        self._max_age_s = max_age_s
         self._tasks: dict[int, ServoTask] = {}
         self._strays = 0
         self._disturbed = Recent()
@@ -109,7 +110,7 @@ class ServoNetwork:
         """Take the goals, all or none. Returns '' when taken, otherwise why not."""
         if self.stopped_by:
             return self.stopped_by
-        if not is_fresh(command.stamp_ns, now_ns, ARM_COMMAND.max_age_s):
+        if not is_fresh(command.stamp_ns, now_ns, self._max_age_s):
             return "too old"
         if unknown := [name for name in command.joints if name not in self._by_name]:
             return f"no joint {unknown[0]!r} on this network, which has {', '.join(self._by_name)}"

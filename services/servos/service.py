@@ -52,8 +52,11 @@ class NetworkService:
         robot = node.robot
         joints = [robot.joints[name] for name in robot.network_joints(node.name)]
         keeps_goal = node.name == "hand"
-        self._network = ServoNetwork(joints, keeps_goal=keeps_goal, timeout_s=robot.base.command_timeout_s)
-        row = robot.networks[node.name]  # type: ignore[index] # one of the two names
+        row = robot.networks[node.name]
+        self._state, command = NETWORKS[node.name]
+        self._network = ServoNetwork(
+            joints, keeps_goal=keeps_goal, timeout_s=row.command_timeout_s, max_age_s=command.max_age_s
+        )
         settings = {
             joint.id: ServoSettings(
                 slope=table.slope_of(radians(joint.compliance_deg) / SERVO_COUNT_RAD),
@@ -63,7 +66,6 @@ class NetworkService:
         }
         port = port_path(config.arm_port if node.name == "arm" else config.hand_port, node.robot_name)
         self._line = ServoLine(port, row.baud, settings, row.rate_hz, config.reply_s, self._heard, keeps_goal)
-        self._state, command = NETWORKS[node.name]
         self._epoch = node.clock.epoch
         self._changed = asyncio.Event()
         LatchKeeper(node, self._latched, self._line.halt)

@@ -1,7 +1,7 @@
-"""Pictures of the simulated world: one small interface, a fast renderer and a fallback.
+"""Renders the simulated world: an interface, a fast renderer and a fallback.
 
-`make_renderer` chooses: moderngl where EGL is there (a few milliseconds a frame, no display needed), else
-PyBullet's TinyRenderer (some 100 ms a view, needs nothing).
+`make_renderer` chooses moderngl where EGL is available (a few milliseconds per frame, no display needed), otherwise
+PyBullet's TinyRenderer (about 100 ms per view, needs nothing).
 """
 
 from sim.render.interface import Images, Lighting, Renderer, make_renderer

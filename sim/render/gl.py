@@ -1,8 +1,8 @@
-"""The fast renderer: OpenGL 3.3 through moderngl on EGL, without a display; on a machine without a graphics card
-Mesa draws on the processor (llvmpipe).
+"""The fast renderer: OpenGL 3.3 through moderngl on EGL, without a display. Without a graphics card Mesa draws on the
+processor (llvmpipe).
 
-A frame is four passes: the lamp's shadow map, the colour camera's picture, the projector's shadow map (for real
-sensors), and the depth camera's metres.
+A frame takes four passes: the lamp's shadow map, the colour picture, the projector's shadow map (for real sensors), and
+the depth picture.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 from cocoro.arrays import FloatArray
 from cocoro.robot import Camera
 from sim.render.interface import Images, Lighting, Visual
-from sim.render.meshes import batches_of, floor_batch, wall_batch
+from sim.render.meshes import floor_mesh, instanced_meshes, wall_mesh
 from sim.render.room import FLOOR_RGB, OTHER_TILE_RGB, TILE_M
 from sim.render.views import (
     PROJECTOR_BIAS_PER_M,
@@ -33,10 +33,10 @@ from sim.render.views import (
 )
 
 LIBRARIES = {"libgl": "libGL.so.1", "libegl": "libEGL.so.1"}
-"""By the names that a machine without development packages has."""
+"""The libraries by their run-time names, which exist without development packages."""
 LAMP_TEXELS = 512
 LAMP_HALF_WIDTH_M = 2.0
-"""Shadows fall in a cube of this half width before the camera, 8 mm a texel; beyond it all is lit."""
+"""Half width of the cube in front of the camera that has shadows, 8 mm per texel. Everything outside is lit."""
 LAMP_AHEAD_M = 1.2
 
 
@@ -50,9 +50,9 @@ class _ShadowMap(NamedTuple):
 
 
 class GlRenderer:
-    """See `interface.Renderer`. To be used in the thread that made the process's first one.
+    """See `interface.Renderer`. All instances in a process must be used in the thread that made the first one.
 
-    Raises whatever moderngl raises when there is no OpenGL.
+    Raises moderngl's own exceptions when there is no OpenGL.
     """
 
     name = "moderngl"
@@ -61,8 +61,8 @@ class GlRenderer:
         self.camera = camera
         self._ctx = ctx = _context()
         self._owned: list[_Owned] = []
-        self._objects = batches_of(ctx, visuals)
-        self._floor, self._walls = floor_batch(ctx), wall_batch(ctx)
+        self._objects = instanced_meshes(ctx, visuals)
+        self._floor, self._walls = floor_mesh(ctx), wall_mesh(ctx)
         self._owned += [*self._objects, self._floor, self._walls]
 
         self._lambert = self._program("object", "object")
@@ -91,8 +91,8 @@ class GlRenderer:
     ) -> Images:
         self._ctx.enable_only(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
         placed = poses.astype(np.float32)
-        for batch in self._objects:
-            batch.place(placed)
+        for mesh in self._objects:
+            mesh.place(placed)
         self._draw_colour(camera_pose, light)
         self._draw_depth(depth_camera_pose, projector_pose)
         self._colour_target.read_into(self._rgba, components=4)
@@ -110,7 +110,7 @@ class GlRenderer:
     def _draw_colour(self, pose: FloatArray, light: Lighting) -> None:
         direction = np.asarray(light.direction) / np.linalg.norm(light.direction)
         lamp = lamp_view(direction, _floor_ahead(pose), LAMP_HALF_WIDTH_M, LAMP_TEXELS)
-        # The sides away from the lamp go into its map: a lit surface is then never behind itself.
+        # The lamp's map holds the faces away from the lamp, so that a lit surface never shades itself.
         self._draw_shadow_map(self._lamp_map, lamp, front_face="ccw")
 
         view = self._projection @ rigid_inverse(pose)
@@ -122,8 +122,8 @@ class GlRenderer:
         self._lamp_map.depth.use(0)
         self._colour_target.use()
         self._colour_target.clear()
-        for batch in (*self._objects, self._walls):
-            batch.draw(self._lambert)
+        for mesh in (*self._objects, self._walls):
+            mesh.draw(self._lambert)
         self._floor.draw(self._tiles)
 
     def _draw_depth(self, pose: FloatArray, projector_pose: FloatArray | None) -> None:
@@ -133,12 +133,12 @@ class GlRenderer:
         _set(self._metres, view=self._projection @ view, axis=view[2], projecting=projector_pose is not None)
         self._depth_target.use()
         self._depth_target.clear(red=np.inf)
-        for batch in (*self._objects, self._floor, self._walls):
-            batch.draw(self._metres)
+        for mesh in (*self._objects, self._floor, self._walls):
+            mesh.draw(self._metres)
 
     def _draw_projector_map(self, pose: FloatArray, baseline_m: float) -> None:
-        """What the projector's light reaches. It stands beside the depth camera and looks the same way, so a row
-        of its map is a row of the depth picture."""
+        """Draw the depth seen from the projector. It stands beside the depth camera and looks the same way, so a row of
+        its map is a row of the depth picture."""
         wide = projector_camera(self.camera, baseline_m)
         if self._projector_map is None:
             self._projector_map = self._shadow_map((wide.width, wide.height), moderngl.NEAREST)
@@ -155,11 +155,11 @@ class GlRenderer:
         target.use()
         target.scissor = (0, 0, target.width, target.height)
         target.clear()
-        # The outermost texels stay empty: a look outside of the map ends there, and finds light.
+        # The outermost texels stay empty: lookups outside of the map are clamped to them, and find light.
         target.scissor = (1, 1, target.width - 2, target.height - 2)
         self._ctx.front_face = front_face
-        for batch in self._objects:
-            batch.draw(self._shade)
+        for mesh in self._objects:
+            mesh.draw(self._shade)
         self._ctx.front_face = "cw"
 
     # --- making -----------------------------------------------------------------------------------
@@ -190,7 +190,7 @@ class GlRenderer:
 
 @cache
 def _context() -> moderngl.Context:
-    """The process's one OpenGL context, which its renderers share."""
+    """The process's only OpenGL context, which all its renderers share."""
     create: Any = moderngl.create_context
     ctx: moderngl.Context = create(standalone=True, require=330, backend="egl", **LIBRARIES)
     ctx.front_face = "cw"  # rows run downwards (see `projection`), which mirrors the winding
@@ -198,13 +198,13 @@ def _context() -> moderngl.Context:
 
 
 def _set(program: moderngl.Program, **values: ArrayLike) -> None:
-    """Set uniforms. Matrices go row by row: the shaders multiply vector * matrix."""
+    """Set uniforms. Matrices are written row by row: the shaders multiply vector * matrix."""
     for name, value in values.items():
         uniform: Any = program[name]
         uniform.write(np.asarray(value, np.float32).tobytes())
 
 
 def _floor_ahead(pose: FloatArray) -> FloatArray:
-    """Where the shadows matter: on the floor a little before the camera, (3,)."""
+    """The point on the floor in front of the camera about which shadows are drawn, (3,), m."""
     ahead = pose[:2, 2] / max(float(np.linalg.norm(pose[:2, 2])), 1e-6)
     return np.array([*(pose[:2, 3] + LAMP_AHEAD_M * ahead), 0.0])

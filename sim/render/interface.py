@@ -1,4 +1,4 @@
-"""What the camera asks of a renderer."""
+"""The interface of a renderer, and the choice of the one that runs on this machine."""
 
 from __future__ import annotations
 
@@ -13,41 +13,39 @@ from cocoro.robot import Camera
 
 
 class Lighting(Protocol):
-    """One lamp far away and the light that the room throws back."""
+    """A distant lamp and ambient light."""
 
     @property
     def ambient(self) -> float:
-        """Share of a surface's colour that it shows in shadow, 0 to 1."""
+        """Share of a surface's colour that is visible in shadow, 0 to 1."""
 
     @property
     def diffuse(self) -> float:
-        """Share that the lamp adds where it falls straight on the surface, 0 to 1."""
+        """Share that the lamp adds at perpendicular incidence, 0 to 1."""
 
     @property
     def direction(self) -> tuple[float, float, float]:
-        """Where the lamp's light goes, world frame; its length does not matter."""
+        """Direction in which the lamp's light travels, world frame; any length except zero."""
 
     @property
     def temperature_k(self) -> float:
-        """Colour temperature; the camera is balanced for 6500 K, so that is white."""
+        """Colour temperature of the lamp. The camera is balanced for 6500 K, so that this is white."""
 
 
 class Images(NamedTuple):
-    """One look at the world. The arrays are the renderer's own: they hold until its next `render`."""
+    """The images of one frame. The renderer owns the arrays, and overwrites them at its next `render`."""
 
     colour: ImageArray
-    """height x width x 3, RGB, the colour camera's view."""
+    """RGB, (height, width, 3), from the colour camera."""
     depth_m: Float32Array
-    """height x width, metres along the depth camera's optical axis, from that camera's own pose; infinite where
-    there is nothing. NEGATIVE (the same metres) where the projector's light does not reach, if a projector
-    was given."""
+    """Metres along the depth camera's optical axis, (height, width); infinite where there is nothing. With a projector,
+    pixels that its light does not reach have the NEGATIVE of their depth."""
 
 
 class Renderer(Protocol):
     """Draws the visuals that it was made with. Both cameras have the intrinsics `camera`.
 
-    Poses are 4 x 4 transforms to the world; a camera's frame is x right, y down, z forward. Equal inputs
-    give equal bytes, in this process and in another one.
+    A camera's frame is x right, y down, z forward. Equal inputs give equal bytes, also in different processes.
     """
 
     @property
@@ -64,10 +62,10 @@ class Renderer(Protocol):
         light: Lighting,
         projector_pose: FloatArray | None = None,
     ) -> Images:
-        """One frame. `poses` is (n, 4, 4) in the order of the visuals."""
+        """Draw a frame. `poses`: world poses of the visuals in their order, (n, 4, 4); the other poses are (4, 4)."""
 
     def close(self) -> None:
-        """Give back what was taken; the renderer must not be used after it."""
+        """Release all resources. The renderer must not be used afterwards."""
 
 
 Shape = Literal["box", "cylinder", "sphere"]
@@ -75,14 +73,14 @@ Shape = Literal["box", "cylinder", "sphere"]
 
 @dataclass(frozen=True)
 class Visual:
-    """One primitive, centred on its own frame; where that frame stands is said by `World.visual_poses`."""
+    """A coloured rigid primitive, centred on its own frame. `World.visual_poses` gives the frame's pose."""
 
     name: str
     shape: Shape
     size_m: tuple[float, ...]
     """box: full x, y, z; cylinder: radius, height (its axis is z); sphere: radius."""
     rgb: tuple[float, float, float]
-    """Surface colour, 0 to 1 a channel."""
+    """Surface colour, 0 to 1 per channel."""
 
 
 _log = logging.getLogger(__name__)
@@ -96,9 +94,10 @@ RendererChoice = Literal["auto", "moderngl", "tiny"]
 
 
 def make_renderer(visuals: Sequence[Visual], camera: Camera, choice: RendererChoice = "auto") -> Renderer:
-    """The fast renderer, or by `auto` the slow one where that cannot run, with one logged warning.
+    """Make the chosen renderer. With `auto` that is the fast one, or the slow one and a warning when the fast one
+    cannot run.
 
-    Raises ConfigError when `moderngl` is demanded and cannot run.
+    Raises ConfigError when `moderngl` is chosen and cannot run.
     """
     if choice != "tiny":
         try:

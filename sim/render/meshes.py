@@ -1,6 +1,7 @@
-"""Triangles of the three primitives at unit size: a row is a corner's position (3) and its normal (3).
+"""Triangle meshes of the three primitives at unit size, and their drawing by OpenGL in instances.
 
-Scaled by `scale_of`, a mesh has the visual's size. Triangles wind counter-clockwise seen from outside.
+A row of a mesh is the position (3) and the normal (3) of a triangle's corner. `scale_of` scales a mesh to the size of a
+visual. Triangles wind counter-clockwise seen from outside.
 """
 
 from __future__ import annotations
@@ -20,13 +21,15 @@ from sim.render.room import HALF_WIDTH_M, walls
 TriangleMesh = Float32Array
 
 CYLINDER_SLICES = 32
-"""At a can's 33 mm radius the flat sides are at most 0.16 mm inside of the round."""
+"""At a can's radius of 33 mm the flat faces are at most 0.16 mm inside the cylinder."""
 SPHERE_SLICES, SPHERE_STACKS = 24, 12
-"""At a ball's 30 mm radius at most 0.5 mm inside; small triangles are what costs most in a small picture."""
+"""At a ball's radius of 30 mm the faces are at most 0.5 mm inside the sphere. More triangles would cost much time in
+small pictures."""
 
 
 def scale_of(visual: Visual) -> tuple[float, float, float]:
-    """What the unit mesh is multiplied by along x, y, z."""
+    """Factors along x, y, z that scale the unit mesh to the visual's size. Raises ValueError for a size that does not
+    fit the shape."""
     match visual.shape, visual.size_m:
         case "box", (x, y, z):
             return x, y, z
@@ -38,7 +41,7 @@ def scale_of(visual: Visual) -> tuple[float, float, float]:
 
 
 def mesh(shape: Shape) -> TriangleMesh:
-    """Triangle corners of a unit primitive, shape (3 * triangles, 6), float32."""
+    """Triangle corners of a unit primitive, (3 * triangles, 6)."""
     build = {"box": box, "cylinder": cylinder, "sphere": sphere}[shape]
     return build()
 
@@ -48,7 +51,7 @@ def box() -> TriangleMesh:
     faces = []
     for axis in range(3):
         for sign in (-0.5, 0.5):
-            # u x v points along +axis; the quad is turned round on the negative side.
+            # u x v points along +axis, so the quad is reversed on the negative side.
             u, v = np.eye(3)[(axis + 1) % 3], np.eye(3)[(axis + 2) % 3]
             centre = np.eye(3)[axis] * sign
             quad = [centre + (a * u + b * v) / 2 for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
@@ -59,14 +62,14 @@ def box() -> TriangleMesh:
 
 
 def square() -> TriangleMesh:
-    """Side 1, in the plane z = 0, seen from above."""
+    """A square of side 1 in the plane z = 0, facing up."""
     up = np.array([0.0, 0.0, 1.0])
     corners = [np.array([x, y, 0.0]) for x, y in ((-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5))]
     return _stack([_quad(corners, [up] * 4)])
 
 
 def cylinder() -> TriangleMesh:
-    """Radius 1, height 1, the axis along z."""
+    """A cylinder of radius 1 and height 1 about z."""
     rim = [np.array([np.cos(a), np.sin(a), 0.0]) for a in np.arange(CYLINDER_SLICES + 1) * 2 * pi / CYLINDER_SLICES]
     up = np.array([0.0, 0.0, 1.0])
     parts = []
@@ -78,7 +81,7 @@ def cylinder() -> TriangleMesh:
 
 
 def sphere() -> TriangleMesh:
-    """Radius 1."""
+    """A sphere of radius 1."""
 
     def corner(stack: int, slice_: int) -> FloatArray:
         down, round_ = stack * pi / SPHERE_STACKS, slice_ * 2 * pi / SPHERE_SLICES
@@ -111,12 +114,12 @@ def _stack(parts: list[FloatArray]) -> TriangleMesh:
 
 
 class InstancedMesh:
-    """One mesh and its instances: what is fixed of each (scale and colour), and where each stands in this frame.
+    """A mesh and its instances, drawn with one call: scale and colour are fixed, the poses change with each frame.
 
     Args:
-        corners: the mesh, see `meshes`.
-        rows: which of the frame's poses are these instances'.
-        scales, rgbs: (n, 3) each.
+        corners: the mesh, (3 * triangles, 6).
+        rows: the indices of these instances among the frame's poses.
+        scales, rgbs: scale and colour of each instance, (n, 3).
     """
 
     def __init__(
@@ -124,7 +127,7 @@ class InstancedMesh:
     ) -> None:
         self._ctx = ctx
         self._rows = list(rows)
-        # A corner that several triangles share is transformed once.
+        # Corners that several triangles share are transformed once.
         corners, order = np.unique(corners, axis=0, return_inverse=True)
         self._corners = ctx.buffer(corners.tobytes())
         self._order = ctx.buffer(order.astype(np.uint32).tobytes())
@@ -133,11 +136,11 @@ class InstancedMesh:
         self._arrays: dict[moderngl.Program, moderngl.VertexArray] = {}
 
     def place(self, poses: Float32Array) -> None:
-        """Where everything stands in this frame: (m, 4, 4), of which this batch takes its rows."""
+        """Set the instances' poses from the poses of the frame, (m, 4, 4)."""
         self._poses.write(poses[self._rows].tobytes())
 
     def draw(self, program: moderngl.Program) -> None:
-        """Draw all instances into the framebuffer in use."""
+        """Draw all instances into the current framebuffer."""
         if program not in self._arrays:
             parts = [
                 _layout(program, self._corners, "", ("3f", "in_corner"), ("3f", "in_normal")),
@@ -157,36 +160,36 @@ class InstancedMesh:
 def _layout(
     program: moderngl.Program, buffer: moderngl.Buffer, divisor: str, *fields: tuple[str, str]
 ) -> tuple[moderngl.Buffer | str, ...]:
-    """One buffer's fields as moderngl wants them told; what the program does not read is padding."""
+    """A buffer's fields in moderngl's format. Fields that the program does not read become padding."""
     read = [(size, name) for size, name in fields if name in program]
     sizes = [size if name in program else f"{4 * int(size[:-1])}x" for size, name in fields]
     return (buffer, " ".join(sizes) + divisor, *(name for _, name in read))
 
 
-def batches_of(ctx: moderngl.Context, visuals: Sequence[Visual]) -> list[InstancedMesh]:
-    """One batch a shape."""
+def instanced_meshes(ctx: moderngl.Context, visuals: Sequence[Visual]) -> list[InstancedMesh]:
+    """One instanced mesh for each shape among the visuals."""
     shapes: list[Shape] = sorted({visual.shape for visual in visuals})
-    batches = []
+    meshes = []
     for shape in shapes:
         rows = [row for row, visual in enumerate(visuals) if visual.shape == shape]
         chosen = [visuals[row] for row in rows]
         scales, rgbs = [scale_of(visual) for visual in chosen], [visual.rgb for visual in chosen]
-        batches.append(InstancedMesh(ctx, mesh(shape), rows, scales, rgbs))
-    return batches
+        meshes.append(InstancedMesh(ctx, mesh(shape), rows, scales, rgbs))
+    return meshes
 
 
-def floor_batch(ctx: moderngl.Context) -> InstancedMesh:
-    """The floor of the room."""
+def floor_mesh(ctx: moderngl.Context) -> InstancedMesh:
+    """The room's floor."""
     floor = InstancedMesh(ctx, square(), [0], [[2 * HALF_WIDTH_M] * 3], [[0.0] * 3])
     floor.place(np.eye(4, dtype=np.float32)[None])
     return floor
 
 
-def wall_batch(ctx: moderngl.Context) -> InstancedMesh:
-    """Walls, skirting and ceiling of the room."""
+def wall_mesh(ctx: moderngl.Context) -> InstancedMesh:
+    """The room's walls, skirting boards and ceiling."""
     parts = walls()
-    (batch,) = batches_of(ctx, [visual for visual, _ in parts])
+    (mesh,) = instanced_meshes(ctx, [visual for visual, _ in parts])
     poses = np.tile(np.eye(4, dtype=np.float32), (len(parts), 1, 1))
     poses[:, :3, 3] = [centre for _, centre in parts]
-    batch.place(poses)
-    return batch
+    mesh.place(poses)
+    return mesh

@@ -1,7 +1,7 @@
-"""The room around every scene: a grey floor, light walls, a ceiling. Nothing in it has an object's colour.
+"""The room around every scene: a grey floor, light walls and a ceiling, none in the colour of an object.
 
-The floor is the physics' floor (z = 0). The walls only close the picture: nothing collides with them, and they
-stand out of the depth camera's range of anything near the middle of the room.
+The floor is that of the physics (z = 0). The walls are only drawn: nothing collides with them, and from the middle of
+the room they are beyond the depth camera's range.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _SKIRTING_M = 0.12
 
 
 def walls() -> list[tuple[Visual, Vec3]]:
-    """Walls, skirting boards and ceiling, each with its centre in the world."""
+    """Walls, skirting boards and ceiling, each with the world position of its centre, m."""
     long, half = 2 * HALF_WIDTH_M, HALF_WIDTH_M + _THICK_M / 2
     parts = [(Visual("ceiling", "box", (long, long, _THICK_M), _CEILING_RGB), (0.0, 0.0, HEIGHT_M + _THICK_M / 2))]
     for x, y in ((half, 0.0), (-half, 0.0), (0.0, half), (0.0, -half)):

@@ -1,7 +1,6 @@
-"""The fallback renderer: PyBullet's TinyRenderer, on the processor, about 100 ms a view at 640 x 480.
+"""The fallback renderer: PyBullet's TinyRenderer on the processor, about 100 ms per view at 640 x 480.
 
-It draws from a PyBullet client of its own that holds the visuals and nothing else, so it needs nothing of the
-world's.
+It draws from a separate PyBullet client that holds only the visuals.
 """
 
 from __future__ import annotations
@@ -21,16 +20,17 @@ from sim.render.room import FLOOR_RGB, HALF_WIDTH_M, walls
 from sim.render.views import PROJECTOR_BIAS_PER_M, lamp_tint, projection, projector_camera, rigid_inverse
 
 NEAR_M, FAR_M = 0.05, 30.0
-"""Closer together than the other renderer's, for its depth is what is left of a 32 bit float after division."""
+"""Closer together than the fast renderer's, since depth is computed from a 32-bit float with a loss of precision."""
 FLOOR_THICK_M = 0.02
 _SAMPLE_OFFSET_PX = (-0.5, 0.5)
 """TinyRenderer samples a pixel at its left lower corner, not at its centre (measured on a plane and a can)."""
 _TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
-"""Camera frame (y down, z forward) to OpenGL's (y up, z backward)."""
+"""From the camera's frame (y down, z forward) to OpenGL's (y up, z backward)."""
 
 
 class TinyRenderer:
-    """See `interface.Renderer`. Plain floor, no shadow of the lamp; sides that the projector just grazes have holes."""
+    """See `interface.Renderer`. The floor is plain, the lamp casts no shadows, and the depth has holes where the
+    projector's light grazes a surface."""
 
     name = "tiny"
 
@@ -102,7 +102,7 @@ class TinyRenderer:
         z = np.asarray(z, np.float32).reshape(camera.height, camera.width)
         depth = FAR_M * NEAR_M / (FAR_M - (FAR_M - NEAR_M) * z)
         depth[depth > 0.99 * FAR_M] = np.inf
-        # The lamp's tint is put on afterwards: TinyRenderer's own colour of the light leaves the ambient share white.
+        # The tint is applied here, since TinyRenderer's light colour would leave the ambient share white.
         rgb = np.asarray(rgba, np.uint8).reshape(camera.height, camera.width, 4)[..., :3]
         return np.rint(rgb * lamp_tint(light.temperature_k)).astype(np.uint8), depth
 
@@ -113,10 +113,10 @@ class TinyRenderer:
 def _shaded(
     depth_m: Float32Array, camera: Camera, lit_m: Float32Array, projector: Camera, baseline_m: float
 ) -> BoolArray:
-    """Which pixels of the depth camera's picture the projector does not reach.
+    """The pixels of the depth picture `depth_m` (height, width) that the projector does not reach, (height, width).
 
-    `lit_m` is the depth picture from the projector, which stands `baseline_m` to the right and looks the same way:
-    a point is in the same row of both, further left in the projector's by its disparity.
+    `lit_m` is the depth picture from the projector, which stands `baseline_m` to the right and looks the same way: a
+    point is in the same row of both pictures, and further left in the projector's by its disparity.
     """
     columns = np.arange(camera.width, dtype=np.float32) - camera.cx + projector.cx
     u = np.rint(columns - camera.fx * baseline_m / depth_m).astype(np.intp)

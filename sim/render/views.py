@@ -1,4 +1,4 @@
-"""Projection matrices, and the tint of a lamp's colour temperature: what both renderers share."""
+"""Projection matrices and the tint of a lamp, shared by both renderers."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ NEAR_M = 0.03
 FAR_M = 60.0
 PROJECTOR_NEAR_M = 0.2
 PROJECTOR_BIAS_PER_M = 0.005
-"""How much nearer (in 1 / z) something must be to shade what lies behind it: 5 mm at 1 m, 2 cm at 2 m; a fifth of
-a pixel of disparity. It keeps slanted surfaces from shading themselves."""
+"""Least difference in 1 / z at which a surface shades the one behind it: 5 mm at 1 m, 2 cm at 2 m, a fifth of a pixel
+of disparity. It keeps slanted surfaces from shading themselves."""
 
 
 def rigid_inverse(pose: FloatArray) -> FloatArray:
-    """Inverse of a 4 x 4 rotation and translation."""
+    """Inverse of a rigid transform, (4, 4)."""
     inverse = np.eye(4)
     inverse[:3, :3] = pose[:3, :3].T
     inverse[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
@@ -27,10 +27,10 @@ def rigid_inverse(pose: FloatArray) -> FloatArray:
 
 
 def projection(camera: Camera, near_m: float = NEAR_M, far_m: float = FAR_M) -> FloatArray:
-    """Camera frame (x right, y down, z forward) to clip space, so that row 0 of the picture comes out at
-    y = -1: OpenGL hands its rows out from y = -1 upwards, so the picture needs no flip.
+    """Matrix (4, 4) from the camera's frame (x right, y down, z forward) to clip space.
 
-    Pixel i covers i - 0.5 to i + 0.5 (see `cocoro.robot.Camera`), so -0.5 is at -1 and width - 0.5 at +1.
+    Row 0 of the picture is at y = -1. OpenGL returns rows from y = -1 upwards, so the picture needs no flip. Pixel i
+    covers i - 0.5 to i + 0.5 (see `cocoro.robot.Camera`), so -0.5 is at -1 and width - 0.5 at +1.
     """
     w, h = camera.width, camera.height
     depth = far_m - near_m
@@ -45,17 +45,17 @@ def projection(camera: Camera, near_m: float = NEAR_M, far_m: float = FAR_M) -> 
 
 
 def projector_camera(camera: Camera, baseline_m: float) -> Camera:
-    """The infrared projector as a camera: the depth camera's pixels, and as many more at both sides as it must see
-    to light everything that the depth camera, `baseline_m` beside it, sees beyond half a metre."""
+    """The infrared projector as a camera: the depth camera's pixels with a margin on both sides, wide enough to cover
+    everything that the depth camera, `baseline_m` beside it, sees beyond half a metre."""
     margin = ceil(camera.fx * baseline_m / 0.5)
     return replace(camera, width=camera.width + 2 * margin, cx=camera.cx + margin)
 
 
 def lamp_view(direction: FloatArray, centre_m: FloatArray, half_width_m: float, texels: int) -> FloatArray:
-    """World to the lamp's clip space: what a parallel light along `direction` (3,) sees of the cube of that
-    half width around `centre_m` (3,).
+    """Matrix (4, 4) from the world to the clip space of a parallel light along `direction` (3,): it covers the cube of
+    that half width around `centre_m` (3,).
 
-    The centre is moved onto the texel grid, so that shadows do not crawl when the centre moves.
+    The centre is rounded to the texel grid, so that shadows do not flicker when the centre moves.
     """
     forward = direction / np.linalg.norm(direction)
     helper = np.array([1.0, 0.0, 0.0]) if abs(forward[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
@@ -71,11 +71,10 @@ def lamp_view(direction: FloatArray, centre_m: FloatArray, half_width_m: float, 
 
 
 def lamp_tint(temperature_k: float) -> FloatArray:
-    """RGB factors of a lamp of this colour temperature, for pixel values as they are displayed; (3,).
+    """RGB factors (3,) of a lamp with this colour temperature, to multiply display values with.
 
-    Planckian locus (cubic fit of Kim et al., US patent 7024034, 1667 to 25000 K) to linear sRGB (IEC
-    61966-2-1) relative to 6500 K, its strongest channel 1; then the display's gamma, since the surface colours
-    that it multiplies are display values. Temperatures outside of the fit count as its ends.
+    Planckian locus (cubic fit of Kim et al., US patent 7024034, 1667 to 25000 K, clipped outside) to linear sRGB (IEC
+    61966-2-1), relative to 6500 K and scaled to a largest channel of 1, then the display's gamma.
     """
     rgb = _planck_rgb(temperature_k) / _planck_rgb(6500.0)
     tint: FloatArray = (rgb / rgb.max()) ** (1 / 2.2)

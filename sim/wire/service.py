@@ -78,7 +78,7 @@ class WireBase(MobileBase):
     def rolled(self, left_m: float, right_m: float, now_ns: int, dt_s: float) -> None:
         self.counted_m = [self.counted_m[0] + left_m, self.counted_m[1] + right_m]
 
-    def _obeyed(self, now_ns: int) -> tuple[float, float]:
+    def _allowed_mps(self, now_ns: int) -> tuple[float, float]:
         return self.asked_mps
 
 

@@ -1,9 +1,11 @@
-// Checks an export for Foxglove against Foxglove's own schemas, and prints by schema how many messages were checked
-// and what was wrong with the first that was.
+// Checks an export for Foxglove against Foxglove's JSON schemas: decodes each message by the schema that the file has
+// (a protobuf descriptor), and prints by schema how many messages were checked and what was wrong with the first bad one.
 import { McapIndexedReader } from "@mcap/core";
 import * as schemas from "@foxglove/schemas/jsonschema.js";
 import Ajv from "ajv";
 import { decompress } from "fzstd";
+import protobuf from "protobufjs";
+import descriptor from "protobufjs/ext/descriptor.js";
 import { open } from "node:fs/promises";
 
 const file = await open(process.argv[2]);
@@ -18,21 +20,41 @@ const readable = {
 const decompressHandlers = { zstd: (packed, size) => decompress(packed, new Uint8Array(Number(size))) };
 const reader = await McapIndexedReader.Initialize({ readable, decompressHandlers });
 const ajv = new Ajv({ strict: false, logger: false });
-const checks = new Map();
+const OPTIONS = { longs: Number, enums: Number, bytes: String, arrays: true, defaults: true };
+
+function snake(name) {
+  return name.replace(/(?<=[a-z])[A-Z]/g, (letter) => "_" + letter.toLowerCase());
+}
+
+// Foxglove's JSON schemas have times as {sec, nsec}, protobuf as {seconds, nanos}; an absent message is no property.
+function plain(value) {
+  if (Array.isArray(value)) return value.map(plain);
+  if (value === null || typeof value !== "object") return value;
+  if ("nanos" in value) return { sec: value.seconds, nsec: value.nanos };
+  const present = Object.entries(value).filter(([, item]) => item !== null);
+  return Object.fromEntries(present.map(([name, item]) => [snake(name), plain(item)]));
+}
+
+const kinds = new Map();
+function kindOf(schema) {
+  if (!kinds.has(schema.id)) {
+    const name = schema.name.slice("foxglove.".length);
+    const root = protobuf.Root.fromDescriptor(descriptor.FileDescriptorSet.decode(schema.data));
+    kinds.set(schema.id, { type: root.lookupType(schema.name), check: schemas[name] && ajv.compile(schemas[name]) });
+  }
+  return kinds.get(schema.id);
+}
+
 const found = {};
 for await (const message of reader.readMessages()) {
   const channel = reader.channelsById.get(message.channelId);
-  const name = reader.schemasById.get(channel.schemaId)?.name ?? "";
-  if (!name.startsWith("foxglove.")) continue;
-  if (!checks.has(name)) {
-    const known = schemas[name.slice("foxglove.".length)];
-    checks.set(name, known ? ajv.compile(known) : null);
-  }
-  const check = checks.get(name);
-  const told = (found[name] ??= { messages: 0, problem: check ? "" : "Foxglove knows no schema of this name" });
+  const schema = reader.schemasById.get(channel.schemaId);
+  if (!schema?.name.startsWith("foxglove.")) continue;
+  const { type, check } = kindOf(schema);
+  const told = (found[schema.name] ??= { messages: 0, problem: check ? "" : "Foxglove knows no schema of this name" });
   told.messages += 1;
-  if (check && !told.problem && !check(JSON.parse(new TextDecoder().decode(message.data))))
-    told.problem = `${channel.topic}: ${ajv.errorsText(check.errors)}`;
+  const value = plain(type.toObject(type.decode(message.data), OPTIONS));
+  if (check && !told.problem && !check(value)) told.problem = `${channel.topic}: ${ajv.errorsText(check.errors)}`;
 }
 await file.close();
 process.stdout.write(JSON.stringify(found));

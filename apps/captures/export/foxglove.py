@@ -1,7 +1,7 @@
-"""`--foxglove`: an MCAP file of Foxglove's well-known schemas, which it opens as they are.
+"""`--foxglove`: an MCAP file that Foxglove opens as it is, by Foxglove's own schemas (foxglove-sdk, an extra).
 
-Its time is the robot's: log times and times within are the messages' stamps. Beside the well-known ones, every
-other message is there as JSON under its own key, to be plotted.
+Log times are the messages' stamps, so time is the robot's. Every recorded message is in the file as JSON as well, on a
+topic named as its key, so that it can be plotted.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ import cv2
 import msgspec
 import numpy as np
 
-from apps.captures.export import foxglove_types as fg
 from apps.captures.export.files import making
 from apps.captures.export.geometry import CAMERA, Posture, about_z, conjugate, points, quaternion, rotated
 from apps.captures.export.story import catalogue_of, robot_of
 from apps.captures.rewrite import info_in
+from cocoro.capture.conventions import CaptureError
 from cocoro.capture.mcap import DamageError
 from cocoro.capture.reader import Capture, Record
-from cocoro.capture.types import JSON, NotReadableError
+from cocoro.capture.types import JSON, NotReadableError, TypeSchema
 from cocoro.clock import NS
 from cocoro.messages import (
     BaseState,
@@ -42,28 +42,43 @@ from services.capture.file import Packer
 from services.capture.keys import KeyInfo, QueuedMessage
 from services.capture.writer import CaptureWriter, Limits
 
+try:
+    from foxglove import messages as fg
+except ModuleNotFoundError as error:
+    raise CaptureError("--foxglove needs foxglove-sdk: pip install 'cocoro-mesh[foxglove]'") from error
+
 ODOMETRY, BODY = "odometry", "body"
-"""Names of frames; the links' are their own."""
+"""Names of coordinate frames; each link's frame has the link's name."""
 DEPTH_STEP = 4
-"""Of the depth image, every so many rows and columns become points."""
+"""Every so many rows and columns of the depth image become points."""
 LATE_NS = 2 * NS
-"""How much later than others a message may be recorded and still be put where its stamp belongs."""
+"""A message may be recorded this much later than others and is still sorted in by its stamp."""
 JPEG_QUALITY = 90
-WHITE, BLACK, BONE = fg.Color(1, 1, 1), fg.Color(0, 0, 0, 0.6), fg.Color(0.85, 0.85, 0.9)
-TRUE = fg.Color(0.2, 0.9, 0.3, 0.45)
 
 
-class Said(NamedTuple):
+def _colour(red: float, green: float, blue: float, alpha: float = 1.0) -> fg.Color:
+    return fg.Color(r=red, g=green, b=blue, a=alpha)
+
+
+WHITE, BLACK, BONE = _colour(1, 1, 1), _colour(0, 0, 0, 0.6), _colour(0.85, 0.85, 0.9)
+TRUE, NOTHING = _colour(0.2, 0.9, 0.3, 0.45), _colour(0, 0, 0, 0)
+
+
+class FoxgloveMessage(NamedTuple):
     """One message of the new file."""
 
     topic: str
-    message: msgspec.Struct | dict[str, Any]
+    message: Any
+    """One of Foxglove's types, or plain data of a recorded message."""
     channel: int | None = None
-    """The recorded one; None where it is told in Foxglove's own terms."""
+    """The number of the recorded channel; None for Foxglove's types."""
 
 
 def export(capture: Capture, out: Path, progress: Callable[[float], None] = lambda _: None) -> int:
-    """Returns how many messages were written. Raises CaptureError when that cannot be done."""
+    """Write the file. Returns the number of messages in it. Raises CaptureError when it cannot be written.
+
+    `progress` is called with the seconds of the capture that are done.
+    """
     with making(out):
         return _export(capture, out, progress)
 
@@ -72,18 +87,19 @@ def _export(capture: Capture, out: Path, progress: Callable[[float], None]) -> i
     translator = Translator(capture)
     writer = CaptureWriter(lambda _: out, Packer("zstd"), Limits(), lambda *_: KeyInfo(JSON, None, {}))
     newest_ns = 0
-    for stamp_ns, said in _by_stamp(capture, translator, progress):
+    for stamp_ns, made in _by_stamp(capture, translator, progress):
         newest_ns = max(newest_ns, stamp_ns)
-        payload = msgspec.json.encode(said.message)
-        writer.put(QueuedMessage(said.topic, 0, newest_ns, newest_ns, payload, translator.info_of(said), said.channel))
+        payload = msgspec.json.encode(made.message) if made.channel is not None else made.message.encode()
+        info = translator.info_of(made)
+        writer.put(QueuedMessage(made.topic, 0, newest_ns, newest_ns, payload, info, made.channel))
     writer.close()
     return writer.messages
 
 
 def _by_stamp(
     capture: Capture, translator: Translator, progress: Callable[[float], None]
-) -> Iterator[tuple[int, Said]]:
-    """In order of the stamps, as far as messages are not recorded too late for that."""
+) -> Iterator[tuple[int, FoxgloveMessage]]:
+    """Stamp and message, in the order of stamps for messages that are recorded less than LATE_NS late."""
     waiting: list[tuple[int, int, Record]] = []
     stamp_ns = _first_stamp_ns(capture)
     for number, record in enumerate(capture.messages()):
@@ -92,11 +108,11 @@ def _by_stamp(
         heapq.heappush(waiting, (stamp_ns, number, record))
         while record.log_ns - waiting[0][2].log_ns > LATE_NS:
             at_ns, _, due = heapq.heappop(waiting)
-            yield from ((at_ns, said) for said in translator.translate(due))
+            yield from ((at_ns, made) for made in translator.translate(due))
         progress((record.log_ns - capture.start_ns) / NS)
     while waiting:
         at_ns, _, due = heapq.heappop(waiting)
-        yield from ((at_ns, said) for said in translator.translate(due))
+        yield from ((at_ns, made) for made in translator.translate(due))
 
 
 def _first_stamp_ns(capture: Capture) -> int:
@@ -104,12 +120,12 @@ def _first_stamp_ns(capture: Capture) -> int:
 
 
 def _stamped(record: Record) -> bool:
-    """A message without a stamp was recorded with the time of its receipt, and is put beside its neighbour."""
+    """A message without a stamp was recorded with its log time as publish time; it is put beside its neighbour."""
     return record.publish_ns != record.log_ns
 
 
 class Translator:
-    """What Foxglove is told of each message."""
+    """Makes Foxglove's messages of recorded ones."""
 
     def __init__(self, capture: Capture) -> None:
         self._capture = capture
@@ -118,7 +134,7 @@ class Translator:
         self._posture = Posture(self._robot)
         self._phase = ""
 
-    def translate(self, record: Record) -> Iterator[Said]:
+    def translate(self, record: Record) -> Iterator[FoxgloveMessage]:
         try:
             message = self._capture.read(record)
         except NotReadableError:
@@ -133,157 +149,189 @@ class Translator:
         except DamageError:
             return
         if isinstance(plain, dict):
-            yield Said(record.key, _for_json(plain), record.channel)
+            yield FoxgloveMessage(record.key, _for_json(plain), record.channel)
 
-    def info_of(self, said: Said) -> KeyInfo:
-        """A recorded channel keeps its own schema; its bytes are given by their number."""
-        if said.channel is not None:
-            return info_in(self._capture, said.channel)._replace(encoding=JSON, metadata={})
-        return KeyInfo(JSON, fg.schema_of(type(said.message)), {})
+    def info_of(self, made: FoxgloveMessage) -> KeyInfo:
+        """A recorded channel keeps its schema; its payloads are JSON, with the length in place of bytes."""
+        if made.channel is not None:
+            return info_in(self._capture, made.channel)._replace(encoding=JSON, metadata={})
+        schema = made.message.get_schema()
+        return KeyInfo(schema.encoding, TypeSchema(schema.name, schema.encoding, schema.data), {})
 
     # --- what is shown ----------------------------------------------------------------------------
 
-    def _shown(self, message: Message) -> Iterator[Said]:
-        at = fg.time_of(message.stamp_ns)
+    def _shown(self, message: Message) -> Iterator[FoxgloveMessage]:
+        at = _time(message.stamp_ns)
         if isinstance(message, BaseState):
             self._posture.move(message)
-            yield Said("/tf", fg.FrameTransforms([self._body(at)]))
-            yield Said("/robot", fg.SceneUpdate([self._chassis(at)]))
+            yield FoxgloveMessage("/tf", fg.FrameTransforms(transforms=[self._body(at)]))
+            yield FoxgloveMessage("/robot", fg.SceneUpdate(entities=[self._chassis(at)]))
         elif isinstance(message, ServoState):
             self._posture.bend(message)
             yield from self._links(at)
         elif isinstance(message, Detections):
-            yield Said("/camera/annotations", self._annotations(at, message))
+            yield FoxgloveMessage("/camera/annotations", self._annotations(at, message))
         elif isinstance(message, PlannerStatus):
-            believed = [self._object(at, "believed", known) for known in message.known]
-            yield Said("/believed", fg.SceneUpdate(believed))
+            believed = [self._believed(at, known) for known in message.known]
+            yield FoxgloveMessage("/believed", fg.SceneUpdate(entities=believed))
         elif isinstance(message, TaskState):
             yield from self._log(at, message)
         elif isinstance(message, Truth):
-            yield Said("/truth", fg.SceneUpdate([self._true(at, message)]))
+            yield FoxgloveMessage("/truth", fg.SceneUpdate(entities=[self._true(at, message)]))
 
-    def _frame(self, frame: Frame) -> Iterator[Said]:
-        at = fg.time_of(frame.stamp_ns)
+    def _frame(self, frame: Frame) -> Iterator[FoxgloveMessage]:
+        at = _time(frame.stamp_ns)
         pixels = np.frombuffer(frame.colour, dtype=np.uint8).reshape(frame.height, frame.width, 3)
         _, jpeg = cv2.imencode(
             ".jpg", cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
         )
-        yield Said("/camera/colour", fg.CompressedImage(at, CAMERA, jpeg.tobytes(), "jpeg"))
+        picture = fg.CompressedImage(timestamp=at, frame_id=CAMERA, data=jpeg.tobytes(), format="jpeg")
+        yield FoxgloveMessage("/camera/colour", picture)
         camera = self._robot.camera.scaled(frame.width, frame.height)
-        k = (camera.fx, 0.0, camera.cx, 0.0, camera.fy, camera.cy, 0.0, 0.0, 1.0)
-        r = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
-        p = (*k[:3], 0.0, *k[3:6], 0.0, *k[6:], 0.0)
-        yield Said(
-            "/camera/calibration",
-            fg.CameraCalibration(at, CAMERA, frame.width, frame.height, "", (), k, r, p),
-        )
+        k = [camera.fx, 0.0, camera.cx, 0.0, camera.fy, camera.cy, 0.0, 0.0, 1.0]
+        calibration = fg.CameraCalibration(
+            timestamp=at, frame_id=CAMERA, width=frame.width, height=frame.height, K=k,
+            R=[1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0], P=[*k[:3], 0.0, *k[3:6], 0.0, *k[6:], 0.0],
+        )  # fmt: skip
+        yield FoxgloveMessage("/camera/calibration", calibration)
         places, colours = points(frame, self._robot, DEPTH_STEP)
         packed = np.zeros(len(places), dtype=[("place", "<f4", 3), ("colour", "u1", 3), ("alpha", "u1")])
         packed["place"], packed["colour"], packed["alpha"] = places, colours, 255
-        fields = [fg.PackedElementField(name, 4 * n, fg.FLOAT32) for n, name in enumerate("xyz")]
-        fields += [fg.PackedElementField(n, 12 + i, fg.UINT8) for i, n in enumerate(("red", "green", "blue", "alpha"))]
-        cloud = fg.PointCloud(at, CAMERA, fg.pose_of((0.0, 0.0, 0.0)), 16, tuple(fields), packed.tobytes())
-        yield Said("/camera/points", cloud)
+        number, byte = fg.PackedElementFieldNumericType.Float32, fg.PackedElementFieldNumericType.Uint8
+        fields = [fg.PackedElementField(name=name, offset=4 * n, type=number) for n, name in enumerate("xyz")]
+        fields += [
+            fg.PackedElementField(name=name, offset=12 + n, type=byte)
+            for n, name in enumerate(("red", "green", "blue", "alpha"))
+        ]
+        cloud = fg.PointCloud(
+            timestamp=at, frame_id=CAMERA, pose=_pose((0.0, 0.0, 0.0)), point_stride=16, fields=fields,
+            data=packed.tobytes(),
+        )  # fmt: skip
+        yield FoxgloveMessage("/camera/points", cloud)
 
-    def _body(self, at: fg.Time) -> fg.FrameTransform:
+    def _body(self, at: fg.Timestamp) -> fg.FrameTransform:
         body = self._posture.body
-        turn = fg.Quaternion(*about_z(body.yaw_rad))
-        return fg.FrameTransform(at, ODOMETRY, BODY, fg.Vector3(body.x_m, body.y_m, 0.0), turn)
+        return _transform(at, ODOMETRY, BODY, (body.x_m, body.y_m, 0.0), about_z(body.yaw_rad))
 
-    def _chassis(self, at: fg.Time) -> fg.SceneEntity:
+    def _chassis(self, at: fg.Timestamp) -> fg.SceneEntity:
         base = self._robot.base
-        size = fg.Vector3(base.chassis_diameter_m, base.chassis_diameter_m, base.chassis_height_m)
-        pose = fg.pose_of((0.0, 0.0, base.chassis_height_m / 2))
-        return fg.SceneEntity(
-            timestamp=at, frame_id=BODY, id="chassis", cylinders=[fg.CylinderPrimitive(pose, size, 1.0, 1.0, BONE)]
-        )
+        size = fg.Vector3(x=base.chassis_diameter_m, y=base.chassis_diameter_m, z=base.chassis_height_m)
+        chassis = _cylinder(_pose((0.0, 0.0, base.chassis_height_m / 2)), size, BONE)
+        return _entity(at, "chassis", cylinders=[chassis])
 
-    def _links(self, at: fg.Time) -> Iterator[Said]:
+    def _links(self, at: fg.Timestamp) -> Iterator[FoxgloveMessage]:
         links = self._posture.links()
         if not links:
             return
         transforms = [
-            fg.FrameTransform(
-                at, BODY, name, fg.Vector3(*map(float, pose[:3, 3])), fg.Quaternion(*quaternion(pose[:3, :3]))
-            )
+            _transform(at, BODY, name, tuple(map(float, pose[:3, 3])), quaternion(pose[:3, :3]))
             for name, pose in links.items()
         ]
-        yield Said("/tf", fg.FrameTransforms(transforms))
-        ends = [fg.Vector3(*place) for bone in self._posture.bones(links) for place in bone]
-        origin = fg.pose_of((0.0, 0.0, 0.0))
-        line = fg.LinePrimitive(fg.LINE_LIST, origin, 0.02, False, ends, BONE, [], [])
-        yield Said("/robot", fg.SceneUpdate([fg.SceneEntity(timestamp=at, frame_id=BODY, id="links", lines=[line])]))
+        yield FoxgloveMessage("/tf", fg.FrameTransforms(transforms=transforms))
+        ends = [fg.Point3(x=x, y=y, z=z) for bone in self._posture.bones(links) for x, y, z in bone]
+        line = fg.LinePrimitive(
+            type=fg.LinePrimitiveLineType.LineList, pose=_pose((0.0, 0.0, 0.0)), thickness=0.02, points=ends, color=BONE
+        )
+        yield FoxgloveMessage("/robot", fg.SceneUpdate(entities=[_entity(at, "links", lines=[line])]))
 
-    def _annotations(self, at: fg.Time, seen: Detections) -> fg.ImageAnnotations:
+    def _annotations(self, at: fg.Timestamp, seen: Detections) -> fg.ImageAnnotations:
         boxes, texts = [], []
         for detection in seen.detections:
             left, top, right, bottom = map(float, detection.box_px)
-            colour = self._colour(detection.label)
-            corners = [fg.Point2(x, y) for x, y in ((left, top), (right, top), (right, bottom), (left, bottom))]
-            nothing = fg.Color(0, 0, 0, 0)
+            corners = [fg.Point2(x=x, y=y) for x, y in ((left, top), (right, top), (right, bottom), (left, bottom))]
             boxes.append(
                 fg.PointsAnnotation(
-                    timestamp=at,
-                    type=fg.LINE_LOOP,
-                    points=corners,
-                    outline_color=colour,
-                    fill_color=nothing,
-                    thickness=2,
+                    timestamp=at, type=fg.PointsAnnotationType.LineLoop, points=corners,
+                    outline_color=self._colour_of(detection.label), fill_color=NOTHING, thickness=2,
                 )
-            )
+            )  # fmt: skip
             texts.append(
                 fg.TextAnnotation(
-                    timestamp=at, position=fg.Point2(left, top), text=describe(detection), font_size=14,
+                    timestamp=at, position=fg.Point2(x=left, y=top), text=describe(detection), font_size=14,
                     text_color=WHITE, background_color=BLACK,
                 )
             )  # fmt: skip
-        return fg.ImageAnnotations(boxes, texts)
+        return fg.ImageAnnotations(points=boxes, texts=texts)
 
-    def _object(self, at: fg.Time, prefix: str, known: TargetEstimate) -> fg.SceneEntity:
+    def _believed(self, at: fg.Timestamp, known: TargetEstimate) -> fg.SceneEntity:
         x, y, z = known.position_m
         words = f"{known.label}, {known.age_s:.1f} s ago" if known.age_s > 0.5 else known.label
-        text = fg.TextPrimitive(fg.pose_of((x, y, z + 0.1)), True, 0.04, False, WHITE, words)
-        entity = fg.SceneEntity(timestamp=at, frame_id=BODY, id=f"{prefix} {known.label}", texts=[text])
-        entity.lifetime = fg.Duration(1, 0)
-        _add_shape(entity, self._catalogue.get(known.label), known.position_m, self._colour(known.label))
-        return entity
+        text = fg.TextPrimitive(pose=_pose((x, y, z + 0.1)), billboard=True, font_size=0.04, color=WHITE, text=words)
+        shape = _shape(self._catalogue.get(known.label), known.position_m, self._colour_of(known.label))
+        return _entity(at, f"believed {known.label}", lifetime_s=1, texts=[text], **_by_kind([shape]))
 
-    def _true(self, at: fg.Time, truth: Truth) -> fg.SceneEntity:
-        """In the body frame, where the belief is too."""
-        entity = fg.SceneEntity(timestamp=at, frame_id=BODY, id="true")
+    def _true(self, at: fg.Timestamp, truth: Truth) -> fg.SceneEntity:
+        """The true objects in the body frame, which is the frame of the believed ones."""
+        shapes = []
         for item in truth.objects:
             if item.kind == "object":
                 x, y, z = (there - here for there, here in zip(item.position_m, truth.body_m, strict=True))
                 place = rotated(conjugate(truth.body_orientation), (x, y, z))
-                _add_shape(entity, self._catalogue.get(item.label), place, TRUE)
-        return entity
+                shapes.append(_shape(self._catalogue.get(item.label), place, TRUE))
+        return _entity(at, "true", **_by_kind(shapes))
 
-    def _log(self, at: fg.Time, task: TaskState) -> Iterator[Said]:
+    def _log(self, at: fg.Timestamp, task: TaskState) -> Iterator[FoxgloveMessage]:
         phase = f"{task.task} {task.label}: {task.outcome or task.phase}".strip()
         if task.task_id and phase != self._phase:
-            level = fg.ERROR if task.outcome == "failed" else fg.INFO
+            level = fg.LogLevel.Error if task.outcome == "failed" else fg.LogLevel.Info
             words = f"{phase} ({task.reason})" if task.reason else phase
-            yield Said("/log", fg.Log(at, level, words, "executive"))
+            yield FoxgloveMessage("/log", fg.Log(timestamp=at, level=level, message=words, name="executive"))
         self._phase = phase
 
-    def _colour(self, label: str) -> fg.Color:
+    def _colour_of(self, label: str) -> fg.Color:
         known = self._catalogue.get(label)
-        return fg.Color(*known.rgb) if known is not None else WHITE
+        return _colour(*known.rgb) if known is not None else WHITE
 
 
-def _add_shape(entity: fg.SceneEntity, known: ObjectSpec | None, place: Vec3, colour: fg.Color) -> None:
-    pose = fg.pose_of(place)
-    size = fg.Vector3(*(known.size_m if known is not None else (0.06, 0.06, 0.06)))
+def _time(stamp_ns: int) -> fg.Timestamp:
+    return fg.Timestamp(*divmod(max(stamp_ns, 0), NS))
+
+
+def _pose(place: Vec3) -> fg.Pose:
+    x, y, z = place
+    return fg.Pose(position=fg.Vector3(x=x, y=y, z=z), orientation=fg.Quaternion(x=0, y=0, z=0, w=1))
+
+
+def _transform(at: fg.Timestamp, parent: str, child: str, place: Any, turn: Any) -> fg.FrameTransform:
+    """`place` is x, y, z in metres, `turn` a quaternion x, y, z, w: the child's frame in the parent's."""
+    translation = fg.Vector3(**dict(zip("xyz", place, strict=True)))
+    rotation = fg.Quaternion(**dict(zip("xyzw", turn, strict=True)))
+    return fg.FrameTransform(
+        timestamp=at, parent_frame_id=parent, child_frame_id=child, translation=translation, rotation=rotation
+    )
+
+
+def _entity(at: fg.Timestamp, name: str, lifetime_s: int = 0, **parts: Any) -> fg.SceneEntity:
+    """Replaces the entity of the same name. With a lifetime of 0 it stays until then."""
+    lifetime = fg.Duration(lifetime_s, 0)
+    return fg.SceneEntity(timestamp=at, frame_id=BODY, id=name, lifetime=lifetime, frame_locked=True, **parts)
+
+
+def _cylinder(pose: fg.Pose, size: fg.Vector3, colour: fg.Color) -> fg.CylinderPrimitive:
+    return fg.CylinderPrimitive(pose=pose, size=size, bottom_scale=1.0, top_scale=1.0, color=colour)
+
+
+def _shape(known: ObjectSpec | None, place: Vec3, colour: fg.Color) -> tuple[str, Any]:
+    """The field of a SceneEntity that an object's shape belongs to, and the shape."""
+    pose = _pose(place)
+    x, y, z = known.size_m if known is not None else (0.06, 0.06, 0.06)
+    size = fg.Vector3(x=x, y=y, z=z)
     if known is not None and known.shape == "cylinder":
-        entity.cylinders.append(fg.CylinderPrimitive(pose, size, 1.0, 1.0, colour))
-    elif known is not None and known.shape == "box":
-        entity.cubes.append(fg.CubePrimitive(pose, size, colour))
-    else:
-        entity.spheres.append(fg.SpherePrimitive(pose, size, colour))
+        return "cylinders", _cylinder(pose, size, colour)
+    if known is not None and known.shape == "box":
+        return "cubes", fg.CubePrimitive(pose=pose, size=size, color=colour)
+    return "spheres", fg.SpherePrimitive(pose=pose, size=size, color=colour)
+
+
+def _by_kind(shapes: list[tuple[str, Any]]) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for kind, shape in shapes:
+        found.setdefault(kind, []).append(shape)
+    return found
 
 
 def _for_json(value: Any) -> Any:
-    """JSON has no bytes and no NaN."""
+    """JSON has no bytes: their length stands in their place."""
     if isinstance(value, dict):
         return {str(name): _for_json(item) for name, item in value.items()}
     if isinstance(value, list):

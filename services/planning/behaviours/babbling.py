@@ -18,7 +18,7 @@ from cocoro.topics import HAND_SAMPLES, WHEEL_TRIALS
 from cocoro.units import Vec2, Vec3
 from services.planning.behaviours.base import Plan, Snapshot
 from services.planning.postures import Postures, sobol
-from services.planning.reach import ARM, LEVEL_ROLL_RAD, HandPose
+from services.planning.reach import ARM, HandPose
 
 
 class ArmBabbling:
@@ -140,7 +140,7 @@ class ArmBabbling:
         found: list[Output] = []
         for sight in snapshot.estimator.sightings_of(snapshot.actuators.config.marker):
             new = self._last_ns is None or sight.stamp_ns - self._last_ns >= self.EVERY_NS
-            level = abs(sight.angles_rad["wrist_roll"] - LEVEL_ROLL_RAD) < 0.03
+            level = abs(sight.angles_rad["wrist_roll"] - snapshot.actuators.robot.claw.level_roll_rad) < 0.03
             if new and level and self._samples < self._count:
                 self._last_ns = sight.stamp_ns
                 self._samples += 1

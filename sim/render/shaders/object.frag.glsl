@@ -1,5 +1,5 @@
 #version 330
-// Lambert's law: a share that is always there, and the lamp's where it reaches.
+// Lambert reflection: ambient light, and the lamp where it is not blocked.
 
 uniform vec3 ambient;    // with the lamp's tint
 uniform vec3 diffuse;

@@ -1,5 +1,5 @@
 #version 330
-// The visuals: one instance a primitive. Poses come row by row, hence vector * matrix.
+// The visuals, one instance per primitive. Poses come row by row, hence vector * matrix.
 
 uniform mat4 view;       // world to clip, rows
 uniform mat4 lamp;       // world to the lamp's clip space, rows

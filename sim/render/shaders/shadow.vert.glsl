@@ -1,5 +1,5 @@
 #version 330
-// A shadow map: what the lamp or the projector sees of the visuals.
+// A shadow map: the depth of the visuals seen from the lamp or the projector.
 
 uniform mat4 view;
 

@@ -1,26 +1,57 @@
-"""`cocoro reset`: the emergency stop is released by hand, and only when the executive agrees."""
+"""`cocoro estop`, `stop` and `reset`: the emergency stop among the commands.
+
+`main` runs `estop` and `stop` before it imports any of this; here they only have their place in `cocoro --help`.
+"""
 
 from __future__ import annotations
 
+import asyncio
 import sys
 
+import typer
+
+from apps.cli import estop as stopping
 from apps.cli import exits
 from apps.cli.link import Answer, joined
-from apps.cli.options import RobotChoice
+from apps.cli.options import MeshOption, RobotChoice, RobotOption
 from cocoro.errors import MeshError
 from cocoro.messages import EstopReply, EstopRequest
 from cocoro.topics import ESTOP
 from deploy.processes import stoppable
 
+app = typer.Typer()
+CONTEXT = {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}
 
-async def reset(where: RobotChoice) -> int:
-    """The executive is asked first: when it refuses, everything stays latched."""
+
+@app.command(context_settings=CONTEXT)
+def estop(context: typer.Context) -> None:
+    """Emergency stop, now: everything that moves stands still until `reset`. (`stop` is the same.)"""
+    sys.exit(stopping.main("estop", context.args))
+
+
+@app.command(hidden=True, context_settings=CONTEXT)
+def stop(context: typer.Context) -> None:
+    """The same as estop."""
+    estop(context)
+
+
+@app.command()
+def reset(robot: RobotOption = None, profile: MeshOption = None) -> None:
+    """Release the emergency stop. The executive may refuse; the command then prints its reason."""
+    sys.exit(asyncio.run(release(RobotChoice(robot, profile))))
+
+
+async def release(choice: RobotChoice) -> int:
+    """Releases a robot's latches; returns the exit code. Raises MeshError when nothing that moves is alive.
+
+    The executive is asked first: when it refuses, everything stays latched.
+    """
     question = EstopRequest(latched=False, by="operator")
-    async with joined(where) as link:
+    async with joined(choice) as link:
         alive = await link.alive()
         moving = {service for service in stoppable() if service in alive}
         if not moving:
-            raise MeshError(f"nothing that moves is alive on {link.robot}: `cocoro status` tells more")
+            raise MeshError(f"no service that moves something is alive on {link.robot}: see `cocoro status`")
         if "executive" in alive and _refused({"executive"}, await link.call_all(ESTOP.of("executive"), question)):
             return exits.REFUSED
         answers = await link.call_all(ESTOP.of("*"), question)
@@ -34,7 +65,7 @@ async def reset(where: RobotChoice) -> int:
 
 
 def _refused(wanted: set[str], answers: list[Answer[EstopReply]]) -> bool:
-    """Whether any of these has not released; says which and why."""
+    """Whether any of the `wanted` services did not release its latch; prints which and why."""
     by_service = {answer.service: answer for answer in answers}
     refused = False
     for service in sorted(wanted):

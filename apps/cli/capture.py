@@ -1,4 +1,4 @@
-"""`cocoro capture info`: what a capture has."""
+"""`cocoro capture`: look at capture files, repair them, re-execute a service on them."""
 
 from __future__ import annotations
 
@@ -9,14 +9,16 @@ from contextlib import ExitStack
 from datetime import UTC, datetime
 from math import isfinite
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
+import typer
 
 from apps.captures.info import AttachmentReport, CaptureReport, report
 from apps.captures.rewrite import REPAIRED, rewrite
 from apps.cli import exits
-from apps.cli.table import table
+from apps.cli.options import CaptureArgument, FromOption, JsonOption, OnlyOption, ToOption, WithoutOption
+from apps.cli.terminal import table
 from cocoro.capture.conventions import CaptureError
 from cocoro.capture.reader import Capture
 from cocoro.clock import NS
@@ -28,7 +30,27 @@ from services.capture.log_clock import WALL_CLOCK, WallClockStep, describe_step
 MB = 1e6
 
 
-def info(file: Path, check: bool, as_json: bool) -> int:
+app = typer.Typer()
+capture = typer.Typer(no_args_is_help=True, help="Look at capture files, repair them, re-execute services on them.")
+app.add_typer(capture, name="capture")
+
+# --- info -----------------------------------------------------------------------------------------
+
+
+@capture.command()
+def info(
+    file: CaptureArgument,
+    check: Annotated[
+        bool, typer.Option("--check", help="Read every byte instead of trusting the file's summary.")
+    ] = False,
+    json: JsonOption = False,
+) -> None:
+    """What a capture has: keys, counts, rates, gaps, losses and where it is from. Exit code 1 when it is damaged."""
+    sys.exit(show_info(file, check, json))
+
+
+def show_info(file: Path, check: bool, as_json: bool) -> int:
+    """Prints what a capture has and returns the exit code. Raises CaptureError for a file that is no capture."""
     with Capture.open(file) as capture:
         found = report(capture, check)
     print(msgspec.json.encode(found).decode() if as_json else text(found), end="\n" if as_json else "")
@@ -78,7 +100,7 @@ def _head(found: CaptureReport) -> list[str]:
         ("robot", found.robot or "unknown"),
         ("started", start if found.messages else ""),
         ("lasts", f"{found.duration_s:.3f} s"),
-        ("clock", "; ".join(_steps(found))),
+        ("clock", "; ".join(_clock_steps(found))),
         ("messages", f"{found.messages}"),
         ("size", f"{found.size_bytes / MB:.1f} MB, of {found.raw_bytes / MB:.1f} MB of payloads"),
         ("state", _state(found)),
@@ -92,30 +114,30 @@ def _head(found: CaptureReport) -> list[str]:
     return [f"{name:<9} {value}" for name, value in lines if value]
 
 
-def _steps(found: CaptureReport) -> list[str]:
-    """How somebody set the wall clock while it was recorded; times since the capture's start."""
+def _clock_steps(found: CaptureReport) -> list[str]:
+    """The steps of the wall clock while the capture was recorded, in words; times from the capture's start."""
     try:
         steps = msgspec.convert(found.metadata.get(WALL_CLOCK, {}).get("steps", ()), tuple[WallClockStep, ...])
-    except msgspec.ValidationError:  # somebody else's record of this name
+    except msgspec.ValidationError:  # another program's metadata of this name
         return []
-    told = []
+    found_steps = []
     for step in steps:
         at_s = (step.log_ns - found.start_ns) / NS
         when = f"at {at_s:.3f} s" if at_s >= 0 else f"{-at_s:.3f} s before this file began"
-        told.append(f"{describe_step(step)} {when}")
-    return told
+        found_steps.append(f"{describe_step(step)} {when}")
+    return found_steps
 
 
 def _state(found: CaptureReport) -> str:
     if found.problems:
-        return "damaged: what can be read is below"
+        return "damaged; the readable part is below"
     if not found.closed:
-        return f"{found.ending}; all else that is there is readable"
+        return f"{found.ending}; everything in it is readable"
     return "whole, every byte read" if found.checked else "whole"
 
 
 def _repaired(repaired: Mapping[str, Any]) -> list[str]:
-    """What is missing in a capture that was made of one that was not whole."""
+    """The file that this capture was repaired from, and what was missing in it."""
     if not repaired:
         return []
     ending = f"{repaired.get('file', '')}, which was {repaired.get('ending') or 'damaged'}"
@@ -123,7 +145,7 @@ def _repaired(repaired: Mapping[str, Any]) -> list[str]:
 
 
 def _files(found: CaptureReport) -> list[str]:
-    """The files that services were configured with, by their fingerprints."""
+    """The files that services were configured with, and their fingerprints."""
     return [
         f"{name.partition('/')[2]} {file['field']} {file['path']} (sha256 {file['sha256'][:12]})"
         for name, entries in found.metadata.items()
@@ -132,7 +154,27 @@ def _files(found: CaptureReport) -> list[str]:
     ]
 
 
+# --- repair ---------------------------------------------------------------------------------------
+
+
+@capture.command()
 def repair(
+    file: CaptureArgument,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="FILE", help="The new file; FILE.repaired.mcap by default.")
+    ] = None,
+    compression: Annotated[str, typer.Option(metavar="zstd|lz4|none", help="Compression of the new file.")] = "zstd",
+    level: Annotated[int, typer.Option(min=1, max=19, help="Level for zstd; 19 is small and slow.")] = 1,
+    only: OnlyOption = None,
+    without: WithoutOption = None,
+    start: FromOption = None,
+    end: ToOption = None,
+) -> None:
+    """Write everything readable of a damaged or unfinished capture into a whole one; the old file stays."""
+    sys.exit(repair_file(file, out, compression, level, only or [], without or [], start, end))
+
+
+def repair_file(
     file: Path,
     out: Path | None,
     compression: str,
@@ -142,16 +184,20 @@ def repair(
     start_s: float | None,
     end_s: float | None,
 ) -> int:
-    """Raises CaptureError, and ConfigError for options that cannot be."""
+    """Writes the new capture, prints what is missing in it, and returns the exit code.
+
+    `start_s` and `end_s` are seconds from the capture's start. Raises CaptureError for a file that cannot be read or
+    written, ConfigError for an impossible option.
+    """
     packer = Packer(_compression(compression), level)
     with Capture.open(file) as capture:
-        choice = KeyFilter(capture.robot, only, without)
+        key_filter = KeyFilter(capture.robot, only, without)
         check_span(capture, start_s, end_s)
         done = rewrite(
             capture,
             out or file.with_suffix(".repaired.mcap"),
             packer,
-            keep=(lambda record: record.key in choice) if only or without else None,
+            keep=(lambda record: record.key in key_filter) if only or without else None,
             start_ns=_at(capture, start_s),
             end_ns=_at(capture, end_s),
         )
@@ -178,7 +224,7 @@ def _compression(text: str) -> Compression:
 
 
 def check_span(capture: Capture, start_s: float | None, end_s: float | None) -> None:
-    """Both are seconds from the capture's start. Raises ConfigError with what is wrong with which of them."""
+    """Checks `--from` and `--to`, in seconds from the capture's start. Raises ConfigError for an impossible one."""
     length_s = (capture.end_ns - capture.start_ns) / NS
     for option, given_s in (("--from", start_s), ("--to", end_s)):
         if given_s is not None and not (isfinite(given_s) and given_s >= 0):
@@ -194,23 +240,49 @@ def check_span(capture: Capture, start_s: float | None, end_s: float | None) -> 
         )
 
 
-def reexecute(files: list[Path], service: str, against: str, tolerance: float, as_json: bool) -> int:
-    """Raises CaptureError when the captures do not have what that takes."""
-    from apps.captures import reexecute as execution
+# --- re-execute -----------------------------------------------------------------------------------
+
+
+@capture.command("rerun", hidden=True)
+@capture.command()
+def reexecute(
+    files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="The captures of one run, in order.")],
+    service: Annotated[str, typer.Option("--service", help="perception, planning, or another with a pure core.")],
+    against: Annotated[
+        str, typer.Option(metavar="recorded|nothing", help="What to compare the outputs with.")
+    ] = "recorded",
+    tolerance: Annotated[
+        float,
+        typer.Option(min=0.0, max=0.1, help="Allowed difference of numbers, relative above 1; 0 compares exactly."),
+    ] = 0.0,
+    json: JsonOption = False,
+) -> None:
+    """Execute a service again on the inputs that it had then, and compare its outputs. Exit code 1 when they differ."""
+    sys.exit(reexecute_service(files, service, against, tolerance, json))
+
+
+def reexecute_service(files: list[Path], service: str, against: str, tolerance: float, as_json: bool) -> int:
+    """Prints the comparison and returns the exit code.
+
+    Raises CaptureError when the captures lack inputs that the service needs, ConfigError for an impossible option.
+    """
+    from apps.captures import reexecute as reexecution
 
     if against not in ("recorded", "nothing"):
         raise ConfigError(f"--against {against}: known are recorded and nothing")
     with ExitStack() as stack:
         captures = [stack.enter_context(Capture.open(file)) for file in files]
         if len({capture.robot for capture in captures}) > 1:
-            raise CaptureError("these captures are of several robots")
-        result = execution.reexecute(captures, service, tolerance, compare=against == "recorded")
+            raise CaptureError(
+                f"captures of several robots ({', '.join(sorted({c.robot for c in captures}))}): give those of one run"
+            )
+        result = reexecution.reexecute(captures, service, tolerance, compare=against == "recorded")
     for capture in captures:
         if capture.ending:
             print(f"note: {capture.path} was {capture.ending}", file=sys.stderr)
     if as_json:
         print(msgspec.json.encode(result).decode())
     else:
-        print("\n".join(execution.describe_result(result)))
+        print("\n".join(reexecution.describe_result(result)))
     bad = result.differing or result.problems or (against == "recorded" and not result.equal)
     return exits.FAILED if bad else exits.DONE

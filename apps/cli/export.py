@@ -1,0 +1,201 @@
+"""`cocoro export` and `cocoro view`: captures as film, table, or scene of another viewer."""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import msgspec
+import typer
+
+from apps.captures.export.files import refuse_existing
+from apps.cli import exits
+from apps.cli.interrupt import interrupt_event
+from apps.cli.link import joined
+from apps.cli.options import CaptureArgument, MeshOption, RobotChoice, RobotOption
+from cocoro.bus.base import Bus, Payload
+from cocoro.capture.reader import Capture
+from cocoro.clock import NS
+from cocoro.errors import ConfigError
+from cocoro.messages import Message
+from cocoro.objects import Catalogue
+from cocoro.robot import Robot
+from cocoro.topics import TOPICS, Topic
+
+if TYPE_CHECKING:
+    from apps.captures.export.rerun_scene import RerunScene
+
+PER_SERVICE = "{service}"
+DEPTH = 4
+"""Messages of one key that may wait; a viewer that is late shows the newest."""
+
+app = typer.Typer()
+
+
+@app.command()
+def export(
+    file: CaptureArgument,
+    video: Annotated[
+        Path | None,
+        typer.Option("--video", metavar="OUT.mp4", help="Film of the camera's pictures with the detections drawn in."),
+    ] = None,
+    foxglove: Annotated[
+        Path | None, typer.Option("--foxglove", metavar="OUT.mcap", help="For Foxglove; needs cocoro-mesh[foxglove].")
+    ] = None,
+    csv: Annotated[
+        Path | None, typer.Option("--csv", metavar="DIR", help="Tables, simulated truth beside belief.")
+    ] = None,
+    parquet: Annotated[
+        Path | None, typer.Option("--parquet", metavar="DIR", help="The same tables; needs cocoro-mesh[tables].")
+    ] = None,
+    rrd: Annotated[
+        Path | None, typer.Option("--rrd", metavar="OUT.rrd", help="For Rerun; needs cocoro-mesh[view].")
+    ] = None,
+    attachments: Annotated[
+        Path | None, typer.Option("--attachments", metavar="DIR", help="The files that are attached to the capture.")
+    ] = None,
+) -> None:
+    """Turn a capture into a film, tables, or a file for Foxglove or Rerun; or extract its attachments. Several forms
+    at once are possible."""
+    sys.exit(export_capture(file, video, rrd, foxglove, csv, parquet, attachments))
+
+
+def export_capture(
+    file: Path,
+    video: Path | None = None,
+    rrd: Path | None = None,
+    foxglove: Path | None = None,
+    csv: Path | None = None,
+    parquet: Path | None = None,
+    attachments: Path | None = None,
+) -> int:
+    """Writes each form whose path is given, and returns the exit code.
+
+    Raises CaptureError for a file that cannot be read or written, ConfigError when no form is asked for.
+    """
+    if not any((video, rrd, foxglove, csv, parquet, attachments)):
+        raise ConfigError(
+            "nothing to export: give at least one of --video, --foxglove, --csv, --parquet, --rrd, --attachments"
+        )
+    for out in (video, rrd, foxglove):
+        if out is not None:
+            refuse_existing(out)  # before the first form has taken minutes
+    with Capture.open(file) as capture:
+        if video is not None:
+            from apps.captures.export import video as films
+
+            with _progress_bar(capture, video) as show:
+                pictures = films.export(capture, video, show)
+            print(f"{video}: {pictures} pictures")
+        if foxglove is not None:
+            from apps.captures.export.foxglove import export as export_foxglove
+
+            with _progress_bar(capture, foxglove) as show:
+                messages = export_foxglove(capture, foxglove, show)
+            print(f"{foxglove}: {messages} messages; open it with Foxglove")
+        if csv is not None or parquet is not None:
+            from apps.captures.export import tables
+
+            if csv is not None:
+                print(f"{csv}: {len(tables.export(capture, tables.CsvFolder(csv)))} tables")
+            if parquet is not None:
+                print(f"{parquet}: {len(tables.export(capture, tables.ParquetFolder(parquet)))} tables")
+        if rrd is not None:
+            from apps.captures.export import rerun_scene
+
+            with _progress_bar(capture, rrd) as show:
+                messages = rerun_scene.export(capture, rrd, show)
+            print(f"{rrd}: {messages} messages; open it with `rerun {rrd}`")
+        if attachments is not None:
+            from apps.captures.export.files import export_attachments
+
+            print(f"{attachments}: {export_attachments(capture, attachments)} attachments")
+        for problem in capture.problems:
+            print(f"missing: {problem}", file=sys.stderr)
+        if capture.ending:
+            print(f"note: {file} was {capture.ending}", file=sys.stderr)
+        return exits.FAILED if capture.problems else exits.DONE
+
+
+@contextmanager
+def _progress_bar(capture: Capture, out: Path) -> Iterator[Callable[[float], None]]:
+    """Yields a function that moves a bar to a position, s from the capture's start; shows none without a terminal."""
+    if not sys.stdout.isatty():
+        yield lambda _at_s: None
+        return
+    from rich.markup import escape
+    from rich.progress import Progress
+
+    with Progress(transient=True, redirect_stdout=False, redirect_stderr=False) as progress:
+        bar = progress.add_task(escape(str(out)), total=(capture.end_ns - capture.start_ns) / NS)
+        yield lambda at_s: progress.update(bar, completed=at_s)
+
+
+# --- the viewer -----------------------------------------------------------------------------------
+
+
+@app.command()
+def view(
+    file: Annotated[
+        Path | None, typer.Argument(metavar="[FILE]", help="A capture; without one, the running robot is shown.")
+    ] = None,
+    robot: RobotOption = None,
+    profile: MeshOption = None,
+) -> None:
+    """Open Rerun on a capture, or live on the mesh. Needs the extra `view`."""
+    if file is not None:
+        sys.exit(view_file(file))
+    sys.exit(asyncio.run(view_mesh(RobotChoice(robot, profile))))
+
+
+def view_file(file: Path) -> int:
+    """Opens Rerun on a capture. Raises CaptureError when Rerun is not installed, or the file cannot be read."""
+    from apps.captures.export.rerun_scene import library, log_capture, no_viewer, opened
+
+    rerun = library()
+    with Capture.open(file) as capture:
+        recording = opened(rerun)
+        with no_viewer():
+            count = log_capture(capture, recording)
+            recording.flush()
+        print(f"{count} messages are in Rerun")
+        return exits.FAILED if capture.problems else exits.DONE
+
+
+async def view_mesh(choice: RobotChoice) -> int:
+    """Opens Rerun on a robot's mesh until Ctrl-C.
+
+    Raises CaptureError when Rerun is not installed, MeshError when there is no mesh.
+    """
+    from apps.captures.export.rerun_scene import RerunScene, library, opened
+
+    rerun = library()
+    async with joined(choice, frames=True) as link:
+        resolved = link.run_dir.resolved()
+        description, measured = (
+            Path(file) if (file := resolved.get(name)) else None for name in ("description", "measured")
+        )
+        recording = opened(rerun)
+        watch(link.bus, link.robot, RerunScene(recording, Robot.load(description, measured), Catalogue.load()))
+        print("Ctrl-C ends it")
+        with interrupt_event() as end:
+            await end.wait()
+    return exits.DONE
+
+
+def watch(bus: Bus, robot: str, scene: RerunScene) -> None:
+    """Sends every message that arrives from now on to the viewer, however old it is: a viewer controls nothing."""
+
+    def receive(topic: Topic[Any], decoder: msgspec.msgpack.Decoder[Message], _key: str, payload: Payload) -> None:
+        with suppress(msgspec.MsgspecError, ValueError, RecursionError):
+            scene.log(topic.name, decoder.decode(payload))
+
+    for topic in TOPICS:
+        if PER_SERVICE not in topic.name:
+            handler = partial(receive, topic, msgspec.msgpack.Decoder(topic.type))
+            bus.subscribe(topic.key(robot), topic.qos, handler, depth=DEPTH)
