@@ -38,10 +38,10 @@ from cocoro.bus.endpoints import default
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.capture.reader import Capture
 from cocoro.clock import RealClock
+from cocoro.keys import recorder_key
 from cocoro.messages import BaseState, Frame
 from cocoro.node import Node
 from cocoro.robot import Robot
-from cocoro.tokens import recorder_key
 from deploy.rundir import RunDir
 from services.capture.file import Packer
 from services.executive.tasks import FetchTask

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from typing import Literal
 
-from cocoro.bus.base import Handle, OnAlive, OnLot, OnSample, Payload, Qos, Reply, Server, Subscription
+from cocoro.bus.base import Handle, OnAlive, OnBatch, OnSample, Payload, Qos, Reply, Server, Subscription
 from cocoro.bus.local import LocalBus
 from deploy.processes import hardware
 
@@ -82,7 +82,7 @@ class FaultyBus:
 
         return self.whole.subscribe(keyexpr, qos, hear, depth=depth)
 
-    def listen(self, keyexpr: str, handler: OnLot, every_s: float) -> Handle:
+    def listen(self, keyexpr: str, handler: OnBatch, every_s: float) -> Handle:
         return self.whole.listen(keyexpr, handler, every_s)
 
     def serve(self, key: str, server: Server) -> Handle:

@@ -1,4 +1,4 @@
-"""What a service is and what it was started with, for those who record it or want to make its core again."""
+"""What a service is and how it was started: enough to record it and to make its core again."""
 
 from __future__ import annotations
 
@@ -10,43 +10,41 @@ from collections.abc import Iterator
 from functools import cache
 from importlib import metadata, resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import msgspec
 
-from cocoro.clock import VirtualClock
 from cocoro.messages import AboutFile, AboutReply
 from cocoro.objects import DEFAULT_FILE
-
-if TYPE_CHECKING:
-    from cocoro.node import Node
+from cocoro.robot import Robot
 
 LARGEST_FILE = 1024 * 1024
-"""Bytes; of a larger one only the fingerprint is told."""
+"""Bytes; of a larger file only the fingerprint is reported."""
 DISTRIBUTIONS = ("cocoro-mesh", "eclipse-zenoh", "msgspec", "numpy", "scipy", "opencv-python-headless")
-"""Whose versions the results of a computation may hang on."""
+"""Distributions whose versions may change the results of a computation."""
 
 
-def about(node: Node) -> AboutReply:
-    virtual = isinstance(node.clock, VirtualClock)  # then everything is the same at each run
+def about(
+    service: str, robot_name: str, robot: Robot, *, module: str, config: Any, record_steps: bool, virtual: bool
+) -> AboutReply:
+    """With `virtual` time, process and host are left out: then two equal runs give equal replies."""
     return AboutReply(
-        service=node.name,
-        robot=node.robot_name,
-        module=node.module,
-        config=msgspec.to_builtins(node.config),
-        description=node.robot.to_data(),
-        latency_s=node.latency_s,
-        record_steps=node.record_steps,
+        service=service,
+        robot=robot_name,
+        module=module,
+        config=msgspec.to_builtins(config),
+        description=robot.to_data(),
+        record_steps=record_steps,
         pid=0 if virtual else os.getpid(),
         host="" if virtual else socket.gethostname(),
         versions=versions(),
-        files=tuple(_files(node.config)),
+        files=tuple(_files(config)),
     )
 
 
 @cache
 def versions() -> dict[str, str]:
-    """Of Python, the machine and the libraries."""
+    """Versions of Python, the machine, the system and `DISTRIBUTIONS`, by name."""
     found = {"python": platform.python_version(), "machine": platform.machine(), "system": platform.system()}
     for name in DISTRIBUTIONS:
         try:
@@ -57,7 +55,7 @@ def versions() -> dict[str, str]:
 
 
 def _files(config: Any) -> Iterator[AboutFile]:
-    """The files that a configuration names; for the known objects the project's own, where it names none."""
+    """The files that a configuration names; the project's own file of known objects where it names none."""
     if not isinstance(config, msgspec.Struct):
         return
     for field, value in msgspec.structs.asdict(config).items():
@@ -69,5 +67,5 @@ def _files(config: Any) -> Iterator[AboutFile]:
 
 def _file(field: str, path: str, content: bytes) -> AboutFile:
     fingerprint = hashlib.sha256(content).hexdigest()
-    told = content if len(content) <= LARGEST_FILE else b""
-    return AboutFile(field=field, path=path, sha256=fingerprint, content=told)
+    reported = content if len(content) <= LARGEST_FILE else b""
+    return AboutFile(field=field, path=path, sha256=fingerprint, content=reported)

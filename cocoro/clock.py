@@ -1,9 +1,9 @@
-"""Clocks: real, virtual (the event loop's own time), and followed (the simulator's clock key).
+"""Clocks: real, virtual (the event loop's own time), and followed (the ticks of the simulator's clock key).
 
 Nothing that decides reads the wall clock: it can be set, and then ages and deadlines would be wrong. The real clock
-goes by the time since the machine was started, the followed clock by the simulator's ticks. A followed clock can begin
-anew (the simulator was started again, a replay went back). That is a new epoch, and whoever keeps ages, histories or
-deadlines begins anew then. The real clock has one epoch for ever.
+counts the time since the machine was started, the followed clock the simulator's ticks. A followed clock can jump back
+(the simulator was restarted, a replay went back): that begins a new epoch, in which ages, histories and deadlines begin
+anew. The real clock has one epoch for ever.
 """
 
 from __future__ import annotations
@@ -15,69 +15,109 @@ from typing import NamedTuple, Protocol
 
 NS = 1_000_000_000
 CLOCKS_APART_NS = NS // 4
-"""The clocks of two machines of one robot may differ by this much. `cocoro.inbox` checks it: it rejects a stamp that is
-further ahead of the reader's clock."""
+"""Greatest difference between the clocks of two machines of one robot. `cocoro.inbox` rejects a stamp that is further
+ahead of the reader's clock."""
 
 
 def steady_ns() -> int:
     """Nanoseconds since this machine was started, on the one clock that nobody can set (CLOCK_BOOTTIME).
 
-    It counts the time that the machine was suspended, which CLOCK_MONOTONIC does not: a command from before a
+    It counts the time during which the machine was suspended, which CLOCK_MONOTONIC does not: a command from before a
     suspension must not seem fresh after it.
     """
     return time.clock_gettime_ns(time.CLOCK_BOOTTIME)
 
 
 def wall_offset_ns() -> int:
-    """Wall time less `steady_ns`, as it is now: the only place where the wall clock is read."""
+    """Wall time minus `steady_ns`, now: the only place where the wall clock is read."""
     before_ns, wall_ns, after_ns = steady_ns(), time.time_ns(), steady_ns()
     return wall_ns - (before_ns + after_ns) // 2
 
 
 def is_fresh(stamp_ns: int, now_ns: int, max_age_s: float) -> bool:
-    """Whether what was stamped then may be acted on now. What lies ahead of our clock is of another epoch: what was
-    heard before a clock jumped back says nothing of now."""
+    """Whether a message with this stamp may be acted on now. A stamp that is further ahead than CLOCKS_APART_NS is of
+    another epoch: the message was received before the clock jumped back."""
     return -CLOCKS_APART_NS <= now_ns - stamp_ns <= max_age_s * NS
 
 
 class Clock(Protocol):
     @property
+    def virtual(self) -> bool:
+        """Whether time is the event loop's own, so that every run is the same."""
+
+    @property
     def epoch(self) -> int:
-        """Counts the times that the clock jumped back."""
+        """Number of times that the clock has jumped back."""
 
     @property
     def stands(self) -> bool:
-        """Time does not go on: whatever keeps it has stopped, or died."""
+        """Whether time does not go on, because its source has stopped or died."""
+
+    @property
+    def needs_ticks(self) -> bool:
+        """Whether the clock has to be ticked by messages of the clock key (`Node` does it)."""
 
     def now_ns(self) -> int: ...
 
+    def latest_ns(self) -> int | None:
+        """Upper bound of the present time: ticks may be on their way. None before the clock has started."""
+
+    def drive(self) -> None:
+        """Announces that the caller will call `tick` itself."""
+
+    def tick(self, stamp_ns: int, incarnation: int, rate: float = 1.0) -> str:
+        """Takes a sample of the clock key. Returns why it is rejected, '' otherwise. A clock with an own source of time
+        ignores it."""
+
+    async def wait_started(self) -> None:
+        """Returns when the clock has a time."""
+
     async def sleep_until(self, when_ns: int) -> bool:
-        """Wait for a time. False when a new epoch began instead: the deadline has lost its meaning.
-        Others get their turn even when the time has passed already."""
+        """Waits for a time. False when a new epoch began instead: the deadline has lost its meaning. Yields to other
+        tasks even when the time has passed already."""
 
 
 async def sleep(clock: Clock, seconds: float) -> bool:
-    """Wait for a duration of the clock's time; False when a new epoch began meanwhile."""
+    """Waits for a duration of the clock's time; False when a new epoch began meanwhile."""
     return await clock.sleep_until(clock.now_ns() + round(seconds * NS))
 
 
-class RealClock:
-    """The robot's clock where nobody simulates it: `steady_ns` plus an offset to wall time that is read once.
-
-    So stamps read as wall time, and setting the wall clock later changes nothing. All processes of a robot on a machine
-    take the same offset: see `deploy.robot_time`.
-    """
+class _OwnTime:
+    """What clocks have in common whose time comes from no other process."""
 
     epoch = 0
     stands = False
+    needs_ticks = False
+
+    def drive(self) -> None:
+        pass
+
+    def tick(self, stamp_ns: int, incarnation: int, rate: float = 1.0) -> str:
+        return ""
+
+    async def wait_started(self) -> None:
+        pass
+
+
+class RealClock(_OwnTime):
+    """`steady_ns` plus an offset to wall time that is read once: the robot's clock when there is no simulator.
+
+    So stamps read as wall time, and setting the wall clock later changes nothing. All processes of a robot on a machine
+    use the same offset: see `deploy.robot_time`.
+    """
+
+    virtual = False
     SLICE_S = 1.0
-    """Waiting is done in pieces of this length: this clock counts a suspension, the event loop's timers do not."""
+    """Waits are cut into slices of this length: this clock counts a suspension, the event loop's timers do not."""
 
     def __init__(self, offset_ns: int | None = None) -> None:
-        """`offset_ns`: what `steady_ns` lacks to wall time; measured now when it is not given."""
+        """`offset_ns`: wall time minus `steady_ns`; measured now by default."""
         self.offset_ns = wall_offset_ns() if offset_ns is None else offset_ns
 
     def now_ns(self) -> int:
+        return steady_ns() + self.offset_ns
+
+    def latest_ns(self) -> int | None:
         return steady_ns() + self.offset_ns
 
     async def sleep_until(self, when_ns: int) -> bool:
@@ -87,14 +127,16 @@ class RealClock:
         return True
 
 
-class VirtualClock:
+class VirtualClock(_OwnTime):
     """The running event loop's own time, for `vloop.VirtualTimeLoop`."""
 
-    epoch = 0
-    stands = False
+    virtual = True
 
     def now_ns(self) -> int:
         return round(asyncio.get_running_loop().time() * NS)
+
+    def latest_ns(self) -> int | None:
+        return self.now_ns()
 
     async def sleep_until(self, when_ns: int) -> bool:
         loop = asyncio.get_running_loop()
@@ -116,7 +158,7 @@ def _finish(done: asyncio.Future[None]) -> None:
 
 
 class Ticks(NamedTuple):
-    """Ticks in a row that were not believed, each consistent with the one before."""
+    """Successive rejected ticks, each consistent with the one before."""
 
     length: int
     stamp_ns: int
@@ -124,25 +166,25 @@ class Ticks(NamedTuple):
 
 
 class FollowedClock:
-    """Follows ticks of simulated time. Between ticks it runs on at the simulator's rate, for at most
-    `run_on_s`: when the simulator stands still, time stands still.
+    """Follows ticks of simulated time. Between ticks it runs on at the simulator's rate, for at most `run_on_s`: when
+    the simulator stands still, time stands still.
 
-    One tick that cannot be right moves nothing: one that lies back, and one that is further ahead than CLOCKS_APART_NS
-    plus twice what the last tick's rate gives in the real time that has passed. When `FOLLOWED_AFTER` ticks in a row
-    are wrong in this way and agree with one another, the clock follows them. Ahead, that is just later (a replay was
-    moved on). Back by more than CLOCKS_APART_NS, it is a new epoch: the tick before them was the wrong one. Back by
-    less than that, the clock waits until the ticks have caught up.
+    A single wrong tick moves nothing. Wrong is a tick before the last one, or further ahead than CLOCKS_APART_NS plus
+    twice what the last tick's rate gives in the real time that has passed. After `FOLLOWED_AFTER` wrong ticks in a row
+    that agree with one another, the clock follows them. Ahead, that is only later (a replay was moved forward). Back
+    by more than CLOCKS_APART_NS, it is a new epoch: the tick before them was the wrong one. Back by less than that,
+    the clock waits until the ticks have caught up.
     """
 
+    virtual = False
     STANDS_NS = NS
-    """Without a tick for so long of real time, the clock stands: the slowest simulator ticks oftener."""
+    """Without a tick for this much real time the clock stands: the slowest simulator ticks more often."""
     FOLLOWED_AFTER = 3
     FASTEST = 100.0
-    """Simulated seconds a real second, of a replay."""
+    """Highest rate of a replay, simulated seconds per real second."""
 
     def __init__(self, run_on_s: float = 0.03) -> None:
-        self.driven = False
-        """Somebody in this process ticks it: see `Node.drive_clock`."""
+        self.needs_ticks = True
         self._run_on_ns = round(run_on_s * NS)
         self._epoch = 0
         self._incarnation: int | None = None
@@ -153,7 +195,8 @@ class FollowedClock:
         self._pace = 1.0
         self._doubted: Ticks | None = None
         self._sleeping: dict[asyncio.Future[None], int] = {}
-        """Until when each wants to sleep. A tick wakes only those to whom it matters: there are a hundred a second."""
+        """Wake-up time of each sleeper. A tick wakes only those that it concerns: there are a hundred ticks a
+        second."""
 
     @property
     def epoch(self) -> int:
@@ -167,15 +210,17 @@ class FollowedClock:
     def stands(self) -> bool:
         return steady_ns() - self._tick_real_ns > self.STANDS_NS
 
+    def drive(self) -> None:
+        self.needs_ticks = False
+
     def tick(self, stamp_ns: int, incarnation: int, rate: float = 1.0) -> str:
-        """Take a sample of the clock key. Returns why it is not believed, '' when it is."""
         real_ns = steady_ns()
         anew = incarnation != self._incarnation
         if not anew:
             ahead_ns = stamp_ns - self._tick_ns
             if not 0 <= ahead_ns <= self._credible_ns(real_ns - self._tick_real_ns):
                 if not self._insists(stamp_ns, real_ns):
-                    return _disbelief(ahead_ns, real_ns - self._tick_real_ns)
+                    return _rejection(ahead_ns, real_ns - self._tick_real_ns)
                 anew = ahead_ns < 0
         if anew:
             if self._incarnation is not None:
@@ -194,11 +239,11 @@ class FollowedClock:
         return ""
 
     def _credible_ns(self, passed_ns: int) -> int:
-        """How far the ticks can have come on in some real time."""
+        """How far ticks can have advanced in some real time."""
         return CLOCKS_APART_NS + round(2 * self._pace * passed_ns)
 
     def _insists(self, stamp_ns: int, real_ns: int) -> bool:
-        """Whether a tick that is not believed is the last of so many that agree that it is to be followed."""
+        """Whether a rejected tick is the `FOLLOWED_AFTER`th in a row that agree, so that the clock follows it."""
         if 0 < self._tick_ns - stamp_ns <= CLOCKS_APART_NS:
             return False
         length, before = 1, self._doubted
@@ -215,8 +260,6 @@ class FollowedClock:
         return self._newest_ns
 
     def latest_ns(self) -> int | None:
-        """The latest time that it can be by now: ticks may be on their way, or wait for this process. None before the
-        first tick."""
         if self._incarnation is None:
             return None
         return self._tick_ns + self._credible_ns(steady_ns() - self._tick_real_ns) - CLOCKS_APART_NS
@@ -231,7 +274,7 @@ class FollowedClock:
         await asyncio.sleep(0)
         while (left_ns := when_ns - self.now_ns()) > 0 and self._epoch == epoch:
             reachable_ns = self._tick_ns + self._run_on_ns - self.now_ns()
-            # A tick may say that time goes faster than it seemed, so it always ends the wait.
+            # Without a limit where only another tick can bring the time; a tick may also change the rate.
             wait_s = left_ns / NS / self._rate if left_ns <= reachable_ns else None
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(wait_s):
@@ -239,7 +282,7 @@ class FollowedClock:
         return self._epoch == epoch
 
     async def _tick_that_reaches(self, when_ns: int) -> None:
-        """From which on the clock may run to this time by itself; or one of another epoch."""
+        """Waits for a tick after which the clock can run on to `when_ns` by itself, or for one of a new epoch."""
         sleeper: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self._sleeping[sleeper] = when_ns
         try:
@@ -248,12 +291,7 @@ class FollowedClock:
             del self._sleeping[sleeper]
 
 
-def _disbelief(ahead_ns: int, passed_ns: int) -> str:
+def _rejection(ahead_ns: int, passed_ns: int) -> str:
     if ahead_ns < 0:
         return f"a tick {-ahead_ns / NS:.3f} s before the last one"
     return f"a tick {ahead_ns / NS:.3f} s ahead, {passed_ns / NS:.3f} s after the last one"
-
-
-def latest_ns(clock: Clock) -> int | None:
-    """The latest time that it can be by now on a clock; None when it has not started."""
-    return clock.latest_ns() if isinstance(clock, FollowedClock) else clock.now_ns()

@@ -1,10 +1,11 @@
-"""Node: what a component is written against.
+"""Node: the API that a component is written against.
 
     async with Node("planning", bus, clock, robot) as node:
         await node.drive(PlanningCore(...))
 
-A node publishes with stamp, sequence and incarnation filled in, reads with every sample checked and counted,
-answers typed requests, tells its health once a second, and holds the service's liveliness token.
+A node reads, calls and watches as every participant does. It also publishes, with stamp, sequence number and
+incarnation filled in; serves typed requests; publishes its health once a second; and holds the service's liveliness
+token.
 """
 
 from __future__ import annotations
@@ -21,20 +22,20 @@ import msgspec
 
 from cocoro import topics
 from cocoro.about import about
-from cocoro.bus.base import Bus, Handle, Payload, Qos, Reply
-from cocoro.clock import NS, Clock, FollowedClock, VirtualClock
+from cocoro.bus.base import Bus, Handle, Payload
+from cocoro.clock import NS, Clock
 from cocoro.clock import sleep as clock_sleep
 from cocoro.contact import Contact
 from cocoro.core import Core
-from cocoro.errors import CocoroError, MeshError, RemoteError
-from cocoro.inbox import Inbox, Latest, Stream
-from cocoro.loops import LoopMeter, every
+from cocoro.errors import CocoroError
+from cocoro.health import LoopMeter, ProcessMeter
+from cocoro.inbox import Inbox
+from cocoro.keys import alive_key, recorder_key
 from cocoro.messages import AboutReply, AboutRequest, Exchange, Health, Message
-from cocoro.meter import ProcessMeter
+from cocoro.participant import Participant
 from cocoro.publisher import Publisher
 from cocoro.robot import Robot
-from cocoro.stepper import Stepper, drive
-from cocoro.tokens import alive_key
+from cocoro.stepper import Stepper, drive, every
 from cocoro.topics import EXCHANGES, HEALTH, Request, Topic
 
 M = TypeVar("M", bound=Message)
@@ -42,10 +43,12 @@ Q = TypeVar("Q", bound=msgspec.Struct)
 R = TypeVar("R", bound=msgspec.Struct)
 
 QUESTION_BYTES = 1024 * 1024
-"""A larger question is refused unread."""
+"""Upper bound of an encoded question; a larger one is refused without decoding."""
+RECORDER_S = 5.0
+"""How long a service whose steps are to be recorded waits for a recorder before its first step."""
 
 
-class Node:
+class Node(Participant):
     """One service on the mesh. Use it as an asynchronous context manager."""
 
     def __init__(
@@ -56,7 +59,6 @@ class Node:
         robot: Robot,
         *,
         robot_name: str | None = None,
-        latency_s: float = 0.0,
         record_steps: bool = False,
         health_hz: float = 1.0,
         module: str = "",
@@ -65,18 +67,13 @@ class Node:
         latches: Path | None = None,
         contact: Contact | None = None,
     ) -> None:
-        """`latency_s` is added to every step of a driven core that gives outputs, as if computing them took longer.
-        `module` and `config` are the component that runs here, for those who ask (see `cocoro.about`).
-        `profile` is the resolved profile that it was started with, as data.
-        `latches` is the folder of the emergency stop's records; without it nothing is kept, and the stop path is not
-        listened to (a service in a process of its own has it). `contact` knows what became of services that are not
-        heard any more."""
+        """`module` and `config` are those of the component that runs here; `about` reports them. `profile` is the
+        resolved profile of the start, as data. `latches` is the folder of the emergency stop's records; without it
+        nothing is kept on disk and the stop path is not listened to (a service in its own process has it). `contact`
+        knows what became of services whose tokens dropped."""
+        super().__init__(bus, clock, robot_name or robot.name)
         self.name = name
-        self.bus = bus
-        self.clock = clock
         self.robot = robot
-        self.robot_name = robot_name or robot.name
-        self.latency_s = latency_s
         self.record_steps = record_steps
         self.module = module
         self.config = config
@@ -89,21 +86,19 @@ class Node:
         self.faults: tuple[str, ...] = ()
         self._health_hz = health_hz
         self._started_ns: int | None = None
-        self._inboxes: dict[str, Inbox[Any]] = {}
         self._publishers: dict[str, Publisher[Any]] = {}
         self._meters: list[LoopMeter] = []
-        self._handles: list[Handle] = []
         self._tasks: set[asyncio.Task[Any]] = set()
-        self._watches = False
-        self._process = None if isinstance(clock, VirtualClock) else ProcessMeter()
+        self._detects_sleep = False
+        self._process = None if clock.virtual else ProcessMeter()
 
     # --- lifecycle --------------------------------------------------------------------------------
 
     async def __aenter__(self) -> Node:
-        if isinstance(self.clock, FollowedClock) and not self.clock.driven:
+        if self.clock.needs_ticks:
             self.inbox(topics.CLOCK).judge = self._tick
-        self.serve(topics.ABOUT.of(self.name), self._tell_about)
-        self.spawn(self._tell_health())
+        self.serve(topics.ABOUT.of(self.name), self._serve_about)
+        self.spawn(self._publish_health())
         return self
 
     async def __aexit__(self, *_: object) -> None:
@@ -111,26 +106,24 @@ class Node:
         for task in list(self._tasks):
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
-        for handle in reversed(self._handles):
-            handle.close()
-        self._handles.clear()
+        self.close()
 
     def ready(self, text: str = "") -> None:
-        """Say that the service works from now on: declares its liveliness token."""
+        """Reports that the service works from now on, and declares its liveliness token."""
         if self.state == "starting":
-            self._handles.append(self.bus.declare_alive(alive_key(self.robot_name, self.name)))
+            self.keep(self.bus.declare_alive(alive_key(self.robot_name, self.name)))
         self.state = "ready"
         self.text = text
 
     def degraded(self, text: str) -> None:
-        """Say that it works, but not as it should."""
+        """Reports that the service works, but not as it should."""
         if self.state == "starting":
             self.ready()
         self.state = "degraded"
         self.text = text
 
     def spawn(self, work: Coroutine[Any, Any, Any]) -> asyncio.Task[Any]:
-        """Run something beside; it ends with the node. An exception in it is logged and degrades the node."""
+        """Runs a background task that ends with the node. An exception in it is logged and degrades the node."""
         task = asyncio.create_task(work)
         self._tasks.add(task)
         task.add_done_callback(self._spawn_ended)
@@ -143,69 +136,40 @@ class Node:
             self.degraded(f"background work failed: {error}")
 
     def _tick(self, clock: Message) -> str:
-        assert isinstance(self.clock, FollowedClock)
         return self.clock.tick(clock.stamp_ns, clock.incarnation, getattr(clock, "rate", 1.0))
 
-    def drive_clock(self) -> FollowedClock:
-        """The caller ticks this node's clock from now on, since it makes the time, or hears its key anyway."""
-        assert isinstance(self.clock, FollowedClock)
-        self.clock.driven = True
-        inbox = self._inboxes.pop(topics.CLOCK.name, None)
-        if inbox is not None and inbox.subscription is not None:
-            self._handles.remove(inbox.subscription)
-            inbox.subscription.close()
+    def drive_clock(self) -> Clock:
+        """Returns the clock for the caller to tick, because it makes the time or receives the clock key anyway. The
+        node no longer subscribes to that key."""
+        self.clock.drive()
+        self.drop(topics.CLOCK)
         return self.clock
 
     def sibling(self, name: str) -> Node:
-        """Another service in this process, on the same bus and clock: the simulator stands in for four."""
+        """Another service in this process, on the same bus and clock; a simulator stands in for several."""
         return Node(
             name, self.bus, self.clock, self.robot, robot_name=self.robot_name, health_hz=self._health_hz,
             module=self.module, config=self.config, profile=self.profile, latches=self.latches,
         )  # fmt: skip
 
-    def keep(self, handle: Handle) -> None:
-        """Close this when the node ends."""
-        self._handles.append(handle)
-
-    # --- reading ----------------------------------------------------------------------------------
+    # --- reading (see Participant) ----------------------------------------------------------------
 
     def inbox(self, topic: Topic[M], *, service: str | None = None) -> Inbox[M]:
-        """The one inbox of a topic; `service='*'` reads a per-service topic of all services."""
-        if service is not None:
-            topic = topic.of(service)
-        if topic.name not in self._inboxes:
-            key = topic.key(self.robot_name)
-            inbox = self._inboxes[topic.name] = Inbox(topic, key, self.clock)
-            depth = 2 if topic.qos is Qos.FRAME else 256
-            inbox.subscription = self.bus.subscribe(key, topic.qos, inbox.deliver, depth=depth)
-            inbox.trouble.changed = self._readable_or_not
-            self._handles.append(inbox.subscription)
-        return self._inboxes[topic.name]
+        inbox = super().inbox(topic, service=service)
+        inbox.rejections.changed = self._publish_health_now
+        return inbox
 
-    def latest(self, topic: Topic[M], *, service: str | None = None) -> Latest[M]:
-        return Latest(self.inbox(topic, service=service), self.clock)
+    def watch_alive(self, handler: Callable[[str, bool], None], service: str = "*") -> Handle:
+        if self.contact.sleep_detector is not None and not self._detects_sleep:
+            self._detects_sleep = True
+            self.spawn(self.contact.sleep_detector.keep())
 
-    def stream(self, topic: Topic[M], *, service: str | None = None) -> Stream[M]:
-        return Stream(self.inbox(topic, service=service))
-
-    def on(self, topic: Topic[M], handler: Callable[[M], None], *, service: str | None = None) -> None:
-        """Call `handler(message)` for each message."""
-        self.inbox(topic, service=service).add(lambda _key, message: handler(message))
-
-    def watch_alive(self, handler: Callable[[str, bool], None]) -> None:
-        """Call `handler(service, alive)` as services of this robot come and go, at once for those that live. One that
-        went need not be dead: `contact` tells more."""
-
-        def tell(key: str, alive: bool) -> None:
-            service = key.split("/")[1]
+        def changed(name: str, alive: bool) -> None:
             if alive:
-                self.contact.met(service)
-            handler(service, alive)
+                self.contact.met(name)
+            handler(name, alive)
 
-        if self.contact.vigil is not None and not self._watches:
-            self._watches = True
-            self.spawn(self.contact.vigil.keep())
-        self._handles.append(self.bus.watch_alive(alive_key(self.robot_name, "*"), tell))
+        return super().watch_alive(changed, service)
 
     # --- publishing -------------------------------------------------------------------------------
 
@@ -213,43 +177,27 @@ class Node:
         if topic.name not in self._publishers:
             publisher = Publisher(topic, topic.key(self.robot_name), self.bus, self.clock)
             self._publishers[topic.name] = publisher
-            self._handles.append(publisher)
+            self.keep(publisher)
         return self._publishers[topic.name]
 
     def publish(self, topic: Topic[M], message: M, stamp_ns: int | None = None) -> M:
+        """Publishes a message; see `Publisher.put`."""
         return self.publisher(topic).put(message, stamp_ns)
 
-    # --- requests ---------------------------------------------------------------------------------
-
-    async def call(self, request: Request[Q, R], question: Q, timeout_s: float | None = None) -> R:
-        """Ask, and wait for the answer. Raises MeshError when nobody serves it (CallTimeoutError when nobody answers in
-        time) and RemoteError with the server's own words when it answers with an error."""
-        replies = await self._ask(request, question, timeout_s)
-        if not replies:
-            raise MeshError(f"nobody answers {request.key(self.robot_name)}: is {request.server} running?")
-        return _understand(request, replies[0])
-
-    async def call_all(self, request: Request[Q, R], question: Q, timeout_s: float | None = None) -> list[R]:
-        """Ask all who serve it (a request with `*` in its name); the good answers."""
-        return [_understand(request, reply) for reply in await self._ask(request, question, timeout_s) if reply.ok]
-
-    async def _ask(self, request: Request[Q, R], question: Q, timeout_s: float | None) -> list[Reply]:
-        payload = msgspec.msgpack.encode(question)
-        wait_s = request.timeout_s if timeout_s is None else timeout_s
-        return await self.bus.call(request.key(self.robot_name), payload, wait_s)
+    # --- serving ----------------------------------------------------------------------------------
 
     def serve(self, request: Request[Q, R], handler: Callable[[Q], Awaitable[R]]) -> None:
-        """Answer a request. A handler that raises CocoroError answers with its text. Question and answer are published
-        too, for the record."""
+        """Answers a request. When the handler raises CocoroError, the caller gets its text. Question and answer are
+        also published, for recorders."""
         decoder = msgspec.msgpack.Decoder(request.request)
 
         async def answer(_key: str, payload: Payload) -> bytes:
             exchange = Exchange(request=request.name)
             started = time.perf_counter()
             try:
-                exchange.question = question = _understood(decoder, payload, request)
-                exchange.answer = given = await handler(question)
-                return msgspec.msgpack.encode(given)
+                exchange.question = question = _decoded(decoder, payload, request)
+                exchange.answer = reply = await handler(question)
+                return msgspec.msgpack.encode(reply)
             except CocoroError as error:
                 exchange.error = str(error)
                 raise
@@ -261,7 +209,7 @@ class Node:
                 exchange.took_ms = 0.0 if self._process is None else (time.perf_counter() - started) * 1e3
                 self.publish(EXCHANGES.of(self.name), exchange)
 
-        self._handles.append(self.bus.serve(request.key(self.robot_name), answer))
+        self.keep(self.bus.serve(request.key(self.robot_name), answer))
 
     # --- time -------------------------------------------------------------------------------------
 
@@ -269,14 +217,15 @@ class Node:
         return self.clock.now_ns()
 
     async def sleep(self, seconds: float) -> bool:
+        """Waits by the node's clock; False when a new epoch began meanwhile."""
         return await clock_sleep(self.clock, seconds)
 
     def every(self, rate_hz: float, name: str = "loop") -> AsyncIterator[int]:
-        """`async for now_ns in node.every(50.0)`: a fixed-rate loop whose jitter and overruns show in the health."""
+        """`async for now_ns in node.every(50.0)`: a fixed-rate loop; health reports its jitter and overruns."""
         return every(self.clock, rate_hz, self.meter(name))
 
     def meter(self, name: str) -> LoopMeter:
-        """Of a loop of this node's, which shows in its health."""
+        """A meter for one loop of this node; health reports it."""
         meter = LoopMeter(name)
         self._meters.append(meter)
         return meter
@@ -284,36 +233,66 @@ class Node:
     # --- driving a core ---------------------------------------------------------------------------
 
     async def drive(self, core: Core, name: str | None = None) -> None:
-        """Step a pure core for ever: at its rate, and at once when a triggering topic arrives.
+        """Steps a pure core for ever: at its rate, and as soon as a triggering topic arrives.
 
-        An exception in the core ends the service: its state cannot be trusted any more, and the supervisor starts it
-        afresh. The hardware stops by itself meanwhile.
+        An exception in the core ends the service, since the core's state cannot be trusted any more. The supervisor
+        starts it anew; the hardware stops by itself meanwhile.
         """
-        await drive(self, core, name or self.name)
+        if self.record_steps:
+            await self._until_recorded()
+        step = self.stepper(core, name)
+        meter = self.meter(name or self.name)
+        self.ready()  # before the clock has started: its source (a replay, a restarted simulator) may come later
+        await self.clock.wait_started()
+        await drive(step, core.schedule, self.clock, meter)
 
     def stepper(self, core: Core, name: str | None = None) -> Stepper:
-        """What gathers a core's inputs, steps it and publishes, for those who drive it themselves."""
+        """Collects a core's inputs, steps it and publishes; for callers that do not use `drive`."""
         return Stepper(self, core, name or self.name)
+
+    async def _until_recorded(self) -> None:
+        """Waits for a recorder, for at most `RECORDER_S`: a record of steps is complete only with the first one."""
+        found = asyncio.Event()
+
+        def on_token(_key: str, alive: bool) -> None:
+            if alive:
+                found.set()
+
+        watch = self.bus.watch_alive(recorder_key(self.robot_name), on_token)
+        try:
+            async with asyncio.timeout(RECORDER_S):
+                await found.wait()
+        except TimeoutError:
+            self.log.warning("steps are to be recorded, but there was no recorder within %g s", RECORDER_S)
+        finally:
+            watch.close()
 
     # --- health -----------------------------------------------------------------------------------
 
-    async def _tell_about(self, _: AboutRequest) -> AboutReply:
-        return about(self)
+    def about(self) -> AboutReply:
+        """What this service is and how it was started."""
+        return about(
+            self.name, self.robot_name, self.robot, module=self.module, config=self.config,
+            record_steps=self.record_steps, virtual=self.clock.virtual,
+        )  # fmt: skip
 
-    async def _tell_health(self) -> None:
+    async def _serve_about(self, _: AboutRequest) -> AboutReply:
+        return self.about()
+
+    async def _publish_health(self) -> None:
         async for now_ns in every(self.clock, self._health_hz, LoopMeter("health")):
             self._started_ns = now_ns if self._started_ns is None else self._started_ns
             self.publish(HEALTH.of(self.name), self.health(now_ns, self._started_ns))
 
-    def _readable_or_not(self) -> None:
-        """What this service reads can be read no more, or again: who waits for it should know at once."""
+    def _publish_health_now(self) -> None:
+        """A topic became unreadable, or can be read again; its reader reports that without delay."""
         now_ns = self.clock.now_ns()
         self.publish(HEALTH.of(self.name), self.health(now_ns, self._started_ns or now_ns))
 
     def health(self, now_ns: int, started_ns: int) -> Health:
         ports: list[Inbox[Any] | Publisher[Any]] = [*self._inboxes.values(), *self._publishers.values()]
         cpu_share, rss_mb = self._process.take() if self._process else (0.0, 0.0)
-        told = tuple(port.health(now_ns) for port in ports if port.topic.name != HEALTH.of(self.name).name)
+        reports = tuple(port.health(now_ns) for port in ports if port.topic.name != HEALTH.of(self.name).name)
         return Health(
             service=self.name,
             pid=os.getpid() if self._process else 0,
@@ -322,29 +301,20 @@ class Node:
             uptime_s=(now_ns - started_ns) / NS,
             cpu_share=cpu_share,
             rss_mb=rss_mb,
-            topics=told,
+            topics=reports,
             loops=tuple(meter.health() for meter in self._meters),
             faults=(
                 *self.faults,
-                *(topic.fault for topic in told if topic.fault),
+                *(topic.fault for topic in reports if topic.fault),
                 *(port.trouble for port in self._publishers.values() if port.trouble),
             ),
         )
 
 
-def _understood(decoder: msgspec.msgpack.Decoder[Q], payload: Payload, request: Request[Q, Any]) -> Q:
+def _decoded(decoder: msgspec.msgpack.Decoder[Q], payload: Payload, request: Request[Q, Any]) -> Q:
     if len(payload) > QUESTION_BYTES:
         raise CocoroError(f"{request.name}: a question of {len(payload)} bytes, at most {QUESTION_BYTES} are taken")
     try:
         return decoder.decode(payload)
     except (msgspec.MsgspecError, ValueError) as error:
         raise CocoroError(f"{request.name}: not a good {request.request.__name__}: {error}") from error
-
-
-def _understand(request: Request[Q, R], reply: Reply) -> R:
-    if not reply.ok:
-        raise RemoteError(reply.payload.decode(errors="replace"))
-    try:
-        return msgspec.msgpack.decode(reply.payload, type=request.reply)
-    except msgspec.MsgspecError as error:
-        raise RemoteError(f"{reply.key} answered something that is not a {request.reply.__name__}: {error}") from error

@@ -1,4 +1,4 @@
-"""What publishes on one topic, and a message as it travels."""
+"""Publishing on one topic, and the encoding of messages."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from cocoro.bus.base import Bus
 from cocoro.clock import NS, Clock
-from cocoro.inbox import Rate
+from cocoro.health import Rate
 from cocoro.messages import Message, TopicHealth
 from cocoro.topics import Topic
 
@@ -17,7 +17,7 @@ M = TypeVar("M", bound=Message)
 
 
 class Publisher(Generic[M]):
-    """Publishes on one topic. Makes stamp, sequence and incarnation, so that no component has to."""
+    """Publishes on one topic, and fills in stamp, sequence number and incarnation."""
 
     def __init__(self, topic: Topic[M], key: str, bus: Bus, clock: Clock) -> None:
         self.topic = topic
@@ -29,8 +29,8 @@ class Publisher(Generic[M]):
         self._clock = clock
 
     def put(self, message: M, stamp_ns: int | None = None) -> M:
-        """Publish and return the message, completed in place. `stamp_ns` defaults to the message's own when it has one,
-        else to now."""
+        """Publishes the message and returns it, completed in place. `stamp_ns` defaults to the message's own stamp, or
+        to now when that is 0. Raises TypeError when the topic carries another type."""
         if not isinstance(message, self.topic.type):
             raise TypeError(f"{self.topic.name} carries {self.topic.type.__name__}, not {type(message).__name__}")
         if stamp_ns is not None:
@@ -49,7 +49,7 @@ class Publisher(Generic[M]):
 
     @property
     def trouble(self) -> str:
-        """Why its messages cost more than they should; empty when all is well."""
+        """Why its messages cost more than they should; empty when they do not."""
         return f"{self.topic.name}: {self._raw.trouble}" if self._raw.trouble else ""
 
     def health(self, now_ns: int) -> TopicHealth:
@@ -60,15 +60,15 @@ class Publisher(Generic[M]):
 
 
 def encode(message: Message) -> bytes:
-    """A message as it travels."""
+    """A message in MessagePack, as it is sent."""
     return _ENCODER.encode(message)
 
 
-def _plain(value: object) -> object:
-    """NumPy's scalars as Python's, so that a component's author need not think of it."""
+def _numpy_scalar(value: object) -> object:
+    """Converts NumPy scalars to Python's. Raises TypeError for anything else."""
     if isinstance(value, np.generic):
         return value.item()
     raise TypeError(f"a {type(value).__name__} cannot be sent")
 
 
-_ENCODER = msgspec.msgpack.Encoder(enc_hook=_plain)
+_ENCODER = msgspec.msgpack.Encoder(enc_hook=_numpy_scalar)

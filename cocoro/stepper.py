@@ -1,84 +1,165 @@
-"""What steps a pure core for its node, and the loop that does so at the core's rate."""
+"""Loops at a fixed rate, and the loop that steps a pure core."""
 
 from __future__ import annotations
 
 import asyncio
 import time
-from typing import TYPE_CHECKING
+from collections.abc import AsyncIterator, Callable, Sequence
+from typing import Any, Protocol, TypeVar
 
-from cocoro.clock import NS, Clock, FollowedClock
-from cocoro.core import Core, Sample
-from cocoro.inbox import Intake
-from cocoro.loops import Schedule
-from cocoro.messages import StepRecord
-from cocoro.tokens import recorder_key
-from cocoro.topics import STEPS
+from cocoro.clock import NS, Clock
+from cocoro.core import Core, Output, Sample, Schedule
+from cocoro.health import LoopMeter
+from cocoro.inbox import Inbox
+from cocoro.messages import Message, StepRecord
+from cocoro.topics import STEPS, Topic
 
-if TYPE_CHECKING:
-    from cocoro.node import Node
+M = TypeVar("M", bound=Message)
 
-RECORDER_S = 5.0
-"""How long a service whose steps are to be recorded waits for a recorder before its first."""
+
+class Deadlines:
+    """Deadlines at a fixed rate, from the construction on. A late loop skips whole periods and keeps its phase; a new
+    epoch of the clock restarts the deadlines. Raises ValueError for a rate that is not positive."""
+
+    def __init__(self, clock: Clock, rate_hz: float, meter: LoopMeter) -> None:
+        if rate_hz <= 0:
+            raise ValueError(f"rate_hz must be positive, not {rate_hz}")
+        self._clock = clock
+        self._period_ns = round(NS / rate_hz)
+        self._meter = meter
+        self._epoch = clock.epoch
+        self.next_ns = clock.now_ns()
+
+    def advance(self) -> int:
+        """Returns the next deadline, ns; call it after the work of the present one."""
+        now_ns = self._clock.now_ns()
+        if self._clock.epoch != self._epoch:
+            self._epoch = self._clock.epoch
+            self.next_ns = now_ns
+        self.next_ns += self._period_ns
+        missed = max(0, (now_ns - self.next_ns) // self._period_ns)
+        if missed:
+            self._meter.overruns += missed
+            self.next_ns += missed * self._period_ns
+        return self.next_ns
+
+
+async def every(clock: Clock, rate_hz: float, meter: LoopMeter) -> AsyncIterator[int]:
+    """Yields the clock's time, ns, at a fixed rate; the first time as soon as the clock has started."""
+    deadlines: Deadlines | None = None
+    while True:
+        await clock.sleep_until(deadlines.next_ns if deadlines is not None else 0)
+        if deadlines is None:  # not before: a followed clock starts at any time
+            deadlines = Deadlines(clock, rate_hz, meter)
+        now_ns = clock.now_ns()
+        meter.began(now_ns)
+        yield now_ns
+        deadlines.advance()
+
+
+class Intake:
+    """Collects what arrives between two steps of a core, in order of arrival; of a `latest` topic only the newest."""
+
+    def __init__(self, limit: int = 4096) -> None:
+        self._limit = limit
+        self._samples: dict[int, tuple[Topic[Any], Message]] = {}
+        self._next = 0
+        self._last_of: dict[str, int] = {}
+
+    def reader(
+        self, topic: Topic[M], inbox: Inbox[M], take_all: bool, wake: Callable[[], None] | None
+    ) -> Callable[[str, M], None]:
+        def take(_key: str, message: M) -> None:
+            if not take_all:
+                older = self._last_of.get(topic.name)
+                if older is not None and self._samples.pop(older, None) is not None:
+                    inbox.unread += 1
+                self._last_of[topic.name] = self._next
+            elif len(self._samples) >= self._limit:
+                del self._samples[next(iter(self._samples))]
+                inbox.unread += 1
+            self._samples[self._next] = (topic, message)
+            self._next += 1
+            if wake is not None:
+                wake()
+
+        return take
+
+    def take(self) -> list[tuple[Topic[Any], Message]]:
+        samples = list(self._samples.values())
+        self._samples.clear()
+        self._last_of.clear()
+        return samples
+
+
+class Host(Protocol):
+    """The part of a node that a stepper needs."""
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def record_steps(self) -> bool: ...
+
+    def inbox(self, topic: Topic[M]) -> Inbox[M]: ...
+
+    def publish(self, topic: Topic[M], message: M) -> M: ...
 
 
 class Stepper:
-    """Gathers a core's inputs; each call is one step: take, step, wait out the latency, publish, record."""
+    """Collects a core's inputs; each call is one step: take the inputs, compute, publish, record."""
 
-    def __init__(self, node: Node, core: Core, name: str) -> None:
+    def __init__(self, host: Host, core: Core, name: str) -> None:
         self.wake = asyncio.Event()
-        self._node = node
+        """Set when a triggering topic arrives."""
+        self._host = host
         self._core = core
         self._name = name
         self._intake = Intake()
         triggers = {topic.name for topic in core.schedule.triggers}
         for topic, take in core.reads.items():
-            inbox = node.inbox(topic)
+            inbox = host.inbox(topic)
             wake = self.wake.set if topic.name in triggers else None
             inbox.add(self._intake.reader(topic, inbox, take == "all", wake))
 
     async def __call__(self, now_ns: int) -> int:
-        """One step; the number of messages that it gave."""
-        node = self._node
+        """One step. Returns the number of messages that it published."""
+        samples, outputs = self.compute(now_ns)
+        return self.publish(now_ns, samples, outputs, now_ns)
+
+    def compute(self, now_ns: int) -> tuple[list[Sample], Sequence[Output]]:
+        """Steps the core with what has arrived. Returns what it consumed and its outputs."""
         samples = [Sample(topic, message) for topic, message in self._intake.take()]
-        outputs = self._core.step(samples, now_ns)
-        stamp_ns = now_ns
-        if outputs and node.latency_s > 0:
-            if not await node.sleep(node.latency_s):
-                outputs = ()  # the clock began anew meanwhile: what was computed is of no time that there is
-            # What takes longer to compute is said later; a command's age counts from when it could be given.
-            stamp_ns += round(node.latency_s * NS)
+        return samples, self._core.step(samples, now_ns)
+
+    def publish(self, now_ns: int, samples: Sequence[Sample], outputs: Sequence[Output], stamp_ns: int) -> int:
+        """Publishes a step's outputs, stamped with `stamp_ns` unless they have a stamp, and its record when steps are
+        recorded. Returns the number of outputs."""
+        host = self._host
         produced = []
         for topic, message in outputs:
             if message.stamp_ns == 0:
                 message.stamp_ns = stamp_ns
-            sent = node.publish(topic, message)
+            sent = host.publish(topic, message)
             produced.append((topic.name, sent.incarnation, sent.seq))
-        if node.record_steps:
+        if host.record_steps:
             consumed = tuple((s.topic.name, s.message.incarnation, s.message.seq) for s in samples)
             record = StepRecord(now_ns=now_ns, core=self._name, consumed=consumed, produced=tuple(produced))
-            node.publish(STEPS.of(node.name), record)
+            host.publish(STEPS.of(host.name), record)
         return len(produced)
 
 
-async def drive(node: Node, core: Core, name: str) -> None:
-    """Step a core for ever: at its rate, and at once when a triggering topic arrives."""
-    if node.record_steps:
-        await _until_recorded(node)
-    step = node.stepper(core, name)
-    meter = node.meter(name)
-    clock = node.clock
-    node.ready()  # whoever keeps the clock may come later: a replay, a simulator that starts anew
-    if isinstance(clock, FollowedClock):
-        await clock.wait_started()
-    schedule = Schedule(clock, core.schedule.rate_hz, meter) if core.schedule.rate_hz else None
+async def drive(step: Stepper, schedule: Schedule, clock: Clock, meter: LoopMeter) -> None:
+    """Steps for ever: at the schedule's rate, and as soon as a triggering topic arrives."""
+    deadlines = Deadlines(clock, schedule.rate_hz, meter) if schedule.rate_hz else None
     epoch = clock.epoch
     while True:
-        if schedule is None:
+        if deadlines is None:
             await step.wake.wait()
             due = True
         else:
-            # The clock may have begun anew in the middle of a step: the deadline is of the time before then.
-            due = clock.epoch != epoch or await _wait(clock, step.wake, schedule.deadline_ns)
+            # The clock may have jumped back during a step: then the deadline is of an earlier epoch.
+            due = clock.epoch != epoch or await _wait(clock, step.wake, deadlines.next_ns)
         if clock.epoch != epoch:
             epoch = clock.epoch
             due = True
@@ -89,32 +170,14 @@ async def drive(node: Node, core: Core, name: str) -> None:
         started = time.perf_counter()
         await step(now_ns)
         meter.steps_ms.append((time.perf_counter() - started) * 1e3)
-        if due and schedule is not None:
-            schedule.advance()
-
-
-async def _until_recorded(node: Node) -> None:
-    """A record of steps is whole only when a recorder hears the first; wait for one, but not for ever."""
-    heard = asyncio.Event()
-
-    def on_token(_key: str, alive: bool) -> None:
-        if alive:
-            heard.set()
-
-    watch = node.bus.watch_alive(recorder_key(node.robot_name, "*"), on_token)
-    try:
-        async with asyncio.timeout(RECORDER_S):
-            await heard.wait()
-    except TimeoutError:
-        node.log.warning("steps are to be recorded, but within %g s there was no recorder", RECORDER_S)
-    finally:
-        watch.close()
+        if due and deadlines is not None:
+            deadlines.advance()
 
 
 async def _wait(clock: Clock, wake: asyncio.Event, deadline_ns: int) -> bool:
-    """Wait for a deadline (True) or an earlier wake (False)."""
+    """Waits for a deadline (True) or an earlier wake (False)."""
     if clock.now_ns() >= deadline_ns:
-        await asyncio.sleep(0)  # a core that is too slow for its rate must not keep everything else from running
+        await asyncio.sleep(0)  # a core that is too slow for its rate must leave other tasks their turn
         return True
     timer = asyncio.ensure_future(clock.sleep_until(deadline_ns))
     waker = asyncio.ensure_future(wake.wait())

@@ -13,8 +13,8 @@ from typing import IO
 
 from cocoro import child
 from cocoro.component import Component
+from cocoro.contact import RECOVERY_S, SleepDetector
 from cocoro.errors import ConfigError
-from cocoro.vigil import RECOVERY_S, Vigil
 from deploy.launch import CRASHED, MISCONFIGURED, REFUSED
 from deploy.processes import BACKOFF_LIMIT_S, SETTLED_S
 from deploy.rundir import RunDir
@@ -43,15 +43,20 @@ class Child:
     """`start`, then `keep` for ever, then `stop`. `tell` gets what people should know, a line at a time."""
 
     def __init__(
-        self, row: Component, run_dir: RunDir, parent_fd: int, tell: Callable[[str], None], vigil: Vigil
+        self,
+        row: Component,
+        run_dir: RunDir,
+        parent_fd: int,
+        tell: Callable[[str], None],
+        sleep_detector: SleepDetector,
     ) -> None:
-        """`vigil` knows whether this process was itself asleep."""
+        """`sleep_detector` knows whether this process was itself asleep."""
         self.row = row
         self.restarts = 0
         self._run_dir = run_dir
         self._parent_fd = parent_fd
         self._tell = tell
-        self._vigil = vigil
+        self._sleep_detector = sleep_detector
         self._doubt: asyncio.TimerHandle | None = None
         """Says that it is silent, unless it is back by then."""
         self._alive: set[str] = set()
@@ -151,7 +156,7 @@ class Child:
         if ready:
             self._silent = False
             self._tell(f"{self.row.name} is back")
-        elif self._vigil.look():
+        elif self._sleep_detector.look():
             if self._doubt is None:
                 self._doubt = asyncio.get_running_loop().call_later(RECOVERY_S, self._say_silence_after_all)
         else:

@@ -1,7 +1,7 @@
 """Runs one process of the table: `python -m deploy.launch PROCESS --run-dir DIR`, or `run` from one's own terminal.
 
-Exits with 0 when it was asked to end, 1 for a crash (its traceback in the log), 2 for an error that its user can
-mend and 3 when what is there already does not let it start (one line in the log).
+Exit codes: 0 it was asked to end, 1 it crashed (traceback in the log), 2 an error that its user can correct, 3
+something that runs already keeps it from starting (for both one line in the log).
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from deploy.rundir import RunDir
 
 OK, CRASHED, MISCONFIGURED, REFUSED = 0, 1, 2, 3
 ORPHAN_S = 5.0
-"""How long a process may take to end once its supervisor is gone."""
+"""Time within which a process ends after its supervisor has died."""
 LEVEL = "COCORO_LOG"
 """Environment variable with the log level; info when it is not set."""
 
 
 class _Line(logging.Formatter):
-    """One line a record: time, level, who, what."""
+    """One line per record: time, level, process, message."""
 
     def __init__(self, process: str) -> None:
         super().__init__(f"%(asctime)s.%(msecs)03d %(levelname)-7s {process}: %(message)s", "%Y-%m-%dT%H:%M:%S")
@@ -50,9 +50,9 @@ def set_up_logging(process: str) -> logging.Logger:
 
 
 def watch_parent(fd: int) -> None:
-    """End this process when the other end of a pipe is closed, which is when the supervisor has died.
+    """Ends this process when the other end of a pipe is closed: the supervisor has died.
 
-    In a thread of its own, so that it works while modules are imported and when the loop hangs.
+    A thread does it, so that it works while modules are imported and when the event loop hangs.
     """
 
     def watch() -> None:
@@ -68,8 +68,8 @@ def watch_parent(fd: int) -> None:
 def run(
     process: str, run_dir: RunDir, profile: dict[str, Any], profile_name: str, *, raise_crashes: bool = False
 ) -> int:
-    """Run a process until it is told to end; returns the exit code. Logging is set up already. A crash is logged with
-    its traceback, or raised for a caller who shows it to a person."""
+    """Runs a process until a signal ends it; returns the exit code. Logging must be set up. A crash is logged with its
+    traceback, or raised (`raise_crashes`) for a caller that reports it."""
     log = logging.getLogger(f"cocoro.{process}")
     try:
         with asyncio.Runner() as runner:
@@ -96,18 +96,17 @@ async def _main(process: str, run_dir: RunDir, data: dict[str, Any], profile_nam
     from cocoro.bus.zenoh import ZenohBus
     from cocoro.clock import FollowedClock
     from cocoro.component import load as load_component
-    from cocoro.contact import Contact
-    from cocoro.node import Node
+    from cocoro.contact import Contact, SleepDetector
     from cocoro.robot import Robot
     from cocoro.stop.record import latch_dir
-    from cocoro.vigil import Vigil
     from deploy import processes, profiles, robot_time
+    from deploy.delayed import DelayedNode
 
     profile = profiles.from_data(data, profile_name)
     row = processes.named(process)
     claims = run_dir.claim(process, row.services)
     try:
-        with suppress(PermissionError):  # to be preferred is a privilege
+        with suppress(PermissionError):  # a negative value is a privilege
             os.nice(row.nice)
         component = load_component(row)
         config = profile.config(process, component.config)
@@ -116,11 +115,11 @@ async def _main(process: str, run_dir: RunDir, data: dict[str, Any], profile_nam
         log = logging.getLogger(f"cocoro.{process}")
         log.info("%s with %s", row.module, config)
         stop = _stop_signal()
-        # Whoever comes first, without a supervisor, fixes the robot's time for those who come later.
+        # Without a supervisor, the first process fixes the robot's time for those that come later.
         real_clock = robot_time.clock if run_dir.populated else robot_time.fix
         async with (
             await ZenohBus.open(run_dir.join_as(process, profile.mesh, frames=bool(row.frames))) as bus,
-            Node(
+            DelayedNode(
                 process,
                 bus,
                 FollowedClock() if profile.clock == "sim" else real_clock(run_dir.path),
@@ -132,12 +131,12 @@ async def _main(process: str, run_dir: RunDir, data: dict[str, Any], profile_nam
                 config=config,
                 profile=data,
                 latches=latch_dir(profile.robot),
-                contact=Contact(run_dir.claimant_pid, Vigil(log.warning)),
+                contact=Contact(run_dir.claimant_pid, SleepDetector(log.warning)),
             ) as node,
         ):
             log.info("joined the mesh at %s", bus.where)
             if await _until(stop, component.run(node, config)):
-                log.info("told to end")
+                log.info("ended by a signal")
                 return OK
         log.error("ended by itself, though a component runs for ever")
         return CRASHED
@@ -151,7 +150,7 @@ def _path(file: str | None) -> Path | None:
 
 
 def _stop_signal() -> asyncio.Event:
-    """Set by the first SIGTERM or SIGINT; a second one ends the process at once."""
+    """An event that the first SIGTERM or SIGINT sets; a second one has its default effect."""
     loop, stop = asyncio.get_running_loop(), asyncio.Event()
     before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
 
@@ -167,7 +166,8 @@ def _stop_signal() -> asyncio.Event:
 
 
 async def _until(stop: asyncio.Event, work: Awaitable[None]) -> bool:
-    """Whether `stop` came before the work's end; the work is cancelled then, and its errors while ending are raised."""
+    """Runs the work until its end or until `stop` is set, which cancels it; returns whether it was. Raises the work's
+    errors."""
     working, stopping = asyncio.ensure_future(work), asyncio.ensure_future(stop.wait())
     await asyncio.wait((working, stopping), return_when=asyncio.FIRST_COMPLETED)
     stopping.cancel()

@@ -1,55 +1,48 @@
-"""The run directory: what of a robot runs on this machine. One folder a robot, below one place for them all.
+"""The run directory: one folder per robot with the state of its processes on this machine.
 
     <run>/<robot>/profile.json     the resolved profile of the last start
                   clock.json       the robot's time (see deploy.robot_time)
-                  supervisor       held by the supervisor
+                  supervisor       held by the supervisor (see cocoro.held_file)
                   claims/<service> held by the process that is that service
-                  logs/            one file a process, of the last starts (or in $COCORO_LOG_DIR/<robot>)
-                  (and the mesh's own register, see cocoro.bus.endpoints)
+                  logs/            one file per process, of the last starts (or in $COCORO_LOG_DIR/<robot>)
+                  (and the mesh's register, see cocoro.bus.register)
 
-"Held" means locked for as long as its process lives, however that ends: so a process number that is read from a
-held file is that process, and never one that got the number later.
-
-The folders are this user's alone, and so are the files in them (see `cocoro.private`): what is not is refused with a
-ConfigError, and when the place is full, what must be written raises FullError.
+The folders and the files in them are this user's alone (see `cocoro.private`). Others are refused with a ConfigError;
+when the disk is full, what must be written raises FullError.
 """
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
-import random
 import select
 import signal
-import time
 from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager, suppress
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from typing import IO, Annotated, Any, Literal, NamedTuple
+from typing import IO, Annotated, Any, Literal
 
 import msgspec
 from msgspec import Meta
 
 from cocoro import private
 from cocoro.bus.endpoints import ZenohConfig, default, default_run_dir
-from cocoro.bus.members import Who, members
+from cocoro.bus.register import members
 from cocoro.errors import RefusedError
+from cocoro.held_file import HeldFile, Holder, hold, holder
 
 LOG_DIR = "COCORO_LOG_DIR"
 """Environment variable with a place for the logs that outlives the run directory."""
-LOOK_S = 1.0
-"""Longer than anyone takes to look who holds a file."""
 PROFILE_BYTES = 1024 * 1024
-"""More than any profile has."""
+"""Upper bound of a profile's size."""
 KEPT_LOGS = 5
-"""Of earlier starts, for each process."""
+"""Logs of earlier starts that are kept, per process."""
 
 
 class Mesh(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Where a robot's processes meet: a profile's `[mesh]` table. Without endpoints it is the run directory; the
+    """Where a robot's processes meet: a profile's `[mesh]` table. Without endpoints it is the run directory. The
     fields are those of `cocoro.bus.endpoints.ZenohConfig`."""
 
     mode: Literal["peer", "client", "router"] = "peer"
@@ -60,77 +53,8 @@ class Mesh(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     options: dict[str, Any] = {}
 
 
-class Holder(NamedTuple):
-    """Who holds a file."""
-
-    name: str
-    pid: int
-
-
-class Held:
-    """A held file. `release` gives it back; so does the end of the process."""
-
-    def __init__(self, fd: int) -> None:
-        self._fd: int | None = fd
-
-    def release(self) -> None:
-        fd, self._fd = self._fd, None
-        if fd is not None:
-            os.close(fd)
-
-
-def hold(path: Path, name: str) -> Held | None:
-    """Hold a file in the name of this process; None when another one holds it. Raises ConfigError, FullError."""
-    fd = private.open_file(path, os.O_CREAT | os.O_RDWR, make=True)
-    about = json.dumps({"name": name, "pid": os.getpid()}).encode()
-    deadline_s = time.monotonic() + LOOK_S
-    while not _locked(fd, fcntl.LOCK_EX):
-        if not _locked(fd, fcntl.LOCK_SH) or time.monotonic() > deadline_s:
-            os.close(fd)
-            return None
-        # Nobody holds it: somebody only looks, as `holder` does, and has done so in a moment.
-        fcntl.flock(fd, fcntl.LOCK_UN)
-        time.sleep(random.uniform(0.0, 0.002))  # of two that try, one is first
-    try:
-        os.ftruncate(fd, 1)  # not to 0: what is written takes the room of what was there, which there may be no more of
-        os.pwrite(fd, about, 0)
-    except OSError as error:
-        os.close(fd)
-        raise private.refusal(path, error) from error
-    return Held(fd)
-
-
-def holder(path: Path) -> Holder | None:
-    """Who holds a file now; named "" with the number 0 when that cannot be read. Raises ConfigError."""
-    try:
-        fd = private.open_file(path, os.O_RDONLY)
-    except (FileNotFoundError, NotADirectoryError):
-        return None
-    try:
-        deadline_s = time.monotonic() + LOOK_S
-        while not _locked(fd, fcntl.LOCK_SH):
-            who = Who.of(os.pread(fd, 4096, 0))
-            if who is not None:
-                return Holder(who.name, who.pid)
-            if time.monotonic() > deadline_s:
-                return Holder("", 0)
-            time.sleep(0.001)  # it was taken this very moment: its holder is about to write who it is
-        return None
-    finally:
-        os.close(fd)
-
-
-def _locked(fd: int, kind: int) -> bool:
-    """Lock a file, if that can be had at once."""
-    try:
-        fcntl.flock(fd, kind | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    return True
-
-
 class RunDir:
-    """One robot's folder. Nothing is made until something is written."""
+    """One robot's folder. It is made when something is first written."""
 
     def __init__(self, robot: str, root: Path | None = None) -> None:
         self.robot = robot
@@ -142,7 +66,7 @@ class RunDir:
         self.logs = Path(elsewhere) / robot if elsewhere else self.path / "logs"
 
     def make(self) -> None:
-        """Make the folders. Raises ConfigError for those that cannot be, or are not this user's alone."""
+        """Makes the folders. Raises ConfigError for one that cannot be made or is not this user's alone."""
         with private.directory(self.path, make=True):
             pass
         with suppress(private.FullError), self._log_folder(make=True):
@@ -150,7 +74,7 @@ class RunDir:
 
     # --- who runs ---------------------------------------------------------------------------------
 
-    def hold_supervisor(self, profile: str) -> Held:
+    def hold_supervisor(self, profile: str) -> HeldFile:
         """Raises RefusedError when the robot is up already."""
         held = hold(self.path / "supervisor", profile)
         if held is None:
@@ -162,13 +86,14 @@ class RunDir:
         return held
 
     def supervisor(self) -> Holder | None:
-        """Named after its profile."""
+        """The supervisor, with its profile's name as the holder's name."""
         return holder(self.path / "supervisor")
 
-    def claim(self, process: str, services: Iterable[str]) -> list[Held]:
-        """Be these services, alone on this machine. Raises RefusedError when a process is one of them already."""
-        held: list[Held] = []
-        for service in sorted(services):  # always in one order: of two that start at once, one gets all
+    def claim(self, process: str, services: Iterable[str]) -> list[HeldFile]:
+        """Makes this process these services on this machine. Raises RefusedError when another process is one of
+        them."""
+        held: list[HeldFile] = []
+        for service in sorted(services):  # in a fixed order, so that of two processes that start together one gets all
             claim = hold(self.path / "claims" / service, process)
             if claim is None:
                 by = holder(self.path / "claims" / service)
@@ -183,16 +108,16 @@ class RunDir:
         return held
 
     def claimant(self, service: str) -> Holder | None:
-        """The process of this machine that is a service now."""
+        """The process of this machine that is a service now; None when there is none."""
         return holder(self.path / "claims" / service)
 
     def claimant_pid(self, service: str) -> int | None:
-        """The number of that process, as `cocoro.contact.Contact` asks for it; 0 when it cannot be read."""
+        """The number of that process, for `cocoro.contact.Contact`; 0 when it cannot be read."""
         by = self.claimant(service)
         return None if by is None else by.pid
 
     def claims(self) -> dict[str, Holder]:
-        """Each service that a process of this machine is, and which process that is."""
+        """The process behind each service of this machine, by service."""
         folder = self.path / "claims"
         try:
             with private.directory(folder) as fd:
@@ -200,13 +125,13 @@ class RunDir:
         except FileNotFoundError:
             return {}
         found = ((name, self.claimant(name)) for name in names)
-        return {service: by for service, by in found if by is not None and by.pid}
+        return {service: by for service, by in found if by is not None and by.known}
 
     # --- the mesh ---------------------------------------------------------------------------------
 
     def join_as(self, name: str, mesh: Mesh | None = None, *, frames: bool = False) -> ZenohConfig:
-        """How a process called `name` gets into the mesh that a profile tells of (the last start's by default).
-        `frames`: it publishes or reads them, and would have them in shared memory."""
+        """How a process called `name` joins the mesh of a profile (by default the last start's). `frames`: it publishes
+        or reads frames, so it asks for shared memory."""
         if mesh is None:
             mesh = msgspec.convert(self.resolved().get("mesh", {}), Mesh)
         if not mesh.listen and not mesh.connect:
@@ -218,7 +143,7 @@ class RunDir:
         return ZenohConfig(name=name, shared_memory=frames, **fields)
 
     def resolved(self) -> dict[str, Any]:
-        """The profile of the last start, as data; empty when there was none, or it is damaged. Raises ConfigError."""
+        """The profile of the last start, as data; empty when there is none or it is damaged. Raises ConfigError."""
         try:
             data = json.loads(private.read(self.profile_file, PROFILE_BYTES))
         except (FileNotFoundError, ValueError, RecursionError):
@@ -226,13 +151,13 @@ class RunDir:
         return data if isinstance(data, dict) else {}
 
     def remember(self, profile: bytes) -> None:
-        """Write the profile of this start, for those that are started and for those that ask. Raises ConfigError,
+        """Writes the profile of this start, for the processes that it starts and for commands. Raises ConfigError,
         FullError."""
         private.write(self.profile_file, profile)
 
     @property
     def populated(self) -> bool:
-        """Whether any process of this machine is in the robot's mesh."""
+        """Whether a process of this machine is in the robot's mesh."""
         return self.supervisor() is not None or bool(members(self.path))
 
     # --- logs -------------------------------------------------------------------------------------
@@ -241,8 +166,8 @@ class RunDir:
         return self.logs / f"{process}.log"
 
     def new_log(self, process: str) -> IO[bytes]:
-        """A new file for what a process writes; the last start's is set aside, and the oldest forgotten. Raises
-        ConfigError, FullError: who runs can run without."""
+        """A new log file for a process; earlier logs are rotated, and the oldest is removed. Raises ConfigError,
+        FullError; a process can run without a log."""
         log = self.log(process)
         files = [log, *(self.logs / f"{process}.log.{n}" for n in range(1, KEPT_LOGS + 1))]
         with self._log_folder(make=True) as fd:
@@ -256,7 +181,7 @@ class RunDir:
         return os.fdopen(private.open_file(log, flags, mode=0o644, variable=self._log_variable), "wb", buffering=0)
 
     def open_log(self, process: str) -> IO[bytes]:
-        """What a process has written since its last start, to be read. Raises FileNotFoundError, ConfigError."""
+        """Opens a process's log since its last start for reading. Raises FileNotFoundError, ConfigError."""
         return os.fdopen(private.open_file(self.log(process), os.O_RDONLY, variable=self._log_variable), "rb")
 
     def _log_folder(self, make: bool) -> AbstractContextManager[int]:
@@ -265,13 +190,13 @@ class RunDir:
 
 
 def robots(root: Path | None = None) -> list[RunDir]:
-    """This user's robots of which something runs on this machine. Raises ConfigError for a place that is not to be
+    """This user's robots that have a process on this machine. Raises ConfigError for a run directory that is not to be
     trusted."""
     return [run_dir for run_dir in folders(root) if run_dir.populated]
 
 
 def folders(root: Path | None = None) -> list[RunDir]:
-    """The robots of which this user has a folder, running or not. Raises ConfigError as `robots` does."""
+    """This user's robots that have a folder, running or not. Raises ConfigError as `robots` does."""
     root = root or default_run_dir()
     try:
         with private.directory(root, own=False) as fd, os.scandir(fd) as entries:
@@ -283,17 +208,17 @@ def folders(root: Path | None = None) -> list[RunDir]:
 
 
 class Target:
-    """A process to signal: the one that held a file when this was made, or nobody."""
+    """A process to signal: the one that held a file when this was made, or none (`pid` None)."""
 
     def __init__(self, path: Path) -> None:
         self.pid: int | None = None
         self._fd: int | None = None
         by = holder(path)
-        if by is None or not by.pid:
+        if by is None or not by.known:
             return
         with suppress(ProcessLookupError):
             self._fd = os.pidfd_open(by.pid)
-            if holder(path) == by:  # it still holds the file, so the number is still its own
+            if holder(path) == by:  # it still holds the file, so the number is still its number
                 self.pid = by.pid
             else:
                 self.close()
@@ -304,7 +229,7 @@ class Target:
                 signal.pidfd_send_signal(self._fd, number)
 
     def wait(self, timeout_s: float) -> bool:
-        """Whether it has ended; waits for that."""
+        """Waits for the process to end, for at most `timeout_s`; returns whether it has."""
         if self._fd is None:
             return True
         poll = select.poll()
@@ -318,7 +243,7 @@ class Target:
 
 
 def targets(run_dir: RunDir) -> Iterator[Target]:
-    """What still holds a claim, one target a process."""
+    """The processes that still hold a claim, one target each."""
     seen: set[int] = set()
     for service, by in run_dir.claims().items():
         if by.pid not in seen:

@@ -23,9 +23,10 @@ import msgspec
 
 from cocoro.bus import shared
 from cocoro.bus.zenoh import ZenohBus
+from cocoro.contact import SleepDetector
 from cocoro.errors import CocoroError, ConfigError, RefusedError
+from cocoro.keys import alive_key, service_of
 from cocoro.stop.record import latch_dir, prepare
-from cocoro.vigil import Vigil
 from deploy import robot_time, service_manager
 from deploy.child import Child, StartError
 from deploy.launch import CRASHED
@@ -65,7 +66,7 @@ class Supervisor:
         self._stop = asyncio.Event()
         self._unshared = ""
         """Why frames cannot all be shared, as it was before the processes were started."""
-        self._vigil = Vigil(self._tell)
+        self._sleep_detector = SleepDetector(self._tell)
 
     async def run(self) -> int:
         """Start everything, stay until SIGINT or SIGTERM, stop everything. Returns the exit code.
@@ -94,21 +95,22 @@ class Supervisor:
         try:
             async with await ZenohBus.open(self._run_dir.join_as("supervisor", self._profile.mesh)) as bus:
                 self._children = [
-                    Child(row, self._run_dir, reader_fd, self._tell, self._vigil) for row in self._profile.rows()
+                    Child(row, self._run_dir, reader_fd, self._tell, self._sleep_detector)
+                    for row in self._profile.rows()
                 ]
                 by_service = {service: child for child in self._children for service in child.row.services}
 
                 def on_alive(key: str, alive: bool) -> None:
-                    service = key.split("/")[1]
+                    service = service_of(key)
                     if service in by_service:
                         by_service[service].on_alive(service, alive)
 
-                bus.watch_alive(f"{self._profile.robot}/*/alive", on_alive)
-                keeping_vigil = asyncio.ensure_future(self._vigil.keep())
+                bus.watch_alive(alive_key(self._profile.robot), on_alive)
+                detecting = asyncio.ensure_future(self._sleep_detector.keep())
                 try:
                     code = await self._start_and_keep()
                 finally:
-                    keeping_vigil.cancel()
+                    detecting.cancel()
                     service_manager.notify("STOPPING=1")
                     for child in reversed(self._children):
                         await child.stop()

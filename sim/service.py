@@ -14,7 +14,7 @@ import msgspec
 from msgspec import Meta
 
 from cocoro import topics
-from cocoro.clock import NS, Clock, FollowedClock
+from cocoro.clock import NS, Clock
 from cocoro.component import Implementation
 from cocoro.latch import LatchKeeper
 from cocoro.messages import BaseCommand, BaseState, ClockTick, LatchState, Message, ServoCommand
@@ -116,8 +116,7 @@ class Simulator:
         self._states: tuple[tuple[Publisher[Any], Callable[[], Message]], ...] = ()
         self.rate = 1.0
         self._motion: MotionWriter | None = None
-        if isinstance(self._clock, FollowedClock):
-            node.drive_clock()
+        node.drive_clock()
 
     def connect_camera(self, kinect: Node) -> None:
         """Stand in for the camera alone."""
@@ -186,8 +185,7 @@ class Simulator:
 
     def tell_time(self) -> None:
         sent = self._ticks.put(ClockTick(rate=self.rate), self._world.time_ns)
-        if isinstance(self._clock, FollowedClock):
-            self._clock.tick(sent.stamp_ns, sent.incarnation, self.rate)
+        self._clock.tick(sent.stamp_ns, sent.incarnation, self.rate)
 
 
 async def run(node: Node, config: SimConfig) -> None:
@@ -236,10 +234,10 @@ async def keep_going(node: Node, config: SimConfig, simulator: Simulator) -> Non
     with ExitStack() as stack:
         if config.motion:
             stack.enter_context(simulator.write_motion(Path(config.motion)))
-        if isinstance(node.clock, FollowedClock):
-            await _in_real_time(simulator, config.pace)
-        else:
+        if node.clock.virtual:
             await _in_virtual_time(simulator, node.clock)
+        else:
+            await _in_real_time(simulator, config.pace)
 
 
 async def _in_virtual_time(simulator: Simulator, clock: Clock) -> None:

@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol
 
-from cocoro.bus.base import Bus, Heard, Payload
+from cocoro.bus.base import Bus, Payload, Received
 from cocoro.bus.endpoints import default
 from cocoro.bus.local import LocalBus, LocalMesh
 from cocoro.bus.zenoh import ZenohBus
@@ -109,15 +109,15 @@ class Listener:
     """Collects lots, and lets a test wait for so many samples."""
 
     def __init__(self) -> None:
-        self.lots: list[list[Heard]] = []
+        self.lots: list[list[Received]] = []
         self._came = asyncio.Event()
 
-    def __call__(self, lot: list[Heard]) -> None:
+    def __call__(self, lot: list[Received]) -> None:
         self.lots.append(lot)
         self._came.set()
 
     @property
-    def heard(self) -> list[Heard]:
+    def heard(self) -> list[Received]:
         return [each for lot in self.lots for each in lot]
 
     async def has(self, count: int) -> None:

@@ -15,9 +15,9 @@ from cocoro.capture.reader import Capture, Record
 from cocoro.clock import NS, VirtualClock
 from cocoro.component import load
 from cocoro.messages import BaseState, Frame
-from cocoro.node import Node
 from cocoro.robot import Robot
 from cocoro.vloop import run_virtual
+from deploy.delayed import DelayedNode
 from deploy.processes import named
 from services.capture.file import Compression, Packer
 from services.capture.keys import KeyInfo, QueuedMessage, info_of
@@ -38,8 +38,8 @@ class Room:
         self.mesh = LocalMesh()
         self.clock = VirtualClock()
 
-    def node(self, name: str, **options: Any) -> Node:
-        return Node(name, self.mesh.join(), self.clock, ROBOT, **options)
+    def node(self, name: str, **options: Any) -> DelayedNode:
+        return DelayedNode(name, self.mesh.join(), self.clock, ROBOT, **options)
 
     async def recorded(self, settings: dict[str, Any], scenario: Scenario) -> None:
         """Play a scenario while a recorder of these settings is there."""

@@ -7,7 +7,7 @@ from typing import Any
 import msgpack
 
 from cocoro import topics
-from cocoro.clock import NS
+from cocoro.clock import NS, VirtualClock
 from cocoro.inbox import Inbox
 from cocoro.messages import Message
 from cocoro.topics import Topic
@@ -17,10 +17,9 @@ FAR = 2**62
 """A number that no message and no stamp comes to."""
 
 
-class StillClock:
-    """Stands where it is put."""
+class StillClock(VirtualClock):
+    """A clock that stands at the time that a test sets."""
 
-    epoch = 0
     stands = True
 
     def __init__(self, now_ns: int = 100 * NS) -> None:

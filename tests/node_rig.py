@@ -7,9 +7,9 @@ from typing import Any
 from cocoro.bus.local import LocalMesh
 from cocoro.clock import Clock, VirtualClock
 from cocoro.messages import BaseState, CancelRequest, TaskReply
-from cocoro.node import Node
 from cocoro.robot import Robot
 from cocoro.testing import Tap
+from deploy.delayed import DelayedNode
 
 ROBOT = Robot.load()
 HERE: dict[str, Any] = {"odometry_m": (0.0, 0.0), "odometry_yaw_rad": 0.0, "speed_mps": 0.0, "turn_rate_radps": 0.0}
@@ -22,8 +22,8 @@ class Mesh:
         self.mesh = LocalMesh()
         self.clock = clock or VirtualClock()
 
-    def node(self, name: str, **options: Any) -> Node:
-        return Node(name, self.mesh.join(), self.clock, ROBOT, **options)
+    def node(self, name: str, **options: Any) -> DelayedNode:
+        return DelayedNode(name, self.mesh.join(), self.clock, ROBOT, **options)
 
     def tap(self) -> Tap:
         return Tap(self.mesh.join(), ROBOT.name)

@@ -29,6 +29,7 @@ from cocoro.messages import (
 from cocoro.node import Node
 from cocoro.robot import Robot
 from cocoro.testing import Tap, settle
+from deploy.delayed import DelayedNode
 from deploy.processes import named, needs
 
 SERVICES = ("sim", "perception", "planning", "executive")
@@ -96,7 +97,7 @@ class RobotRig:
         needed = {"needed": needs(name)} if name == "executive" else {}
         config = msgspec.convert(needed | dict(self._settings.get(name, {})), component.config)
         bus = self.mesh.join()
-        node = Node(
+        node = DelayedNode(
             name, bus, self._clock_of(name), self._robot,
             latency_s=self._latency_s.get(name, 0.0), record_steps=self._record_steps,
         )  # fmt: skip
@@ -172,8 +173,9 @@ class RobotRig:
     async def estop(self, latched: bool) -> set[str]:
         """Press or reset the emergency stop; who acknowledged that it is so."""
         question = EstopRequest(latched=latched, by="test")
-        replies = await self.operator.call_all(topics.ESTOP.of("*"), question)
-        return {reply.service for reply in replies if reply.latch == ("latched" if latched else "released")}
+        answers = await self.operator.call_all(topics.ESTOP.of("*"), question)
+        wanted = "latched" if latched else "released"
+        return {answer.service for answer in answers if answer.reply is not None and answer.reply.latch == wanted}
 
     async def driving(self, speed_mps: float = 0.25) -> str:
         """Fetch the red can, and be on the way to it at some speed; the task's id."""

@@ -15,11 +15,11 @@ import pytest
 from test_base_service import Driven
 from wire_base import PATIENCE_NS, Bench, FakeService, guarded
 
+from apps.cli.stop_asking import Asking
 from cocoro import topics
 from cocoro.clock import RealClock
 from cocoro.messages import EstopRequest
 from cocoro.robot import Robot
-from cocoro.stop.asking import Asking
 from cocoro.stop.record import prepare, read
 from cocoro.testing import ServiceUnderTest
 

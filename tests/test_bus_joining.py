@@ -15,7 +15,7 @@ import pytest
 from zenoh_rig import CHILD, PATIENCE_S, appears, changes, child, echo, left_in, local, scenario, who
 
 from cocoro.bus.endpoints import ZenohConfig, default, default_run_dir
-from cocoro.bus.members import Membership, members
+from cocoro.bus.register import Membership, members
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.errors import ConfigError, MeshError
 
@@ -114,7 +114,7 @@ async def main():
         atexit._run_exitfuncs()
         os._exit(0)
     os.wait()
-    from cocoro.bus.members import members
+    from cocoro.bus.register import members
     say(*(member.name for member in members(Path(sys.argv[1]))))
     assert len(await bus.alive("@cocoro/member/*")) == 1
     await bus.close()

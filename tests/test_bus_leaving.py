@@ -12,7 +12,7 @@ import pytest
 from zenoh_rig import CHILD, FRAME, PATIENCE_S, appears, changes, child, local, scenario, who
 
 from cocoro.bus.base import Qos
-from cocoro.bus.members import members
+from cocoro.bus.register import members
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.errors import CallTimeoutError, MeshError
 

@@ -17,7 +17,7 @@ import pytest
 from zenoh_rig import PATIENCE_S, child, left_in, local, scenario, who
 
 from cocoro.bus.endpoints import ZenohConfig
-from cocoro.bus.members import Membership, members, new_identity
+from cocoro.bus.register import Membership, members, new_identity
 from cocoro.bus.session import ACCEPT_PENDING
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.errors import ConfigError
@@ -195,7 +195,7 @@ def test_an_entry_that_has_no_room_for_its_name_is_one(directory: Path, monkeypa
         def write(*_: object) -> int:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-        patch.setattr(os, "write", write)
+        patch.setattr(os, "pwrite", write)
         one = Membership.register(directory, "one")
     assert [(member.identity, member.name, member.pid) for member in members(directory)] == [
         (one.member.identity, "?", 0)

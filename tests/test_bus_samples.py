@@ -8,7 +8,7 @@ import os
 import pytest
 from bus_rig import Inbox, Listener, Local, Mesh, joined, known, scenario
 
-from cocoro.bus.base import Heard, Payload, Qos
+from cocoro.bus.base import Payload, Qos, Received
 
 
 @scenario
@@ -224,7 +224,7 @@ async def test_who_listens_hears_all_in_order_in_few_lots_and_what_has_come_when
         heard = listener.heard
         assert [bytes(each.payload) for each in heard] == [b"%d" % number for number in range(300)]
         assert [each.key for each in heard] == ["robot/x", "robot/y/z"] * 150
-        times = [each.heard_ns for each in heard]
+        times = [each.received_ns for each in heard]
         assert times == sorted(times)
         publishers[0].put(b"more")
         a.publisher("last", Qos.EVENT).put(b"again")
@@ -237,7 +237,7 @@ async def test_who_fails_at_a_lot_gets_the_next_one(mesh: Mesh, caplog: pytest.L
     async with joined(mesh, 1) as (a,):
         listener = Listener()
 
-        def fail_once(lot: list[Heard]) -> None:
+        def fail_once(lot: list[Received]) -> None:
             listener(lot)
             if len(listener.heard) == 1:
                 raise RuntimeError("once")

@@ -10,9 +10,8 @@ from typing import TypeVarTuple
 
 from zenoh_rig import FRAME, PATIENCE_S
 
-from cocoro.bus.outbox import CAPACITY_BYTES, Outbox
-from cocoro.bus.pool import SharedPool, read
-from cocoro.bus.ring import Ring
+from cocoro.bus.declared import SharedPool, read
+from cocoro.bus.queues import OUTBOX_BYTES, Outbox, Ring
 from cocoro.bus.shared import POOL_BYTES
 
 Args = TypeVarTuple("Args")
@@ -120,7 +119,7 @@ def test_an_outbox_never_keeps_the_sender_waiting_and_counts_what_it_cannot_take
         sent.append("first")
 
     outbox.put(send_first, 1)
-    outbox.put(lambda: sent.append("second"), CAPACITY_BYTES - 1)
+    outbox.put(lambda: sent.append("second"), OUTBOX_BYTES - 1)
     outbox.put(lambda: sent.append("too much"), 1)
     assert outbox.lost == 1
     go_on.set()

@@ -11,9 +11,8 @@ from capture_rig import all_of, entry, writer
 
 from apps.captures.info import report
 from apps.cli import capture as capture_command
-from cocoro.boottime import boottime_ns
 from cocoro.capture.reader import Capture
-from cocoro.clock import NS
+from cocoro.clock import NS, steady_ns
 from services.capture.log_clock import KEPT_STEPS, TOGETHER_NS, WALL_CLOCK, LogClock
 from services.capture.service import captures, file_name, make_room
 from services.capture.writer import Limits
@@ -108,7 +107,7 @@ def test_a_clock_that_is_set_for_ever_takes_bounded_room(machine: Machine) -> No
 def test_this_machines_clocks_are_not_set_while_nobody_sets_them() -> None:
     clock = LogClock()
     assert all(clock.look() is None for _ in range(1000))
-    assert clock.at(boottime_ns()) <= clock.now_ns()
+    assert clock.at(steady_ns()) <= clock.now_ns()
 
 
 def test_a_capture_tells_in_each_of_its_files_how_the_clock_was_set(machine: Machine, tmp_path: Path) -> None:

@@ -25,10 +25,10 @@ from cocoro.bus.endpoints import default
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.capture.reader import Capture
 from cocoro.clock import NS, RealClock
+from cocoro.keys import recorder_key
 from cocoro.messages import BaseState
 from cocoro.node import Node
 from cocoro.robot import Robot
-from cocoro.tokens import recorder_key
 from services.capture.config import CaptureConfig
 from services.capture.file import Packer
 from services.capture.log_clock import WALL_CLOCK, LogClock

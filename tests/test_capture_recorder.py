@@ -22,8 +22,7 @@ from cocoro.component import load
 from cocoro.core import Sample, Schedule, Take
 from cocoro.errors import CocoroError, RemoteError
 from cocoro.messages import AboutReply, BaseState, CancelRequest, ClockTick, Recording, TaskReply
-from cocoro.node import Node
-from cocoro.stepper import RECORDER_S
+from cocoro.node import RECORDER_S, Node
 from cocoro.testing import settle
 from cocoro.vloop import run_virtual
 from deploy import profiles

@@ -127,7 +127,7 @@ def test_a_profile_that_cannot_be_read_is_told_in_a_line(
 def test_where_the_kernel_does_not_list_its_sockets_the_mesh_is_asked_and_that_is_said(
     services: Services, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("cocoro.stop.asking.SOCKETS", "/nowhere/unix")
+    monkeypatch.setattr("apps.cli.stop_asking.SOCKETS", "/nowhere/unix")
     assert main(["stop", "--robot", services.robot]) == exits.NO_MESH
     said = capsys.readouterr().err
     assert "the mesh alone was asked" in said

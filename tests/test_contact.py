@@ -8,9 +8,8 @@ from pathlib import Path
 import pytest
 
 from cocoro.clock import NS
-from cocoro.contact import Contact
+from cocoro.contact import BEAT_S, LATE_S, RECOVERY_S, Contact, SleepDetector
 from cocoro.testing import in_virtual_time
-from cocoro.vigil import BEAT_S, LATE_S, RECOVERY_S, Vigil
 from deploy.child import Child
 from deploy.processes import named
 from deploy.rundir import RunDir
@@ -27,27 +26,27 @@ class Steady:
 
 
 class Kept:
-    """A vigil that is kept, and what it told."""
+    """A sleep detector that runs, and what it reported."""
 
     def __init__(self) -> None:
         self.steady = Steady()
         self.told: list[str] = []
-        self.vigil = Vigil(self.told.append, self.steady)
-        self.keeping = asyncio.ensure_future(self.vigil.keep())
+        self.sleep_detector = SleepDetector(self.told.append, self.steady)
+        self.keeping = asyncio.ensure_future(self.sleep_detector.keep())
 
 
 @in_virtual_time
 async def test_a_sleep_is_told_once_and_is_an_excuse_until_connections_are_made_anew() -> None:
     it = Kept()
     await asyncio.sleep(60.0)
-    assert (it.vigil.look(), it.told) == ("", [])
+    assert (it.sleep_detector.look(), it.told) == ("", [])
     it.steady.slept_s += 15.0
     words = "this machine was asleep or starved for 15 s"
-    assert it.vigil.look() == words, "before the vigil's own beat"
+    assert it.sleep_detector.look() == words, "before its own check"
     await asyncio.sleep(RECOVERY_S - 1.0)
-    assert it.vigil.look() == words
+    assert it.sleep_detector.look() == words
     await asyncio.sleep(2.0)
-    assert (it.vigil.look(), it.told) == ("", [words])
+    assert (it.sleep_detector.look(), it.told) == ("", [words])
     it.steady.slept_s += 3.0
     await asyncio.sleep(1.0)
     assert it.told == [words, "this machine was asleep or starved for 3 s"]
@@ -60,7 +59,7 @@ async def test_a_busy_machine_is_not_asleep() -> None:
     for _ in range(100):
         it.steady.slept_s += LATE_S - BEAT_S
         await asyncio.sleep(BEAT_S)
-    assert (it.vigil.look(), it.told) == ("", [])
+    assert (it.sleep_detector.look(), it.told) == ("", [])
     it.keeping.cancel()
 
 
@@ -125,7 +124,8 @@ class Watched:
     def __init__(self, folder: Path) -> None:
         self.kept = Kept()
         self.told: list[str] = []
-        self.child = Child(named("perception"), RunDir("calliope", folder), 0, self.told.append, self.kept.vigil)
+        detector = self.kept.sleep_detector
+        self.child = Child(named("perception"), RunDir("calliope", folder), 0, self.told.append, detector)
         self.child._process = _Process()  # type: ignore[assignment]
         self.child.on_alive("perception", True)
         self.child._say_ready()

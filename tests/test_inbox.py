@@ -17,7 +17,8 @@ from cocoro import topics
 from cocoro.bus.base import Qos
 from cocoro.bus.local import LocalMesh
 from cocoro.clock import NS, FollowedClock
-from cocoro.inbox import Inbox, Intake, Latest, Stream
+from cocoro.inbox import Inbox, Latest, Stream
+from cocoro.stepper import Intake
 from cocoro.testing import in_virtual_time
 from cocoro.topics import TOPICS, Topic
 

@@ -11,7 +11,7 @@ from inbox_rig import FAR, KEY, StillClock, inbox_of, payload
 
 from cocoro import topics
 from cocoro.clock import NS
-from cocoro.source import FOLLOWED_AFTER, FREE_JUMP
+from cocoro.stream_checks import FOLLOWED_AFTER, FREE_JUMP
 from cocoro.topics import Topic
 
 PERIOD_NS = NS // 50

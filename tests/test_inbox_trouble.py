@@ -8,19 +8,19 @@ import pytest
 from inbox_rig import KEY, inbox_of, payload
 
 from cocoro import topics
+from cocoro.stream_checks import REPORTED_S, UNREADABLE_S
 from cocoro.testing import in_virtual_time
-from cocoro.trouble import TOLD_S, UNREADABLE_S
 
 
 @in_virtual_time
 async def test_a_topic_of_which_everything_is_rejected_is_unreadable_and_says_whose_fault_it_is() -> None:
     inbox, _ = inbox_of(topics.BASE_COMMAND)
     told: list[bool] = []
-    inbox.trouble.changed = lambda: told.append(inbox.trouble.unreadable)
+    inbox.rejections.changed = lambda: told.append(inbox.rejections.unreadable)
     inbox.deliver("calliope/base/command", payload(topics.BASE_COMMAND))
     assert (inbox.health(0).fault, inbox.health(0).unreadable) == ("", False)
     began_s = asyncio.get_running_loop().time()
-    while not inbox.trouble.unreadable:
+    while not inbox.rejections.unreadable:
         inbox.deliver("calliope/base/command", payload(topics.BASE_COMMAND, stamp_ns=1))
         await asyncio.sleep(0.02)
     assert asyncio.get_running_loop().time() - began_s == pytest.approx(UNREADABLE_S, abs=0.05)
@@ -29,7 +29,7 @@ async def test_a_topic_of_which_everything_is_rejected_is_unreadable_and_says_wh
     inbox.deliver("calliope/base/command", payload(topics.BASE_COMMAND, seq=1))
     assert (inbox.health(0).fault, inbox.health(0).unreadable) == (why, False)
     assert told == [True, False]
-    await asyncio.sleep(TOLD_S + 0.1)
+    await asyncio.sleep(REPORTED_S + 0.1)
     assert inbox.health(0).fault == ""
 
 
@@ -43,8 +43,8 @@ async def test_bad_messages_among_good_ones_and_on_quiet_topics_make_nothing_unr
             quiet.deliver(KEY, b"rubbish")
         often.deliver(KEY, payload(topics.BASE_STATE, seq))
         await asyncio.sleep(0.02)
-    assert not often.trouble.unreadable
-    assert not quiet.trouble.unreadable
+    assert not often.rejections.unreadable
+    assert not quiet.rejections.unreadable
 
 
 def test_of_a_per_service_topic_the_service_is_named() -> None:

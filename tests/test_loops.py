@@ -7,7 +7,8 @@ import asyncio
 import pytest
 
 from cocoro.clock import NS, Clock, FollowedClock, VirtualClock
-from cocoro.loops import LoopMeter, every
+from cocoro.health import LoopMeter
+from cocoro.stepper import every
 from cocoro.testing import JumpingClock, in_virtual_time
 from cocoro.vloop import run_virtual
 

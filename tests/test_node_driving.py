@@ -13,7 +13,7 @@ from cocoro import topics
 from cocoro.clock import NS, Clock
 from cocoro.core import Output, Sample, Schedule, Take
 from cocoro.messages import BaseCommand, Detections, StepRecord
-from cocoro.stepper import RECORDER_S
+from cocoro.node import RECORDER_S
 from cocoro.testing import JumpingClock, in_virtual_time, settle
 from cocoro.topics import Topic
 

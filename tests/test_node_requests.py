@@ -109,7 +109,7 @@ def test_a_malformed_answer_is_the_servers_fault_and_said_so(garbage: bytes) -> 
 
 
 @in_virtual_time
-async def test_everyone_can_be_asked_at_once_and_those_that_fail_are_left_out() -> None:
+async def test_all_services_can_be_called_at_once_and_each_answer_names_its_service() -> None:
     mesh = Mesh()
     async with mesh.node("base") as base, mesh.node("arm") as arm, mesh.node("operator") as caller:
 
@@ -121,5 +121,6 @@ async def test_everyone_can_be_asked_at_once_and_those_that_fail_are_left_out() 
 
         base.serve(topics.ESTOP.of("base"), latch)
         arm.serve(topics.ESTOP.of("arm"), fail)
-        replies = await caller.call_all(topics.ESTOP.of("*"), EstopRequest(latched=True))
-        assert [reply.service for reply in replies] == ["base"]
+        answers = await caller.call_all(topics.ESTOP.of("*"), EstopRequest(latched=True))
+        assert {answer.service: answer.error for answer in answers} == {"base": "", "arm": "no"}
+        assert [answer.reply.latch for answer in answers if answer.reply is not None] == ["latched"]

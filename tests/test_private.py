@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from cocoro import private
-from cocoro.bus.members import Membership, members
+from cocoro.bus.register import Membership, members
 from cocoro.errors import CocoroError, ConfigError
 from deploy.rundir import RunDir, robots
 from sim.wire.line import PseudoSerialPort
@@ -267,7 +267,7 @@ def test_a_file_that_cannot_be_written_whole_stays_as_it_was(tmp_path: Path, mon
 
 
 def test_a_held_file_that_says_nothing_is_held_by_somebody(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("deploy.rundir.LOOK_S", 0.01)
+    monkeypatch.setattr("cocoro.held_file.LOOK_S", 0.01)
     run_dir = RunDir("robbie", tmp_path)
     held = run_dir.claim("executive", ["executive"])
     for rubbish in (b"", b"\xff\x00", b"[" * 4096, b'{"name": 1}', b'{"name": "x", "pid": -7}', b'{"pid": 1e99}'):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from cocoro.clock import NS
-from cocoro.recent import Recent
+from cocoro.health import Recent
 
 
 def test_amounts_add_up_and_leave_the_window() -> None:

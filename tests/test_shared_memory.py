@@ -109,7 +109,7 @@ def test_what_may_not_be_locked_in_memory_is_said(place: Path, monkeypatch: pyte
 
 UNPRIVILEGED = """
 import os, resource, sys
-from cocoro.bus.pool import SharedPool
+from cocoro.bus.declared import SharedPool
 from cocoro.bus import shared
 try:
     resource.setrlimit(resource.RLIMIT_MEMLOCK, (int(sys.argv[1]), int(sys.argv[2])))

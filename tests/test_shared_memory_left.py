@@ -13,7 +13,7 @@ from namespace_rig import Namespace, needs_root
 from zenoh_rig import PATIENCE_S, PUBLISHER, held
 
 from cocoro.bus import shared
-from cocoro.bus.pool import SharedPool
+from cocoro.bus.declared import SharedPool
 
 
 @pytest.fixture

@@ -15,8 +15,8 @@ from pathlib import Path
 
 import pytest
 
-from cocoro.stop import asking as asking_module
-from cocoro.stop.asking import Asking, addresses
+from apps.cli import stop_asking as asking_module
+from apps.cli.stop_asking import Asking, addresses
 from cocoro.stop.path import PREFIX, StopPoint, listen
 
 PATIENCE_S = 60.0
@@ -57,12 +57,14 @@ def stop(robot: str | None, within_s: float = PATIENCE_S) -> Asking:
 
 def reached(asking: Asking) -> list[bool]:
     """For each stop point of the robot, whether the request has been delivered to it."""
-    return [point.told_s is not None for point in asking.points.values()]
+    return [point.sent_s is not None for point in asking.points.values()]
 
 
 def another_user(robot: str, code: str) -> subprocess.Popen[str]:
     """Some Python run by nobody (user 65534), without one variable of the environment; `robot` is its argument."""
-    imports = f"import os, socket, sys, time; sys.path.insert(0, {str(ROOT)!r}); from cocoro.stop.asking import Asking;"
+    imports = (
+        f"import os, socket, sys, time; sys.path.insert(0, {str(ROOT)!r}); from apps.cli.stop_asking import Asking;"
+    )
     become = "os.setgroups([]); os.setgid(65534); os.setuid(65534);"
     command = [sys.executable, "-I", "-S", "-c", imports + become + code, robot]
     return subprocess.Popen(command, env={}, cwd="/", stdout=subprocess.PIPE, text=True)
@@ -299,7 +301,7 @@ def test_a_caller_that_has_nearly_all_its_files_open_stops_the_robot(robot: str,
     code = (
         "import resource, time; hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1];"
         "resource.setrlimit(resource.RLIMIT_NOFILE, (min(3000, hard), hard));"
-        "from cocoro.stop.asking import Asking\nopen_files = []\n"
+        "from apps.cli.stop_asking import Asking\nopen_files = []\n"
         "try:\n  while True: open_files.append(open('/dev/null'))\nexcept OSError: pass\n"
         "del open_files[-int(sys.argv[2]):]\n"
         "a = Asking(sys.argv[1]); a.go_on(time.monotonic() + 60)\n"

@@ -32,7 +32,7 @@ def test_each_process_is_told_as_it_becomes_ready_and_all_stop_in_reverse_order(
     assert up.end(signal.SIGINT) == 0
     assert [line for line in up.lines if line.endswith(" stopped")] == ["pair stopped", "good stopped"]
     assert shell.run_dir.claims() == {}
-    assert "told to end" in shell.run_dir.log("good").read_text()
+    assert "ended by a signal" in shell.run_dir.log("good").read_text()
 
 
 def test_detached_it_stays_up_until_down_and_a_further_down_is_no_error(shell: Shell) -> None:
@@ -129,7 +129,7 @@ def test_run_joins_the_robot_that_is_up_and_ends_with_ctrl_c(shell: Shell) -> No
     run = shell.start("run", "once")
     run.until("joined the mesh")
     assert run.end(signal.SIGINT) == 0
-    assert run.lines[-1].endswith("once: told to end")
+    assert run.lines[-1].endswith("once: ended by a signal")
 
 
 def test_processes_do_not_outlive_a_killed_supervisor_and_the_robot_can_be_started_again(shell: Shell) -> None:

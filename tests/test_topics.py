@@ -9,8 +9,8 @@ import pytest
 
 from cocoro import topics
 from cocoro.bus.base import Qos
-from cocoro.bus.keys import matches
 from cocoro.installed import topic_named
+from cocoro.keys import matches
 from cocoro.messages import Message
 from cocoro.topics import REQUESTS, TOPICS
 

@@ -15,8 +15,8 @@ from cocoro.capture.former import todays_name, todays_payload
 from cocoro.capture.reader import Capture, Record
 from cocoro.capture.types import MADE_HERE, LossyFrame, NotReadableError
 from cocoro.errors import ConfigError, RefusedError
+from cocoro.keys import alive_key, service_of
 from cocoro.messages import ClockTick
-from cocoro.tokens import alive_key
 from cocoro.topics import ARM_STATE, BASE_STATE, CLOCK, FRAME, HAND_STATE, RECORDING
 from deploy import processes
 from services.capture.keys import KeyFilter
@@ -36,14 +36,14 @@ def played_keys(capture: Capture, only: Iterable[str], hardware: bool) -> frozen
     Raises ConfigError when that is nothing.
     """
     robot = capture.robot
-    recorders = {key.split("/")[1] for key in capture.keys if key.endswith(RECORDING.name.partition("}")[2])}
+    recorders = {service_of(key) for key in capture.keys if key.endswith(RECORDING.name.partition("}")[2])}
     choice = KeyFilter(robot, only)
     keys = {
         key
         for key, channels in capture.keys.items()
         if key in choice
         and key.startswith(f"{robot}/")
-        and key.split("/")[1] not in recorders
+        and service_of(key) not in recorders
         and any(capture.channels[channel].metadata.get("publisher") != MADE_HERE for channel in channels)
     }
     if hardware:
@@ -55,12 +55,12 @@ def played_keys(capture: Capture, only: Iterable[str], hardware: bool) -> frozen
 
 def services_of(keys: Iterable[str]) -> frozenset[str]:
     """Whose keys these are."""
-    return frozenset(key.split("/")[1] for key in keys)
+    return frozenset(service_of(key) for key in keys)
 
 
 async def refuse_if_alive(bus: Bus, robot: str, services: frozenset[str]) -> None:
     """Raises RefusedError when a robot of that name is there, or anyone whose keys are to be played."""
-    alive = {key.split("/")[1] for key in await bus.alive(f"{robot}/*/alive")}
+    alive = {service_of(key) for key in await bus.alive(alive_key(robot))}
     hardware = sorted(alive & {*processes.hardware(), SIMULATOR})
     if hardware:
         raise RefusedError(

@@ -16,11 +16,12 @@ from cocoro.bus import shared
 from cocoro.checks import Check, bad, note, ok
 from cocoro.component import Component, load, machine_checks
 from cocoro.errors import ConfigError
+from cocoro.held_file import Holder
 from cocoro.robot import Robot
 from deploy import profiles
 from deploy.processes import shared_bytes
 from deploy.profiles import Profile
-from deploy.rundir import Holder, RunDir
+from deploy.rundir import RunDir
 
 RULES = Path("/etc/udev/rules.d/99-cocoro.rules")
 ENOUGH_GB = 1.0

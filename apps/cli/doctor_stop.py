@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 
+from apps.cli.stop_asking import addresses
 from cocoro.checks import Check, bad, note, ok
-from cocoro.stop.asking import addresses
 from cocoro.stop.path import StopPoint
 from cocoro.stop.record import latch_dir, read
 

@@ -12,7 +12,7 @@ import time
 from typing import NamedTuple, TextIO
 
 from apps.cli import exits
-from cocoro.stop.asking import Asking, Point
+from apps.cli.stop_asking import Asking, Point
 
 STOPPABLE = ("base", "arm", "hand")
 """As `cocoro.topics` has it, which takes its time to import."""

@@ -14,6 +14,7 @@ from apps.cli.estop import STOPPABLE, StopResult
 from cocoro.bus.endpoints import ZenohConfig
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.errors import CallTimeoutError, CocoroError, MeshError
+from cocoro.keys import alive_key, service_of
 from cocoro.messages import EstopReply, EstopRequest
 from cocoro.topics import ESTOP
 from deploy.rundir import RunDir, robots
@@ -104,5 +105,5 @@ async def _ask(robot: str, bus: ZenohBus) -> dict[str, str]:
 
 async def _living(run_dir: RunDir, bus: ZenohBus) -> set[str]:
     """The services that are alive on the mesh, and those that a process here is, though it may have been stopped."""
-    tokens = await bus.alive(f"{run_dir.robot}/*/alive", ROUND_S)
-    return {token.split("/")[1] for token in tokens} | set(run_dir.claims())
+    tokens = await bus.alive(alive_key(run_dir.robot), ROUND_S)
+    return {service_of(token) for token in tokens} | set(run_dir.claims())

@@ -26,7 +26,7 @@ from apps.cli.options import JsonOption, KeyArgument, MeshOption, RobotChoice, R
 from apps.cli.terminal import table
 from cocoro.bus.base import Payload
 from cocoro.installed import topic_named
-from cocoro.source import ANY_HZ, Source
+from cocoro.stream_checks import ANY_HZ, SequenceTracker
 
 SHOW_S = 1.0
 SILENT_PERIODS = 3.0
@@ -82,7 +82,7 @@ class RateMeter:
         self._nominal_hz = nominal_hz
         self._window_s = window_s
         self._arrivals: deque[Arrival] = deque()
-        self._source = Source()
+        self._source = SequenceTracker()
 
     def hear(self, payload: Payload, at_s: float) -> None:
         try:

@@ -103,9 +103,8 @@ async def _frame(link: Link, joints: tuple[str, ...]) -> tuple[Frame, dict[str, 
         await within(FRAME_S, lambda: found(still=True) is not None, news)
         pair = found(still=True) or found(still=False)
     finally:
-        for inbox in (camera, servos):
-            assert inbox.subscription is not None
-            inbox.subscription.close()
+        for topic in (FRAME, ARM_STATE):
+            link.drop(topic)
     if pair is None:
         missing = "frame from the camera" if not frames else "word from the arm's servos about the head"
         raise MeshError(f"no {missing} within {FRAME_S:g} s: `cocoro status` tells more")

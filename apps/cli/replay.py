@@ -25,6 +25,7 @@ from cocoro.bus.zenoh import ZenohBus
 from cocoro.capture.conventions import CaptureError
 from cocoro.capture.reader import Capture
 from cocoro.errors import ConfigError, RefusedError
+from cocoro.keys import alive_key, service_of
 from deploy import processes
 from deploy.rundir import RunDir
 
@@ -101,12 +102,12 @@ async def _play(bus: ZenohBus, capture: Capture, player: Player, hardware: bool,
     intruder: list[str] = []
 
     def on_alive(key: str, alive: bool) -> None:
-        service = key.split("/")[1]
+        service = service_of(key)
         if alive and service in ({SIMULATOR} if hardware else services | {*processes.hardware(), SIMULATOR}):
             intruder.append(service)
             end.set()
 
-    watch = bus.watch_alive(f"{capture.robot}/*/alive", on_alive)
+    watch = bus.watch_alive(alive_key(capture.robot), on_alive)
     work = asyncio.ensure_future(replaying.run())
     with (
         _keyboard(lambda text: _handle_key(text, player, replaying, end)) as has_keys,

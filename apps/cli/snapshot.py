@@ -6,7 +6,7 @@ import asyncio
 import sys
 from collections import OrderedDict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -14,7 +14,6 @@ from apps.cli import exits
 from apps.cli.link import Link, joined, within
 from apps.cli.options import MeshOption, RobotChoice, RobotOption
 from cocoro.errors import ConfigError, MeshError
-from cocoro.inbox import Inbox
 from cocoro.messages import Detections, Frame
 from cocoro.topics import DETECTIONS, FRAME
 
@@ -60,7 +59,6 @@ class SnapshotTaker:
 
     def __init__(self, link: Link) -> None:
         self._link = link
-        self._inboxes: list[Inbox[Any]] = []
         self._frames: OrderedDict[tuple[int, int], Frame] = OrderedDict()
         self._pair: tuple[Frame, Detections] | None = None
         self._changed = asyncio.Event()
@@ -69,7 +67,6 @@ class SnapshotTaker:
         frames, detections = self._link.inbox(FRAME), self._link.inbox(DETECTIONS)
         frames.add(lambda _key, frame: self._on_frame(frame))
         detections.add(lambda _key, seen: self._on_detections(seen))
-        self._inboxes = [frames, detections]
 
     async def write(self, out: Path) -> str:
         """Writes the picture, closes, and returns a line about it. Raises MeshError when the robot sends no frames."""
@@ -78,9 +75,8 @@ class SnapshotTaker:
                 raise MeshError(f"no frame from the camera within {FRAME_S:g} s: see `cocoro status`")
             await within(DETECTIONS_S, lambda: self._pair is not None, self._changed)
         finally:
-            for inbox in self._inboxes:
-                assert inbox.subscription is not None
-                inbox.subscription.close()
+            for topic in (FRAME, DETECTIONS):
+                self._link.drop(topic)
         frame, detections = self._pair or (next(reversed(self._frames.values())), None)
         _write(out, frame, detections)
         if detections is None:

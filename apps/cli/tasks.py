@@ -17,12 +17,11 @@ from apps.cli.options import RobotChoice
 from apps.cli.output import going_on
 from apps.cli.progress import TaskDisplay, task_display
 from apps.cli.snapshot import SnapshotTaker, check
-from cocoro.contact import Contact
+from cocoro.contact import RECOVERY_S, Contact, SleepDetector
 from cocoro.errors import CallTimeoutError, CocoroError
 from cocoro.messages import CancelRequest, TaskReply, TaskRequest, TaskState
 from cocoro.tasks import Task
 from cocoro.topics import CANCEL, LATCH, RUN, TASK
-from cocoro.vigil import RECOVERY_S, Vigil
 
 USAGE_REFUSALS = ("unknown_label", "not_graspable", "bad_request")
 """Refusals that are the operator's mistake, not the robot's state."""
@@ -43,7 +42,8 @@ async def run(where: RobotChoice, request: TaskRequest, as_json: bool, picture: 
     if picture is not None:
         check(picture)
     async with joined(where, frames=picture is not None) as link:
-        follower = Follower(link, request, task_display(as_json), picture, Contact(link.run_dir.claimant_pid, Vigil()))
+        contact = Contact(link.run_dir.claimant_pid, SleepDetector())
+        follower = Follower(link, request, task_display(as_json), picture, contact)
         with on_interrupt(follower.interrupt), going_on():
             code, result = await follower.run()
     if as_json:
@@ -94,14 +94,14 @@ class Follower:
         """The exit code, and the result as data."""
         news = self._link.inbox(TASK)  # before the call, so that nothing is missed
         news.add(lambda _key, state: self._news.put_nowait(state))
-        alive = self._link.watch_alive(EXECUTIVE, self._on_alive)
+        alive = self._link.watch_alive(self._on_alive, EXECUTIVE)
         reply = await self._ask()
         if not reply.accepted:
             return self._refused(reply)
         self._task_id = reply.task_id
         beside = [asyncio.create_task(self._cancel_when_interrupted())]
-        if self._contact.vigil is not None:
-            beside.append(asyncio.create_task(self._contact.vigil.keep()))
+        if self._contact.sleep_detector is not None:
+            beside.append(asyncio.create_task(self._contact.sleep_detector.keep()))
         try:
             state = await self._follow()
         finally:
@@ -111,7 +111,7 @@ class Follower:
                 task.cancel()
         return self._outcome(state)
 
-    def _on_alive(self, alive: bool) -> None:
+    def _on_alive(self, _service: str, alive: bool) -> None:
         if alive:
             self._contact.met(EXECUTIVE)
         self._news.put_nowait(alive)

@@ -20,9 +20,9 @@ from apps.cli.link import Link, joined, within
 from apps.cli.options import JsonOption, MeshOption, RobotChoice, RobotOption
 from apps.cli.status import expected
 from apps.cli.top_view import Screen, print_report
-from cocoro.bus.keys import matches
 from cocoro.component import Component
 from cocoro.installed import topic_named
+from cocoro.keys import matches
 from cocoro.messages import Health, Message, TopicHealth
 from cocoro.topics import BASE_STATE, CLOCK, HEALTH, LATCH, PLAN, TASK, Topic
 from deploy import processes
@@ -97,15 +97,14 @@ class MeshWatch:
         link.inbox(HEALTH.of("*")).add(lambda _key, health: self._on_health(health))
         for what, topic in NEWS.items():
             link.inbox(topic).add(partial(self._on_news, what))
-        link.bus.watch_alive(f"{link.robot}/*/alive", self._on_alive)
+        link.watch_alive(self._on_alive)
 
     async def first(self) -> None:
         """Waits for the health of every live service, at most FIRST_S."""
         self._alive |= set(await self._link.alive())
         await within(FIRST_S, lambda: self._alive <= set(self._health), self._changed)
 
-    def _on_alive(self, key: str, alive: bool) -> None:
-        service = key.split("/")[1]
+    def _on_alive(self, service: str, alive: bool) -> None:
         (self._alive.add if alive else self._alive.discard)(service)
         self._changed.set()
 

@@ -32,6 +32,7 @@ from cocoro.robot import Robot
 from cocoro.stepper import Stepper
 from cocoro.tasks import Task
 from cocoro.vloop import run_virtual
+from deploy.delayed import DelayedNode
 from deploy.processes import named, needs
 from sim.judge import Judge, PursuitJudge
 from sim.random_scene import find_scene
@@ -99,7 +100,7 @@ class LockstepCycle:
                 await plan(planner.now_ns())
 
 
-class LockstepNode(Node):
+class LockstepNode(DelayedNode):
     """A node whose core is driven by the cycle."""
 
     cycle: LockstepCycle
@@ -146,7 +147,7 @@ class _Rehearsal:
                     settings["needed"] = needs(name)
                 config = msgspec.convert(settings, component.config)
                 lockstep = request.lockstep and name in LockstepCycle.ORDER
-                kind = LockstepNode if lockstep else Node
+                kind = LockstepNode if lockstep else DelayedNode
                 node = kind(
                     name, mesh.join(), clock, robot, latency_s=request.latency.get(name, 0.0),
                     record_steps=request.record is not None, module=row.module, config=config,

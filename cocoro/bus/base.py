@@ -1,23 +1,28 @@
-"""The one seam to the mesh. Two implementations, neither special: `zenoh` (processes) and `local` (one
-process, virtual time). One conformance suite runs against both.
+"""The interface to the mesh. Two implementations: `zenoh` (between processes) and `local` (one process, virtual time).
+One conformance suite (tests/test_bus_*.py) runs against both.
 
-A bus moves bytes between keys and calls back in the event loop's thread; meaning (types, ages, sequence
-numbers) is the node's. `<robot>/*/health`: in a key expression `*` stands for one chunk and `**` for any number.
+A bus moves bytes between keys and calls back in the event loop's thread. Types, ages and sequence numbers are the
+node's. For keys and key expressions see `cocoro.keys`.
 """
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Awaitable, Callable
 from enum import Enum
 from typing import NamedTuple, Protocol
 
+from cocoro.errors import CocoroError
+
+log = logging.getLogger(__name__)
+
 Payload = bytes | memoryview
 OnSample = Callable[[str, Payload], None]
-"""Gets the key and the payload, in the loop's thread. The payload stays valid for as long as it is referenced."""
+"""Called with key and payload, in the loop's thread. The payload stays valid for as long as it is referenced."""
 OnAlive = Callable[[str, bool], None]
-"""Gets the key of a liveliness token and whether it lives. Called at once for tokens that live already."""
+"""Called with the key of a liveliness token and whether it lives; first for every token that lives already."""
 Server = Callable[[str, Payload], Awaitable[bytes]]
-"""Answers a request. Raising cocoro.errors.CocoroError answers with an error whose text the caller gets."""
+"""Answers a request. Raises cocoro.errors.CocoroError to answer with an error; the caller gets its text."""
 
 
 class Qos(Enum):
@@ -33,74 +38,73 @@ class Qos(Enum):
     """Reliable and ordered; nothing is dropped silently."""
 
 
-class Heard(NamedTuple):
-    """A sample, for who listens to everything."""
+class Received(NamedTuple):
+    """One sample, as a listener to all keys gets it."""
 
     key: str
     payload: Payload
-    heard_ns: int
-    """When it came in: by `cocoro.boottime` between processes, by the loop's time within one."""
+    received_ns: int
+    """Time of arrival: `cocoro.clock.steady_ns` on zenoh, the loop's time on the local bus."""
 
 
-OnLot = Callable[[list[Heard]], None]
-"""Gets samples in the loop's thread, in the order in which they came."""
+OnBatch = Callable[[list[Received]], None]
+"""Called with samples in order of arrival, in the loop's thread."""
 
 
 class Reply(NamedTuple):
     key: str
     ok: bool
     payload: bytes
-    """The answer, or UTF-8 text of the error."""
+    """The encoded answer, or the error's text in UTF-8."""
 
 
 class Handle(Protocol):
-    """Something declared on the bus; `close` takes it back (twice is once)."""
+    """Something declared on the bus. `close` undeclares it; closing twice is allowed."""
 
     def close(self) -> None: ...
 
 
 class RawPublisher(Handle, Protocol):
     def put(self, payload: Payload) -> None:
-        """Send; never blocks the loop noticeably, never raises for want of subscribers."""
+        """Sends. Does not block the loop noticeably, and does not raise when there is no subscriber."""
 
     @property
     def trouble(self) -> str:
-        """Why samples cost more than they should, in words; empty when all is well."""
+        """Why samples cost more than they should; empty when they do not."""
 
 
 class Subscription(Handle, Protocol):
     @property
     def skipped(self) -> int:
-        """Samples that newer ones overwrote before the loop got to them."""
+        """Samples that newer ones replaced before the loop read them."""
 
 
 class Bus(Protocol):
     @property
     def where(self) -> str:
-        """In words, for errors: 'tcp/127.0.0.1:7447', 'in this process'."""
+        """The mesh's place, for error messages: 'tcp/127.0.0.1:7447', 'in this process'."""
 
     def new_incarnation(self) -> int:
-        """A number that no other start of a publisher on this mesh has; deterministic on the local bus."""
+        """A number that no other publisher on this mesh has, for one start of a publisher. The local bus counts."""
 
     def publisher(self, key: str, qos: Qos) -> RawPublisher: ...
 
     def subscribe(self, keyexpr: str, qos: Qos, handler: OnSample, *, depth: int) -> Subscription:
-        """`depth` bounds what may wait for the loop, per key; beyond it the oldest is dropped and counted.
-        Order per key is kept. Qos.EVENT: nothing is dropped."""
+        """At most `depth` samples per key wait for the loop; beyond it the oldest is dropped and counted. Order per key
+        is kept. With Qos.EVENT nothing is dropped."""
 
-    def listen(self, keyexpr: str, handler: OnLot, every_s: float) -> Handle:
-        """All that travels there; nothing is dropped. It comes in lots, one in `every_s` at most, since waking the loop
-        for each of a thousand samples a second would cost more than all that is done with them. Closing it gives
-        the handler what has come until then."""
+    def listen(self, keyexpr: str, handler: OnBatch, every_s: float) -> Handle:
+        """Receives all samples, in batches at most every `every_s`; nothing is dropped. Batches, because waking the
+        loop for each of a thousand samples a second costs more than handling them. Closing delivers what waits."""
 
     def serve(self, key: str, server: Server) -> Handle: ...
 
     async def call(self, keyexpr: str, payload: bytes, timeout_s: float) -> list[Reply]:
-        """Ask everyone who serves a matching key. Returns the answers when all have answered or the time is over;
-        raises cocoro.errors.CallTimeoutError when by then none has. An empty list means that nobody serves it."""
+        """Sends a request to every server with a matching key. Returns the answers when all have answered or the time
+        is over; an empty list when there is no server. Raises CallTimeoutError when none has answered in time."""
 
     def declare_alive(self, key: str) -> Handle:
-        """A liveliness token: it vanishes with this process, however it ends."""
+        """Declares a liveliness token: it vanishes with this process, however that ends."""
 
     def watch_alive(self, keyexpr: str, handler: OnAlive) -> Handle: ...
 
@@ -108,4 +112,16 @@ class Bus(Protocol):
         """The keys of the matching tokens that live now."""
 
     async def close(self) -> None:
-        """Take everything back and leave the mesh; afterwards nothing calls back."""
+        """Undeclares everything and leaves the mesh; no callback is called afterwards."""
+
+
+async def answer(server: Server, key: str, payload: Payload) -> Reply:
+    """Calls a server. A CocoroError's text goes to the caller; any other exception is a bug, logged here and named to
+    the caller as an internal error."""
+    try:
+        return Reply(key, True, bytes(await server(key, payload)))
+    except CocoroError as error:
+        return Reply(key, False, str(error).encode())
+    except Exception as error:
+        log.exception("the server of %s failed", key)
+        return Reply(key, False, f"internal error: {type(error).__name__}: {error}".encode())

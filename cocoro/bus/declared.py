@@ -1,4 +1,4 @@
-"""What a zenoh bus has declared: publishers, subscriptions, servers, tokens. Each can be taken back by itself."""
+"""What a zenoh bus declares: publishers, subscriptions, servers, tokens; and the shared memory of one publisher."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from functools import partial
 from typing import Any
 
 import zenoh
+from zenoh import shm
 
+from cocoro.bus import shared
 from cocoro.bus.base import Payload, Qos
-from cocoro.bus.lots import Lots
-from cocoro.bus.outbox import Outbox
-from cocoro.bus.pool import SharedPool
-from cocoro.bus.ring import Ring
+from cocoro.bus.queues import Batches, Outbox, Ring
+from cocoro.bus.shared import POOL_BYTES, PROCESS_BYTES
 
 _DROP, _BLOCK = zenoh.CongestionControl.DROP, zenoh.CongestionControl.BLOCK
 QOS: dict[Qos, dict[str, Any]] = {
@@ -22,24 +22,68 @@ QOS: dict[Qos, dict[str, Any]] = {
     Qos.EVENT: {"priority": zenoh.Priority.DATA, "congestion_control": _BLOCK, "express": False},
     Qos.FRAME: {"priority": zenoh.Priority.BACKGROUND, "congestion_control": _DROP, "express": False},
 }
-"""Express samples are sent at once and alone; others may share a packet with those that follow. A key that drops
-does so when a receiver does not read, and then waits for 1 ms at most; one that blocks is put by an `Outbox`."""
+"""Express samples are sent at once, each in a packet of its own; others may share a packet with those that follow. A
+key that drops does so when a receiver does not read, after at most 1 ms; one that blocks is put by an `Outbox`."""
+POLICY = shm.Defragment(shm.GarbageCollect(safe=False))
+"""Reclaims free memory, and memory that a stopped receiver still holds. When that receiver goes on, it finds its
+samples invalid (see `read`)."""
+
+
+class SharedPool:
+    """Shared memory of one publisher. It is made and mapped at once, so that the first sample is as fast as the
+    rest."""
+
+    def __init__(self) -> None:
+        self.missed = 0
+        """Samples that were copied through sockets because the pool was full."""
+        self.trouble = shared.obstacle(POOL_BYTES + PROCESS_BYTES)
+        """Why there is no shared memory; empty when there is. Decided once, when the publisher is made."""
+        self._provider: shm.ShmProvider | None = None
+        if not self.trouble:
+            try:
+                self._provider = shm.ShmProvider.default_backend(POOL_BYTES)
+                self.hold(b"warm")
+            except zenoh.ZError as error:  # other processes have filled it since
+                self._provider = None
+                shared.drop_failed()
+                self.trouble = shared.obstacle(POOL_BYTES + PROCESS_BYTES) or str(error)
+
+    def hold(self, data: bytes) -> zenoh.ZBytes | bytes:
+        """The data in shared memory; `data` itself when there is none, or no room."""
+        if self._provider is None:
+            return data
+        try:
+            buffer = self._provider.alloc(len(data), POLICY)
+        except zenoh.ZError:
+            self.missed += 1
+            return data
+        buffer[:] = data
+        return zenoh.ZBytes(buffer)
+
+
+def read(payload: zenoh.ZBytes) -> bytes | None:
+    """The bytes of a sample; None when its shared memory was reclaimed before it was read."""
+    data = payload.to_bytes()
+    held = payload.as_shm()
+    if held is not None and not held.is_valid():
+        return None
+    return data
 
 
 class Declared:
-    """Something declared on a session, with the ring that its samples come through, if it receives."""
+    """Something declared on a session, with the queue that its samples pass through when it receives."""
 
-    def __init__(self, declaration: Any, ring: Ring[Any] | Lots[Any] | None = None) -> None:
+    def __init__(self, declaration: Any, queue: Ring[Any] | Batches[Any] | None = None) -> None:
         self.on_close: Callable[[Declared], None] = lambda _: None
         self._declaration = declaration
-        self._ring = ring
+        self._queue = queue
         self._closed = False
 
     def mute(self) -> None:
-        """Nothing goes through any more, though zenoh still knows of it."""
+        """Stops all delivery; the session still knows the declaration."""
         self._closed = True
-        if self._ring is not None:
-            self._ring.close()
+        if self._queue is not None:
+            self._queue.close()
 
     def close(self) -> None:
         if self._closed:
@@ -54,13 +98,13 @@ class Declared:
 
 
 class ZenohListening(Declared):
-    def __init__(self, subscriber: zenoh.Subscriber[None], lots: Lots[Any]) -> None:
-        super().__init__(subscriber, lots)
-        self._lots = lots
+    def __init__(self, subscriber: zenoh.Subscriber[None], batches: Batches[Any]) -> None:
+        super().__init__(subscriber, batches)
+        self._batches = batches
 
     def close(self) -> None:
         if not self._closed:
-            self._lots.deliver()
+            self._batches.deliver()
         super().close()
 
 
@@ -103,7 +147,7 @@ class ZenohPublisher(Declared):
             self._declaration.put(data)
 
     def _undeclare(self) -> None:
-        if self._outbox is not None:  # after what waits there
+        if self._outbox is not None:  # after the samples that wait there
             self._outbox.put(super()._undeclare, 0)
         else:
             super()._undeclare()

@@ -1,7 +1,7 @@
-"""The bus of one process: deterministic, no threads, for virtual time and for tests.
+"""The bus within one process: deterministic, no threads, for virtual time and for tests.
 
-A `LocalMesh` is the network; each participant joins it for a bus of its own, so that one can leave, or be killed
-(`kill`), and the others see what they would see on a real mesh.
+A `LocalMesh` is the network. Each participant joins it and gets its own bus, so one can leave or be killed (`kill`)
+and the others see what they would see on a real mesh.
 """
 
 from __future__ import annotations
@@ -10,17 +10,16 @@ import asyncio
 from collections import defaultdict, deque
 from typing import TypeVar
 
-from cocoro.bus.answer import answer
-from cocoro.bus.base import Handle, Heard, OnAlive, OnLot, OnSample, Payload, Qos, Reply, Server
-from cocoro.bus.keys import matches
+from cocoro.bus.base import Handle, OnAlive, OnBatch, OnSample, Payload, Qos, Received, Reply, Server, answer
 from cocoro.clock import NS
 from cocoro.errors import CallTimeoutError
+from cocoro.keys import matches
 
 D = TypeVar("D", bound=Handle)
 
 
 class LocalMesh:
-    """What the participants share. `transport_s` is the time that a sample takes from put to callback."""
+    """The state shared by all participants. `transport_s` is the time from put to callback of a sample."""
 
     def __init__(self, transport_s: float = 0.0) -> None:
         self.transport_s = transport_s
@@ -46,7 +45,7 @@ class LocalMesh:
             subscription.offer(key, payload)
 
     def changed(self) -> None:
-        """A subscription came or went."""
+        """Call it when a subscription was added or removed."""
         self._matching.clear()
 
     def token(self, key: str, change: int) -> None:
@@ -59,7 +58,7 @@ class LocalMesh:
 
 
 class LocalSubscription:
-    """A ring per key between `put` and the loop, as on the real mesh."""
+    """A ring per key between `put` and the handler, as on the real mesh."""
 
     def __init__(self, mesh: LocalMesh, keyexpr: str, qos: Qos, handler: OnSample, depth: int) -> None:
         self.keyexpr = keyexpr
@@ -107,13 +106,13 @@ class LocalSubscription:
 
 
 class LocalListening(LocalSubscription):
-    """No time passes between samples that could be saved: each is a lot."""
+    """A listener; waking a virtual loop costs nothing, so each sample is a batch by itself."""
 
-    def __init__(self, mesh: LocalMesh, keyexpr: str, handler: OnLot) -> None:
+    def __init__(self, mesh: LocalMesh, keyexpr: str, handler: OnBatch) -> None:
         loop = asyncio.get_running_loop()
 
         def hear(key: str, payload: Payload) -> None:
-            handler([Heard(key, payload, round(loop.time() * NS))])
+            handler([Received(key, payload, round(loop.time() * NS))])
 
         super().__init__(mesh, keyexpr, Qos.EVENT, hear, depth=1)
 
@@ -203,7 +202,7 @@ class LocalBus:
     def subscribe(self, keyexpr: str, qos: Qos, handler: OnSample, *, depth: int) -> LocalSubscription:
         return self._keep(LocalSubscription(self.mesh, keyexpr, qos, handler, depth))
 
-    def listen(self, keyexpr: str, handler: OnLot, every_s: float) -> Handle:
+    def listen(self, keyexpr: str, handler: OnBatch, every_s: float) -> Handle:
         return self._keep(LocalListening(self.mesh, keyexpr, handler))
 
     def serve(self, key: str, server: Server) -> Handle:
@@ -222,7 +221,7 @@ class LocalBus:
         return replies
 
     def answer(self, serving: _Serving, payload: bytes) -> asyncio.Task[Reply]:
-        """This participant's part of a call; its end, not the caller's, is what cancels it."""
+        """Answers a call as this participant. Closing this bus cancels the task; the caller's end does not."""
         task = asyncio.create_task(answer(serving.server, serving.key, bytes(payload)))
         self._answers.add(task)
         task.add_done_callback(self._answers.discard)
@@ -238,7 +237,7 @@ class LocalBus:
         return sorted(key for key, count in self.mesh.tokens.items() if count > 0 and matches(keyexpr, key))
 
     def kill(self) -> None:
-        """Leave as a killed process does: at once, with requests unanswered."""
+        """Leaves as a killed process does: at once, with requests unanswered."""
         for declared in reversed(self._declared):
             declared.close()
         self._declared.clear()

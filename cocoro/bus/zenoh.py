@@ -1,7 +1,7 @@
-"""The bus between processes, on zenoh. Nothing here blocks the event loop, and leaving never hangs.
+"""The bus between processes, on zenoh. Nothing here blocks the event loop, and leaving the mesh never hangs.
 
-Zenoh calls back in threads of its own. They only put what arrives into a `Ring`; bytes are copied out of (shared)
-memory in the loop's thread, and only those that are still wanted then.
+Zenoh calls back in its own threads. The callbacks only queue what arrives (`Ring`, `Batches`). The loop's thread
+copies the bytes out of (shared) memory, and only those of samples that were not replaced by newer ones.
 """
 
 from __future__ import annotations
@@ -19,18 +19,14 @@ from typing import TypeVar
 import zenoh
 from zenoh.handlers import Callback
 
-from cocoro.boottime import boottime_ns
-from cocoro.bus.answer import answer
-from cocoro.bus.base import Heard, OnAlive, OnLot, OnSample, Qos, Reply, Server
-from cocoro.bus.declared import QOS, Declared, ZenohListening, ZenohPublisher, ZenohSubscription
+from cocoro.bus.base import OnAlive, OnBatch, OnSample, Qos, Received, Reply, Server, answer
+from cocoro.bus.declared import QOS, Declared, SharedPool, ZenohListening, ZenohPublisher, ZenohSubscription, read
 from cocoro.bus.endpoints import ZenohConfig
-from cocoro.bus.lots import Lots
-from cocoro.bus.members import Membership, members, new_identity
-from cocoro.bus.outbox import Outbox
-from cocoro.bus.pool import SharedPool, read
-from cocoro.bus.ring import Ring
+from cocoro.bus.queues import Batches, Outbox, Ring
+from cocoro.bus.register import Membership, members, new_identity
 from cocoro.bus.session import LEAVE_S, Opened, close_session, exit_guard, in_thread, no_mesh, open_session, options
 from cocoro.bus.shared import COSTS
+from cocoro.clock import steady_ns
 from cocoro.errors import CallTimeoutError, MeshError
 from cocoro.private import FullError
 
@@ -38,15 +34,15 @@ log = logging.getLogger(__name__)
 D = TypeVar("D", bound=Declared)
 
 MEMBER = "@cocoro/member"
-"""Each member holds a token there by its zenoh id. No wildcard matches a chunk with '@', so nobody else sees it."""
+"""Each member declares a token below it, named by its zenoh id. No wildcard matches a chunk with '@'."""
 LOOK_AGAIN_S = 0.05
-"""How often one who joins looks whether those that it waits for are still there."""
+"""How often a joining process checks whether the members that it waits for are still registered."""
 LATER_S = 1.0
-"""Zenoh's time-outs come this much after ours, since what zenoh says then looks like an answer."""
+"""Zenoh's time-outs are this much later than ours, since zenoh reports a time-out as an answer."""
 
 
 class ZenohBus:
-    """One process's place in the mesh. Make it with `await ZenohBus.open(config)`, best in `async with`."""
+    """One process's membership of the mesh. Make it with `await ZenohBus.open(config)`, best in `async with`."""
 
     def __init__(self, config: ZenohConfig, opened: Opened, membership: Membership | None) -> None:
         self._config = config
@@ -64,11 +60,11 @@ class ZenohBus:
 
     @classmethod
     async def open(cls, config: ZenohConfig, *, expect_mesh: bool = False) -> ZenohBus:
-        """Join the mesh. When this returns, what its members have declared is known: a first call reaches them all.
+        """Joins the mesh. On return the declarations of all members are known, so a first call reaches them all.
 
-        With `expect_mesh` somebody must be there already: MeshError, after `config.patience_s` at the latest, when
-        nobody is. Then it needs no room in the mesh's directory: where that is full it only connects, and is not
-        found by who comes later. ConfigError when the configuration cannot be, FullError when there is no room.
+        With `expect_mesh` a member must exist already: raises MeshError within `config.patience_s` when none does. It
+        then needs no room in the mesh's directory: where that is full it connects to the members, but members that
+        join later do not connect to it. Raises ConfigError for a wrong configuration, FullError without room.
         """
         membership, identity = None, new_identity()
         listen, connect = list(config.listen), list(config.connect)
@@ -92,7 +88,7 @@ class ZenohBus:
         return bus
 
     async def _settle(self, identity: str, expect_mesh: bool) -> None:
-        """Wait for the members' tokens: each declares its own after all else, and declarations arrive in order."""
+        """Waits for the members' tokens: each declares its own last, and declarations arrive in order."""
         if self._membership is not None:
             awaited = {other.identity: f"{other.name} (process {other.pid})" for other in self._membership.others}
         else:
@@ -118,7 +114,7 @@ class ZenohBus:
         self.declare_alive(f"{MEMBER}/{identity}")
 
     def _forget_gone(self, awaited: dict[str, str]) -> None:
-        """Some may leave before they have answered."""
+        """Stops waiting for members that have left."""
         if awaited and self._config.directory is not None:
             there = {member.identity for member in members(self._config.directory)}
             for identity in awaited.keys() - there:
@@ -161,19 +157,19 @@ class ZenohBus:
         subscriber = self._session.declare_subscriber(keyexpr, Callback(on_sample, indirect=False))
         return self._keep(ZenohSubscription(subscriber, ring))
 
-    def listen(self, keyexpr: str, handler: OnLot, every_s: float) -> ZenohListening:
+    def listen(self, keyexpr: str, handler: OnBatch, every_s: float) -> ZenohListening:
         def deliver(samples: list[tuple[zenoh.Sample, int]]) -> None:
-            found = ((str(sample.key_expr), read(sample.payload), heard_ns) for sample, heard_ns in samples)
-            handler([Heard(key, data, heard_ns) for key, data, heard_ns in found if data is not None])
+            found = ((str(sample.key_expr), read(sample.payload), received_ns) for sample, received_ns in samples)
+            handler([Received(key, data, at_ns) for key, data, at_ns in found if data is not None])
 
-        lots = Lots(self._loop, deliver, every_s)
-        push = lots.push
+        batches = Batches(self._loop, deliver, every_s)
+        push = batches.push
 
         def on_sample(sample: zenoh.Sample) -> None:
-            push((sample, boottime_ns()))
+            push((sample, steady_ns()))
 
         return self._keep(
-            ZenohListening(self._session.declare_subscriber(keyexpr, Callback(on_sample, indirect=False)), lots)
+            ZenohListening(self._session.declare_subscriber(keyexpr, Callback(on_sample, indirect=False)), batches)
         )
 
     def serve(self, key: str, server: Server) -> Declared:
@@ -196,7 +192,7 @@ class ZenohBus:
             if reply.ok is not None:
                 replies.append(Reply(str(reply.ok.key_expr), True, reply.ok.payload.to_bytes()))
             elif reply.err is not None:
-                # An error has no key; `_answer` says it in the encoding's schema.
+                # An error reply has no key; `_answer` puts it into the encoding's schema.
                 key = str(reply.err.encoding).partition(";")[2]
                 replies.append(Reply(key, False, reply.err.payload.to_bytes()))
 
@@ -248,7 +244,7 @@ class ZenohBus:
         return sorted(keys)
 
     async def _until_final(self, ask: Callable[[Callable[[], None]], None], timeout_s: float) -> None:
-        """Ask, and wait until zenoh says that everyone has answered; TimeoutError when it does not by then."""
+        """Asks, and waits until zenoh reports that all have answered. Raises TimeoutError when it does not in time."""
         everyone = asyncio.Event()
 
         def final() -> None:
@@ -274,10 +270,10 @@ class ZenohBus:
             async with asyncio.timeout(LEAVE_S):
                 await in_thread(self._leave)
         except TimeoutError:
-            log.warning("leaving the mesh at %s takes more than %g s: given up", self.where, LEAVE_S)
+            log.warning("leaving the mesh at %s took more than %g s; gave up waiting", self.where, LEAVE_S)
 
     def _leave(self) -> None:
-        """Blocks; from any thread, and once."""
+        """Leaves the mesh; blocks. From any thread; only the first call does anything."""
         with self._leaving:
             if self._left:
                 return
@@ -309,12 +305,12 @@ def _join(directory: Path, name: str, visit: bool) -> Membership:
     except FullError as error:
         if not visit:
             raise
-        log.warning("%s; until then, services that start from now on are not seen here", error)
+        log.warning("%s; until then, services that start from now on are not seen by this command", error)
         return Membership.visit(directory, name)
 
 
 async def _answer(server: Server, key: str, query: zenoh.Query) -> None:
-    with query:  # the caller waits until it is dropped
+    with query:  # dropping the query ends the caller's wait
         reply = await answer(server, key, query.payload.to_bytes() if query.payload is not None else b"")
         with contextlib.suppress(zenoh.ZError):  # the caller has gone, or the session has ended
             if reply.ok:

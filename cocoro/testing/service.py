@@ -14,12 +14,12 @@ from cocoro.bus.base import Handle
 from cocoro.bus.local import LocalMesh
 from cocoro.clock import NS, Clock, VirtualClock
 from cocoro.component import Component, Implementation, load
+from cocoro.keys import alive_key
 from cocoro.messages import Message, TopicHealth
 from cocoro.node import Node
 from cocoro.robot import Robot
 from cocoro.testing.tap import Tap
 from cocoro.testing.virtual import settle
-from cocoro.tokens import alive_key
 from cocoro.topics import Request, Topic
 
 M = TypeVar("M", bound=Message)
@@ -39,7 +39,6 @@ class ServiceUnderTest:
         robot: Robot | None = None,
         clock: Clock | None = None,
         mesh: LocalMesh | None = None,
-        latency_s: float = 0.0,
         record_steps: bool = False,
         latches: Path | None = None,
     ) -> None:
@@ -61,7 +60,7 @@ class ServiceUnderTest:
         self._clock = clock or VirtualClock()
         self._bus = self.mesh.join()
         self.node = Node(
-            self.name, self._bus, self._clock, self.robot, latency_s=latency_s, record_steps=record_steps,
+            self.name, self._bus, self._clock, self.robot, record_steps=record_steps,
             module=module, config=self._config, latches=latches,
         )  # fmt: skip
         self.tester = Node("tester", self.mesh.join(), self._clock, self.robot)

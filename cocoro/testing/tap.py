@@ -9,8 +9,8 @@ import msgspec
 from cocoro.bus.base import Payload, Qos
 from cocoro.bus.local import LocalBus
 from cocoro.installed import topic_named
+from cocoro.keys import recorder_key
 from cocoro.messages import Message
-from cocoro.tokens import recorder_key
 from cocoro.topics import Topic
 
 M = TypeVar("M", bound=Message)

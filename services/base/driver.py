@@ -5,9 +5,9 @@ from __future__ import annotations
 import msgspec
 
 from cocoro.clock import NS, is_fresh
+from cocoro.health import WINDOW_S, Recent
 from cocoro.messages import BaseCommand, BaseState, LatchState
 from cocoro.odometry import Odometry, WheelRamp
-from cocoro.recent import WINDOW_S, Recent
 from cocoro.robot import Base
 from cocoro.topics import BASE_COMMAND
 from services.base import oi

@@ -11,10 +11,10 @@ import msgspec
 import numpy as np
 
 from cocoro.bus.base import Qos
-from cocoro.bus.keys import matches
 from cocoro.capture.types import JSON, MADE_HERE, MSGPACK, OTHER, Alive, LossyFrame, TypeSchema, schema_of
 from cocoro.errors import ConfigError
 from cocoro.installed import topic_named
+from cocoro.keys import matches
 from cocoro.messages import Frame, Message
 from cocoro.topics import FRAME, TOPICS
 

@@ -9,8 +9,7 @@ from typing import NamedTuple
 
 import msgspec
 
-from cocoro.boottime import boottime_ns
-from cocoro.clock import NS
+from cocoro.clock import NS, steady_ns
 
 WALL_CLOCK = "wall_clock"
 """The metadata record that tells how the wall clock was set while the recording went on."""
@@ -41,7 +40,7 @@ class _Reading(NamedTuple):
 class LogClock:
     """`at` gives a message its log time. `look` from time to time, to notice that the wall clock has been set."""
 
-    def __init__(self, wall_ns: Callable[[], int] = time.time_ns, steady_ns: Callable[[], int] = boottime_ns) -> None:
+    def __init__(self, wall_ns: Callable[[], int] = time.time_ns, steady_ns: Callable[[], int] = steady_ns) -> None:
         self._wall_ns = wall_ns
         self._steady_ns = steady_ns
         self._start = self._newest = min((self._read() for _ in range(TRIES)), key=lambda reading: reading.apart_ns)
@@ -49,7 +48,7 @@ class LogClock:
         self._count = 0
 
     def at(self, steady_ns: int) -> int:
-        """The log time, in nanoseconds, of what came in at a time of `boottime_ns`."""
+        """The log time, in nanoseconds, of what came in at a time of `steady_ns`."""
         return steady_ns + self._start.offset_ns
 
     def now_ns(self) -> int:

@@ -12,16 +12,16 @@ from typing import Any
 
 import msgspec
 
-from cocoro.about import about, versions
-from cocoro.bus.base import Handle, Heard, Payload
+from cocoro.about import versions
+from cocoro.bus.base import Handle, Payload, Received
 from cocoro.capture.types import Alive, MessageHead
-from cocoro.clock import NS, FollowedClock
+from cocoro.clock import NS, Clock
 from cocoro.errors import MeshError, RemoteError
 from cocoro.installed import topic_named
+from cocoro.keys import alive_key, recorder_key
 from cocoro.messages import AboutReply, AboutRequest, ClockTick, DisturbedFile, Recording
 from cocoro.node import Node
-from cocoro.source import ANY_HZ, Source
-from cocoro.tokens import alive_key, recorder_key
+from cocoro.stream_checks import ANY_HZ, SequenceTracker
 from cocoro.topics import ABOUT, CLOCK, RECORDING
 from services.capture.keys import ALIVE_INFO, KeyFilter, KeyInfo, QueuedMessage
 from services.capture.log_clock import WALL_CLOCK, LogClock, describe_step
@@ -46,15 +46,15 @@ class KeyCounts:
         self.heard = 0
         self.dropped = 0
         self._rate_hz = rate_hz
-        self._source = Source()
+        self._source = SequenceTracker()
 
     @property
     def lost(self) -> int:
         return self._source.gaps
 
     def hear(self, head: MessageHead) -> bool:
-        """Count a message. Returns whether its sequence number can be right, by the rules of `cocoro.source`; gaps
-        before one that cannot are no losses."""
+        """Count a message. Returns whether its sequence number can be right, by the rules of `cocoro.stream_checks`;
+        gaps before one that cannot are no losses."""
         self.heard += 1
         source = self._source
         if head.incarnation != source.incarnation:
@@ -110,7 +110,7 @@ class Recorder:
         self._disturbed: tuple[DisturbedFile, ...] = ()
         self._handles: list[Handle] = []
         self._head = msgspec.msgpack.Decoder(MessageHead)
-        self._clock: FollowedClock | None = None
+        self._clock: Clock | None = None
         self._clock_key = CLOCK.key(node.robot_name)
         self._time = msgspec.msgpack.Decoder(ClockTick)
         self._newest_ns = 0
@@ -118,7 +118,7 @@ class Recorder:
 
     def start(self) -> None:
         robot, bus = self._node.robot_name, self._node.bus
-        if isinstance(self._node.clock, FollowedClock):
+        if self._node.clock.needs_ticks:
             self._clock = self._node.drive_clock()
         self._remember_run()
         # Nothing is dropped before this loop has seen it; the sink bounds what may wait.
@@ -186,7 +186,7 @@ class Recorder:
 
     # --- what is heard ----------------------------------------------------------------------------
 
-    def _on_lot(self, lot: list[Heard]) -> None:
+    def _on_lot(self, lot: list[Received]) -> None:
         for key, payload, heard_ns in lot:
             if key == self._clock_key:
                 self._tick(payload)
@@ -276,7 +276,7 @@ class Recorder:
         }
         self._sink.remember("run", run)
         self._sink.remember("robot", {"description": json.dumps(node.robot.to_data())})
-        self._sink.remember(f"service/{node.name}", _entries(about(node)))
+        self._sink.remember(f"service/{node.name}", _entries(node.about()))
         if node.profile:
             self._sink.remember("profile", {"profile": json.dumps(node.profile)})
 

@@ -11,7 +11,7 @@ from datetime import UTC, datetime, timedelta
 from functools import partial
 from pathlib import Path
 
-from cocoro.clock import NS, VirtualClock
+from cocoro.clock import NS
 from cocoro.component import Implementation
 from cocoro.node import Node
 from services.capture.config import CaptureConfig, folder_of
@@ -27,7 +27,7 @@ async def run(node: Node, config: CaptureConfig, log_clock: LogClock | None = No
     """Record until cancelled. A disk that does not take it is a fault that the mesh hears of, not the end. `log_clock`
     is of use in real time alone, and made when there is none."""
     ledger = Ledger(node.robot_name, KeyFilter(node.robot_name, config.only, config.without))
-    virtual = isinstance(node.clock, VirtualClock)
+    virtual = node.clock.virtual
     if virtual:
         log_clock = None
     elif log_clock is None:

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 from cocoro.clock import NS, is_fresh
+from cocoro.health import WINDOW_S, Recent
 from cocoro.messages import LatchState, ServoCommand, ServoState
-from cocoro.recent import WINDOW_S, Recent
 from cocoro.robot import Joint
 from services.servos import table
 from services.servos.motion import AT_GOAL_COUNTS, JointMotion

@@ -1,0 +1,114 @@
+"""What a node measures of itself for its health message: counts and rates, loop periods, CPU and memory."""
+
+from __future__ import annotations
+
+import logging
+import resource
+import sys
+import time
+from collections import deque
+
+import numpy as np
+import psutil
+
+from cocoro.clock import NS
+from cocoro.messages import LoopHealth
+
+log = logging.getLogger(__name__)
+
+WINDOW_S = 10.0
+
+
+class Rate:
+    """A count, and its rate over the last health period."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._counted = 0
+        self._since_ns: int | None = None
+
+    def take(self, now_ns: int) -> float:
+        """Counts per second since the last call; 0 at the first."""
+        since_ns, counted = self._since_ns, self._counted
+        self._since_ns, self._counted = now_ns, self.count
+        if since_ns is None or now_ns <= since_ns:
+            return 0.0
+        return (self.count - counted) * NS / (now_ns - since_ns)
+
+
+class Recent:
+    """Sum of the amounts that were added within the last `window_s`, for faults that are reported for a while after
+    they happened. Any clock will do, but always the same one."""
+
+    def __init__(self, window_s: float = WINDOW_S) -> None:
+        self._window_ns = round(window_s * NS)
+        self._amounts: deque[tuple[int, int]] = deque()
+        self._total = 0
+
+    def add(self, amount: int, now_ns: int) -> None:
+        if amount > 0:
+            self._amounts.append((now_ns, amount))
+            self._total += amount
+
+    def total(self, now_ns: int) -> int:
+        """The sum now. A clock that jumped back empties the window."""
+        while self._amounts and not 0 <= now_ns - self._amounts[0][0] <= self._window_ns:
+            self._total -= self._amounts.popleft()[1]
+        return self._total
+
+
+class LoopMeter:
+    """Periods, step times and overruns of one loop; `health` covers the time since its last call."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.overruns = 0
+        self.periods_ms: deque[float] = deque(maxlen=4096)
+        self.steps_ms: deque[float] = deque(maxlen=4096)
+        self._last_ns: int | None = None
+
+    def began(self, now_ns: int) -> None:
+        if self._last_ns is not None and now_ns >= self._last_ns:
+            self.periods_ms.append((now_ns - self._last_ns) / 1e6)
+        self._last_ns = now_ns
+
+    def health(self) -> LoopHealth:
+        periods, steps = np.array(self.periods_ms), np.array(self.steps_ms)
+        self.periods_ms.clear()
+        self.steps_ms.clear()
+        median = float(np.median(periods)) if periods.size else 0.0
+        return LoopHealth(
+            name=self.name,
+            rate_hz=1e3 / float(periods.mean()) if periods.size and periods.mean() > 0 else 0.0,
+            period_median_ms=median,
+            period_p99_ms=float(np.percentile(periods, 99)) if periods.size else 0.0,
+            step_median_ms=float(np.median(steps)) if steps.size else 0.0,
+            overruns=self.overruns,
+        )
+
+
+class ProcessMeter:
+    """CPU share and resident memory of this process."""
+
+    def __init__(self) -> None:
+        self._cpu_s, self._at_s = time.process_time(), time.monotonic()
+        self._process: psutil.Process | None = None
+        try:
+            self._process = psutil.Process()
+            self._process.memory_info()
+        except (psutil.Error, OSError) as error:
+            log.warning("/proc cannot be read (%s): health reports the peak memory of this process", error)
+            self._process = None
+
+    def take(self) -> tuple[float, float]:
+        """(share of one core since the last call, resident memory in MB); the peak memory where /proc is missing."""
+        cpu_s, at_s = time.process_time(), time.monotonic()
+        share = (cpu_s - self._cpu_s) / max(at_s - self._at_s, 1e-6)
+        self._cpu_s, self._at_s = cpu_s, at_s
+        return share, self._rss_mb()
+
+    def _rss_mb(self) -> float:
+        if self._process is not None:
+            return float(self._process.memory_info().rss) / 1e6
+        unit = 1 if sys.platform == "darwin" else 1024  # getrusage(2)
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6

@@ -1,0 +1,115 @@
+"""Files that a process holds: locked (flock) for as long as it lives, with its name and number inside.
+
+The lock ends with the process, however that ends. So a process number read from a held file is the number of that
+process, never of a later one that got the same number. Used by the mesh's register and by the run directory.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import random
+import time
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+from msgspec import Meta
+
+from cocoro import private
+
+LOOK_S = 1.0
+"""Upper bound for one look at a lock by another process, and for a new holder to write its name, s."""
+_HOLDER_BYTES = 4096
+
+
+class Holder(msgspec.Struct, frozen=True):
+    """The process that holds a file."""
+
+    name: str
+    pid: Annotated[int, Meta(ge=0, lt=2**31)]
+
+    @property
+    def known(self) -> bool:
+        """False for `UNKNOWN`."""
+        return self.pid > 0
+
+
+UNKNOWN = Holder("", 0)
+"""A holder whose name and number cannot be read."""
+_DECODER = msgspec.json.Decoder(Holder)
+
+
+class HeldFile:
+    """A file that this process holds. `release` lets go of it; so does the end of the process."""
+
+    def __init__(self, fd: int) -> None:
+        self._fd: int | None = fd
+
+    def release(self) -> None:
+        fd, self._fd = self._fd, None
+        if fd is not None:
+            os.close(fd)
+
+
+def hold(path: Path, name: str, *, named: bool = True) -> HeldFile | None:
+    """Holds a file in the name of this process; None when another process holds it.
+
+    Raises ConfigError when the file's directory is not this user's alone, FullError when there is no room. With
+    `named=False`, a file that could be made but has no room for the name is held without one.
+    """
+    fd = private.open_file(path, os.O_CREAT | os.O_RDWR, make=True)
+    deadline_s = time.monotonic() + LOOK_S
+    while not _lock(fd, fcntl.LOCK_EX):
+        if not _lock(fd, fcntl.LOCK_SH) or time.monotonic() > deadline_s:
+            os.close(fd)
+            return None
+        # A shared lock was free: another process only looks at the file (see `holder_of`) and is done in a moment.
+        fcntl.flock(fd, fcntl.LOCK_UN)
+        time.sleep(random.uniform(0.0, 0.002))  # so that of two processes that try, one is first
+    try:
+        # Not truncated first: a full disk may have no room for new bytes, only for those of the last holder.
+        written = os.pwrite(fd, msgspec.json.encode(Holder(name, os.getpid())), 0)
+        os.ftruncate(fd, written)
+    except OSError as error:
+        if named:
+            os.close(fd)
+            raise private.refusal(path, error) from error
+    return HeldFile(fd)
+
+
+def holder(path: Path) -> Holder | None:
+    """The process that holds a file now; None when no process does. Raises ConfigError as `private.open_file` does."""
+    try:
+        fd = private.open_file(path, os.O_RDONLY)
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    try:
+        return holder_of(fd, LOOK_S)
+    finally:
+        os.close(fd)
+
+
+def holder_of(fd: int, patience_s: float = 0.0) -> Holder | None:
+    """The process that holds an open file; None when no process does. `UNKNOWN` when the holder has written no valid
+    name and number within `patience_s`."""
+    deadline_s = time.monotonic() + patience_s
+    while not _lock(fd, fcntl.LOCK_SH):
+        try:
+            found = _DECODER.decode(os.pread(fd, _HOLDER_BYTES, 0))
+        except (msgspec.MsgspecError, ValueError, RecursionError):
+            found = UNKNOWN
+        if found.known or time.monotonic() >= deadline_s:
+            return found if found.known else UNKNOWN
+        time.sleep(0.001)  # it was taken this moment: its holder is about to write its name
+    fcntl.flock(fd, fcntl.LOCK_UN)
+    return None
+
+
+def _lock(fd: int, kind: int) -> bool:
+    """Locks a file; False when another process's lock excludes that now."""
+    try:
+        fcntl.flock(fd, kind | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
