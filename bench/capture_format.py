@@ -213,7 +213,7 @@ def _frames(name: str, frames: list[bytes], times: int) -> None:
 
     def read() -> None:
         for content in contents:
-            unpacked(content, ours=True)
+            unpacked(content, strict=True)
 
     def read_by_package() -> None:
         for content in contents:

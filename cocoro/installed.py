@@ -73,12 +73,14 @@ def all_topics() -> tuple[Topic[Any], ...]:
     return TOPICS + third_parties().topics
 
 
+def unrecorded() -> tuple[str, ...]:
+    """The names of the topics that recorders leave out."""
+    return tuple(topic.name for topic in all_topics() if not topic.recorded)
+
+
 def all_requests() -> tuple[Request[Any, Any], ...]:
     """The project's own requests, then those of third parties."""
     return REQUESTS + third_parties().requests
-
-
-Row = Topic[Any] | Request[Any, Any]
 
 
 def _new(declared: Iterable[Any], own: Iterable[Any], theirs: dict[str, Any]) -> dict[str, Any]:

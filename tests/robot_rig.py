@@ -13,7 +13,7 @@ import msgspec
 from spelled import asked
 
 from cocoro import topics
-from cocoro.bus.local import LocalBus, LocalMesh
+from cocoro.bus.local import LocalMesh
 from cocoro.clock import NS, Clock, VirtualClock
 from cocoro.component import load
 from cocoro.frames import wrap_rad
@@ -28,7 +28,7 @@ from cocoro.messages import (
 )
 from cocoro.node import Node
 from cocoro.robot import Robot
-from cocoro.testing import Tap, settle
+from cocoro.testing import NotedBus, Tap, settle
 from deploy.delayed import DelayedNode
 from deploy.processes import named, needs
 
@@ -39,7 +39,7 @@ CLAWS = {"claw_left", "claw_right"}
 
 
 class _Running(NamedTuple):
-    bus: LocalBus
+    bus: NotedBus
     node: Node
     work: asyncio.Future[None]
 
@@ -96,7 +96,7 @@ class RobotRig:
         component = load(named(name))
         needed = {"needed": needs(name)} if name == "executive" else {}
         config = msgspec.convert(needed | dict(self._settings.get(name, {})), component.config)
-        bus = self.mesh.join()
+        bus = NotedBus(self.mesh, self._robot.name)
         node = DelayedNode(
             name, bus, self._clock_of(name), self._robot,
             latency_s=self._latency_s.get(name, 0.0), record_steps=self._record_steps,
@@ -104,6 +104,10 @@ class RobotRig:
         await node.__aenter__()
         self._services[name] = _Running(bus, node, asyncio.ensure_future(component.run(node, config)))
         await settle()
+
+    def bus(self, name: str) -> NotedBus:
+        """The bus of a running component."""
+        return self._services[name].bus
 
     async def kill(self, name: str) -> None:
         """As SIGKILL does: at once, nothing said."""

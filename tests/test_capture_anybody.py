@@ -115,7 +115,7 @@ def test_statistics_that_are_not_so_are_told(tmp_path: Path) -> None:
         found = report(capture, check=True)
         (filtered,) = (list(capture.messages("base/state")),)
     assert found.messages == len(filtered) == 50
-    assert found.problems == ("its statistics say 57 messages, and 50 can be read",)
+    assert found.problems == ("its statistics have 57 messages, and 50 can be read",)
 
 
 # --- messages outside of chunks -------------------------------------------------------------------

@@ -150,7 +150,7 @@ def test_records_of_kinds_that_are_not_mcaps_own_are_passed_by_and_told(
     with Capture.open(path) as capture:
         (note,) = report(capture, check=True).notes
         done = rewrite(capture, tmp_path / "out.mcap", Packer("zstd"))
-    assert note == f"{len(parts)} records of kinds that are not MCAP's own (0x80) are passed by"
+    assert note == f"{len(parts)} records of kinds that are not MCAP's own (0x80) are skipped"
     assert done.notes == (note,)
     assert here(tmp_path / "out.mcap") == known
 
@@ -163,7 +163,7 @@ def test_a_chunk_whose_kind_was_changed_is_damage_and_no_private_record(tmp_path
     with Capture.open(path) as capture:
         assert list(capture.messages()) == []
         (problem,) = capture.problems
-    assert "by its content it is a chunk" in problem
+    assert "a record with the content of a chunk" in problem
 
 
 def test_the_checksum_of_all_the_data_is_looked_at_by_check(tmp_path: Path) -> None:

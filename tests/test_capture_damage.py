@@ -167,7 +167,7 @@ def test_a_record_that_its_recorder_did_not_finish_is_no_damage_but_told_of(
         assert capture.problems == []
         assert capture.cut_bytes == last.length - 10
     assert main(["capture", "info", str(path)]) == 0
-    assert f"of its last record there are {last.length - 10} bytes" in capsys.readouterr().out
+    assert f"the last record is cut off after {last.length - 10} bytes" in capsys.readouterr().out
     for command in (["export", str(path), "--csv", str(tmp_path / "csv")], ["capture", "repair", str(path)]):
         assert main(command) == 0
         out, err = capsys.readouterr()

@@ -132,13 +132,13 @@ def test_a_chunks_times_that_are_zeros_are_told_by_check(whole: bytes, tmp_path:
     chunk = parts(whole, Opcode.CHUNK)[1]
     data = zeroed(whole, chunk.start + PREFIX.size, 16)
     (problem,) = problems(tmp_path / "zeros.mcap", data, check=True)
-    assert problem == f"the times of the chunk at byte {chunk.start} are not those of its messages"
+    assert problem == f"the times of the chunk at byte {chunk.start} differ from those of its messages"
     assert len(all_of(tmp_path / "zeros.mcap")) == 20
 
 
 def test_an_index_of_messages_that_is_zeros_or_missing_is_told_by_check(whole: bytes, tmp_path: Path) -> None:
     path, chunk, index = tmp_path / "x.mcap", *parts(whole, Opcode.CHUNK, Opcode.MESSAGE_INDEX)[:2]
-    words = f"an index of the chunk at byte {chunk.start} is not that of its messages"
+    words = f"an index of the chunk at byte {chunk.start} differs from its messages"
     for start, length in ((index.start + PREFIX.size, 2), (index.start + PREFIX.size + 6, 16), (index.end - 1, 1)):
         spoilt = zeroed(whole, start, length)
         if spoilt != whole:
@@ -195,7 +195,7 @@ def test_a_name_of_metadata_that_is_zeros_is_told_and_not_given(whole: bytes, tm
     for part in found:
         (length,) = struct.unpack_from("<I", whole, part.start + PREFIX.size)
         data = zeroed(whole, part.start + PREFIX.size + 4 + length - 1, 1)
-        assert any(f"at byte {part.start} is not what was written" in each for each in problems(path, data))
+        assert any(f"at byte {part.start} differs from what was written" in each for each in problems(path, data))
         with Capture.open(path) as capture:
             assert len(capture.metadata) == len(found) - 1
 
@@ -275,7 +275,7 @@ def test_statistics_that_contradict_what_was_read_are_told_of_anybodys_file(tmp_
             count = len(list(reading(capture)))
             (problem,) = capture.problems
         which = "of channel 1, " if read is not Capture.messages else ""
-        assert problem.startswith("its statistics say ")
+        assert problem.startswith("its statistics have ")
         assert problem.endswith(f"{which or 'messages, '}and {count} can be read")
     with Capture.open(path) as capture:
         found = report(capture)

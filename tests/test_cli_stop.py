@@ -112,7 +112,7 @@ def test_as_data_it_has_the_moment_at_which_each_was_stopped(
 def test_help_stops_nothing(services: Services, capsys: pytest.CaptureFixture[str]) -> None:
     services("base")
     assert main(["stop", "--help"]) == exits.DONE
-    assert "whoever's it is" in capsys.readouterr().out
+    assert "other users'" in capsys.readouterr().out
     assert main(["stop", "--now"]) == exits.USAGE
     assert services.halted == []
 

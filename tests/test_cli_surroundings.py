@@ -178,7 +178,7 @@ def test_what_is_logged_is_a_line_each(table: Table) -> None:
 def test_the_error_of_one_task_of_several_is_told_as_its_own(capsys: pytest.CaptureFixture[str]) -> None:
     error = OSError(errno.EACCES, os.strerror(errno.EACCES), "a file")
     assert failed(ExceptionGroup("tasks", [ExceptionGroup("more", [error])])) == exits.FAILED
-    assert capsys.readouterr().err == "cocoro: a file: Permission denied; choose another place, or have it allowed\n"
+    assert capsys.readouterr().err == "cocoro: a file: Permission denied; choose another place, or get permission\n"
 
 
 def line_of(text: str) -> int:
@@ -249,7 +249,11 @@ COMMAND = f"{sys.executable} -m apps.cli.main"
         (f"{COMMAND} topics >&- 2>&- <&-", exits.FAILED, ""),
         (f"LC_ALL=C PYTHONUTF8=0 PYTHONCOERCECLOCALE=0 {COMMAND} export gröden.mcap --csv x", exits.FAILED, "gröden"),
         (f"{COMMAND} topics | true; exit ${{PIPESTATUS[0]}}", None, ""),
-        (f"mkdir gone && cd gone && rmdir ../gone && {COMMAND} record", exits.FAILED, "current directory is gone"),
+        (
+            f"mkdir gone && cd gone && rmdir ../gone && {COMMAND} record",
+            exits.FAILED,
+            "current directory has been removed",
+        ),
     ],
 )
 def test_the_forks_are_as_the_process_is(

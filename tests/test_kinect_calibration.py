@@ -10,7 +10,7 @@ import pytest
 from chessboard import Eyes, Painter, lying
 
 from apps.cli import kinect as command
-from apps.cli.robot_file import write_values
+from apps.cli.toml_files import write_values
 from cocoro.arrays import FloatArray
 from cocoro.errors import CocoroError, ConfigError
 from cocoro.robot import Robot

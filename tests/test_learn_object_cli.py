@@ -13,11 +13,12 @@ import cv2
 import msgspec
 import numpy as np
 import pytest
+import tomlkit
 from perception_scenes import Canvas, Scene, Thing, facing
 
 from apps.cli.learn_object import size_of
 from apps.cli.main import main
-from apps.cli.objects_file import as_toml, save, with_object
+from apps.cli.toml_files import save, with_object
 from apps.rehearsal.rehearse import rehearse
 from apps.rehearsal.request import RehearsalRequest
 from cocoro.bus.endpoints import default
@@ -135,7 +136,7 @@ def test_what_is_known_is_only_replaced_or_added_to_when_that_is_said(
         (["Cup", "--from", "photo.png"], "is no label"),
         (["cup", "--from", "nowhere.png"], "there is no picture nowhere.png"),
         (["cup", "--from", "words.png"], "is no picture that can be read"),
-        (["cup", "--from", "photo.png"], "say --size"),
+        (["cup", "--from", "photo.png"], "give --size"),
         (["cup", "--from", "photo.png", "--size", "6cm"], "write it in metres"),
         (["cup", "--from", "photo.png", "--size", "60"], "it is in metres"),
         (["cup", "--from", "photo.png", "--size", "0x1"], "write it in metres"),
@@ -258,7 +259,7 @@ BOX = msgspec.structs.replace(CUP, shape="box", radius_m=None, height_m=None, bo
 
 @pytest.mark.parametrize("known", [CUP, BOX, *Catalogue.load()], ids=lambda known: f"{known.label} {known.shape}")
 def test_an_objects_table_says_what_the_object_is(known: ObjectSpec) -> None:
-    assert tuple(Catalogue.from_text(as_toml(known), "test")) == (known,)
+    assert tuple(Catalogue.from_text(with_object("", known), "test")) == (known,)
 
 
 def test_an_object_is_put_behind_all_others_and_nothing_else_changes() -> None:
@@ -277,9 +278,37 @@ def test_an_object_takes_the_place_of_its_own_older_table_and_peoples_comments_s
     for line in before.splitlines():
         if line.startswith("#"):
             assert line in text
+    unchanged = with_object(before, catalogue["red_can"])
+    assert unchanged == before, "a value that is the same is not written anew"
     assert [known for known in catalogue if known.label != "blue_can"] == [
         known for known in Catalogue.load() if known.label != "blue_can"
     ]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "# mine\n[[ object ]] # one\n{row}\n\n# end\n",
+        "object = [ # mine, one\n  {{ {inline} }}, # end\n]\n",
+        "# mine one\n'object' = [{{{inline}}}] # end\n",
+    ],
+)
+def test_an_object_is_added_to_and_replaced_in_any_form_of_list(text: str) -> None:
+    mug = tomlkit.parse(with_object("", msgspec.structs.replace(CUP, label="mug")))["object"][0]
+    rows = [f"{key} = {tomlkit.item(value).as_string()}" for key, value in mug.items()]
+    text = text.format(row="\n".join(rows), inline=", ".join(rows))
+    for known in (CUP, msgspec.structs.replace(CUP, label="mug", mass_kg=0.3, lab_by_shape=())):
+        changed = with_object(text, known)
+        catalogue = Catalogue.from_text(changed, "test")
+        assert catalogue[known.label] == known
+        assert catalogue.labels == tuple(dict.fromkeys(("mug", known.label)))
+        assert all(word in changed for word in ("mine", "one", "# end"))
+
+
+def test_a_catalogue_whose_objects_are_no_list_of_tables_is_refused(here: Path) -> None:
+    (here / "mine.toml").write_text("object = 3\n")
+    with pytest.raises(ConfigError, match=r"mine\.toml: object is no list of tables"):
+        save(here / "mine.toml", CUP)
 
 
 def test_a_file_that_would_be_no_catalogue_is_left_as_it_was(here: Path) -> None:

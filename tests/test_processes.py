@@ -117,8 +117,8 @@ def test_who_publishes_a_topic_is_derived() -> None:
 # --- the implementations --------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("process", profiles.read("sim").rows(), ids=lambda process: process.name)
-def test_a_component_of_the_simulated_robot_starts_with_nothing_configured(process: Component) -> None:
+@pytest.mark.parametrize("process", COMPONENTS, ids=lambda process: process.name)
+def test_a_component_starts_with_nothing_configured(process: Component) -> None:
     component = load_component(process)
     config = component.config()
     assert msgspec.convert({}, component.config) == config

@@ -220,7 +220,7 @@ def test_the_doctor_warns_of_a_place_that_does_not_outlive_a_reboot_or_cannot_be
     assert [one.state for one in doctor_stop.check("robbie")] == ["ok", "bad"]
     (tmp_path / "file").touch()
     monkeypatch.setenv(record.STATE_DIR, str(tmp_path / "file"))
-    assert "comes up stopped" in list(doctor_stop.check("robbie"))[1].text
+    assert "the robot starts stopped" in list(doctor_stop.check("robbie"))[1].text
 
 
 def test_the_doctor_says_when_the_kernels_list_cannot_be_read(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -76,8 +76,8 @@ def test_a_known_type_is_named_and_a_good_message_of_it_has_no_problem() -> None
     [
         (msgpack.packb({"left_mps": "fast"}), "no good BaseCommand: Expected `float`, got `str`"),
         (msgpack.packb({"left_mps": math.nan, "right_mps": 0.0}), "no good BaseCommand"),
-        (b"\xc1\x00", "no MessagePack"),
-        (b"", "no MessagePack"),
+        (b"\xc1\x00", "not MessagePack"),
+        (b"", "not MessagePack"),
         (msgpack.packb({"left_mps": 0.1, "right_mps": 0.1, "more": "x" * 70_000}), "at most 65536 are taken"),
     ],
 )

@@ -1,4 +1,4 @@
-"""What a new object looks like, from one picture of it: where it is, which colours are its, how large it is.
+"""Learns the appearance of a new object from one picture: its pixels, its colours, its size.
 
-Pure functions over pixels; `cocoro objects learn` is their user.
+Pure functions over pixels, used by `cocoro objects learn`.
 """

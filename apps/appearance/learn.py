@@ -1,4 +1,4 @@
-"""From one look at a new object to its row of the catalogue, with all that a person wants to know before it is kept."""
+"""Learns an object's row of the catalogue from one view of it, with warnings for the person who decides to save it."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from math import pi
 import cv2
 import numpy as np
 
-from apps.appearance.ranges import NEARLY_GREY, ColourOverlap, ColourRange, overlaps, range_of
+from apps.appearance.colours import NEARLY_GREY, ColourOverlap, ColourRange, overlaps, range_of
 from apps.appearance.region import ColourField, ObjectRegion, PixelBox, at_pixel, in_box, most_salient
 from apps.appearance.size import MeasuredSize, ObjectShape, guessed_shape, size_of, surface_depth_m
 from cocoro.arrays import BoolArray, CodeArray, FloatArray, ImageArray
@@ -18,101 +18,107 @@ from cocoro.objects import Catalogue, ObjectSpec
 from cocoro.robot import Robot
 
 GRASPABLE_WIDTH_M = (0.02, 0.075)
+"""Least and greatest width that the claws reach around."""
 GRASPABLE_HEIGHT_M = 0.045
-"""What the claws reach around, and what they do not close above."""
+"""Least height of a graspable object; the claws close above a lower one."""
 FEW_PX = 600.0
-"""Of 640 x 480: with fewer pixels the size is off by more than a few per cent."""
+"""Pixels of a 640 x 480 picture; with fewer, the size has an error of more than a few per cent."""
 ELSEWHERE_PX = 32.0
-"""Of 640 x 480: a smaller blob of the new colour elsewhere is passed over by the detector."""
+"""Pixels of a 640 x 480 picture; the detector ignores smaller blobs of the new colour."""
 SIZES: dict[ObjectShape, int] = {"sphere": 1, "cylinder": 2, "box": 3}
-"""How many lengths a shape has, as the person gives them."""
+"""Number of lengths that `--size` has for a shape."""
 MAX_OBJECTS = 32
-"""As many as the detector's colour table holds."""
+"""Capacity of the detector's colour table."""
 
 
 @dataclass(frozen=True)
 class ObjectView:
-    """One look at the object."""
+    """One view of the object."""
 
     colour: ImageArray
     """RGB, (height, width, 3)."""
     robot: Robot
     raw_depth: CodeArray | None = None
-    """The depth camera's own view, (height, width); None for a mere picture."""
+    """Raw picture of the depth camera, (height, width), codes; None for a picture file."""
     camera_pose: FloatArray | None = None
-    """4 x 4, camera frame to body frame; None when nobody knows how the head stood."""
+    """Camera frame to body frame, (4, 4), m; None when the pose of the head is unknown."""
 
 
 @dataclass(frozen=True)
 class ObjectHints:
-    """What the person says of it."""
+    """What the person states about the object; None where it is to be found in the picture."""
 
     label: str
     at_px: tuple[int, int] | None = None
     box_px: PixelBox | None = None
     shape: ObjectShape | None = None
     size_m: tuple[float, ...] | None = None
-    """Sphere: diameter; cylinder: diameter, height; box: x, y, z."""
+    """Lengths in m: sphere diameter; cylinder diameter, height; box x, y, z."""
     distance_m: float | None = None
-    """From the camera to the object's surface, for a picture without depth."""
+    """Distance from the camera to the object's surface, for a picture without depth."""
     graspable: bool | None = None
     mass_kg: float | None = None
 
 
 @dataclass(frozen=True)
 class LearnedObject:
-    """What was learnt, and what is to be said of it."""
+    """The learned row of the catalogue, and how it was found."""
 
     known: ObjectSpec
     region: ObjectRegion
     range: ColourRange
     measured: MeasuredSize | None
-    """None when the person gave the size."""
+    """None when the person stated the size."""
     overlaps: tuple[ColourOverlap, ...]
     matched: BoolArray
-    """(height, width): pixels of the picture that have one of its colours, as the detector smooths them."""
+    """Pixels with one of its colours in the smoothed picture, (height, width)."""
     elsewhere: int
-    """Blobs of them that are not the object."""
+    """Number of matched blobs that are not the object."""
     warnings: tuple[str, ...]
 
     @property
     def matched_share(self) -> float:
-        """Of the object's own pixels."""
+        """Share of the object's own pixels that match."""
         return float(self.matched[self.region.mask > 0].mean())
 
 
-def learn(look: ObjectView, wanted: ObjectHints, catalogue: Catalogue) -> LearnedObject:
-    """Raises ConfigError when there is no object to be told in the picture, or its size is not known."""
-    others = [known for known in catalogue if known.label != wanted.label]
+def learn(view: ObjectView, hints: ObjectHints, catalogue: Catalogue) -> LearnedObject:
+    """Finds the object in the view and learns its colours and size.
+
+    Raises ConfigError when no object can be found, its size is unknown, or the catalogue is full.
+    """
+    others = [known for known in catalogue if known.label != hints.label]
     if len(others) >= MAX_OBJECTS:
-        raise ConfigError(f"there are {len(others)} known objects already, {MAX_OBJECTS} is all that can be told apart")
-    picture = ColourField(look.colour)
-    region = _region(picture, wanted, others)
-    smooth = np.asarray(cv2.blur(np.ascontiguousarray(look.colour), (3, 3)), dtype=np.uint8)
+        raise ConfigError(
+            f"{len(others)} known objects, and the detector takes at most {MAX_OBJECTS}: remove one from the catalogue"
+        )
+    picture = ColourField(view.colour)
+    region = _region(picture, hints, others)
+    smooth = np.asarray(cv2.blur(np.ascontiguousarray(view.colour), (3, 3)), dtype=np.uint8)
     found = range_of(smooth[region.coloured], others)
-    camera = look.robot.camera.scaled(picture.width, picture.height)
-    shape = wanted.shape or _shape_of(wanted.size_m) or guessed_shape(region, camera)
-    measured = None if wanted.size_m is not None else _measured(look, wanted, region, shape)
-    known = _row(wanted, shape, measured, found)
+    camera = view.robot.camera.scaled(picture.width, picture.height)
+    shape = hints.shape or _shape_of(hints.size_m) or guessed_shape(region, camera)
+    measured = None if hints.size_m is not None else _measured(view, hints, region, shape)
+    known = _row(hints, shape, measured, found)
     common = tuple(overlaps(found, others))
     matched = in_boxes(found.boxes, lab_of(smooth))
     elsewhere = _blobs_beside(matched, region, picture.scale)
     few = region.area_px < FEW_PX * picture.scale**2
     warnings = [
         *_colour_warnings(found, common, elsewhere),
-        *(["it touches the picture's edge: its size is too small by what is cut off"] if region.cut else []),
-        *([f"it has only {region.area_px} pixels: its size is rough"] if few and measured is not None else []),
-        *(["the camera is taken to look level: say --size if it did not"]
-          if measured is not None and look.camera_pose is None and shape != "sphere" else []),
+        *(["it touches the picture's edge, so the learned size lacks the part that is cut off"] if region.cut else []),
+        *([f"it has only {region.area_px} pixels, so its size is inexact"] if few and measured is not None else []),
+        *(["the camera is assumed to look horizontally; give --size if it did not"]
+          if measured is not None and view.camera_pose is None and shape != "sphere" else []),
     ]  # fmt: skip
     return LearnedObject(known, region, found, measured, common, matched, elsewhere, tuple(warnings))
 
 
-def _region(picture: ColourField, wanted: ObjectHints, others: list[ObjectSpec]) -> ObjectRegion:
-    if wanted.at_px is not None:
-        return at_pixel(picture, *wanted.at_px)
-    if wanted.box_px is not None:
-        return in_box(picture, wanted.box_px)
+def _region(picture: ColourField, hints: ObjectHints, others: list[ObjectSpec]) -> ObjectRegion:
+    if hints.at_px is not None:
+        return at_pixel(picture, *hints.at_px)
+    if hints.box_px is not None:
+        return in_box(picture, hints.box_px)
     known = np.zeros((picture.height, picture.width), dtype=np.bool_)
     for other in others:
         known |= matches(other, picture.lab)
@@ -123,33 +129,33 @@ def _region(picture: ColourField, wanted: ObjectHints, others: list[ObjectSpec])
 
 
 def _shape_of(size_m: tuple[float, ...] | None) -> ObjectShape | None:
-    """The shape that has as many sizes as are given."""
+    """The shape that has this number of lengths."""
     return None if size_m is None else next(shape for shape, sizes in SIZES.items() if sizes == len(size_m))
 
 
-def _measured(look: ObjectView, wanted: ObjectHints, region: ObjectRegion, shape: ObjectShape) -> MeasuredSize:
-    depth_m = wanted.distance_m
-    if depth_m is None and look.raw_depth is None:
+def _measured(view: ObjectView, hints: ObjectHints, region: ObjectRegion, shape: ObjectShape) -> MeasuredSize:
+    depth_m = hints.distance_m
+    if depth_m is None and view.raw_depth is None:
         raise ConfigError(
-            "a picture does not tell how large the object is: say --size 0.066x0.12 (diameter x height, metres; one "
-            "number for a ball, three for a box), or how far away it was with --distance"
+            "the object's size cannot be measured in a picture without depth: give --size 0.066x0.12 (diameter x height"
+            " in metres; one number for a ball, three for a box), or its distance with --distance"
         )
-    if depth_m is None and look.raw_depth is not None:
-        depth_m = surface_depth_m(look.raw_depth, region, look.robot)
+    if depth_m is None and view.raw_depth is not None:
+        depth_m = surface_depth_m(view.raw_depth, region, view.robot)
         if depth_m is None:
             raise ConfigError(
-                "there is no depth where the object is: place it 0.6 to 2 m away from the camera, or say its --size"
+                "the camera has no depth at the object: place it 0.6 to 2 m away from the camera, or give --size"
             )
     assert depth_m is not None
-    camera = look.robot.camera.scaled(look.colour.shape[1], look.colour.shape[0])
-    return size_of(region, camera, depth_m, shape, look.camera_pose)
+    camera = view.robot.camera.scaled(view.colour.shape[1], view.colour.shape[0])
+    return size_of(region, camera, depth_m, shape, view.camera_pose)
 
 
-def _row(wanted: ObjectHints, shape: ObjectShape, measured: MeasuredSize | None, found: ColourRange) -> ObjectSpec:
-    if wanted.size_m is not None:
-        sizes = wanted.size_m
+def _row(hints: ObjectHints, shape: ObjectShape, measured: MeasuredSize | None, found: ColourRange) -> ObjectSpec:
+    if hints.size_m is not None:
+        sizes = hints.size_m
         if _shape_of(sizes) != shape:
-            raise ConfigError(f"--size: a {shape} has {SIZES[shape]} sizes, not {len(sizes)}")
+            raise ConfigError(f"--size: a {shape} has {SIZES[shape]} lengths, not {len(sizes)}")
         width_m, height_m = sizes[0], sizes[-1]
         box_m = (sizes[0], sizes[1], sizes[2]) if len(sizes) == 3 else None
     else:
@@ -161,20 +167,20 @@ def _row(wanted: ObjectHints, shape: ObjectShape, measured: MeasuredSize | None,
     fits = GRASPABLE_WIDTH_M[0] <= narrow_m <= GRASPABLE_WIDTH_M[1] and height_m >= GRASPABLE_HEIGHT_M
     volume_m3 = (pi / 6 if shape == "sphere" else pi / 4 if round_shape else 1.0) * width_m * narrow_m * height_m
     return ObjectSpec(
-        label=wanted.label,
+        label=hints.label,
         shape=shape,
         radius_m=width_m / 2 if round_shape else None,
         height_m=height_m if shape == "cylinder" else None,
         box_m=box_m if shape == "box" else None,
-        mass_kg=wanted.mass_kg or max(round(500.0 * volume_m3, 2), 0.01),
-        graspable=fits if wanted.graspable is None else wanted.graspable,
+        mass_kg=hints.mass_kg or max(round(500.0 * volume_m3, 2), 0.01),
+        graspable=fits if hints.graspable is None else hints.graspable,
         rgb=found.rgb,
         lab=found.lab,
         lab_by_shape=found.lab_by_shape,
     )
 
 
-# --- what is to be said ---------------------------------------------------------------------------
+# --- warnings -----------------------------------------------------------------------------------
 
 
 def _blobs_beside(matched: BoolArray, region: ObjectRegion, scale: float) -> int:
@@ -186,15 +192,17 @@ def _blobs_beside(matched: BoolArray, region: ObjectRegion, scale: float) -> int
 
 
 def _colour_warnings(found: ColourRange, common: tuple[ColourOverlap, ...], elsewhere: int) -> list[str]:
-    told = []
+    warnings = []
     if found.chromaticity < NEARLY_GREY:
-        told.append("its colour is nearly grey, as walls, floors and the robot itself are: it will be seen everywhere")
-    told += [
-        f"{overlap.label} has colours in common with it: {overlap.of_new:.0%} of its own would pass for "
-        f"{overlap.label}, {overlap.of_known:.0%} of {overlap.label}'s for it; then only shape and size tell them apart"
+        warnings.append("its colour is nearly grey, like walls, floors and the robot, so it will be seen everywhere")
+    warnings += [
+        f"{overlap.label} has colours in common with it: {overlap.of_new:.0%} of its colours match "
+        f"{overlap.label}, {overlap.of_known:.0%} of {overlap.label}'s match it; only shape and size distinguish them"
         for overlap in common
     ]
     if elsewhere:
         places = "one more place" if elsewhere == 1 else f"{elsewhere} more places"
-        told.append(f"{places} in this picture {'has' if elsewhere == 1 else 'have'} its colour (red in the picture)")
-    return told
+        warnings.append(
+            f"{places} in this picture {'has' if elsewhere == 1 else 'have'} its colour (red in the picture)"
+        )
+    return warnings

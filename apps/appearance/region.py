@@ -1,7 +1,7 @@
-"""Which pixels of a picture are the new object: grown from a pixel that is pointed at, or the one blob that stands out.
+"""Finds the pixels of a new object: grown from a given pixel or box, or the blob that stands out most.
 
-Colours are compared by their chromaticity 100 (a, b) / (L + 16): with less light on a surface its L + 16, a and b all
-shrink alike, so this stays what it is from the lit side into the shade (CIE 1976; derived).
+Colours are compared by their chromaticity 100 (a, b) / (L + 16). Less light on a surface scales L + 16, a and b alike,
+so the chromaticity is the same on its lit side and in the shade (CIE 1976; derived).
 """
 
 from __future__ import annotations
@@ -17,35 +17,36 @@ from cocoro.errors import ConfigError
 
 ChromaArray = Float32Array
 PixelBox = tuple[int, int, int, int]
-"""left, top, right, bottom in pixels; right and bottom exclusive."""
+"""Left, top, right, bottom in pixels; right and bottom exclusive."""
 
 MIN_AREA_PX = 150.0
-"""Of 640 x 480. A can at 3.5 m has 220; with less neither colour nor size can be told."""
+"""Least pixels of an object in a 640 x 480 picture; a can at 3.5 m has 220. Fewer give neither colour nor size."""
 MAX_SHARE = 0.4
-"""Of the picture: more is no object but a background."""
+"""Greatest share of the picture that an object has; more is a background."""
 DARKEST_L = 8.0
-"""Below it a colour is nearly all noise."""
+"""Below this lightness a colour is nearly all noise."""
 GREY = 6.0
-"""A chromaticity below this is nearly grey: then lightness counts too."""
+"""Below this chromaticity a colour is nearly grey, and its lightness is compared, too."""
 GREY_LIGHTNESS = 9.0
 TOLERANCE = (5.0, 14.0)
 """Least and greatest difference in chromaticity within one object, for a well-lit pixel."""
 TOLERANCE_SHARE = 0.33
-"""Of the difference between the object and what is around it."""
+"""Tolerance as a share of the difference between the object and its surroundings."""
 SEED_PX = 3
-"""Around a pixel that is pointed at, of 640 x 480."""
+"""Radius of the seed around a given pixel, in a 640 x 480 picture."""
 MIDDLE = 0.7
-"""Without anybody pointing, the object is looked for in this share of the picture's width and height, but for what
-stands out much more beyond it."""
+"""Share of the picture's width and height around its middle where an object is most likely; objects beyond it get a
+lower score."""
 CUT_PENALTY = 0.7
+"""Share of its score that a blob at the picture's edge loses."""
 STANDS_OUT = 10.0
-"""Least difference in chromaticity (or a third of it in lightness) from what is frequent along the picture's rim."""
+"""Least difference in chromaticity (or thrice that in lightness) from the frequent colours of the picture's rim."""
 KNOWN_PENALTY = 0.9
-"""What is known already is hardly meant, but may be all that there is."""
+"""Share of its score that a blob of a known object's colours loses; it is rarely meant."""
 LEAST_EXCESS = 0.15
-"""Of a box's pixels, that must have a colour which is not that frequent around the box."""
+"""Least share of a box's pixels by which one colour is more frequent inside than around it."""
 LEAST_BACKGROUND = 0.03
-"""Of the rim's pixels: a colour that fewer have is that of something which stands there."""
+"""Least share of the rim's pixels of a background colour; a rarer colour belongs to a thing at the rim."""
 CELL = 4.0
 """Width of a cell of chromaticities when colours are counted."""
 
@@ -55,20 +56,20 @@ class ObjectRegion:
     """The object's pixels in one picture."""
 
     mask: MaskArray
-    """(height, width), 1 inside; holes are filled, since a label on a can is a part of the can."""
+    """1 inside, (height, width); holes are filled, since a label on a can is a part of the can."""
     coloured: BoolArray
-    """(height, width): those that have the object's colour, well inside of it."""
+    """Pixels of the object's colour well inside of it, (height, width)."""
     box: PixelBox
     area_px: int
     cut: bool
-    """It touches the picture's edge, so there may be more of it."""
+    """Whether it touches the picture's edge, so that a part may be missing."""
 
 
 class ColourField:
-    """A picture, made ready for looking for a thing in it."""
+    """A smoothed picture with the CIELAB colour and chromaticity of each pixel."""
 
     def __init__(self, colour: ImageArray) -> None:
-        """`colour`: RGB, (height, width, 3)."""
+        """`colour` is RGB, (height, width, 3)."""
         self.height, self.width = colour.shape[:2]
         self.scale = float(np.sqrt(self.width * self.height / (640 * 480)))
         kernel = 5 if self.scale > 0.75 else 3
@@ -76,12 +77,12 @@ class ColourField:
         light = self.lab[..., :1] + np.float32(16)
         self.chroma: ChromaArray = np.float32(100) * self.lab[..., 1:] / light
         self.doubt = np.maximum(np.float32(66) / light[..., 0], np.float32(1))
-        """How much more noise there is in a pixel's chromaticity than in one of a middling lightness."""
+        """Noise of each pixel's chromaticity relative to a pixel of medium lightness, (height, width)."""
         self.lit: BoolArray = self.lab[..., 0] >= DARKEST_L
 
 
 def at_pixel(picture: ColourField, u_px: int, v_px: int) -> ObjectRegion:
-    """The object that the pixel (u right, v down) is of. Raises ConfigError when there is none to be told there."""
+    """The object at a pixel (u right, v down). Raises ConfigError when none can be found there."""
     if not (0 <= u_px < picture.width and 0 <= v_px < picture.height):
         raise ConfigError(f"--at {u_px},{v_px} is outside of the picture, which has {picture.width} x {picture.height}")
     reach = max(round(SEED_PX * picture.scale), 1)
@@ -90,19 +91,19 @@ def at_pixel(picture: ColourField, u_px: int, v_px: int) -> ObjectRegion:
     seed = np.zeros((picture.height, picture.width), dtype=np.bool_)
     seed[rows, columns] = picture.lit[rows, columns]
     if not seed.any():
-        raise ConfigError(f"--at {u_px},{v_px}: it is too dark there to tell a colour")
+        raise ConfigError(f"--at {u_px},{v_px}: the picture is too dark there; point at a lighter place of the object")
     return _checked(picture, _grown(picture, seed), f"around {u_px},{v_px}")
 
 
 def in_box(picture: ColourField, box: PixelBox) -> ObjectRegion:
-    """The object that fills most of a box: of what is in it and is not around it, the most frequent colour.
+    """The object that fills most of a box, found by the colour that is most frequent inside compared with around it.
 
-    Raises ConfigError when nothing in it stands out.
+    Raises ConfigError for an impossible box, or when no colour in it stands out.
     """
     left, top, right, bottom = box
     if not (0 <= left < right <= picture.width and 0 <= top < bottom <= picture.height):
         raise ConfigError(
-            f"--box {left},{top},{right},{bottom} is no box within {picture.width} x {picture.height} pixels"
+            f"--box {left},{top},{right},{bottom} is not a box within {picture.width} x {picture.height} pixels"
         )
     inside = np.zeros((picture.height, picture.width), dtype=np.bool_)
     inside[top:bottom, left:right] = True
@@ -113,14 +114,16 @@ def in_box(picture: ColourField, box: PixelBox) -> ObjectRegion:
     own, others = _counted(picture, inside & picture.lit), _counted(picture, around & picture.lit)
     excess = own - others
     if excess.max() < LEAST_EXCESS:
-        raise ConfigError("--box: nothing in it has a colour of its own; point at the object with --at U,V")
+        raise ConfigError("--box: no colour in it differs from its surroundings; point at the object with --at U,V")
     seed = inside & _of_cell(picture, int(np.argmax(excess)))
     return _checked(picture, _grown(picture, seed & picture.lit, inside), "in the box")
 
 
 def most_salient(picture: ColourField, known: BoolArray | None = None) -> ObjectRegion:
-    """The uniform blob that stands out most, near the picture's middle and, if possible, no known object (`known`,
-    (height, width), is where their colours are). Raises ConfigError when nothing stands out."""
+    """The uniform blob that stands out most, preferably near the picture's middle and of no known object.
+
+    `known` marks the pixels with colours of known objects, (height, width). Raises ConfigError when nothing stands out.
+    """
     rim = np.ones((picture.height, picture.width), dtype=np.bool_)
     edge = max(picture.width // 16, 2), max(picture.height // 16, 2)
     rim[edge[1] : -edge[1], edge[0] : -edge[0]] = False
@@ -150,7 +153,7 @@ def most_salient(picture: ColourField, known: BoolArray | None = None) -> Object
 
 
 def _grown(picture: ColourField, seed: BoolArray, within: BoolArray | None = None) -> ObjectRegion | None:
-    """All connected pixels that have the seed's colour; None when hardly any are left."""
+    """All connected pixels of the seed's colour; None when hardly any are left."""
     centre = np.median(picture.chroma[seed], axis=0)
     lightness = float(np.median(picture.lab[..., 0][seed]))
     distance = np.linalg.norm(picture.chroma - centre, axis=-1) / picture.doubt
@@ -169,7 +172,7 @@ def _grown(picture: ColourField, seed: BoolArray, within: BoolArray | None = Non
     if mask is None:
         return None
     around = _ring(mask, picture) & picture.lit
-    if around.any():  # with what is around known, what is between can be told
+    if around.any():  # the surroundings are known: set the tolerance by their difference
         between = float(np.median(distance[around]))
         like, mask = part(float(np.clip(TOLERANCE_SHARE * between, *TOLERANCE)))
         if mask is None:
@@ -187,7 +190,7 @@ def _grown(picture: ColourField, seed: BoolArray, within: BoolArray | None = Non
 
 
 def _connected(like: BoolArray, seed: BoolArray) -> MaskArray | None:
-    """The connected part that has most of the seed, its holes filled."""
+    """The connected part with most of the seed's pixels, its holes filled."""
     opened = cv2.morphologyEx(like.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), dtype=np.uint8))
     count, labels = cv2.connectedComponents(np.asarray(opened, dtype=np.uint8), connectivity=4, ltype=cv2.CV_32S)
     own = np.bincount(np.asarray(labels)[seed], minlength=count)
@@ -200,7 +203,7 @@ def _connected(like: BoolArray, seed: BoolArray) -> MaskArray | None:
 
 
 def _ring(mask: MaskArray, picture: ColourField) -> BoolArray:
-    """Just outside of a region, beyond the pixels that are blended with it."""
+    """A ring around a region, beyond the pixels that are blended with it."""
     near, far = (2 * round(reach * picture.scale) + 1 for reach in (3, 9))
     outer = cv2.dilate(mask, np.ones((far, far), dtype=np.uint8))
     inner = cv2.dilate(mask, np.ones((near, near), dtype=np.uint8))
@@ -212,46 +215,48 @@ def _checked(picture: ColourField, region: ObjectRegion | None, where: str) -> O
     if region is None or region.area_px < least:
         size = 0 if region is None else region.area_px
         raise ConfigError(
-            f"the thing {where} has {size} pixels of one colour, at least {least:.0f} are needed: bring it nearer, "
+            f"the object {where} has {size} pixels of one colour, and {least:.0f} are needed: bring it nearer, "
             "into better light, or point at another place of it"
         )
     if region.area_px > MAX_SHARE * picture.width * picture.height:
-        raise ConfigError(f"the thing {where} fills {region.area_px} pixels: that is a background, point at the object")
+        raise ConfigError(
+            f"the region {where} has {region.area_px} pixels, so it is background: point at the object with --at U,V"
+        )
     return region
 
 
-# --- colours that are frequent, and colours that stand out ----------------------------------------
+# --- frequent colours, and colours that stand out -------------------------------------------------
 
 _CELLS = 64
 
 
 def _cells(picture: ColourField) -> IntArray:
-    """Each pixel's cell of chromaticities."""
+    """Index of each pixel's cell of chromaticities, (height, width)."""
     cell = np.clip(np.rint(picture.chroma / CELL).astype(np.int64) + _CELLS // 2, 0, _CELLS - 1)
     return np.asarray(cell[..., 0] * _CELLS + cell[..., 1])
 
 
 def _counted(picture: ColourField, where: BoolArray) -> FloatArray:
-    """The share that each cell has of these pixels, its neighbours counted in."""
+    """Share of the pixels in each cell and its neighbours, (cells,)."""
     counts = np.bincount(_cells(picture)[where], minlength=_CELLS**2).reshape(_CELLS, _CELLS).astype(np.float32)
     summed = np.asarray(cv2.boxFilter(counts, -1, (3, 3), normalize=False), dtype=np.float64)
     return np.asarray(summed.reshape(-1) / max(int(np.count_nonzero(where)), 1))
 
 
 def _of_cell(picture: ColourField, cell: int) -> BoolArray:
-    """Pixels of a cell or next to it."""
+    """Pixels in a cell or next to it, (height, width)."""
     cells = _cells(picture)
     row, column = divmod(cell, _CELLS)
     return (np.abs(cells // _CELLS - row) <= 1) & (np.abs(cells % _CELLS - column) <= 1)
 
 
 def _difference_from(picture: ColourField, rim: BoolArray) -> Float32Array:
-    """How far each pixel's colour is from the nearest of those that are frequent along the picture's rim."""
+    """Distance of each pixel's colour from the nearest frequent colour of the rim's pixels, (height, width)."""
     colours = np.concatenate([picture.chroma, picture.lab[..., :1] / 3], axis=-1)
     samples = np.ascontiguousarray(colours[rim][:: max(np.count_nonzero(rim) // 4000, 1)])
     if len(samples) < 8:
         return np.full(rim.shape, np.float32(99))
-    cv2.setRNGSeed(1)  # the clusters' first guesses: the same picture gives the same object
+    cv2.setRNGSeed(1)  # for the initial clusters, so that equal pictures give equal objects
     criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 20, 0.5)
     _, nearest, centres = cv2.kmeans(samples, 6, np.empty(0, dtype=np.int32), criteria, 2, cv2.KMEANS_PP_CENTERS)
     shares = np.bincount(np.asarray(nearest).reshape(-1), minlength=6) / len(samples)
@@ -261,7 +266,7 @@ def _difference_from(picture: ColourField, rim: BoolArray) -> Float32Array:
 
 
 def _blobs(candidates: BoolArray, picture: ColourField) -> list[tuple[BoolArray, tuple[float, float]]]:
-    """The largest connected blobs, and their middles: seeds for growing."""
+    """The largest connected blobs, (height, width) each, and their middles in pixels."""
     opened = cv2.morphologyEx(candidates.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), dtype=np.uint8))
     _, labels, stats, middles = cv2.connectedComponentsWithStats(np.asarray(opened, dtype=np.uint8), connectivity=4)
     found = []

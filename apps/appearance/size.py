@@ -1,4 +1,4 @@
-"""How large the new object is: from its outline, its depth and the way the camera looks at it."""
+"""Measures a new object from its outline, its depth and the camera's direction."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from cocoro.robot import Camera, Robot
 ObjectShape = Literal["cylinder", "sphere", "box"]
 
 MIN_DEPTH_SHARE = 0.3
-"""Of the outline's pixels, that must have a depth."""
+"""Least share of the region's pixels that must have a depth."""
 ROUND = 0.845
-"""Share of its box that an outline fills: a disc 0.785, an upright can 0.9 or more."""
+"""Share of its box that a region fills: a disc 0.785, an upright can 0.9 or more."""
 ROUND_ASPECT = 0.85
 """Least ratio of a ball's width and height."""
 
@@ -28,14 +28,14 @@ class MeasuredSize(NamedTuple):
     width_m: float
     height_m: float
     distance_m: float
-    """From the camera to the object's middle."""
+    """Distance from the camera to the object's middle."""
 
 
 def surface_depth_m(raw_depth: CodeArray, region: ObjectRegion, robot: Robot) -> float | None:
-    """Depth of the visible surface along the optical axis, of the colour camera; None when too little of it has any.
+    """Depth of the visible surface along the colour camera's optical axis; None when too few pixels have a depth.
 
-    The depth camera stands beside the colour camera, so each of its pixels is carried to the colour picture, where the
-    nearest of several hides the others.
+    `raw_depth` are codes, (height, width). The depth camera stands beside the colour camera, so each of its pixels is
+    projected into the colour picture, where the nearest of several hides the others.
     """
     height, width = raw_depth.shape
     camera = robot.camera.scaled(width, height)
@@ -47,9 +47,9 @@ def surface_depth_m(raw_depth: CodeArray, region: ObjectRegion, robot: Robot) ->
     v = ((rows - camera.cy) * z + camera.fy * oy) / (z + oz) + camera.cy
     column, row = np.rint(u).astype(np.int64), np.rint(v).astype(np.int64)
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    carried = np.full(width * height, np.inf)
-    np.minimum.at(carried, row[inside] * width + column[inside], z[inside] + oz)
-    own = carried.reshape(height, width)[region.mask > 0]
+    projected = np.full(width * height, np.inf)
+    np.minimum.at(projected, row[inside] * width + column[inside], z[inside] + oz)
+    own = projected.reshape(height, width)[region.mask > 0]
     own = own[np.isfinite(own)]
     if len(own) < MIN_DEPTH_SHARE * region.area_px:
         return None
@@ -57,7 +57,7 @@ def surface_depth_m(raw_depth: CodeArray, region: ObjectRegion, robot: Robot) ->
 
 
 def guessed_shape(region: ObjectRegion, camera: Camera) -> ObjectShape:
-    """A ball when the outline is round, else a cylinder: a box looks like one, and has to be said."""
+    """A sphere when the outline is round, otherwise a cylinder; a box looks like one, so the person must state it."""
     left, top, right, bottom = region.box
     across, down = (right - left) / camera.fx, (bottom - top) / camera.fy
     fills = region.area_px / ((right - left) * (bottom - top))
@@ -67,11 +67,11 @@ def guessed_shape(region: ObjectRegion, camera: Camera) -> ObjectShape:
 def size_of(
     region: ObjectRegion, camera: Camera, depth_m: float, shape: ObjectShape, pose: FloatArray | None = None
 ) -> MeasuredSize:
-    """Width and height of the upright object whose visible surface is that far along the optical axis.
+    """Width and height of an upright object whose visible surface is at `depth_m` along the optical axis.
 
-    The outline is that of its middle, a radius behind the surface. Seen from above at an angle e, a cylinder of height
-    h and radius r has an outline h cos e + 2 r sin e high (orthographic; derived). `pose`: camera frame (x right, y
-    down, z forward) to body frame; without it the camera is taken to look level.
+    The outline is that of the object's middle, one radius behind the surface. Seen from above at an angle e, a cylinder
+    of height h and radius r has an outline of height h cos e + 2 r sin e (orthographic; derived). `pose`, (4, 4), is
+    camera frame (x right, y down, z forward) to body frame; without it the camera is assumed to look horizontally.
     """
     left, top, right, bottom = region.box
     middle = (left + right - 1) / 2, (top + bottom - 1) / 2
@@ -95,7 +95,7 @@ def size_of(
 
 
 def _width_px(region: ObjectRegion, shape: ObjectShape) -> float:
-    """Of an upright thing: the median over the rows of its middle half."""
+    """Width of an upright object in pixels: the median over the rows of its middle half."""
     left, top, right, bottom = region.box
     quarter = (bottom - top) // 4
     rows = region.mask[top + quarter : bottom - quarter or bottom, left:right]
@@ -108,6 +108,6 @@ def _angle(a: FloatArray, b: FloatArray) -> float:
 
 
 def outline_of(region: ObjectRegion) -> list[NDArray[np.int32]]:
-    """The region's outline, as OpenCV draws it."""
+    """The region's outlines in OpenCV's form, (n, 1, 2) pixels each."""
     outlines, _ = cv2.findContours(region.mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     return [np.asarray(outline, dtype=np.int32) for outline in outlines]

@@ -121,7 +121,7 @@ def report(capture: Capture, check: bool = False) -> CaptureReport:
         metadata={
             name: {entry: _plain(value) for entry, value in entries.items()}
             for name, entries in capture.metadata.items()
-            if name != TALLY or not capture.follows_page
+            if name != TALLY or not capture.follows_conventions
         },
     )
 
@@ -166,7 +166,12 @@ def _contradictions(capture: Capture) -> list[str]:
     if capture.problems:
         return []
     found = []
-    if capture.follows_page and TALLY in capture.metadata and capture.summarised and _told_tallies(capture) is None:
+    if (
+        capture.follows_conventions
+        and TALLY in capture.metadata
+        and capture.summarised
+        and _told_tallies(capture) is None
+    ):
         found.append(f"its metadata {TALLY!r} is not of this file, so its messages were counted")
     return found
 

@@ -98,7 +98,7 @@ def _copied(
     if capture.problems or capture.ending:
         problems = json.dumps(capture.problems)
         file.metadata(REPAIRED, {"file": capture.path.name, "ending": capture.ending, "problems": problems})
-    if capture.follows_page:
+    if capture.follows_conventions:
         file.tally(*missing_of(capture))
     file.finish()
     return count

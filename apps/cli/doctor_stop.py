@@ -1,4 +1,4 @@
-"""What `cocoro doctor` says of the emergency stop: whether it can be heard, and where its latch is kept."""
+"""Checks of `cocoro doctor` on the emergency stop: whether the stop path works, and where the latch is kept."""
 
 from __future__ import annotations
 
@@ -21,33 +21,43 @@ def check(robot: str) -> Iterator[Check]:
 
 
 def _path() -> Check:
-    """Take an address as a service of a robot would, and look for it as `cocoro stop` would."""
+    """Opens a stop point as a service does, and looks for it as `cocoro stop` does."""
     name = f"doctor-{os.getpid()}"
     try:
         with closing(StopPoint(name, "doctor")):
             found = addresses(name)
     except OSError as error:
-        return bad("emergency stop", f"its path cannot be used ({error}): is /proc mounted?")
+        return bad("emergency stop", f"the stop path does not work ({error}): is /proc mounted?")
     if not found:
-        return bad("emergency stop", "its addresses are not listed in /proc/net/unix: `cocoro stop` would miss them")
-    return ok("emergency stop", "its path works; everybody who can log in here may stop the robot")
+        return bad(
+            "emergency stop", "its addresses are missing in /proc/net/unix, so `cocoro stop` would not find them"
+        )
+    return ok("emergency stop", "the stop path works; every user of this machine may stop the robot")
 
 
 def _latch(robot: str) -> Check:
     folder = latch_dir(robot)
     there = next(path for path in (folder, *folder.parents) if path.exists())
     if not there.is_dir() or not os.access(there, os.W_OK):
-        return bad("its latch", f"{there} cannot be written: the robot comes up stopped; COCORO_STATE_DIR says another")
+        return bad(
+            "its latch",
+            f"{there} cannot be written, so the robot starts stopped; set COCORO_STATE_DIR",
+        )
     if (kind := _filesystem(there)) in IN_MEMORY:
-        return bad("its latch", f"{folder} is in memory ({kind}) and does not outlive a reboot; set COCORO_STATE_DIR")
-    latched = [said for file in sorted(folder.glob("[!.]*")) if (said := read(file)).latched] if folder.is_dir() else []
+        return bad(
+            "its latch",
+            f"{folder} is in memory ({kind}) and does not survive a reboot; set COCORO_STATE_DIR",
+        )
+    latched = (
+        [latch for file in sorted(folder.glob("[!.]*")) if (latch := read(file)).latched] if folder.is_dir() else []
+    )
     if latched:
         return note("its latch", f"latched by {latched[0].by}; `cocoro reset` releases it when the robot is up")
     return ok("its latch", f"kept in {folder}")
 
 
 def _filesystem(path: Path) -> str:
-    """The kind of file system on which a path lies; empty where that is not told."""
+    """Type of the file system that holds a path; empty where /proc does not list it."""
     try:
         mounts = [line.split() for line in Path("/proc/self/mounts").read_text(errors="replace").splitlines()]
     except OSError:

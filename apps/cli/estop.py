@@ -1,7 +1,6 @@
-"""`cocoro estop`, in short `stop`: first by the stop path, which nothing can deny, then by the mesh where that left
-something open.
+"""`cocoro estop`, in short `stop`: the emergency stop by the stop path, then by the mesh where the path left something.
 
-The stop path is used before anything else is imported or read, so it takes no longer than Python takes to start.
+The stop path is used before anything else is imported or read, so a stop takes no longer than Python takes to start.
 """
 
 from __future__ import annotations
@@ -15,34 +14,34 @@ from apps.cli import exits
 from apps.cli.stop_asking import Asking, Point
 
 STOPPABLE = ("base", "arm", "hand")
-"""As `cocoro.topics` has it, which takes its time to import."""
+"""Copy of the list in `cocoro.topics`, which is slow to import."""
 EXECUTIVE = "executive"
-"""It is told so that it ends its task. It moves nothing itself, so nobody waits for it to find its tongue."""
+"""The executive ends its task at a stop. It moves nothing itself, so the command does not wait for its answer."""
 ACKNOWLEDGE_S = 0.6
-"""How long the stop path waits for acknowledgements before the mesh is tried, too."""
+"""Longest wait for acknowledgements on the stop path; then the mesh is tried, too."""
 KEPT_S = 0.3
-"""How long it then waits to hear whether the latches are on the disk."""
+"""Longest wait after that for the news that the latches are on the disk."""
 
 
 class StopResult(NamedTuple):
-    """How stopping one robot went."""
+    """Result of stopping one robot."""
 
     robot: str
     acknowledged: tuple[str, ...]
     missing: tuple[str, ...]
-    """Known to run, and did not acknowledge."""
+    """Services that run and did not acknowledge."""
     absent: tuple[str, ...]
-    """Nobody there to acknowledge."""
+    """Services that do not run."""
     seconds: float
-    """From Enter to the moment at which the last of them stopped what it moves."""
+    """Time from Enter until the last service had stopped what it moves."""
     not_kept: tuple[str, ...] = ()
-    """Why latches will not outlive a restart."""
+    """Reasons why latches will not survive a restart."""
     not_yet_kept: tuple[str, ...] = ()
-    """Who has not said whether its latch is on the disk."""
+    """Services that have not reported whether their latch is on the disk."""
     owner: int | None = None
-    """User id of a robot that is another's."""
+    """User id of the owner when it is another user's robot."""
     latched_ns: dict[str, int] = {}  # noqa: RUF012 # read only
-    """When each service stopped what it moves, CLOCK_MONOTONIC; by the stop path alone."""
+    """Time at which each service stopped what it moves, ns of CLOCK_MONOTONIC; known by the stop path only."""
 
     @property
     def code(self) -> int:
@@ -72,13 +71,15 @@ def main(command: str, arguments: list[str]) -> int:
         parser = argparse.ArgumentParser(
             prog=f"cocoro {command}",
             description="Latch the emergency stop: wheels, arm and hand hold still until `cocoro reset`. "
-            "Without --robot and --profile every robot on this machine is stopped, whoever's it is.",
+            "Without --robot and --profile every robot on this machine is stopped, other users' robots, too.",
             epilog="Exit code 0 when every service that moves something has acknowledged, 1 when one has not "
             "(it is named), 4 when no robot is there.",
         )
         parser.add_argument("--robot", metavar="NAME")
-        parser.add_argument("--profile", metavar="FILE", help="reach it as this profile says, on another machine")
-        parser.add_argument("--json", action="store_true", help="print one JSON object a robot")
+        parser.add_argument(
+            "--profile", metavar="FILE", help="reach a robot on another machine through the mesh of this profile"
+        )
+        parser.add_argument("--json", action="store_true", help="print one JSON object for each robot")
         try:
             options = parser.parse_args(arguments)
         except SystemExit as end:
@@ -100,19 +101,21 @@ def main(command: str, arguments: list[str]) -> int:
         left_open = None if profile is not None or not stops else _left_open(robot, stops)
         if left_open is None or left_open:
             stops, troubles, code = _by_mesh_too(robot, profile, left_open, started_s, stops, troubles)
-    except Exception as error:  # whatever it is, what has been stopped is told
+    except Exception as error:  # whatever it is, the stops so far must be reported
         troubles.append(f"the mesh could not be asked: {type(error).__name__}: {error}")
         code = exits.FAILED
-    for stop in sorted(stops, key=lambda stop: stop.owner is None):  # the operator's own where he sees it: last
-        is_said = _say(stop, as_json)
-        code = code or stop.code or (exits.DONE if is_said else exits.FAILED)
+    for stop in sorted(
+        stops, key=lambda stop: stop.owner is None
+    ):  # the operator's own robots last, where they are seen
+        printed = _report(stop, as_json)
+        code = code or stop.code or (exits.DONE if printed else exits.FAILED)
     for trouble in troubles:
         _print(f"cocoro: {trouble}", sys.stderr)
     return code
 
 
 def by_path(robot: str | None) -> tuple[list[StopResult], list[str]]:
-    """Stop by the stop path; how it went with each robot, and what was in the way."""
+    """Stops by the stop path; returns the result of each robot, and the problems."""
     try:
         with Asking(robot) as asking:
             asking.go_on(time.monotonic() + ACKNOWLEDGE_S)
@@ -128,11 +131,10 @@ def by_path(robot: str | None) -> tuple[list[StopResult], list[str]]:
 
 
 def _left_open(robot: str | None, stops: list[StopResult]) -> set[str]:
-    """This user's own robots of which something runs that the path did not stop. What others' robots answered says
-    nothing about them."""
+    """This user's robots that have a running service which the stop path did not stop."""
     own = {stop.robot: stop for stop in stops if stop.owner is None}
     left_open = {stop.robot for stop in own.values() if stop.missing}
-    from deploy.rundir import RunDir, robots  # it takes its time, and by now everything has been told
+    from deploy.rundir import RunDir, robots  # slow to import; by now every stop has been sent
 
     for run_dir in robots() if robot is None else [RunDir(robot)]:
         stopped = own[run_dir.robot].acknowledged if run_dir.robot in own else ()
@@ -144,13 +146,13 @@ def _left_open(robot: str | None, stops: list[StopResult]) -> set[str]:
 def _stop_of(uid: int, robot: str, points: list[Point], started_s: float) -> StopResult:
     there = {point.service for point in points}
     silent = {point.service for point in points if point.latched_ns is None}
-    acknowledged = sorted(there - silent, key=_in_order)
+    acknowledged = sorted(there - silent, key=_movers_first)
     missing = silent - {EXECUTIVE}
     latched_s = [point.latched_ns / 1e9 for point in points if point.latched_ns is not None]
     return StopResult(
         robot,
         tuple(acknowledged),
-        tuple(sorted(missing, key=_in_order)),
+        tuple(sorted(missing, key=_movers_first)),
         tuple(service for service in STOPPABLE if service not in there),
         max(latched_s, default=time.monotonic()) - started_s,
         tuple(dict.fromkeys(point.why_not_kept for point in points if point.kept is False)),
@@ -160,8 +162,8 @@ def _stop_of(uid: int, robot: str, points: list[Point], started_s: float) -> Sto
     )
 
 
-def _in_order(service: str) -> tuple[int, str]:
-    """What moves first, in the order in which people name it."""
+def _movers_first(service: str) -> tuple[int, str]:
+    """Sort key: services that move something first."""
     return STOPPABLE.index(service) if service in STOPPABLE else len(STOPPABLE), service
 
 
@@ -173,8 +175,7 @@ def _by_mesh_too(
     stops: list[StopResult],
     troubles: list[str],
 ) -> tuple[list[StopResult], list[str], int]:
-    """Ask on the mesh what the stop path left open (`only` these robots, or all): what both know of each robot, what
-    was in the way, exit code."""
+    """Stops on the mesh the robots in `only` (None: all); returns merged results, problems and the exit code."""
     from apps.cli import estop_mesh
     from cocoro.errors import CocoroError, ConfigError
 
@@ -193,7 +194,7 @@ def _by_mesh_too(
 
 
 def _merged(by_path: list[StopResult], by_mesh: list[StopResult]) -> list[StopResult]:
-    """What either way acknowledged is stopped."""
+    """Merges the results of both ways: a service that acknowledged on either is stopped."""
     found = {stop.robot: stop for stop in by_mesh}
     merged = []
     for one in by_path:
@@ -202,8 +203,8 @@ def _merged(by_path: list[StopResult], by_mesh: list[StopResult]) -> list[StopRe
             missing = {*one.missing, *other.missing} - acknowledged
             absent = tuple(name for name in one.absent if name not in acknowledged | missing)
             one = one._replace(
-                acknowledged=tuple(sorted(acknowledged, key=_in_order)),
-                missing=tuple(sorted(missing, key=_in_order)),
+                acknowledged=tuple(sorted(acknowledged, key=_movers_first)),
+                missing=tuple(sorted(missing, key=_movers_first)),
                 absent=absent,
                 seconds=max(one.seconds, other.seconds),
                 not_kept=(*one.not_kept, *other.not_kept),
@@ -212,7 +213,7 @@ def _merged(by_path: list[StopResult], by_mesh: list[StopResult]) -> list[StopRe
     return [*merged, *found.values()]
 
 
-def _say(stop: StopResult, as_json: bool) -> bool:
+def _report(stop: StopResult, as_json: bool) -> bool:
     if as_json:
         import json
 
@@ -223,7 +224,7 @@ def _say(stop: StopResult, as_json: bool) -> bool:
 
 
 def _print(text: str, file: TextIO | None) -> bool:
-    """Whether it was taken: what cannot be told changes nothing about what was stopped."""
+    """Prints a line; returns whether it was written. Output that is lost changes nothing about the stop."""
     try:
         print(text, file=file, flush=True)
     except UnicodeError:
@@ -234,9 +235,9 @@ def _print(text: str, file: TextIO | None) -> bool:
 
 
 def _process_start_s() -> float:
-    """When this process was started, on the monotonic clock: the operator's Enter, to 10 ms (proc_pid_stat(5))."""
+    """Start of this process on the monotonic clock, s: the operator's Enter to 10 ms (proc_pid_stat(5))."""
     try:
-        with open("/proc/self/stat") as stat:  # noqa: PTH123 # pathlib takes as long to import as the stop itself
+        with open("/proc/self/stat") as stat:  # noqa: PTH123 # importing pathlib takes as long as the stop
             ticks = int(stat.read().rpartition(")")[2].split()[19])
         age_s = time.clock_gettime(time.CLOCK_BOOTTIME) - ticks / os.sysconf("SC_CLK_TCK")
     except (OSError, AttributeError):  # no /proc

@@ -1,4 +1,4 @@
-"""The mesh's own emergency stop: the second way, for robots on other machines and for what the stop path misses."""
+"""The emergency stop over the mesh: for robots on other machines, and for services that the stop path missed."""
 
 from __future__ import annotations
 
@@ -20,27 +20,28 @@ from cocoro.topics import ESTOP
 from deploy.rundir import RunDir, robots
 
 ROUND_S = 0.3
-"""How long one round of asking waits for those that do not answer."""
+"""Longest wait for answers in one round of requests."""
 PAUSE_S = 0.05
+"""Pause between two rounds."""
 GIVE_UP_S = 3.0
 PATIENCE_S = 0.15
-"""How long joining the mesh waits for members that do not answer (a stopped process, say)."""
+"""Longest wait, when joining the mesh, for members that do not answer (a stopped process, for example)."""
 
 
 def found(robot: str | None, profile: str | None) -> list[tuple[RunDir, ZenohConfig]]:
-    """The robots to be stopped, and how to reach each. Raises ConfigError."""
+    """The robots to be stopped, and how to reach each. Raises ConfigError for a profile that cannot be read."""
     if profile is not None:
         from deploy import profiles
 
-        said = profiles.read(profile)
-        run_dir = RunDir(robot or said.robot)
-        return [(run_dir, run_dir.join_as("operator", said.mesh))]
+        read = profiles.read(profile)
+        run_dir = RunDir(robot or read.robot)
+        return [(run_dir, run_dir.join_as("operator", read.mesh))]
     here = robots() if robot is None else [run_dir for run_dir in (RunDir(robot),) if run_dir.populated]
     return [(run_dir, run_dir.join_as("operator")) for run_dir in here]
 
 
 def stop_all(which: list[tuple[RunDir, ZenohConfig]], started_s: float) -> tuple[list[StopResult], list[CocoroError]]:
-    """Latch them one beside the other; how each went, and what kept others from being asked."""
+    """Stops the robots concurrently; returns the results, and the errors of those that could not be reached."""
 
     async def run() -> list[StopResult | BaseException]:
         stops = (stop(run_dir, config, started_s) for run_dir, config in which)
@@ -58,9 +59,10 @@ def stop_all(which: list[tuple[RunDir, ZenohConfig]], started_s: float) -> tuple
 
 
 async def stop(run_dir: RunDir, config: ZenohConfig, started_s: float) -> StopResult:
-    """Latch one robot's emergency stop: ask again and again until all who run and move have acknowledged.
+    """Latches one robot's emergency stop; repeats the request until every running service that moves something has
+    acknowledged, or GIVE_UP_S have passed.
 
-    Raises MeshError when the mesh is not there.
+    `started_s` is the command's start on the monotonic clock. Raises MeshError when the mesh is not there.
     """
     async with await ZenohBus.open(replace(config, patience_s=PATIENCE_S), expect_mesh=True) as bus:
         acknowledged: dict[str, float] = {}
@@ -88,7 +90,7 @@ async def stop(run_dir: RunDir, config: ZenohConfig, started_s: float) -> StopRe
 
 
 async def _ask(robot: str, bus: ZenohBus) -> dict[str, str]:
-    """Ask everybody once; the services that say they are latched, and why the disk has it not, or ''."""
+    """Sends one request to all services; returns those that are latched, each with why its latch is not on the disk."""
     question = msgspec.msgpack.encode(EstopRequest(latched=True, by="operator"))
     try:
         replies = await bus.call(ESTOP.of("*").key(robot), question, ROUND_S)
@@ -104,6 +106,6 @@ async def _ask(robot: str, bus: ZenohBus) -> dict[str, str]:
 
 
 async def _living(run_dir: RunDir, bus: ZenohBus) -> set[str]:
-    """The services that are alive on the mesh, and those that a process here is, though it may have been stopped."""
+    """Services that are alive on the mesh, or that a process of this machine has claimed (it may be suspended)."""
     tokens = await bus.alive(alive_key(run_dir.robot), ROUND_S)
     return {service_of(token) for token in tokens} | set(run_dir.claims())

@@ -1,4 +1,4 @@
-"""Payloads for people: any MessagePack map as text and as JSON, whatever type it is, and what is wrong with it."""
+"""Decodes payloads of any type, checks those of known types, and renders them as text and as JSON."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from cocoro.bus.base import Payload
 from cocoro.installed import topic_named
 
 SHOWN = 12
-"""Elements of a list that are shown unless all are wanted."""
+"""Elements of a list that are shown by default."""
 HEAD = ("stamp_ns", "seq", "incarnation")
-"""What every message says of itself: in the headline, not among the fields."""
+"""Fields that every message has; `echo` shows them in the headline."""
 
 
 class DecodedPayload(NamedTuple):
     type: str
     """The name of the topic's type; empty for a key that the table of topics does not have."""
     value: Any
-    """Maps, lists, texts, numbers, bytes; None when the payload is no MessagePack."""
+    """Maps, lists, texts, numbers, bytes; None when the payload is not MessagePack."""
     problem: str
-    """Why a reader of the topic's type would reject it; empty when it would not."""
+    """Why a reader of the topic rejects it; empty when it accepts it."""
 
 
 def read(payload: Payload, topic_name: str) -> DecodedPayload:
@@ -33,10 +33,10 @@ def read(payload: Payload, topic_name: str) -> DecodedPayload:
     name = topic.type.__name__ if topic is not None else ""
     try:
         value = msgpack.unpackb(payload, strict_map_key=False, timestamp=3, unicode_errors="replace")
-    except Exception as error:  # the library raises what it likes for what is broken
+    except Exception as error:  # the library raises many types of errors
         start = bytes(payload[:16]).hex(" ")
         return DecodedPayload(
-            name, None, f"no MessagePack ({error or type(error).__name__}): {len(payload)} bytes, {start}"
+            name, None, f"not MessagePack ({error or type(error).__name__}): {len(payload)} bytes, {start}"
         )
     if topic is None:
         return DecodedPayload("", value, "")
@@ -50,7 +50,7 @@ def read(payload: Payload, topic_name: str) -> DecodedPayload:
 
 
 def jsonable(value: Any) -> Any:
-    """The same with what JSON does not have as text: bytes by their number, NaN and infinity by their names."""
+    """The value with everything that JSON lacks as text: bytes by their number, NaN and infinity by their names."""
     if isinstance(value, dict):
         return {key if isinstance(key, str) else _text(key): jsonable(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -63,7 +63,7 @@ def jsonable(value: Any) -> Any:
 
 
 def lines(value: Any, everything: bool = False, indent: int = 2) -> Iterator[str]:
-    """A value as lines, a field each; long lists end in how many more there are, unless everything is wanted."""
+    """Renders a value, one line for each field; long lists are cut unless `everything` is set."""
     shift = " " * indent
     if isinstance(value, dict):
         for key, item in value.items():
@@ -85,7 +85,7 @@ def lines(value: Any, everything: bool = False, indent: int = 2) -> Iterator[str
 
 
 def _is_block(value: Any) -> bool:
-    """It takes lines of its own: a map with anything in it, or a list with such a map in it."""
+    """Whether a value needs lines of its own: a non-empty map, or a list that contains one."""
     if isinstance(value, list):
         return any(isinstance(item, dict) and item for item in value)
     return isinstance(value, dict) and bool(value)

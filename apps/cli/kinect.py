@@ -12,7 +12,7 @@ import typer
 
 from apps.cli import exits
 from apps.cli.options import ProfileOption
-from apps.cli.robot_file import write_values
+from apps.cli.toml_files import write_values
 from cocoro.component import load
 from cocoro.errors import ConfigError, RefusedError
 from cocoro.robot import Robot
@@ -83,8 +83,8 @@ def calibrate_from_views(
         report(f"show the board ({size} inner corners) 0.6 to 2 m away, in every part of the picture, tilted every way")
         taken = tools.capture(_config(profile), board, views, keep, report)
     found = calibration.calibrate(taken, board, robot)
-    write_values(file, "kinect", found.values())
     _print(found)
+    write_values(file, "kinect", found.values())
     print(f"written to {file}")
     if profile.measured is None:
         print(f'Name the file in the profile: measured = "{file}"')

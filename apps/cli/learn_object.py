@@ -15,8 +15,8 @@ import msgspec
 from apps.appearance.learn import LearnedObject, ObjectHints, learn
 from apps.cli import exits
 from apps.cli.learn_sight import CameraView, of_picture, of_robot, preview
-from apps.cli.objects_file import save, text_of, with_object
 from apps.cli.options import RobotChoice
+from apps.cli.toml_files import save, text_of, with_object
 from cocoro.errors import ConfigError, naming
 from cocoro.objects import Catalogue, ObjectSpec
 from cocoro.picture import save_png

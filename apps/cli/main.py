@@ -1,7 +1,7 @@
-"""`cocoro`: the operator's command. The emergency stop takes a way of its own that imports next to nothing.
+"""`cocoro`: the operator's command, from its arguments to its exit code.
 
-However a command ends, it ends here, and in an exit code: with one line for what an operator can mend, and one for a
-fault of the program's own.
+`cocoro stop` takes a path that imports next to nothing; all other commands are in `app`. An error becomes one line on
+on standard error that says what failed, where, and what to do.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ ADVICE = {
     errno.EDQUOT: "make room there, or choose another place",
     errno.EFBIG: "choose another place, or raise the limit (ulimit -f)",
     errno.EROFS: "choose another place",
-    errno.EACCES: "choose another place, or have it allowed",
-    errno.EPERM: "choose another place, or have it allowed",
+    errno.EACCES: "choose another place, or get permission",
+    errno.EPERM: "choose another place, or get permission",
     errno.ENAMETOOLONG: "choose a shorter name",
     errno.EMFILE: "raise the limit (ulimit -n)",
 }
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run a command; returns its exit code. A mistake of the operator's gets one line, no traceback."""
+    """Runs a command and returns its exit code. An operator's mistake gets one line and no traceback."""
     arguments = sys.argv[1:] if arguments is None else arguments
-    output.said_already.clear()
+    output.recent_complaints.clear()
     try:
         if arguments and arguments[0] in ESTOP:
             from apps.cli import estop
@@ -53,46 +53,45 @@ def main(arguments: list[str] | None = None) -> int:
 def _command(arguments: list[str]) -> int:
     from typer.main import get_group
 
-    from apps.cli import log_lines
     from apps.cli.app import app
 
     if output.taken_over():
-        log_lines.take_over()
+        output.log_to_stderr()
     try:
-        get_group(app)(args=arguments, prog_name="cocoro")  # not app itself, which hooks itself into sys.excepthook
+        get_group(app)(args=arguments, prog_name="cocoro")  # calling `app` would replace sys.excepthook
     except SystemExit as end:
-        if _interrupted(end):  # the command line library has an exit code of its own for it
+        if _interrupted(end):  # typer has another exit code for it
             return _cancelled()
         return end.code if isinstance(end.code, int) else exits.DONE if end.code is None else exits.FAILED
     return exits.DONE
 
 
 def failed(error: BaseException) -> int:
-    """Say what ended a command, in one line at most; the exit code for it."""
+    """Reports the error that ended a command in at most one line, and returns the exit code for it."""
     from cocoro.errors import CocoroError
 
-    while isinstance(error, BaseExceptionGroup) and len(error.exceptions) == 1:  # as a group of tasks wraps it
+    while isinstance(error, BaseExceptionGroup) and len(error.exceptions) == 1:  # a TaskGroup wraps errors
         error = error.exceptions[0]
     if isinstance(error, CocoroError):
         output.complain(str(error))
         return code_of(error)
     output.show_trace(error)
-    if isinstance(error, output.OutputError):  # said at the end, when nothing more can get lost
+    if isinstance(error, output.OutputError):  # `finish` reports it
         return exits.FAILED
     if isinstance(error, OSError):
-        output.complain(_of_system(error))
+        output.complain(_system_error(error))
         return exits.FAILED
     if _interrupted(error):
         return _cancelled()
     if isinstance(error, UnicodeEncodeError) and any("\udc80" <= c <= "\udcff" for c in error.object):
-        output.complain(f"{error.object}: this is no UTF-8, which is needed here; choose another name")
+        output.complain(f"{error.object}: this name is not valid UTF-8; choose another name")
         return exits.USAGE
-    _say_bug(error)
+    _report_bug(error)
     return exits.FAILED
 
 
 def _cancelled() -> int:
-    """End as cancelled. What was interrupted while it was made is taken apart now, and has nothing to say."""
+    """The exit code of a cancelled command. Silences what half-made objects report while they are destroyed."""
     if output.taken_over():
         import warnings
 
@@ -101,13 +100,13 @@ def _cancelled() -> int:
     return exits.REFUSED
 
 
-def _say_bug(error: BaseException) -> None:
-    said = f"{output.named(error)}{_place(error)}"
-    output.complain(f"internal error, please report it: {said}; {output.LEVEL}=debug shows the traceback")
+def _report_bug(error: BaseException) -> None:
+    text = f"{output.named(error)}{_place(error)}"
+    output.complain(f"internal error, please report it: {text}; {output.LEVEL}=debug shows the traceback")
 
 
 def code_of(error: Exception) -> int:
-    """The exit code that stands for an error."""
+    """The exit code for an error."""
     from cocoro import errors
 
     if isinstance(error, errors.MeshError):
@@ -119,10 +118,10 @@ def code_of(error: Exception) -> int:
     return exits.FAILED
 
 
-def _of_system(error: OSError) -> str:
-    """What the system has refused, where, and what to do about it."""
-    if error.errno == errno.ENOENT and not _has_place():
-        return "the current directory is gone; change to one that is there"
+def _system_error(error: OSError) -> str:
+    """Text for an error of the operating system: where, what, and what to do."""
+    if error.errno == errno.ENOENT and not _has_directory():
+        return "the current directory has been removed; change to another one"
     names = [os.fsdecode(name) for name in (error.filename, error.filename2) if isinstance(name, str | bytes)]
     where = " to ".join(names) or (_full() if error.errno == errno.ENOSPC else "") or f"the system{_place(error)}"
     advice = ADVICE.get(error.errno or 0, f"{output.LEVEL}=debug shows the traceback")
@@ -130,7 +129,7 @@ def _of_system(error: OSError) -> str:
 
 
 def _full() -> str:
-    """Which of the places that every command may write to is full: the system does not say that of a write."""
+    """A directory of those that commands write to whose disk is full; a failed write does not name its file."""
     import tempfile
 
     from cocoro.bus.endpoints import default_run_dir
@@ -142,24 +141,24 @@ def _full() -> str:
     return ""
 
 
-def _has_place() -> bool:
-    """Whether there is a current directory."""
+def _has_directory() -> bool:
+    """Whether the current directory exists."""
     try:
-        os.getcwd()  # noqa: PTH109 # to ask costs no import
+        os.getcwd()  # noqa: PTH109 # needs no import
     except OSError:
         return False
     return True
 
 
 def _interrupted(error: BaseException | None) -> bool:
-    """Whether it came of Ctrl-C: libraries that are interrupted make errors of their own of it."""
+    """Whether Ctrl-C caused the error; libraries wrap a KeyboardInterrupt in errors of their own."""
     while error is not None and not isinstance(error, KeyboardInterrupt):
         error = error.__cause__ or error.__context__
     return error is not None
 
 
 def _place(error: BaseException) -> str:
-    """Where in this project an error was raised."""
+    """The module and line of this project that raised the error, as text; empty when none did."""
     found, trace = "", error.__traceback__
     while trace is not None:
         name = str(trace.tb_frame.f_globals.get("__name__", ""))
@@ -173,45 +172,45 @@ def _place(error: BaseException) -> str:
 
 
 def run() -> NoReturn:
-    """The process `cocoro`, to its end."""
+    """The process `cocoro`: runs the command and ends the process with its exit code."""
     sys.excepthook = _leave
     sys.unraisablehook = _unraisable
-    threading.excepthook = _of_thread
+    threading.excepthook = _thread_failed
     for number in (signal.SIGTERM, signal.SIGHUP):
-        if signal.getsignal(number) == signal.SIG_DFL:  # nohup's stays as it is
-            signal.signal(number, _told)
+        if signal.getsignal(number) == signal.SIG_DFL:  # nohup's SIG_IGN stays
+            signal.signal(number, _as_interrupt)
     output.take_over()
     code = output.finish(main())
-    signal.signal(signal.SIGINT, lambda *_: os._exit(code))  # all is done; who is in a hurry need not wait
+    signal.signal(signal.SIGINT, lambda *_: os._exit(code))  # the command is done; Ctrl-C skips the clean-up
     signal.signal(signal.SIGTERM, lambda *_: os._exit(code))
     quit_process(code)
 
 
-def _told(_number: int, _frame: FrameType | None) -> None:
-    """Being told to end, and a closed terminal, are as Ctrl-C, which every command knows how to end at."""
-    if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:  # in the background of a script
+def _as_interrupt(_number: int, _frame: FrameType | None) -> None:
+    """Handles SIGTERM and SIGHUP as Ctrl-C, which every command handles."""
+    if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:  # a script runs the command in the background
         raise KeyboardInterrupt
     signal.raise_signal(signal.SIGINT)
 
 
 def _leave(_kind: type[BaseException], error: BaseException, _trace: TracebackType | None) -> NoReturn:
-    """Ctrl-C where nothing is under way any more, or yet: of all else there is nothing that `main` does not catch."""
+    """Handles Ctrl-C outside of `main`, which catches everything else."""
     os._exit(output.finish(failed(error)))
 
 
 def _unraisable(found: UnraisableHookArgs) -> None:
-    """Ctrl-C that came in a destructor or the like, where Python drops it: again, a moment later."""
+    """Repeats a Ctrl-C that came in a destructor, where Python would drop it; reports other errors as bugs."""
     if isinstance(found.exc_value, KeyboardInterrupt):
         import _thread
 
         _thread.start_new_thread(_thread.interrupt_main, ())
     elif found.exc_value is not None:
         output.show_trace(found.exc_value)
-        _say_bug(found.exc_value)
+        _report_bug(found.exc_value)
 
 
-def _of_thread(found: threading.ExceptHookArgs) -> None:
-    """An error that ended a thread, and not the command."""
+def _thread_failed(found: threading.ExceptHookArgs) -> None:
+    """Reports an error that ended a thread but not the command."""
     if found.exc_value is not None:
         failed(found.exc_value)
 

@@ -1,4 +1,4 @@
-"""`cocoro objects`: what the robot knows, and where it saw each thing last."""
+"""`cocoro objects`: the objects that the robot knows, and where it saw each last."""
 
 from __future__ import annotations
 

@@ -1,11 +1,11 @@
-"""Standard input, output and error of the process `cocoro`, whatever they are: closed, full, left by their reader, or
-of an encoding that cannot spell what is said.
+"""Standard streams of the process `cocoro` that survive anything: closed, full, abandoned by their reader, or with an
+encoding that lacks a character.
 
-Standard error never raises: there is nobody left to tell. Standard output raises `OutputError`, once, in the write that
-finds it lost; what is written afterwards is discarded, so that a command ends in good order. Under `going_on` it does
-not even raise. Either way `finish` says it in one line and makes it an exit code.
+Standard error never raises. Standard output raises `OutputError` once, in the write that finds it lost, and discards
+all later writes, so that a command can still clean up. Inside `going_on` it does not raise at all. In both cases
+`finish` reports the loss in one line and turns it into an exit code.
 
-Little is imported here: the emergency stop comes this way, too.
+This module imports little, because the emergency stop uses it.
 """
 
 from __future__ import annotations
@@ -23,35 +23,35 @@ from typing import Any, TextIO
 from apps.cli import exits
 
 LEVEL = "COCORO_LOG"
-"""Environment variable with the log level; `debug` shows the tracebacks of errors that were told in a line."""
+"""Environment variable with the log level; at `debug`, errors are printed with their tracebacks."""
 SPELLING = "cocoro.spelling"
-"""The error handler of both streams, by the name that `codecs` knows it by."""
+"""Name under which `codecs` knows the streams' error handler."""
 CLOSED = OSError(errno.EBADF, "it is closed")
 ADVICE = {
     errno.ENOSPC: "make room there, or write it elsewhere",
-    errno.EBADF: "to do without it, say >/dev/null",
+    errno.EBADF: "redirect it to /dev/null to do without it",
     errno.EPIPE: "its reader ended before it read anything",
 }
 
 
 class OutputError(Exception):
-    """Standard output takes nothing more. It is no OSError, so that nobody takes it for that of a file."""
+    """Standard output takes nothing more. Not an OSError, so that it is not mistaken for the error of a file."""
 
 
 class _Out(io.RawIOBase):
-    """A file descriptor that takes everything, if only to discard it."""
+    """Writes to a file descriptor; after a failure it discards everything."""
 
     mode = "wb"
 
     def __init__(self, fd: int, name: str, *, vital: bool, closed: bool) -> None:
         self.name = name
         self.vital = vital
-        """Whether a write that fails is to raise."""
+        """Whether a failed write raises OutputError."""
         self.failure: OSError | None = None
         self.arrived = False
-        """Whether anything has been taken."""
+        """Whether any byte was written."""
         self._fd = fd
-        self._is_closed = closed
+        self._was_closed = closed
 
     def write(self, data: bytes, /) -> int:  # type: ignore[override]
         rest = memoryview(data).cast("B")
@@ -66,12 +66,12 @@ class _Out(io.RawIOBase):
         return size
 
     def _some(self, data: memoryview) -> int:
-        if self._is_closed:
+        if self._was_closed:
             raise CLOSED
         while True:
             try:
                 count = os.write(self._fd, data)
-            except BlockingIOError:  # somebody else has made it so, at the pipe's other end or before us
+            except BlockingIOError:  # another process set O_NONBLOCK on the shared descriptor
                 import select
 
                 select.select([], [self._fd], [])
@@ -90,31 +90,31 @@ class _Out(io.RawIOBase):
 
 
 _outs: dict[str, _Out] = {}
-said_already: deque[str] = deque(maxlen=8)
-"""The last complaints of the command that runs."""
+recent_complaints: deque[str] = deque(maxlen=8)
+"""Latest complaints of the running command, so that none is printed twice."""
 
 
 def take_over() -> None:
-    """Put what bears everything in the place of this process's standard streams.
+    """Replaces this process's standard streams.
 
-    A descriptor that is closed becomes /dev/null: else the next file that is opened would get its number, and what a
-    library prints.
+    A closed descriptor becomes /dev/null; otherwise the next opened file would get its number, and with it the text
+    that libraries print.
     """
     closed = [fd for fd in range(3) if not _is_open(fd)]
     for _ in closed:
         with suppress(OSError):
-            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)  # it gets the least number that is free: this one
+            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)  # gets the lowest free number, which is this one
     codecs.register_error(SPELLING, spelt)
     if isinstance(sys.stdin, io.TextIOWrapper):
         sys.stdin.reconfigure(errors="replace")
     elif sys.stdin is None:
-        sys.stdin = open(0, encoding="utf-8", errors="replace", closefd=False)  # noqa: SIM115 # a number
+        sys.stdin = open(0, encoding="utf-8", errors="replace", closefd=False)  # noqa: SIM115 # the descriptor stays open
     sys.stdout = _stream(sys.stdout, _Out(1, "<stdout>", vital=True, closed=1 in closed))
     sys.stderr = _stream(sys.stderr, _Out(2, "<stderr>", vital=False, closed=2 in closed))
 
 
 def taken_over() -> bool:
-    """Whether the standard streams are those of `take_over`: this is the process `cocoro`, and no test of it."""
+    """Whether `take_over` was called: true in the process `cocoro`, false in tests of its functions."""
     return bool(_outs)
 
 
@@ -127,9 +127,9 @@ def _is_open(fd: int) -> bool:
 
 
 def _stream(before: TextIO | None, out: _Out) -> TextIO:
-    """As Python made it, but for what it does when it fails."""
+    """A stream with the encoding and buffering of `before` that writes to `out`."""
     _outs[out.name] = out
-    straight = bool(getattr(before, "write_through", False))  # as PYTHONUNBUFFERED has it
+    straight = bool(getattr(before, "write_through", False))  # set by PYTHONUNBUFFERED
     raw: Any = out
     return io.TextIOWrapper(
         raw if straight else io.BufferedWriter(raw),
@@ -141,12 +141,12 @@ def _stream(before: TextIO | None, out: _Out) -> TextIO:
 
 
 def spelt(error: UnicodeError) -> tuple[bytes, int]:
-    """How what an encoding lacks is written: of a file name the very bytes that it has, else as `\\xfc`."""
+    """Error handler for `codecs`: a file name's undecodable bytes are written as they are, others as `\\xfc`."""
     if not isinstance(error, UnicodeEncodeError):
         raise error
     found = bytearray()
     for character in error.object[error.start : error.end]:
-        if "\udc80" <= character <= "\udcff":  # a byte that was none of the file system's encoding
+        if "\udc80" <= character <= "\udcff":  # a byte that the file system's encoding could not decode
             found.append(ord(character) - 0xDC00)
         else:
             found += character.encode("ascii", "backslashreplace")
@@ -155,7 +155,8 @@ def spelt(error: UnicodeError) -> tuple[bytes, int]:
 
 @contextmanager
 def going_on() -> Iterator[None]:
-    """While a robot is commanded or recorded: that nobody hears of it any more must not end it half done."""
+    """Standard output does not raise in this context: lost output must not interrupt a command to a robot, or a
+    recording."""
     out = _outs.get("<stdout>")
     before = out is not None and out.vital
     if out is not None:
@@ -168,9 +169,9 @@ def going_on() -> Iterator[None]:
 
 
 def finish(code: int) -> int:
-    """Write what waits to be written; the exit code, which is 1 at least when standard output has not taken all of it.
+    """Flushes the streams and returns the exit code: at least 1 when standard output did not take everything.
 
-    A reader who has read something and left, as `head` does, is not told of: he has what he wanted.
+    A reader that read something and left, as `head` does, is not reported.
     """
     with going_on():
         for stream in (sys.stdout, sys.stderr):
@@ -182,17 +183,17 @@ def finish(code: int) -> int:
     number = out.failure.errno or 0
     if number != errno.EPIPE or not out.arrived:
         advice = ADVICE.get(number, "write it elsewhere")
-        complain(f"standard output: {out.failure.strerror}, so not all that was to be said has been; {advice}")
+        complain(f"standard output: {out.failure.strerror}, so output was lost; {advice}")
     return code or exits.FAILED
 
 
 def named(error: BaseException) -> str:
-    """An error's type and text."""
+    """The error's type and text."""
     return f"{type(error).__name__}: {error}".rstrip(": ")
 
 
 def show_trace(error: BaseException) -> None:
-    """Print an error's traceback, when it is asked for."""
+    """Prints the error's traceback when COCORO_LOG=debug."""
     if os.environ.get(LEVEL, "").lower() == "debug":
         import traceback
 
@@ -200,18 +201,35 @@ def show_trace(error: BaseException) -> None:
 
 
 def complain(text: str) -> None:
-    """One line on standard error, whatever characters are in it; once, though a library may have said it already."""
+    """Prints one line on standard error, unless it was just printed; control characters are escaped."""
     line = f"cocoro: {one_line(text)}"
-    if line not in said_already:
-        said_already.append(line)
+    if line not in recent_complaints:
+        recent_complaints.append(line)
         print(line, file=sys.stderr, flush=True)
 
 
 def one_line(text: str) -> str:
-    """A text with its line ends and control characters, which a file's name may have, written out."""
-    return "".join(map(_shown, text))
+    """The text with line ends and control characters, which a file's name may have, escaped."""
+    return "".join(map(_escaped, text))
 
 
-def _shown(character: str) -> str:
+def _escaped(character: str) -> str:
     plain = character.isprintable() or "\udc80" <= character <= "\udcff"
     return character if plain else character.encode("unicode_escape").decode()
+
+
+def log_to_stderr() -> None:
+    """Prints log records of commands that set up no log, one line each; tracebacks with COCORO_LOG=debug."""
+    import logging
+
+    class Lines(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            error = record.exc_info[1] if record.exc_info else None
+            if isinstance(error, OutputError):  # `finish` reports it
+                return
+            first = record.getMessage().partition("\n")[0]
+            complain(first if error is None else f"{first}: {named(error)}")
+            if error is not None:
+                show_trace(error)
+
+    logging.lastResort = Lines(logging.WARNING)

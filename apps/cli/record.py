@@ -21,15 +21,15 @@ from apps.cli.terminal import StatusLine
 from cocoro.clock import FollowedClock
 from cocoro.component import load as load_component
 from cocoro.errors import ConfigError
+from cocoro.installed import unrecorded
 from cocoro.messages import Recording
 from cocoro.node import Node
 from cocoro.robot import Robot
 from cocoro.topics import RECORDING
-from deploy import processes, robot_time
+from deploy import robot_time
+from services.capture.component import CAPTURE
 from services.capture.writer import describe_disturbance
 
-RECORDER = "capture"
-"""The process whose component records."""
 END_S = 1.0
 """Longest wait for the recorder's last message after it has ended."""
 
@@ -64,12 +64,13 @@ async def record_mesh(choice: RobotChoice, settings: dict[str, Any], seconds: fl
     `settings` are fields of the recorder's configuration. Raises MeshError when there is no mesh, ConfigError for a
     setting that the recorder does not take.
     """
-    row = processes.named(RECORDER)
-    component = load_component(row)
+    component = load_component(CAPTURE)
     try:
         config = msgspec.convert(settings, component.config)
     except msgspec.ValidationError as error:
         raise ConfigError(f"record: {error}") from error
+    if left_out := unrecorded():
+        print(f"not recorded, as declared: {', '.join(left_out)}", file=sys.stderr)
     async with joined(choice, frames=True) as link:
         resolved = link.run_dir.resolved()
         description, measured = (
@@ -78,7 +79,9 @@ async def record_mesh(choice: RobotChoice, settings: dict[str, Any], seconds: fl
         clock = FollowedClock() if resolved.get("clock") == "sim" else robot_time.clock(link.run_dir.path)
         robot = Robot.load(description, measured)
         name = f"record-{os.getpid()}"
-        async with Node(name, link.bus, clock, robot, robot_name=link.robot, module=row.module, config=config) as node:
+        async with Node(
+            name, link.bus, clock, robot, robot_name=link.robot, module=CAPTURE.module, config=config
+        ) as node:
             with StatusLine() as line, interrupt_event() as end, going_on():
                 display = _RecordingDisplay(line)
                 node.on(RECORDING.of(name), display.show)

@@ -17,8 +17,8 @@ import typer
 from apps.cli import exits
 from apps.cli.link import Link, joined
 from apps.cli.options import JsonOption, MeshOption, ProfileOption, RobotChoice, RobotOption
-from apps.cli.robot_file import write_values
 from apps.cli.terminal import StatusLine, print_table
+from apps.cli.toml_files import write_values
 from cocoro.component import load
 from cocoro.errors import CocoroError, ConfigError, MeshError, RefusedError
 from cocoro.messages import ServoRequest
@@ -169,9 +169,11 @@ class ServoWorkbench:
             yield line
 
     def write(self, joint: Joint, values: dict[str, Any]) -> None:
-        write_values(self.file, "joint", values, joint.name)
+        """Prints the values before they are written: a file that cannot be written must not cost a calibration."""
         text = ", ".join(f"{key} = {value}" for key, value in values.items())
-        print(f"{joint.name}: {text}; written to {self.file}")
+        print(f"{joint.name}: {text}", flush=True)
+        write_values(self.file, "joint", values, joint.name)
+        print(f"written to {self.file}")
         if self.profile.measured is None:
             print(f'Name the file in the profile: measured = "{self.file}"')
 
@@ -243,11 +245,12 @@ def _write_ports(bench: ServoWorkbench, found: list[Any], names: dict[int, Joint
                 " them to one line, or write the profile by hand"
             )
         port, baud = places.pop()
+        print(f"{network}_port = {port}, {baud} baud", flush=True)
         write_values(file, "service.servos", {f"{network}_port": port})
-        print(f"{network}_port = {port}; written to {file}")
+        print(f"the port is written to {file}")
         if baud != row.baud:
             write_values(bench.file, f"network.{network}", {"baud": baud})
-            print(f"{network}: {baud} baud; written to {bench.file}")
+            print(f"the baud rate is written to {bench.file}")
 
 
 @servos.command("set-id")

@@ -1,4 +1,5 @@
-"""Captures: MCAP files with all that travelled on a robot's mesh. Written, read, mended, played and looked at here.
+"""Captures are MCAP files with every message of a robot's mesh. Here is their format, and reading them.
 
-docs/captures.md says what is in one, for readers that know nothing of this project.
+`reader.Capture` opens one and gives its messages; `types` reads them as today's message types. The recorder writes
+them (`services.capture`). docs/captures.md describes the format for readers without this project.
 """

@@ -1,4 +1,4 @@
-"""What a capture is beyond MCAP."""
+"""What a capture has beyond plain MCAP: profile, checksums of metadata, the tally at the file's end; and errors."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from cocoro.errors import CocoroError, ConfigError
 
 
 class CaptureError(CocoroError):
-    """A capture cannot be read, or written; the text names the file."""
+    """A capture cannot be read or written. The text names the file."""
 
 
 class NotAFileError(CaptureError, ConfigError):
-    """Something else than a file was named: a pipe, a device."""
+    """The path names a pipe or a device."""
 
 
 PROFILE = "cocoro"
-"""In the MCAP header: the conventions of docs/captures.md hold."""
+"""MCAP profile of files that follow the conventions of docs/captures.md."""
 MAKER = "cocoro"
-"""The header's library begins with this in files that were written here."""
+"""The header's library begins with this in files that this project wrote."""
 
 
 class KeyTally(msgspec.Struct):
@@ -33,12 +33,12 @@ class KeyTally(msgspec.Struct):
 
     messages: int = 0
     size_bytes: int = 0
-    """Size of the payloads."""
+    """Payloads only."""
     first_ns: int = 0
     last_ns: int = 0
     """Log times."""
     longest_gap_ns: int = 0
-    """Between two messages' log times."""
+    """Longest time between the log times of two consecutive messages."""
     longest_gap_from_ns: int = 0
 
     def add(self, log_ns: int, size_bytes: int) -> None:
@@ -52,11 +52,11 @@ class KeyTally(msgspec.Struct):
 
 
 TALLY = "tally"
-"""The metadata record that a whole file ends with: what it has of each key, and what is missing."""
+"""Metadata record at the end of a complete file: counts by key, and the number of dropped and lost messages."""
 
 
 def tally_names(channels: Mapping[int, Channel]) -> dict[int, str]:
-    """The name of each channel in the tally, by its number: its key, or KEY#NUMBER where a key has several."""
+    """Each channel's name in the tally, by channel number: its key, or KEY#NUMBER where a key has several channels."""
     counts = Counter(channel.topic for channel in channels.values())
     return {
         id: channel.topic if counts[channel.topic] == 1 else f"{channel.topic}#{id}" for id, channel in channels.items()
@@ -64,11 +64,11 @@ def tally_names(channels: Mapping[int, Channel]) -> dict[int, str]:
 
 
 CHECKSUM = "crc32"
-"""The metadata entry with the checksum of the others."""
+"""Metadata entry with the checksum of the record's other entries."""
 
 
 def checksum(entries: Mapping[str, str]) -> str:
-    """Over names and values, sorted by name, each followed by a zero byte."""
+    """CRC-32 of names and values, sorted by name, each followed by a zero byte; 8 hexadecimal digits."""
     crc = 0
     for name in sorted(entries):
         if name != CHECKSUM:

@@ -1,14 +1,14 @@
-"""Reading captures, whole or not, ours or others'. Channels are told apart by their numbers: a key may have several.
+"""Reads captures, also damaged and unfinished ones, and MCAP files of other programs.
 
     with Capture.open(path) as capture:
         for record in capture.messages("base/state", "kinect/frame"):
             print(record.log_ns, record.key, capture.decode(record))
 
-What cannot be read is passed by and told of in `capture.problems`; whoever has read a capture looks there at the end.
+Channels are identified by number, since a key may have several. Unreadable parts are skipped and listed in
+`capture.problems`; look there after reading.
 
-By hand, because the package's readers end at the first damage, know channels only from the summary where there is one,
-and copy every payload: they take 1.0 to 1.4 times as long for frames, 1.5 to 2.0 times for small messages
-(`python bench/capture_format.py files`).
+The `mcap` package's readers stop at the first damage, know channels only from the summary, and copy every payload. They
+take 1.0 to 1.4 times as long for frames, 1.5 to 2.0 times for small messages (`python bench/capture_format.py files`).
 """
 
 from __future__ import annotations
@@ -39,13 +39,13 @@ from cocoro.keys import matches
 
 Raw = bytes | memoryview
 AHEAD = 4
-"""Chunks that are read before they are asked for."""
+"""Chunks that a thread reads and unpacks ahead."""
 MOST_PROBLEMS = 20
-"""Told one by one; of further ones there is a count."""
+"""Further problems are counted, not listed."""
 
 
 class Record(NamedTuple):
-    """One message, as it was recorded."""
+    """A recorded message."""
 
     key: str
     log_ns: int
@@ -53,11 +53,11 @@ class Record(NamedTuple):
     sequence: int
     payload: memoryview
     channel: int
-    """Its number."""
+    """The channel's number in the file."""
 
 
 class Capture:
-    """Make it with `open`; close it, or use it in `with`."""
+    """An open capture file. `open` makes one; close it, or use it in a `with` statement."""
 
     def __init__(self, path: Path, fd: int) -> None:
         self.path = path
@@ -72,17 +72,15 @@ class Capture:
             os.close(fd)
             raise CaptureError(f"{path} cannot be read: {error.strerror}") from error
         self._problems = list(self._contents.problems)
-        self._untold = 0
+        self._not_listed = 0
 
     @classmethod
     def open(cls, path: Path) -> Capture:
-        """Raises CaptureError when it is no MCAP file, or cannot be read at all; NotAFileError for what is no file."""
+        """Raises CaptureError when the file cannot be read or is not MCAP, NotAFileError for a pipe or a device."""
         try:
             mode = path.stat().st_mode
-            if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):  # opening one may block, or do something
-                raise NotAFileError(
-                    f"{path} is {_kind(mode)} and no file; copy what it gives into a file, and name that"
-                )
+            if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):  # opening a device may block, or have an effect
+                raise NotAFileError(f"{path} is {_kind(mode)} and no file; copy its output into a file, and name that")
             fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
         except OSError as error:
             raise CaptureError(f"{path} cannot be read: {error.strerror}") from error
@@ -92,23 +90,23 @@ class Capture:
 
     @property
     def whole(self) -> bool:
-        """It was closed by its writer, and nothing of it has been found to be damaged so far."""
+        """The file was closed by its writer, and no damage has been found so far."""
         return self._contents.closed and not self._problems
 
     @property
     def closed(self) -> bool:
-        """It has its end. A recorder that was killed, or still writes, leaves none."""
+        """The file has its footer. A recorder that was killed or is still running leaves none."""
         return self._contents.closed
 
     @property
     def summarised(self) -> bool:
-        """Its contents were taken from its summary, so not all of it has been read."""
+        """The contents come from the file's summary, so not all of the file has been read."""
         return self._contents.summarised
 
     @property
-    def follows_page(self) -> bool:
-        """Its profile says that the conventions of docs/captures.md hold."""
-        return self._contents.follows_page
+    def follows_conventions(self) -> bool:
+        """The file follows the conventions of docs/captures.md, as its profile says."""
+        return self._contents.follows_conventions
 
     @property
     def profile(self) -> str:
@@ -116,21 +114,21 @@ class Capture:
 
     @property
     def ending(self) -> str:
-        """In words, why it may be shorter than the run was; '' when it was closed."""
+        """Why the capture may be shorter than the run, in words; '' for a closed file."""
         if self.closed:
             return ""
-        cut = f" (of its last record there are {self.cut_bytes} bytes and not the rest)" if self.cut_bytes else ""
-        return f"not closed: it is still being written, or its recorder was killed or had no room left{cut}"
+        cut = f" (the last record is cut off after {self.cut_bytes} bytes)" if self.cut_bytes else ""
+        return f"not closed: it is still being written, or its recorder was killed or ran out of room{cut}"
 
     @property
     def cut_bytes(self) -> int:
-        """At its end, of a record that was never finished."""
+        """Bytes of an unfinished last record."""
         return self._contents.cut_bytes
 
     @property
     def problems(self) -> list[str]:
-        """Parts that could not be read, and counts that are not so, as far as it was tried, in words."""
-        more = [f"and {self._untold} more of the kind"] if self._untold else []
+        """Unreadable parts and wrong counts found so far, in words."""
+        more = [f"and {self._not_listed} more problems"] if self._not_listed else []
         return [*self._problems, *more]
 
     @property
@@ -139,36 +137,36 @@ class Capture:
 
     @property
     def notes(self) -> list[str]:
-        """Records that are passed by without being damaged, in words."""
+        """Records that were skipped without being damaged, in words."""
         kinds = self._contents.unknown
         if not kinds:
             return []
         names = ", ".join(f"{op:#04x}" for op in sorted(kinds))
-        return [f"{kinds.total()} records of kinds that are not MCAP's own ({names}) are passed by"]
+        return [f"{kinds.total()} records of kinds that are not MCAP's own ({names}) are skipped"]
 
     @property
     def places(self) -> tuple[MessageBlock, ...]:
-        """Where its messages are, in the order of the file."""
+        """The parts of the file that hold messages, in the order of the file."""
         return tuple(self._contents.places)
 
     @property
     def statistics(self) -> Statistics | None:
-        """Counts that the file states in its summary; None where it has none."""
+        """The counts that the file's summary states; None without a summary."""
         return self._contents.statistics
 
     @property
     def chunk_bytes(self) -> int:
-        """Size of all chunks before compression."""
+        """Uncompressed size of all chunks."""
         return self._contents.raw_bytes
 
     @cached_property
     def channels(self) -> dict[int, Channel]:
-        """By number, also those without messages."""
+        """Channels by number, including those without messages."""
         return dict(sorted(self._contents.channels.items()))
 
     @cached_property
     def keys(self) -> dict[str, tuple[int, ...]]:
-        """Every key with the numbers of its channels."""
+        """Each key with the numbers of its channels."""
         found: dict[str, tuple[int, ...]] = {}
         for id, channel in self.channels.items():
             found[channel.topic] = (*found.get(channel.topic, ()), id)
@@ -179,49 +177,50 @@ class Capture:
         return dict(self._contents.schemas)
 
     def schema(self, channel: int) -> Schema | None:
-        """The schema of a channel; None where it has none."""
+        """A channel's schema; None when it has none."""
         return self._contents.schemas.get(self.channels[channel].schema_id)
 
     @property
     def metadata(self) -> dict[str, dict[str, str]]:
-        """By name, without checksums; of several of one name the newest."""
+        """Metadata by name, without checksums; the newest where a name occurs several times."""
         return {found.name: _unsealed(found.metadata) for found in self._contents.metadata}
 
     def every_metadata(self, name: str) -> list[dict[str, str]]:
-        """All of one name, in the order in which they were written, without checksums."""
+        """All metadata of one name, in the order of writing, without checksums."""
         return [_unsealed(found.metadata) for found in self._contents.metadata if found.name == name]
 
     @property
     def metadata_records(self) -> list[tuple[str, dict[str, str]]]:
-        """All but the tally, as they stand in the file and in that order."""
+        """Name and entries of all metadata except the tally, in the order of the file, with checksums."""
         return [
             (found.name, dict(found.metadata))
             for found in self._contents.metadata
-            if found.name != TALLY or not self.follows_page
+            if found.name != TALLY or not self.follows_conventions
         ]
 
     @property
     def attachments(self) -> tuple[AttachmentIndex, ...]:
-        """The index of each attachment: its names, times and size, and its place in the file."""
+        """Index of each attachment: name, times, size and place in the file."""
         return tuple(self._contents.attachments)
 
     def attachment(self, index: AttachmentIndex) -> Attachment:
-        """Read one attachment with its data. Raises DamageError where its checksum is wrong."""
+        """Read one attachment with its data. Raises DamageError when its checksum is wrong."""
         content = self._disk.read(index.offset, index.length)
-        return mcap.attachment(content[mcap.PREFIX.size :], self._contents.ours)
+        return mcap.attachment(content[mcap.PREFIX.size :], self._contents.strict)
 
     @cached_property
     def robot(self) -> str:
-        """The robot's name: keys begin with it. '' when the capture does not say, and its keys begin differently."""
-        told = self.metadata.get("run", {}).get("robot")
-        if told is not None:
-            return told
+        """The robot's name, with which its keys begin; '' when the capture names none and its keys differ in the
+        beginning."""
+        name = self.metadata.get("run", {}).get("robot")
+        if name is not None:
+            return name
         names = {key.partition("/")[0] for key in self.keys if "/" in key}
         return names.pop() if len(names) == 1 else ""
 
     @property
     def start_ns(self) -> int:
-        """The first log time; 0 of an empty capture."""
+        """First log time; 0 for an empty capture."""
         return min((place.start_ns for place in self._contents.places), default=0)
 
     @property
@@ -237,10 +236,10 @@ class Capture:
         end_ns: int | None = None,
         channels: Collection[int] | None = None,
     ) -> Iterator[Record]:
-        """In order of their log times; those of one time as they stand in the file.
+        """Messages in the order of their log times, then in the order of the file.
 
-        `keys` are key expressions, with or without the robot's name; none means all. Times are log times, the end
-        exclusive. Of `channels`, if they are given, and no others.
+        `keys` are key expressions, with or without the robot's name; none means all. `channels` restricts to these
+        numbers. `start_ns` and `end_ns` are log times; the end is exclusive. Raises CaptureError when the disk fails.
         """
         wanted = {
             id
@@ -272,11 +271,11 @@ class Capture:
             yield heapq.heappop(waiting)[3]
 
     def check(self) -> None:
-        """Look at what reading messages does not look at: the checksums of all the data and of attachments, and of a
-        recorder's file every record, from front to back. What is wrong is in `problems` then. Raises CaptureError."""
+        """Verify what reading messages does not: the checksum over all data, the attachments, and for a recorder's file
+        every record front to back. Adds to `problems`. Raises CaptureError when the disk fails."""
         found = self._contents
         try:
-            if found.ours and found.summarised:
+            if found.strict and found.summarised:
                 for problem in front_to_back(self._disk).problems:
                     self.add_problem(problem)
             if found.data_crc and self._disk.checksum(0, found.data_end) != found.data_crc:
@@ -299,12 +298,12 @@ class Capture:
         return Record(self.channels[channel_id].topic, log_ns, publish_ns, sequence, payload, channel_id)
 
     def _read_ahead(self, places: list[MessageBlock]) -> Iterator[tuple[MessageBlock, Future[Raw]]]:
-        """Read and unpack in a thread what is wanted next, while this one works on what it has."""
+        """Read and unpack the next blocks in a thread while the caller works on the current one."""
         with ThreadPoolExecutor(1, "capture reader") as pool:
             ahead: deque[tuple[MessageBlock, Future[Raw]]] = deque()
             try:
                 for place in places:
-                    ahead.append((place, pool.submit(read_block, self._disk, place, self._contents.ours)))
+                    ahead.append((place, pool.submit(read_block, self._disk, place, self._contents.strict)))
                     if len(ahead) > AHEAD:
                         yield ahead.popleft()
                 while ahead:
@@ -321,26 +320,26 @@ class Capture:
                 if channel_id in wanted:
                     yield mcap.message(content)
                 elif channel_id not in self.channels:
-                    self.add_problem(f"a message is of channel {channel_id}, which the file does not tell of")
+                    self.add_problem(f"a message belongs to channel {channel_id}, which the file does not declare")
         except DamageError as damage:
             kind = "run of messages" if place.loose else "chunk"
-            self.add_problem(f"the {kind} at byte {place.offset} ({place.length} bytes) is passed by: {damage}")
+            self.add_problem(f"the {kind} at byte {place.offset} ({place.length} bytes) is skipped: {damage}")
         except OSError as error:
             raise CaptureError(f"{self.path} cannot be read: {error.strerror}") from error
 
     def add_problem(self, text: str) -> None:
-        """Have it told of something that could not be read."""
+        """Add an unreadable part to `problems`."""
         if text in self._problems:
             return
         if len(self._problems) < MOST_PROBLEMS:
             self._problems.append(text)
         else:
-            self._untold += 1
+            self._not_listed += 1
 
     # --- what they mean ---------------------------------------------------------------------------
 
     def decode(self, record: Record) -> Any:
-        """A message as plain data: MessagePack and JSON as maps, anything else as bytes. Raises DamageError."""
+        """A message as plain data: maps for MessagePack and JSON, otherwise bytes. Raises DamageError."""
         encoding = self.channels[record.channel].message_encoding
         try:
             if encoding == MSGPACK:
@@ -348,15 +347,15 @@ class Capture:
             if encoding == JSON:
                 return json.loads(bytes(record.payload))
         except (msgspec.MsgspecError, ValueError, RecursionError) as error:
-            raise DamageError(f"{record.key} {record.sequence}: the payload is no {encoding}: {error}") from error
+            raise DamageError(f"{record.key} {record.sequence}: the payload is not {encoding}: {error}") from error
         return bytes(record.payload)
 
     def read(self, record: Record) -> msgspec.Struct:
-        """A message as today's type of its key, by the rules of `cocoro.capture.schema`. Raises NotReadableError."""
+        """A message as today's type of its key, by the rules of `cocoro.capture.types`. Raises NotReadableError."""
         schema = self.schema(record.channel)
         read = reader_of(record.key.removeprefix(f"{self.robot}/"), None if schema is None else schema.name)
         if read is None:
-            raise NotReadableError(f"{record.key}: no type is known for it here")
+            raise NotReadableError(f"{record.key}: its type is unknown")
         try:
             return read(record.payload)
         except (msgspec.MsgspecError, ValueError, RecursionError, DamageError) as error:
@@ -379,12 +378,12 @@ class Capture:
 
 
 def _unsealed(entries: dict[str, str]) -> dict[str, str]:
-    """Without the checksum that recorders put there; an entry of that name that is none stays."""
+    """Entries without a recorder's checksum; another program's entry of that name stays."""
     return {name: value for name, value in entries.items() if name != CHECKSUM or value != checksum(entries)}
 
 
 def _kind(mode: int) -> str:
-    """Name the kind of something that is no file."""
+    """A file kind in words."""
     if stat.S_ISFIFO(mode):
         return "a pipe"
     return "a socket" if stat.S_ISSOCK(mode) else "a device"

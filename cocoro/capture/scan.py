@@ -1,11 +1,11 @@
-"""Finding what is in a file of records: by its summary where that can be relied on, else from front to back.
+"""Finds the contents of an MCAP file: from its summary where that is reliable, otherwise front to back.
 
-A summary is relied on when its checksum, if it has one, is right, and it lists as many schemas, channels, chunks,
-attachments and metadata as its statistics say and the file has; what it does not list is looked for between the chunks,
-from record to record. Any other file is read from front to back: that is slower, and no fault of the file's.
+A summary is reliable when its checksum (if any) is right, and it lists as many schemas, channels, chunks, attachments
+and metadata as its statistics say and the file has. Records between the listed chunks are read one by one. Any other
+file is read front to back, which is slower; such a file need not be damaged.
 
-Resynchronisation in damaged files is by hand, since the package ends at the first damage: where the framing of records
-breaks, the next chunk is searched for whose checksum is right.
+Where the framing of records breaks, reading resumes at the next chunk with a right checksum. The `mcap` package stops
+at the first damage.
 """
 
 from __future__ import annotations
@@ -17,25 +17,25 @@ from mcap.opcode import Opcode
 from mcap.records import ChunkIndex, Footer, MetadataIndex, Statistics
 
 from cocoro.capture import mcap
-from cocoro.capture.contents import Contents, Disk, MessageBlock, begun, compare, read_chunk
+from cocoro.capture.contents import Contents, Disk, MessageBlock, compare, read_chunk, read_header
 from cocoro.capture.mcap import MAGIC, PREFIX, CutOffError, DamageError
 from cocoro.capture.walk import Walk
 
 LARGEST_SUMMARY = 1 << 30
 _SEARCHED = 1 << 20
 _MARKS = (struct.pack("<I", 4) + b"zstd", struct.pack("<I", 3) + b"lz4", struct.pack("<I", 0))
-"""A chunk's compression, as it stands in its head."""
+"""A chunk's compression, as its head encodes it."""
 _MARK_AT = PREFIX.size + 28
 _MCAPS = frozenset(Opcode)
 _FOOTER_DAMAGED = "the file's footer is damaged"
 
 
 class _UnsureError(Exception):
-    """The summary does not say all; the text is '' unless that is damage."""
+    """The summary is not complete. The text is empty unless that is damage."""
 
 
 def contents(disk: Disk) -> Contents:
-    """Raises DamageError when it is no MCAP file at all."""
+    """Raises DamageError for a file that is not MCAP."""
     if disk.size == 0:
         raise DamageError("the file is empty")
     if disk.size < len(MAGIC) or disk.read(0, len(MAGIC)) != MAGIC:
@@ -55,9 +55,9 @@ def contents(disk: Disk) -> Contents:
 
 
 def _by_summary(disk: Disk) -> Contents:
-    """Raises _UnsureError, or DamageError for what a reading from front to back will find, too."""
-    found, indices = begun(disk), []
-    summary, summary_start = _summary(disk, found.ours)
+    """Raises _UnsureError, or DamageError for damage that reading front to back will find as well."""
+    found, indices = read_header(disk), []
+    summary, summary_start = _summary(disk, found.strict)
     for op, content, _ in mcap.records(summary):
         if op == Opcode.SCHEMA:
             found.add_schema(content)
@@ -69,7 +69,7 @@ def _by_summary(disk: Disk) -> Contents:
             indices.append(mcap.parsed(ChunkIndex, content)[0])
         elif op == Opcode.METADATA_INDEX:
             index, _ = mcap.parsed(MetadataIndex, content)
-            found.metadata_told[index.offset] = index.name
+            found.metadata_index[index.offset] = index.name
         elif op not in _MCAPS:
             found.unknown[op] += 1
     if found.statistics is None:
@@ -80,8 +80,14 @@ def _by_summary(disk: Disk) -> Contents:
     found.places += map(_place, indices)
     found.places.sort()
     found.raw_bytes += sum(index.uncompressed_size for index in indices)
-    told = found.statistics
-    listed = (told.schema_count, told.channel_count, told.chunk_count, told.attachment_count, told.metadata_count)
+    stated = found.statistics
+    listed = (
+        stated.schema_count,
+        stated.channel_count,
+        stated.chunk_count,
+        stated.attachment_count,
+        stated.metadata_count,
+    )
     if listed != (len(found.schemas), len(found.channels), found.chunks, len(found.attachments), len(found.metadata)):
         raise _UnsureError
     found.messages.clear()
@@ -91,44 +97,44 @@ def _by_summary(disk: Disk) -> Contents:
     return found
 
 
-def _footer(disk: Disk, ours: bool) -> tuple[Footer, int]:
-    """Read the footer; also the offset of its record. Raises _UnsureError where there is none with a summary, which
-    is damage in a file of `ours`."""
+def _footer(disk: Disk, strict: bool) -> tuple[Footer, int]:
+    """Returns the footer and the offset of its record. Raises _UnsureError for a file without footer or summary; in a
+    `strict` file a missing summary is damage."""
     if not _ends(disk):
-        raise _UnsureError  # it was never closed, which is no damage; or its footer is longer than what is known of it
+        raise _UnsureError  # never closed, or the footer has unknown fields; neither is damage
     at = disk.size - mcap.FOOTER_LENGTH - len(MAGIC)
     footer, _ = mcap.parsed(Footer, disk.read(at + PREFIX.size, mcap.FOOTER_LENGTH - PREFIX.size))
     if footer.summary_start == 0:
-        raise _UnsureError(_FOOTER_DAMAGED if ours else "")
+        raise _UnsureError(_FOOTER_DAMAGED if strict else "")
     return footer, at
 
 
-def _summary(disk: Disk, ours: bool) -> tuple[bytes, int]:
-    """Read the summary section, which its checksum vouches for, and the offset at which it begins. In a file of `ours`
-    it must have a checksum. Raises _UnsureError."""
-    footer, footer_at = _footer(disk, ours)
+def _summary(disk: Disk, strict: bool) -> tuple[bytes, int]:
+    """Returns the summary section, checked by its checksum, and its offset. A `strict` summary must have a checksum.
+    Raises _UnsureError."""
+    footer, footer_at = _footer(disk, strict)
     if not len(MAGIC) <= footer.summary_start <= footer_at or footer_at - footer.summary_start > LARGEST_SUMMARY:
         raise _UnsureError(_FOOTER_DAMAGED)
     summary = disk.read(footer.summary_start, footer_at - footer.summary_start)
-    if not mcap.vouches_for(footer, summary, must=ours):
+    if not mcap.checksum_is_right(footer, summary, strict):
         raise _UnsureError("the file's summary is damaged")
     return summary, footer.summary_start
 
 
-def _summary_is_right(disk: Disk, ours: bool) -> bool:
+def _summary_is_right(disk: Disk, strict: bool) -> bool:
     try:
-        _summary(disk, ours)
+        _summary(disk, strict)
     except (_UnsureError, DamageError):
         return False
     return True
 
 
 def _between_chunks(disk: Disk, found: Contents, indices: list[ChunkIndex], end: int) -> None:
-    """Take in all that is not in a chunk that the summary lists."""
+    """Read everything outside of the chunks that the summary lists."""
     walk, at = Walk(disk, found, check=False), len(MAGIC)
     for index in indices:
         if index.message_start_time == index.message_end_time == 0:
-            continue  # its times may stand for that it has no messages, so it is looked into
+            continue  # times of 0 may mean "no messages", so the chunk is read
         walk.through(at, index.chunk_start_offset)
         at = index.chunk_start_offset + index.chunk_length + index.message_index_length
     indices[:] = [index for index in indices if index.message_start_time or index.message_end_time]
@@ -146,22 +152,22 @@ def _place(index: ChunkIndex) -> MessageBlock:
 
 
 def front_to_back(disk: Disk) -> Contents:
-    """Read everything, and keep what is whole."""
+    """Read everything, and keep what is intact."""
     found = _scanned(disk)
     compare(found)
     return found
 
 
 def _scanned(disk: Disk) -> Contents:
-    found = begun(disk)
+    found = read_header(disk)
     found.closed = _ends(disk)
-    walk, at = Walk(disk, found, check=True, sure=_summary_is_right(disk, found.ours)), len(MAGIC)
+    walk, at = Walk(disk, found, check=True, sure=_summary_is_right(disk, found.strict)), len(MAGIC)
     while at < disk.size:
         try:
             at = walk.step(at)
         except DamageError as damage:
             start = at if walk.suspect is None else walk.suspect
-            after = _search(disk, start + 1, found.ours)
+            after = _search(disk, start + 1, found.strict)
             if after == disk.size and isinstance(damage, CutOffError) and not found.closed:
                 found.cut_bytes = disk.size - at
                 break
@@ -173,22 +179,22 @@ def _scanned(disk: Disk) -> Contents:
 
 
 def _ends(disk: Disk) -> bool:
-    """Whether there is a footer where one without an extension would be."""
+    """Whether a footer of the known length ends the file."""
     tail = disk.read(
         max(disk.size - mcap.FOOTER_LENGTH - len(MAGIC), 0), min(disk.size, mcap.FOOTER_LENGTH + len(MAGIC))
     )
     return tail.endswith(MAGIC) and tail.startswith(PREFIX.pack(Opcode.FOOTER, mcap.FOOTER_LENGTH - PREFIX.size))
 
 
-def _search(disk: Disk, start: int, ours: bool) -> int:
-    """Where the next chunk is that is right; the file's size when there is none."""
+def _search(disk: Disk, start: int, strict: bool) -> int:
+    """The offset of the next intact chunk, or the file's size."""
     overlap = mcap.LONGEST_CHUNK_HEAD + PREFIX.size
     for block_at in range(start, disk.size, _SEARCHED):
         block = disk.read(block_at, min(_SEARCHED + overlap, disk.size - block_at))
         for candidate in _candidates(block):
             at = block_at + candidate
             try:
-                read_chunk(disk, at, ours, exactly=True)
+                read_chunk(disk, at, strict, exactly=True)
             except DamageError:
                 continue
             return at
@@ -196,7 +202,7 @@ def _search(disk: Disk, start: int, ours: bool) -> int:
 
 
 def _candidates(block: bytes) -> Iterator[int]:
-    """Where in these bytes a chunk may begin, in order."""
+    """Offsets in `block` at which a chunk may begin, in order."""
     places = set()
     for mark in _MARKS:
         at = block.find(mark)

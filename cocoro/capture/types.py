@@ -1,4 +1,14 @@
-"""Recorded payloads as today's message types."""
+"""The message types of a capture: how recorded payloads are read as today's types, and their JSON schemas.
+
+Rules, which msgspec applies to each message:
+
+- A field that today's type does not have is ignored.
+- A field that the recorded message lacks takes today's default. Without a default the message can be read only as a
+  map.
+- A field whose type or limits have changed is read where the recorded value fits today's.
+
+`cocoro.capture.former` has the rules for types whose shape has changed otherwise.
+"""
 
 from __future__ import annotations
 
@@ -17,33 +27,32 @@ from cocoro.capture.mcap import DamageError
 from cocoro.installed import topic_named
 from cocoro.messages import Frame, Message
 
-Read = Callable[[bytes | memoryview], msgspec.Struct]
-
 
 class NotReadableError(DamageError):
-    """A recorded message cannot be had as today's type."""
+    """A recorded message does not fit today's type."""
 
 
-@cache
-def reader_of(name: str, schema: str | None) -> Read | None:
-    """How payloads of a topic (the key without the robot) are read, by the recorded schema's name; None for keys that
-    are not in today's table. Lossy frames come as frames."""
-    if schema == Alive.__name__:
-        return msgspec.msgpack.Decoder(Alive).decode
-    if schema == LossyFrame.__name__:
-        decoder = msgspec.msgpack.Decoder(LossyFrame)
-        return lambda payload: expand(decoder.decode(payload))
-    topic = topic_named(name)
-    if topic is None or (schema is not None and todays_name(schema) != topic.type.__name__):
-        return None
-    kind: type[Message] = topic.type
-    decode = msgspec.msgpack.Decoder(kind).decode
-    return lambda payload: decode(todays_payload(kind.__name__, payload))
+MADE_HERE = "recorder"
+"""Channel metadata `publisher` of messages that the recorder made itself and nobody published."""
+
+
+class MessageHead(msgspec.Struct, gc=False):
+    """The fields that every message of this project has, decoded alone. Payloads of other programs may lack them."""
+
+    stamp_ns: int = 0
+    seq: int = 0
+    incarnation: int = 0
+
+
+class Alive(Message):
+    """The recorder's note that a liveliness token appeared or disappeared; the key names the service."""
+
+    alive: bool
 
 
 class LossyFrame(Message):
-    """In place of a Frame on the same key, where a recorder was told to save room; stamp, sequence and incarnation are
-    the frame's."""
+    """A frame with its colour as JPEG, recorded in place of a Frame on the same key to save room. Stamp, sequence
+    number and incarnation are the frame's."""
 
     width: Annotated[int, Meta(ge=1, le=4096)]
     height: Annotated[int, Meta(ge=1, le=4096)]
@@ -53,7 +62,8 @@ class LossyFrame(Message):
 
 
 def expand(lossy: LossyFrame) -> Frame:
-    """A frame that looks like the one that was recorded. Raises DamageError when the picture is none."""
+    """Returns a frame that looks like the recorded one; perception is not reproducible from it. Raises DamageError when
+    the picture is damaged."""
     pixels = cv2.imdecode(np.frombuffer(lossy.colour_jpeg, dtype=np.uint8), cv2.IMREAD_COLOR)
     if pixels is None or pixels.shape[:2] != (lossy.height, lossy.width):
         raise DamageError("a frame's picture is damaged")
@@ -68,25 +78,6 @@ def expand(lossy: LossyFrame) -> Frame:
     )
 
 
-MSGPACK, JSON, OTHER = "msgpack", "json", "application/octet-stream"
-MADE_HERE = "recorder"
-"""The channel metadata `publisher` of what was never published: the recorder's own notes."""
-
-
-class MessageHead(msgspec.Struct, gc=False):
-    """The fields that every message has, decoded alone; a payload of others may lack any of them."""
-
-    stamp_ns: int = 0
-    seq: int = 0
-    incarnation: int = 0
-
-
-class Alive(Message):
-    """A liveliness token came or went, as the recorder saw it: a service of the robot, by its key."""
-
-    alive: bool
-
-
 ENCODING = "jsonschema"
 
 
@@ -98,7 +89,7 @@ class TypeSchema(NamedTuple):
 
 @cache
 def schema_of(kind: type[msgspec.Struct]) -> TypeSchema:
-    """The schema of a message's type: an object at its root, binary fields as `contentEncoding: binary`."""
+    """The JSON schema of a message's type: an object at the root, binary fields as `contentEncoding: binary`."""
     whole = msgspec.json.schema(kind)
     parts = dict(whole.get("$defs", {}))
     root = parts.pop(kind.__name__, whole)
@@ -109,10 +100,31 @@ def schema_of(kind: type[msgspec.Struct]) -> TypeSchema:
 
 
 def _binary(node: Any) -> Any:
-    """MessagePack carries bytes as they are, not as text in base 64."""
+    """MessagePack carries bytes as they are, so they are `binary` and not `base64`."""
     if isinstance(node, dict):
         return {
             name: "binary" if (name, value) == ("contentEncoding", "base64") else _binary(value)
             for name, value in node.items()
         }
     return [_binary(item) for item in node] if isinstance(node, list) else node
+
+
+MSGPACK, JSON, OTHER = "msgpack", "json", "application/octet-stream"
+Read = Callable[[bytes | memoryview], msgspec.Struct]
+
+
+@cache
+def reader_of(name: str, schema: str | None) -> Read | None:
+    """Returns a decoder for the payloads of a topic (the key without the robot) by the recorded schema's name; None
+    when no type is known for the key. It returns lossy frames as frames."""
+    topic = topic_named(name)
+    if topic is not None and (schema is None or topic.type.__name__ in (schema, todays_name(schema))):
+        kind: type[Message] = topic.type
+        decode = msgspec.msgpack.Decoder(kind).decode
+        return lambda payload: decode(todays_payload(kind.__name__, payload))
+    if schema == Alive.__name__:
+        return msgspec.msgpack.Decoder(Alive).decode
+    if schema == LossyFrame.__name__:
+        decoder = msgspec.msgpack.Decoder(LossyFrame)
+        return lambda payload: expand(decoder.decode(payload))
+    return None

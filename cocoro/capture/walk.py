@@ -1,4 +1,4 @@
-"""From record to record through a file, taking in what each is."""
+"""Reads a file record by record and adds each record to the file's contents."""
 
 from __future__ import annotations
 
@@ -26,26 +26,26 @@ from cocoro.capture.contents import LARGEST_RECORD, Contents, Disk, MessageBlock
 from cocoro.capture.mcap import KNOWN, MAGIC, PREFIX, CutOffError, DamageError
 
 RUN_BYTES = 1 << 20
-"""A run of messages outside of chunks is closed at this size, so that a reader need not hold more at once."""
+"""A run of messages outside of chunks ends at this size, which bounds a reader's memory."""
 HEAD_BYTES = 1 << 16
-"""An attachment's names and times are looked for in so much of it."""
+"""An attachment's head must fit into this."""
 _SUMMARY = {
     Opcode.CHUNK_INDEX: ChunkIndex,
     Opcode.ATTACHMENT_INDEX: AttachmentIndex,
     Opcode.SUMMARY_OFFSET: SummaryOffset,
 }
-"""Kinds that only say where others are."""
+"""Records that only locate others."""
 
 
 class Walk:
-    """Takes records into `found`. Raises DamageError from `step` for one that cannot be; what is before it stays."""
+    """Adds records to `found`. `step` raises DamageError for a damaged record; what was read before stays."""
 
     def __init__(self, disk: Disk, found: Contents, check: bool, sure: bool = True) -> None:
-        """With `check` the checksums of attachments are looked at, which reads them. Unless it is `sure` that the
-        summary is as it was written, nothing is taken from there."""
+        """With `check`, attachments are read and their checksums verified. Unless the caller is `sure` that the summary
+        is undamaged, nothing is taken from it."""
         self.suspect: int | None = None
-        """The first of the records just before this place that nothing vouches for: of unknown kinds, or longer than
-        what is known of them. A wrong length may be hidden there."""
+        """Offset of the first of the records just before this one that no checksum covers: of an unknown kind, or
+        longer than its known fields. One of them may have a damaged length. None: no such record."""
         self._disk = disk
         self._found = found
         self._check = check
@@ -55,7 +55,7 @@ class Walk:
         self._run_times: list[int] = []
         self._run_channels: set[int] = set()
         self._due: dict[int, list[tuple[int, int]]] = {}
-        """By channel, log time and offset of each message in the chunk that was read last, until its index is read."""
+        """Log time and offset of each message of the last chunk, by channel, until the channel's index is read."""
         self._kinds: dict[int, Callable[[bytes], int]] = {
             Opcode.SCHEMA: self._schema,
             Opcode.CHANNEL: self._channel,
@@ -66,20 +66,20 @@ class Walk:
         }
 
     def through(self, start: int, end: int) -> None:
-        """From record to record up to `end`, where one must begin. Raises DamageError."""
+        """Read records from `start` to `end`, where one must begin. Raises DamageError."""
         at = start
         while at < end:
             at = self.step(at)
         if at > end:
-            raise DamageError("a record reaches into another")
+            raise DamageError("a record overlaps the next one")
         self.finish()
 
     def jump(self) -> None:
-        """Records were passed by, so what the next one is says nothing of those before."""
+        """Forget the records before this place, after some were skipped."""
         self.suspect, self._due = None, {}
 
     def finish(self) -> None:
-        """Close the run of messages outside of chunks, if there is one."""
+        """Close the current run of messages outside of chunks."""
         if self._run_times:
             self._found.places.append(
                 MessageBlock(
@@ -90,8 +90,8 @@ class Walk:
             self._run_times, self._run_channels = [], set()
 
     def step(self, at: int) -> int:
-        """Take in one record. Where the next one is; the file's size after the footer. Raises DamageError."""
-        op, length = PREFIX.unpack(self._disk.near(at, PREFIX.size))
+        """Read one record. Returns the next one's offset, or the file's size after the footer. Raises DamageError."""
+        op, length = PREFIX.unpack(self._disk.read_cached(at, PREFIX.size))
         end: int = at + PREFIX.size + length
         if end > self._disk.size:
             raise CutOffError("a record is cut off")
@@ -108,7 +108,7 @@ class Walk:
         elif op == Opcode.FOOTER:
             end = self._footer(start, end)
         elif op == Opcode.DATA_END:
-            taken = self._data_end(at, self._disk.near(start, min(length, HEAD_BYTES)))
+            taken = self._data_end(at, self._disk.read_cached(start, min(length, HEAD_BYTES)))
         elif op == Opcode.HEADER and at == len(MAGIC):
             taken = mcap.parsed(Header, self._content(start, length))[1]
         elif op == Opcode.METADATA:
@@ -116,16 +116,16 @@ class Walk:
         elif op in self._kinds:
             taken = self._kinds[op](self._content(start, length))
         elif op in (0, Opcode.HEADER):
-            raise DamageError(f"a record of kind {op} has no place there")
+            raise DamageError(f"a record of kind {op} does not belong there")
         else:
             taken = -1
         if taken == length:
             self.suspect = None
             return end
         if op != Opcode.CHUNK and _is_chunk(self._disk, start, length):
-            raise DamageError("by its content it is a chunk, by its kind it is none")
-        if self._found.ours:
-            self._found.problems.append(f"bytes {at} to {end} are no record of a recorder's")
+            raise DamageError("a record with the content of a chunk has another kind")
+        if self._found.strict:
+            self._found.problems.append(f"bytes {at} to {end} are not a record that a recorder writes")
         self.suspect = at if self.suspect is None else self.suspect
         if taken < 0:
             self._found.unknown[op] += 1
@@ -133,17 +133,17 @@ class Walk:
 
     def _content(self, start: int, length: int) -> bytes:
         if length > LARGEST_RECORD:
-            raise DamageError("no record is so large")
-        return self._disk.near(start, length)
+            raise DamageError("a record is larger than any can be")
+        return self._disk.read_cached(start, length)
 
     # --- each kind --------------------------------------------------------------------------------
 
     def _message(self, at: int, start: int, end: int) -> None:
-        if self._found.ours:
-            raise DamageError("a message has no place there")
+        if self._found.strict:
+            raise DamageError("a message does not belong there")
         if end - start < mcap.MESSAGE_FIELDS.size:
             raise DamageError("a message is shorter than its head")
-        channel_id, _, log_ns, _ = mcap.MESSAGE_FIELDS.unpack(self._disk.near(start, mcap.MESSAGE_FIELDS.size))
+        channel_id, _, log_ns, _ = mcap.MESSAGE_FIELDS.unpack(self._disk.read_cached(start, mcap.MESSAGE_FIELDS.size))
         if at != self._run_end or self._run_end - self._run_at >= RUN_BYTES:
             self.finish()
         if not self._run_times:
@@ -155,7 +155,7 @@ class Walk:
 
     def _chunk(self, at: int, start: int, end: int) -> int:
         record = self._disk.read(start, end - start)
-        raw, taken = unpacked(record, self._found.ours)
+        raw, taken = unpacked(record, self._found.strict)
         index: dict[int, list[tuple[int, int]]] = defaultdict(list)
         times = []
         for op, content, offset in mcap.records(raw):
@@ -172,29 +172,29 @@ class Walk:
         self._found.messages.update({channel: len(entries) for channel, entries in index.items()})
         if times:
             self._found.places.append(MessageBlock(at, end - at, min(times), max(times), frozenset(index)))
-        if self._found.ours:
+        if self._found.strict:
             self._due = index
             head, _ = mcap.ChunkHead.unpack(record)
             if times and (head.start_ns, head.end_ns) != (min(times), max(times)):
-                self._found.problems.append(f"the times of the chunk at byte {at} are not those of its messages")
+                self._found.problems.append(f"the times of the chunk at byte {at} differ from those of its messages")
         return taken
 
     def _message_index(self, content: bytes) -> int:
         taken = mcap.check_message_index(content)
-        if self._found.ours:
+        if self._found.strict:
             channel, entries = mcap.index_entries(content)
             if sorted(entries) != sorted(self._due.pop(channel, ())):
                 place = self._found.places[-1].offset if self._found.places else 0
-                self._found.problems.append(f"an index of the chunk at byte {place} is not that of its messages")
+                self._found.problems.append(f"an index of the chunk at byte {place} differs from its messages")
         return taken
 
     def _attachment(self, at: int, start: int, end: int) -> int:
-        head = self._disk.near(start, min(end - start, HEAD_BYTES))
+        head = self._disk.read_cached(start, min(end - start, HEAD_BYTES))
         index, data_at = mcap.attachment_index(head, at, end - at)
         if self._check:
             try:
-                mcap.attachment(self._disk.read(start, end - start), self._found.ours)
-            except DamageError as damage:  # its record is as long as it says, so what follows can be read
+                mcap.attachment(self._disk.read(start, end - start), self._found.strict)
+            except DamageError as damage:  # the record's length is right, so reading can continue after it
                 self._found.problems.append(f"bytes {at} to {end} are not readable: {damage}")
                 return data_at + index.data_size + 4
         self._found.attachments.append(index)
@@ -211,15 +211,15 @@ class Walk:
         return self._found.add_channel(content)
 
     def _statistics(self, content: bytes) -> int:
-        told, taken = mcap.parsed(Statistics, content)
+        parsed, taken = mcap.parsed(Statistics, content)
         if self._sure:
-            self._found.statistics = told
+            self._found.statistics = parsed
         return taken
 
     def _metadata_index(self, content: bytes) -> int:
-        told, taken = mcap.parsed(MetadataIndex, content)
+        parsed, taken = mcap.parsed(MetadataIndex, content)
         if self._sure:
-            self._found.metadata_told[told.offset] = told.name
+            self._found.metadata_index[parsed.offset] = parsed.name
         return taken
 
     def _data_end(self, at: int, content: bytes) -> int:
@@ -228,14 +228,14 @@ class Walk:
         return taken
 
     def _footer(self, start: int, end: int) -> int:
-        """Nothing comes after it but the magic bytes."""
-        mcap.parsed(Footer, self._disk.near(start, min(end - start, HEAD_BYTES)))
+        """Only the magic bytes follow it."""
+        mcap.parsed(Footer, self._disk.read_cached(start, min(end - start, HEAD_BYTES)))
         if self._disk.read(end, len(MAGIC)) != MAGIC:
             raise DamageError("the file does not end after its footer")
         self._found.closed = True
         after = end + len(MAGIC)
         if after < self._disk.size:
-            self._found.problems.append(f"bytes {after} to {self._disk.size} come after the file's end")
+            self._found.problems.append(f"bytes {after} to {self._disk.size} follow the file's end")
         return self._disk.size
 
 
@@ -244,12 +244,12 @@ def _taken(kind: Any, content: bytes) -> int:
 
 
 def _is_chunk(disk: Disk, start: int, length: int) -> bool:
-    """Whether a record's content is that of a chunk, as its checksum says."""
+    """Whether a record's content is an intact chunk with a right checksum."""
     try:
-        head, _ = mcap.ChunkHead.unpack(disk.near(start, min(length, mcap.LONGEST_CHUNK_HEAD)))
+        head, _ = mcap.ChunkHead.unpack(disk.read_cached(start, min(length, mcap.LONGEST_CHUNK_HEAD)))
         if head.crc == 0 or head.compression not in KNOWN or head.packed_bytes > length:
             return False
-        unpacked(disk.read(start, length), ours=False)
+        unpacked(disk.read(start, length), strict=False)
     except DamageError:
         return False
     return True

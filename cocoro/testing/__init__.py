@@ -15,6 +15,7 @@ was recorded of it.
 from cocoro.testing.again import Executed, execute_again
 from cocoro.testing.clock import JumpingClock
 from cocoro.testing.core import CoreUnderTest
+from cocoro.testing.declared import NotedBus, misdeclared
 from cocoro.testing.service import ServiceUnderTest
 from cocoro.testing.tap import Tap
 from cocoro.testing.virtual import in_virtual_time, settle
@@ -23,9 +24,11 @@ __all__ = [
     "CoreUnderTest",
     "Executed",
     "JumpingClock",
+    "NotedBus",
     "ServiceUnderTest",
     "Tap",
     "execute_again",
     "in_virtual_time",
+    "misdeclared",
     "settle",
 ]

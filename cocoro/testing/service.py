@@ -18,6 +18,7 @@ from cocoro.keys import alive_key
 from cocoro.messages import Message, TopicHealth
 from cocoro.node import Node
 from cocoro.robot import Robot
+from cocoro.testing.declared import NotedBus
 from cocoro.testing.tap import Tap
 from cocoro.testing.virtual import settle
 from cocoro.topics import Request, Topic
@@ -58,9 +59,10 @@ class ServiceUnderTest:
         else:
             self._config = msgspec.convert(config or {}, implementation.config)
         self._clock = clock or VirtualClock()
-        self._bus = self.mesh.join()
+        self.bus = NotedBus(self.mesh, self.robot.name)
+        """The service's own; `misdeclared(component, service.bus)` compares it with a declaration."""
         self.node = Node(
-            self.name, self._bus, self._clock, self.robot, record_steps=record_steps,
+            self.name, self.bus, self._clock, self.robot, record_steps=record_steps,
             module=module, config=self._config, latches=latches,
         )  # fmt: skip
         self.tester = Node("tester", self.mesh.join(), self._clock, self.robot)
@@ -162,7 +164,7 @@ class ServiceUnderTest:
 
     async def kill(self) -> None:
         """End the service as SIGKILL would: at once, nothing said."""
-        self._bus.kill()
+        self.bus.kill()
         await self._end()
 
     async def _end(self) -> None:

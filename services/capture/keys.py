@@ -13,10 +13,10 @@ import numpy as np
 from cocoro.bus.base import Qos
 from cocoro.capture.types import JSON, MADE_HERE, MSGPACK, OTHER, Alive, LossyFrame, TypeSchema, schema_of
 from cocoro.errors import ConfigError
-from cocoro.installed import topic_named
+from cocoro.installed import all_topics, topic_named
 from cocoro.keys import matches
 from cocoro.messages import Frame, Message
-from cocoro.topics import FRAME, TOPICS
+from cocoro.topics import FRAME
 
 FRAMES = "frames"
 """In place of a key expression: all that carries pictures."""
@@ -76,7 +76,7 @@ class KeyFilter:
 
 def _expressions(text: str, robot: str) -> list[str]:
     if text == FRAMES:
-        return [topic.key(robot) for topic in TOPICS if topic.qos is Qos.FRAME]
+        return [topic.key(robot) for topic in all_topics() if topic.qos is Qos.FRAME]
     if not text or any(not chunk or ("*" in chunk and chunk not in ("*", "**")) for chunk in text.split("/")):
         raise ConfigError(f"{text!r} is no key expression; write it as base/** or calliope/*/health, or {FRAMES}")
     return [text, f"{robot}/{text}"]

@@ -17,7 +17,7 @@ from cocoro.bus.base import Handle, Payload, Received
 from cocoro.capture.types import Alive, MessageHead
 from cocoro.clock import NS, Clock
 from cocoro.errors import MeshError, RemoteError
-from cocoro.installed import topic_named
+from cocoro.installed import topic_named, unrecorded
 from cocoro.keys import alive_key, recorder_key
 from cocoro.messages import AboutReply, AboutRequest, ClockTick, DisturbedFile, Recording
 from cocoro.node import Node
@@ -86,7 +86,9 @@ class Ledger:
     def counts(self, key: str) -> KeyCounts | None:
         """None for a key that is not recorded."""
         if key not in self._counts:
-            self._counts[key] = counts_of(key, self._robot) if key in self._chosen else None
+            topic = topic_named(key.removeprefix(f"{self._robot}/"))
+            recorded = key in self._chosen and (topic is None or topic.recorded)
+            self._counts[key] = counts_of(key, self._robot) if recorded else None
         return self._counts[key]
 
     def missing(self) -> Missing:
@@ -120,6 +122,8 @@ class Recorder:
         robot, bus = self._node.robot_name, self._node.bus
         if self._node.clock.needs_ticks:
             self._clock = self._node.drive_clock()
+        if left_out := unrecorded():
+            self._node.log.info("not recorded, as declared: %s", ", ".join(left_out))
         self._remember_run()
         # Nothing is dropped before this loop has seen it; the sink bounds what may wait.
         self._handles.append(bus.listen(f"{robot}/**", self._on_lot, LISTEN_S))

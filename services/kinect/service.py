@@ -8,6 +8,7 @@ from contextlib import closing
 import numpy as np
 
 from cocoro import topics
+from cocoro.component import Implementation
 from cocoro.faults import FaultReporter
 from cocoro.messages import Frame
 from cocoro.node import Node
@@ -31,6 +32,9 @@ async def run(node: Node, config: KinectConfig) -> None:
             # In a thread: it takes a few milliseconds, for which the event loop must not wait.
             straight = frame if straighten.idle else await asyncio.to_thread(straighten, frame)
             node.publish(topics.FRAME, to_message(straight))
+
+
+implementation = Implementation(KinectConfig, run)
 
 
 def to_message(frame: RawFrame) -> Frame:

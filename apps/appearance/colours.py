@@ -1,4 +1,4 @@
-"""Which colours are the new object's: from the pixels of one picture to boxes in CIELAB that hold in other light."""
+"""Finds the colours of a new object: from the pixels of one picture to boxes in CIELAB that hold in other light."""
 
 from __future__ import annotations
 
@@ -14,36 +14,37 @@ from cocoro.errors import ConfigError
 from cocoro.objects import LabBox, ObjectSpec
 
 EDGES_L = (8.0, 12.0, 20.0, 30.0, 40.0, 50.0, 60.0, 75.0, 99.0)
-"""One box between each two: chroma falls with lightness, so one box for all would hold many other colours too."""
+"""Limits of lightness, with one box between each two: chroma falls with lightness, so a single box would contain many
+other colours, too."""
 BRIGHTNESS = np.geomspace(0.4, 1.8, 15)
-"""Of other light, relative to the picture's: into deep shade, and up to a lamp nearby."""
+"""Brightness of other light relative to the picture's, from deep shade to a lamp nearby."""
 TINTS = np.linspace(-0.14, 0.14, 5)
-"""Of other light: red by so much more and blue by so much less. A lamp of 4500 K against one of 6500 K has +-0.15."""
+"""Tint of other light: red is raised and blue lowered by this share. Lamps of 4500 K and 6500 K differ by 0.15."""
 MARGIN = 2.0
-"""In a and b, for the noise that is left after the detector's 3 x 3 mean."""
+"""Margin in a and b for the noise that remains after the detector's 3 x 3 mean."""
 QUANTILES = (0.01, 0.99)
 MIN_SAMPLES = 40
-"""In a box, or there is none for that lightness."""
+"""Least number of samples for a box."""
 MOST_PIXELS = 600
 LEAST_SPREAD = 3.0
 MAX_SPREADS = 3.0
-"""Pixels whose chromaticity is off by more of the spread are reflections, labels, noise."""
+"""Pixels whose chromaticity differs by more than this many spreads are reflections, labels or noise."""
 SHARED = 0.01
-"""A box of which a known object has more than this counts only for a detector that tells shapes apart."""
+"""A box with a larger share of a known object's colours is used only where the detector checks shapes."""
 NEARLY_GREY = 8.0
-"""Chromaticity below which a colour is that of walls, floors and the robot itself."""
+"""Below this chromaticity a colour is that of walls, floors and the robot itself."""
 
 ColourSamples = ImageArray
 
 
 class ColourRange(NamedTuple):
-    """The colours of a new object, as a row of the catalogue has them."""
+    """Colours of a new object, in the form of a row of the catalogue."""
 
     lab: tuple[LabBox, ...]
     lab_by_shape: tuple[LabBox, ...]
     rgb: tuple[float, float, float]
     samples: Lab
-    """Its colours in all sorts of light, (n, 3): what the boxes are drawn around."""
+    """Its colours in simulated other light, CIELAB, (n, 3); the boxes contain most of them."""
     chromaticity: float
 
     @property
@@ -52,25 +53,25 @@ class ColourRange(NamedTuple):
 
 
 class ColourOverlap(NamedTuple):
-    """What a new object and a known one have in common."""
+    """Common colours of a new object and a known one."""
 
     label: str
     of_new: float
-    """Share of the new object's colours that would pass for the known one's."""
+    """Share of the new object's colours that match the known one."""
     of_known: float
-    """Share of the known one's that would pass for the new object's."""
+    """Share of the known object's colours that match the new one."""
 
 
 def range_of(pixels: ImageArray, known: Iterable[ObjectSpec] = ()) -> ColourRange:
-    """The range that an object has whose pixels (n, 3), RGB, are these. Raises ConfigError when they are too dark."""
+    """The colours of an object from its pixels, RGB, (n, 3). Raises ConfigError when the pixels are too dark."""
     own = _typical(pixels)
     samples = lab_of(in_other_light(own))
     boxes = [box for box in (_box(samples, low, high) for low, high in pairwise(EDGES_L)) if box is not None]
     if not boxes:
-        raise ConfigError("the object is too dark in the picture to tell its colour: it wants more light")
+        raise ConfigError("the object is too dark in the picture to find its colour: give it more light")
     others = tuple(known)
     shared = [_is_shared(box, samples, others) for box in boxes]
-    if all(shared):  # nothing is its alone: then at least the boxes are told, and the overlap is
+    if all(shared):  # no box is its own: use all of them, and `overlaps` gives the warning
         shared = [False] * len(boxes)
     lab = lab_of(own[None])[0]
     return ColourRange(
@@ -83,15 +84,14 @@ def range_of(pixels: ImageArray, known: Iterable[ObjectSpec] = ()) -> ColourRang
 
 
 def in_other_light(pixels: ImageArray) -> ColourSamples:
-    """The pixels (n, 3) as they would be in darker, brighter, warmer and colder light; (m, 3), nothing saturated
-    that would not be, as a sensor clips."""
+    """The pixels, RGB, (n, 3), in darker, brighter, warmer and colder light, (m, 3), clipped as a sensor does."""
     gains = np.array([[k * (1 + tint), k, k * (1 - tint)] for k in BRIGHTNESS for tint in TINTS])
     values = pixels[:, None, :].astype(np.float64) * gains
     return np.asarray(np.clip(np.rint(values), 0, 255), dtype=np.uint8).reshape(-1, 3)
 
 
 def overlaps(found: ColourRange, known: Iterable[ObjectSpec]) -> list[ColourOverlap]:
-    """With each known object that has any colours in common with it, the most first."""
+    """The known objects that have colours in common with the new one, the largest overlap first."""
     common = []
     for other in known:
         boxes = other.lab + other.lab_by_shape
@@ -105,7 +105,7 @@ def overlaps(found: ColourRange, known: Iterable[ObjectSpec]) -> list[ColourOver
 
 
 def _typical(pixels: ImageArray) -> ImageArray:
-    """Some of the pixels, without those that have another colour."""
+    """At most about MOST_PIXELS of the pixels, without those of another colour."""
     chromaticity = _chromaticity(lab_of(pixels[None])[0])
     off = np.linalg.norm(chromaticity - np.median(chromaticity, axis=0), axis=-1)
     spread = max(1.4826 * float(np.median(off)), LEAST_SPREAD)
@@ -135,7 +135,7 @@ def _is_shared(box: LabBox, samples: Lab, known: Iterable[ObjectSpec]) -> bool:
 
 
 def _full_light(pixels: ImageArray) -> tuple[float, float, float]:
-    """The surface's colour as its brightest pixels have it: 0 to 1 a channel."""
+    """RGB of the brightest pixels, each 0 to 1."""
     bright = pixels.max(axis=1)
     red, green, blue = (float(value) for value in np.median(pixels[bright >= np.quantile(bright, 0.97)], axis=0) / 255)
     return round(red, 3), round(green, 3), round(blue, 3)

@@ -1,0 +1,73 @@
+"""Whether a component speaks as it declares: a bus that notes every topic and request that is used on it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+from cocoro.bus.base import Handle, OnBatch, OnSample, Qos, Reply, Server
+from cocoro.bus.local import LocalBus, LocalMesh, LocalPublisher, LocalSubscription
+from cocoro.component import Component
+from cocoro.topics import ABOUT, CLOCK, EXCHANGES, HEALTH, STEPS, Request, Topic
+
+BY_EVERY_NODE = {row.name for row in (HEALTH, STEPS, EXCHANGES, ABOUT, CLOCK)}
+
+
+class NotedBus(LocalBus):
+    """A participant of a `LocalMesh` whose uses of the bus are noted, by names without the robot."""
+
+    def __init__(self, mesh: LocalMesh, robot_name: str) -> None:
+        super().__init__(mesh)
+        self.publishes: set[str] = set()
+        self.reads: set[str] = set()
+        self.serves: set[str] = set()
+        self.calls: set[str] = set()
+        self.records = False
+        self._prefix = f"{robot_name}/"
+
+    def publisher(self, key: str, qos: Qos) -> LocalPublisher:
+        self.publishes.add(self._name(key))
+        return super().publisher(key, qos)
+
+    def subscribe(self, keyexpr: str, qos: Qos, handler: OnSample, *, depth: int) -> LocalSubscription:
+        self.reads.add(self._name(keyexpr))
+        return super().subscribe(keyexpr, qos, handler, depth=depth)
+
+    def listen(self, keyexpr: str, handler: OnBatch, every_s: float) -> Handle:
+        self.records = True
+        return super().listen(keyexpr, handler, every_s)
+
+    def serve(self, key: str, server: Server) -> Handle:
+        self.serves.add(self._name(key))
+        return super().serve(key, server)
+
+    async def call(self, keyexpr: str, payload: bytes, timeout_s: float) -> list[Reply]:
+        self.calls.add(self._name(keyexpr))
+        return await super().call(keyexpr, payload, timeout_s)
+
+    def _name(self, key: str) -> str:
+        return key.removeprefix(self._prefix)
+
+
+def misdeclared(component: Component, *buses: NotedBus) -> list[str]:
+    """How a component's declaration and its uses of these buses differ, in words; empty when they agree. A use that
+    these runs did not come to counts as a difference."""
+    found = [*_differences("publishes", component.all_publishes(), {name for bus in buses for name in bus.publishes})]
+    found += _differences("reads", component.reads, {name for bus in buses for name in bus.reads})
+    found += _differences("serves", component.all_serves(), {name for bus in buses for name in bus.serves})
+    found += _differences("calls", component.calls, {name for bus in buses for name in bus.calls})
+    if component.records != any(bus.records for bus in buses):
+        found.append(f"records is declared as {component.records}")
+    return found
+
+
+def _differences(verb: str, declared: Iterable[Topic[Any] | Request[Any, Any]], used: set[str]) -> Iterator[str]:
+    names = {row.name for row in declared}
+    unused = set(names)
+    for name in sorted(used):
+        general = "{service}/" + name.partition("/")[2]
+        if {name, general} & names:
+            unused -= {name, general}
+        elif not {name, general} & BY_EVERY_NODE:
+            yield f"it {verb} {name}, which it does not declare"
+    yield from (f"it declares that it {verb} {name}, and does not" for name in sorted(unused))
