@@ -68,7 +68,7 @@ def run(script: str, folder: Path, environment: dict[str, str]) -> str:
 
 def test_every_piece_of_python_says_which_file_it_is() -> None:
     pieces = [block for block in blocks() if block.language != "sh"]
-    assert len(pieces) == 5
+    assert len(pieces) == 6
     assert all(block.path for block in pieces)
 
 
@@ -90,10 +90,12 @@ def test_the_tutorial_works_word_for_word(tmp_path: Path, environment: dict[str,
     finally:
         run("cocoro down", folder, environment)
     made, tested, operated = printed
-    assert "5 passed" in made
+    assert "6 passed" in made
     assert "2 passed" in tested
-    assert "calliope/nearest/object  (unknown type)" in operated
+    assert re.search(r"^nearest/object +Nearest +2 Hz +2 s +state +nearest +yes", operated, re.MULTILINE)
+    assert "calliope/nearest/object  Nearest  #" in operated
     assert re.search(r"^nearest +ready", operated, re.MULTILINE)
-    assert re.search(r"^calliope/nearest/object +\d\.\d Hz", operated, re.MULTILINE)
-    assert "nearest: nearest.service with Config(rate_hz=5.0, within_m=3.0)" in operated
+    assert re.search(r"^calliope/nearest/object +\d\.\d Hz +2\.0 Hz", operated, re.MULTILINE)
+    assert "nearest: nearest.service with NearestConfig(rate_hz=5.0, within_m=3.0)" in operated
+    assert re.search(r"^nearest: \d+ steps, \d+ outputs compared: every one equal", operated, re.MULTILINE)
     assert sys.prefix not in operated

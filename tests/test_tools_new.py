@@ -47,7 +47,7 @@ def test_its_tests_pass_and_it_is_clean(written: Path) -> None:
         )
 
     tests = run("pytest", "-q", "-p", "no:cacheprovider", "-W", "error")
-    assert "5 passed" in tests.stdout, tests.stdout + tests.stderr
+    assert "6 passed" in tests.stdout, tests.stdout + tests.stderr
     for check in (("check", "--select", "E,F,I,N,UP,B,SIM,RUF"), ("format", "--check")):
         done = run("ruff", check[0], "--no-cache", *check[1:], ".")
         assert done.returncode == 0, done.stdout
