@@ -23,8 +23,8 @@ class Detection(msgspec.Struct, kw_only=True):
     depth_m: Finite | None = None
     """Depth of the visible surface along the optical axis; None when the depth image has no value there."""
     position_m: FiniteVec3 | None = None
-    """The object's centre (the visible surface moved inwards by the known radius) in the body frame at the frame's stamp;
-    None without depth or without head angles for that stamp."""
+    """The object's centre (the visible surface moved inwards by the known radius) in the body frame at the frame's
+    stamp; None without depth or without head angles for that stamp."""
     note: str = ""
     """Why the position is missing or doubtful: 'no depth', 'no head angles', 'occluded', 'cut'."""
 
