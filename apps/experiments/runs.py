@@ -1,5 +1,5 @@
-"""The runs that experiments are made of: each in a process of its own, as many at once as there are cores, each result
-kept on disk, so that the same command goes on where an earlier one was ended."""
+"""Performs the runs of experiments in worker processes, and keeps each result on disk, so that a repeated command
+continues where an earlier one was interrupted."""
 
 from __future__ import annotations
 
