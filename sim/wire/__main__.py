@@ -1,6 +1,6 @@
-"""A Create and a Calliope's servos without a robot and without physics: `python -m sim.wire DIR` until Ctrl-C.
+"""Emulates a Create and a Calliope's servos without physics, until Ctrl-C: `python -m sim.wire DIR`.
 
-For first steps with the tools: DIR gets the ports `create`, `arm` and `hand`, and the socket `control` (see
+For first steps with the tools. It makes the ports `create`, `arm` and `hand` in DIR, and the socket `control` (see
 `sim.wire.control`).
 """
 
@@ -22,7 +22,7 @@ MODELS = {"arm": 28, "hand": 12}
 
 def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m sim.wire", description="Emulated hardware on pseudo-terminals.")
-    parser.add_argument("folder", type=Path, help="where the ports are to be")
+    parser.add_argument("folder", type=Path, help="folder for the ports")
     folder: Path = parser.parse_args().folder
     robot = Robot.load()
     create = EmulatedCreate()
