@@ -8,8 +8,8 @@ from typing import Any
 
 from apps.experiments import bodies, figures
 from apps.experiments.lessons import SIZES
+from apps.experiments.results import Plot, Section, row
 from apps.experiments.runs import ExperimentRun, RunResult
-from apps.experiments.section import Plot, Section, row
 from apps.experiments.settings import ExperimentSettings
 from apps.learning.study import BEST, METHODS
 

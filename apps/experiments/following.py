@@ -7,8 +7,8 @@ from functools import partial
 from typing import Any
 
 from apps.experiments import bodies, figures
+from apps.experiments.results import Plot, Section, row
 from apps.experiments.runs import ExperimentRun, RunResult
-from apps.experiments.section import Plot, Section, row
 from apps.experiments.settings import ExperimentSettings
 
 KEY, TITLE = "E5", "Following"

@@ -8,8 +8,8 @@ from math import cos, isnan, radians, sin
 from typing import Any
 
 from apps.experiments import bodies, figures
+from apps.experiments.results import Plot, Section, row
 from apps.experiments.runs import ExperimentRun, RunResult
-from apps.experiments.section import Plot, Section, row
 from apps.experiments.settings import ExperimentSettings
 
 KEY, TITLE = "E4", "Navigation"

@@ -7,8 +7,8 @@ from functools import partial
 from typing import Any
 
 from apps.experiments import bodies, figures
+from apps.experiments.results import Plot, ResultRow, Section, row
 from apps.experiments.runs import ExperimentRun, RunResult
-from apps.experiments.section import Plot, ResultRow, Section, row
 from apps.experiments.settings import ExperimentSettings
 
 KEY, TITLE = "E2", "Reaching four suspended targets"

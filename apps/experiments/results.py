@@ -1,32 +1,61 @@
-"""What an experiment has to say: rows of a table, plots, words."""
+"""Results of an experiment: statistics over runs, rows of a table, plots and notes."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, NamedTuple
+from math import sqrt
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
-from apps.experiments.stats import Best, Summary, summarise
+import numpy as np
+from scipy.stats import t as student
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+Best = Literal["low", "high", "zero"]
+
+
+class Summary(NamedTuple):
+    """Statistics of one measure over the seeds or runs; NaN where there are too few values."""
+
+    mean: float
+    ci95: float
+    """Half the width of the mean's 95% confidence interval (Student's t); needs two values."""
+    worst: float
+    runs: int
+    sd: float = float("nan")
+    median: float = float("nan")
+
+
+def summarise(values: Sequence[float], *, best: Best = "low") -> Summary:
+    """Summarises values; NaN values are left out. `best` says which are good: 'low', 'high', or those near 'zero'."""
+    kept = np.array([value for value in values if value == value], dtype=np.float64)
+    if not len(kept):
+        nan = float("nan")
+        return Summary(nan, nan, nan, 0)
+    worst = kept[np.abs(kept).argmax()] if best == "zero" else kept.max() if best == "low" else kept.min()
+    sd = float(kept.std(ddof=1)) if len(kept) > 1 else float("nan")
+    ci95 = float(student.ppf(0.975, len(kept) - 1)) * sd / sqrt(len(kept)) if len(kept) > 1 else float("nan")
+    return Summary(float(kept.mean()), ci95, float(worst), len(kept), sd, float(np.median(kept)))
+
+
 class ResultRow(NamedTuple):
-    """One measure of one way of doing it."""
+    """One measure of one method."""
 
     measure: str
     who: str
-    """Ours, or which baseline."""
+    """Our method, or the baseline."""
     values: Summary
     unit: str
     digits: int = 1
     wanted: str = ""
     held: bool | None = None
     paper: str = ""
-    """What the paper's text says of the same."""
+    """The paper's text about this measure."""
     said: str = ""
-    """Instead of the mean, where a mean says little."""
+    """Text in place of the mean, where a mean is misleading."""
 
     @property
     def mean(self) -> str:
@@ -55,10 +84,10 @@ class ResultRow(NamedTuple):
 
 
 class Plot(NamedTuple):
-    """A picture, drawn when it is wanted."""
+    """A plot, and the function that draws it."""
 
     name: str
-    """Of its file, without the ending."""
+    """Name of its file without the suffix."""
     caption: str
     draw: Callable[[], Figure]
 
@@ -68,12 +97,12 @@ class Section:
     key: str
     title: str
     about: str
-    """What was done, in a few sentences."""
+    """Description of the experiment, a few sentences."""
     rows: list[ResultRow] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     plots: list[Plot] = field(default_factory=list)
     errors: list[str] = field(default_factory=list)
-    """Runs that could not be."""
+    """Runs that failed, each with its error."""
 
     def data(self) -> dict[str, Any]:
         return {
@@ -84,5 +113,5 @@ class Section:
 
 
 def row(measure: str, who: str, values: Sequence[float], unit: str, *, best: Best = "low", **more: Any) -> ResultRow:
-    """A row over values, one a seed or a run."""
+    """A row from values, one for each seed or run."""
     return ResultRow(measure, who, summarise(values, best=best), unit, **more)
