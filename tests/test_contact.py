@@ -128,7 +128,7 @@ class Watched:
         self.child = SupervisedProcess(named("perception"), RunDir("calliope", folder), 0, self.told.append, detector)
         self.child._process = _Process()  # type: ignore[assignment]
         self.child.on_alive("perception", True)
-        self.child._say_ready()
+        self.child._report_ready()
         self.told.clear()
 
 
