@@ -20,9 +20,9 @@ from apps.experiments.every import EXPERIMENTS
 from apps.experiments.results import summarise
 from apps.experiments.runs import ExperimentRun, RunResult, perform
 from apps.experiments.settings import ExperimentSettings
+from apps.learning.dataset import HandRow, SampleFile, WheelRow, hand_header, wheel_header
 from apps.learning.study import BEST
 from apps.rehearsal.request import RehearsalRequest
-from cocoro.learning.dataset import HandRow, SampleFile, WheelRow, hand_header, wheel_header
 from cocoro.learning.nominal_model import NominalModel
 from cocoro.robot import Robot
 

@@ -13,10 +13,11 @@ import numpy as np
 import pytest
 from learning_arm import sightings
 
+from apps.learning import dataset
+from apps.learning.dataset import HandRow, SampleFile, WheelRow, hand_header, wheel_header
 from apps.learning.study import BEST, METHODS, fit
 from cocoro.errors import ConfigError, RefusedError
-from cocoro.learning import dataset, model
-from cocoro.learning.dataset import HandRow, SampleFile, WheelRow, hand_header, wheel_header
+from cocoro.learning import model
 from cocoro.learning.model import Training, WheelModel
 from cocoro.learning.nominal_model import NominalModel
 from cocoro.robot import Robot

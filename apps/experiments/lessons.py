@@ -9,12 +9,12 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from apps.learning import study
+from apps.learning import dataset, study
+from apps.learning.dataset import HandRow, WheelRow
 from apps.learning.lesson import learn_arm, learn_wheels, sightings
 from apps.learning.wheels import fit_wheels
 from cocoro.clock import NS
-from cocoro.learning import dataset, model
-from cocoro.learning.dataset import HandRow, WheelRow
+from cocoro.learning import model
 from cocoro.learning.nominal_model import NominalModel
 from cocoro.robot import Robot
 from services.planning.teaching import Adapter

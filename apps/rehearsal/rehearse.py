@@ -16,6 +16,7 @@ from typing import Any
 import msgspec
 
 from apps.learning.collector import TOPICS, SampleCollector, collector
+from apps.pictures import draw, save_png
 from apps.rehearsal.lockstep import LOCKSTEP_PLANNER, LOCKSTEP_SETTINGS, LockstepCycle, LockstepNode
 from apps.rehearsal.request import RehearsalRequest
 from cocoro import topics
@@ -27,7 +28,6 @@ from cocoro.inbox import Stream
 from cocoro.messages import Detections, Frame, Recording, TaskReply, TaskRequest, TaskState
 from cocoro.node import Node
 from cocoro.objects import Catalogue
-from cocoro.picture import draw, save_png
 from cocoro.robot import Robot
 from cocoro.vloop import run_virtual
 from deploy.delayed import DelayedNode
