@@ -64,7 +64,7 @@ def test_any_tool_reads_them_line_by_line(tmp_path: Path, robot: Robot) -> None:
 KILLED = """
 import sys
 from pathlib import Path
-from cocoro.learning.dataset import HandRow, SampleFile, hand_header
+from apps.learning.dataset import HandRow, SampleFile, hand_header
 from cocoro.learning.nominal_model import NominalModel
 from cocoro.robot import Robot
 
