@@ -17,11 +17,13 @@ from typer.main import get_group
 
 from apps.cli.options import (
     AdaptOption,
+    DescriptionOption,
     DistanceOption,
     ForOption,
     FramesOption,
     JsonOption,
     LatencyOption,
+    MeasuredOption,
     MeshOption,
     ModelOption,
     ObjectsOption,
@@ -277,6 +279,8 @@ def rehearse(
         str, typer.Option(metavar="ideal|real", help="Perfect camera and body, or real ones.")
     ] = "ideal",
     body: BodyOption = "nominal",
+    description: DescriptionOption = None,
+    measured: MeasuredOption = None,
     model: ModelOption = None,
     reach: ReachOption = None,
     adapt: AdaptOption = False,
@@ -306,6 +310,8 @@ def rehearse(
         "record": None if record is None else str(record), "count": count, "reach": reach or "learned",
         "model": None if model is None else str(model), "samples": None if samples is None else str(samples),
         "objects": None if objects is None else str(objects),
+        "description": None if description is None else str(description),
+        "measured": None if measured is None else str(measured),
     }  # fmt: skip
     sys.exit(rehearsing.rehearse(options, latency or [], frames, json))
 

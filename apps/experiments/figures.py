@@ -49,9 +49,8 @@ def sheet(columns: int = 1, rows: int = 1, *, width: float = 5.0, height: float 
     return figure, found
 
 
-def hand_places(samples: Path, learned: Path) -> Figure:
+def hand_places(samples: Path, learned: Path, robot: Robot) -> Figure:
     """Seen, drawn and learned places of the held-out sightings, from above and from the side."""
-    robot = Robot.load()
     drawing = NominalModel(robot)
     _, held = study.split(study.clean(sightings(dataset.read(samples, HandRow, robot).rows), drawing))
     arm = model.load(learned, robot).arm

@@ -9,6 +9,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from apps.experiments.settings import load_robot
 from apps.learning import study
 from apps.learning.lesson import learn_arm, learn_wheels, sightings
 from apps.learning.wheels import fit_wheels
@@ -16,16 +17,18 @@ from cocoro.clock import NS
 from cocoro.learning import dataset, model
 from cocoro.learning.dataset import HandRow, WheelRow
 from cocoro.learning.nominal_model import NominalModel
-from cocoro.robot import Robot
 from services.planning.teaching import Adapter
 
 SIZES = (100, 300, 1000, 2000)
 
 
-def learn(arm: str, wheels: str, into: str, method: str | None = None) -> dict[str, Any]:
+def learn(
+    arm: str, wheels: str, into: str, method: str | None = None, description: str | None = None,
+    measured: str | None = None,
+) -> dict[str, Any]:  # fmt: skip
     """A model of arm and wheels, with every method's score (or only of the one that is asked for) and how the error
     falls with the samples."""
-    robot, file = Robot.load(), Path(into)
+    robot, file = load_robot(description, measured), Path(into)
     file.unlink(missing_ok=True)
     _, report = learn_arm(Path(arm), file, robot, method=method)
     _, fit = learn_wheels(Path(wheels), file, robot)
@@ -62,9 +65,11 @@ def _babbled_s(rows: Sequence[HandRow]) -> float:
     return float(steps[steps > 0].sum()) / NS
 
 
-def bend(into: str, bent: str, bend_s: float) -> dict[str, Any]:
+def bend(
+    into: str, bent: str, bend_s: float, description: str | None = None, measured: str | None = None
+) -> dict[str, Any]:
     """The learned map's error at each sighting of an arm that is bent meanwhile: left as it was, and taught on."""
-    robot = Robot.load()
+    robot = load_robot(description, measured)
     arm = model.load(Path(into), robot).arm
     if arm is None:
         raise msgspec.ValidationError(f"{into} has no arm in it")

@@ -38,6 +38,10 @@ class RehearsalRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
     sensors: Sensors = "ideal"
     body: Body = "nominal"
     """Worn: lengths, joint zeros, camera, marker and wheels are off what the drawing says, as the seed says."""
+    description: str | None = None
+    """A robot description instead of the Calliope's."""
+    measured: str | None = None
+    """A robot's own file with the values that were measured on it; they replace the description's."""
     model: str | None = None
     """The file of what was learned of the body."""
     reach: Literal["learned", "rigid"] = "learned"
