@@ -70,7 +70,7 @@ class Fuzzer:
             at += len(piece)
             now_ns += draws.randrange(1, 60) * MS
             frames += parser.feed(piece)
-            logic.heard(piece, now_ns)
+            logic.receive(piece, now_ns)
             logic.ask(draws.randint(-900, 900), draws.randint(-900, 900), now_ns + draws.randint(-50, 400) * MS, now_ns)
             written = logic.poll(now_ns)
             assert logic.wheels[:2] == (0, 0) or logic.link == "up"

@@ -32,8 +32,8 @@ CAN_M = (1.5, 0.0, 0.06)
 class Planner:
     """A planning core on a robot that is perfectly obedient but for its wheels, and sees a can and free floor."""
 
-    def __init__(self, config: PlanningConfig | None = None) -> None:
-        self.under_test = CoreUnderTest(PlanningCore(ROBOT, config or PlanningConfig()))
+    def __init__(self, config: PlanningConfig | None = None, make: type[PlanningCore] = PlanningCore) -> None:
+        self.under_test = CoreUnderTest(make(ROBOT, config or PlanningConfig()))
         self.angles = dict.fromkeys(ROBOT.joints, 0.0) | ROBOT.poses["park"]
         self.base: dict[str, Any] = {}
         self.hand_load = 0.0
@@ -112,9 +112,9 @@ class Planner:
         return Detections(frame_seq=0, frame_incarnation=1, width=640, height=480, detections=found)
 
 
-def started(config: PlanningConfig | None = None) -> Planner:
+def started(config: PlanningConfig | None = None, make: type[PlanningCore] = PlanningCore) -> Planner:
     """A planner that has seen what there is."""
-    planner = Planner(config)
+    planner = Planner(config, make)
     planner.run(0.2)
     return planner
 

@@ -45,7 +45,7 @@ class Line:
         now, self._sent = self._sent[:BYTES_A_TURN], self._sent[BYTES_A_TURN:]
         self._body.advance(self.now_ns)
         self.create.receive(now, BAUD, self.now_ns)
-        self.logic.heard(self.create.advance(BAUD, self.now_ns), self.now_ns)
+        self.logic.receive(self.create.advance(BAUD, self.now_ns), self.now_ns)
 
     def drives(self) -> bool:
         """It goes as it was asked to, within a time; False when it hears nobody any more."""

@@ -35,7 +35,7 @@ class Rig:
             self.poll()
             if self.streams:
                 readings = {packet: self.readings.get(packet, 0) for packet in self.streams}
-                heard += self.logic.heard(frame(readings), self.now_ns)
+                heard += self.logic.receive(frame(readings), self.now_ns)
         self.poll()
         return heard
 
@@ -80,9 +80,9 @@ def test_a_frame_that_is_broken_while_counts_are_asked_for_loses_them(rig: Rig) 
         rig.poll()
         if rig.streams == LONG:
             break
-        rig.logic.heard(frame({packet: rig.readings[packet] for packet in SHORT}), rig.now_ns)
+        rig.logic.receive(frame({packet: rig.readings[packet] for packet in SHORT}), rig.now_ns)
     assert not rig.logic.take_counts_lost()
-    rig.logic.heard(b"\x13\x07rubbish", rig.now_ns)
+    rig.logic.receive(b"\x13\x07rubbish", rig.now_ns)
     rig.frames(2)
     assert rig.logic.take_counts_lost()
     assert not rig.logic.take_counts_lost()
@@ -100,7 +100,7 @@ def test_a_command_that_the_create_took_for_another_is_repeated_at_once(rig: Rig
     rig.readings[oi.LEFT_SPEED] = 400
     rig.written = b""
     rig.now_ns += 15 * MS
-    rig.logic.heard(frame({packet: rig.readings[packet] for packet in SHORT}), rig.now_ns)
+    rig.logic.receive(frame({packet: rig.readings[packet] for packet in SHORT}), rig.now_ns)
     assert rig.logic.poll(rig.now_ns).endswith(oi.drive_direct(100, 100))
 
 
@@ -112,7 +112,7 @@ def test_a_create_that_takes_commands_for_the_rest_of_another_gets_more_than_it_
     written, taken = [], dict(rig.readings)
     for _ in range(8):
         rig.now_ns += 15 * MS
-        rig.logic.heard(frame({packet: taken[packet] for packet in SHORT}), rig.now_ns)
+        rig.logic.receive(frame({packet: taken[packet] for packet in SHORT}), rig.now_ns)
         written.append(rig.logic.poll(rig.now_ns))
     assert max(len(data) for data in written) > 255
     assert set(b"".join(written)) == set(oi.drive_direct(0, 0))
@@ -177,9 +177,9 @@ def test_whatever_comes_wheels_turn_only_for_a_fresh_command_and_an_awake_create
     logic.opened(now_ns)
     for step, value in steps:
         if step == "bytes":
-            logic.heard(value, now_ns)
+            logic.receive(value, now_ns)
         elif step == "frame":
-            logic.heard(frame(QUIET | {oi.MODE: value}), now_ns)
+            logic.receive(frame(QUIET | {oi.MODE: value}), now_ns)
         elif step == "ask":
             left, right, for_ms = value
             until_ns = min(now_ns + for_ms * MS, now_ns + 200 * MS)

@@ -205,7 +205,7 @@ def test_a_disturbed_line_is_told_and_stops_nothing_for_long(bench: Bench, way: 
             await base.roll()
             fault = LineFault("corrupted", 0.01, way, 10**19)  # type: ignore[arg-type]
             bench.emulator.call(lambda: bench.line.disturb(fault))
-            await base.fault("its line is disturbed, look after the cable")
+            await base.fault("its line is disturbed, check the cable")
             bench.emulator.call(bench.line.undisturb)
             bench.emulator.call(lambda: setattr(bench.create, "baud", 57600))  # a flipped bit may have changed it
             await base.service.ask(topics.RECOVER, RecoverRequest())
@@ -218,7 +218,7 @@ def test_a_disturbed_line_is_told_and_stops_nothing_for_long(bench: Bench, way: 
 async def test_an_adapter_that_is_pulled_is_a_fault_and_no_crash(bench: Bench) -> None:
     async with driven(bench) as base:
         bench.emulator.call(bench.line.port.unplug)
-        await base.fault("no word from the Create")
+        await base.fault("no connection to the Create")
         bench.emulator.call(bench.line.port.plug)
         await base.state(lambda state: state.mode == "safe")
 

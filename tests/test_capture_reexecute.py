@@ -15,9 +15,11 @@ import pytest
 from capture_rig import Room, drive, record
 
 from apps.captures.compare import difference
+from apps.captures.recorded import origins
 from apps.captures.reexecute import ReexecutionResult, reexecute
 from apps.captures.rewrite import info_in, rewrite
 from apps.cli.main import main
+from apps.rehearsal.lockstep import LockstepPlanner
 from cocoro import topics
 from cocoro.capture.conventions import CaptureError
 from cocoro.capture.reader import Capture, Record
@@ -30,6 +32,7 @@ from services.capture.writer import CaptureWriter, Limits
 from services.perception import service as perception
 from services.planning import service as planning
 from services.planning.config import PlanningConfig
+from services.planning.core import PlanningCore
 
 GOLDEN = Path(__file__).parent / "golden" / "fetch.mcap"
 TOLERANCE = 1e-3
@@ -310,6 +313,15 @@ def test_a_setting_that_is_no_more_ends_it_with_its_name(tmp_path: Path) -> None
     path = started_otherwise(tmp_path / "older.mcap", lambda config: config.update(mood=3))
     with pytest.raises(CaptureError, match=r"older\.mcap: what planning was started with cannot be had again: .*mood"):
         again(path, "planning")
+
+
+@pytest.mark.parametrize(("coordination", "kind"), [("concurrent", PlanningCore), ("lockstep", LockstepPlanner)])
+def test_the_planner_s_former_setting_coordination_chooses_the_core(
+    coordination: str, kind: type[PlanningCore], tmp_path: Path
+) -> None:
+    path = started_otherwise(tmp_path / "older.mcap", lambda config: config.update(coordination=coordination))
+    with Capture.open(path) as capture, origins([capture], "planning") as made:
+        assert [type(origin.core()) for origin in made] == [kind]
 
 
 # --- a core of a third party, over restarts -------------------------------------------------------

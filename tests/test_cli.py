@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 import tempfile
@@ -167,6 +168,24 @@ def test_the_emergency_stop_imports_next_to_nothing() -> None:
 
 def test_the_emergency_stop_knows_what_can_be_stopped() -> None:
     assert stoppable() == estop.STOPPABLE
+
+
+def test_a_foreign_package_that_hides_one_of_ours_is_named(tmp_path: Path) -> None:
+    (tmp_path / "services").mkdir()
+    (tmp_path / "services" / "__init__.py").touch()
+    # An editable installation finds the modules of a hidden package all the same; a wheel's does not.
+    code = (
+        "import sys; sys.meta_path = [finder for finder in sys.meta_path if 'editable' not in finder.__module__]; "
+        "from apps.cli.main import main; sys.exit(main(['doctor', 'sim']))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", code],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join((str(tmp_path), str(ROOT)))},
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+    assert f"'services' in {tmp_path} hides" in done.stderr
 
 
 # --- rehearse -------------------------------------------------------------------------------------

@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 
 from apps.cli import estop_mesh, exits, objects, safety, snapshot, status
-from apps.cli.estop import StopResult
 from apps.cli.options import RobotChoice
+from apps.cli.stop_asking import StopResult
 from cocoro.bus.endpoints import default
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.clock import RealClock

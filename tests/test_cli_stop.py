@@ -15,8 +15,9 @@ from pathlib import Path
 import pytest
 
 from apps.cli import estop, exits
-from apps.cli.estop import StopResult, _left_open, _merged
+from apps.cli.estop import _left_open, _merged
 from apps.cli.main import main
+from apps.cli.stop_asking import StopResult
 from cocoro.stop.path import StopPoint, listen
 from deploy.rundir import RunDir
 

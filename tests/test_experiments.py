@@ -17,9 +17,9 @@ from apps.cli.experiment import RunProgress
 from apps.cli.main import main
 from apps.experiments import bodies, lessons, report
 from apps.experiments.every import EXPERIMENTS
+from apps.experiments.results import summarise
 from apps.experiments.runs import ExperimentRun, RunResult, perform
 from apps.experiments.settings import ExperimentSettings
-from apps.experiments.stats import summarise
 from apps.learning.study import BEST
 from apps.rehearsal.request import RehearsalRequest
 from cocoro.learning.dataset import HandRow, SampleFile, WheelRow, hand_header, wheel_header

@@ -133,9 +133,9 @@ def test_pictures_of_a_kinect_that_was_not_measured_are_passed_on_as_they_are() 
 
 
 def test_too_few_views_and_a_board_of_another_size_are_said(views: list[BoardView]) -> None:
-    with pytest.raises(CocoroError, match="seen in 5 views; 6 are the least"):
+    with pytest.raises(CocoroError, match="visible in 5 views; at least 6 are needed"):
         calibrate(views[:5], BOARD, Robot.load())
-    with pytest.raises(CocoroError, match="there is depth on the board in 0 views; 6 are the least"):
+    with pytest.raises(CocoroError, match="the board has depth in 0 views; at least 6 are needed"):
         calibrate(views[:6], Board(8, 6, 0.05), Robot.load())
     rng = np.random.default_rng(5)
     bent = [BoardView(view.corners_px + rng.normal(0.0, 2.0, view.corners_px.shape), view.depth) for view in views[:6]]
@@ -150,11 +150,11 @@ def test_a_view_is_taken_when_the_board_is_held_still_somewhere_new(painter: Pai
     nothing = RawFrame(0, np.full((480, 640, 3), 90, np.uint8), shots[0].depth)
     assert collector.take(nothing) == "the board is not seen whole"
     assert collector.take(shots[0]) == "hold it still"
-    told = [collector.take(shots[0]) for _ in range(tools.STILL_SHOTS)]
-    assert told == [""] * (tools.STILL_SHOTS - 1) + ["view 1"]
-    assert collector.take(shots[0]) == "now elsewhere, or tilted another way"
+    told = [collector.take(shots[0]) for _ in range(tools.STILL_FRAMES)]
+    assert told == [""] * (tools.STILL_FRAMES - 1) + ["view 1"]
+    assert collector.take(shots[0]) == "now move it elsewhere, or tilt it another way"
     assert collector.take(shots[1]) == "hold it still"
-    told += [collector.take(shots[1]) for _ in range(tools.STILL_SHOTS)]
+    told += [collector.take(shots[1]) for _ in range(tools.STILL_FRAMES)]
     assert told[-1] == "view 2"
 
     read = tools.read(tmp_path, BOARD, told.append)
@@ -190,7 +190,7 @@ def test_the_command_calibrates_from_kept_views_and_writes_the_robots_file(
 
 def test_depths_of_a_still_view_are_their_middle_and_none_where_one_is_missing() -> None:
     depths = [np.array([[700, 701]], np.uint16), np.array([[704, 2047]], np.uint16), np.array([[702, 701]], np.uint16)]
-    assert tools.mean_depth(depths).tolist() == [[702, 2047]]
+    assert tools.median_depth(depths).tolist() == [[702, 2047]]
 
 
 def test_a_folder_without_views_and_one_with_half_a_view_are_said(tmp_path: Path) -> None:
@@ -198,5 +198,5 @@ def test_a_folder_without_views_and_one_with_half_a_view_are_said(tmp_path: Path
         tools.read(tmp_path, BOARD, print)
     tools.save(tmp_path, 1, np.zeros((48, 64, 3), np.uint8), np.zeros((48, 64), np.uint16))
     (tmp_path / "view-01-depth.png").unlink()
-    with pytest.raises(ConfigError, match=r"view-01-depth.png are no view"):
+    with pytest.raises(ConfigError, match=r"view-01-depth.png are not a view"):
         tools.read(tmp_path, BOARD, print)

@@ -216,8 +216,8 @@ def test_what_nobody_reads_is_dropped_and_the_next_is_read_again(ends: tuple[soc
     colour, depth = (ctypes.c_char * COLOUR_BYTES)(), (ctypes.c_char * DEPTH_BYTES)()
 
     def picture(number: int) -> None:
-        grabber.heard("colour", ctypes.addressof(colour), number * 2_000_000)
-        grabber.heard("depth", ctypes.addressof(depth), number * 2_000_000)
+        grabber.on_image("colour", ctypes.addressof(colour), number * 2_000_000)
+        grabber.on_image("depth", ctypes.addressof(depth), number * 2_000_000)
 
     for number in range(20):
         picture(number)
@@ -266,7 +266,7 @@ def _taken(library: FakeLibrary, grabber: Grabber) -> None:
 
 
 def _mute(library: FakeLibrary, grabber: Grabber) -> None:
-    grabber.heard_s -= 60.0
+    grabber.image_s -= 60.0
 
 
 def _blind(library: FakeLibrary, grabber: Grabber) -> None:
@@ -337,7 +337,7 @@ def test_a_process_that_ends_by_itself_is_told_and_started_again(tmp_path: Path)
         return faults, camera.starts
 
     faults, starts = asyncio.run(scenario())
-    assert faults == ["the Kinect is being opened", f"{tmp_path} is no recording: there is no readable INDEX.txt in it"]
+    assert faults == ["the Kinect is being opened", f"{tmp_path} is not a recording: it has no readable INDEX.txt"]
     assert starts == 2
 
 
@@ -358,10 +358,10 @@ def test_a_recording_is_checked_before_it_is_played(tmp_path: Path) -> None:
         return str(error.value)
 
     whole = (depth.name, colour.name)
-    assert "names no colour or no depth pictures" in fault(depth.name)
+    assert "lists no colour or no depth images" in fault(depth.name)
     assert "cannot be read (No such file or directory)" in fault(*whole, "d-2.0-61.pgm")
-    assert "has no name of a recording's" in fault(*whole, "r-soon-61.ppm")
-    assert "an empty line" in fault(depth.name, "", colour.name)
+    assert "is not named like a file of a recording" in fault(*whole, "r-soon-61.ppm")
+    assert "has an empty line" in fault(depth.name, "", colour.name)
     assert "a-1.0-60.dump is empty" in fault(*whole, "a-1.0-60.dump")
     index.write_text("\n".join(whole) + "\n")
     check_recording(str(tmp_path))

@@ -223,7 +223,7 @@ def test_the_doctor_says_whether_pictures_come(library: str, recording: Path, tm
     assert (lenses.state, lenses.text) == ("note", "not measured: `cocoro kinect calibrate`")
     nothing, _ = doctor.check(KinectConfig(library=library, recording=str(tmp_path)), robot, "calliope")
     assert nothing.state == "bad"
-    assert "is no recording" in nothing.text
+    assert "is not a recording" in nothing.text
     missing, _ = doctor.check(KinectConfig(library="/nowhere/libfreenect.so"), robot, "calliope")
     assert missing.text.endswith("sudo apt install libfreenect0.5")
 

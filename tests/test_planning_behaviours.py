@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 from planner_rig import ROBOT, Planner, standing, started
 
+from apps.rehearsal.lockstep import LockstepPlanner
 from cocoro import topics
 from services.planning.config import PlanningConfig
-from services.planning.core import PlanningCore
 
 
 @pytest.fixture
@@ -80,10 +80,10 @@ def test_claws_that_are_stopped_hold_something_and_push_on_a_little(planner: Pla
 
 
 def test_in_lock_step_it_plans_once_a_cycle_and_keeps_the_arm_back(planner: Planner) -> None:
-    core = PlanningCore(ROBOT, PlanningConfig(coordination="lockstep"))
+    core = LockstepPlanner(ROBOT, PlanningConfig())
     assert core.schedule.rate_hz is None
     assert core.schedule.triggers == (topics.DETECTIONS,)
-    lockstep = started(PlanningConfig(coordination="lockstep"))
+    lockstep = started(make=LockstepPlanner)
     lockstep.want("approach", "red_can")
     lockstep.run(3.0)
     planner.want("approach", "red_can")

@@ -153,11 +153,11 @@ class Net:
         """All are read, and what is to be done is done."""
         self.now_ns += ms * MS
         for number, one in self.net.joints.items():
-            self.net.heard(number, reading(error=errors.get(one.joint.name, 0)), self.now_ns)
+            self.net.read(number, reading(error=errors.get(one.joint.name, 0)), self.now_ns)
         while (task := self.net.next_task()) is not None:
             self.tasks.append(task)
-            if task.what == "meet":
-                self.net.met(
+            if task.action == "inspect":
+                self.net.inspected(
                     task.number, ServoStatus(torque_enabled=False, goal=512, position=512, error=0), self.now_ns
                 )
             else:
@@ -187,22 +187,22 @@ def test_nothing_is_made_to_hold_before_the_emergency_stops_state_is_known() -> 
     arm = Net()
     arm.cycle()
     arm.cycle()
-    assert {task.what for task in arm.tasks} == {"meet"}
+    assert {task.action for task in arm.tasks} == {"inspect"}
     assert arm.net.orders(arm.now_ns) == {}
     arm.net.set_latch("released")
     arm.cycle()
-    assert [task.what for task in arm.tasks].count("enable") == 6
+    assert [task.action for task in arm.tasks].count("enable") == 6
     assert set(arm.net.orders(arm.now_ns)) == {1, 2, 3, 4, 5, 6}
 
 
 def test_a_servo_that_holds_already_goes_on_holding_what_it_holds() -> None:
     hand = Net("hand")
-    hand.net.heard(8, reading(500), hand.now_ns)
-    hand.net.met(8, ServoStatus(torque_enabled=True, goal=600, position=500, error=0), hand.now_ns)
+    hand.net.read(8, reading(500), hand.now_ns)
+    hand.net.inspected(8, ServoStatus(torque_enabled=True, goal=600, position=500, error=0), hand.now_ns)
     assert hand.net.orders(hand.now_ns)[8][0] == pytest.approx(600, abs=20)
     arm = Net()
-    arm.net.heard(5, reading(500), arm.now_ns)
-    arm.net.met(5, ServoStatus(torque_enabled=True, goal=600, position=500, error=0), arm.now_ns)
+    arm.net.read(5, reading(500), arm.now_ns)
+    arm.net.inspected(5, ServoStatus(torque_enabled=True, goal=600, position=500, error=0), arm.now_ns)
     assert arm.net.orders(arm.now_ns)[5][0] == 500
 
 
@@ -252,10 +252,10 @@ def test_a_reset_of_the_emergency_stop_clears_the_overloads(arm: Net) -> None:
 def test_a_servo_that_was_shut_down_before_the_service_started_is_a_fault_too() -> None:
     arm = Net()
     arm.net.set_latch("released")
-    arm.net.heard(5, reading(error=0x20), arm.now_ns)
-    arm.net.met(5, ServoStatus(torque_enabled=False, goal=512, position=512, error=0x20), arm.now_ns)
+    arm.net.read(5, reading(error=0x20), arm.now_ns)
+    arm.net.inspected(5, ServoStatus(torque_enabled=False, goal=512, position=512, error=0x20), arm.now_ns)
     assert arm.net.latched_faults() == ("elbow: overload",)
-    assert arm.net.next_task() == ServoTask("meet", 5)
+    assert arm.net.next_task() == ServoTask("inspect", 5)
     assert arm.net.next_task() is None
 
 
@@ -297,8 +297,8 @@ def test_a_silent_servo_is_left_out_and_named_and_the_others_go_on(arm: Net) -> 
 def test_a_servo_that_was_silent_and_has_held_all_the_while_is_nothing_to_tell_of(arm: Net) -> None:
     for _ in range(MISSES):
         arm.net.missed(5)
-    arm.net.heard(5, reading(), arm.now_ns)
-    arm.net.met(5, ServoStatus(torque_enabled=True, goal=512, position=512, error=0), arm.now_ns)
+    arm.net.read(5, reading(), arm.now_ns)
+    arm.net.inspected(5, ServoStatus(torque_enabled=True, goal=512, position=512, error=0), arm.now_ns)
     assert arm.faults() == ""
     assert 5 in arm.net.orders(arm.now_ns)
 
@@ -327,7 +327,7 @@ def test_a_limp_joint_stays_limp_until_it_is_told_to_hold(arm: Net) -> None:
 
 def test_heat_and_voltage_are_told() -> None:
     arm = Net()
-    arm.net.heard(5, reading(temperature_c=66, voltage_v=8.2), arm.now_ns)
+    arm.net.read(5, reading(temperature_c=66, voltage_v=8.2), arm.now_ns)
     faults = arm.faults()
     assert "elbow is hot: 66 C" in faults
     assert "elbow has a bad voltage: 8.2 V" in faults
@@ -370,7 +370,7 @@ def test_measured_joint_limits_are_what_the_servo_line_keeps(tmp_path: Path) -> 
 def test_direction_and_centre_of_a_joint_are_its_own() -> None:
     joint = Joint("elbow", "arm", 5, (-150.0, 150.0), 2.5, 6.0, direction=-1, centre_count=600.0)
     net = ServoNetwork([joint], keeps_goal=False, timeout_s=0.2, max_age_s=0.15)
-    net.heard(5, ServoReading(500, 10, 100, 12.0, 40, 0, 0), NS)
+    net.read(5, ServoReading(500, 10, 100, 12.0, 40, 0, 0), NS)
     state = net.state(NS)
     assert state is not None
     assert state.position_rad[0] == pytest.approx(100 * COUNT)

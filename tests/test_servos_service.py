@@ -209,7 +209,7 @@ async def test_a_disturbed_line_is_told_and_obeyed_no_wrong_way(bench: ServoBenc
         servos.move("arm", elbow=0.4)
         bench.call(bench.servo(ELBOW).acted.clear)
         bench.call(lambda: line.disturb(LineFault("corrupted", 0.02, "both", FOREVER_NS)))
-        await servos.fault("arm", "the line is disturbed, look after its cables")
+        await servos.fault("arm", "the line is disturbed, check its cables")
         bench.call(line.undisturb)
         await servos.state("arm", lambda state: "elbow" in state.joints and angle(state, "elbow") > 0.35)
         goals = [value for _, address, value in bench.call(bench.servo(ELBOW).acted.copy) if address == 30]

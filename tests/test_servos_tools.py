@@ -65,7 +65,7 @@ def test_a_servo_gets_another_number_and_no_delay(bench: ServoBench, line: Servo
     tools.set_number(line, 50, 50)
     with pytest.raises(RefusedError, match="there is a servo 4 on this line already"):
         tools.set_number(line, 50, 4)
-    with pytest.raises(RefusedError, match="nobody answers as 5: is it alone"):
+    with pytest.raises(RefusedError, match="no servo answers as 5: is it alone"):
         tools.set_number(line, 5, 6)
 
 
@@ -207,7 +207,7 @@ def test_the_doctor_looks_at_every_servo(bench: ServoBench) -> None:
     for number, registers in {5: {5: 250}, 4: {43: 75}, 3: {42: 70}}.items():
         bench.put(number, registers)
     texts = {check.name: check.text for check in check_servos(config, ROBOT, "robbie") if check.state == "bad"}
-    assert "waits 500 us" in texts["servo 5, elbow"]
+    assert "answers after 500 us" in texts["servo 5, elbow"]
     assert "let it cool" in texts["servo 4, shoulder"]
     assert "bad voltage" in texts["servo 3, arm_base"]
     assert "does not answer at 1000000 baud" in texts["servo 9, claw_right"]

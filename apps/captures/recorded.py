@@ -16,6 +16,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import msgspec
 
+from apps.rehearsal.lockstep import LOCKSTEP_PLANNER
 from cocoro.capture.conventions import CaptureError
 from cocoro.capture.reader import Capture, Record
 from cocoro.capture.types import LossyFrame, MessageHead, NotReadableError
@@ -179,13 +180,16 @@ def recorded_file(capture: Capture, service: str, field: str, load: Callable[[Pa
 
 def _origin(service: str, entries: Mapping[str, str], folder: Path) -> Origin:
     module = entries["module"]
-    component = processes.by_module(module)
+    settings = json.loads(entries["config"])
+    # Until 2026 the planner had the setting `coordination`; lock-step is a component of its own now.
+    if settings.pop("coordination", "concurrent") == "lockstep":
+        module = LOCKSTEP_PLANNER.module
+    component = LOCKSTEP_PLANNER if module == LOCKSTEP_PLANNER.module else processes.by_module(module)
     if component is None:
         raise ConfigError(f"no component that is installed here has the module {module!r}")
     implementation = load_component(component)
     if implementation.core is None:
         raise CaptureError(f"{service} cannot be executed again: {module} has no pure core")
-    settings = json.loads(entries["config"])
     for file in json.loads(entries["files"]):
         settings[file["field"]] = _same_file(file, folder, settings.get(file["field"]))
     try:

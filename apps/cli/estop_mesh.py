@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import msgspec
 
-from apps.cli.estop import STOPPABLE, StopResult
+from apps.cli.stop_asking import STOPPABLE, StopResult
 from cocoro.bus.endpoints import ZenohConfig
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.errors import CallTimeoutError, CocoroError, MeshError

@@ -86,8 +86,27 @@ def failed(error: BaseException) -> int:
     if isinstance(error, UnicodeEncodeError) and any("\udc80" <= c <= "\udcff" for c in error.object):
         output.complain(f"{error.object}: this name is not valid UTF-8; choose another name")
         return exits.USAGE
+    hiding = _hiding(error) if isinstance(error, ImportError) else ""
+    if hiding:
+        output.complain(hiding)
+        return exits.USAGE
     _report_bug(error)
     return exits.FAILED
+
+
+def _hiding(error: ImportError) -> str:
+    """Text for a failed import of this project's own code because a foreign package of the same name comes first on
+    Python's search path; '' for any other failed import."""
+    name = (error.name or "").partition(".")[0]
+    own = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))  # noqa: PTH120, PTH100
+    package = sys.modules.get(name)
+    folders = [os.path.dirname(os.path.abspath(path)) for path in getattr(package, "__path__", ())]  # noqa: PTH120, PTH100
+    if name not in PACKAGES or not folders or own in folders:
+        return ""
+    return (
+        f"the package {name!r} in {folders[0]} hides this project's package of that name; remove {folders[0]} from "
+        f"PYTHONPATH, or install cocoro-mesh into an environment of its own"
+    )
 
 
 def _cancelled() -> int:

@@ -14,7 +14,12 @@ import struct
 import sys
 import time
 from contextlib import suppress
+from typing import NamedTuple
 
+from apps.cli import exits
+
+STOPPABLE = ("base", "arm", "hand")
+"""Copy of the list in `cocoro.topics`, which is slow to import."""
 SOCKETS = "/proc/net/unix"
 PREFIX = "@cocoro-stop/"
 """The addresses of `cocoro.stop.path`, as the kernel lists them."""
@@ -40,6 +45,46 @@ _ABOUT_BYTES = 16
 """Bytes between an entry's header and its attributes."""
 _PATIENCE_S = 0.1
 _MOST_BYTES = 1 << 18
+
+
+class StopResult(NamedTuple):
+    """Result of stopping one robot."""
+
+    robot: str
+    acknowledged: tuple[str, ...]
+    missing: tuple[str, ...]
+    """Services that run and did not acknowledge."""
+    absent: tuple[str, ...]
+    """Services that do not run."""
+    seconds: float
+    """Time from Enter until the last service had stopped what it moves."""
+    not_kept: tuple[str, ...] = ()
+    """Reasons why latches will not survive a restart."""
+    not_yet_kept: tuple[str, ...] = ()
+    """Services that have not reported whether their latch is on the disk."""
+    owner: int | None = None
+    """User id of the owner when it is another user's robot."""
+    latched_ns: dict[str, int] = {}  # noqa: RUF012 # read only
+    """Time at which each service stopped what it moves, ns of CLOCK_MONOTONIC; known by the stop path only."""
+
+    @property
+    def code(self) -> int:
+        if self.missing:
+            return exits.FAILED
+        return exits.DONE if any(service in STOPPABLE for service in self.acknowledged) else exits.NO_MESH
+
+    def __str__(self) -> str:
+        whose = "" if self.owner is None else f" (of user {self.owner})"
+        text = f"{self.robot}{whose}: stopped {', '.join(self.acknowledged) or 'nothing'} in {self.seconds:.2f} s"
+        if self.missing:
+            text += f"; NOT ACKNOWLEDGED by {', '.join(self.missing)}"
+        if self.absent:
+            text += f"; not there: {', '.join(self.absent)}"
+        if self.not_kept:
+            text += f"; A RESTART WILL FORGET IT: {', '.join(self.not_kept)}"
+        if self.not_yet_kept:
+            text += f"; not yet known to be on the disk: {', '.join(self.not_yet_kept)}"
+        return text
 
 
 class Point:

@@ -1,4 +1,4 @@
-"""The runs that every other one stands on: each seed's body babbles, and learns."""
+"""The runs that all others need: each seed's body babbles and learns."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from apps.experiments.settings import ExperimentSettings
 
 
 def babbled(settings: ExperimentSettings, seed: int) -> list[ExperimentRun]:
-    """Arm and wheels of one body."""
+    """Babbling of one body's arm and wheels."""
     common = settings.common(seed)
     arm = {"task": "babble-arm", "count": settings.samples, "samples": str(settings.arm_file(seed)), **common}
     wheels = {
@@ -23,7 +23,7 @@ def babbled(settings: ExperimentSettings, seed: int) -> list[ExperimentRun]:
 
 
 def learned(settings: ExperimentSettings, seed: int) -> list[ExperimentRun]:
-    """The same, and a model of them."""
+    """Babbling of one body, and learning its model."""
     fields = {
         "arm": str(settings.arm_file(seed)), "wheels": str(settings.wheels_file(seed)),
         "into": str(settings.model_file(seed)), **settings.robot_files,
@@ -37,6 +37,6 @@ def learned_name(seed: int) -> str:
 
 
 def with_model(settings: ExperimentSettings, seed: int, name: str, **fields: Any) -> ExperimentRun:
-    """A rehearsal of a body that has learned."""
+    """A rehearsal with the model of a body; `fields` are further fields of the request."""
     request = {**settings.common(seed), "model": str(settings.model_file(seed)), **fields}
     return ExperimentRun(name, "rehearse", request, needs=(learned_name(seed),))

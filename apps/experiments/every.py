@@ -1,4 +1,4 @@
-"""The experiments by their names, and how to run them."""
+"""The experiments by name, and the function that runs and reports them."""
 
 from __future__ import annotations
 
@@ -7,12 +7,14 @@ from pathlib import Path
 from typing import Protocol
 
 from apps.experiments import arm_map, fetching, figures, following, going, reaching, report, wheel_distance
+from apps.experiments.results import Section
 from apps.experiments.runs import ExperimentRun, RunDisplay, RunResult, perform
-from apps.experiments.section import Section
 from apps.experiments.settings import ExperimentSettings
 
 
 class Experiment(Protocol):
+    """A module of an experiment: the runs that it needs, and its section of the report from their results."""
+
     KEY: str
     TITLE: str
 
@@ -29,7 +31,10 @@ EXPERIMENTS: dict[str, Experiment] = {
 def run(
     keys: Sequence[str], settings: ExperimentSettings, display: RunDisplay, *, plots: bool
 ) -> tuple[list[Section], Path]:
-    """Run them and write the report. Raises ConfigError; what was run before an end of any kind is kept."""
+    """Runs experiments and writes the report; returns its sections and the path of its Markdown file.
+
+    Finished runs are kept when it is interrupted. Raises ConfigError when `plots` needs a missing library.
+    """
     if plots:
         figures.available()
     runs: dict[str, ExperimentRun] = {}
@@ -39,7 +44,7 @@ def run(
     sections = []
     for key in keys:
         section = EXPERIMENTS[key].section(settings, results)
-        mine = EXPERIMENTS[key].runs(settings)
-        section.errors = [f"{run.name}: {results[run.name]['error']}" for run in mine if "error" in results[run.name]]
+        needed = EXPERIMENTS[key].runs(settings)
+        section.errors = [f"{run.name}: {results[run.name]['error']}" for run in needed if "error" in results[run.name]]
         sections.append(section)
     return sections, report.write(sections, settings, plots=plots)

@@ -1,4 +1,4 @@
-"""The plots. matplotlib is loaded here alone, and when something is drawn: it is an extra."""
+"""Plots of the experiments. Only this module imports matplotlib, an extra, and only when it draws."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 OURS, OTHER, TRUE, FAINT = "#1b6ca8", "#c8553d", "#2f2f2f", "#b9b9b9"
 COLOURS = (OURS, OTHER, "#6a994e")
 SMOOTHED = 15
-"""Sightings over which the bent arm's errors are averaged."""
+"""Number of sightings over which the bent arm's errors are averaged."""
 
 
 def available() -> None:
@@ -37,7 +37,7 @@ def available() -> None:
 
 
 def sheet(columns: int = 1, rows: int = 1, *, width: float = 5.0, height: float = 3.8) -> tuple[Figure, list[Axes]]:
-    """A figure and its axes, row by row; nothing of it is global."""
+    """A figure and its axes, row by row, without matplotlib's global state. Sizes in inches."""
     from matplotlib.figure import Figure as Sheet
 
     figure = Sheet(figsize=(width * columns, height * rows), layout="constrained")
@@ -50,49 +50,54 @@ def sheet(columns: int = 1, rows: int = 1, *, width: float = 5.0, height: float 
 
 
 def hand_places(samples: Path, learned: Path, robot: Robot) -> Figure:
-    """Seen, drawn and learned places of the held-out sightings, from above and from the side."""
-    drawing = NominalModel(robot)
-    _, held = study.split(study.clean(sightings(dataset.read(samples, HandRow, robot).rows), drawing))
+    """Held-out places of the hand, from above and from the side: seen, by the nominal model, by the learned map."""
+    nominal = NominalModel(robot)
+    _, held = study.split(study.clean(sightings(dataset.read(samples, HandRow, robot).rows), nominal))
     arm = model.load(learned, robot).arm
     assert arm is not None
     held = held.pick(slice(None, None, max(len(held) // 150, 1)))
-    drawn, mapped = drawing.predict(held.angles_rad), model.hand_map(arm, robot).predict(held.angles_rad)
+    modelled, mapped = nominal.predict(held.angles_rad), model.hand_map(arm, robot).predict(held.angles_rad)
     figure, axes = sheet(2, width=4.6, height=4.6)
-    for axis, (one, other, said) in zip(axes, ((0, 1, "left, m"), (0, 2, "up, m")), strict=True):
-        for start, end in zip(held.places_m, drawn, strict=True):
+    for axis, (one, other, label) in zip(axes, ((0, 1, "left, m"), (0, 2, "up, m")), strict=True):
+        for start, end in zip(held.places_m, modelled, strict=True):
             axis.plot([start[one], end[one]], [start[other], end[other]], color=FAINT, linewidth=0.7, zorder=1)
-        axis.scatter(drawn[:, one], drawn[:, other], s=9, color=OTHER, label="the drawing", zorder=2)
+        axis.scatter(modelled[:, one], modelled[:, other], s=9, color=OTHER, label="the nominal model", zorder=2)
         axis.scatter(mapped[:, one], mapped[:, other], s=9, color=OURS, label="the learned map", zorder=3)
         axis.scatter(held.places_m[:, one], held.places_m[:, other], s=26, facecolors="none", edgecolors=TRUE,
                      linewidths=0.7, label="seen", zorder=4)  # fmt: skip
-        axis.set(xlabel="ahead, m", ylabel=said, aspect="equal")
+        axis.set(xlabel="ahead, m", ylabel=label, aspect="equal")
     figure.legend(*axes[0].get_legend_handles_labels(), frameon=False, fontsize=8, ncols=3, loc="outside lower center")
     return figure
 
 
 def curves(seeds: Sequence[Mapping[str, Mapping[str, float]]]) -> Figure:
+    """Held-out error against the number of samples, for each method of `lessons.learn`; a line for each seed."""
     figure, (axis,) = sheet(width=6.0)
-    names = {"default": "ours: 81 bases over the drawing", "paper over drawing": "the paper's rule over the drawing",
-             "paper": "the paper's rule, primed"}  # fmt: skip
-    for (key, said), colour in zip(names.items(), COLOURS, strict=True):
+    names = {
+        "default": "ours: 81 bases over the nominal model",
+        "paper over drawing": "the paper's rule over the nominal model",
+        "paper": "the paper's rule, primed",
+    }
+    for (key, label), colour in zip(names.items(), COLOURS, strict=True):
         sizes = sorted({int(size) for seed in seeds for size in seed[key]})
         lines = np.array([[100 * seed[key].get(str(size), np.nan) for size in sizes] for seed in seeds])
         axis.plot(sizes, lines.T, color=colour, linewidth=0.5, alpha=0.4)
-        axis.plot(sizes, np.nanmean(lines, axis=0), color=colour, marker="o", markersize=4, label=said)
+        axis.plot(sizes, np.nanmean(lines, axis=0), color=colour, marker="o", markersize=4, label=label)
     axis.set(xscale="log", yscale="log", xlabel="samples", ylabel="held-out error, RMS, cm")
     axis.legend(frameon=False, fontsize=8)
     return figure
 
 
 def bend(seeds: Sequence[Mapping[str, Any]]) -> Figure:
+    """Error of each sighting before and after the arm is bent (`lessons.bend`): median over the seeds, smoothed."""
     figure, (axis,) = sheet(width=6.0)
     before = min(seed["bent_at"] for seed in seeds)
     after = min(len(seed["fixed_m"]) - seed["bent_at"] for seed in seeds)
-    for key, said, colour in (("fixed_m", "the map as it was", OTHER), ("adapted_m", "taught on", OURS)):
+    for key, label, colour in (("fixed_m", "the map, fixed", OTHER), ("adapted_m", "the map, trained further", OURS)):
         lines = np.array([seed[key][seed["bent_at"] - before : seed["bent_at"] + after] for seed in seeds])
         middle = np.median(100 * lines, axis=0)
         smooth = np.convolve(middle, np.ones(SMOOTHED) / SMOOTHED, mode="valid")
-        axis.plot(np.arange(len(smooth)) - before + SMOOTHED // 2, smooth, color=colour, label=said)
+        axis.plot(np.arange(len(smooth)) - before + SMOOTHED // 2, smooth, color=colour, label=label)
     axis.axvline(0, color=TRUE, linewidth=0.8, linestyle=":")
     axis.set(xlabel="sightings since the bend", ylabel="error, cm", ylim=(0, None))
     axis.legend(frameon=False, fontsize=8)
@@ -100,15 +105,15 @@ def bend(seeds: Sequence[Mapping[str, Any]]) -> Figure:
 
 
 def reaches(traces: Mapping[tuple[str, str], Mapping[str, list[Any]]], said: Sequence[str]) -> Figure:
-    """A column a way of reaching, rows: from above and from the side."""
+    """The hand's path: a column for each method, rows from above and from the side. `said` are the columns' titles."""
     figure, axes = sheet(2, 2, width=4.2, height=3.6)
     ways = list(dict.fromkeys(way for way, _ in traces))
     for column, way in enumerate(ways):
-        for (its, scene), trace in traces.items():
-            if its != way:
+        for (method, scene), trace in traces.items():
+            if method != way:
                 continue
             hidden = scene.endswith("hidden")
-            # Not how the arm unfolds before the first of them.
+            # Leave out the arm's unfolding before the first target.
             first = trace["target"][0]
             later = next(number for number, target in enumerate(trace["target"]) if target != first)
             hand = np.array(trace["hand_m"][later:])
@@ -124,6 +129,7 @@ def reaches(traces: Mapping[tuple[str, str], Mapping[str, list[Any]]], said: Seq
 
 
 def wheel_trials(seeds: Sequence[tuple[Mapping[str, Any], float]]) -> Figure:
+    """Error of the wheel distance over the trials; each seed is a fit and the true distance in m."""
     figure, (left, right) = sheet(2, width=5.2)
     for fit, true_m in seeds:
         after = [np.nan if value is None else 1000 * (value - true_m) for value in fit["after_m"]]
@@ -139,6 +145,7 @@ def wheel_trials(seeds: Sequence[tuple[Mapping[str, Any], float]]) -> Figure:
 
 
 def paths(traces: Sequence[Mapping[str, list[Any]]], asked_m: float) -> Figure:
+    """The robot's true paths to the balls, from above, with circles at the requested distance."""
     from matplotlib.patches import Circle
 
     figure, (axis,) = sheet(width=5.6, height=5.0)
@@ -154,11 +161,12 @@ def paths(traces: Sequence[Mapping[str, list[Any]]], asked_m: float) -> Figure:
 
 
 def square(traces: Mapping[str, Mapping[str, list[Any]]]) -> Figure:
+    """The robot's true path behind the ball for each method, and the ball's, from above."""
     figure, (axis,) = sheet(width=5.6, height=5.0)
-    for (said, trace), colour in zip(traces.items(), COLOURS, strict=False):
+    for (label, trace), colour in zip(traces.items(), COLOURS, strict=False):
         following = np.array([phase == "follow" for phase in trace["phase"]])
         way = np.array(trace["body"])[following]
-        axis.plot(way[:, 0], way[:, 1], color=colour, linewidth=1.0, label=said)
+        axis.plot(way[:, 0], way[:, 1], color=colour, linewidth=1.0, label=label)
     ball = np.array([place for place in next(iter(traces.values()))["target_m"] if place is not None])
     axis.plot(ball[:, 0], ball[:, 1], color=TRUE, linewidth=0.8, linestyle=":", label="the ball")
     axis.set(xlabel="ahead, m", ylabel="left, m", aspect="equal")
@@ -167,6 +175,7 @@ def square(traces: Mapping[str, Mapping[str, list[Any]]]) -> Figure:
 
 
 def phases(ways: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
+    """Mean duration of each phase over the runs of each method."""
     figure, (axis,) = sheet(width=7.0, height=2.6)
     names = list(dict.fromkeys(p["name"] for runs in ways.values() for run in runs for p in run["phases"]))
     palette = ("#8ecae6", "#219ebc", "#126782", "#ffb703", "#fb8500", "#6a994e", "#bc4749", "#a7a7a7")

@@ -1,4 +1,4 @@
-"""What is learned between the runs of the experiments: a model of each seed's body, and what a bent arm does to it."""
+"""Learning between the rehearsals of the experiments: a model of each seed's body, and its error on a bent arm."""
 
 from __future__ import annotations
 
@@ -20,21 +20,24 @@ from cocoro.learning.nominal_model import NominalModel
 from services.planning.teaching import Adapter
 
 SIZES = (100, 300, 1000, 2000)
+"""Numbers of samples of the learning curves."""
 
 
 def learn(
     arm: str, wheels: str, into: str, method: str | None = None, description: str | None = None,
     measured: str | None = None,
 ) -> dict[str, Any]:  # fmt: skip
-    """A model of arm and wheels, with every method's score (or only of the one that is asked for) and how the error
-    falls with the samples."""
+    """Learns arm and wheels from two files of samples and writes the model to `into`.
+
+    Returns every method's score (or that of `method` alone), learning curves and the fit of the wheels.
+    """
     robot, file = load_robot(description, measured), Path(into)
     file.unlink(missing_ok=True)
     _, report = learn_arm(Path(arm), file, robot, method=method)
     _, fit = learn_wheels(Path(wheels), file, robot)
-    drawing = NominalModel(robot)
+    nominal = NominalModel(robot)
     rows = dataset.read(Path(arm), HandRow, robot).rows
-    learn, held = study.split(study.clean(sightings(rows), drawing))
+    learn, held = study.split(study.clean(sightings(rows), nominal))
     methods = {"default": study.BEST, "paper": study.METHODS[0], "paper over drawing": study.METHODS[2]}
     sizes = [size for size in SIZES if size <= len(learn)]
     draws = np.unique([row.draw for row in rows])
@@ -45,7 +48,7 @@ def learn(
         "learn": len(learn),
         "held": len(held),
         "curves": {
-            name: {str(s): e for s, e in zip(sizes, study.curve(m, drawing, learn, held, sizes), strict=True)}
+            name: {str(s): e for s, e in zip(sizes, study.curve(m, nominal, learn, held, sizes), strict=True)}
             for name, m in methods.items()
         },
         "draws_used": len(draws),
@@ -60,7 +63,7 @@ def learn(
 
 
 def _babbled_s(rows: Sequence[HandRow]) -> float:
-    """How long it took to see them; a babbling that was gone on with began its clock anew."""
+    """Simulated time of the babbling; each continued babbling starts its clock at 0 again."""
     steps = np.diff([row.stamp_ns for row in rows])
     return float(steps[steps > 0].sum()) / NS
 
@@ -68,11 +71,11 @@ def _babbled_s(rows: Sequence[HandRow]) -> float:
 def bend(
     into: str, bent: str, bend_s: float, description: str | None = None, measured: str | None = None
 ) -> dict[str, Any]:
-    """The learned map's error at each sighting of an arm that is bent meanwhile: left as it was, and taught on."""
+    """Error of the learned map at each sighting of an arm that is bent after `bend_s`: fixed, and trained further."""
     robot = load_robot(description, measured)
     arm = model.load(Path(into), robot).arm
     if arm is None:
-        raise msgspec.ValidationError(f"{into} has no arm in it")
+        raise msgspec.ValidationError(f"{into} has no model of the arm")
     fixed = model.hand_map(arm, robot)
     adapter = Adapter(model.hand_map(arm, robot), arm.training.scores["held_out_rms_m"])
     rows = dataset.read(Path(bent), HandRow, robot).rows

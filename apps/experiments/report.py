@@ -1,4 +1,4 @@
-"""The report of the experiments: Markdown, HTML that needs nothing beside it, JSON, and a manifest."""
+"""The report of the experiments: Markdown, HTML in one file, JSON, and a manifest of versions and settings."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Any
 
 import msgspec
 
-from apps.experiments.section import ResultRow, Section
+from apps.experiments.results import ResultRow, Section
 from apps.experiments.settings import ExperimentSettings
 from cocoro.about import DISTRIBUTIONS
 from cocoro.errors import naming
@@ -29,7 +29,7 @@ figure{margin:1.5rem 0} img{max-width:100%} figcaption{color:#555;font-size:13px
 
 
 def write(sections: Sequence[Section], settings: ExperimentSettings, *, plots: bool) -> Path:
-    """Everything, into the settings' folder. Returns the Markdown's path."""
+    """Writes report, plots and manifest into the settings' folder; returns the path of the Markdown file."""
     folder = settings.out
     folder.mkdir(parents=True, exist_ok=True)
     if plots:
@@ -70,9 +70,9 @@ def _about(settings: ExperimentSettings) -> str:
     count = f"{len(seeds)} seed" + ("" if len(seeds) == 1 else "s")
     return (
         f"{count} ({which}); sensors {settings.sensors}, body {settings.body}, frames"
-        f" {settings.width}x{settings.height} at {settings.frame_rate_hz:g} Hz; virtual time. A row is over the seeds,"
-        " or over all runs where it says so; 'worst' is of all of them. Rows of ours are measured in the same runs as"
-        " the baselines' beside them."
+        f" {settings.width}x{settings.height} at {settings.frame_rate_hz:g} Hz; virtual time. A row summarises the"
+        " seeds, or all runs where it says so; 'worst' is the worst of all. Our rows and the baselines beside them are"
+        " measured in the same runs."
     )
 
 
@@ -94,26 +94,26 @@ def _markdown(sections: Sequence[Section], settings: ExperimentSettings, plots: 
         for note in section.notes:
             yield f"\n{note}"
         for error in section.errors:
-            yield f"\nA run could not be: {error}"
+            yield f"\nA run failed: {error}"
         if plots:
             for plot in section.plots:
                 yield f"\n![{plot.caption}]({plot.name}.png)\n\n*{plot.caption}*"
 
 
 def _page(sections: Sequence[Section], settings: ExperimentSettings, plots: bool) -> str:
-    said = html.escape
-    parts = [f"<h1>The paper's experiments</h1><p>{said(_about(settings))}</p>"]
+    escape = html.escape
+    parts = [f"<h1>The paper's experiments</h1><p>{escape(_about(settings))}</p>"]
     for section in sections:
-        parts.append(f"<h2>{said(section.key)}: {said(section.title)}</h2><p>{said(section.about)}</p>")
-        parts.append("<table><tr>" + "".join(f"<th>{said(head)}</th>" for head in HEADS) + "</tr>")
+        parts.append(f"<h2>{escape(section.key)}: {escape(section.title)}</h2><p>{escape(section.about)}</p>")
+        parts.append("<table><tr>" + "".join(f"<th>{escape(head)}</th>" for head in HEADS) + "</tr>")
         for row in section.rows:
             cells = "".join(
-                f'<td class="{cell.lower() if cell == row.verdict else ""}">{said(cell)}</td>' for cell in _cells(row)
+                f'<td class="{cell.lower() if cell == row.verdict else ""}">{escape(cell)}</td>' for cell in _cells(row)
             )
             parts.append(f'<tr class="{"ours" if row.who.startswith("ours") else ""}">{cells}</tr>')
         parts.append("</table>")
-        parts += [f"<p>{said(note)}</p>" for note in section.notes]
-        parts += [f"<p>A run could not be: {said(error)}</p>" for error in section.errors]
+        parts += [f"<p>{escape(note)}</p>" for note in section.notes]
+        parts += [f"<p>A run failed: {escape(error)}</p>" for error in section.errors]
         if plots:
             parts += [_figure(settings.out / f"{plot.name}.png", plot.caption) for plot in section.plots]
     return (

@@ -1,5 +1,5 @@
-"""The runs that experiments are made of: each in a process of its own, as many at once as there are cores, each result
-kept on disk, so that the same command goes on where an earlier one was ended."""
+"""Performs the runs of experiments in worker processes, and keeps each result on disk, so that a repeated command
+continues where an earlier one was interrupted."""
 
 from __future__ import annotations
 
@@ -21,27 +21,30 @@ from apps.rehearsal.request import RehearsalRequest
 from cocoro.errors import CocoroError, naming
 
 TASKS_A_PROCESS = 25
-"""A new one now and then, lest something grows; to begin costs each as long as a short run."""
+"""Runs after which a worker process is replaced, against growing memory; starting one takes as long as a short run."""
 LESSONS: dict[str, Callable[..., dict[str, Any]]] = {"learn": lessons.learn, "bend": lessons.bend}
 RunResult = dict[str, Any]
-"""JSON; with 'error' in it where the run could not be."""
+"""A run's result as JSON data; a failed run has its message under 'error'."""
 
 
 @dataclass(frozen=True)
 class ExperimentRun:
-    """One piece of work. Equal names, equal runs."""
+    """One piece of work for a worker process. Runs of equal names are equal."""
 
     name: str
-    """Its file's, under `runs`."""
+    """Name of its result's file in the folder `runs`."""
     kind: Literal["rehearse", "learn", "bend"]
     fields: dict[str, Any] = field(hash=False)
     """Rehearse: of the request; else the arguments of the lesson of that name."""
     needs: tuple[str, ...] = ()
-    """Names of the runs that must be done before."""
+    """Names of the runs whose results it uses."""
 
 
 class RunDisplay(Protocol):
-    def begin(self, total: int, had: int) -> None: ...
+    """Shows the progress of `perform`."""
+
+    def begin(self, total: int, had: int) -> None:
+        """`had` of the `total` runs have a result from an earlier time."""
 
     def started(self, name: str) -> None: ...
 
@@ -49,36 +52,41 @@ class RunDisplay(Protocol):
 
 
 def carry_out(kind: str, fields: dict[str, Any]) -> RunResult:
-    """In a process of its own."""
+    """Performs one run in a worker process; errors become part of the result."""
     try:
         if kind == "rehearse":
             request = msgspec.convert(fields, RehearsalRequest)
             if request.samples is not None and request.bend_s is not None:
-                Path(request.samples).unlink(missing_ok=True)  # half a babbling has no bend at that time
+                Path(request.samples).unlink(
+                    missing_ok=True
+                )  # samples of an interrupted run do not contain the bend at that time
             return dict(rehearse(request))
         return dict(LESSONS[kind](**fields))
     except (CocoroError, msgspec.ValidationError) as error:
         return {"error": str(error)}
-    except Exception as error:  # one run that breaks must not end the others, of which there are hundreds
+    except Exception as error:  # a failed run must not end hundreds of others
         return {"error": f"{type(error).__name__}: {error}"}
 
 
 def perform(runs: Iterable[ExperimentRun], folder: Path, jobs: int, display: RunDisplay) -> dict[str, RunResult]:
-    """All runs, by name, each given after what it needs. What the folder holds of them already is not done again,
-    unless something that it needs was; a run whose needs failed fails."""
+    """Performs all runs in `jobs` worker processes and returns their results by name.
+
+    A run starts when the runs that it needs have finished, and fails when one of them failed. A result in `folder` is
+    used again when the run's fields and the results that it used are the same.
+    """
     results: dict[str, RunResult] = {}
     waiting: dict[str, ExperimentRun] = {}
     for run in runs:
-        kept = _kept(run, folder, results) if all(name in results for name in run.needs) else None
-        if kept is not None:
-            results[run.name] = kept
+        stored = _stored(run, folder, results) if all(name in results for name in run.needs) else None
+        if stored is not None:
+            results[run.name] = stored
         else:
             waiting[run.name] = run
     for run in waiting.values():
         lacking = [name for name in run.needs if name not in waiting and name not in results]
-        assert not lacking, f"{run.name} needs {lacking}, which nobody does"
+        assert not lacking, f"{run.name} needs {lacking}, which are not among the runs"
     display.begin(len(waiting) + len(results), len(results))
-    # One thread of linear algebra a process: more of them only get in one another's way.
+    # One thread of linear algebra in each process, since there is a process for each core.
     os.environ |= {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(jobs, context, initializer=_quiet, max_tasks_per_child=TASKS_A_PROCESS) as pool:
@@ -90,7 +98,7 @@ def perform(runs: Iterable[ExperimentRun], folder: Path, jobs: int, display: Run
                 for future in done:
                     run = running.pop(future)
                     results[run.name] = result = future.result()
-                    _keep(run, folder, results)
+                    _store(run, folder, results)
                     display.ended(run.name, result)
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
@@ -119,7 +127,7 @@ def _start(
 
 
 def _quiet() -> None:
-    """What a worker prints is nobody's: the display has the terminal."""
+    """Discards what a worker prints, because the display has the terminal."""
     null = os.open(os.devnull, os.O_WRONLY)
     os.dup2(null, 1)
     os.dup2(null, 2)
@@ -129,35 +137,35 @@ def _path(run: ExperimentRun, folder: Path) -> Path:
     return folder / f"{run.name}.json"
 
 
-def _kept(run: ExperimentRun, folder: Path, results: Mapping[str, RunResult]) -> RunResult | None:
-    """The result of an earlier time, if it was of the same run, after the same, and no error."""
+def _stored(run: ExperimentRun, folder: Path, results: Mapping[str, RunResult]) -> RunResult | None:
+    """The stored result of an equal run that used equal results; None when there is none."""
     try:
         data = json.loads(_path(run, folder).read_text())
-        same = data["fields"] == _plain(run.fields) and data["after"] == _after(run, results)
+        same = data["fields"] == _as_json(run.fields) and data["after"] == _used(run, results)
         return dict(data["result"]) if same else None
     except (OSError, ValueError, KeyError, TypeError):
         return None
 
 
-def _keep(run: ExperimentRun, folder: Path, results: Mapping[str, RunResult]) -> None:
+def _store(run: ExperimentRun, folder: Path, results: Mapping[str, RunResult]) -> None:
     result = results[run.name]
     if "error" in result:
         return
     path = _path(run, folder)
     path.parent.mkdir(parents=True, exist_ok=True)
-    beside = path.with_suffix(".part")
-    data = {"kind": run.kind, "fields": _plain(run.fields), "after": _after(run, results), "result": result}
-    with naming(beside):
-        beside.write_text(json.dumps(data))
-    beside.replace(path)
+    part = path.with_suffix(".part")
+    data = {"kind": run.kind, "fields": _as_json(run.fields), "after": _used(run, results), "result": result}
+    with naming(part):
+        part.write_text(json.dumps(data))
+    part.replace(path)
 
 
-def _after(run: ExperimentRun, results: Mapping[str, RunResult]) -> dict[str, str]:
-    """Fingerprints of what the run stood on."""
+def _used(run: ExperimentRun, results: Mapping[str, RunResult]) -> dict[str, str]:
+    """Fingerprints of the results that the run used."""
     return {
         name: hashlib.sha256(json.dumps(results[name], sort_keys=True).encode()).hexdigest()[:16] for name in run.needs
     }
 
 
-def _plain(fields: dict[str, Any]) -> Any:
+def _as_json(fields: dict[str, Any]) -> Any:
     return json.loads(json.dumps(fields))

@@ -1,4 +1,4 @@
-"""What an experiment is run with."""
+"""Settings of the experiments, and the files of each seed."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ class ExperimentSettings(msgspec.Struct, frozen=True, kw_only=True):
     height: int = 480
     frame_rate_hz: float = 30.0
     samples: int = 2600
-    """Of the arm's babbling: four fifths of them are learned from, so that there are 2,000 and a few."""
+    """Samples of the arm's babbling; four fifths of them, a little over 2,000, are for learning."""
     trials: int = 40
-    """Of the wheels' babbling."""
+    """Trials of the wheels' babbling."""
     jobs: int = 1
-    """Runs at once."""
+    """Runs at the same time."""
 
     def common(self, seed: int) -> dict[str, Any]:
-        """Of every rehearsal's request."""
+        """Fields of every rehearsal's request."""
         return {
             "seed": seed, "sensors": self.sensors, "body": self.body, "width": self.width, "height": self.height,
             "frame_rate_hz": self.frame_rate_hz, **self.robot_files,

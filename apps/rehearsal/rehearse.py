@@ -9,18 +9,19 @@ from __future__ import annotations
 import asyncio
 import time
 from contextlib import AsyncExitStack
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
 from apps.learning.collector import TOPICS, SampleCollector, collector
+from apps.rehearsal.lockstep import LOCKSTEP_PLANNER, LOCKSTEP_SETTINGS, LockstepCycle, LockstepNode
 from apps.rehearsal.request import RehearsalRequest
 from cocoro import topics
 from cocoro.bus.local import LocalMesh
 from cocoro.clock import NS, VirtualClock
 from cocoro.component import load
-from cocoro.core import Core
 from cocoro.errors import CocoroError, ConfigError
 from cocoro.inbox import Stream
 from cocoro.messages import Detections, Frame, Recording, TaskReply, TaskRequest, TaskState
@@ -28,7 +29,6 @@ from cocoro.node import Node
 from cocoro.objects import Catalogue
 from cocoro.picture import draw, save_png
 from cocoro.robot import Robot
-from cocoro.stepper import Stepper
 from cocoro.vloop import run_virtual
 from deploy.delayed import DelayedNode
 from deploy.processes import named, needs
@@ -41,7 +41,6 @@ RECORDER = "capture"
 PROCESSES = ("sim", "perception", "planning", "executive")
 START_S = 5.0
 """So long the robot may take until it accepts a task."""
-_LONG_S = 60.0
 
 
 def rehearse(request: RehearsalRequest) -> dict[str, Any]:
@@ -64,45 +63,6 @@ class TaskRefusedError(CocoroError):
     def __init__(self, reply: TaskReply) -> None:
         super().__init__(reply.text)
         self.code = reply.refusal
-
-
-class LockstepCycle:
-    """The paper's one serial cycle: sense, perceive, plan, act; the next begins when the last has ended, and
-    commands hold meanwhile. The services' own cores, latencies included, in turn."""
-
-    ORDER = ("perception", "planning")
-
-    def __init__(self) -> None:
-        self._steps: dict[str, tuple[Node, Stepper]] = {}
-
-    async def join(self, node: Node, core: Core) -> None:
-        """In place of `Node.drive`: the core is stepped when its turn comes."""
-        self._steps[node.name] = (node, node.stepper(core))
-        node.ready()
-        if set(self._steps) == set(self.ORDER):
-            await self._run()
-        else:
-            await asyncio.get_running_loop().create_future()
-
-    async def _run(self) -> None:
-        perceiver, perceive = self._steps["perception"]
-        planner, plan = self._steps["planning"]
-        while True:
-            await perceive.wake.wait()
-            perceive.wake.clear()
-            if await perceive(perceiver.now_ns()):
-                # Lets what was published arrive; no time passes.
-                await asyncio.sleep(0)
-                await plan(planner.now_ns())
-
-
-class LockstepNode(DelayedNode):
-    """A node whose core is driven by the cycle."""
-
-    cycle: LockstepCycle
-
-    async def drive(self, core: Core, name: str | None = None) -> None:
-        await self.cycle.join(self, core)
 
 
 class _Rehearsal:
@@ -132,7 +92,8 @@ class _Rehearsal:
         async with AsyncExitStack() as stack:
             services = []
             for name in (*((RECORDER,) if request.record else ()), *PROCESSES):
-                row = named(name)
+                lockstep = request.lockstep and name in LockstepCycle.ORDER
+                row = LOCKSTEP_PLANNER if lockstep and name == "planning" else named(name)
                 component = load(row)
                 settings = self._settings(name)
                 if request.objects is not None and "objects" in component.config.__struct_fields__:
@@ -140,14 +101,11 @@ class _Rehearsal:
                 if "needed" in component.config.__struct_fields__:
                     settings["needed"] = needs(name)
                 config = msgspec.convert(settings, component.config)
-                lockstep = request.lockstep and name in LockstepCycle.ORDER
-                kind = LockstepNode if lockstep else DelayedNode
-                node = kind(
+                make_node = partial(LockstepNode, cycle=cycle) if lockstep else DelayedNode
+                node = make_node(
                     name, mesh.join(), clock, robot, latency_s=request.latency.get(name, 0.0),
                     record_steps=request.record is not None, module=row.module, config=config,
                 )  # fmt: skip
-                if isinstance(node, LockstepNode):
-                    node.cycle = cycle
                 await stack.enter_async_context(node)
                 services.append(asyncio.ensure_future(component.run(node, config)))
             operator = await stack.enter_async_context(Node("operator", mesh.join(), clock, robot))
@@ -179,27 +137,20 @@ class _Rehearsal:
         request = self._request
         if name == RECORDER:
             return {"file": request.record}
+        held = LOCKSTEP_SETTINGS.get(name, {}) if request.lockstep else {}
         if name == "sim":
             world: dict[str, Any] = {
                 field: getattr(request, field)
                 for field in ("scene", "seed", "sensors", "body", "width", "height", "frame_rate_hz")
             }
             world |= {"target": request.label, "bend_at_s": request.bend_s}
-            return world | ({"command_timeout_s": _LONG_S} if request.lockstep else {})
-        settings: dict[str, Any] = {}
+            return world | held
         if name == "planning":
-            settings = {
+            return {
                 "model": request.model or "", "reach": request.reach, "see_hand": request.see_hand,
                 "adapt": request.adapt,
             }  # fmt: skip
-        if request.lockstep:
-            # The baseline's planner speaks once a cycle, however long that is: no penalty for it.
-            baseline: dict[str, dict[str, Any]] = {
-                "planning": {"coordination": "lockstep"},
-                "executive": {"planner_silence_s": _LONG_S},
-            }
-            settings |= baseline.get(name, {})
-        return settings
+        return dict(held)
 
     async def _operate(self, operator: Node) -> TaskState:
         """What the operator does: give the task, watch it to its end, and again with each other label."""

@@ -1,4 +1,4 @@
-"""What `cocoro doctor` looks at for the base, while the service is down."""
+"""The checks of `cocoro doctor` for the base, while its service is down."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ def check(config: BaseConfig, robot: Robot, robot_name: str) -> list[Check]:
 
 
 def _talk(path: str) -> list[Check]:
-    """Wake it and ask; it stays in passive mode, in which it does not move."""
+    """Wake the Create and query it. It stays in passive mode, in which it does not move."""
     try:
         with serial.Serial(path, oi.BAUD, timeout=ANSWER_S, exclusive=True) as port:
             port.write(oi.start())
-            time.sleep(0.05)  # what it was still sending comes in meanwhile, and is thrown away
+            time.sleep(0.05)  # what it was still sending arrives meanwhile, and is discarded
             port.reset_input_buffer()
             port.write(oi.query(ASKED))
             data = port.read(oi.length(ASKED) - len(ASKED))
     except OSError as error:
-        return [note("Create", f"{path} cannot be opened ({error}): does its service run? `cocoro base` tells more")]
+        return [note("Create", f"{path} cannot be opened ({error}): does its service run? See `cocoro base`")]
     readings = oi.answer(data, ASKED)
     if readings is None:
         return [bad("Create", "it does not answer: switch it on (its light is on), and check the cable")]

@@ -1,4 +1,4 @@
-"""What the base service makes of the guard's reports: odometry, health, and what to ask of the wheels. Pure."""
+"""The base service's core: odometry, state and faults from the guard's reports, and wheel speeds to ask for. Pure."""
 
 from __future__ import annotations
 
@@ -14,33 +14,34 @@ from services.base import oi
 from services.base.guard_logic import LinkState
 
 FRESH_NS = 180_000_000
-"""The state is told as long as the Create was heard within this time."""
+"""The state is published only while the newest frame is not older than this."""
 LONGEST_S = 0.25
-"""For longer than this nobody knows what the wheels did: then it is the Create's own count that tells."""
+"""Longest gap between two frames over which the commanded speeds are integrated; the Create's own count corrects the
+rest."""
 BATTERY_LOW = 0.15
 
 
 class GuardReport(msgspec.Struct):
-    """What the guard tells: a frame of the Create's, or that there is none."""
+    """A report of the guard: a frame of the Create, or that there is none."""
 
     t: int
     """CLOCK_MONOTONIC, ns."""
     link: LinkState
     why: str
-    """What keeps the wheels from turning as they were asked to, or the port from working."""
+    """Why the wheels do not turn as asked, or why the port does not work; '' when neither."""
     left: int
-    """mm/s, as the Create was told last."""
+    """Newest command to the Create, mm/s."""
     right: int
     stops: int = 0
-    """Emergency stops that the guard has heard by itself."""
+    """Count of emergency stops that the guard received on its own address."""
     damage: int = 0
-    """Bytes and commands so far that were damaged on the line."""
+    """Count of bytes and commands that were damaged on the line."""
     readings: dict[int, int] | None = None
     counts_lost: bool = False
 
 
 class BaseDriver:
-    """Told the time (the robot's clock) with every call."""
+    """Every `now_ns` is the robot's clock."""
 
     def __init__(self, base: Base) -> None:
         self.latch: LatchState = "unknown"
@@ -61,7 +62,7 @@ class BaseDriver:
     # --- commands -----------------------------------------------------------------------------------
 
     def command(self, command: BaseCommand, now_ns: int) -> None:
-        """Take wheel speeds; they count from when they were said, the faster the shorter (`Base.patience_s`)."""
+        """Accept wheel speeds. They expire `Base.patience_s` after the command's stamp, the sooner the faster."""
         if self.latch != "released" or not is_fresh(command.stamp_ns, now_ns, BASE_COMMAND.max_age_s):
             return
         limit_mmps = self._base.max_wheel_speed_mps * 1000.0
@@ -74,18 +75,17 @@ class BaseDriver:
         self._until_ns = min(command.stamp_ns, now_ns) + round(patience_s * NS)
 
     def set_latch(self, state: LatchState) -> None:
-        """Latched and unknown stop the wheels; a command from before counts no more after the release. From any
-        thread."""
+        """Latched and unknown stop the wheels; a release does not revive an earlier command. Thread-safe."""
         self.latch = state
         self._until_ns = -1
 
     def new_epoch(self) -> None:
-        """The clock began anew: what was commanded and heard before is of no time that there is."""
+        """The clock restarted: earlier commands and frames belong to no time of the new epoch."""
         self._until_ns = -1
         self._frame_ns = None
 
     def wheels(self, now_ns: int) -> tuple[int, int, int]:
-        """Left and right speed in mm/s to ask of the guard, and for how many ns from now."""
+        """Left and right speed to ask the guard for, mm/s, and for how long from now, ns."""
         left_ns = self._until_ns - now_ns
         if self.latch != "released" or left_ns < 0:
             return 0, 0, self._timeout_ns
@@ -94,7 +94,7 @@ class BaseDriver:
     # --- reports ------------------------------------------------------------------------------------
 
     def take(self, report: GuardReport, now_ns: int) -> None:
-        """A report that was made at `now_ns`."""
+        """Take a report that was made at `now_ns`."""
         self.link, self.why = report.link, report.why
         self._damaged.add(report.damage - self._damage, report.t)
         self._damage, self._reported_ns = report.damage, report.t
@@ -110,7 +110,7 @@ class BaseDriver:
         self._frame_ns = now_ns
 
     def _roll(self, readings: oi.Readings, now_ns: int) -> None:
-        """Carry the pose on by what the wheels are told to do: by the Create's own word, which comes with the frame."""
+        """Advance the odometry by the speeds that the Create reports as commanded in the frame."""
         if self._frame_ns is None or now_ns <= self._frame_ns:
             return
         dt_s = min((now_ns - self._frame_ns) / NS, LONGEST_S)
@@ -122,10 +122,10 @@ class BaseDriver:
             (before[0] + self._ramp.left_mps) / 2 * dt_s, (before[1] + self._ramp.right_mps) / 2 * dt_s, dt_s
         )
 
-    # --- what it is like ----------------------------------------------------------------------------
+    # --- state --------------------------------------------------------------------------------------
 
     def state(self, now_ns: int) -> BaseState | None:
-        """As of the newest frame; None when the Create was not heard of late."""
+        """The state at the newest frame; None when that is older than `FRESH_NS`."""
         if self._frame_ns is None or not 0 <= now_ns - self._frame_ns <= FRESH_NS:
             return None
         readings, odometry = self._readings, self._odometry
@@ -171,9 +171,9 @@ class BaseDriver:
         return self.why
 
     def faults(self) -> tuple[str, ...]:
-        """What is wrong with the base, for people; in the order in which one would look for it."""
+        """The base's faults, for people, most fundamental first."""
         if self.link in ("closed", "silent"):
-            return (f"no word from the Create: {self.why}" if self.link == "closed" else SILENT,)
+            return (f"no connection to the Create: {self.why}" if self.link == "closed" else SILENT,)
         if not self._readings:
             return ()
         found = []
@@ -187,7 +187,7 @@ class BaseDriver:
         if self._readings[oi.OVERCURRENTS] & oi.WHEEL_OVERCURRENTS:
             found.append("a wheel draws too much current: is it blocked?")
         if damage := self._damaged.total(self._reported_ns):
-            found.append(f"its line is disturbed, look after the cable: {damage} damaged bytes in {WINDOW_S:g} s")
+            found.append(f"its line is disturbed, check the cable: {damage} damaged bytes in {WINDOW_S:g} s")
         if self.battery_fraction < BATTERY_LOW:
             found.append(f"the battery is low: {100 * self.battery_fraction:.0f}%")
         return tuple(found)

@@ -1,20 +1,22 @@
-"""The guard: the one process that has the Create's serial port open.
+"""The guard: the only process that has the Create's serial port open.
 
-A Create goes on driving when its driver dies. So what decides whether its wheels may turn is this small process, below
-the base service: it passes on what the service asks of the wheels while the service keeps asking, and stops them
+A Create keeps driving when its driver dies. So this small process below the base service decides whether the wheels may
+turn. It forwards the wheel speeds that the service asks for, and stops the wheels
 
-- 0.2 s after the service has asked last (it hangs, it was stopped, it has too much to do),
-- at once when the service's end of the socket closes (it crashed, it was killed),
-- at once on SIGTERM, and on any error of its own,
-- at once when somebody says stop to its own address of the stop path, `ROBOT/wheels` (`cocoro.stop.path`),
+- 0.2 s after the last request of the service (it hangs, was stopped or is overloaded),
+- immediately when the service's end of the socket closes (it crashed or was killed),
+- immediately on SIGTERM and on any error of its own,
+- immediately on a stop request to its own address of the stop path, `ROBOT/wheels` (`cocoro.stop.path`),
 - by the reflexes of `services.base.guard_logic`: bumpers, cliffs, wheel drops, a Create that left its mode.
+
+`services.base.guard_supervisor` starts it.
 
     python -m services.base.guard PORT --fd N --robot NAME --mode safe --deadman-ms 200
 
-`--fd` is its end of a SOCK_SEQPACKET pair. Down come {"left": mm/s, "right": mm/s, "until": ns, "reset": how many
-emergency stops have been reset} and {"recover": true}, up goes a report for each frame, and twenty a second when there
-are none (`Report` in `services.base.driver`). Times are CLOCK_MONOTONIC, which all processes of a machine share. Beyond
-Python and this project's stop path it needs pyserial.
+`--fd` is its end of a SOCK_SEQPACKET pair. It receives {"left": mm/s, "right": mm/s, "until": ns, "reset": number of
+emergency stops that have been reset} and {"recover": true}. It sends a report for each frame, and 20 a second without
+frames (`GuardReport` in `services.base.driver`). Times are CLOCK_MONOTONIC, which all processes of a machine share. It
+imports only the standard library, this project's stop path and pyserial.
 """
 
 from __future__ import annotations
@@ -39,11 +41,11 @@ from services.base import oi
 from services.base.guard_logic import MS, GuardLogic
 
 TURN_S = 0.005
-"""How long it sleeps at most between two looks at the clock."""
+"""Longest sleep between two looks at the clock."""
 QUIET_NS = 50 * MS
 REOPEN_NS = 200 * MS
 STOPPING_NS = 1000 * MS
-"""How long it sees to it that the wheels have stopped, before it ends."""
+"""Upper bound for the time in which it waits for the wheels to stand before it ends."""
 PRIORITY = 20
 SENTENCES = {
     errno.ENOENT: "there is no such port: is the adapter plugged in?",
@@ -55,7 +57,7 @@ SENTENCES = {
 
 
 class Guard:
-    """Keeps one port by one `GuardLogic`."""
+    """Runs one port by one `GuardLogic`."""
 
     def __init__(self, path: str, logic: GuardLogic, channel: socket.socket, point: StopPoint | None = None) -> None:
         self._path = path
@@ -68,7 +70,7 @@ class Guard:
         self._tried_ns = -REOPEN_NS
 
     def turn(self) -> bool:
-        """Take what has come in, write what is due. False when the service is gone."""
+        """Handle what has arrived, and write what is due. False when the service is gone."""
         if self._port is None:
             self._open()
         descriptors = [one for one in (self._channel, self._port, self._point) if one is not None]
@@ -82,8 +84,8 @@ class Guard:
                 if self._port in readable:
                     self._take_bytes(self._port, now_ns)
                 self._write(self._port, self._logic.poll(now_ns))
-            except OSError as error:  # pyserial's own errors are such, too
-                self._lose(_plain(error, self._path))
+            except OSError as error:  # pyserial's errors derive from it
+                self._lose(_sentence(error, self._path))
         for asked in stops:
             self._answer(asked, now_ns)
         if now_ns - self._reported_ns > QUIET_NS:
@@ -91,8 +93,7 @@ class Guard:
         return True
 
     def stop(self) -> None:
-        """Stop the wheels, and let go of the port when the Create says that they stand; what says nothing is told a few
-        times."""
+        """Stop the wheels, and close the port when a frame confirms that they stand, or after `STOPPING_NS`."""
         if self._port is None:
             return
         began_ns = now_ns = time.monotonic_ns()
@@ -103,7 +104,7 @@ class Guard:
                 readable = select.select([self._port], [], [], TURN_S)[0]
                 now_ns = time.monotonic_ns()
                 if readable:
-                    self._logic.heard(os.read(self._port.fileno(), 4096), now_ns)
+                    self._logic.receive(os.read(self._port.fileno(), 4096), now_ns)
             self._port.flush()
         with suppress(OSError):
             self._port.close()
@@ -116,7 +117,7 @@ class Guard:
         try:
             port = serial.Serial(self._path, oi.BAUD, timeout=0, write_timeout=0, exclusive=True)
         except (OSError, ValueError, termios.error) as error:
-            self._why = _plain(error, self._path)
+            self._why = _sentence(error, self._path)
             return
         self._port = port
         self._why = ""
@@ -134,17 +135,17 @@ class Guard:
         data = os.read(port.fileno(), 4096)
         if not data:
             raise OSError(errno.EIO, "end of file")
-        for readings in self._logic.heard(data, now_ns):
+        for readings in self._logic.receive(data, now_ns):
             self._report(now_ns, readings)
 
     def _write(self, port: serial.Serial, data: bytes) -> None:
-        """All of it, or nothing more of it: what the line does not take now would be late."""
+        """Write without waiting. Bytes that the line does not accept now are dropped, since they would be late."""
         if data:
             with suppress(BlockingIOError):
                 os.write(port.fileno(), data)
 
     def _take_stops(self) -> list[Asked]:
-        """Stops that have come in; many of them are taken in several turns, so that the port is not forgotten."""
+        """Receive stop requests, at most 16 per turn, so that a flood of them does not delay the port."""
         assert self._point is not None
         stops: list[Asked] = []
         while len(stops) < 16 and (asked := self._point.take(wait=False)) is not None:
@@ -153,7 +154,7 @@ class Guard:
         return stops
 
     def _answer(self, asked: Asked, at_ns: int) -> None:
-        """The service above keeps the latch on disk."""
+        """Acknowledge a stop request. The guard keeps no record on disk: the base service does."""
         assert self._point is not None
         self._point.latched(asked, at_ns)
         self._point.keeps_nothing(asked)
@@ -182,7 +183,7 @@ class Guard:
             elif command.get("recover"):
                 self._logic.recover(now_ns)
         except (ValueError, TypeError, KeyError, AttributeError, OverflowError):
-            return  # not understood, so not obeyed
+            return  # a malformed command is ignored
 
     def _report(self, now_ns: int, readings: oi.Readings | None = None) -> None:
         self._reported_ns = now_ns
@@ -202,7 +203,7 @@ class Guard:
             self._channel.send(json.dumps(report).encode())
 
 
-def _plain(error: Exception, path: str) -> str:
+def _sentence(error: Exception, path: str) -> str:
     number: int = getattr(error, "errno", None) or 0
     what = SENTENCES.get(number) or (os.strerror(number) if number else str(error))
     return f"{path}: {what}"
@@ -212,15 +213,15 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m services.base.guard", description="Own a Create's serial port.")
     parser.add_argument("port")
     parser.add_argument("--fd", type=int, required=True, help="this process's end of a socket pair")
-    parser.add_argument("--robot", help="whose emergency stop to hear; without it there is none")
+    parser.add_argument("--robot", help="name of the robot whose emergency stop to obey; none by default")
     parser.add_argument("--mode", choices=("safe", "full"), default="safe")
     parser.add_argument("--deadman-ms", type=int, default=200)
     options = parser.parse_args()
 
-    told: list[int] = []
-    signal.signal(signal.SIGTERM, lambda number, _: told.append(number))
+    signals: list[int] = []
+    signal.signal(signal.SIGTERM, lambda number, _: signals.append(number))
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the service, which closes the socket
-    with suppress(OSError):  # needs the right to: LimitRTPRIO in the unit file
+    with suppress(OSError):  # the permission is LimitRTPRIO in the unit file
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
     channel = socket.socket(fileno=options.fd)
     channel.setblocking(False)
@@ -228,7 +229,7 @@ def main() -> int:
     point = StopPoint(options.robot, "wheels") if options.robot else None
     guard = Guard(options.port, GuardLogic(options.mode, options.deadman_ms * MS), channel, point)
     try:
-        while not told and guard.turn():
+        while not signals and guard.turn():
             pass
     finally:
         guard.stop()

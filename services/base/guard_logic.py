@@ -1,7 +1,8 @@
-"""What the guard of the Create's port decides, as a pure machine: bytes and commands in, bytes to write out.
+"""The decisions of the guard of the Create's port: a pure state machine from received bytes and commands to bytes to
+write.
 
-It lets wheels turn only while all of this holds: the service above asked for it, not longer ago than the deadman
-allows; the Create is heard; it is in the mode in which it was put; no bumper, cliff or wheel drop forbids it.
+The wheels may turn only while all of this holds: the service asked for it within the deadman time; the Create sends
+frames; the Create is in the mode that the guard chose; no bumper, cliff sensor or wheel drop forbids it.
 """
 
 from __future__ import annotations
@@ -11,20 +12,21 @@ from typing import Literal, NamedTuple
 from services.base import oi
 
 LinkState = Literal["closed", "silent", "waking", "up", "fallen"]
-"""closed: no port. silent: nothing good is heard. waking: being put into its mode. fallen: the Create left the mode by
-itself, and waits for somebody to say that it may go on."""
+"""closed: no port is open. silent: no valid frames arrive. waking: the guard puts the Create into its mode. up: it
+obeys. fallen: the Create left the mode by itself, and stays so until the operator recovers it."""
 
 MS = 1_000_000
 SAFE = oi.MODES.index("safe")
 SILENT_NS = 180 * MS
-"""Twelve frames missed: the Create is not heard any more."""
+"""After twelve missing frames the Create counts as silent."""
 RESEND_NS = 40 * MS
-"""Wheel commands are repeated so often even when nothing has changed: one may have been lost on the wire."""
+"""Period at which an unchanged wheel command is repeated, since one may have been lost on the wire."""
 HEEDED_NS = 75 * MS
-"""By then a frame says that a command was heeded, or it was lost or garbled: the longest take 46 ms on the wire, and a
-frame comes every 15 ms."""
+"""Time after which a frame must confirm a command; otherwise the command was lost or garbled. The longest commands take
+46 ms on the wire, and a frame comes every 15 ms."""
 COUNTS_NS = 200 * MS
-"""How often way and turn are asked for: at 5 Hz their units, 1 mm and 1 degree, are small beside what they count."""
+"""Period at which distance and angle are requested. At 5 Hz their units, 1 mm and 1 degree, are small compared with
+what they count."""
 COUNTS_LATE_NS = 60 * MS
 WAKE_NS = 500 * MS
 RIGHT_AGAIN_NS = 5000 * MS
@@ -34,24 +36,24 @@ SHORT = (
     oi.CHARGE, oi.CAPACITY, oi.CHARGERS, oi.MODE, oi.RIGHT_SPEED, oi.LEFT_SPEED,
 )  # fmt: skip
 LONG = (*SHORT, oi.DISTANCE, oi.ANGLE)
-"""A frame that holds way and turn starts both counts anew, and what is less than a unit is forgotten. So they are in
-one frame every `COUNTS_NS`, by changing the list for just that long; a checksum protects them there as it does all."""
+"""A frame with distance and angle resets both counters and loses what is less than a unit. So only one frame every
+`COUNTS_NS` contains them: the list of packets is changed for just that long. A frame's checksum protects them."""
 
 
 class WheelSpeeds(NamedTuple):
     left_mmps: int
     right_mmps: int
     why: str = ""
-    """What keeps them from turning as they were asked to."""
+    """Why they do not turn as the service asked; '' when they do."""
 
 
 STILL = WheelSpeeds(0, 0)
 
 
 def reflex(wanted: WheelSpeeds, readings: oi.Readings) -> WheelSpeeds:
-    """What of the wanted speeds the robot's own sensors let through.
+    """The part of the wanted speeds that the robot's sensors allow.
 
-    Against a bumper or at a cliff there is no way forward, but a round base may turn on the spot and back away.
+    With a bumper pressed or at a cliff the base must not drive forward, but it may turn on the spot and back away.
     """
     left, right, _ = wanted
     if readings[oi.BUMPS] & oi.WHEEL_DROPS:
@@ -67,18 +69,19 @@ def reflex(wanted: WheelSpeeds, readings: oi.Readings) -> WheelSpeeds:
 
 
 class GuardLogic:
-    """Told the time (monotonic, ns) with every call. `mode` is safe or full."""
+    """Every `now_ns` is CLOCK_MONOTONIC. `mode` is safe or full."""
 
     def __init__(self, mode: str, deadman_ns: int) -> None:
         self.link: LinkState = "closed"
         self.readings: oi.Readings = {}
         """The newest frame."""
         self.wheels = STILL
-        """What the Create was told last."""
+        """The newest command to the Create."""
         self.damage = 0
-        """Bytes so far that were no part of a good frame, and commands that did not arrive as they were sent."""
+        """Count of received bytes that were not part of a valid frame, and of commands that arrived garbled or not at
+        all."""
         self.stops = 0
-        """Emergency stops so far; the wheels stand until each of them has been reset."""
+        """Count of emergency stops; the wheels stand until each of them has been reset."""
         self._reset_stops = 0
         self._mode = mode
         self._deadman_ns = deadman_ns
@@ -99,42 +102,43 @@ class GuardLogic:
         self._wake_ns = 0
         self._wake: list[tuple[int, bytes]] = []
 
-    # --- what happens -------------------------------------------------------------------------------
+    # --- inputs -------------------------------------------------------------------------------------
 
     def opened(self, now_ns: int) -> None:
-        """There is a port; whatever is at its other end is put into the mode."""
+        """The port was opened: put the Create into its mode."""
         self._parser.reset()
         self._start_waking(now_ns)
 
     def closed(self) -> None:
+        """The port was lost."""
         self.link = "closed"
         self.readings = {}
         self._counts_lost = True
 
     def ask(self, left_mmps: int, right_mmps: int, until_ns: int, now_ns: int) -> None:
-        """Wheel speeds, until then and never for longer than the deadman."""
+        """The service asks for wheel speeds until `until_ns`, and never for longer than the deadman time."""
         self._wanted = WheelSpeeds(oi.harmless(left_mmps), oi.harmless(right_mmps))
         self._until_ns = min(until_ns, now_ns + self._deadman_ns)
 
     def stop(self) -> None:
-        """Emergency stop: what is asked of the wheels does not count until a reset that knows of this stop."""
+        """Emergency stop: the wheels stand until this stop has been reset."""
         self.stops += 1
 
     def reset(self, stops: int) -> None:
-        """So many of the emergency stops have been reset by the robot's owner."""
+        """The operator has reset the first `stops` emergency stops."""
         self._reset_stops = min(max(stops, 0), self.stops)
 
     def recover(self, now_ns: int) -> None:
-        """Somebody says that a Create that left its mode may go on."""
+        """The operator lets a Create that left its mode go on."""
         if self.link == "fallen":
             self._start_waking(now_ns)
 
     def end(self, now_ns: int) -> None:
-        """The service is gone: from now on the wheels are stopped, and nothing else."""
+        """The service is gone: from now on the guard only stops the wheels."""
         self._ended_ns = now_ns
 
-    def heard(self, data: bytes, now_ns: int) -> list[oi.Readings]:
-        """Bytes from the Create; the good frames in them."""
+    def receive(self, data: bytes, now_ns: int) -> list[oi.Readings]:
+        """Take bytes from the Create; returns the valid frames in them."""
         skipped = self._parser.skipped
         frames = self._parser.feed(data)
         if self._parser.skipped > skipped and self.link == "up":
@@ -152,14 +156,14 @@ class GuardLogic:
         return frames
 
     def take_counts_lost(self) -> bool:
-        """Whether, since the last call, a count of way and turn may have been lost on the wire."""
+        """Whether a count of distance and angle may have been lost on the wire since the last call."""
         lost, self._counts_lost = self._counts_lost, False
         return lost
 
     @property
     def stands(self) -> bool:
-        """Whether a frame that came after the end says that the Create was told to stand still; or, where it is in a
-        mode in which it heeds no speeds, came long enough after it was halted."""
+        """Whether a frame since `end` confirms that the commanded speeds are zero, or, in a mode that ignores speeds,
+        arrived long enough after the halt."""
         if self._ended_ns is None or self._frame_ns <= self._ended_ns:
             return False
         readings = self.readings
@@ -167,10 +171,10 @@ class GuardLogic:
             return self._halted_ns is not None and self._frame_ns > self._halted_ns + HEEDED_NS
         return (readings[oi.LEFT_SPEED], readings[oi.RIGHT_SPEED]) == (0, 0)
 
-    # --- what to write ------------------------------------------------------------------------------
+    # --- outputs ------------------------------------------------------------------------------------
 
     def poll(self, now_ns: int) -> bytes:
-        """What to write to the port now. To be called after everything above, and every few milliseconds."""
+        """The bytes to write to the port now. Call it after each input, and every few milliseconds."""
         if self.link == "closed":
             return b""
         if self._ended_ns is not None:
@@ -188,7 +192,7 @@ class GuardLogic:
         return self._waking(now_ns) + self._counts(now_ns) + self._drive(now_ns)
 
     def allowed(self, now_ns: int) -> WheelSpeeds:
-        """What the wheels may do now, and why not more."""
+        """The speeds that are allowed now, and the reason for any limit."""
         if self.link != "up":
             return WheelSpeeds(0, 0, "mode" if self.link == "fallen" else "link")
         if self.stops > self._reset_stops:
@@ -200,7 +204,7 @@ class GuardLogic:
     def _drive(self, now_ns: int) -> bytes:
         wheels, before = self.allowed(now_ns), self.wheels
         self.wheels = wheels
-        # The Create repeats in each frame what it was told: a command that was garbled on its way is put right.
+        # Each frame repeats the commanded speeds, so a command that was garbled on its way is noticed and sent again.
         heeded = (self.readings.get(oi.LEFT_SPEED), self.readings.get(oi.RIGHT_SPEED)) == wheels[:2]
         stale = self._frame_ns > self._sent_ns and not heeded
         if wheels[:2] != before[:2]:
@@ -216,8 +220,8 @@ class GuardLogic:
         return oi.drive_direct(wheels.left_mmps, wheels.right_mmps)
 
     def _stop(self, now_ns: int) -> bytes:
-        """The one command that matters may be lost or garbled on the wire, taken for the rest of another, or not be
-        heeded; then it is said so that it must be."""
+        """Stop the wheels: first by a drive command; by a halt when no frame confirms that. The drive command may be
+        lost or garbled, be taken for the data of another command, or be ignored in the Create's mode."""
         assert self._ended_ns is not None
         if not self._told_stop:
             self._told_stop = True
@@ -248,8 +252,8 @@ class GuardLogic:
         return b""
 
     def _fell(self, now_ns: int) -> None:
-        """It has left its mode. Where its own safety made it, somebody must say when it may go on. Where nothing did,
-        a byte lost on the wire may have become a command, a demo even: that is ended at once, but not for ever."""
+        """Handle a Create that left its mode. When its own safety caused that, the operator must recover it. Otherwise
+        a lost byte may have become a command, even a demo: the guard ends that at once, but not more than every 5 s."""
         if not self._has_cause() and now_ns - self._righted_ns > RIGHT_AGAIN_NS:
             self._righted_ns = now_ns
             self._start_waking(now_ns)
@@ -257,7 +261,7 @@ class GuardLogic:
             self.link = "fallen"
 
     def _has_cause(self) -> bool:
-        """Whether something is there that makes a Create leave safe mode."""
+        """Whether the sensors show a cause for leaving safe mode."""
         readings = self.readings
         return bool(readings[oi.BUMPS] & oi.WHEEL_DROPS or readings[oi.CHARGERS] or any(readings[p] for p in oi.CLIFFS))
 
@@ -265,8 +269,7 @@ class GuardLogic:
         self.link = "waking"
         self._wake_ns = now_ns
         self._counting_ns = None
-        # The first bytes stop the wheels in case that it still drives, whatever it takes some of them for; a change of
-        # mode takes a Create up to 20 ms.
+        # The halt comes first, in case that the Create still drives. A change of mode takes it up to 20 ms.
         self._wake = [
             (now_ns, oi.halt()),
             (now_ns + 100 * MS, oi.enter(self._mode)),

@@ -1,4 +1,4 @@
-"""The Create's Open Interface as bytes: commands, sensor packets, stream frames. Pure; needs nothing but Python.
+"""The Create's Open Interface as bytes: commands, sensor packets, stream frames. Pure; needs only the standard library.
 
 Source: iRobot Create Open Interface (OI) manual. Multi-byte values are big-endian, speeds mm/s, angles degrees
 counter-clockwise.
@@ -12,21 +12,21 @@ from typing import Literal, NamedTuple
 BAUD = 57_600
 MAX_SPEED_MMPS = 500
 STREAM_S = 0.015
-"""The Create sends a stream frame each so often."""
+"""Period of the Create's stream frames."""
 MAX_FRAME = 86
-"""Bytes of a stream frame that fit into that time at 57600 baud."""
+"""Largest stream frame, bytes, that fits into that period at 57600 baud."""
 
 START, SAFE, FULL, DEMO, DRIVE, DRIVE_DIRECT, STREAM, QUERY = 128, 131, 132, 136, 137, 145, 148, 149
 OPCODES = range(128, 159)
 OVERRUN = 52
-"""So many drive commands are more bytes than any other command waits for."""
+"""This many drive commands are more bytes than any other command waits for."""
 Mode = Literal["off", "passive", "safe", "full"]
 MODES: tuple[Mode, ...] = ("off", "passive", "safe", "full")
 HEADER = 19
 
 
 class Packet(NamedTuple):
-    """One sensor packet: what it is called, how it is written, what it may say."""
+    """One sensor packet: its name, its size in bytes, and its range of values."""
 
     name: str
     size: int
@@ -76,7 +76,7 @@ PACKETS: dict[int, Packet] = {
     RIGHT_SPEED: Packet("requested right velocity", 2, -500, 500),
     LEFT_SPEED: Packet("requested left velocity", 2, -500, 500),
 }
-"""The packets that this driver asks for (and two of the manual's examples), with the values that the manual allows."""
+"""The packets that this driver requests and two of the manual's examples, with the ranges from the manual."""
 
 BUMP_RIGHT, BUMP_LEFT, WHEEL_DROPS = 0x01, 0x02, 0x1C
 WHEEL_OVERCURRENTS = 0x18
@@ -101,46 +101,47 @@ def enter(mode: str) -> bytes:
 
 
 def drive_direct(left_mmps: int, right_mmps: int) -> bytes:
-    """Turn each wheel at its own speed. The manual's order on the wire is right before left."""
+    """Drive the wheels at these speeds. On the wire the right one comes first."""
     return bytes([DRIVE_DIRECT]) + _word(_clip(right_mmps)) + _word(_clip(left_mmps))
 
 
 def drive(speed_mmps: int, radius_mm: int) -> bytes:
-    """Drive an arc; radius positive to the left, -32768 straight, 1 and -1 turn on the spot."""
+    """Drive an arc. The radius is positive to the left; -32768 is straight, 1 and -1 turn on the spot."""
     return bytes([DRIVE]) + _word(_clip(speed_mmps)) + _word(radius_mm)
 
 
 def stream(packets: Sequence[int]) -> bytes:
-    """Send these packets every 15 ms from now on, in place of any that were asked for before."""
+    """Make the Create send these packets every 15 ms, instead of earlier ones. Raises ValueError when they do not
+    fit."""
     if 3 + length(packets) > MAX_FRAME:
-        raise ValueError("so many packets do not fit into 15 ms")
+        raise ValueError(f"a stream frame of {len(packets)} packets does not fit into 15 ms")
     return bytes([STREAM, len(packets), *packets])
 
 
 def query(packets: Sequence[int]) -> bytes:
-    """Send these packets once, bare: without numbers, frame or checksum."""
+    """Make the Create send these packets once, without numbers, frame and checksum."""
     return bytes([QUERY, len(packets), *packets])
 
 
 def abort_demo() -> bytes:
-    """End a built-in demo, should one have been started."""
+    """End a built-in demo, if one runs."""
     return bytes([DEMO, 255])
 
 
 def halt() -> bytes:
-    """Stop a Create, whatever it does and whatever it takes these bytes for: it ends in passive mode.
+    """Stop a Create in any state. It is in passive mode afterwards.
 
-    A garbled byte may have become a command that waits for up to 255 bytes (a script, a list of packets) and takes
-    what comes for them, or one that starts a demo, which drives on its own and heeds no speeds."""
+    A garbled byte may have become a command that waits for up to 255 data bytes (a script, a list of packets) and
+    swallows the next commands, or one that starts a demo, which drives by itself and ignores speeds."""
     return drive_direct(0, 0) * OVERRUN + abort_demo() + start()
 
 
 def harmless(speed_mmps: int) -> int:
-    """The nearest speed whose bytes cannot be taken for opcodes.
+    """The nearest speed whose bytes are not opcodes.
 
-    Commands have no checksum. When a byte is lost, what follows is read shifted by one, and a speed's low byte may
-    become an opcode: 135 drives off on its own, 155 is deaf for seconds, 129 changes the baud rate. Speeds that avoid
-    these bytes are at most 16 mm/s off, and a shifted command puts itself right with the next one.
+    Commands have no checksum. When a byte is lost, the rest is read shifted by one, and a speed's low byte may be taken
+    for an opcode: 135 drives off by itself, 155 makes the Create deaf for seconds, 129 changes the baud rate. Speeds
+    that avoid these bytes differ by at most 16 mm/s, and after a lost byte the next command is read correctly.
     """
     speed_mmps = _clip(speed_mmps)
     low = speed_mmps & 0xFF
@@ -162,21 +163,21 @@ def _clip(speed_mmps: int) -> int:
 
 
 class StreamParser:
-    """Finds frames in a stream of bytes: `[19][N][id data ...][checksum]`, all of it summing up to 0 modulo 256.
+    """Finds frames in a stream of bytes: `[19][N][id data ...][checksum]`, whose sum is 0 modulo 256.
 
-    Only a frame that is whole in every respect comes out: the sum right, the packets one of the lists that were asked
-    for, each value one that the manual allows. At anything else one byte is given up and the search goes on behind it.
+    A frame is accepted only when its sum is right, its packets are one of the requested lists, and each value is in the
+    manual's range. Otherwise one byte is skipped and the search goes on behind it.
     """
 
     def __init__(self, lists: Collection[Sequence[int]]) -> None:
         self.skipped = 0
-        """Bytes given up so far."""
+        """Bytes skipped so far."""
         self._lists = {tuple(packets) for packets in lists}
         self._lengths = {length(packets) for packets in self._lists}
         self._bytes = bytearray()
 
     def feed(self, data: bytes) -> list[Readings]:
-        """The frames that these bytes complete."""
+        """Parse more bytes; returns the readings of the frames that they complete."""
         self._bytes += data
         frames = []
         at = 0
@@ -203,29 +204,30 @@ class StreamParser:
         return frames
 
     def reset(self) -> None:
-        """Forget an unfinished frame."""
+        """Drop an incomplete frame."""
         self.skipped += len(self._bytes)
         self._bytes.clear()
 
 
 def answer(data: bytes, packets: Sequence[int]) -> Readings | None:
-    """What answers a `query`; None when it is too short, or says what cannot be. It has no checksum: not to act on."""
-    spelled = bytearray()
+    """Parse the answer to a `query`; None when it is too short or a value is out of range. It has no checksum, so
+    nothing must be controlled by it."""
+    payload = bytearray()
     at = 0
     for packet in packets:
         size = PACKETS[packet].size
-        spelled += bytes([packet]) + data[at : at + size]
+        payload += bytes([packet]) + data[at : at + size]
         at += size
-    return _decode(spelled) if at == len(data) else None
+    return _decode(payload) if at == len(data) else None
 
 
 def length(packets: Sequence[int]) -> int:
-    """Bytes of a stream frame's payload with these packets."""
+    """Length of a stream frame's payload with these packets, bytes."""
     return sum(1 + PACKETS[packet].size for packet in packets)
 
 
 def _decode(payload: bytearray) -> Readings | None:
-    """Values by packet, in order; None when a number or value is none that can be, or a packet is there twice."""
+    """Values by packet number, in order; None when a number is unknown or repeated, or a value is out of range."""
     readings: Readings = {}
     at = 0
     while at < len(payload):

@@ -1,4 +1,4 @@
-"""The base as a service: the guard keeps the port, the driver makes sense of it, this joins them to the mesh."""
+"""The base service: connects the guard, which owns the port, and the driver, the pure core, to the mesh."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from services.base.driver import BaseDriver, GuardReport
 from services.base.guard_supervisor import GuardSupervisor
 
 BEAT_S = 0.02
-"""How often the guard is asked anew; a tenth of the time after which it stops the wheels."""
+"""Period of the requests to the guard, a tenth of the time after which it stops the wheels."""
 RECOVERY_S = 2.0
 DEGRADED = {"up": "", "waking": "waking the Create", "fallen": "not obeying"}
-"""What the service says of itself by the link to the Create; without any, 'no Create'."""
+"""State text of the service by the link to the Create; 'no Create' for the others."""
 
 
 class BaseConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     port: str = "/dev/cocoro-create"
     """The serial port: a device, or wire:NAME for an emulated one."""
     mode: Literal["safe", "full"] = "safe"
-    """In safe mode the Create itself stops at cliffs, when a wheel drops and at the charger."""
+    """In safe mode the Create itself also stops at cliffs, when a wheel drops and at the charger."""
     guard_timeout_s: Annotated[float, Meta(gt=0.05, le=1.0)] = 0.2
-    """The guard stops the wheels when it was not asked for so long."""
+    """The guard stops the wheels when the service has not asked for this long."""
 
 
 class BaseService:
@@ -42,26 +42,26 @@ class BaseService:
         self._driver = BaseDriver(node.robot.base)
         port = port_path(config.port, node.robot_name)
         robot = node.robot_name if node.latches is not None else None
-        self.guard = GuardSupervisor(port, config.mode, config.guard_timeout_s, self._heard, robot)
+        self.guard = GuardSupervisor(port, config.mode, config.guard_timeout_s, self._on_report, robot)
         self._stops = self._reset_stops = 0
-        """Emergency stops that the guard has heard by itself, and those of them that were reset."""
+        """Count of emergency stops that the guard received, and how many of them were reset."""
         self._epoch = node.clock.epoch
         self._changed = asyncio.Event()
-        self._keeper = LatchKeeper(node, self._latched, self._halt)
+        self._latch = LatchKeeper(node, self._latched, self._halt)
         node.on(topics.BASE_COMMAND, self._commanded)
         node.serve(topics.RECOVER, self._recover)
 
     async def run(self) -> None:
         async with self.guard:
-            self._tell()
+            self._report_faults()
             self._node.spawn(self._beat())
             async for now_ns in self._node.every(self._node.robot.base.state_rate_hz, "state"):
                 if (state := self._driver.state(now_ns)) is not None:
                     self._node.publish(topics.BASE_STATE, state)
-                self._tell()
+                self._report_faults()
 
     async def _beat(self) -> None:
-        """The pulse that keeps the wheels turning. It goes by real time, as the guard does."""
+        """Ask the guard steadily, which keeps the wheels turning. Goes by real time, as the guard does."""
         while True:
             self.guard.check()
             self._ask()
@@ -86,16 +86,16 @@ class BaseService:
         self._ask()
 
     def _halt(self) -> None:
-        """In the stop path's thread."""
+        """Stop without waiting for the event loop. Called in the stop path's thread."""
         self._driver.set_latch("latched")
         self.guard.halt()
 
-    def _heard(self, report: GuardReport) -> None:
+    def _on_report(self, report: GuardReport) -> None:
         age_ns = max(time.monotonic_ns() - report.t, 0)
         stops, self._stops = self._stops, report.stops
         if report.stops > stops:
-            self._keeper.stop("the guard of its wheels, which was told to stop")
-        elif report.stops < stops:  # another guard, which counts anew
+            self._latch.stop("the guard of its wheels, which received a stop")
+        elif report.stops < stops:  # a new guard counts from 0
             self._reset_stops = 0
         before = self._driver.link
         self._driver.take(report, self._node.now_ns() - age_ns)
@@ -112,7 +112,7 @@ class BaseService:
                 while driver.link != "up":
                     self._changed.clear()
                     await self._changed.wait()
-                    if driver.link == "fallen":  # once more: what made it fall is still there
+                    if driver.link == "fallen":  # again: its cause is still there
                         break
         except TimeoutError:
             pass
@@ -120,8 +120,7 @@ class BaseService:
             return RecoverReply(recovered=True)
         return RecoverReply(recovered=False, text="; ".join(driver.faults()) or driver.why)
 
-    def _tell(self) -> None:
-        """Health, as people read it."""
+    def _report_faults(self) -> None:
         self._reporter.report(self._driver.faults(), degraded=DEGRADED.get(self._driver.link, "no Create"))
 
 

@@ -1,4 +1,4 @@
-"""The Kinect service's settings."""
+"""The settings of the Kinect service."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from msgspec import Meta
 
 class KinectConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     device: str = "freenect"
-    """The driver's name."""
+    """Name of the driver."""
     library: str = ""
-    """A libfreenect of one's own; the system's where nothing is said."""
+    """Path of a libfreenect; by default the system's."""
     recording: str = ""
-    """A recording of fakenect's to play, over and over, in the place of a device."""
+    """Folder of a fakenect recording that is played in a loop instead of a device."""
     tilt_deg: Annotated[float, Meta(ge=-30, le=30)] = 0.0
-    """To which the device's own tilt motor is put: the robot's description wants 0."""
+    """Angle of the device's own tilt motor. The robot's description assumes 0."""
     latency_s: Annotated[float, Meta(ge=0, le=0.2)] = 0.033
-    """From the middle of a picture's exposure to its arrival, at the least: half an exposure and the time that it takes
-    to be read out and sent. An estimate: it has not been measured on a device."""
+    """Least time from the middle of an exposure to the arrival of its image: half an exposure, read-out and transfer.
+    An estimate that has not been measured on a device."""

@@ -1,4 +1,4 @@
-"""What `cocoro doctor` looks at for the Kinect, while its service is down."""
+"""The checks of `cocoro doctor` for the Kinect, while its service is down."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ LOOK_S = 4.0
 
 
 def check(config: KinectConfig, robot: Robot, robot_name: str) -> list[Check]:
-    """Whether pictures come of it."""
+    """Check whether frames come from the device, and whether its lenses were measured."""
     checks = [asyncio.run(_look(config))]
     if robot.kinect.depth_lens is None:
         checks.append(note("Kinect's lenses", "not measured: `cocoro kinect calibrate`"))

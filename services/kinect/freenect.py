@@ -1,7 +1,7 @@
-"""libfreenect's own interface, as far as it is used here: colour and raw depth by callbacks, tilt motor, LED.
+"""libfreenect through ctypes: colour and raw depth images by callbacks, tilt motor, LED.
 
-Through ctypes and the asynchronous API of libfreenect 0.5 (`libfreenect.h`), which the playback library fakenect has,
-too. Needs nothing but Python, so that the process that talks to the device stays small.
+Uses the asynchronous API of libfreenect 0.5 (`libfreenect.h`), which the playback library fakenect has too. Needs only
+the standard library, so that the process that talks to the device stays small.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from typing import Literal, NamedTuple
 
 LIBRARY = "libfreenect.so.0.5"
 PACKAGE = "libfreenect0.5"
-"""Debian's, Ubuntu's. It holds the playback library, too."""
+"""Name of the package in Debian and Ubuntu. It contains the playback library too."""
 PLAYERS = "/usr/lib/*/fakenect/" + LIBRARY
 WIDTH, HEIGHT = 640, 480
 COLOUR_BYTES, DEPTH_BYTES = WIDTH * HEIGHT * 3, WIDTH * HEIGHT * 2
 TICKS_HZ = 60_000_000
-"""The device's own clock, whose 32 bits are the timestamps."""
+"""Rate of the device's clock, whose lower 32 bits are the timestamps."""
 
 MOTOR, CAMERA = 1, 2
 MEDIUM = 1
@@ -35,11 +35,11 @@ ImageCallback = Callable[[ImageKind, int, int], None]
 
 
 class MissingLibraryError(Exception):
-    """The text names the package to install."""
+    """libfreenect is missing. The text names the package to install."""
 
 
 class DeviceError(Exception):
-    """What the device or its library would not do, for people."""
+    """The device or its library failed; the text is for people."""
 
 
 class FrameMode(ctypes.Structure):
@@ -72,7 +72,7 @@ class _Seconds(ctypes.Structure):
 
 
 class TiltReading(NamedTuple):
-    """What the device feels: its tilt motor's angle, and the acceleration of rest (m/s^2; x right, y up, z back)."""
+    """Angle of the tilt motor, and acceleration of a device at rest (x right, y up, z back)."""
 
     angle_deg: float
     acceleration_mps2: tuple[float, float, float]
@@ -109,20 +109,20 @@ _PROTOTYPES: dict[str, tuple[object, tuple[object, ...]]] = {
 
 
 def find(library: str, recording: bool) -> str:
-    """Which library to load: the one that was named, or the device's, or where there is a recording the player's.
-    Raises MissingLibraryError."""
+    """The library to load: `library` if given, else the player's for a recording, else the system's. Raises
+    MissingLibraryError when the player is not installed."""
     if library:
         return library
     if not recording:
         return LIBRARY
-    players = sorted(glob(PLAYERS))  # noqa: PTH207 # pathlib's takes longer to import than the library to load
+    players = sorted(glob(PLAYERS))  # noqa: PTH207 # importing pathlib takes longer than loading the library
     if not players:
         raise MissingLibraryError(f"the player of recordings is not installed: sudo apt install {PACKAGE}")
     return players[0]
 
 
 def load(path: str) -> ctypes.CDLL:
-    """The library, its functions typed. Raises MissingLibraryError."""
+    """Load the library and declare its functions' types. Raises MissingLibraryError."""
     try:
         library = ctypes.CDLL(path)
         for name, (result, arguments) in _PROTOTYPES.items():
@@ -130,29 +130,29 @@ def load(path: str) -> ctypes.CDLL:
             function.restype, function.argtypes = result, arguments
     except OSError as error:
         missing = path == LIBRARY or "libusb" in str(error)
-        what = "is not installed" if missing else f"{path} cannot be loaded ({error})"
-        raise MissingLibraryError(f"libfreenect {what}: sudo apt install {PACKAGE}") from error
+        problem = "is not installed" if missing else f"{path} cannot be loaded ({error})"
+        raise MissingLibraryError(f"libfreenect {problem}: sudo apt install {PACKAGE}") from error
     except AttributeError as error:
         raise MissingLibraryError(f"{path} is no libfreenect 0.5 ({error}): sudo apt install {PACKAGE}") from error
     return library
 
 
 class FreenectDevice:
-    """The first device that is found, open and streaming. `heard(kind, address, ticks)` is called from `process` with
-    each picture, kind colour or depth; the pixels are good until it returns.
+    """The first device that is found, open and streaming.
 
-    Raises DeviceError where there is none, or where it will not open or stream.
+    `process` calls `on_image(kind, address, ticks)` with each image; its pixels are valid until the callback returns.
+    Raises DeviceError when there is no device, or when it cannot be opened or streamed from.
     """
 
-    def __init__(self, library: ctypes.CDLL, heard: ImageCallback) -> None:
+    def __init__(self, library: ctypes.CDLL, on_image: ImageCallback) -> None:
         self._library = library
         self.log = ""
-        """The library's newest complaint."""
+        """Newest error message of the library."""
         self._context, self._device = c_void_p(), c_void_p()
-        # Kept here: ctypes keeps no reference to a callback.
+        # ctypes keeps no reference to a callback, so this object must.
         self._callbacks = (
-            FrameCallback(lambda _, pixels, ticks: heard("colour", pixels, ticks)),
-            FrameCallback(lambda _, pixels, ticks: heard("depth", pixels, ticks)),
+            FrameCallback(lambda _, pixels, ticks: on_image("colour", pixels, ticks)),
+            FrameCallback(lambda _, pixels, ticks: on_image("depth", pixels, ticks)),
             LogCallback(self._logged),
         )
         if library.freenect_init(byref(self._context), None) < 0:
@@ -170,14 +170,14 @@ class FreenectDevice:
         library.freenect_set_log_callback(context, self._callbacks[2])
         if library.freenect_num_devices(context) <= 0:
             raise DeviceError("no Kinect is found: is it plugged in, and does it have its own 12 V supply?")
-        for parts in (MOTOR | CAMERA, CAMERA):  # a later model's motor needs firmware, its cameras do not
+        for parts in (MOTOR | CAMERA, CAMERA):  # the motor of later models needs firmware, their cameras do not
             library.freenect_select_subdevices(context, parts)
             if library.freenect_open_device(context, byref(self._device), 0) >= 0:
                 self.has_motor = bool(parts & MOTOR)
                 return
             self._device = c_void_p()
         raise DeviceError(
-            f"the Kinect cannot be opened: does another program use it, are you in the group plugdev?{self._said}"
+            f"the Kinect cannot be opened: does another program use it, are you in the group plugdev?{self._log_suffix}"
         )
 
     def _start(self) -> None:
@@ -195,10 +195,11 @@ class FreenectDevice:
             library.freenect_start_video(device),
         ):
             if code < 0:
-                raise DeviceError(f"the Kinect's streams cannot be started (code {code}){self._said}")
+                raise DeviceError(f"the Kinect's streams cannot be started (code {code}){self._log_suffix}")
 
     def process(self, wait_s: float) -> int:
-        """Wait for what comes, and hand it on. Negative when the stream has ended, as by unplugging."""
+        """Wait for images and pass them to the callback. Negative when the stream has ended, as when it is
+        unplugged."""
         wait = _Seconds(0, round(wait_s * 1e6))
         code: int = self._library.freenect_process_events_timeout(self._context, byref(wait))
         return code
@@ -211,8 +212,8 @@ class FreenectDevice:
         if self.has_motor:
             self._library.freenect_set_led(self._device, LEDS[led])
 
-    def feel(self) -> TiltReading | None:
-        """None where the motor, which feels it, cannot be asked."""
+    def read_tilt(self) -> TiltReading | None:
+        """The tilt motor's state; None when there is no motor or it does not answer."""
         if not self.has_motor or self._library.freenect_update_tilt_state(self._device) < 0:
             return None
         state = self._library.freenect_get_tilt_state(self._device).contents
@@ -231,7 +232,7 @@ class FreenectDevice:
             self._context = c_void_p()
 
     @property
-    def _said(self) -> str:
+    def _log_suffix(self) -> str:
         return f" ({self.log})" if self.log else ""
 
     def _logged(self, _: int, level: int, text: bytes) -> None:
@@ -246,32 +247,33 @@ LONGEST_HEADER = 64
 
 
 def check_recording(folder: str) -> None:
-    """Raises DeviceError that names the file, and says what to do."""
-    index = os.path.join(folder, INDEX)  # noqa: PTH118 # as in all of this process: pathlib is slow to import
+    """Check that a fakenect recording is complete, since its player reads beyond the end of a short file. Raises
+    DeviceError that names the damaged file and says what to do."""
+    index = os.path.join(folder, INDEX)  # noqa: PTH118 # pathlib is slow to import
     try:
         with open(index, encoding="utf-8") as file:  # noqa: PTH123
             names = file.read().splitlines()
     except (OSError, UnicodeDecodeError):
-        raise DeviceError(f"{folder} is no recording: there is no readable {INDEX} in it") from None
+        raise DeviceError(f"{folder} is not a recording: it has no readable {INDEX}") from None
     if not {"r", "d"} <= {name[:1] for name in names}:
-        raise DeviceError(f"{index} names no colour or no depth pictures: the recording holds nothing to play")
+        raise DeviceError(f"{index} lists no colour or no depth images: the recording has nothing to play")
     for fault in _faults(folder, names):
-        raise DeviceError(f"{fault}: record anew, or take its line out of {index}")
+        raise DeviceError(f"{fault}: record again, or remove its line from {index}")
 
 
 def _faults(folder: str, names: list[str]) -> Iterator[str]:
     for name in names:
         path = os.path.join(folder, name)  # noqa: PTH118
         if not name:
-            yield f"{folder}: an empty line stands in {INDEX}"
-        elif not _is_named_well(name):
-            yield f"{path} has no name of a recording's"
+            yield f"{folder}: {INDEX} has an empty line"
+        elif not _is_valid_name(name):
+            yield f"{path} is not named like a file of a recording"
         else:
             yield from _wrong_size(path, name[0])
 
 
-def _is_named_well(name: str) -> bool:
-    """TYPE-SECONDS-TICKS.anything."""
+def _is_valid_name(name: str) -> bool:
+    """Whether a name is TYPE-SECONDS-TICKS.anything."""
     parts = name.split(".pgm")[0].split(".ppm")[0].split(".dump")[0].split("-")
     try:
         return len(parts) == 3 and parts[0] in ("r", "d", "a") and float(parts[1]) >= 0 and int(parts[2]) >= 0

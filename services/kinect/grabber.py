@@ -1,7 +1,17 @@
-"""Which colour picture belongs to which depth picture, and when they were taken. Pure.
+"""The process that has the Kinect open: receives libfreenect's callbacks, sends pairs of colour and depth images.
 
-The Kinect's two cameras run freely at 30 Hz each and stamp their pictures by the device's own clock. Those stamps have
-no jitter but also no relation to anybody else's time; the time at which a picture arrives here has both.
+It is a separate process because it runs a C library on USB: when that hangs, crashes or ends the process (as the
+playback library does), the service reports a fault and starts this process again.
+
+    python -m services.kinect.grabber --fd N --memory M
+
+`--fd` is its end of a SOCK_SEQPACKET pair, `--memory` a memory file with `BUFFERS` colour and as many depth images. It
+sends messages in JSON: {"open": true, ...}, then {"colour": buffer, "depth": buffer, "t": CLOCK_MONOTONIC of the colour
+image, ns} for each pair, and {"fault": sentence} before it ends. It receives {"free": [colour, depth]},
+{"tilt": degrees} and {"led": name}. It ends when the other end closes.
+
+The Kinect's cameras run freely at 30 Hz each and stamp their images by the device's clock, without jitter but also
+without relation to other clocks. `DeviceClock` converts these stamps, and `Pairer` finds the pairs.
 """
 
 from __future__ import annotations
@@ -35,18 +45,20 @@ from services.kinect.freenect import (
 NS = 1_000_000_000
 PERIOD_NS = NS // 30
 TOLERANCE_NS = round(0.55 * PERIOD_NS)
-"""Of two free-running streams of one rate, one picture at least is nearer than half a period; and some jitter."""
+"""Largest time between the two images of a pair: in free-running streams of equal rate the nearest image is within half
+a period; plus some jitter."""
 DRIFT = 100e-6
-"""How much slower than ours the device's clock may be: quartzes are within 50 ppm each."""
-ANEW_NS = NS // 5
-"""What comes so much later than expected says that the device's clock began anew (or that it stands)."""
+"""Largest difference in rate between the device's clock and this machine's; quartz oscillators are within 50 ppm."""
+RESTART_NS = NS // 5
+"""An image that arrives this much later than expected shows that the device's clock restarted or stands still."""
 WRAP = 1 << 32
 WAITING = 2
-"""Pictures of one kind that wait for their partner at most."""
+"""Largest number of images of one kind that wait for their partners."""
 
 
 class DeviceClock:
-    """One stream's stamps by our monotonic clock: as if each picture had come as fast as the fastest."""
+    """Converts the stamps of one stream to CLOCK_MONOTONIC, as if each image had arrived with the smallest delay
+    seen."""
 
     def __init__(self) -> None:
         self._ticks: int | None = None
@@ -54,7 +66,7 @@ class DeviceClock:
         self._offset_ns = 0.0
 
     def at(self, ticks: int, arrival_ns: int) -> int:
-        """When a picture would have arrived without delay, ns, by the clock that `arrival_ns` goes by."""
+        """The time at which an image would have arrived with the smallest delay, ns, by the clock of `arrival_ns`."""
         if self._ticks is None:
             self._offset_ns = arrival_ns - self._device_ns
         else:
@@ -64,15 +76,16 @@ class DeviceClock:
             self._offset_ns += abs(passed_ns) * DRIFT
         self._ticks = ticks
         seen_ns = arrival_ns - self._device_ns
-        if seen_ns < self._offset_ns or seen_ns - self._offset_ns > ANEW_NS:
+        if seen_ns < self._offset_ns or seen_ns - self._offset_ns > RESTART_NS:
             self._offset_ns = seen_ns
         return round(self._device_ns + self._offset_ns)
 
 
 class BufferedImage(NamedTuple):
-    """One picture in its buffer."""
+    """An image in a buffer of the shared memory."""
 
     at_ns: int
+    """CLOCK_MONOTONIC."""
     buffer: int
 
 
@@ -82,24 +95,25 @@ class ImagePair(NamedTuple):
 
 
 class Pairer:
-    """Told of every picture; gives pairs, and the buffers of pictures that will be in none."""
+    """Finds pairs of images that were taken at about the same time."""
 
     def __init__(self) -> None:
         self._waiting: dict[ImageKind, list[BufferedImage]] = {"colour": [], "depth": []}
 
-    def add(self, kind: ImageKind, picture: BufferedImage) -> tuple[ImagePair | None, list[tuple[ImageKind, int]]]:
-        """The pair that this picture completes, and the buffers that are free now, with their kinds."""
+    def add(self, kind: ImageKind, image: BufferedImage) -> tuple[ImagePair | None, list[tuple[ImageKind, int]]]:
+        """Add an image; returns the pair that it completes, and the buffers that are free now because their images will
+        be in no pair, with their kinds."""
         other: ImageKind = "depth" if kind == "colour" else "colour"
-        near = min(self._waiting[other], key=lambda waiting: abs(waiting.at_ns - picture.at_ns), default=None)
-        if near is None or abs(near.at_ns - picture.at_ns) > TOLERANCE_NS:
+        near = min(self._waiting[other], key=lambda waiting: abs(waiting.at_ns - image.at_ns), default=None)
+        if near is None or abs(near.at_ns - image.at_ns) > TOLERANCE_NS:
             waiting = self._waiting[kind]
-            waiting.append(picture)
+            waiting.append(image)
             return None, [(kind, waiting.pop(0).buffer)] if len(waiting) > WAITING else []
         self._waiting[other].remove(near)
-        pair = ImagePair(picture, near) if kind == "colour" else ImagePair(near, picture)
+        pair = ImagePair(image, near) if kind == "colour" else ImagePair(near, image)
         free: list[tuple[ImageKind, int]] = []
         for each, waiting in self._waiting.items():
-            # What is older than a pair has missed its partner.
+            # Images older than this pair will have no partner.
             own_ns = (pair.colour if each == "colour" else pair.depth).at_ns
             free += [(each, one.buffer) for one in waiting if one.at_ns < own_ns]
             waiting[:] = [one for one in waiting if one.at_ns >= own_ns]
@@ -107,19 +121,22 @@ class Pairer:
 
 
 BUFFERS = 6
-"""Of each kind: two wait for their partners, two are being read, the others are there to be filled."""
+"""Buffers of each kind: two hold images that wait for partners, two are being read, the others are filled next."""
 MEMORY_BYTES = BUFFERS * (COLOUR_BYTES + DEPTH_BYTES)
 WAIT_S = 0.05
 FIRST_S, SILENT_S = 4.0, 1.0
-"""A Kinect whose cable is pulled may just say nothing more. Its first picture takes a while."""
-TOLD_S = 0.5
+"""Time limits for the first and for each further image: a Kinect that is unplugged may just become silent."""
+FAULT_S = 0.5
+"""Time limit for sending the last message."""
 RECORDING = "FAKENECT_PATH"
-"""Where the playback library looks for its recording."""
+"""Environment variable that names the playback library's recording."""
 
 
 class Grabber:
+    """Copies images into the shared memory, and sends their pairs."""
+
     def __init__(self, channel: socket.socket, memory: mmap.mmap) -> None:
-        self.heard_s = time.monotonic() + FIRST_S - SILENT_S
+        self.image_s = time.monotonic() + FIRST_S - SILENT_S
         self.counts: dict[ImageKind, int] = {"colour": 0, "depth": 0}
         self.dropped = 0
         self._channel = channel
@@ -128,10 +145,10 @@ class Grabber:
         self._clocks = {kind: DeviceClock() for kind in self.counts}
         self._pairer = Pairer()
 
-    def heard(self, kind: ImageKind, pixels: int, ticks: int) -> None:
-        """A picture, as the library calls back with it."""
+    def on_image(self, kind: ImageKind, pixels: int, ticks: int) -> None:
+        """Take an image from the library: the address of its pixels and its stamp."""
         now_ns = time.monotonic_ns()
-        self.heard_s = now_ns / 1e9
+        self.image_s = now_ns / 1e9
         self.counts[kind] += 1
         at_ns = self._clocks[kind].at(ticks, now_ns)
         if not self._free[kind]:  # nobody reads
@@ -140,13 +157,13 @@ class Grabber:
         buffer = self._free[kind].pop()
         ctypes.memmove(self._address + offset(kind, buffer), pixels, size(kind))
         pair, free = self._pairer.add(kind, BufferedImage(at_ns, buffer))
-        for of_kind, number in free:
-            self._free[of_kind].append(number)
-        if pair is not None and not self.say(colour=pair.colour.buffer, depth=pair.depth.buffer, t=pair.colour.at_ns):
+        for free_kind, number in free:
+            self._free[free_kind].append(number)
+        if pair is not None and not self.send(colour=pair.colour.buffer, depth=pair.depth.buffer, t=pair.colour.at_ns):
             self._take_back(pair.colour.buffer, pair.depth.buffer)
 
-    def say(self, **message: object) -> bool:
-        """False when it could not be said now."""
+    def send(self, **message: object) -> bool:
+        """Send a message. False when the socket is full."""
         try:
             self._channel.send(json.dumps(message).encode())
         except BlockingIOError:
@@ -154,7 +171,7 @@ class Grabber:
         return True
 
     def obey(self, kinect: FreenectDevice) -> bool:
-        """Do what was asked meanwhile. False when the other end is closed."""
+        """Carry out the requests that wait. False when the other end is closed."""
         while True:
             try:
                 message = self._channel.recv(4096)
@@ -166,13 +183,13 @@ class Grabber:
                 return False
             self._do(json.loads(message), kinect)
 
-    def _do(self, asked: dict[str, Any], kinect: FreenectDevice) -> None:
-        if "free" in asked:
-            self._take_back(*asked["free"])
-        if "tilt" in asked:
-            kinect.tilt(asked["tilt"])
-        if "led" in asked:
-            kinect.led(asked["led"])
+    def _do(self, request: dict[str, Any], kinect: FreenectDevice) -> None:
+        if "free" in request:
+            self._take_back(*request["free"])
+        if "tilt" in request:
+            kinect.tilt(request["tilt"])
+        if "led" in request:
+            kinect.led(request["led"])
 
     def _take_back(self, colour: int, depth: int) -> None:
         self._free["colour"].append(colour)
@@ -180,7 +197,7 @@ class Grabber:
 
 
 def offset(kind: ImageKind, buffer: int) -> int:
-    """Where a picture begins in the memory."""
+    """Offset of a buffer in the shared memory, bytes."""
     return buffer * COLOUR_BYTES if kind == "colour" else BUFFERS * COLOUR_BYTES + buffer * DEPTH_BYTES
 
 
@@ -189,38 +206,40 @@ def size(kind: ImageKind) -> int:
 
 
 def grab(grabber: Grabber, options: argparse.Namespace) -> None:
-    """Until the other end closes. Raises DeviceError and MissingLibraryError."""
-    played = os.environ.get(RECORDING, "")
-    if played:
-        check_recording(played)
-    kinect = FreenectDevice(load(find(options.library, bool(played))), grabber.heard)
+    """Grab until the other end closes. Raises DeviceError or MissingLibraryError."""
+    recording = os.environ.get(RECORDING, "")
+    if recording:
+        check_recording(recording)
+    kinect = FreenectDevice(load(find(options.library, bool(recording))), grabber.on_image)
     try:
         kinect.tilt(options.tilt)
         kinect.led(options.led)
-        felt = kinect.feel()
-        grabber.say(open=True, motor=kinect.has_motor, tilt_deg=felt.angle_deg if felt else None)
+        tilt = kinect.read_tilt()
+        grabber.send(open=True, motor=kinect.has_motor, tilt_deg=tilt.angle_deg if tilt else None)
         while grabber.obey(kinect):
             if kinect.process(WAIT_S) < 0:
-                raise DeviceError("the recording has ended" if played else f"the Kinect was unplugged{_said(kinect)}")
-            if time.monotonic() - grabber.heard_s > SILENT_S:
-                raise DeviceError(f"the Kinect sends no pictures: is its own 12 V supply on?{_said(kinect)}")
+                raise DeviceError(
+                    "the recording has ended" if recording else f"the Kinect was unplugged{_log_suffix(kinect)}"
+                )
+            if time.monotonic() - grabber.image_s > SILENT_S:
+                raise DeviceError(f"the Kinect sends no pictures: is its own 12 V supply on?{_log_suffix(kinect)}")
             if not all(grabber.counts.values()) and max(grabber.counts.values()) > 90:
                 silent = min(grabber.counts, key=lambda kind: grabber.counts[kind])
-                raise DeviceError(f"the Kinect sends no {silent} pictures{_said(kinect)}")
+                raise DeviceError(f"the Kinect sends no {silent} pictures{_log_suffix(kinect)}")
         kinect.led("off")
     finally:
         kinect.close()
 
 
-def _said(kinect: FreenectDevice) -> str:
+def _log_suffix(kinect: FreenectDevice) -> str:
     return f" ({kinect.log})" if kinect.log else ""
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(prog="python -m services.kinect.grabber", description="Have a Kinect open.")
+    parser = argparse.ArgumentParser(prog="python -m services.kinect.grabber", description="Keep a Kinect open.")
     parser.add_argument("--fd", type=int, required=True, help="this process's end of a socket pair")
-    parser.add_argument("--memory", type=int, required=True, help="the file in memory that takes the pictures")
-    parser.add_argument("--library", default="", help="instead of the system's libfreenect")
+    parser.add_argument("--memory", type=int, required=True, help="the memory file for the images")
+    parser.add_argument("--library", default="", help="path of a libfreenect; by default the system's")
     parser.add_argument("--tilt", type=float, default=0.0, metavar="DEG")
     parser.add_argument("--led", choices=tuple(LEDS), default="green")
     options = parser.parse_args()
@@ -233,9 +252,9 @@ def main() -> int:
         grab(grabber, options)
     except (DeviceError, MissingLibraryError) as error:
         channel.setblocking(True)
-        channel.settimeout(TOLD_S)
+        channel.settimeout(FAULT_S)
         with suppress(OSError):
-            grabber.say(fault=str(error))
+            grabber.send(fault=str(error))
         return 1
     return 0
 

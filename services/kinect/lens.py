@@ -1,9 +1,9 @@
-"""A lens as OpenCV models it, and straightened pictures: as if both cameras were the pinholes of the description.
+"""Rectification: makes the images of a real Kinect those of the description's ideal cameras.
 
-Everybody who reads frames reckons with one pinhole for both pictures, and with a depth camera that looks where the
-colour camera looks from a place beside it. A real Kinect's lenses bend, their middles and focal lengths differ, and
-one is turned against the other by a fraction of a degree. Once that has been measured (`services.kinect.calibration`)
-it is taken out here, where the pictures come in, and nowhere else. (Rectification; derived.)
+Readers of frames assume one pinhole model for both images, and a depth camera beside the colour camera that looks in
+the same direction. A real Kinect's lenses distort, their centres and focal lengths differ, and one camera is turned
+against the other by a fraction of a degree. Once that is measured (`services.kinect.calibration`), it is corrected
+here, where frames enter the system. (Derived.)
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from services.kinect.device import RawFrame
 Maps = tuple[cv2.typing.MatLike, cv2.typing.MatLike]
 NO_DATA = 2047
 MATTERS_CODES = 0.5
-"""Less is lost in the rounding."""
+"""A smaller correction is lost in rounding."""
 
 
 class Lens:
-    """Made of the nine numbers of a robot's own file: fx, fy, cx, cy in pixels, then k1, k2, p1, p2, k3."""
+    """A lens in OpenCV's model. `values` as in a robot's file: fx, fy, cx, cy in pixels, then k1, k2, p1, p2, k3."""
 
     def __init__(self, values: tuple[float, ...]) -> None:
         fx, fy, cx, cy = values[:4]
@@ -33,21 +33,22 @@ class Lens:
 
     @classmethod
     def of(cls, camera: Camera) -> Lens:
+        """The lens of an ideal pinhole camera."""
         return cls((camera.fx, camera.fy, camera.cx, camera.cy, 0.0, 0.0, 0.0, 0.0, 0.0))
 
     def pixels(self, rays: FloatArray) -> FloatArray:
-        """Where directions (n, 3), camera frame, appear: (n, 2)."""
+        """Pixels (n, 2) of directions (n, 3) in the camera's frame."""
         points, _ = cv2.projectPoints(rays.reshape(-1, 1, 3), np.zeros(3), np.zeros(3), self.matrix, self.distortion)
         return np.asarray(points, float).reshape(-1, 2)
 
     def rays(self, pixels: FloatArray) -> FloatArray:
-        """The directions of pixels (n, 2), with z = 1: (n, 3)."""
+        """Directions (n, 3) of pixels (n, 2), with z = 1."""
         points = cv2.undistortPoints(pixels.reshape(-1, 1, 2), self.matrix, self.distortion).reshape(-1, 2)
         return np.column_stack([points, np.ones(len(points))])
 
 
 class Straightener:
-    """Of one robot's Kinect. Where nothing was measured pictures are passed on as they are."""
+    """Rectifies the frames of one robot's Kinect. Without measured lenses it changes nothing."""
 
     def __init__(self, robot: Robot) -> None:
         kinect = robot.kinect
@@ -62,9 +63,9 @@ class Straightener:
         self._move: tuple[Float32Array, Float32Array] | None = None
         if kinect.depth_lens is not None:
             turn, _ = cv2.Rodrigues(np.array(kinect.depth_rotation_rad))
-            turned = rays @ turn  # by its inverse: into the depth camera's own frame
+            turned = rays @ turn  # the inverse rotation: into the depth camera's frame
             self._depth = _maps(Lens(kinect.depth_lens).pixels(turned), shape, nearest=True)
-            # Along another axis the same point has another depth: z / turned z. Codes are all but linear in 1 / z.
+            # A point's depth differs along the turned axis by the factor `gain`. Codes are almost linear in 1 / z.
             _, b, c = kinect.depth_curve
             endless = b * (pi / 2 - c)
             gain = turned[:, 2].reshape(shape).astype(np.float32)
@@ -73,12 +74,13 @@ class Straightener:
 
     @property
     def idle(self) -> bool:
-        """Nothing was measured."""
+        """Whether no lens was measured."""
         return self._colour is None and self._depth is None
 
-    def __call__(self, shot: RawFrame) -> RawFrame:
-        """Colour smoothly, depth from the nearest pixel: two depths have no mean."""
-        colour, depth = shot.colour, shot.depth
+    def __call__(self, frame: RawFrame) -> RawFrame:
+        """Rectify a frame: colour with interpolation, depth from the nearest pixel, since the mean of two depths means
+        nothing at an edge."""
+        colour, depth = frame.colour, frame.depth
         if self._colour is not None:
             colour = np.asarray(cv2.remap(colour, self._colour[0], self._colour[1], cv2.INTER_LINEAR), np.uint8)
         if self._depth is not None:
@@ -89,7 +91,7 @@ class Straightener:
                 gain, shift = self._move
                 moved = (depth * gain + shift).astype(np.uint16)
                 depth = np.where(depth >= NO_DATA, np.uint16(NO_DATA), moved)
-        return RawFrame(shot.stamp_ns, colour, depth)
+        return RawFrame(frame.stamp_ns, colour, depth)
 
 
 def _maps(

@@ -146,8 +146,6 @@ class HandSightConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 class PlanningConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     rate_hz: Positive = 50.0
-    coordination: Literal["concurrent", "lockstep"] = "concurrent"
-    """Lockstep: the arm waits until the base stands, as the paper has it."""
     marker: str = "hand_marker"
     """The label of the ball on the hand, which is no object of the room."""
     model: str = ""

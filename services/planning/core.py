@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import ClassVar
 
 import numpy as np
 
@@ -30,10 +31,13 @@ _STALE_NS = NS
 class PlanningCore:
     """See `cocoro.core.Core`. Stands still, and says why, whenever it is not sure."""
 
+    LONGEST_STEP_S: ClassVar[float] = 0.05
+    """Motion advances by at most this much time in one step."""
+
     def __init__(self, robot: Robot, config: PlanningConfig) -> None:
         self._config = config
         self._estimator = StateEstimator(config, robot)
-        self._actuators = Actuators(robot, config)
+        self.actuators = Actuators(robot, config)
         self._intent = Intent()
         self._behaviour: Behaviour = Idle()
         self._ended: Plan | None = None
@@ -48,11 +52,11 @@ class PlanningCore:
 
     def _use_learned(self) -> None:
         learned = self.learned
-        self._actuators.reacher.use(learned.hand)
-        self._actuators.reachability.use(learned.map, learned.mesh)
-        self._actuators.camera_tilt = self._estimator.camera_tilt = learned.camera_tilt
-        self._actuators.driver.turn_with(learned.separation_m)
-        drawn_m = self._actuators.robot.base.wheel_separation_m
+        self.actuators.reacher.use(learned.hand)
+        self.actuators.reachability.use(learned.map, learned.mesh)
+        self.actuators.camera_tilt = self._estimator.camera_tilt = learned.camera_tilt
+        self.actuators.driver.turn_with(learned.separation_m)
+        drawn_m = self.actuators.robot.base.wheel_separation_m
         self._estimator.turning.ratio = drawn_m / learned.separation_m if learned.separation_m is not None else 1.0
 
     reads: Mapping[Topic, Take] = {  # type: ignore[type-arg]
@@ -67,8 +71,6 @@ class PlanningCore:
 
     @property
     def schedule(self) -> Schedule:
-        if self._config.coordination == "lockstep":
-            return Schedule(None, (topics.DETECTIONS,))
         return Schedule(self._config.rate_hz, (topics.DETECTIONS,))
 
     def step(self, inputs: Sequence[Sample], now_ns: int) -> Sequence[Output]:
@@ -88,13 +90,13 @@ class PlanningCore:
                 Output(topics.BASE_COMMAND, BaseCommand(left_mps=0.0, right_mps=0.0)),
                 *self._halt(missing or "no odometry yet", now_ns),
             ]
-        self._actuators.grip.feel(hand, now_ns)
+        self.actuators.grip.feel(hand, now_ns)
         latched = self._estimator.latched()
         if latched:
             return self._halt(latched, now_ns)
         self._missing_since_ns = None
         self._estimator.look_around(now_ns, self._own_hull)
-        snapshot = Snapshot(now_ns, dt_s, self._estimator, body, self._estimator.angles(), self._actuators)
+        snapshot = Snapshot(now_ns, dt_s, self._estimator, body, self._estimator.angles(), self.actuators)
         plan = self._plan(snapshot)
         if isinstance(self._behaviour, Idle):
             self.learned.rest()
@@ -103,13 +105,13 @@ class PlanningCore:
 
     def _own_hull(self, angles: Mapping[str, float]) -> tuple[FloatArray, FloatArray]:
         """Where the robot itself, and what it holds, is in its own view in a posture."""
-        centres, radii = self._actuators.arm.clearance.hull(angles)
+        centres, radii = self.actuators.arm.clearance.hull(angles)
         off = self.learned.offset_m(angles)
         if off is not None:  # the arm is seen there, and nearer to its shoulder in between
             centres, radii = np.vstack([centres, centres + off / 2, centres + off]), np.tile(radii, 3)
-        held = self._actuators.reacher.position(angles)
+        held = self.actuators.reacher.position(angles)
         chassis = np.array([0.0, 0.0, 0.0])
-        own_m = self._actuators.robot.base.chassis_diameter_m / 2 + 0.03
+        own_m = self.actuators.robot.base.chassis_diameter_m / 2 + 0.03
         return np.vstack([centres, held, chassis]), np.append(radii + 0.03, [0.09, own_m])
 
     def _elapsed(self, now_ns: int) -> float:
@@ -117,11 +119,7 @@ class PlanningCore:
         if last_ns is None or now_ns <= last_ns:
             return 1.0 / self._config.rate_hz
         # After a pause, motion goes on from where it stood, it does not jump.
-        return min((now_ns - last_ns) / NS, self._longest_s)
-
-    @property
-    def _longest_s(self) -> float:
-        return 1.0 if self._config.coordination == "lockstep" else 0.05
+        return min((now_ns - last_ns) / NS, self.LONGEST_STEP_S)
 
     def _follow_intent(self, now_ns: int) -> None:
         fresh = self._estimator.fresh_intent(now_ns)
@@ -150,17 +148,15 @@ class PlanningCore:
                 self._ended.distance_m,
             )
         plan = self._blind(snapshot) or self._behaviour.step(snapshot)
-        self._slow_down(plan, snapshot)
+        self.slow_down(plan, snapshot)
         if plan.state != "running" and not isinstance(self._behaviour, Idle):
             self._ended = plan
         return plan
 
-    def _slow_down(self, plan: Plan, snapshot: Snapshot) -> None:
+    def slow_down(self, plan: Plan, snapshot: Snapshot) -> None:
         """Drive no faster than from where the wheels stand in time if whoever was heard the longest ago is gone: one
         that is late makes the robot slower, one that is silent makes it stand."""
-        if self._config.coordination == "lockstep":  # where everyone waits for everyone, and no deadman is either
-            return
-        driver, base = self._actuators.driver, self._actuators.robot.base
+        driver, base = self.actuators.driver, self.actuators.robot.base
         needs_sight = self._intent.behaviour in _NEED_SIGHT
         who, age_s = self._estimator.oldest(snapshot.now_ns, sight=needs_sight)
         if self._estimator.intent_age_s(snapshot.now_ns) > base.command_timeout_s:
@@ -189,9 +185,9 @@ class PlanningCore:
 
     def _halt(self, why: str, now_ns: int) -> Sequence[Output]:
         """Command nothing, so that everything stops by itself, and start afresh from what is measured later."""
-        self._actuators.arm.resync()
-        self._actuators.driver.reset()
-        self._actuators.grip.keep()
+        self.actuators.arm.resync()
+        self.actuators.driver.reset()
+        self.actuators.grip.keep()
         self._head_goal = None
         if self._missing_since_ns is None or now_ns < self._missing_since_ns:
             self._missing_since_ns = now_ns
@@ -204,14 +200,14 @@ class PlanningCore:
             state="failed" if failed else "running",
             reason="stale" if failed else "",
             why=f"standing still: {why}",
-            holding=self._actuators.grip.holding(now_ns),
+            holding=self.actuators.grip.holding(now_ns),
             body_m=(body.x_m, body.y_m) if body is not None else None,
             body_yaw_rad=body.yaw_rad if body is not None else 0.0,
         )
         return [Output(topics.PLAN, status)]
 
     def _status(self, plan: Plan, snapshot: Snapshot) -> PlannerStatus:
-        x, y, z = self._actuators.reacher.position(snapshot.angles)
+        x, y, z = self.actuators.reacher.position(snapshot.angles)
         return PlannerStatus(
             task_id=self._intent.task_id,
             step=self._intent.step,
@@ -242,7 +238,7 @@ class PlanningCore:
             goal_rad=(*self._head_goal, *(float(angle) for angle in step.goal_rad)),
             speed_radps=(head_speed, head_speed, *(float(speed) for speed in step.speed_radps)),
         )
-        hand = self._actuators.grip.command(step.roll_rad)
+        hand = self.actuators.grip.command(step.roll_rad)
         return [
             Output(topics.BASE_COMMAND, base),
             Output(topics.ARM_COMMAND, arm),

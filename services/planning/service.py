@@ -20,7 +20,11 @@ def core(robot: Robot, config: PlanningConfig) -> PlanningCore:
 
 async def run(node: Node, config: PlanningConfig) -> None:
     """Plan for ever: at a fixed rate, and at once when a new detection arrives."""
-    planner = core(node.robot, config)
+    await plan(node, config, core(node.robot, config))
+
+
+async def plan(node: Node, config: PlanningConfig, planner: PlanningCore) -> None:
+    """Drives a planner for ever, and serves it learned models."""
     if config.model:
         node.log.info("reaching: %s", planner.learned.text)
 

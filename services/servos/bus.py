@@ -1,7 +1,9 @@
-"""Status packets of Protocol 1.0, found in whatever comes over the wire. Pure.
+"""A serial line with servos on it (Dynamixel Protocol 1.0), through the Dynamixel SDK. It blocks: call it from a
+thread.
 
-`FF FF ID LENGTH ERROR data CHECKSUM`, LENGTH = bytes of data + 2, CHECKSUM = inverted sum from ID on (ROBOTIS AX-12
-manual). Instructions are written by the SDK; what it is given to read has been through here.
+The SDK writes the instructions. `CheckedPort` replaces its reading: only valid answers of the asked servo reach it. A
+status packet is `FF FF ID LENGTH ERROR data CHECKSUM` with LENGTH = bytes of data + 2 and CHECKSUM = inverted sum from
+ID on (ROBOTIS AX-12 manual).
 """
 
 from __future__ import annotations
@@ -29,17 +31,19 @@ READ = 2
 
 
 class Status(NamedTuple):
+    """A status packet."""
+
     packet: bytes
     error: int
     data: bytes
 
 
 def find_status(stream: bytes, number: int, length: int) -> Status | None:
-    """The answer of servo `number` to what asks for `length` bytes; None while there is none.
+    """Find the answer of servo `number` to a request for `length` bytes; None when there is none yet.
 
-    A packet counts only when everything in it is right: its number, its length, its checksum. An answer without data
-    counts where data were asked for only when it says that it refuses. All else is passed over, byte by byte, so that
-    a broken packet cannot hide a good one.
+    A packet is valid when its number, length and checksum are right. When data were requested, a packet without data is
+    valid only if its error bits say that the servo refuses. Everything else is skipped byte by byte, so that a broken
+    packet cannot hide a good one.
     """
     at = stream.find(HEADER)
     while at >= 0:
@@ -56,7 +60,8 @@ def find_status(stream: bytes, number: int, length: int) -> Status | None:
 
 
 def asked(instruction: bytes) -> tuple[int, int] | None:
-    """Of an instruction packet: who is asked, and for how many bytes; None when nobody is to answer."""
+    """The servo that an instruction packet addresses, and the number of bytes that it requests; None when no servo
+    answers it."""
     number = instruction[2]
     if number == BROADCAST:
         return None
@@ -64,10 +69,10 @@ def asked(instruction: bytes) -> tuple[int, int] | None:
 
 
 class CheckedPort(PortHandler):  # type: ignore[misc] # the SDK has no types
-    """The SDK's own port polls without rest, by the wall clock, and its reader takes what looks like a packet.
+    """A port for the SDK that sleeps until bytes arrive, goes by the monotonic clock, and returns only a complete and
+    valid answer of the requested length from the requested servo.
 
-    This one sleeps until bytes arrive, measures time by the monotonic clock, and hands on nothing but the whole,
-    checked answer of the servo that was asked, of the length that was asked for.
+    The SDK's own port polls without pause, goes by the wall clock, and accepts whatever looks like a packet.
     """
 
     is_open: bool
@@ -77,7 +82,7 @@ class CheckedPort(PortHandler):  # type: ignore[misc] # the SDK has no types
         self.baudrate = baud
         self.timeout_s = timeout_s
         self.strays = 0
-        """Bytes that were no part of an answer."""
+        """Count of bytes that were not part of an answer."""
         self._stream = bytearray()
         self._ready = b""
         self._asked: tuple[int, int] | None = None
@@ -94,7 +99,7 @@ class CheckedPort(PortHandler):  # type: ignore[misc] # the SDK has no types
     def clearPort(self) -> None:  # noqa: N802
         try:
             termios.tcflush(self.ser.fd, termios.TCIFLUSH)
-        except termios.error as error:  # which is no OSError
+        except termios.error as error:  # not an OSError
             raise OSError(*error.args) from error
         self.strays += len(self._stream)
         self._stream.clear()
@@ -107,7 +112,7 @@ class CheckedPort(PortHandler):  # type: ignore[misc] # the SDK has no types
         return written
 
     def readPort(self, length: int) -> bytes:  # noqa: N802
-        """Bytes of the awaited answer; waits for it, and gives none when the time is over."""
+        """Read bytes of the expected answer. Waits for it; returns none after the time limit."""
         if not self._ready and self._asked is not None:
             self._await(*self._asked)
         data, self._ready = self._ready[:length], self._ready[length:]
@@ -140,7 +145,7 @@ class CheckedPort(PortHandler):  # type: ignore[misc] # the SDK has no types
 
 
 REPLY_S = 0.015
-"""So long an answer may take: what a servo and an FTDI adapter at 1 ms take, ten times over."""
+"""Time limit for an answer: ten times what a servo and an FTDI adapter with 1 ms latency take."""
 
 SENTENCES = {
     errno.ENOENT: "there is no such port: is the adapter plugged in?",
@@ -159,15 +164,15 @@ class SilentError(CocoroError):
 
 
 class RefusedWriteError(CocoroError):
-    """A servo answers that it did not do what it was asked."""
+    """A servo answers that it did not carry out an instruction."""
 
 
 class PortError(CocoroError):
-    """The line itself: no such port, no permission, the adapter was pulled."""
+    """The line failed: no such port, no permission, or the adapter was unplugged."""
 
 
 class ServoBus:
-    """Use it with `with`. Raises PortError whenever the line fails; then it is of no use any more."""
+    """A context manager. Every method raises PortError when the line fails; the bus is unusable afterwards."""
 
     def __init__(self, path: str, baud: int, timeout_s: float = REPLY_S) -> None:
         self.path = path
@@ -176,7 +181,7 @@ class ServoBus:
         try:
             self._port.openPort()
         except (OSError, ValueError, termios.error) as error:
-            raise PortError(f"{path}: {_plain(error)}") from error
+            raise PortError(f"{path}: {_sentence(error)}") from error
 
     def __enter__(self) -> ServoBus:
         return self
@@ -190,36 +195,36 @@ class ServoBus:
 
     @property
     def strays(self) -> int:
-        """Bytes so far that were no part of an answer: noise, damaged packets, late ones."""
+        """Count of received bytes that were not part of an answer: noise, and damaged or late packets."""
         return self._port.strays
 
     def ping(self, number: int) -> int | None:
-        """The model of the servo with this ID; None when there is none."""
+        """The model number of the servo with this ID; None when no servo answers."""
         try:
             return self.read(number, "model")
         except SilentError:
             return None
 
     def read(self, number: int, register: str) -> int:
-        """A register's value. Raises SilentError, RefusedWriteError."""
+        """Read a register. Raises SilentError or RefusedWriteError."""
         row = REGISTERS[register]
         data, error = self.read_block(number, row.address, row.size)
         if error & REFUSALS:
-            raise RefusedWriteError(f"servo {number} refuses to tell its {register}: {_words(error)}")
+            raise RefusedWriteError(f"servo {number} refuses to read its {register}: {_error_names(error)}")
         return int.from_bytes(data, "little")
 
     def read_block(self, number: int, address: int, length: int) -> tuple[bytes, int]:
-        """Registers as they stand, and the error byte. Raises SilentError."""
+        """Read the bytes of consecutive registers, and the error byte. Raises SilentError."""
         try:
             data, result, error = self._sdk.readTxRx(self._port, number, address, length)
         except (OSError, ValueError) as fault:
-            raise PortError(f"{self.path}: {_plain(fault)}") from fault
+            raise PortError(f"{self.path}: {_sentence(fault)}") from fault
         if result != COMM_SUCCESS or (len(data) < length and not error & REFUSALS):
             raise SilentError(number)
         return bytes(data), error
 
     def reading(self, number: int) -> ServoReading:
-        """What the servo measures now. Raises SilentError."""
+        """Read what the servo measures now. Raises SilentError."""
         data, error = self.read_block(number, table.FIRST, table.LENGTH)
         found = table.reading(data, error, time.monotonic_ns()) if len(data) == table.LENGTH else None
         if found is None:
@@ -227,24 +232,25 @@ class ServoBus:
         return found
 
     def write(self, number: int, register: str, value: int) -> int:
-        """Set a register; the error byte. Raises SilentError when it is not confirmed, RefusedWriteError."""
+        """Write a register; returns the error byte. Raises SilentError when it is not confirmed, RefusedWriteError when
+        it is refused, ValueError for a read-only register."""
         row = REGISTERS[register]
         if not row.writable:
-            raise ValueError(f"{register} cannot be written")
+            raise ValueError(f"register {register} is read-only")
         try:
             result, error = self._sdk.writeTxRx(
                 self._port, number, row.address, row.size, list(value.to_bytes(row.size, "little"))
             )
         except (OSError, ValueError) as fault:
-            raise PortError(f"{self.path}: {_plain(fault)}") from fault
+            raise PortError(f"{self.path}: {_sentence(fault)}") from fault
         if result != COMM_SUCCESS:
             raise SilentError(number)
         if error & REFUSALS:
-            raise RefusedWriteError(f"servo {number} refuses {value} for its {register}: {_words(error)}")
+            raise RefusedWriteError(f"servo {number} refuses {value} for its {register}: {_error_names(error)}")
         return int(error)
 
     def go(self, orders: Mapping[int, tuple[int, int]]) -> None:
-        """Goal position and moving speed of several servos at once, by one sync write, which nobody answers."""
+        """Write goal position and moving speed (counts) of several servos by one sync write, which is not answered."""
         if not orders:
             return
         row = REGISTERS["goal_position"]
@@ -254,12 +260,12 @@ class ServoBus:
         try:
             self._sdk.syncWriteTxOnly(self._port, row.address, 4, data, len(data))
         except OSError as fault:
-            raise PortError(f"{self.path}: {_plain(fault)}") from fault
+            raise PortError(f"{self.path}: {_sentence(fault)}") from fault
 
 
-def _words(error: int) -> str:
+def _error_names(error: int) -> str:
     return ", ".join(table.errors_in(error & REFUSALS))
 
 
-def _plain(error: Exception) -> str:
+def _sentence(error: Exception) -> str:
     return SENTENCES.get(getattr(error, "errno", None) or 0, str(error))

@@ -1,4 +1,4 @@
-"""What `cocoro doctor` looks at for the servos, while the service is down."""
+"""The checks of `cocoro doctor` for the servos, while their service is down."""
 
 from __future__ import annotations
 
@@ -31,21 +31,23 @@ def _servos(name: str, path: str, baud: int, joints: list[Joint], reply_s: float
         with ServoBus(path, baud, max(reply_s, tools.SCAN_S)) as bus:
             return [_servo(bus, baud, joint) for joint in joints]
     except PortError as error:
-        return [note(f"{name} servos", f"{error}: does their service run? `cocoro status` tells more")]
+        return [note(f"{name} servos", f"{error}: does their service run? See `cocoro status`")]
 
 
 def _servo(bus: ServoBus, baud: int, joint: Joint) -> Check:
     what = f"servo {joint.id}, {joint.name}"
     try:
-        found = tools.look_at(bus, baud, joint.id)
+        found = tools.examine(bus, baud, joint.id)
     except SilentError:
         return bad(what, f"does not answer at {baud} baud: power, plugs, ID; `cocoro servos scan` finds it")
     text = f"{found.model}, {found.voltage_v:.1f} V, {found.temperature_c} C"
     wrong = []
     if found.errors:
-        wrong.append(f"says {', '.join(found.errors)}: start the robot and `cocoro servos clear`")
+        wrong.append(f"reports {', '.join(found.errors)}: start the robot and `cocoro servos clear`")
     if found.return_delay_us:
-        wrong.append(f"waits {found.return_delay_us} us to answer: `cocoro servos set-id {joint.id} {joint.id}`")
+        wrong.append(
+            f"answers after {found.return_delay_us} us: set that to 0 by `cocoro servos set-id {joint.id} {joint.id}`"
+        )
     if not LOW_V <= found.voltage_v <= HIGH_V:
         wrong.append("bad voltage: check the supply")
     if found.temperature_c >= HOT_C:

@@ -1,7 +1,7 @@
-"""The thread that talks to one servo line, so that the event loop never waits for a wire.
+"""The thread that talks to a servo line, so that the event loop never waits for a wire.
 
-Each cycle it writes the newest orders by one sync write, reads every servo, and does at most one task. What it finds
-goes to the event loop as an `CycleResult`; nothing else is shared but the newest orders and the tasks' queue.
+In each cycle it writes the newest orders by one sync write, reads every servo, and does at most one task. It passes the
+results to the event loop as a `CycleResult`. The two share only the newest orders and the queue of tasks.
 """
 
 from __future__ import annotations
@@ -26,20 +26,20 @@ log = logging.getLogger("cocoro.servos")
 
 REOPEN_S = 0.3
 PROBE_S = 0.2
-"""A silent servo is asked so often whether it is back: waiting for its answer costs the others their time."""
+"""Period at which one silent servo is tried again. More often would take too much time from the others."""
 CHECK_CYCLES = 8
-"""In each of so many cycles one servo is looked at closer."""
+"""Once in this many cycles the settings of one servo are checked."""
 ORDERS_S = 0.2
-"""Orders that were not renewed for so long are not written any more: the event loop hangs."""
+"""Orders expire when they are not renewed for this long, as when the event loop hangs."""
 _TORQUE, _SLOPE, _GOAL, _LIMIT = (
     table.REGISTERS[name] for name in ("torque_enable", "cw_slope", "goal_position", "torque_limit")
 )
 STATE = _TORQUE.address, _LIMIT.address + _LIMIT.size - _TORQUE.address
-"""First register and length of what is read of a servo's state: longer than a reading."""
+"""Address and length of the registers of a servo's state. It differs from that of a reading."""
 
 
 class _State(NamedTuple):
-    """What was written into a servo."""
+    """The writable registers of a servo."""
 
     torque: bool
     slope: int
@@ -49,33 +49,33 @@ class _State(NamedTuple):
 
 @dataclass
 class CycleResult:
-    """What one cycle found."""
+    """The results of one cycle, by servo ID."""
 
     readings: dict[int, ServoReading] = field(default_factory=dict)
     missed: list[int] = field(default_factory=list)
-    met: dict[int, ServoStatus] = field(default_factory=dict)
+    inspected: dict[int, ServoStatus] = field(default_factory=dict)
     checked: dict[int, bool] = field(default_factory=dict)
-    """Whether a servo's torque is on and its settings are those that were written into it."""
+    """Whether a servo's torque is on and its settings are the configured ones."""
     done: list[tuple[ServoTask, int]] = field(default_factory=list)
-    """With the position."""
+    """Tasks that were done, with the servo's position, counts."""
     failed: list[ServoTask] = field(default_factory=list)
     refused: list[tuple[ServoTask, str]] = field(default_factory=list)
     port_fault: str = ""
     busy_s: float = 0.0
-    """How long the cycle took."""
+    """Duration of the cycle."""
     strays: int = 0
 
 
 @dataclass(frozen=True)
 class ServoSettings:
-    """What is written into a servo before it holds."""
+    """Settings that are written before a servo is enabled."""
 
     slope: int
     torque_limit: int
 
 
 class ServoLine:
-    """`heard(event)` is called in the event loop in which this was made. Start it, and stop it at the end."""
+    """Calls `on_cycle(result)` in the event loop in which it was made. Call `start`, and `stop` at the end."""
 
     def __init__(
         self,
@@ -84,14 +84,14 @@ class ServoLine:
         settings: Mapping[int, ServoSettings],
         rate_hz: float,
         reply_s: float,
-        heard: Callable[[CycleResult], None],
+        on_cycle: Callable[[CycleResult], None],
         keeps_goal: bool = False,
     ) -> None:
-        """`keeps_goal`: halted, its servos go on to where they were told to (a hand that holds something)."""
+        """`keeps_goal`: when halted, servos still go to their last goal, so that the hand keeps its grip."""
         self._open: Callable[[], ServoBus] = lambda: ServoBus(path, baud, reply_s)
         self._settings = settings
         self._period_s = 1.0 / rate_hz
-        self._heard = heard
+        self._on_cycle = on_cycle
         self._keeps_goal = keeps_goal
         self._loop = asyncio.get_running_loop()
         self._ended = threading.Event()
@@ -99,7 +99,7 @@ class ServoLine:
         self._orders: tuple[float, Mapping[int, tuple[int, int]]] = (0.0, {})
         self._halted = False
         self._held: dict[int, tuple[int, int]] = {}
-        """Where the servos were when the line was halted, in counts, and with which speed they hold that."""
+        """Position at which each servo is held since the line was halted, and the speed to hold it with; counts."""
         self._misses = dict.fromkeys(settings, 0)
         self._probed_s = 0.0
         self._next_probe = 0
@@ -114,19 +114,20 @@ class ServoLine:
         await self._loop.run_in_executor(None, self._thread.join, 5.0)
 
     def order(self, goals: Mapping[int, tuple[int, int]]) -> None:
-        """Goal and speed in counts by servo, from now on; to be renewed in every cycle."""
+        """Set goal and speed, counts, by servo ID. Must be renewed within `ORDERS_S`."""
         self._orders = (time.monotonic() + ORDERS_S, goals)  # one assignment: the thread sees the old or the new
 
     def halt(self) -> None:
-        """Orders are not written from now on, and what moves holds where it is. From any thread, and whatever the event
-        loop does."""
+        """Stop writing orders, and make moving servos hold where they are. Thread-safe, and independent of the event
+        loop."""
         self._halted = True
 
     def go_on(self) -> None:
-        """Orders are written again: the newest were made by who knows of the emergency stop."""
+        """Write orders again. Call it after `order` with orders that respect the emergency stop."""
         self._halted = False
 
     def do(self, task: ServoTask) -> None:
+        """Queue a task."""
         self._tasks.put(task)
 
     # --- in the thread ------------------------------------------------------------------------------
@@ -146,28 +147,28 @@ class ServoLine:
     def _start_over(self, why: str) -> None:
         while not self._tasks.empty():
             self._tasks.get()
-        self._tell(CycleResult(port_fault=why))
+        self._publish(CycleResult(port_fault=why))
         self._ended.wait(REOPEN_S)
 
     def _talk(self, bus: ServoBus) -> None:
         due_s = time.monotonic()
         while not self._ended.wait(max(due_s - time.monotonic(), 0.0)):
             started_s = time.monotonic()
-            event = CycleResult()
+            result = CycleResult()
             self._order(bus, started_s)
             for number in self._to_read(started_s):
-                self._read(bus, number, event)
+                self._read(bus, number, result)
             if self._halted:
-                self._hold(bus, event.readings)
-            self._do_task(bus, event)
-            self._check(bus, event)
-            event.busy_s = time.monotonic() - started_s
-            event.strays = bus.strays
-            self._tell(event)
+                self._hold(bus, result.readings)
+            self._do_task(bus, result)
+            self._check(bus, result)
+            result.busy_s = time.monotonic() - started_s
+            result.strays = bus.strays
+            self._publish(result)
             due_s = max(due_s + self._period_s, time.monotonic())
 
     def _order(self, bus: ServoBus, now_s: float) -> None:
-        """Write the newest orders; of a halted line, where its servos were when it was halted."""
+        """Write the newest orders; when halted, the positions at which the servos are held."""
         if not self._halted:
             self._held = {}
             until_s, goals = self._orders
@@ -177,17 +178,17 @@ class ServoLine:
             bus.go(self._held)
 
     def _hold(self, bus: ServoBus, readings: Mapping[int, ServoReading]) -> None:
-        """Have what is under orders hold where it has just been read, which may take some cycles where one does not
-        answer; a line that keeps its goals only takes no new ones."""
+        """Make the servos under orders hold where they were just read. A servo that does not answer follows in a later
+        cycle. A line that keeps its goals holds nothing: it just takes no new goals."""
         speed = round(HOLD_RADPS / table.SPEED_RADPS)
         ordered = () if self._keeps_goal else self._orders[1]
-        fresh = [number for number in ordered if number in readings and number not in self._held]
-        if fresh:
-            self._held |= {number: (readings[number].position, speed) for number in fresh}
+        new = [number for number in ordered if number in readings and number not in self._held]
+        if new:
+            self._held |= {number: (readings[number].position, speed) for number in new}
             bus.go(self._held)
 
     def _to_read(self, now_s: float) -> Collection[int]:
-        """All that answer; of those that do not, one at a time and not often."""
+        """The servos to read in this cycle: all that answer, and at times one of those that do not."""
         alive = [number for number, misses in self._misses.items() if misses < MISSES]
         silent = [number for number, misses in self._misses.items() if misses >= MISSES]
         if silent and (not alive or now_s - self._probed_s > PROBE_S):
@@ -196,34 +197,34 @@ class ServoLine:
             return [*alive, silent[self._next_probe % len(silent)]]
         return alive
 
-    def _read(self, bus: ServoBus, number: int, event: CycleResult) -> None:
+    def _read(self, bus: ServoBus, number: int, result: CycleResult) -> None:
         try:
-            event.readings[number] = bus.reading(number)
+            result.readings[number] = bus.reading(number)
             self._misses[number] = 0
         except SilentError:
-            event.missed.append(number)
+            result.missed.append(number)
             self._misses[number] += 1
 
-    def _do_task(self, bus: ServoBus, event: CycleResult) -> None:
+    def _do_task(self, bus: ServoBus, result: CycleResult) -> None:
         try:
             task = self._tasks.get_nowait()
         except Empty:
             return
         try:
-            if task.what == "meet":
-                event.met[task.number] = self._meet(bus, task.number)
+            if task.action == "inspect":
+                result.inspected[task.number] = self._inspect(bus, task.number)
             else:
-                position = self._enable(bus, task.number) if task.what == "enable" else self._relax(bus, task.number)
-                event.done.append((task, position))
+                position = self._enable(bus, task.number) if task.action == "enable" else self._relax(bus, task.number)
+                result.done.append((task, position))
         except SilentError:
-            event.failed.append(task)
+            result.failed.append(task)
         except RefusedWriteError as error:
-            event.refused.append((task, str(error)))
+            result.refused.append((task, str(error)))
 
-    def _meet(self, bus: ServoBus, number: int) -> ServoStatus:
+    def _inspect(self, bus: ServoBus, number: int) -> ServoStatus:
         state = self._state(bus, number)
         reading = bus.reading(number)
-        if state.torque and not reading.error & table.SHUTDOWNS:  # it holds already, but perhaps by another's settings
+        if state.torque and not reading.error & table.SHUTDOWNS:  # it holds already, but perhaps with other settings
             self._set(bus, number)
         return ServoStatus(state.torque, state.goal, reading.position, reading.error)
 
@@ -234,9 +235,9 @@ class ServoLine:
         bus.write(number, "torque_limit", setting.torque_limit)  # after a shutdown it is 0
 
     def _enable(self, bus: ServoBus, number: int) -> int:
-        """Have a servo hold where it is. The order matters: what decides how it would move comes before what might
-        make it move, and its goal is where it is before its torque is on. That this was written is read, too: a
-        confirmation that came late may be another's."""
+        """Make a servo hold where it is; returns its position, counts. Speed and limits are written before anything
+        that could make it move, and its goal is set to its position before its torque is switched on. The goal is read
+        back, since a late confirmation may belong to another instruction."""
         bus.write(number, "moving_speed", round(HOLD_RADPS / table.SPEED_RADPS))
         self._set(bus, number)
         position = bus.reading(number).position
@@ -250,20 +251,20 @@ class ServoLine:
         bus.write(number, "torque_enable", 0)
         return bus.reading(number).position
 
-    def _check(self, bus: ServoBus, event: CycleResult) -> None:
+    def _check(self, bus: ServoBus, result: CycleResult) -> None:
         self._cycles += 1
         number = list(self._misses)[self._cycles // CHECK_CYCLES % len(self._misses)]
-        if self._cycles % CHECK_CYCLES == 0 and self._misses[number] == 0 and number not in event.missed:
+        if self._cycles % CHECK_CYCLES == 0 and self._misses[number] == 0 and number not in result.missed:
             with suppress(SilentError, RefusedWriteError):
-                event.checked[number] = self._is_as_set(bus, number)
+                result.checked[number] = self._is_as_set(bus, number)
 
     def _is_as_set(self, bus: ServoBus, number: int) -> bool:
         state, setting = self._state(bus, number), self._settings[number]
         return (state.torque, state.slope, state.limit) == (True, setting.slope, setting.torque_limit)
 
     def _state(self, bus: ServoBus, number: int) -> _State:
-        """What was written into a servo. Always this whole block: an answer says nothing of what it answers, and one
-        that comes late must not be taken for that to another question, such as `ServoBus.reading`."""
+        """Read the writable registers of a servo. Always this whole block: an answer does not say what it answers, and
+        by its length a late one cannot be taken for the answer to another request, such as `ServoBus.reading`."""
         data, _ = bus.read_block(number, *STATE)
         if len(data) < STATE[1]:
             raise SilentError(number)
@@ -274,6 +275,6 @@ class ServoLine:
 
         return _State(bool(value(_TORQUE)), value(_SLOPE), value(_GOAL), value(_LIMIT))
 
-    def _tell(self, event: CycleResult) -> None:
+    def _publish(self, result: CycleResult) -> None:
         with suppress(RuntimeError):  # the loop has ended
-            self._loop.call_soon_threadsafe(self._heard, event)
+            self._loop.call_soon_threadsafe(self._on_cycle, result)

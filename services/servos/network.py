@@ -1,7 +1,6 @@
-"""One servo network as the service sees it: readings in, orders and state out, faults and what to do about them. Pure.
+"""The core of a servo network's service: commands and readings in, orders, state and faults out. Pure.
 
-Who talks to the line is told what to do in two ways: `orders`, which are written again and again, and `tasks`, things
-to do once with one servo.
+The line gets two kinds of work: `orders`, which it writes in every cycle, and tasks, each done once with one servo.
 """
 
 from __future__ import annotations
@@ -19,30 +18,30 @@ from services.servos.motion import AT_GOAL_COUNTS, JointMotion
 from services.servos.table import ServoReading
 
 MISSES = 3
-"""A servo that does not answer so often in a row is silent."""
+"""A servo is silent after this many missing answers in a row."""
 STALE_NS = NS // 10
-"""A reading may be told again for so long while its servo is being asked once more."""
+"""A reading is published until it is older than this, in case that the next answer is missing."""
 HOT_C = 60
 LOW_V, HIGH_V = 9.0, 16.0
 GRACE_NS = NS // 2
-"""After it was enabled a servo may speak of its last shutdown for so long."""
+"""Time after it was enabled in which a servo may still report its last shutdown."""
 INTERRUPTED_NS = 30 * NS
-"""A loss of power is told for so long, though the servo holds again at once."""
+"""A loss of power is reported for this long, although the servo holds again immediately."""
 
-ServoAction = Literal["meet", "enable", "relax"]
+ServoAction = Literal["inspect", "enable", "relax"]
 
 
 @dataclass(frozen=True)
 class ServoTask:
-    """Something to do once: see what state a servo is in, make it hold where it is, let it go limp."""
+    """Work to do once: inspect a servo's state, make it hold where it is, or let it go limp."""
 
-    what: ServoAction
+    action: ServoAction
     number: int
 
 
 @dataclass(frozen=True)
 class ServoStatus:
-    """What a servo said when it was met."""
+    """A servo's state as it was inspected."""
 
     torque_enabled: bool
     goal: int
@@ -51,25 +50,27 @@ class ServoStatus:
 
 
 class ServoJoint:
-    """What is known of one joint's servo."""
+    """The state of one joint's servo."""
 
     def __init__(self, joint: Joint, *, keeps_goal: bool) -> None:
         self.joint = joint
         self.motion = JointMotion(joint, keeps_goal=keeps_goal)
         self.reading: ServoReading | None = None
         self.read_ns = 0
-        """By the robot's clock."""
+        """Robot's clock."""
         self.misses = 0
-        self.met = False
+        self.inspected = False
+        """Whether its state has been read since it last was silent."""
         self.enabled = False
         self.enabled_ns = 0
         self.held = False
-        """When it fell silent."""
+        """Whether it was enabled when it became silent."""
         self.interrupted_ns: int | None = None
+        """When it was found to have lost its power for a moment."""
         self.relaxed = False
-        """On somebody's word."""
+        """Whether it is limp on request."""
         self.fault = ""
-        """Latched."""
+        """Latched until `clear`."""
 
     @property
     def silent(self) -> bool:
@@ -81,11 +82,11 @@ class ServoJoint:
 
     @property
     def obeys(self) -> bool:
-        return self.met and self.enabled and not self.relaxed and not self.fault and not self.silent
+        return self.inspected and self.enabled and not self.relaxed and not self.fault and not self.silent
 
 
 class ServoNetwork:
-    """Told the robot's time with every call."""
+    """All servos of a line. Every `now_ns` is the robot's clock."""
 
     def __init__(self, joints: Iterable[Joint], *, keeps_goal: bool, timeout_s: float, max_age_s: float) -> None:
         """A command counts for `timeout_s` from its stamp, and is refused once it is older than `max_age_s`."""
@@ -107,7 +108,7 @@ class ServoNetwork:
         return {"released": "", "latched": "estop", "unknown": "latch unknown"}[self.latch]
 
     def command(self, command: ServoCommand, now_ns: int) -> str:
-        """Take the goals, all or none. Returns '' when taken, otherwise why not."""
+        """Accept all goals or none. Returns '' when accepted, otherwise the reason for refusing."""
         if self.stopped_by:
             return self.stopped_by
         if not is_fresh(command.stamp_ns, now_ns, self._max_age_s):
@@ -122,8 +123,8 @@ class ServoNetwork:
         return ""
 
     def set_latch(self, state: LatchState) -> None:
-        """Latched and unknown hold the arm and neck where they are; a release lets what is limp hold again, and after
-        an emergency stop it clears the faults."""
+        """Latched and unknown hold arm and neck where they are. A release enables servos that are not, and after an
+        emergency stop it also clears the faults."""
         before, self.latch = self.latch, state
         if state != "released":
             if before == "released" and not self._keeps_goal:
@@ -137,7 +138,8 @@ class ServoNetwork:
             self._enable_if_due(one)
 
     def clear(self, names: Iterable[str]) -> list[str]:
-        """Forget latched faults (of all joints when none is named) and have those joints hold again; their names."""
+        """Clear latched faults (of all joints when none is named) and make these joints hold again; returns their
+        names."""
         cleared = []
         for one in self._named(names):
             if one.fault:
@@ -147,7 +149,7 @@ class ServoNetwork:
         return cleared
 
     def relax(self, names: Iterable[str]) -> list[str]:
-        """Let joints go limp until `hold`; their names."""
+        """Let joints go limp until `hold`; returns their names."""
         for one in (chosen := self._named(names)):
             one.relaxed = True
             one.motion.goal_rad = None
@@ -155,11 +157,11 @@ class ServoNetwork:
         return [one.joint.name for one in chosen]
 
     def hold(self, names: Iterable[str]) -> list[str]:
-        """Have joints hold where they are, also such as were relaxed; their names."""
+        """Make joints hold where they are, also relaxed ones; returns their names."""
         for one in (chosen := self._named(names)):
             one.relaxed = False
             one.motion.goal_rad = None
-            if one.met and not one.fault:
+            if one.inspected and not one.fault:
                 self._tasks[one.joint.id] = ServoTask("enable", one.joint.id)
         return [one.joint.name for one in chosen]
 
@@ -167,7 +169,7 @@ class ServoNetwork:
         return [name for name in names if name not in self._by_name]
 
     def new_epoch(self) -> None:
-        """The clock began anew: what was commanded before is of no time that there is."""
+        """The clock restarted: earlier commands and readings belong to no time of the new epoch."""
         for one in self.joints.values():
             one.motion.forget_time()
             one.read_ns = 0
@@ -176,77 +178,79 @@ class ServoNetwork:
         return [self._by_name[name] for name in names] or list(self.joints.values())
 
     def _enable_if_due(self, one: ServoJoint) -> None:
-        if one.met and not one.enabled and not one.relaxed and not one.fault and self.latch == "released":
+        if one.inspected and not one.enabled and not one.relaxed and not one.fault and self.latch == "released":
             self._tasks[one.joint.id] = ServoTask("enable", one.joint.id)
 
-    # --- what was heard -----------------------------------------------------------------------------
+    # --- results of the line ------------------------------------------------------------------------
 
-    def heard(self, number: int, reading: ServoReading, now_ns: int) -> None:
+    def read(self, number: int, reading: ServoReading, now_ns: int) -> None:
+        """A servo answered."""
         one = self.joints[number]
         one.reading, one.read_ns, one.misses = reading, now_ns, 0
-        if not one.met:
-            self._tasks.setdefault(number, ServoTask("meet", number))
+        if not one.inspected:
+            self._tasks.setdefault(number, ServoTask("inspect", number))
         if one.enabled and now_ns - one.enabled_ns > GRACE_NS:
             self._shut_down(one, reading.error)
 
     def missed(self, number: int) -> None:
-        """It did not answer."""
+        """A servo did not answer."""
         one = self.joints[number]
         one.misses += 1
         if one.silent:
             one.held = one.held or one.enabled
-            one.met = one.enabled = False  # who knows what it is like when it comes back
+            one.inspected = one.enabled = False  # its state may be another one when it is back
             one.motion.goal_rad = None
             self._tasks.pop(number, None)
 
     def disturbed(self, strays: int, missed: int, now_ns: int) -> None:
-        """So many bytes so far that were no part of an answer, and so many servos now that did not answer, though they
-        are not silent."""
+        """Count disturbances: `strays` is the count of bytes so far that were not part of an answer, `missed` the
+        number of servos that did not answer now although they are not silent."""
         self._disturbed.add(max(strays - self._strays, 0) + missed, now_ns)
         self._strays = strays
 
-    def met(self, number: int, met: ServoStatus, now_ns: int) -> None:
-        """What a servo was found to be like. One that holds already goes on holding: the hand what it holds, the arm
-        where it is unless it was there for long."""
+    def inspected(self, number: int, status: ServoStatus, now_ns: int) -> None:
+        """A servo was inspected. If it holds already it goes on holding: the hand, or an arm joint at rest, at its
+        goal, a moving arm joint where it is."""
         one = self.joints[number]
-        one.met = True
-        one.enabled = met.torque_enabled
-        self._shut_down(one, met.error)
-        if one.held and not one.enabled and not one.fault:  # it lost its power meanwhile, and with it all that was set
+        one.inspected = True
+        one.enabled = status.torque_enabled
+        self._shut_down(one, status.error)
+        if one.held and not one.enabled and not one.fault:  # it lost its power meanwhile, and with it its settings
             one.interrupted_ns = now_ns
         one.held = False
         if one.enabled:
-            resting = abs(met.goal - met.position) <= AT_GOAL_COUNTS * 4
-            one.motion.hold(one.joint.to_angle(met.goal if self._keeps_goal or resting else met.position))
+            resting = abs(status.goal - status.position) <= AT_GOAL_COUNTS * 4
+            one.motion.hold(one.joint.to_angle(status.goal if self._keeps_goal or resting else status.position))
         self._enable_if_due(one)
 
     def checked(self, number: int, as_set: bool, now_ns: int) -> None:
-        """Whether a servo still has what was written into it, looked at now and then: one whose power failed for a
-        moment has not, and would go on limp or with the settings of the factory."""
+        """A servo's settings were checked, as they are periodically: a servo whose power failed for a moment has lost
+        them, and is limp or has the factory's settings."""
         one = self.joints[number]
         if not one.obeys or as_set or number in self._tasks:
             return
-        if one.reading is not None and one.reading.error & table.SHUTDOWNS:  # it let go by itself, just after it held
+        if one.reading is not None and one.reading.error & table.SHUTDOWNS:  # it has shut down since
             self._shut_down(one, one.reading.error)
             return
         one.interrupted_ns = now_ns
         self._tasks[number] = ServoTask("enable", number)
 
     def done(self, task: ServoTask, position: int, now_ns: int) -> None:
-        """A task was done, with the servo there."""
+        """A task was done, with the servo at `position` (counts)."""
         one = self.joints[task.number]
-        one.enabled, one.enabled_ns = task.what == "enable", now_ns
+        one.enabled, one.enabled_ns = task.action == "enable", now_ns
         if one.enabled:
             one.motion.hold(one.joint.to_angle(position))
 
     def port_lost(self, why: str) -> None:
+        """The line failed: all servos are silent."""
         self.port_fault = why
         for number, one in self.joints.items():
             one.misses = max(one.misses, MISSES - 1)
             self.missed(number)
 
     def refused(self, task: ServoTask, why: str) -> None:
-        """A servo would not do what a task asks."""
+        """A servo refused a task."""
         self._fault(self.joints[task.number], why)
 
     def _shut_down(self, one: ServoJoint, error: int) -> None:
@@ -259,19 +263,19 @@ class ServoNetwork:
             one.enabled = False
             one.motion.goal_rad = None
 
-    # --- what to do ---------------------------------------------------------------------------------
+    # --- work for the line --------------------------------------------------------------------------
 
     def next_task(self) -> ServoTask | None:
-        """The next thing to do once; it is forgotten here, and comes again when it did not succeed."""
+        """Take the next task; `again` puts it back when it fails."""
         return self._tasks.pop(next(iter(self._tasks))) if self._tasks else None
 
     def again(self, task: ServoTask) -> None:
-        """A task did not succeed."""
+        """A task failed: try it again, unless the servo is silent."""
         if not self.joints[task.number].silent:
             self._tasks.setdefault(task.number, task)
 
     def orders(self, now_ns: int) -> dict[int, tuple[int, int]]:
-        """Goal and speed in counts, by servo, of those that obey."""
+        """Goal and speed to write, counts, by servo ID, for the servos that obey."""
         orders = {}
         for number, one in self.joints.items():
             if one.obeys and (position_rad := one.position_rad) is not None:
@@ -280,26 +284,26 @@ class ServoNetwork:
                     orders[number] = order
         return orders
 
-    # --- what it is like ----------------------------------------------------------------------------
+    # --- state --------------------------------------------------------------------------------------
 
     def state(self, now_ns: int) -> ServoState | None:
-        """Of the joints that were heard of late; None when there is none."""
-        heard = [
+        """The state of the joints with a recent reading; None when there are none."""
+        recent = [
             (one, one.reading, one.read_ns)
             for one in self.joints.values()
             if one.reading is not None and not one.silent and 0 <= now_ns - one.read_ns <= STALE_NS
         ]
-        if not heard:
+        if not recent:
             return None
         return ServoState(
-            stamp_ns=sum(read_ns for _, _, read_ns in heard) // len(heard),
-            joints=tuple(one.joint.name for one, _, _ in heard),
-            position_rad=tuple(one.joint.to_angle(reading.position) for one, reading, _ in heard),
-            speed_radps=tuple(one.joint.direction * reading.speed * table.SPEED_RADPS for one, reading, _ in heard),
-            load=tuple(one.joint.direction * reading.load / table.FULL_TORQUE for one, reading, _ in heard),
-            temperature_c=tuple(float(reading.temperature_c) for _, reading, _ in heard),
-            voltage_v=tuple(reading.voltage_v for _, reading, _ in heard),
-            torque_enabled=tuple(one.enabled for one, _, _ in heard),
+            stamp_ns=sum(read_ns for _, _, read_ns in recent) // len(recent),
+            joints=tuple(one.joint.name for one, _, _ in recent),
+            position_rad=tuple(one.joint.to_angle(reading.position) for one, reading, _ in recent),
+            speed_radps=tuple(one.joint.direction * reading.speed * table.SPEED_RADPS for one, reading, _ in recent),
+            load=tuple(one.joint.direction * reading.load / table.FULL_TORQUE for one, reading, _ in recent),
+            temperature_c=tuple(float(reading.temperature_c) for _, reading, _ in recent),
+            voltage_v=tuple(reading.voltage_v for _, reading, _ in recent),
+            torque_enabled=tuple(one.enabled for one, _, _ in recent),
             faults=self.latched_faults(),
             latch=self.latch,
             stopped_by=self.stopped_by,
@@ -312,19 +316,19 @@ class ServoNetwork:
         return [f"{one.joint.name} (ID {number})" for number, one in self.joints.items() if one.silent]
 
     def faults(self, now_ns: int) -> tuple[str, ...]:
-        """All that is wrong now, for people."""
+        """All current faults, for people."""
         if self.port_fault:
             return (self.port_fault,)
         found = [f"{fault}; `cocoro servos clear`" for fault in self.latched_faults()]
         found += [f"{name} does not answer" for name in self.silent_joints()]
         if damage := self._disturbed.total(now_ns):
-            found.append(f"the line is disturbed, look after its cables: {damage} damaged bytes in {WINDOW_S:g} s")
+            found.append(f"the line is disturbed, check its cables: {damage} damaged bytes in {WINDOW_S:g} s")
         for one in self.joints.values():
             name = one.joint.name
             if one.relaxed:
                 found.append(f"{name} is limp; `cocoro servos hold`")
             if one.interrupted_ns is not None and 0 <= now_ns - one.interrupted_ns < INTERRUPTED_NS:
-                found.append(f"{name} lost its settings a moment ago, and got them back: look after its power")
+                found.append(f"{name} lost its settings a moment ago, and got them back: check its power")
             if one.reading is None or one.silent:
                 continue
             if one.reading.temperature_c >= HOT_C:

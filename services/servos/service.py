@@ -1,4 +1,4 @@
-"""Both servo networks as services: a thread talks to each line, a network makes sense of it, this joins the mesh."""
+"""The services of both servo networks: for each, a thread talks to the line, and a pure core decides."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ class ServosConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The serial port of neck and arm: a device, or wire:NAME for an emulated one."""
     hand_port: str = "/dev/cocoro-hand"
     reply_s: Annotated[float, Meta(gt=0, le=0.5)] = 0.03
-    """How long a servo's answer may take."""
+    """Time limit for a servo's answer."""
     torque: dict[str, PositiveShare] = {}
-    """By joint, the share of its stall torque that it may push with; all of it where nothing is said."""
+    """By joint, the share of its stall torque that it may push with; by default all of it."""
 
 
 class NetworkService:
-    """One network: one line, one thread, one participant of the mesh."""
+    """One network: a line with its thread, and a participant of the mesh."""
 
     def __init__(self, node: Node, config: ServosConfig) -> None:
         self._node = node
@@ -65,7 +65,7 @@ class NetworkService:
             for joint in joints
         }
         port = port_path(config.arm_port if node.name == "arm" else config.hand_port, node.robot_name)
-        self._line = ServoLine(port, row.baud, settings, row.rate_hz, config.reply_s, self._heard, keeps_goal)
+        self._line = ServoLine(port, row.baud, settings, row.rate_hz, config.reply_s, self._on_cycle, keeps_goal)
         self._epoch = node.clock.epoch
         self._changed = asyncio.Event()
         LatchKeeper(node, self._latched, self._line.halt)
@@ -73,7 +73,7 @@ class NetworkService:
         node.serve(topics.SERVOS.of(node.name), self._asked)
 
     async def run(self) -> None:
-        self._tell()
+        self._report_faults()
         self._line.start()
         try:
             await asyncio.get_running_loop().create_future()
@@ -90,38 +90,38 @@ class NetworkService:
         self._line.order(self._network.orders(self._node.now_ns()))
         self._line.go_on()  # these orders know of the latch
 
-    def _heard(self, event: CycleResult) -> None:
-        """What a cycle found. The line's thread goes by the monotonic clock, the network by the robot's."""
+    def _on_cycle(self, result: CycleResult) -> None:
+        """Take the results of a cycle. The line's thread goes by the monotonic clock, the network by the robot's."""
         network, now_ns = self._network, self._node.now_ns()
         if self._node.clock.epoch != self._epoch:
             self._epoch = self._node.clock.epoch
             network.new_epoch()
         monotonic_ns = time.monotonic_ns()
-        network.port_fault = event.port_fault
-        if event.port_fault:
-            network.port_lost(event.port_fault)
-        for number, reading in event.readings.items():
-            network.heard(number, reading, now_ns - max(monotonic_ns - reading.at_ns, 0))
-        missed = [number for number in event.missed if not network.joints[number].silent]
-        network.disturbed(event.strays, len(missed), now_ns)
-        for number in event.missed:
+        network.port_fault = result.port_fault
+        if result.port_fault:
+            network.port_lost(result.port_fault)
+        for number, reading in result.readings.items():
+            network.read(number, reading, now_ns - max(monotonic_ns - reading.at_ns, 0))
+        missed = [number for number in result.missed if not network.joints[number].silent]
+        network.disturbed(result.strays, len(missed), now_ns)
+        for number in result.missed:
             network.missed(number)
-        for number, met in event.met.items():
-            network.met(number, met, now_ns)
-        for number, as_set in event.checked.items():
+        for number, status in result.inspected.items():
+            network.inspected(number, status, now_ns)
+        for number, as_set in result.checked.items():
             network.checked(number, as_set, now_ns)
-        for task, position in event.done:
+        for task, position in result.done:
             network.done(task, position, now_ns)
-        for task, why in event.refused:
+        for task, why in result.refused:
             network.refused(task, why)
-        for task in event.failed:
+        for task in result.failed:
             network.again(task)
         if (next_task := network.next_task()) is not None:
             self._line.do(next_task)
         self._line.order(network.orders(now_ns))
         if now_ns and (state := network.state(now_ns)) is not None:
             self._node.publish(self._state, state)
-        self._tell()
+        self._report_faults()
         self._changed.set()
 
     async def _asked(self, request: ServoRequest) -> ServoReply:
@@ -148,8 +148,7 @@ class NetworkService:
         one = next(one for one in self._network.joints.values() if one.joint.name == name)
         return not one.enabled if action == "relax" else one.enabled
 
-    def _tell(self) -> None:
-        """Health, as people read it."""
+    def _report_faults(self) -> None:
         network = self._network
         silent = "servos do not answer" if network.silent_joints() else ""
         degraded = "no line" if network.port_fault else silent

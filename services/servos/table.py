@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 
 class Register(NamedTuple):
-    """Where a value stands; more than one byte is little-endian. What stands below 24 outlives the power."""
+    """A register of the control table: little-endian; registers below address 24 keep their value without power."""
 
     address: int
     size: int
@@ -48,16 +48,17 @@ REGISTERS: dict[str, Register] = {
     "punch": Register(48, 2),
 }
 MODELS = {12: "AX-12", 18: "AX-18", 300: "AX-12W", 10: "RX-10", 24: "RX-24F", 28: "RX-28", 64: "RX-64"}
-"""By what register `model` says."""
+"""Names by the value of register `model`."""
 
 SPEED_RADPS = 0.111 * 2 * pi / 60
-"""The unit of the speed registers."""
+"""Unit of the speed registers."""
 FASTEST = 1023
 FULL_TORQUE = 1023
 SLOPES = (2, 4, 8, 16, 32, 64, 128)
-"""What the slope registers know: counts from the goal within which the servo pushes with less than its limit."""
+"""Values of the slope registers: distance from the goal, counts, below which the servo pushes with less than its
+limit."""
 SIGN = 1 << 10
-"""In speed and load: set is clockwise, towards smaller positions."""
+"""Sign bit of speed and load: set is clockwise, towards smaller positions."""
 
 ERRORS = {
     0x01: "voltage",
@@ -71,23 +72,23 @@ ERRORS = {
 """The bits of a status packet's error byte."""
 VOLTAGE, ANGLE_LIMIT, OVERHEATING, RANGE, CHECKSUM, OVERLOAD, INSTRUCTION = ERRORS
 REFUSALS = ANGLE_LIMIT | RANGE | CHECKSUM | INSTRUCTION
-"""The servo did not do what it was asked."""
+"""Errors with which a servo refuses an instruction."""
 SHUTDOWNS = OVERHEATING | OVERLOAD
-"""The servo let go, and holds only once its torque limit is written again."""
+"""Errors after which a servo has let go. It holds again only after its torque limit is written."""
 
 
 def slope_of(compliance_counts: float) -> int:
-    """The slope nearest to so many counts, by ratio; the steepest for none."""
+    """The slope nearest to `compliance_counts` by ratio; the steepest for 0."""
     return min(SLOPES, key=lambda slope: max(slope, compliance_counts) / min(slope, max(compliance_counts, 1.0)))
 
 
 def baud_of(value: int) -> int:
-    """The baud rate that register `baud` stands for."""
+    """The baud rate for a value of register `baud`."""
     return round(2_000_000 / (value + 1))
 
 
 def signed(value: int) -> int:
-    """A speed or load register as a signed number."""
+    """Decode the value of a speed or load register."""
     return -(value & (SIGN - 1)) if value & SIGN else value & (SIGN - 1)
 
 
@@ -101,15 +102,15 @@ class ServoReading(NamedTuple):
     temperature_c: int
     error: int
     at_ns: int
-    """Monotonic."""
+    """CLOCK_MONOTONIC."""
 
 
 FIRST, LENGTH = 36, 8
-"""What a reading reads."""
+"""Address and length of the registers of a reading."""
 
 
 def reading(data: bytes, error: int, at_ns: int) -> ServoReading | None:
-    """From eight bytes; None when they cannot be what a servo measures."""
+    """Decode eight bytes; None when a servo cannot measure such values."""
     position = int.from_bytes(data[0:2], "little")
     speed, load = int.from_bytes(data[2:4], "little"), int.from_bytes(data[4:6], "little")
     if position > 1023 or speed > 2047 or load > 2047:

@@ -1,6 +1,7 @@
-"""What is done with servos by hand, while the service is down: find them, number them, measure their zeros and limits.
+"""Manual work on servos while their service is down: find them, set their IDs, measure zeros and limits.
 
-The commands are `cocoro servos ...`; whoever calls gives the questions' answers and takes what is to be told.
+The commands are `cocoro servos ...`. `show` displays a line to the operator; `prompt` displays an instruction, and
+returns when the operator has carried it out.
 """
 
 from __future__ import annotations
@@ -19,21 +20,17 @@ from services.servos import table
 from services.servos.bus import PortError, RefusedWriteError, ServoBus, SilentError
 
 BAUDS = (1_000_000, 57_600, 115_200, 500_000, 2_000_000, 9_600)
-"""In the order in which one meets them."""
+"""Baud rates, most common first."""
 SCAN_S = 0.02
 READINGS = 20
 MARGIN_DEG = 2.0
-"""Kept from the ends that were felt by hand."""
+"""Margin between the measured ends of a joint and its limits."""
 TURNED_COUNTS = 20
-"""Less than this is no turn by hand."""
-
-Tell = Callable[[str], None]
-Ask = Callable[[str], None]
-"""Shows a sentence, and returns when the operator has done what it says."""
+"""A joint counts as turned by hand when its position changed by this much."""
 
 
 class FoundServo(NamedTuple):
-    """A servo on a port."""
+    """A servo that was found on a port."""
 
     port: str
     baud: int
@@ -47,29 +44,31 @@ class FoundServo(NamedTuple):
 
 
 def candidates() -> list[str]:
-    """Serial ports that may be a servo adapter."""
+    """Serial ports that may be servo adapters."""
     ports = [port.device for port in list_ports.comports() if port.vid is not None]
     return sorted(ports)
 
 
-def scan(ports: Iterable[str], bauds: Iterable[int], numbers: Iterable[int], tell: Tell) -> Iterator[FoundServo]:
-    """Ask every number at every rate. A port that cannot be opened is told of and passed over."""
+def scan(
+    ports: Iterable[str], bauds: Iterable[int], numbers: Iterable[int], show: Callable[[str], None]
+) -> Iterator[FoundServo]:
+    """Try every ID at every baud rate. A port that cannot be opened is reported and skipped."""
     wanted = list(numbers)
     for port in ports:
         for baud in bauds:
             try:
                 with ServoBus(port, baud, SCAN_S) as bus:
-                    tell(f"{port} at {baud} baud ...")
+                    show(f"{port} at {baud} baud ...")
                     for number in wanted:
                         if bus.ping(number) is not None:
-                            yield look_at(bus, baud, number)
+                            yield examine(bus, baud, number)
             except PortError as error:
-                tell(str(error))
+                show(str(error))
                 break
 
 
-def look_at(bus: ServoBus, baud: int, number: int) -> FoundServo:
-    """Everything that one wants to know first of a servo. Raises SilentError."""
+def examine(bus: ServoBus, baud: int, number: int) -> FoundServo:
+    """Read the basic data of a servo. Raises SilentError."""
     model = bus.read(number, "model")
     reading = bus.reading(number)
     return FoundServo(
@@ -86,17 +85,17 @@ def look_at(bus: ServoBus, baud: int, number: int) -> FoundServo:
 
 
 def set_number(bus: ServoBus, old: int, new: int) -> None:
-    """Give a servo another ID, and no return delay. Raises RefusedError when the new one is taken, or the old one is
-    silent (or there are two of it: then they talk over each other)."""
+    """Give a servo another ID, and a return delay of 0. Raises RefusedError when the new ID is taken, or when no servo
+    answers as the old one; two servos with one ID talk over each other, and seem silent."""
     if bus.ping(old) is None:
-        raise RefusedError(f"nobody answers as {old}: is it alone on the line, powered, and at this baud rate?")
+        raise RefusedError(f"no servo answers as {old}: is it alone on the line, powered, and at this baud rate?")
     if new != old:
         if bus.ping(new) is not None:
             raise RefusedError(f"there is a servo {new} on this line already; take it off first")
-        with suppress(SilentError):  # it may answer by its new name already
+        with suppress(SilentError):  # it may answer by its new ID already
             bus.write(old, "id", new)
         if bus.ping(new) is None:
-            raise RefusedError(f"the servo does not answer as {new}; `cocoro servos scan` tells what it is now")
+            raise RefusedError(f"the servo does not answer as {new}; `cocoro servos scan` shows its ID")
     bus.write(new, "return_delay", 0)
 
 
@@ -108,23 +107,24 @@ def relax(bus: ServoBus, joint: Joint) -> None:
 
 
 def position_of(bus: ServoBus, joint: Joint) -> float:
-    """Its mean position over a moment. Raises RefusedError when it moves meanwhile."""
+    """Mean position over a moment, counts. Raises RefusedError when the joint moves meanwhile."""
     positions = []
     for _ in range(READINGS):
         positions.append(bus.reading(joint.id).position)
-        time.sleep(0.01)  # the readings span a while, in which an unsteady hand shows
+        time.sleep(0.01)  # spread over time, so that an unsteady hand is noticed
     if max(positions) - min(positions) > TURNED_COUNTS:
         raise RefusedError(f"{joint.name} moved while it was measured; hold it still")
     return sum(positions) / len(positions)
 
 
-def calibrate(bus: ServoBus, joint: Joint, at_deg: float, ask: Ask) -> dict[str, float | int]:
-    """Where a joint's zero is and which way it turns: guided by hand to a known angle, then towards greater angles.
-    The values of its [[joint]] row. Raises RefusedError."""
+def calibrate(bus: ServoBus, joint: Joint, at_deg: float, prompt: Callable[[str], None]) -> dict[str, float | int]:
+    """Measure a joint's zero and sense of rotation: the operator turns it to a known angle, then towards greater
+    angles. Returns the values for its [[joint]] row. Raises RefusedError when it was not turned or did not keep
+    still."""
     relax(bus, joint)
-    ask(f"{joint.name}: turn it to {at_deg:g} degrees by hand, and hold it there")
+    prompt(f"{joint.name}: turn it to {at_deg:g} degrees by hand, and hold it there")
     there = position_of(bus, joint)
-    ask(f"{joint.name}: now turn it some way towards greater angles")
+    prompt(f"{joint.name}: now turn it some way towards greater angles")
     turned = position_of(bus, joint) - there
     if abs(turned) < TURNED_COUNTS:
         raise RefusedError(f"{joint.name} was turned by {abs(turned) * degrees(SERVO_COUNT_RAD):.1f} degrees only")
@@ -133,9 +133,11 @@ def calibrate(bus: ServoBus, joint: Joint, at_deg: float, ask: Ask) -> dict[str,
     return {"direction": direction, "centre_count": round(centre, 2)}
 
 
-def feel_limits(bus: ServoBus, joint: Joint, done: Callable[[], bool], tell: Tell) -> tuple[float, float]:
-    """The ends between which somebody turns a limp joint until `done`, in degrees, with a margin. Raises
-    RefusedError when it was hardly turned."""
+def feel_limits(
+    bus: ServoBus, joint: Joint, done: Callable[[], bool], show: Callable[[str], None]
+) -> tuple[float, float]:
+    """Measure the ends between which the operator turns a limp joint until `done`; returns limits in degrees, with a
+    margin. Raises RefusedError when the joint was hardly turned."""
     relax(bus, joint)
     low, high = 1023, 0
     while not done():
@@ -146,7 +148,7 @@ def feel_limits(bus: ServoBus, joint: Joint, done: Callable[[], bool], tell: Tel
         if position < low or position > high:
             low, high = min(low, position), max(high, position)
             ends = sorted(degrees(joint.to_angle(count)) for count in (low, high))
-            tell(f"{joint.name}: {ends[0]:.1f} to {ends[1]:.1f} degrees")
+            show(f"{joint.name}: {ends[0]:.1f} to {ends[1]:.1f} degrees")
     if high - low < 2 * TURNED_COUNTS:
         raise RefusedError(f"{joint.name} was hardly turned; nothing is changed")
     first, last = sorted(degrees(joint.to_angle(count)) for count in (low, high))
@@ -154,7 +156,8 @@ def feel_limits(bus: ServoBus, joint: Joint, done: Callable[[], bool], tell: Tel
 
 
 def write_limits(bus: ServoBus, joint: Joint, limits_deg: tuple[float, float]) -> tuple[int, int]:
-    """Put a joint's limits into its servo too, which then refuses goals beyond them; the two positions."""
+    """Write a joint's limits into its servo, which then refuses goals beyond them; returns them in counts. Raises
+    CocoroError when the servo does not confirm."""
     ends = sorted(joint.to_count(radians(limit)) for limit in limits_deg)
     try:
         bus.write(joint.id, "cw_limit", ends[0])

@@ -1,14 +1,11 @@
-"""The interface of a renderer, and the choice of the one that runs on this machine."""
+"""The interface of a renderer."""
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple, Protocol
 
 from cocoro.arrays import Float32Array, FloatArray, ImageArray
-from cocoro.errors import ConfigError
 from cocoro.robot import Camera
 
 
@@ -81,38 +78,3 @@ class Visual:
     """box: full x, y, z; cylinder: radius, height (its axis is z); sphere: radius."""
     rgb: tuple[float, float, float]
     """Surface colour, 0 to 1 per channel."""
-
-
-_log = logging.getLogger(__name__)
-
-MISSING_EGL = (
-    "slow pictures: no OpenGL on EGL here (%s), so PyBullet's TinyRenderer draws;"
-    " for the fast one: apt install libegl1 libgl1 libgl1-mesa-dri"
-)
-
-RendererChoice = Literal["auto", "moderngl", "tiny"]
-
-
-def make_renderer(visuals: Sequence[Visual], camera: Camera, choice: RendererChoice = "auto") -> Renderer:
-    """Make the chosen renderer. With `auto` that is the fast one, or the slow one and a warning when the fast one
-    cannot run.
-
-    Raises ConfigError when `moderngl` is chosen and cannot run.
-    """
-    if choice != "tiny":
-        try:
-            from sim.render.gl import GlRenderer
-
-            renderer: Renderer = GlRenderer(visuals, camera)
-            return renderer
-        except Exception as error:  # moderngl and glcontext raise plain Exception for a missing library
-            reason = " ".join(str(error).split()) or type(error).__name__
-            if choice == "moderngl":
-                raise ConfigError(
-                    f"the moderngl renderer cannot run here ({reason}): apt install libegl1 libgl1"
-                    " libgl1-mesa-dri, or let the renderer be chosen (auto)"
-                ) from error
-            _log.warning(MISSING_EGL, reason)
-    from sim.render.tiny import TinyRenderer
-
-    return TinyRenderer(visuals, camera)

@@ -44,6 +44,9 @@ class Actuators:
     unfolding: FloatArray = field(init=False)
     """The floor places (n, 2), body frame, over which the arm swings when it unfolds."""
     camera_tilt: CameraTilt = field(init=False)
+    ready_on_the_way: bool = True
+    """Whether the hand gets ready for a target while the base still drives; else it stays parked until the base
+    stands."""
     grasp_height_m: float = 0.065
     """At which height what is in the hand was grasped: there it is put down."""
 

@@ -148,7 +148,7 @@ class Approach:
         actuators, config = snapshot.actuators, snapshot.actuators.config.arm
         arm, angles, dt_s = actuators.arm, snapshot.angles, snapshot.dt_s
         reference = arm.reference or angles
-        if actuators.config.coordination == "lockstep":
+        if not actuators.ready_on_the_way:
             return arm.park(angles, dt_s), move
         if not arm.folded(reference):
             have = actuators.reacher.pose({**angles, **reference})
