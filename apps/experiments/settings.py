@@ -7,7 +7,7 @@ from typing import Any
 
 import msgspec
 
-from apps.rehearsal.request import Body, Sensors
+from apps.rehearsal.request import BodyKind, Sensors
 from cocoro.robot import Robot
 
 
@@ -20,11 +20,11 @@ class ExperimentSettings(msgspec.Struct, frozen=True, kw_only=True):
     seeds: tuple[int, ...]
     out: Path
     sensors: Sensors = "real"
-    body: Body = "worn"
+    body: BodyKind = "worn"
     description: str | None = None
-    """A robot description instead of the Calliope's."""
+    """File of a robot description in place of the Calliope's."""
     measured: str | None = None
-    """Values measured on that robot; they replace the description's."""
+    """File of the values measured on one robot; they replace the description's."""
     width: int = 640
     height: int = 480
     frame_rate_hz: float = 30.0
