@@ -61,6 +61,18 @@ class Profile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     mesh: Mesh = Mesh()
     service: dict[Name, dict[str, Any]] = {}
 
+    @property
+    def robot_files(self) -> tuple[Path | None, Path | None]:
+        """The description and the measured file, as `Robot.load` takes them."""
+        description, measured = (None if file is None else Path(file) for file in (self.description, self.measured))
+        return description, measured
+
+    def with_robot(self, description: Path | None, measured: Path | None) -> Profile:
+        """This profile with another description or measured file; None keeps its own."""
+        files = {"description": description, "measured": measured}
+        given = {name: str(file.resolve()) for name, file in files.items() if file is not None}
+        return msgspec.structs.replace(self, **given)
+
     def rows(self) -> tuple[Component, ...]:
         """The components. Raises ConfigError for an unknown one."""
         return tuple(named(name) for name in self.processes)

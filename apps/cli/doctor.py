@@ -32,9 +32,9 @@ EARLIEST_S = 1_700_000_000
 """A wall clock before this time (end of 2023) is wrong."""
 
 
-def doctor(profile_name: str, as_json: bool) -> int:
+def doctor(profile_name: str, as_json: bool, description: Path | None = None, measured: Path | None = None) -> int:
     """Print all checks of a profile. Returns exit code 1 when one found a problem."""
-    profile = profiles.read(profile_name)
+    profile = profiles.read(profile_name).with_robot(description, measured)
     checks = list(examine(profile))
     if as_json:
         print(json.dumps([check._asdict() for check in checks]))
@@ -75,9 +75,8 @@ def examine(profile: Profile) -> Iterator[Check]:
 
 def _robot(profile: Profile) -> tuple[Robot, Check | None]:
     """The robot's description, and a check of its files."""
-    files = [None if file is None else Path(file) for file in (profile.description, profile.measured)]
     try:
-        robot = Robot.load(*files)
+        robot = Robot.load(*profile.robot_files)
     except ConfigError as error:
         return Robot.load(), bad("robot's files", str(error))
     if profile.measured is not None:

@@ -18,7 +18,6 @@ from apps.experiments.settings import ExperimentSettings
 from cocoro.about import DISTRIBUTIONS
 from cocoro.errors import naming
 from cocoro.learning.dataset import fingerprint_of
-from cocoro.robot import Robot
 
 HEADS = ("measure", "who", "mean ± 95% CI", "worst", "unit", "wanted", "", "the paper's text")
 DOTS_PER_INCH = 90
@@ -54,7 +53,7 @@ def _manifest(settings: ExperimentSettings) -> dict[str, Any]:
             versions[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
             versions[name] = "not installed"
-    robot = Robot.load()
+    robot = settings.robot()
     return {
         "settings": {**msgspec.to_builtins(settings, enc_hook=str), "out": settings.out.name},
         "robot": robot.name,
