@@ -256,6 +256,7 @@ def test_outputs_of_an_older_version_are_compared_by_the_fields_that_both_have(
         "calliope/planning/status: mood is no more: passed by",
         "calliope/planning/status: model is new: takes its default",
         "calliope/planning/status: TargetEstimate.sigma_m is new: takes its default",
+        "calliope/executive/intent: Intent has changed: its former shape is converted",
     )
     assert main(["capture", "reexecute", str(path), "--service", "planning", "--tolerance", "0.001"]) == 0
     assert "changed since, calliope/planning/status: model is new" in capsys.readouterr().out

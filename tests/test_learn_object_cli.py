@@ -34,6 +34,7 @@ from cocoro.robot import Robot
 from cocoro.topics import ARM_STATE, FRAME
 from deploy import profiles
 from deploy.processes import named
+from services.executive.tasks import FetchTask
 from sim.scene import Light
 
 TEAL = (20, 150, 140)
@@ -239,7 +240,7 @@ def test_what_was_learnt_from_one_look_is_fetched(here: Path) -> None:
         """
     )
     rehearsal = RehearsalRequest(
-        task="fetch", label="orange_can", scene="scene.toml", sensors="real", objects="objects.toml",
+        task=FetchTask(label="orange_can"), scene="scene.toml", sensors="real", objects="objects.toml",
         width=320, height=240, frame_rate_hz=15.0,
     )  # fmt: skip
     result = rehearse(rehearsal)

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 from robot_rig import RobotRig
+from spelled import asked
 
 from apps.rehearsal.rehearse import TaskRefusedError, rehearse
 from apps.rehearsal.request import RehearsalRequest
@@ -36,7 +37,7 @@ position_m = [1.2, -0.4]
 
 def small(task: str = "fetch", label: str = "red_can", **more: Any) -> RehearsalRequest:
     """With small frames, at half their rate."""
-    return RehearsalRequest(task=task, label=label, width=320, height=240, frame_rate_hz=15.0, **more)  # type: ignore[arg-type]
+    return RehearsalRequest(task=asked(task, label).task, width=320, height=240, frame_rate_hz=15.0, **more)
 
 
 @pytest.fixture(scope="module")

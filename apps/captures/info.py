@@ -11,7 +11,7 @@ import msgspec
 from apps.captures.compare import changes
 from cocoro.capture import mcap
 from cocoro.capture.conventions import TALLY, KeyTally, tally_names
-from cocoro.capture.former import todays_name
+from cocoro.capture.former import is_former, todays_name
 from cocoro.capture.mcap import DamageError
 from cocoro.capture.reader import Capture
 from cocoro.capture.types import MADE_HERE, LossyFrame, schema_of
@@ -226,6 +226,8 @@ def changed_since(capture: Capture, channel: int) -> list[str]:
         return []
     if todays_name(schema.name) != topic.type.__name__:
         return [f"it carries {topic.type.__name__} today"]
+    if is_former(schema.name, schema.data):
+        return [f"{schema.name} has changed: its former shape is converted"]
     kind: type[Message] = topic.type
     return [change.text for change in changes(schema.data, schema_of(kind).data)]
 

@@ -11,6 +11,7 @@ import msgspec
 
 from apps.captures.player import Player
 from cocoro.bus.base import Bus, Handle, Qos, RawPublisher
+from cocoro.capture.former import todays_name, todays_payload
 from cocoro.capture.reader import Capture, Record
 from cocoro.capture.types import MADE_HERE, LossyFrame, NotReadableError
 from cocoro.errors import ConfigError, RefusedError
@@ -140,10 +141,12 @@ class Replay:
         self.sent += 1
 
     def _payload(self, record: Record) -> bytes | memoryview:
-        """As it was published; a frame that was kept with loss, as near to that as can be."""
+        """As it was published; a message of a former shape in today's, a lossy frame as a frame."""
         schema = self._capture.schema(record.channel)
-        if schema is None or schema.name != LossyFrame.__name__:
+        if schema is None:
             return record.payload
+        if schema.name != LossyFrame.__name__:
+            return todays_payload(todays_name(schema.name), record.payload)
         try:
             return msgspec.msgpack.encode(self._capture.read(record))
         except NotReadableError:

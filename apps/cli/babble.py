@@ -7,17 +7,20 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from msgspec.structs import replace
+
 from apps.cli.interrupt import on_interrupt
 from apps.cli.link import Link, joined
 from apps.cli.options import RobotChoice
 from apps.cli.output import going_on
 from apps.cli.progress import TaskDisplay, task_display
 from apps.cli.tasks import Follower
-from apps.learning.collector import TOPICS, SampleCollector, collector
+from apps.learning.collector import SampleCollector, collector
 from cocoro.errors import CocoroError, MeshError
-from cocoro.messages import AboutRequest, Message, ObjectsRequest, TaskName, TaskRequest, TaskState
+from cocoro.messages import AboutRequest, Message, ObjectsRequest, TaskRequest, TaskState
 from cocoro.robot import Robot
 from cocoro.topics import ABOUT, OBJECTS
+from services.executive.tasks import BabbleArmTask, BabbleWheelsTask
 
 BAR = 20
 """Characters of the progress bar."""
@@ -71,21 +74,24 @@ class SampleWriter:
                 self._cancel()
 
 
-async def babble(where: RobotChoice, task: TaskName, wanted: int, file: Path, label: str, as_json: bool) -> int:
+async def babble(
+    where: RobotChoice, task: BabbleArmTask | BabbleWheelsTask, wanted: int, file: Path, as_json: bool
+) -> int:
     """Babble until the file holds `wanted` samples or trials. Ctrl-C stops the robot and keeps them. Returns the exit
-    code; raises ConfigError or RefusedError for a file that cannot be gone on with."""
+    code; raises ConfigError or RefusedError for a file that cannot be continued."""
     async with joined(where) as link:
         robot = await description(link)
-        with collector(task, file, robot, await _standing_height(link, label) if label else None) as kept:
+        height_m = await _standing_height(link, task.target) if task.target else None
+        with collector(task.samples, file, robot, height_m) as kept:
             shown = BabbleDisplay(task_display(as_json), kept, wanted)
             if len(kept) >= wanted:
                 shown.result(f"{file} holds enough already")
                 return 0
             if len(kept):
                 shown.say(f"going on from {file}: {kept.said}")
-            samples = link.inbox(TOPICS[task])  # before the task is asked for, so that nothing is missed
-            request = TaskRequest(task=task, label=label, first=kept.next, count=wanted - len(kept))
-            follower = Follower(link, request, shown, None)
+            samples: Any = link.inbox(task.samples)  # before the task is asked for, so that nothing is missed
+            task = replace(task, first=kept.next, count=wanted - len(kept))
+            follower = Follower(link, TaskRequest(task=task), shown, None)
             keeper = SampleWriter(kept, follower.cancel)
             samples.add(lambda _key, message: keeper.take(message))
             with on_interrupt(follower.interrupt), going_on():
@@ -102,7 +108,7 @@ async def babble(where: RobotChoice, task: TaskName, wanted: int, file: Path, la
 
 
 async def _standing_height(link: Link, label: str) -> float | None:
-    """Of the centre of a known object that stands on the floor, as the robot knows it."""
+    """Height of the centre of a known object that stands on the floor, m; None for an unknown one."""
     reply = await link.call(OBJECTS, ObjectsRequest())
     return next((known.size_m[2] / 2 for known in reply.objects if known.label == label), None)
 

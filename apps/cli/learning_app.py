@@ -24,7 +24,7 @@ from apps.cli.options import (
 if TYPE_CHECKING:
     from cocoro import robot as robots
     from cocoro.learning.model import BodyModel
-    from cocoro.messages import TaskName
+    from services.executive.tasks import BabbleArmTask, BabbleWheelsTask
 
 app = typer.Typer()
 babble = typer.Typer(no_args_is_help=True, help="Move to learn: the arm before the eyes, the wheels before a target.")
@@ -42,7 +42,9 @@ def babble_arm(
     json: JsonOption = False,
 ) -> None:
     """Move the arm about and look at the hand. Ctrl-C stops it; the same command goes on, and nothing is lost."""
-    _babble("babble-arm", samples, out, "", robot, profile, json)
+    from services.executive.tasks import BabbleArmTask
+
+    _babble(BabbleArmTask(), samples, out, robot, profile, json)
 
 
 @babble.command("wheels")
@@ -57,15 +59,22 @@ def babble_wheels(
     json: JsonOption = False,
 ) -> None:
     """Turn the wheels to and fro before a target. The robot needs half a metre around it. Ctrl-C stops it."""
-    _babble("babble-wheels", trials, out, target, robot, profile, json)
+    from services.executive.tasks import BabbleWheelsTask
+
+    _babble(BabbleWheelsTask(label=target), trials, out, robot, profile, json)
 
 
 def _babble(
-    task: TaskName, wanted: int, out: Path, target: str, robot: str | None, profile: str | None, as_json: bool
+    task: BabbleArmTask | BabbleWheelsTask,
+    wanted: int,
+    out: Path,
+    robot: str | None,
+    profile: str | None,
+    as_json: bool,
 ) -> None:
     from apps.cli import babble as babbling
 
-    sys.exit(asyncio.run(babbling.babble(RobotChoice(robot, profile), task, wanted, out, target, as_json)))
+    sys.exit(asyncio.run(babbling.babble(RobotChoice(robot, profile), task, wanted, out, as_json)))
 
 
 @learn.command("arm")

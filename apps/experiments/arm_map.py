@@ -12,6 +12,7 @@ from apps.experiments.results import Plot, Section, row
 from apps.experiments.runs import ExperimentRun, RunResult
 from apps.experiments.settings import ExperimentSettings
 from apps.learning.study import BEST, METHODS
+from services.executive.tasks import BabbleArmTask
 
 KEY, TITLE = "E1", "The hand-eye map, from babbling"
 BEND_S = 30.0
@@ -26,7 +27,7 @@ def runs(settings: ExperimentSettings) -> list[ExperimentRun]:
     for seed in settings.seeds:
         found += bodies.learned(settings, seed)
         bent = {
-            "task": "babble-arm", "count": BENT_SAMPLES, "samples": str(settings.bent_file(seed)), "bend_s": BEND_S,
+            "task": BabbleArmTask(count=BENT_SAMPLES), "samples": str(settings.bent_file(seed)), "bend_s": BEND_S,
             **settings.common(seed),
         }  # fmt: skip
         lesson = {"into": str(settings.model_file(seed)), "bent": str(settings.bent_file(seed)), "bend_s": BEND_S}

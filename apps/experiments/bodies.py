@@ -6,14 +6,15 @@ from typing import Any
 
 from apps.experiments.runs import ExperimentRun
 from apps.experiments.settings import ExperimentSettings
+from services.executive.tasks import BabbleArmTask, BabbleWheelsTask
 
 
 def babbled(settings: ExperimentSettings, seed: int) -> list[ExperimentRun]:
     """Babbling of one body's arm and wheels."""
     common = settings.common(seed)
-    arm = {"task": "babble-arm", "count": settings.samples, "samples": str(settings.arm_file(seed)), **common}
+    arm = {"task": BabbleArmTask(count=settings.samples), "samples": str(settings.arm_file(seed)), **common}
     wheels = {
-        "task": "babble-wheels", "label": "red_can", "scene": "wheels", "count": settings.trials,
+        "task": BabbleWheelsTask(label="red_can", count=settings.trials), "scene": "wheels",
         "samples": str(settings.wheels_file(seed)), **common,
     }  # fmt: skip
     return [

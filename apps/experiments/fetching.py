@@ -11,6 +11,7 @@ from apps.experiments import bodies, figures
 from apps.experiments.results import Plot, Section, row
 from apps.experiments.runs import ExperimentRun, RunResult
 from apps.experiments.settings import ExperimentSettings
+from services.executive.tasks import FetchTask
 
 KEY, TITLE = "E6", "Fetching"
 CANS = ("red_can", "green_can", "blue_can")
@@ -29,7 +30,7 @@ def runs(settings: ExperimentSettings) -> list[ExperimentRun]:
         for way, (_, fields) in WAYS.items():
             for can in CANS:
                 name = f"fetch-{way}-{can}-{seed}"
-                found.append(bodies.with_model(settings, seed, name, **{"task": "fetch", "label": can, **fields}))
+                found.append(bodies.with_model(settings, seed, name, task=FetchTask(label=can), **fields))
     return found
 
 

@@ -10,6 +10,7 @@ from apps.experiments import bodies, figures
 from apps.experiments.results import Plot, Section, row
 from apps.experiments.runs import ExperimentRun, RunResult
 from apps.experiments.settings import ExperimentSettings
+from services.executive.tasks import FollowTask
 
 KEY, TITLE = "E5", "Following"
 FOR_S = 33.0
@@ -28,9 +29,10 @@ def runs(settings: ExperimentSettings) -> list[ExperimentRun]:
         found += bodies.learned(settings, seed)
         for way, (_, fields) in WAYS.items():
             request = {
-                "task": "follow", "label": "blue_ball", "scene": "follow", "for_s": FOR_S,
+                "task": FollowTask(label="blue_ball", for_s=FOR_S),
+                "scene": "follow",
                 "trace": seed == settings.seeds[0],
-            }  # fmt: skip
+            }
             found.append(bodies.with_model(settings, seed, f"follow-{way}-{seed}", **{**request, **fields}))
     return found
 

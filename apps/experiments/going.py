@@ -11,6 +11,7 @@ from apps.experiments import bodies, figures
 from apps.experiments.results import Plot, Section, row
 from apps.experiments.runs import ExperimentRun, RunResult
 from apps.experiments.settings import ExperimentSettings
+from services.executive.tasks import GoToTask
 
 KEY, TITLE = "E4", "Navigation"
 BEARINGS_DEG = (-90, -45, 0, 45, 90)
@@ -45,9 +46,7 @@ def runs(settings: ExperimentSettings) -> list[ExperimentRun]:
             for bearing in BEARINGS_DEG:
                 scene = str(folder / f"ball{bearing:+d}.toml")
                 request = {
-                    "task": "go-to",
-                    "label": "yellow_ball",
-                    "distance_m": ASKED_M,
+                    "task": GoToTask(label="yellow_ball", distance_m=ASKED_M),
                     "scene": scene,
                     "trace": True,
                 }

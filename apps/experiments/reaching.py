@@ -10,6 +10,7 @@ from apps.experiments import bodies, figures
 from apps.experiments.results import Plot, ResultRow, Section, row
 from apps.experiments.runs import ExperimentRun, RunResult
 from apps.experiments.settings import ExperimentSettings
+from services.executive.tasks import TouchTask
 
 KEY, TITLE = "E2", "Reaching four suspended targets"
 TARGETS = ("red_can", "green_can", "blue_can", "yellow_ball")
@@ -34,7 +35,7 @@ def runs(settings: ExperimentSettings) -> list[ExperimentRun]:
                 order = TARGETS * ROUNDS
                 found.append(
                     bodies.with_model(
-                        settings, seed, _name(scene, way, seed), task="touch", label=order[0], then=list(order[1:]),
+                        settings, seed, _name(scene, way, seed), task=TouchTask(label=order[0]), then=list(order[1:]),
                         scene=scene, trace=seed == settings.seeds[0], **fields,
                     )
                 )  # fmt: skip

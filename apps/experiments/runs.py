@@ -35,7 +35,7 @@ class ExperimentRun:
     """Name of its result's file in the folder `runs`."""
     kind: Literal["rehearse", "learn", "bend"]
     fields: dict[str, Any] = field(hash=False)
-    """Rehearse: of the request; else the arguments of the lesson of that name."""
+    """Rehearse: the request's fields; otherwise the arguments of the lesson of that name."""
     needs: tuple[str, ...] = ()
     """Names of the runs whose results it uses."""
 
@@ -168,4 +168,4 @@ def _used(run: ExperimentRun, results: Mapping[str, RunResult]) -> dict[str, str
 
 
 def _as_json(fields: dict[str, Any]) -> Any:
-    return json.loads(json.dumps(fields))
+    return json.loads(msgspec.json.encode(fields))

@@ -7,14 +7,14 @@ from typing import Any
 
 import msgspec
 
-from apps.rehearsal.request import Body, Sensors
+from apps.rehearsal.request import BodyKind, Sensors
 
 
 class ExperimentSettings(msgspec.Struct, frozen=True, kw_only=True):
     seeds: tuple[int, ...]
     out: Path
     sensors: Sensors = "real"
-    body: Body = "worn"
+    body: BodyKind = "worn"
     width: int = 640
     height: int = 480
     frame_rate_hz: float = 30.0

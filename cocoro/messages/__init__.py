@@ -30,7 +30,6 @@ from cocoro.messages.executive import (
     Outcome,
     Phase,
     RefusalCode,
-    TaskName,
     TaskReply,
     TaskRequest,
     TaskState,
@@ -62,7 +61,6 @@ from cocoro.messages.perception import (
     Obstacles,
 )
 from cocoro.messages.planning import (
-    Behaviour,
     HandSample,
     Intent,
     LearnedModel,
@@ -90,7 +88,6 @@ __all__ = [
     "AboutRequest",
     "BaseCommand",
     "BaseState",
-    "Behaviour",
     "CancelRequest",
     "ClockTick",
     "Count",
@@ -133,7 +130,6 @@ __all__ = [
     "ServoState",
     "StepRecord",
     "TargetEstimate",
-    "TaskName",
     "TaskReply",
     "TaskRequest",
     "TaskState",

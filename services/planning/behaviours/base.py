@@ -147,6 +147,13 @@ class Plan:
 
 
 class Behaviour(Protocol):
+    """Carries out one action. Made when the action is asked for, then stepped at the planner's rate until it reports
+    `done` or `failed`."""
+
+    @property
+    def needs_sight(self) -> bool:
+        """Whether it drives or looks for something, so that it pauses while perception is silent."""
+
     def step(self, snapshot: Snapshot) -> Plan: ...
 
 
