@@ -20,9 +20,9 @@ from apps.experiments.every import EXPERIMENTS
 from apps.experiments.results import summarise
 from apps.experiments.runs import ExperimentRun, RunResult, perform
 from apps.experiments.settings import ExperimentSettings
+from apps.learning.dataset import HandRow, SampleFile, WheelRow, hand_header, wheel_header
 from apps.learning.study import BEST
 from apps.rehearsal.request import RehearsalRequest
-from cocoro.learning.dataset import HandRow, SampleFile, WheelRow, hand_header, wheel_header
 from cocoro.learning.nominal_model import NominalModel
 from cocoro.robot import Robot
 
@@ -71,6 +71,18 @@ def test_every_experiment_asks_for_rehearsals_that_are_possible_and_names_what_i
             else:
                 assert hasattr(lessons, run.kind)
             msgspec.json.encode(run.fields)
+
+
+def test_every_run_of_an_experiment_is_of_the_robot_that_is_described(tmp_path: Path) -> None:
+    own = tmp_path / "own.toml"
+    own.write_text("[base]\nwheel_separation_m = 0.3\n")
+    settings = ExperimentSettings(seeds=(0,), out=tmp_path, measured=str(own))
+    assert settings.robot().base.wheel_separation_m == 0.3
+    for experiment in EXPERIMENTS.values():
+        for run in experiment.runs(settings):
+            assert run.fields["measured"] == str(own)
+            if run.kind == "rehearse":
+                assert msgspec.convert(run.fields, RehearsalRequest).measured == str(own)
 
 
 def test_what_cannot_be_run_fails_with_its_reason_and_so_does_what_needs_it(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""`cocoro echo KEY`: what travels on a key, decoded, of whatever type it is."""
+"""`cocoro echo KEY`: prints the messages of a key, of any type."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from apps.cli.listening import Ear, Heard, keyexpr_of, takes_frames
 from apps.cli.options import RobotChoice
 
 HINT_S = 3.0
-"""A person who has heard nothing for so long is told so, and where to look."""
+"""After this time without a message a hint is printed."""
 
 
 async def echo(
     where: RobotChoice, text: str, count: int | None, seconds: float | None, as_json: bool, everything: bool
 ) -> int:
-    """Print until interrupted, or so many messages, or for so long. Exit code 1 when the time is over and there was
-    nothing, or fewer than were wanted."""
+    """Print until interrupted, `count` messages, or for `seconds`. Returns exit code 1 when the time ended before the
+    first message, or before `count` messages."""
     async with joined(where, frames=takes_frames(text)) as link:
         ear = Ear(link, keyexpr_of(text, link.robot))
         with interrupt_event() as end:
             printed = await _print(ear, link.robot, end, count, seconds, as_json, everything)
             interrupted = end.is_set()
         if ear.dropped:
-            print(f"cocoro: {ear.dropped} more came than could be printed", file=sys.stderr)
+            print(f"cocoro: {ear.dropped} messages arrived too fast and were not printed", file=sys.stderr)
     enough = printed >= (count or 1)
     return exits.DONE if interrupted or enough else exits.FAILED
 
@@ -38,7 +38,7 @@ async def echo(
 async def _print(
     ear: Ear, robot: str, end: asyncio.Event, count: int | None, seconds: float | None, as_json: bool, everything: bool
 ) -> int:
-    """The number of messages that were printed."""
+    """Print messages; returns their number."""
     printed, hinted = 0, False
     started_s = time.monotonic()
     while not end.is_set() and (count is None or printed < count):
@@ -49,7 +49,7 @@ async def _print(
         if not await ear.wait(end, wait_s):
             if not (printed or hinted or end.is_set()) and (left_s is None or left_s > HINT_S):
                 hinted = True
-                print(f"nothing on {ear.keyexpr} yet; `cocoro topics` lists what there is, `cocoro top` what is sent",
+                print(f"nothing on {ear.keyexpr} yet; `cocoro topics` lists the topics, `cocoro top` the live ones",
                       file=sys.stderr)  # fmt: skip
             continue
         for heard in ear.take()[: None if count is None else count - printed]:

@@ -6,7 +6,7 @@ import sys
 
 import typer
 
-from apps.cli.options import JsonOption, ProfileArgument
+from apps.cli.options import DescriptionOption, JsonOption, MeasuredOption, ProfileArgument
 
 app = typer.Typer()
 
@@ -14,9 +14,11 @@ app = typer.Typer()
 @app.command()
 def doctor(
     profile: ProfileArgument = "robot",
+    description: DescriptionOption = None,
+    measured: MeasuredOption = None,
     json: JsonOption = False,
 ) -> None:
     """Look over a machine and its robot before a run; each line is well, or says what to do. Exit code 1 if not."""
     from apps.cli import doctor as looking
 
-    sys.exit(looking.doctor(profile, json))
+    sys.exit(looking.doctor(profile, json, description, measured))

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from apps.cli.options import JsonOption, MeshOption, RobotChoice, RobotOption
+from apps.cli.options import DescriptionOption, JsonOption, MeasuredOption, MeshOption, RobotChoice, RobotOption
 
 app = typer.Typer()
 objects = typer.Typer(invoke_without_command=True)
@@ -59,6 +59,8 @@ def learn(
     yes: Annotated[bool, typer.Option("--yes", "-y", help="Save it without asking.")] = False,
     replace: Annotated[bool, typer.Option("--replace", help="Forget what an object of that name looked like.")] = False,
     add: Annotated[bool, typer.Option("--add", help="Add these colours to it: seen in another light.")] = False,
+    description: DescriptionOption = None,
+    measured: MeasuredOption = None,
     robot: RobotOption = None,
     profile: MeshOption = None,
     json: JsonOption = False,
@@ -69,6 +71,7 @@ def learn(
     """
     from apps.cli import learn_object as learning
     from apps.cli.snapshot import check
+    from cocoro.robot import Robot
 
     wanted = learning.wanted_of(
         label, at_px=learning.pixel_of(at), box_px=learning.box_of(box), shape=shape, size_m=learning.size_of(size),
@@ -77,4 +80,5 @@ def learn(
     if picture is not None:
         check(picture)
     keeping = learning.SaveOptions(catalogue, picture, yes, replace, add, json)
-    sys.exit(asyncio.run(learning.learn_object(RobotChoice(robot, profile), source, wanted, keeping)))
+    camera_of = Robot.load(description, measured)
+    sys.exit(asyncio.run(learning.learn_object(RobotChoice(robot, profile), source, wanted, keeping, camera_of)))

@@ -31,6 +31,7 @@ def runs(settings: ExperimentSettings) -> list[ExperimentRun]:
             **settings.common(seed),
         }  # fmt: skip
         lesson = {"into": str(settings.model_file(seed)), "bent": str(settings.bent_file(seed)), "bend_s": BEND_S}
+        lesson |= settings.robot_files
         found.append(ExperimentRun(f"babble-bent-{seed}", "rehearse", bent))
         found.append(
             ExperimentRun(f"bend-{seed}", "bend", lesson, needs=(f"babble-bent-{seed}", bodies.learned_name(seed)))
@@ -119,7 +120,7 @@ def _plots(settings: ExperimentSettings, good: Mapping[int, RunResult], bent: li
         plots.append(
             Plot("e1-hand", f"The hand on the held-out draws of seed {seed}: seen, by the nominal model, and by the"
                  " learned map.",
-                 partial(figures.hand_places, settings.arm_file(seed), settings.model_file(seed)))
+                 partial(figures.hand_places, settings.arm_file(seed), settings.model_file(seed), settings.robot()))
         )  # fmt: skip
         curves = [result["curves"] for result in good.values()]
         plots.append(Plot("e1-curves", "Held-out error against samples; the mean over the seeds, and all seeds.",

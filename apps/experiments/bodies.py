@@ -27,7 +27,7 @@ def learned(settings: ExperimentSettings, seed: int) -> list[ExperimentRun]:
     """Babbling of one body, and learning its model."""
     fields = {
         "arm": str(settings.arm_file(seed)), "wheels": str(settings.wheels_file(seed)),
-        "into": str(settings.model_file(seed)),
+        "into": str(settings.model_file(seed)), **settings.robot_files,
     }  # fmt: skip
     runs = babbled(settings, seed)
     return [*runs, ExperimentRun(learned_name(seed), "learn", fields, needs=tuple(run.name for run in runs))]

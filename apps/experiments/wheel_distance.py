@@ -10,7 +10,6 @@ from apps.experiments import bodies, figures
 from apps.experiments.results import Plot, ResultRow, Section, row
 from apps.experiments.runs import ExperimentRun, RunResult
 from apps.experiments.settings import ExperimentSettings
-from cocoro.robot import Robot
 
 KEY, TITLE = "E3", "The distance between the wheels, from babbling"
 MEDIAN_M, WORST_M = 0.003, 0.008
@@ -32,7 +31,7 @@ def section(settings: ExperimentSettings, results: Mapping[str, RunResult]) -> S
         f"A can 1.5 m ahead; {settings.trials} trials, in pairs of a Sobol draw within ±0.15 m/s for each wheel for 1 s"
         " and its reverse. The can is seen before and after each.",
     )
-    nominal_m = Robot.load().base.wheel_separation_m
+    nominal_m = settings.robot().base.wheel_separation_m
     for measure, key in (("wheel distance", "wheel_separation_m"), ("distance that turns it", "turning_separation_m")):
         axle = key == "wheel_separation_m"
         true_m = [body[key] for _, body in good]
