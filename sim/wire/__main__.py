@@ -24,7 +24,9 @@ MODELS = {"arm": 28, "hand": 12}
 def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m sim.wire", description="Emulated hardware on pseudo-terminals.")
     parser.add_argument("folder", type=Path, help="folder for the ports")
-    parser.add_argument("--description", type=Path, metavar="FILE", help="description of a robot that is not a Calliope")
+    parser.add_argument(
+        "--description", type=Path, metavar="FILE", help="description of a robot other than the Calliope"
+    )
     parser.add_argument("--measured", type=Path, metavar="FILE", help="values that were measured on this robot")
     options = parser.parse_args()
     folder: Path = options.folder
