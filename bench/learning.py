@@ -19,8 +19,9 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
+from apps.learning.rules import learn_in_order
 from apps.learning.study import BEST, METHODS, Sightings, fit
-from cocoro.learning.fitting import LeastSquares, learn_in_order
+from cocoro.learning.fitting import LeastSquares
 from cocoro.learning.network import PAPER_RATE, HyperplaneRbf
 from cocoro.learning.nominal_model import NominalModel
 from cocoro.robot import Robot

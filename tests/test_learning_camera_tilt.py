@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cocoro.learning.camera_tilt import LEAST_TRIALS, CameraTilt, eye_tilt
-from cocoro.learning.dataset import WheelRow
+from apps.learning.dataset import WheelRow
+from apps.learning.lesson import LEAST_TRIALS, eye_tilt
+from cocoro.learning.camera_tilt import CameraTilt
 from cocoro.messages import Obstacles
 from cocoro.robot import Robot
 from cocoro.units import Vec3

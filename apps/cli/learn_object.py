@@ -17,9 +17,9 @@ from apps.cli import exits
 from apps.cli.learn_sight import CameraView, of_picture, of_robot, preview
 from apps.cli.options import RobotChoice
 from apps.cli.toml_files import save, text_of, with_object
+from apps.pictures import save_png
 from cocoro.errors import ConfigError, naming
 from cocoro.objects import Catalogue, ObjectSpec
-from cocoro.picture import save_png
 from cocoro.robot import Robot
 
 LIVE = "live"

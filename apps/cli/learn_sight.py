@@ -16,13 +16,14 @@ from apps.appearance.learn import LearnedObject, ObjectView
 from apps.appearance.size import outline_of
 from apps.cli.link import Link, joined, within
 from apps.cli.options import RobotChoice
+from apps.pictures import colour_of, describe, draw
 from cocoro.arrays import ImageArray
 from cocoro.component import load as load_component
 from cocoro.core import Sample
 from cocoro.errors import ConfigError, MeshError
 from cocoro.messages import Detections, Frame, Message, ServoState
 from cocoro.objects import Catalogue
-from cocoro.picture import colour_of, describe, draw, load
+from cocoro.picture import load
 from cocoro.robot import Robot
 from cocoro.topics import ARM_STATE, FRAME
 from deploy import processes

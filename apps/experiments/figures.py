@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from apps.learning import study
+from apps.learning import dataset, study
+from apps.learning.dataset import HandRow
 from apps.learning.lesson import sightings
 from cocoro.errors import ConfigError
-from cocoro.learning import dataset, model
-from cocoro.learning.dataset import HandRow
+from cocoro.learning import model
 from cocoro.learning.nominal_model import NominalModel
 from cocoro.robot import Robot
 

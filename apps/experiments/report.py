@@ -13,11 +13,11 @@ from typing import Any
 
 import msgspec
 
+from apps.experiments.plan import ExperimentSettings
 from apps.experiments.results import ResultRow, Section
-from apps.experiments.settings import ExperimentSettings
 from cocoro.about import DISTRIBUTIONS
 from cocoro.errors import naming
-from cocoro.learning.dataset import fingerprint_of
+from cocoro.learning.nominal_model import fingerprint_of
 
 HEADS = ("measure", "who", "mean ± 95% CI", "worst", "unit", "wanted", "", "the paper's text")
 DOTS_PER_INCH = 90

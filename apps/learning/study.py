@@ -16,8 +16,9 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from apps.learning.outliers import inliers, plausible
+from apps.learning.rules import folds, learn_in_order
 from cocoro.arrays import BoolArray, FloatArray, IntArray
-from cocoro.learning.fitting import LeastSquares, folds, learn_in_order
+from cocoro.learning.fitting import LeastSquares
 from cocoro.learning.handmap import Coordinates, HandMap
 from cocoro.learning.network import PAPER_BASES, PAPER_RANGE_RAD, PAPER_RATE, PAPER_WIDTH_RAD, HyperplaneRbf
 from cocoro.learning.nominal_model import NominalModel

@@ -17,6 +17,7 @@ import msgspec
 from msgspec.structs import replace
 
 from apps.learning.collector import SampleCollector, collector
+from apps.pictures import draw, save_png
 from apps.rehearsal.lockstep import LOCKSTEP_PLANNER, LOCKSTEP_SETTINGS, LockstepCycle, LockstepNode
 from apps.rehearsal.request import RehearsalRequest
 from cocoro import topics
@@ -28,7 +29,6 @@ from cocoro.inbox import Stream
 from cocoro.messages import Detections, Frame, Recording, TaskReply, TaskRequest, TaskState
 from cocoro.node import Node
 from cocoro.objects import Catalogue
-from cocoro.picture import draw, save_png
 from cocoro.robot import Robot
 from cocoro.tasks import Task
 from cocoro.vloop import run_virtual

@@ -7,17 +7,13 @@ from (derived).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from math import atan2, cos, hypot, sin
 
 import numpy as np
 
 from cocoro.arrays import FloatArray
-from cocoro.learning.dataset import WheelRow
 from cocoro.messages import FiniteVec3
 from cocoro.robot import Robot
-
-LEAST_TRIALS = 4
 
 
 class CameraTilt:
@@ -53,13 +49,3 @@ class CameraTilt:
         away = hypot(level, up)
         true_up = height_m - self._axis_z_m
         return atan2(up, level) - atan2(true_up, max(away**2 - true_up**2, 1e-9) ** 0.5)
-
-
-def eye_tilt(trials: Sequence[WheelRow], height_m: float | None, robot: Robot) -> float | None:
-    """The median over wheel trials before a target whose centre is known to be so high; None where that is not known,
-    or too few trials tell how high it was seen."""
-    if height_m is None:
-        return None
-    eye = CameraTilt(robot)
-    found = [eye.tilt_of((*row.after_m, row.height_m), height_m) for row in trials if row.height_m is not None]
-    return float(np.median(found)) if len(found) >= LEAST_TRIALS else None

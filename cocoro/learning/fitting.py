@@ -1,35 +1,15 @@
-"""Three ways to set a network's weights: the paper's rule, recursive least squares, and the same all at once."""
+"""Recursive least squares on a network's weights, one sample at a time or many at once."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from copy import copy
 from typing import Any
 
 import numpy as np
-import scipy  # which loads its parts when they are needed: a robot that has learned nothing does without
 from numpy.typing import NDArray
 
-from cocoro.arrays import BoolArray, FloatArray, IntArray
+from cocoro.arrays import FloatArray
 from cocoro.learning.network import HyperplaneRbf
-
-_BLOCK = 128
-
-
-def learn_in_order(network: HyperplaneRbf, inputs: FloatArray, targets: FloatArray, rate: float) -> None:
-    """The paper's rule: each sample once, in order. Changes the network. inputs (b, n), targets (b, k).
-
-    Block by block, exactly as sample by sample: with G the Gram matrix of a block's features, the errors E that the
-    rule meets one after the other are the solution of the triangular system (I + rate tril(G, -1)) E = T - Phi W, and
-    the weights then gain rate Phi' E (derived).
-    """
-    for start in range(0, len(inputs), _BLOCK):
-        phi = network.features(inputs[start : start + _BLOCK])
-        before = targets[start : start + _BLOCK] - phi @ network.weights
-        system = np.tril(rate * (phi @ phi.T), -1)
-        np.fill_diagonal(system, 1.0)
-        errors = scipy.linalg.solve_triangular(system, before, lower=True, unit_diagonal=True)
-        network.weights += rate * (phi.T @ errors)
 
 
 class LeastSquares:
@@ -72,15 +52,6 @@ class LeastSquares:
         self._covariance = _symmetric(np.linalg.inv(information + scaled.T @ phi))
         errors = targets - phi @ self.network.weights
         self.network.weights += self._covariance @ (scaled.T @ errors)
-
-
-def folds(groups: IntArray, count: int) -> Iterable[tuple[BoolArray, BoolArray]]:
-    """`count` pairs of boolean masks (learn, check), whole groups in each: what is checked was never near to what was
-    learned. `groups` (b,) tells which samples belong together."""
-    names = np.unique(groups)
-    for number in range(count):
-        check = np.isin(groups, names[number::count])
-        yield ~check, check
 
 
 def _symmetric(matrix: NDArray[Any]) -> FloatArray:

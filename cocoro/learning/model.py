@@ -17,10 +17,9 @@ from msgspec import Meta
 
 from cocoro.arrays import FloatArray
 from cocoro.errors import ConfigError
-from cocoro.learning.dataset import fingerprint_of
 from cocoro.learning.handmap import Coordinates, HandMap
 from cocoro.learning.network import HyperplaneRbf
-from cocoro.learning.nominal_model import NominalModel
+from cocoro.learning.nominal_model import NominalModel, fingerprint_of
 from cocoro.messages import FiniteVec3
 from cocoro.robot import Robot
 

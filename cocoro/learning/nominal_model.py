@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
+
+import msgspec
 import numpy as np
 
 from cocoro.arrays import FloatArray
@@ -88,3 +91,22 @@ class NominalModel:
         grid = np.stack(np.meshgrid(*[axis] * len(self.joints), indexing="ij"), axis=-1).reshape(-1, len(self.joints))
         grid = grid[np.random.default_rng(0).permutation(len(grid))]
         return grid, self.predict(grid)
+
+
+def fingerprint_of(robot: Robot) -> str:
+    """A fingerprint of what positions and turns are computed with: links, zeros of the joints, marker, wheels, camera.
+    Descriptions that agree in these have equal fingerprints. Fields with their default value are left out, so that a
+    field that is added to descriptions later does not change the fingerprint."""
+    data = robot.to_data()
+    drawing = {
+        "link": data["link"],
+        "joint": [(row["name"], row["direction"], row["centre_count"]) for row in data["joint"]],
+        "marker": data["marker"],
+        "base": [data["base"][name] for name in ("wheel_separation_m", "wheel_radius_m")],
+        "kinect": {
+            field.name: data["kinect"][field.name]
+            for field in msgspec.structs.fields(robot.kinect)
+            if field.required or getattr(robot.kinect, field.name) != field.default
+        },
+    }
+    return hashlib.sha256(msgspec.json.encode(drawing, order="deterministic")).hexdigest()[:16]
