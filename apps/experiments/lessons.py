@@ -16,6 +16,7 @@ from apps.learning.wheels import fit_wheels
 from cocoro.clock import NS
 from cocoro.learning import model
 from cocoro.learning.handmap import NominalModel
+from cocoro.robot import Robot
 from services.planning.teaching import Adapter
 
 SIZES = (100, 300, 1000, 2000)
