@@ -19,7 +19,7 @@ from cocoro.clock import RealClock
 from cocoro.errors import ConfigError
 from services.kinect import grabber as grabbing
 from services.kinect.camera import FreenectCamera
-from services.kinect.config import KinectConfig
+from services.kinect.device import KinectConfig
 from services.kinect.freenect import (
     COLOUR_BYTES,
     DEPTH_BYTES,
