@@ -18,8 +18,8 @@ from apps.learning.dataset import HandRow, SampleFile, WheelRow, hand_header, wh
 from apps.learning.study import BEST, METHODS, fit
 from cocoro.errors import ConfigError, RefusedError
 from cocoro.learning import model
+from cocoro.learning.handmap import NominalModel
 from cocoro.learning.model import Training, WheelModel
-from cocoro.learning.nominal_model import NominalModel
 from cocoro.robot import Robot
 
 TRAINING = Training(data="0123456789abcdef", samples=600, method=BEST.name, scores={"held_out_rms_m": 0.0035})
@@ -65,7 +65,7 @@ KILLED = """
 import sys
 from pathlib import Path
 from apps.learning.dataset import HandRow, SampleFile, hand_header
-from cocoro.learning.nominal_model import NominalModel
+from cocoro.learning.handmap import NominalModel
 from cocoro.robot import Robot
 
 robot = Robot.load()

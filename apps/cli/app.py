@@ -32,7 +32,9 @@ COMMANDS = (
     CommandRow("objects", WATCH, "The objects that the robot knows, and where it saw each last; `learn` adds one."),
     CommandRow("snapshot", WATCH, "Write a picture of what the robot sees now, with its detections drawn in."),
     CommandRow(
-        "topics", WATCH, "What travels on the mesh: every key, its type, rate, quality of service and publisher."
+        "topics",
+        WATCH,
+        "List the topics and requests of all installed components: type, rate, age, quality of service, publisher.",
     ),
     CommandRow("capture", CAPTURES, "Look at capture files, repair them, re-execute services on them."),
     CommandRow("record", CAPTURES, "Record what travels on the mesh into MCAP files, until Ctrl-C."),
