@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from apps.cli import app, estop
+from apps.cli import app, stop_asking
 from apps.cli.main import PACKAGES, main
 from apps.cli.options import frames_of, latencies_of
 from apps.cli.running import overrides
@@ -176,7 +176,7 @@ def test_the_emergency_stop_imports_next_to_nothing() -> None:
 
 
 def test_the_emergency_stop_knows_what_can_be_stopped() -> None:
-    assert stoppable() == estop.STOPPABLE
+    assert stoppable() == stop_asking.STOPPABLE
 
 
 def test_a_foreign_package_that_hides_one_of_ours_is_named(tmp_path: Path) -> None:

@@ -13,10 +13,10 @@ from apps.cli.babble import BabbleDisplay
 from apps.cli.main import main
 from apps.cli.progress import SilentDisplay
 from apps.learning.collector import Coverage, HandCollector, WheelCollector, collector
+from apps.learning.dataset import HandRow, SampleFile, WheelRow, hand_header, wheel_header
 from apps.learning.study import BEST
 from cocoro.learning import model
-from cocoro.learning.dataset import HandRow, SampleFile, WheelRow, hand_header, wheel_header
-from cocoro.learning.nominal_model import NominalModel
+from cocoro.learning.handmap import NominalModel
 from cocoro.messages import HandSample, TaskState, WheelTrial
 from cocoro.robot import Robot
 from cocoro.topics import HAND_SAMPLES

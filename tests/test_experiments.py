@@ -15,15 +15,15 @@ from learning_arm import sightings
 
 from apps.cli.experiment import RunProgress
 from apps.cli.main import main
-from apps.experiments import bodies, lessons, report
-from apps.experiments.every import EXPERIMENTS
+from apps.experiments import lessons, plan, report
+from apps.experiments.experiments import EXPERIMENTS
+from apps.experiments.plan import ExperimentSettings
 from apps.experiments.results import summarise
 from apps.experiments.runs import ExperimentRun, RunResult, perform
-from apps.experiments.settings import ExperimentSettings
+from apps.learning.dataset import HandRow, SampleFile, WheelRow, hand_header, wheel_header
 from apps.learning.study import BEST
 from apps.rehearsal.request import RehearsalRequest
-from cocoro.learning.dataset import HandRow, SampleFile, WheelRow, hand_header, wheel_header
-from cocoro.learning.nominal_model import NominalModel
+from cocoro.learning.handmap import NominalModel
 from cocoro.robot import Robot
 
 # --- statistics ---------------------------------------------------------------------------------------
@@ -73,6 +73,18 @@ def test_every_experiment_asks_for_rehearsals_that_are_possible_and_names_what_i
             msgspec.json.encode(run.fields)
 
 
+def test_every_run_of_an_experiment_is_of_the_robot_that_is_described(tmp_path: Path) -> None:
+    own = tmp_path / "own.toml"
+    own.write_text("[base]\nwheel_separation_m = 0.3\n")
+    settings = ExperimentSettings(seeds=(0,), out=tmp_path, measured=str(own))
+    assert settings.robot().base.wheel_separation_m == 0.3
+    for experiment in EXPERIMENTS.values():
+        for run in experiment.runs(settings):
+            assert run.fields["measured"] == str(own)
+            if run.kind == "rehearse":
+                assert msgspec.convert(run.fields, RehearsalRequest).measured == str(own)
+
+
 def test_what_cannot_be_run_fails_with_its_reason_and_so_does_what_needs_it(tmp_path: Path) -> None:
     runs = [
         ExperimentRun("one", "learn", {"arm": str(tmp_path / "a"), "wheels": "w", "into": str(tmp_path / "m.json")}),
@@ -115,7 +127,7 @@ def learned(tmp_path_factory: pytest.TempPathFactory, robot: Robot) -> tuple[Exp
     """A body that has learned, and what its lesson says."""
     settings = ExperimentSettings(seeds=(0,), out=tmp_path_factory.mktemp("experiments"))
     arm_and_wheels(settings, robot)
-    run = bodies.learned(settings, 0)[-1]
+    run = plan.learned(settings, 0)[-1]
     return settings, lessons.learn(**run.fields, method=BEST.name)
 
 

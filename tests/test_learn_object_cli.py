@@ -19,6 +19,7 @@ from perception_scenes import Canvas, Scene, Thing, facing
 from apps.cli.learn_object import size_of
 from apps.cli.main import main
 from apps.cli.toml_files import save, with_object
+from apps.pictures import colour_of
 from apps.rehearsal.rehearse import rehearse
 from apps.rehearsal.request import RehearsalRequest
 from cocoro.bus.endpoints import default
@@ -29,7 +30,6 @@ from cocoro.errors import ConfigError
 from cocoro.messages import ServoState
 from cocoro.node import Node
 from cocoro.objects import Catalogue, LabBox, ObjectSpec, own_text
-from cocoro.picture import colour_of
 from cocoro.robot import Robot
 from cocoro.topics import ARM_STATE, FRAME
 from deploy import profiles

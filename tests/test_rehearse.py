@@ -101,6 +101,15 @@ def test_parking_needs_nothing_to_be_seen() -> None:
     assert (result["outcome"], result["truth"]["collisions"]) == ("done", ())
 
 
+def test_a_rehearsal_is_of_the_robot_that_is_described(tmp_path: Path) -> None:
+    own = tmp_path / "own.toml"
+    own.write_text("[base]\nwheel_separation_m = 0.3\n")
+    result = rehearse(small(task="park", label="", measured=str(own)))
+    assert (result["outcome"], result["body"]["wheel_separation_m"]) == ("done", 0.3)
+    with pytest.raises(ConfigError, match=r"robot description .*nothing\.toml"):
+        rehearse(small(description=str(tmp_path / "nothing.toml")))
+
+
 # --- exact re-execution ---------------------------------------------------------------------------
 
 

@@ -17,6 +17,7 @@ import msgspec
 from msgspec.structs import replace
 
 from apps.learning.collector import SampleCollector, collector
+from apps.pictures import draw, save_png
 from apps.rehearsal.lockstep import LOCKSTEP_PLANNER, LOCKSTEP_SETTINGS, LockstepCycle, LockstepNode
 from apps.rehearsal.request import RehearsalRequest
 from cocoro import topics
@@ -28,7 +29,6 @@ from cocoro.inbox import Stream
 from cocoro.messages import Detections, Frame, Recording, TaskReply, TaskRequest, TaskState
 from cocoro.node import Node
 from cocoro.objects import Catalogue
-from cocoro.picture import draw, save_png
 from cocoro.robot import Robot
 from cocoro.tasks import Task
 from cocoro.vloop import run_virtual
@@ -72,17 +72,16 @@ class TaskRefusedError(CocoroError):
 class _Rehearsal:
     def __init__(self, request: RehearsalRequest) -> None:
         self._request = request
+        self._robot = Robot.load(*(Path(file) if file else None for file in (request.description, request.measured)))
         self._task: Task = request.task
         label = self._task.target
         scene = find_scene(request.scene, request.seed, label)
         present = label if label in [item.label for item in scene.objects] else ""
         self._judge: Judge | PursuitJudge = (
-            PursuitJudge(Robot.load(), scene, present)
-            if self._task.pursuit_phase and present
-            else Judge(scene, present)
+            PursuitJudge(self._robot, scene, present) if self._task.pursuit_phase and present else Judge(scene, present)
         )
         self._scene = scene
-        self._body = body_of(Robot.load(), request.body, request.seed).robot
+        self._body = body_of(self._robot, request.body, request.seed).robot
         self._trace = Trace(self._body, present)
         self._steps: list[dict[str, Any]] = []
         """One by one, the tasks that came to an end."""
@@ -93,7 +92,7 @@ class _Rehearsal:
 
     async def run(self) -> dict[str, Any]:
         request = self._request
-        mesh, clock, robot = LocalMesh(), VirtualClock(), Robot.load()
+        mesh, clock, robot = LocalMesh(), VirtualClock(), self._robot
         cycle = LockstepCycle()
         async with AsyncExitStack() as stack:
             services = []

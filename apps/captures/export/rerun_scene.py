@@ -18,6 +18,7 @@ import numpy as np
 from apps.captures.export.files import making
 from apps.captures.export.geometry import CAMERA, Posture, about_z, conjugate, points, quaternion, rotated
 from apps.captures.export.story import catalogue_of, robot_of
+from apps.pictures import describe
 from cocoro.capture.conventions import CaptureError
 from cocoro.capture.reader import Capture
 from cocoro.capture.types import NotReadableError
@@ -34,7 +35,6 @@ from cocoro.messages import (
     Truth,
 )
 from cocoro.objects import Catalogue
-from cocoro.picture import describe
 from cocoro.robot import Robot
 
 APPLICATION = "cocoro"

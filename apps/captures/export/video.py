@@ -13,12 +13,12 @@ import cv2
 
 from apps.captures.export.files import making
 from apps.captures.export.story import Story, catalogue_of, read
+from apps.pictures import draw
 from cocoro.arrays import ImageArray
 from cocoro.capture.conventions import CaptureError
 from cocoro.capture.reader import Capture
 from cocoro.clock import NS
 from cocoro.messages import Frame
-from cocoro.picture import draw
 from cocoro.topics import FRAME
 
 RATE_HZ = 30.0

@@ -6,11 +6,11 @@ from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
-from apps.experiments import bodies, figures
+from apps.experiments import figures, plan
 from apps.experiments.lessons import SIZES
+from apps.experiments.plan import ExperimentSettings
 from apps.experiments.results import Plot, Section, row
 from apps.experiments.runs import ExperimentRun, RunResult
-from apps.experiments.settings import ExperimentSettings
 from apps.learning.study import BEST, METHODS
 from services.executive.tasks import BabbleArmTask
 
@@ -25,21 +25,22 @@ AFTER = 100
 def runs(settings: ExperimentSettings) -> list[ExperimentRun]:
     found = []
     for seed in settings.seeds:
-        found += bodies.learned(settings, seed)
+        found += plan.learned(settings, seed)
         bent = {
             "task": BabbleArmTask(count=BENT_SAMPLES), "samples": str(settings.bent_file(seed)), "bend_s": BEND_S,
             **settings.common(seed),
         }  # fmt: skip
         lesson = {"into": str(settings.model_file(seed)), "bent": str(settings.bent_file(seed)), "bend_s": BEND_S}
+        lesson |= settings.robot_files
         found.append(ExperimentRun(f"babble-bent-{seed}", "rehearse", bent))
         found.append(
-            ExperimentRun(f"bend-{seed}", "bend", lesson, needs=(f"babble-bent-{seed}", bodies.learned_name(seed)))
+            ExperimentRun(f"bend-{seed}", "bend", lesson, needs=(f"babble-bent-{seed}", plan.learned_name(seed)))
         )
     return found
 
 
 def section(settings: ExperimentSettings, results: Mapping[str, RunResult]) -> Section:
-    learned = {seed: results[bodies.learned_name(seed)] for seed in settings.seeds}
+    learned = {seed: results[plan.learned_name(seed)] for seed in settings.seeds}
     good = {seed: result for seed, result in learned.items() if "error" not in result}
     bent = [r for seed in settings.seeds if "error" not in (r := results[f"bend-{seed}"])]
     made = Section(KEY, TITLE, _about(good))
@@ -119,7 +120,7 @@ def _plots(settings: ExperimentSettings, good: Mapping[int, RunResult], bent: li
         plots.append(
             Plot("e1-hand", f"The hand on the held-out draws of seed {seed}: seen, by the nominal model, and by the"
                  " learned map.",
-                 partial(figures.hand_places, settings.arm_file(seed), settings.model_file(seed)))
+                 partial(figures.hand_places, settings.arm_file(seed), settings.model_file(seed), settings.robot()))
         )  # fmt: skip
         curves = [result["curves"] for result in good.values()]
         plots.append(Plot("e1-curves", "Held-out error against samples; the mean over the seeds, and all seeds.",

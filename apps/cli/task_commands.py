@@ -22,9 +22,11 @@ from typer.main import get_group
 from apps.cli.options import (
     AdaptOption,
     BodyOption,
+    DescriptionOption,
     FramesOption,
     JsonOption,
     LatencyOption,
+    MeasuredOption,
     MeshOption,
     ModelOption,
     ObjectsOption,
@@ -76,6 +78,8 @@ def rehearse(
         str, typer.Option(metavar="ideal|real", help="Perfect camera and body, or real ones.")
     ] = "ideal",
     body: BodyOption = "nominal",
+    description: DescriptionOption = None,
+    measured: MeasuredOption = None,
     model: ModelOption = None,
     reach: ReachOption = None,
     adapt: AdaptOption = False,
@@ -102,6 +106,7 @@ def rehearse(
     options = {
         "task": task, "scene": scene, "seed": seed, "sensors": sensors, "body": body, "model": _text(model),
         "reach": reach or "learned", "adapt": adapt, "bend_s": bend, "samples": _text(samples), "lockstep": lockstep,
+        "description": _text(description), "measured": _text(measured),
         "objects": _text(objects), "timeout_s": timeout, "picture": _text(picture), "record": _text(record),
     }  # fmt: skip
     sys.exit(rehearsing.rehearse(options, latency or [], frames, json))

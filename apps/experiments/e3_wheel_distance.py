@@ -6,25 +6,24 @@ from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
-from apps.experiments import bodies, figures
+from apps.experiments import figures, plan
+from apps.experiments.plan import ExperimentSettings
 from apps.experiments.results import Plot, ResultRow, Section, row
 from apps.experiments.runs import ExperimentRun, RunResult
-from apps.experiments.settings import ExperimentSettings
-from cocoro.robot import Robot
 
 KEY, TITLE = "E3", "The distance between the wheels, from babbling"
 MEDIAN_M, WORST_M = 0.003, 0.008
 
 
 def runs(settings: ExperimentSettings) -> list[ExperimentRun]:
-    return [run for seed in settings.seeds for run in bodies.learned(settings, seed)]
+    return [run for seed in settings.seeds for run in plan.learned(settings, seed)]
 
 
 def section(settings: ExperimentSettings, results: Mapping[str, RunResult]) -> Section:
     good = [
-        (results[bodies.learned_name(seed)]["wheels"], results[f"babble-wheels-{seed}"]["body"])
+        (results[plan.learned_name(seed)]["wheels"], results[f"babble-wheels-{seed}"]["body"])
         for seed in settings.seeds
-        if "error" not in results[bodies.learned_name(seed)]
+        if "error" not in results[plan.learned_name(seed)]
     ]
     made = Section(
         KEY,
@@ -32,7 +31,7 @@ def section(settings: ExperimentSettings, results: Mapping[str, RunResult]) -> S
         f"A can 1.5 m ahead; {settings.trials} trials, in pairs of a Sobol draw within ±0.15 m/s for each wheel for 1 s"
         " and its reverse. The can is seen before and after each.",
     )
-    nominal_m = Robot.load().base.wheel_separation_m
+    nominal_m = settings.robot().base.wheel_separation_m
     for measure, key in (("wheel distance", "wheel_separation_m"), ("distance that turns it", "turning_separation_m")):
         axle = key == "wheel_separation_m"
         true_m = [body[key] for _, body in good]
