@@ -44,6 +44,7 @@ from cocoro.node import Node
 from cocoro.robot import Robot
 from deploy.rundir import RunDir
 from services.capture.file import Packer
+from services.executive.tasks import FetchTask
 
 COCORO = [sys.executable, "-m", "apps.cli.main"]
 HEARD_S, LOOK_S = 10.0, 0.2
@@ -205,7 +206,7 @@ def frames(folder: Path) -> None:
     """Time of the processor, since the machine may have other work."""
     for sensors in ("ideal", "real"):
         path = folder / f"{sensors}.mcap"
-        rehearse(RehearsalRequest(task="fetch", label="red_can", sensors=sensors, record=str(path)))
+        rehearse(RehearsalRequest(task=FetchTask(label="red_can"), sensors=sensors, record=str(path)))
         with Capture.open(path) as capture:
             payloads = [bytes(each.payload) for each in list(capture.messages("kinect/frame"))[10:250:8]]
         for compression in ("zstd", "lz4"):

@@ -25,13 +25,14 @@ from cocoro.capture.conventions import CaptureError
 from cocoro.capture.reader import Capture, Record
 from cocoro.clock import NS
 from services.capture.file import Packer
+from services.executive.tasks import FetchTask
 
 
 def damage(folder: Path, times: int) -> None:
     """What each command makes of damaged captures."""
     second, spoilt = folder / "second.mcap", folder / "spoilt.mcap"
     request = RehearsalRequest(
-        task="fetch", label="red_can", width=160, height=120, frame_rate_hz=10.0, record=str(folder / "whole.mcap")
+        task=FetchTask(label="red_can"), width=160, height=120, frame_rate_hz=10.0, record=str(folder / "whole.mcap")
     )
     rehearse(request)
     with Capture.open(folder / "whole.mcap") as capture:

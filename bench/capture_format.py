@@ -41,6 +41,7 @@ from services.capture import file
 from services.capture.file import QUICK, Packer
 from services.capture.keys import QueuedMessage, info_of
 from services.capture.writer import CaptureWriter, Limits
+from services.executive.tasks import FetchTask
 
 SMALL_BYTES = 64 * 1024
 MEMORY = Path("/dev/shm")
@@ -49,7 +50,7 @@ MEMORY = Path("/dev/shm")
 def recorded(folder: Path, sensors: Literal["ideal", "real"], seconds: float) -> list[QueuedMessage]:
     """The first messages of a rehearsed fetch, in order."""
     path = folder / f"{sensors}.mcap"
-    rehearse(RehearsalRequest(task="fetch", label="red_can", sensors=sensors, record=str(path)))
+    rehearse(RehearsalRequest(task=FetchTask(label="red_can"), sensors=sensors, record=str(path)))
     with Capture.open(path) as capture:
         end_ns = capture.start_ns + round(seconds * NS)
         made = [

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from bench.fault_bus import LATE_S, FaultyBus, Way
-from bench.fault_scenes import Drive, Errand
+from bench.fault_scenes import Errand
 from cocoro import topics
 from cocoro.bus.base import Payload, Qos
 from cocoro.bus.local import LocalMesh
@@ -35,7 +35,7 @@ WATCH_S = 1.0
 FRAMES = {"width": 320, "height": 240, "frame_rate_hz": 30.0, "sensors": "real"}
 
 
-def full_speed_mps(drive: Drive) -> float:
+def full_speed_mps(drive: str) -> float:
     """The highest speed that the planner drives at, of itself, on an errand."""
     planning = PlanningConfig()
     return planning.follow.max_speed_mps if drive == "follow" else planning.navigation.max_speed_mps
@@ -114,7 +114,7 @@ class FaultRobot:
     async def drive(self, rng: random.Random) -> MotionRow:
         """Give the task, and be at full speed at a random moment; how the body moves then. Raises NotFastError."""
         await self._begin()
-        full_mps = 0.97 * full_speed_mps(self._errand.task)
+        full_mps = 0.97 * full_speed_mps(self._errand.task.name)
         end_s = PATIENCE_S + self._now_s()
         while self._now_s() < end_s:
             await asyncio.sleep(0.02)
@@ -123,12 +123,10 @@ class FaultRobot:
             await asyncio.sleep(rng.uniform(0.0, 0.8))
             if (now := self._newest()).speed_mps >= full_mps:
                 return now
-        raise NotFastError(f"{self._errand.task} {self._errand.label}: never at {full_mps:.2f} m/s")
+        raise NotFastError(f"{self._errand.task.name} {self._errand.task.target}: never at {full_mps:.2f} m/s")
 
     async def _begin(self) -> None:
-        question = TaskRequest(
-            task=self._errand.task, label=self._errand.label, distance_m=0.4, for_s=60.0, timeout_s=60.0
-        )
+        question = TaskRequest(task=self._errand.task, timeout_s=60.0)
         for _ in range(100):
             await asyncio.sleep(0.05)
             reply = TaskReply(accepted=False)

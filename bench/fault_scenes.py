@@ -7,6 +7,9 @@ from math import cos, pi, sin
 from pathlib import Path
 from typing import Literal, NamedTuple
 
+from cocoro.tasks import Task
+from services.executive.tasks import FetchTask, FollowTask, GoToTask
+
 Drive = Literal["fetch", "go-to", "follow"]
 DRIVES: tuple[Drive, ...] = ("fetch", "go-to", "follow")
 CANS = ("red_can", "green_can", "blue_can")
@@ -16,8 +19,7 @@ BALL = "blue_ball"
 class Errand(NamedTuple):
     """A task, and the file of the scene that it is for."""
 
-    task: Drive
-    label: str
+    task: Task
     scene: Path
 
 
@@ -26,14 +28,16 @@ def draw_errand(drive: Drive, rng: random.Random, folder: Path) -> Errand:
     scene = folder / "scene.toml"
     if drive == "follow":
         scene.write_text(_walk(rng))
-        return Errand(drive, BALL, scene)
+        return Errand(FollowTask(label=BALL, for_s=60.0), scene)
     labels = rng.sample(CANS, k=3)
     text = _can(labels[0], rng.uniform(1.7, 2.6), rng.uniform(-0.5, 0.5))
     for number, label in enumerate(labels[1 : 1 + rng.randrange(3)]):
         side = 1.0 if number else -1.0
         text += _can(label, rng.uniform(1.2, 2.4), side * rng.uniform(0.75, 1.1))
     scene.write_text(text)
-    return Errand(drive, labels[0], scene)
+    target = labels[0]
+    task = FetchTask(label=target) if drive == "fetch" else GoToTask(label=target, distance_m=0.4)
+    return Errand(task, scene)
 
 
 def _can(label: str, distance_m: float, bearing_rad: float) -> str:

@@ -32,6 +32,7 @@ from cocoro.messages import PlannerStatus, TaskReply, TaskRequest, TaskState
 from cocoro.node import Node
 from cocoro.robot import Robot
 from deploy.rundir import Target
+from services.executive.tasks import FetchTask, FollowTask
 from sim.motion import MotionRow, read_motion
 
 VICTIMS = {"sim": ("planning", "executive", "perception"), "sim-wire": ("base", "arm")}
@@ -100,8 +101,8 @@ class LiveRobot:
 
     async def at_speed(self, errand: Errand, rng: random.Random) -> MotionRow:
         """Give the task, and be at full speed at a random moment. Raises TimeoutError."""
-        await self.begin(TaskRequest(task=errand.task, label=errand.label, distance_m=0.4, for_s=60.0))
-        full_mps = 0.97 * full_speed_mps(errand.task)
+        await self.begin(TaskRequest(task=errand.task))
+        full_mps = 0.97 * full_speed_mps(errand.task.name)
         async with asyncio.timeout(PATIENCE_S):
             while True:
                 await asyncio.sleep(0.005)
@@ -155,7 +156,7 @@ async def _trial(number: int, profile: str, rng: random.Random) -> LiveTrial:
         moving = [row for row in robot.rows if row.sim_ns > since_ns and row.moves_mps >= STANDING_MPS]
         stood_ns, real_ns = (moving[-1].sim_ns, moving[-1].real_ns) if moving else (since_ns, sent_ns)
     return LiveTrial(
-        f"{victim} {how.name}", errand.task, round(before.speed_mps + before.rim_mps, 3),
+        f"{victim} {how.name}", errand.task.name, round(before.speed_mps + before.rim_mps, 3),
         round((stood_ns - since_ns) / NS, 4), round((real_ns - sent_ns) / NS, 4),
     )  # fmt: skip
 
@@ -252,7 +253,7 @@ async def _alarms(scene: str, question: TaskRequest, *settings: str) -> Alarms:
     events, deepest, stood = _deadman(rows)
     steps = 1.0 / 240
     return Alarms(
-        f"{question.task} {scene}", state.elapsed_s, steps * sum(row.asked_mps > STANDING_MPS for row in rows),
+        f"{question.task.name} {scene}", state.elapsed_s, steps * sum(row.asked_mps > STANDING_MPS for row in rows),
         events, deepest, stood, sum(1 for _ in _events(whys, "slower, for")),
         Counter(_events(whys, "standing still:")), state.outcome or "",
     )  # fmt: skip
@@ -274,8 +275,8 @@ def alarms(count: int, others: int, settings: Sequence[str]) -> bool:
     with busy(others):
         for _ in range(count):
             for scene, question in (
-                ("paper", TaskRequest(task="fetch", label="red_can")),
-                ("follow-fast", TaskRequest(task="follow", label="blue_ball", for_s=24.0)),
+                ("paper", TaskRequest(task=FetchTask(label="red_can"))),
+                ("follow-fast", TaskRequest(task=FollowTask(label="blue_ball", for_s=24.0))),
             ):
                 met = asyncio.run(_alarms(scene, question, *settings))
                 well = well and met.outcome == "done"

@@ -15,6 +15,7 @@ from concurrent.futures import ProcessPoolExecutor
 from typing import Any
 
 from apps.rehearsal.request import RehearsalRequest
+from services.executive.tasks import FetchTask, FollowTask
 from sim.random_scene import random_scene
 
 Result = dict[str, Any]
@@ -46,24 +47,24 @@ def _not_found(result: Result) -> bool:
 
 def _paper(seed: int) -> Iterator[dict[str, Any]]:
     for label in PAPER:
-        yield {"task": "fetch", "label": label}
+        yield {"task": FetchTask(label=label)}
 
 
 def _random(seed: int) -> Iterator[dict[str, Any]]:
-    yield {"task": "fetch", "label": random_scene(seed).objects[0].label, "scene": "random"}
+    yield {"task": FetchTask(label=random_scene(seed).objects[0].label), "scene": "random"}
 
 
 def _follow(seed: int) -> Iterator[dict[str, Any]]:
-    yield {"task": "follow", "label": "blue_ball", "scene": "follow", "for_s": 33.0}
-    yield {"task": "follow", "label": "blue_ball", "scene": "follow-fast", "for_s": 24.0}
+    yield {"task": FollowTask(label="blue_ball", for_s=33.0), "scene": "follow"}
+    yield {"task": FollowTask(label="blue_ball", for_s=24.0), "scene": "follow-fast"}
 
 
 def _bring(seed: int) -> Iterator[dict[str, Any]]:
-    yield {"task": "fetch", "label": PAPER[seed % 3], "bring": True}
+    yield {"task": FetchTask(label=PAPER[seed % 3], bring=True)}
 
 
 def _absent(seed: int) -> Iterator[dict[str, Any]]:
-    yield {"task": "fetch", "label": "yellow_ball"}
+    yield {"task": FetchTask(label="yellow_ball")}
 
 
 SETS: dict[str, tuple[Callable[[int], Iterator[dict[str, Any]]], Callable[[Result], bool]]] = {
@@ -92,7 +93,7 @@ def _line(request: RehearsalRequest, result: Result, good: bool) -> str:
         if value not in ([], None)
     }
     mark = "ok " if good else "BAD"
-    what = f"{request.task} {request.label} {request.scene} seed {request.seed}"
+    what = f"{request.task.name} {request.task.target} {request.scene} seed {request.seed}"
     return f"{mark} {what:44s} {result['outcome']} {result['reason']} {result['sim_s']:.1f} s {json.dumps(truth)}"
 
 

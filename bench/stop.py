@@ -39,6 +39,7 @@ from cocoro.node import Node
 from cocoro.robot import Robot
 from cocoro.topics import Topic
 from deploy.rundir import Target
+from services.executive.tasks import FetchTask
 
 STANDING_MPS = 0.01
 BOUNDS_S = {"quiet": 0.3, "loaded": 1.0}
@@ -251,7 +252,7 @@ async def _still_latched(here: Place) -> str:
         for topic in reporting:
             await asyncio.wait_for(node.latest(topic).next(), PATIENCE_S)
         await asyncio.sleep(1.5)  # longer than a cold start takes to be believed
-        reply = await node.call(topics.RUN, TaskRequest(task="fetch", label="red_can"), 10.0)
+        reply = await node.call(topics.RUN, TaskRequest(task=FetchTask(label="red_can")), 10.0)
         if reply.accepted or set(states.values()) != {"latched"}:
             return f"{states}, a fetch was {reply.refusal or 'accepted'}"
     return ""

@@ -1,4 +1,4 @@
-"""One line of `cocoro doctor`: what was looked at, whether it is well, and what to do if it is not."""
+"""The lines of `cocoro doctor`: what was checked, the result, and what to do about a problem."""
 
 from __future__ import annotations
 
@@ -6,9 +6,11 @@ from typing import Literal, NamedTuple
 
 
 class Check(NamedTuple):
+    """One line."""
+
     name: str
     state: Literal["ok", "note", "bad"]
-    """A note is worth knowing, and keeps nothing from working."""
+    """A `note` is information: everything works nevertheless."""
     text: str
 
 

@@ -1,7 +1,7 @@
-"""The contract of a service's pure core: no I/O, no clock, no randomness of its own.
+"""The contract of a pure core: no I/O, no clock, no source of randomness besides its inputs.
 
-The node gathers what arrived since the last step, calls `step`, and publishes what it returns; it can record
-for each step its `now` and what was consumed, which is all that exact re-execution needs.
+The node collects the messages that arrive between two steps, calls `step` and publishes the outputs. It can record the
+time and the inputs of each step; exact re-execution needs nothing else.
 """
 
 from __future__ import annotations
@@ -14,37 +14,41 @@ from cocoro.messages import Message
 from cocoro.topics import Topic
 
 Take = Literal["latest", "all"]
-"""`latest`: of what arrived since the last step only the newest. `all`: everything, in order (bounded)."""
+"""Which messages of a topic a step gets: the newest since the last step, or all of them in order (bounded)."""
 
 
 class Sample(NamedTuple):
+    """One input of a step."""
+
     topic: Topic[Any]
     message: Message
 
 
 class Output(NamedTuple):
+    """One output of a step."""
+
     topic: Topic[Any]
     message: Message
-    """`stamp_ns` 0 lets the node stamp it with the step's now."""
+    """With `stamp_ns` 0 the node stamps it with the time of the step."""
 
 
 @dataclass(frozen=True)
 class Schedule:
-    """When a core is stepped: at a fixed rate, when a triggering topic arrives, or both."""
+    """When a core is stepped: at a fixed rate, when a message of a triggering topic arrives, or both."""
 
     rate_hz: float | None
     triggers: tuple[Topic[Any], ...] = ()
 
 
 class Core(Protocol):
-    """A service's maths."""
+    """The computation of a service, as a function of its inputs and its state."""
 
     @property
     def reads(self) -> Mapping[Topic[Any], Take]:
-        """The topics that it consumes."""
+        """The topics of its inputs."""
 
     @property
     def schedule(self) -> Schedule: ...
 
     def step(self, inputs: Sequence[Sample], now_ns: int) -> Sequence[Output]:
-        """One step. Same inputs and nows in the same order give the same outputs, always."""
+        """One step at the robot's time `now_ns`. Equal sequences of inputs and times give equal outputs."""

@@ -41,7 +41,7 @@ def check_port(what: str, name: str, robot: str, *, quick: bool) -> list[Check]:
     if not port.exists():
         return [bad(f"{what} port", f"there is no {path}: plug the adapter in; its name comes from {RULES}")]
     if not os.access(port, os.R_OK | os.W_OK):
-        return [bad(f"{what} port", f"{path} may not be used: `sudo usermod -aG dialout $USER`, then log in anew")]
+        return [bad(f"{what} port", f"{path} may not be used: `sudo usermod -aG dialout $USER`, then log in again")]
     checks = [ok(f"{what} port", path)]
     latency_ms = _latency_ms(port)
     if quick and latency_ms is not None:

@@ -115,96 +115,96 @@ def _service_of(name: str) -> str:
 
 FRAME = Topic(
     "kinect/frame", m.Frame, Qos.FRAME, 30.0, 0.5,
-    "Colour and raw depth. Older frames are not looked at.", max_bytes=16 * 1024 * 1024,
+    "Colour and raw depth. Perception ignores older frames.", max_bytes=16 * 1024 * 1024,
 )  # fmt: skip
 BASE_STATE = Topic(
     "base/state", m.BaseState, Qos.STATE, 50.0, 0.15,
-    "Odometry, bumpers, battery. Beyond its age the planner stops the base; until then it drives the slower.",
+    "Odometry, bumpers, battery. The older it is the slower the planner drives; beyond its age it stops the base.",
 )  # fmt: skip
 BASE_COMMAND = Topic(
     "base/command", m.BaseCommand, Qos.COMMAND, 50.0, 0.15,
-    "Wheel speeds. Beyond its age the base commands zero.",
+    "Wheel speeds. Beyond its age the base sets them to zero.",
     publisher="planning",
 )  # fmt: skip
 ARM_STATE = Topic(
     "arm/state", m.ServoState, Qos.STATE, 50.0, 0.15,
-    "Neck and arm servos. Beyond its age the planner commands nothing and detections stay unlocalised.",
+    "Neck and arm servos. Beyond its age the planner sends no commands, and detections are not localised.",
 )  # fmt: skip
 ARM_COMMAND = Topic(
     "arm/command", m.ServoCommand, Qos.COMMAND, 50.0, 0.15,
-    "Neck and arm goals. Beyond its age the joints hold where they are.",
+    "Neck and arm goals. Beyond its age the joints hold their positions.",
     publisher="planning",
 )  # fmt: skip
 HAND_STATE = Topic(
     "hand/state", m.ServoState, Qos.STATE, 50.0, 0.15,
-    "Wrist roll and claws. Beyond its age the planner does not start to grasp.",
+    "Wrist roll and claws. Beyond its age the planner does not begin to grasp.",
 )  # fmt: skip
 HAND_COMMAND = Topic(
     "hand/command", m.ServoCommand, Qos.COMMAND, 50.0, 0.15,
-    "Wrist roll and claw goals. Beyond its age the hand keeps its goal: what is held stays held.",
+    "Wrist roll and claw goals. Beyond its age the hand keeps its goal, so that it does not drop what it holds.",
     publisher="planning",
 )  # fmt: skip
 DETECTIONS = Topic(
     "perception/detections", m.Detections, Qos.STATE, 30.0, 1.0,
-    "Known objects in one frame, stamped with the frame's time. Older ones only age the target memory.",
+    "Known objects in one frame, stamped with the time of the frame. Older ones are not used.",
 )  # fmt: skip
 OBSTACLES = Topic(
     "perception/obstacles", m.Obstacles, Qos.STATE, 10.0, 1.0,
-    "What stands on the floor and where it is free, from the depth image. Older ones are not entered in the map.",
+    "Obstacles and free floor, from the depth image. Older ones are not entered in the map.",
     max_bytes=262_144,
 )  # fmt: skip
 PLAN = Topic(
     "planning/status", m.PlannerStatus, Qos.STATE, 50.0, 0.5,
-    "What the planner does and why. Beyond its age the running task fails: planner silent.",
+    "What the planner does, and the reason. Beyond its age the running task fails.",
 )  # fmt: skip
 HAND_SAMPLES = Topic(
     "planning/hand-samples", m.HandSample, Qos.EVENT, None, 1.0,
-    "What the arm's babbling saw: joint angles and the hand's marker at one time.",
+    "One sample of the arm's babbling: joint angles, and the position of the hand's marker at that time.",
 )  # fmt: skip
 WHEEL_TRIALS = Topic(
     "planning/wheel-trials", m.WheelTrial, Qos.EVENT, None, 1.0,
-    "What each trial of the wheels' babbling saw.",
+    "One trial of the wheels' babbling.",
 )  # fmt: skip
 MODEL = Topic(
     "planning/model", m.LearnedModel, Qos.EVENT, None, 1.0,
-    "The learned model that the planner has taken over.", max_bytes=8 * 1024 * 1024,
+    "The learned model that the planner has accepted.", max_bytes=8 * 1024 * 1024,
 )  # fmt: skip
 INTENT = Topic(
     "executive/intent", m.Intent, Qos.COMMAND, 50.0, 0.3,
-    "The behaviour that is wanted. The wheels stand when it is 0.15 s old; beyond its age the planner goes idle.",
+    "The wanted behaviour. The wheels stop when it is 0.15 s old; beyond its age the planner becomes idle.",
 )  # fmt: skip
 TASK = Topic(
     "executive/task", m.TaskState, Qos.EVENT, 5.0, 2.0,
-    "The running task's phase and progress, and its outcome.",
+    "The phase and the progress of the running task, and its outcome.",
 )  # fmt: skip
 LATCH = Topic(
     "executive/latch", m.Latch, Qos.STATE, 5.0, 2.0,
-    "The emergency stop's state, for hardware services that have just started.",
+    "The state of the emergency stop, for hardware services that have just started.",
 )  # fmt: skip
 CLOCK = Topic(
     "sim/clock", m.ClockTick, Qos.COMMAND, 120.0, 1.0,
-    "Simulated time. When it stands, time stands.",
+    "Simulated time. Time stands still without it.",
 )  # fmt: skip
 TRUTH = Topic(
     "sim/truth", m.Truth, Qos.STATE, 30.0, 1.0,
-    "Where everything really is: for tests, the judge and viewers alone.",
+    "The true poses: only for tests, the judge and viewers.",
 )  # fmt: skip
 HEALTH = Topic(
     "{service}/health", m.Health, Qos.STATE, 1.0, 3.0,
-    "A service's rates, ages, losses, loops, CPU and memory.",
+    "Rates, ages, losses, loops, CPU time and memory of a service.",
 )  # fmt: skip
 STEPS = Topic(
     "{service}/steps", m.StepRecord, Qos.EVENT, None, 1.0,
-    "What each step of a pure core consumed and gave (when recording of steps is on).",
+    "The inputs and outputs of each step of a pure core, when recording of steps is on.",
 )  # fmt: skip
 
 EXCHANGES = Topic(
     "{service}/requests", m.Exchange, Qos.EVENT, None, 1.0,
-    "Every request that a service was asked, with its answer: for the record.", max_bytes=4 * 1024 * 1024,
+    "Every request to a service, with its answer, for recorders.", max_bytes=4 * 1024 * 1024,
 )  # fmt: skip
 RECORDING = Topic(
     "{service}/recording", m.Recording, Qos.STATE, 1.0, 3.0,
-    "How a recorder is getting on: its file, what it dropped, why it stopped.",
+    "The state of a recorder: its file, what it dropped, why it stopped.",
 )  # fmt: skip
 
 TOPICS: tuple[Topic[Any], ...] = (
@@ -215,29 +215,29 @@ TOPICS: tuple[Topic[Any], ...] = (
 
 RUN = Request(
     "executive/run", m.TaskRequest, m.TaskReply,
-    "Start a task; refused with a reason when it cannot be.",
+    "Start a task; refused, with the reason, when that is not possible.",
 )  # fmt: skip
 CANCEL = Request(
     "executive/cancel", m.CancelRequest, m.TaskReply,
-    "End the running task; the robot stands still.",
+    "End the running task; the robot stops.",
 )  # fmt: skip
 OBJECTS = Request(
     "executive/objects", m.ObjectsRequest, m.ObjectsReply,
-    "The known objects and where each was seen last.",
+    "The known objects, and where each was seen last.",
 )  # fmt: skip
 ESTOP = Request(
     "{service}/estop", m.EstopRequest, m.EstopReply,
-    "Latch or release the emergency stop; answered by every hardware service and the executive.",
+    "Latch or release the emergency stop; answered by each service that moves something, and by the executive.",
     timeout_s=1.0,
 )  # fmt: skip
 
 LEARNED = Request(
     "planning/learned", m.ModelRequest, m.ModelReply,
-    "Take over a learned model; refused, with the reason, when it is damaged, foreign or of another version.",
+    "Use a learned model; refused, with the reason, when it is damaged, of another robot or of another version.",
 )  # fmt: skip
 RECOVER = Request(
     "base/recover", m.RecoverRequest, m.RecoverReply,
-    "Put a Create that left its mode back into it; answered by the real base.",
+    "Put a Create that has left its mode back into it; answered by the real base.",
     timeout_s=3.0,
 )  # fmt: skip
 SERVOS = Request(
@@ -247,7 +247,7 @@ SERVOS = Request(
 )  # fmt: skip
 ABOUT = Request(
     "{service}/about", m.AboutRequest, m.AboutReply,
-    "What a service is and what it was started with: answered by every service.",
+    "The component, settings and versions of a service; answered by every service.",
 )  # fmt: skip
 
 REQUESTS: tuple[Request[Any, Any], ...] = (RUN, CANCEL, OBJECTS, ESTOP, LEARNED, RECOVER, SERVOS, ABOUT)

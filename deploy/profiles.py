@@ -1,14 +1,14 @@
-"""Profiles: which robot, which processes, how they are configured and where they meet. One TOML file each.
+"""Profiles: TOML files that name a robot, its processes, their settings and their mesh.
 
 robot = "calliope"
 clock = "sim"                     # or "real"
 processes = ["sim", "perception", "planning", "executive"]
-objects = "objects.toml"          # known objects instead of the project's own; beside this file
+objects = "objects.toml"          # known objects instead of the project's own; relative to this file
 
-[mesh]                            # see deploy.rundir.Mesh; on one machine nothing need be said
-[service.sim]                     # that process's own Config; and for each of them
-latency_s = 0.0                   #   added to every step, as if computing took that much longer
-record_steps = false              #   publish what each step consumed
+[mesh]                            # see deploy.rundir.Mesh; on one machine it may be left out
+[service.sim]                     # the settings of that component, and for any component:
+latency_s = 0.0                   #   added to every step, as if its computation took longer
+record_steps = false              #   publish the inputs and outputs of each step
 """
 
 from __future__ import annotations
@@ -30,49 +30,65 @@ from deploy.rundir import Mesh
 
 C = TypeVar("C")
 Name = Annotated[str, Meta(pattern=r"\A[a-z0-9][a-z0-9_-]{0,31}\Z")]
-"""A chunk of a key, and a directory."""
+"""A chunk of a key, and the name of a directory."""
 
 PACKAGE = "deploy"
-"""Where the profiles that come with the project are; a resource, not an import."""
+"""The package whose resources contain the project's profiles."""
 
 
 class Launch(msgspec.Struct, frozen=True, kw_only=True):
-    """What a `[service.NAME]` table may say of any process, beside what its own Config says."""
+    """Settings that every `[service.NAME]` table may have besides those of its component."""
 
     latency_s: Annotated[float, Meta(ge=0, le=60)] = 0.0
     record_steps: bool = False
 
 
 class Profile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A profile, resolved: overrides applied, paths absolute, names checked. Make it with `read`."""
+    """A resolved profile: overrides applied, paths absolute, names checked. `read` makes it."""
 
     name: str = ""
-    """Where it came from, for messages; not written in the file."""
+    """Its name or path, for error messages; not part of the file."""
     robot: Name
     clock: Literal["sim", "real"] = "real"
     processes: Annotated[tuple[Name, ...], Meta(min_length=1)]
-    """In the order in which they are started; they are stopped in reverse."""
+    """The components that are started, in this order; they are stopped in reverse order."""
     description: str | None = None
     """A robot description file instead of the Calliope's."""
     measured: str | None = None
-    """A robot's own file with the values that were measured on that robot; it overrides the description."""
+    """A file of values measured on this robot; they override the description."""
     objects: str | None = None
-    """A file of known objects instead of the project's own, for every process whose Config has a field of that name."""
+    """A file of known objects instead of the project's own, for every component with a setting `objects`."""
     mesh: Mesh = Mesh()
     service: dict[Name, dict[str, Any]] = {}
 
+    @property
+    def robot_files(self) -> tuple[Path | None, Path | None]:
+        """The description and the measured file, as `Robot.load` takes them."""
+        description, measured = (None if file is None else Path(file) for file in (self.description, self.measured))
+        return description, measured
+
+    def with_robot(self, description: Path | None, measured: Path | None) -> Profile:
+        """This profile with another description or measured file; None keeps its own."""
+        files = {"description": description, "measured": measured}
+        given = {name: str(file.resolve()) for name, file in files.items() if file is not None}
+        return msgspec.structs.replace(self, **given)
+
     def rows(self) -> tuple[Component, ...]:
+        """The components. Raises ConfigError for an unknown one."""
         return tuple(named(name) for name in self.processes)
 
     def services(self) -> tuple[str, ...]:
-        """All services that are alive when the profile is up."""
+        """The services that are alive when all components are ready."""
         return tuple(service for row in self.rows() for service in row.services)
 
     def launch(self, process: str) -> Launch:
+        """The settings that every component has. Raises ConfigError as `config` does."""
         return self._convert(process, self._table(process), Launch)
 
     def config(self, process: str, kind: type[C]) -> C:
-        """A process's table as its Config. Raises ConfigError that names profile, table and field."""
+        """The settings of a component, of the class `kind`. If its table has no `objects` or `needed`, these are
+        filled in: the profile's objects, and the services that the component needs. Raises ConfigError that names
+        profile, table and field."""
         table = {k: v for k, v in self._table(process).items() if k not in Launch.__struct_fields__}
         fields = getattr(kind, "__struct_fields__", ())
         if self.objects is not None and "objects" in fields:
@@ -88,17 +104,17 @@ class Profile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
         try:
             return msgspec.convert(table, kind)
         except msgspec.ValidationError as error:
-            raise ConfigError(f"profile {self.name}, [service.{process}]: {_plain(error)}") from error
+            raise ConfigError(f"profile {self.name}, [service.{process}]: {_describe(error)}") from error
 
 
 def names() -> list[str]:
-    """The profiles that come with the project."""
+    """The names of the project's profiles."""
     folder = resources.files(PACKAGE).joinpath("profiles")
     return sorted(entry.name.removesuffix(".toml") for entry in folder.iterdir() if entry.name.endswith(".toml"))
 
 
 def read(which: str, overrides: Iterable[str] = ()) -> Profile:
-    """Read the profile of that name, or of that path, and apply overrides such as `service.sim.seed=3`.
+    """Read the profile with the name or path `which` and apply overrides such as `service.sim.seed=3`.
 
     Raises ConfigError that names file, table and field.
     """
@@ -122,12 +138,13 @@ def read(which: str, overrides: Iterable[str] = ()) -> Profile:
 
 
 def from_data(data: dict[str, Any], name: str) -> Profile:
+    """The profile of a parsed file; `name` is for error messages. Raises ConfigError as `read` does."""
     try:
         profile = msgspec.structs.replace(msgspec.convert(data, Profile), name=name)
     except msgspec.ValidationError as error:
-        raise ConfigError(f"profile {name}: {_plain(error)}") from error
+        raise ConfigError(f"profile {name}: {_describe(error)}") from error
     if len(set(profile.processes)) < len(profile.processes):
-        raise ConfigError(f"profile {name}: processes names one twice")
+        raise ConfigError(f"profile {name}: processes names a process twice")
     try:
         rows = profile.rows()
     except ConfigError as error:
@@ -136,7 +153,7 @@ def from_data(data: dict[str, Any], name: str) -> Profile:
     for row in rows:
         for service in row.services:
             if service in owner:
-                raise ConfigError(f"profile {name}, processes: {owner[service]} and {row.name} are both {service}")
+                raise ConfigError(f"profile {name}, processes: {owner[service]} and {row.name} both provide {service}")
             owner[service] = row.name
     for table in profile.service:
         named(table)
@@ -159,11 +176,11 @@ def _find(which: str) -> Path | Traversable:
 
 
 def _override(data: dict[str, Any], override: str) -> None:
-    """Apply `a.b.c=value`; the value as in TOML, or, where that is none, as it stands."""
+    """Apply `a.b.c=value` to a parsed file. A value that is not TOML is taken as a string."""
     path, equals, text = override.partition("=")
     keys = path.strip().split(".")
     if not equals or not all(keys):
-        raise ConfigError(f"{override!r} is no setting; write it as service.sim.seed=3")
+        raise ConfigError(f"{override!r} is not a setting; write it as service.sim.seed=3")
     try:
         value = tomllib.loads(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:
@@ -182,7 +199,7 @@ def _absolute(file: str | None, home: Path | None) -> str | None:
     return str((home / file).resolve())
 
 
-def _plain(error: msgspec.ValidationError) -> str:
-    """msgspec's words, with the field in place of its path: 'seed: Expected `int`, got `str`'."""
+def _describe(error: msgspec.ValidationError) -> str:
+    """msgspec's message with the field first: 'seed: Expected `int`, got `str`'."""
     text, at, path = str(error).partition(" - at `$.")
     return f"{path.rstrip('`')}: {text}" if at else text

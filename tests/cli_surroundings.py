@@ -9,12 +9,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import typer.main
 from cli_forks import Case, Ending
 
 from apps.cli import exits
 from apps.cli.app import COMMANDS as LISTED
-from apps.cli.app import app, load
+from apps.cli.app import load
+from apps.cli.task_commands import task_command, task_names
 
 GOLDEN = Path(__file__).parent / "golden" / "fetch.mcap"
 CODES = (exits.DONE, exits.FAILED, exits.USAGE, exits.REFUSED, exits.NO_MESH)
@@ -24,7 +24,7 @@ ARGUMENTS: dict[str, str] = {
     "follow": "{name}",
     "touch": "{name}",
     "go-to": "{name}",
-    "rehearse": "dance",
+    "rehearse fetch": "{name} --seed -1",
     "snapshot": "{name}.png",
     "record": "--out {name}",
     "replay": "{capture} --paused",
@@ -65,12 +65,12 @@ def commands(command: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[str, An
         yield from commands(sub, (*path, name))
 
 
-LOADED = {row.name: load(row.name) for row in LISTED}
-COMMANDS = dict(
-    found
-    for name, command in typer.main.get_group(app).commands.items()
-    for found in commands(LOADED.get(name, command), (name,))
-)
+LOADED: dict[str, Any] = {
+    **{row.name: load(row.name) for row in LISTED if row.name != "rehearse"},
+    **{name: task_command(name) for name in task_names()},
+    "rehearse fetch": task_command("fetch"),  # the other rehearsals are made in the same way
+}
+COMMANDS = dict(found for name, command in LOADED.items() for found in commands(command, tuple(name.split())))
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ from contextlib import asynccontextmanager
 from typing import Any
 
 import msgspec
+from spelled import asked, idle
 
 from cocoro import topics
 from cocoro.clock import NS, Clock
@@ -21,9 +22,9 @@ from cocoro.messages import (
     ServoState,
     TargetEstimate,
     TaskReply,
-    TaskRequest,
     TaskState,
 )
+from cocoro.messages.actions import Idle
 from cocoro.testing import ServiceUnderTest
 from deploy.processes import hardware, needs, stoppable
 
@@ -43,7 +44,7 @@ class Robot:
         self.task_id = ""
         self.asked: list[str] = []
         """The behaviours that were wanted, each once."""
-        self._intent = Intent()
+        self._intent = idle()
         self._since_ns = 0
         self._end = "done"
         service.tester.on(topics.INTENT, self._hear)
@@ -53,8 +54,8 @@ class Robot:
         if (intent.task_id, intent.step) == (self._intent.task_id, self._intent.step):
             return
         self._intent, self._since_ns = intent, self.service.tester.now_ns()
-        self.asked.append(intent.behaviour)
-        self._end = (self.script.get(intent.behaviour) or ["done"]).pop(0)
+        self.asked.append(intent.action.name)
+        self._end = (self.script.get(intent.action.name) or ["done"]).pop(0)
 
     async def _work(self) -> None:
         async for _ in self.service.tester.every(50.0):
@@ -77,10 +78,10 @@ class Robot:
         status = PlannerStatus(
             task_id=self._intent.task_id,
             step=self._intent.step,
-            behaviour=self._intent.behaviour,
+            behaviour=self._intent.action.name,
             state=("done" if self._end == "done" else "failed") if over else "running",
             reason=self._end if over and self._end != "done" else "",
-            why=f"{self._intent.behaviour} is what I do",
+            why=f"{self._intent.action.name} is what I do",
             distance_m=0.5,
             holding=self.holding,
             body_m=(0.0, 0.0),
@@ -91,7 +92,7 @@ class Robot:
     # --- what an operator does ------------------------------------------------------------------------
 
     async def ask(self, task: str = "fetch", label: str = "red_can", **more: Any) -> TaskReply:
-        return await self.service.ask(topics.RUN, TaskRequest(task=task, label=label, **more))  # type: ignore[arg-type]
+        return await self.service.ask(topics.RUN, asked(task, label, **more))
 
     async def begin(self, task: str = "fetch", label: str = "red_can", **more: Any) -> str:
         reply = await self.ask(task, label, **more)
@@ -141,4 +142,4 @@ async def robot(
 
 
 def idle_again(robot: Robot) -> bool:
-    return robot.service.latest(topics.INTENT).behaviour == "idle"
+    return isinstance(robot.service.latest(topics.INTENT).action, Idle)

@@ -21,6 +21,7 @@ from typing import Any, TypeVar
 import msgspec
 from operator_shell import PATIENCE_S, Running
 from places import short_folder
+from spelled import asked
 
 from cocoro import topics
 from cocoro.bus.base import Payload, Qos
@@ -199,7 +200,7 @@ class LiveRobot:
 
     async def driving(self, label: str = "red_can", speed_mps: float = 0.12) -> str:
         """Fetch something, and be on the way to it; the task's id."""
-        task_id = await self.begin(TaskRequest(task="fetch", label=label))
+        task_id = await self.begin(asked("fetch", label=label))
         await self.drives(speed_mps, task_id)
         return task_id
 

@@ -10,7 +10,8 @@ import msgspec
 from hypothesis import strategies as st
 from msgspec import inspect
 
-from cocoro.messages import LARGEST, Frame, Message, ServoCommand, ServoState
+from cocoro.messages import LARGEST, Frame, Intent, Message, ServoCommand, ServoState
+from cocoro.messages.actions import ACTIONS
 from cocoro.topics import REQUESTS, TOPICS
 
 MESSAGES: tuple[type[Message], ...] = tuple(dict.fromkeys(topic.type for topic in TOPICS))
@@ -20,12 +21,19 @@ Data = dict[str, Any]
 Path = tuple[str | int, ...]
 
 
-@cache
 def data_of(kind: type[msgspec.Struct]) -> st.SearchStrategy[Data]:
     """Plain data of valid messages of a type."""
+    return _data_of(kind)
+
+
+@cache
+def _data_of(kind: type[msgspec.Struct]) -> st.SearchStrategy[Data]:
     fields = _fields(inspect.type_info(kind))
     if issubclass(kind, Frame):
         return st.builds(_frame, fields, st.integers(1, 4), st.integers(1, 4))
+    if issubclass(kind, Intent):
+        actions = [_fields(inspect.type_info(each)) for each in ACTIONS.own.values()]
+        return st.builds(_intent, fields, st.one_of(actions))
     if issubclass(kind, ServoState | ServoCommand):
         return st.builds(_servos, st.just(kind), fields, st.integers(0, 9))
     return fields
@@ -65,6 +73,10 @@ def _children(data: Any) -> list[tuple[str | int, Any]]:
     return list(enumerate(data)) if isinstance(data, list) else []
 
 
+def _intent(fields: Data, action: Data) -> Data:
+    return fields | {"action": action}
+
+
 def _frame(fields: Data, width: int, height: int) -> Data:
     pixels = width * height
     return fields | {"width": width, "height": height, "colour": bytes(3 * pixels), "depth": bytes(2 * pixels)}
@@ -83,7 +95,8 @@ def _fields(kind: inspect.Type) -> st.SearchStrategy[Any]:
             required = {field.encode_name: _fields(field.type) for field in fields if field.required}
             optional = {field.encode_name: _fields(field.type) for field in fields if not field.required}
             own = {name: optional.pop(name) for name in ("stamp_ns", "seq", "incarnation") if name in optional}
-            return st.fixed_dictionaries(required | own, optional=optional)
+            tag = {} if kind.tag_field is None else {kind.tag_field: st.just(kind.tag)}
+            return st.fixed_dictionaries(required | own | tag, optional=optional)
         case inspect.FloatType():
             low = (
                 -LARGEST if kind.ge is None and kind.gt is None else max(v for v in (kind.ge, kind.gt) if v is not None)

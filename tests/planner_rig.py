@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
+from spelled import action, idle
+
 from cocoro import topics
 from cocoro.messages import (
     BaseCommand,
     BaseState,
-    Behaviour,
     Detection,
     Detections,
     Intent,
@@ -38,7 +39,7 @@ class Planner:
         self.base: dict[str, Any] = {}
         self.hand_load = 0.0
         self.latch = "released"
-        self.wants: Intent | None = Intent()
+        self.wants: Intent | None = idle()
         self.sees: tuple[float, float, float] | None = CAN_M
         self.silent: set[str] = set()
         self.incarnation = 1
@@ -56,7 +57,7 @@ class Planner:
             wants = self.wants
             self._feed(
                 topics.INTENT,
-                Intent(task_id=wants.task_id, step=wants.step, behaviour=wants.behaviour, label=wants.label),
+                Intent(task_id=wants.task_id, step=wants.step, action=wants.action),
             )
         if self._count % 2 == 0:
             self._feed(topics.DETECTIONS, self._seen())
@@ -74,9 +75,9 @@ class Planner:
             status = self.tick()
         return status
 
-    def want(self, behaviour: Behaviour, label: str = "") -> None:
+    def want(self, name: str, label: str = "") -> None:
         step = self.wants.step + 1 if self.wants is not None else 1
-        self.wants = Intent(task_id="task", step=step, behaviour=behaviour, label=label)
+        self.wants = Intent(task_id="task", step=step, action=action(name, label))
 
     @property
     def status(self) -> PlannerStatus:

@@ -10,6 +10,7 @@ from math import atan2, hypot
 from typing import Any, NamedTuple
 
 import msgspec
+from spelled import asked
 
 from cocoro import topics
 from cocoro.bus.local import LocalMesh
@@ -20,9 +21,7 @@ from cocoro.messages import (
     BaseState,
     CancelRequest,
     EstopRequest,
-    TaskName,
     TaskReply,
-    TaskRequest,
     TaskState,
     TrueObject,
     Truth,
@@ -144,10 +143,10 @@ class RobotRig:
 
     # --- the operator ---------------------------------------------------------------------------------
 
-    async def ask(self, task: TaskName, label: str = "", timeout_s: float | None = None) -> TaskReply:
-        return await self.operator.call(topics.RUN, TaskRequest(task=task, label=label, timeout_s=timeout_s))
+    async def ask(self, task: str, label: str = "", timeout_s: float | None = None) -> TaskReply:
+        return await self.operator.call(topics.RUN, asked(task, label, timeout_s))
 
-    async def begin(self, task: TaskName, label: str = "", timeout_s: float | None = None) -> str:
+    async def begin(self, task: str, label: str = "", timeout_s: float | None = None) -> str:
         """Have a task accepted, as soon as the robot is ready for one; its id."""
         reply = await self.ask(task, label, timeout_s)
         while reply.refusal in ("not_alive", "estop") and self.now_s < 3.0:
@@ -165,7 +164,7 @@ class RobotRig:
         await self.until(lambda: task_id in self._tasks and self._tasks[task_id].outcome is not None, timeout_s)
         return self._tasks[task_id]
 
-    async def run(self, task: TaskName, label: str = "", timeout_s: float | None = None) -> TaskState:
+    async def run(self, task: str, label: str = "", timeout_s: float | None = None) -> TaskState:
         return await self.outcome(await self.begin(task, label, timeout_s))
 
     async def phase(self, task_id: str, phase: str) -> None:

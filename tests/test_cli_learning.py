@@ -13,12 +13,13 @@ from apps.cli.babble import BabbleDisplay
 from apps.cli.main import main
 from apps.cli.progress import SilentDisplay
 from apps.learning.collector import Coverage, HandCollector, WheelCollector, collector
+from apps.learning.dataset import HandRow, SampleFile, WheelRow, hand_header, wheel_header
 from apps.learning.study import BEST
 from cocoro.learning import model
-from cocoro.learning.dataset import HandRow, SampleFile, WheelRow, hand_header, wheel_header
-from cocoro.learning.nominal_model import NominalModel
+from cocoro.learning.handmap import NominalModel
 from cocoro.messages import HandSample, TaskState, WheelTrial
 from cocoro.robot import Robot
+from cocoro.topics import HAND_SAMPLES
 
 JOINTS = ("arm_base", "shoulder", "elbow", "wrist_pitch")
 
@@ -129,7 +130,7 @@ def test_what_was_reported_is_kept_and_gone_on_with(tmp_path: Path, robot: Robot
         assert kept.next == 1
         kept.take(HandSample(stamp_ns=5, draw=17, angles_rad=angles, seen_m=(0.4, 0.0, 0.2), area_px=90))
         kept.take(trial(3, 0.5))  # none of its own
-    with collector("babble-arm", path, robot) as again:
+    with collector(HAND_SAMPLES, path, robot) as again:
         assert len(again) == 1
         assert again.next == 18
 

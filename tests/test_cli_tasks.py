@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from msgspec import to_builtins
 
 from apps.cli import exits
 from apps.cli.babble import SampleWriter
@@ -36,8 +37,9 @@ from cocoro.robot import Robot
 from cocoro.topics import CANCEL, LATCH, RUN, TASK
 from cocoro.vloop import run_virtual
 from deploy.rundir import RunDir
+from services.executive.tasks import FetchTask
 
-REQUEST = TaskRequest(task="fetch", label="red_can")
+REQUEST = TaskRequest(task=FetchTask(label="red_can"))
 ID = "fetch-1"
 
 
@@ -121,7 +123,7 @@ async def test_a_task_that_is_done_is_followed_phase_by_phase_and_exits_with_0(s
     executive.tell("end", 9.5, outcome="done")
     code, result = await running
     assert code == exits.DONE
-    assert executive.asked == [REQUEST]
+    assert [request.task for request in executive.asked] == [to_builtins(REQUEST.task)]
     assert scene.out.getvalue().splitlines() == [
         "   0.4 s  search               because",
         "   3.2 s  approach     0.80 m  because",

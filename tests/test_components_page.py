@@ -24,7 +24,7 @@ PATIENCE_S = 120.0
 
 class Block(NamedTuple):
     path: str | None
-    """Of the file that it is, where the line before names one."""
+    """The path of the file, if the line before the block names one."""
     language: str
     text: str
 

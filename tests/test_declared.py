@@ -13,13 +13,14 @@ from typing import Any
 import numpy as np
 import pytest
 from robot_rig import SMALL_FRAMES, RobotRig
+from spelled import idle
 from wire_base import Bench as CreateBench
 from wire_servos import REPLY_S, ServoBench
 
 from cocoro import topics
 from cocoro.clock import FollowedClock, RealClock
 from cocoro.learning import model
-from cocoro.messages import Intent, ModelRequest, TaskName
+from cocoro.messages import ModelRequest
 from cocoro.robot import Robot
 from cocoro.testing import ServiceUnderTest, in_virtual_time, misdeclared
 from cocoro.topics import (
@@ -55,7 +56,7 @@ async def test_the_simulated_robot_speaks_as_it_declares(tmp_path: Path) -> None
     settings: dict[str, dict[str, Any]] = {
         "capture": {"file": str(tmp_path / "all.mcap")}, "sim": SMALL_FRAMES | {"scene": "wheels"},
     }  # fmt: skip
-    runs: tuple[tuple[TaskName, str, str], ...] = (
+    runs: tuple[tuple[str, str, str], ...] = (
         ("babble-arm", "", HAND_SAMPLES.name), ("babble-wheels", "red_can", WHEEL_TRIALS.name),
     )  # fmt: skip
     async with RobotRig(services=SIMULATED, settings=settings, record_steps=True) as rig:
@@ -141,7 +142,7 @@ def test_the_simulator_behind_wires_speaks_as_it_declares(monkeypatch: pytest.Mo
 async def test_a_component_that_says_more_or_less_than_it_declares_is_found() -> None:
     other = replace(PLANNING, reads=(*PLANNING.reads, TRUTH), serves=(), publishes=(PLAN,), calls=(RUN,), records=True)
     async with ServiceUnderTest(other) as service:
-        service.feed(INTENT, Intent(behaviour="idle"))
+        service.feed(INTENT, idle())
         await service.advance(0.1)
         assert misdeclared(other, service.bus) == [
             "it publishes base/command, which it does not declare",

@@ -16,7 +16,7 @@ from cocoro.messages import CancelRequest
 from cocoro.testing import JumpingClock, in_virtual_time
 from deploy.processes import hardware
 from deploy.rundir import RunDir
-from services.executive import executive
+from services.executive.tasks import ParkTask
 
 
 @in_virtual_time
@@ -190,7 +190,7 @@ async def test_a_mistake_in_a_task_is_told_and_is_not_the_end_of_the_executive(m
     async def broken(*_: object) -> None:
         raise ZeroDivisionError("a mistake")
 
-    monkeypatch.setitem(executive.TASKS, "park", broken)
+    monkeypatch.setattr(ParkTask, "run", broken)
     async with robot() as it:
         await it.begin("park", "")
         state = await it.outcome()

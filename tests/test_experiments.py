@@ -15,15 +15,15 @@ from learning_arm import sightings
 
 from apps.cli.experiment import RunProgress
 from apps.cli.main import main
-from apps.experiments import bodies, lessons, report
-from apps.experiments.every import EXPERIMENTS
+from apps.experiments import lessons, plan, report
+from apps.experiments.experiments import EXPERIMENTS
+from apps.experiments.plan import ExperimentSettings
 from apps.experiments.results import summarise
 from apps.experiments.runs import ExperimentRun, RunResult, perform
-from apps.experiments.settings import ExperimentSettings
+from apps.learning.dataset import HandRow, SampleFile, WheelRow, hand_header, wheel_header
 from apps.learning.study import BEST
 from apps.rehearsal.request import RehearsalRequest
-from cocoro.learning.dataset import HandRow, SampleFile, WheelRow, hand_header, wheel_header
-from cocoro.learning.nominal_model import NominalModel
+from cocoro.learning.handmap import NominalModel
 from cocoro.robot import Robot
 
 # --- statistics ---------------------------------------------------------------------------------------
@@ -70,7 +70,19 @@ def test_every_experiment_asks_for_rehearsals_that_are_possible_and_names_what_i
                 assert (request.sensors, request.body) == ("real", "worn")
             else:
                 assert hasattr(lessons, run.kind)
-            json.dumps(run.fields)
+            msgspec.json.encode(run.fields)
+
+
+def test_every_run_of_an_experiment_is_of_the_robot_that_is_described(tmp_path: Path) -> None:
+    own = tmp_path / "own.toml"
+    own.write_text("[base]\nwheel_separation_m = 0.3\n")
+    settings = ExperimentSettings(seeds=(0,), out=tmp_path, measured=str(own))
+    assert settings.robot().base.wheel_separation_m == 0.3
+    for experiment in EXPERIMENTS.values():
+        for run in experiment.runs(settings):
+            assert run.fields["measured"] == str(own)
+            if run.kind == "rehearse":
+                assert msgspec.convert(run.fields, RehearsalRequest).measured == str(own)
 
 
 def test_what_cannot_be_run_fails_with_its_reason_and_so_does_what_needs_it(tmp_path: Path) -> None:
@@ -115,7 +127,7 @@ def learned(tmp_path_factory: pytest.TempPathFactory, robot: Robot) -> tuple[Exp
     """A body that has learned, and what its lesson says."""
     settings = ExperimentSettings(seeds=(0,), out=tmp_path_factory.mktemp("experiments"))
     arm_and_wheels(settings, robot)
-    run = bodies.learned(settings, 0)[-1]
+    run = plan.learned(settings, 0)[-1]
     return settings, lessons.learn(**run.fields, method=BEST.name)
 
 
@@ -164,9 +176,9 @@ def made_up(run: ExperimentRun, lesson: RunResult) -> dict[str, Any]:
         return lesson
     if run.kind == "bend":
         return {"bent_at": 20, "fixed_m": [0.004] * 20 + [0.03] * 180, "adapted_m": [0.004] * 200, "changes": 1}
-    task = run.fields["task"]
+    task = run.fields["task"].name
     return {
-        "task": task, "label": run.fields.get("label", ""), "seed": 0, "outcome": "done", "reason": "", "sim_s": 20.0,
+        "task": task, "label": run.fields["task"].target, "seed": 0, "outcome": "done", "reason": "", "sim_s": 20.0,
         "phases": [{"name": "search", "sim_s": 1.0}, {"name": "grasp", "sim_s": 2.0}], "trace": TRACE,
         "tasks": [TOUCHED] * (12 if task == "touch" else 1), "truth": FOLLOWED if task == "follow" else FETCHED,
         "body": {"wheel_separation_m": 0.256, "turning_separation_m": 0.255},

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 from faults_live import SERVICES, LiveRobot, live
+from spelled import asked
 
 from cocoro import topics
-from cocoro.messages import TaskRequest
 from deploy.processes import hardware
 
 pytestmark = [pytest.mark.zenoh, pytest.mark.sim, pytest.mark.process]
@@ -91,7 +91,7 @@ def test_who_is_stopped_for_longer_than_the_lease_ends_the_task_and_is_back_when
             assert (state.outcome, state.reason) == ("failed", "not_alive: lost contact with perception")
             await stands_in_time(robot, stopped_s)
             await robot.told("perception is silent: no sign of perception")
-            assert (await robot.ask(TaskRequest(task="park"))).refusal == "not_alive"
+            assert (await robot.ask(asked("park"))).refusal == "not_alive"
             robot.signal("perception", signal.SIGCONT)
             await robot.told("perception is back")
             assert robot.pid("perception") == pid, "who is stopped is not killed"
@@ -198,7 +198,7 @@ def test_a_robot_whose_battery_is_low_says_so_and_takes_no_task(tmp_path: Path) 
             for task in (("fetch", "red_can"), ("follow", "red_can"), ("park",)):
                 code, said = await robot.command(*task)
                 assert (code, said) == (3, "cocoro: refused: the battery is low (10%); charge the robot first\n")
-            reply = await robot.ask(TaskRequest(task="fetch", label="red_can"))
+            reply = await robot.ask(asked("fetch", label="red_can"))
             assert (reply.accepted, reply.refusal) == (False, "battery")
 
     asyncio.run(scenario())

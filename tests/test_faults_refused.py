@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import pytest
 from robot_rig import SMALL_FRAMES, RobotRig
+from spelled import asked
 
 from cocoro import topics
-from cocoro.messages import BaseState, PlannerStatus, ServoState, TaskName, TaskReply, TaskRequest
+from cocoro.messages import BaseState, PlannerStatus, ServoState, TaskReply
 from cocoro.testing import ServiceUnderTest, in_virtual_time
 from cocoro.units import Vec2
 from deploy.processes import hardware
@@ -30,15 +31,15 @@ async def executive(
     await service.settle()
 
 
-async def ask(service: ServiceUnderTest, task: TaskName, label: str = "") -> TaskReply:
-    return await service.ask(topics.RUN, TaskRequest(task=task, label=label))
+async def ask(service: ServiceUnderTest, task: str, label: str = "") -> TaskReply:
+    return await service.ask(topics.RUN, asked(task, label))
 
 
 @in_virtual_time
 async def test_with_a_low_battery_no_task_starts_and_the_refusal_says_so() -> None:
     async with ServiceUnderTest("services.executive.service") as service:
         await executive(service, LOW - 0.01)
-        tasks: tuple[tuple[TaskName, str], ...] = (("fetch", "red_can"), ("follow", "red_can"), ("park", ""))
+        tasks: tuple[tuple[str, str], ...] = (("fetch", "red_can"), ("follow", "red_can"), ("park", ""))
         for task, label in tasks:
             refused = await ask(service, task, label)
             assert (refused.accepted, refused.refusal) == (False, "battery")

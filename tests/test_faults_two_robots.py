@@ -11,12 +11,13 @@ from typing import Any
 import pytest
 from faults_live import LiveRobot, live
 from robot_rig import HALTED_MPS, RobotRig
+from spelled import asked
 
 from cocoro import topics
 from cocoro.bus.endpoints import ZenohConfig
 from cocoro.bus.local import LocalMesh
 from cocoro.bus.zenoh import ZenohBus
-from cocoro.messages import TaskRequest, TaskState
+from cocoro.messages import TaskState
 from cocoro.testing import in_virtual_time
 from cocoro.topics import Topic
 from cocoro.vloop import run_virtual
@@ -116,7 +117,7 @@ def test_two_robots_behind_one_router_each_do_their_own(tmp_path: Path) -> None:
             assert state.outcome is None, state.reason
             assert one.heard(topics.BASE_STATE)[-1].latch == "released"
             assert other.heard(topics.BASE_STATE)[-1].latch == "latched"
-            assert (await other.ask(TaskRequest(task="park"))).refusal == "estop"
+            assert (await other.ask(asked("park"))).refusal == "estop"
             code, told = await other.command("reset")
             assert code == 0, told
             code, told = await one.command("cancel")

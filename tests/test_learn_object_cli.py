@@ -17,6 +17,7 @@ from perception_scenes import Canvas, Scene, Thing, facing
 from apps.cli.learn_object import size_of
 from apps.cli.main import main
 from apps.cli.toml_files import save, with_object
+from apps.pictures import colour_of
 from apps.rehearsal.rehearse import rehearse
 from apps.rehearsal.request import RehearsalRequest
 from cocoro.bus.endpoints import default
@@ -27,11 +28,11 @@ from cocoro.errors import ConfigError
 from cocoro.messages import ServoState
 from cocoro.node import Node
 from cocoro.objects import Catalogue, LabBox, ObjectSpec, own_text
-from cocoro.picture import colour_of
 from cocoro.robot import Robot
 from cocoro.topics import ARM_STATE, FRAME
 from deploy import profiles
 from deploy.processes import named
+from services.executive.tasks import FetchTask
 from sim.scene import Light
 
 TEAL = (20, 150, 140)
@@ -236,7 +237,7 @@ def test_what_was_learnt_from_one_look_is_fetched(here: Path) -> None:
         """
     )
     rehearsal = RehearsalRequest(
-        task="fetch", label="orange_can", scene="scene.toml", sensors="real", objects="objects.toml",
+        task=FetchTask(label="orange_can"), scene="scene.toml", sensors="real", objects="objects.toml",
         width=320, height=240, frame_rate_hz=15.0,
     )  # fmt: skip
     result = rehearse(rehearsal)

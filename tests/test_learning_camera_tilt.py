@@ -5,12 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cocoro.learning.camera_tilt import LEAST_TRIALS, CameraTilt, eye_tilt
-from cocoro.learning.dataset import WheelRow
+from apps.learning.dataset import WheelRow
+from apps.learning.lesson import LEAST_TRIALS, eye_tilt
 from cocoro.messages import Obstacles
 from cocoro.robot import Robot
 from cocoro.units import Vec3
 from services.planning.config import PlanningConfig
+from services.planning.head import CameraTilt
 from services.planning.state_estimator import StateEstimator
 
 

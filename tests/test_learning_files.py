@@ -13,12 +13,13 @@ import numpy as np
 import pytest
 from learning_arm import sightings
 
+from apps.learning import dataset
+from apps.learning.dataset import HandRow, SampleFile, WheelRow, hand_header, wheel_header
 from apps.learning.study import BEST, METHODS, fit
 from cocoro.errors import ConfigError, RefusedError
-from cocoro.learning import dataset, model
-from cocoro.learning.dataset import HandRow, SampleFile, WheelRow, hand_header, wheel_header
+from cocoro.learning import model
+from cocoro.learning.handmap import NominalModel
 from cocoro.learning.model import Training, WheelModel
-from cocoro.learning.nominal_model import NominalModel
 from cocoro.robot import Robot
 
 TRAINING = Training(data="0123456789abcdef", samples=600, method=BEST.name, scores={"held_out_rms_m": 0.0035})
@@ -63,8 +64,8 @@ def test_any_tool_reads_them_line_by_line(tmp_path: Path, robot: Robot) -> None:
 KILLED = """
 import sys
 from pathlib import Path
-from cocoro.learning.dataset import HandRow, SampleFile, hand_header
-from cocoro.learning.nominal_model import NominalModel
+from apps.learning.dataset import HandRow, SampleFile, hand_header
+from cocoro.learning.handmap import NominalModel
 from cocoro.robot import Robot
 
 robot = Robot.load()

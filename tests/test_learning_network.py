@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from learning_arm import slope_by_differences
 
-from cocoro.learning.fitting import LeastSquares, learn_in_order
-from cocoro.learning.network import HyperplaneRbf
+from apps.learning.rules import learn_in_order
+from cocoro.learning.network import HyperplaneRbf, LeastSquares
 
 
 @pytest.fixture

@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from apps.learning.dataset import WheelRow
 from apps.learning.wheels import fit_wheels, separation_of, turn_between
 from cocoro.frames import Pose2
-from cocoro.learning.dataset import WheelRow
 
 TRUE_M = 0.2665
 TARGET_M = (1.5, 0.0)

@@ -9,11 +9,12 @@ from itertools import pairwise
 import msgspec
 import pytest
 from node_rig import Mesh, answered, state
+from spelled import idle
 
 from cocoro import topics
 from cocoro.clock import NS
 from cocoro.errors import MeshError
-from cocoro.messages import BaseCommand, BaseState, Intent, Message
+from cocoro.messages import BaseCommand, BaseState, Message
 from cocoro.testing import in_virtual_time, settle
 
 # --- publishing -----------------------------------------------------------------------------------
@@ -179,7 +180,7 @@ async def test_a_node_that_ends_leaves_nothing_behind() -> None:
             node.watch_alive(lambda service, alive: None)
             node.spawn(asyncio.sleep(1e6))
             await settle()
-        other.publish(topics.INTENT, Intent())
+        other.publish(topics.INTENT, idle())
         await settle()
         assert (len(asyncio.all_tasks()), len(mesh.mesh.subscriptions), len(mesh.mesh.servers)) == before
         assert len(mesh.mesh.watchers) == 0

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from perception_scenes import CATALOGUE, Canvas, seen
 
+from apps.pictures import colour_of, describe, draw, save_png
 from cocoro.errors import CocoroError
 from cocoro.messages import Detection, Detections, Frame
-from cocoro.picture import colour_of, describe, draw, save_png
 
 
 def scene() -> Frame:

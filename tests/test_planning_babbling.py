@@ -6,16 +6,16 @@ from itertools import islice
 
 import numpy as np
 import pytest
+from spelled import action
 
 from cocoro import topics
 from cocoro.arrays import FloatArray
 from cocoro.clock import NS
 from cocoro.core import Output, Sample
-from cocoro.learning.nominal_model import NominalModel
+from cocoro.learning.handmap import NominalModel
 from cocoro.messages import (
     BaseCommand,
     BaseState,
-    Behaviour,
     Detection,
     Detections,
     HandSample,
@@ -202,8 +202,8 @@ class Body:
         )  # fmt: skip
 
 
-def intent(behaviour: Behaviour, count: int, first: int = 1, label: str = "") -> Intent:
-    return Intent(task_id="t", step=1, behaviour=behaviour, label=label, first=first, count=count)
+def intent(name: str, count: int, first: int = 1, label: str = "") -> Intent:
+    return Intent(task_id="t", step=1, action=action(name, label, first=first, count=count))
 
 
 def test_the_arm_babbles_until_there_are_samples_enough_and_comes_home(robot: Robot, postures: Postures) -> None:

@@ -14,9 +14,10 @@ from apps.rehearsal.rehearse import rehearse
 from apps.rehearsal.request import RehearsalRequest
 from cocoro.arrays import FloatArray
 from cocoro.clock import NS
+from cocoro.learning.handmap import NominalModel
 from cocoro.learning.model import Training, arm_model, empty, encode
-from cocoro.learning.nominal_model import NominalModel
 from cocoro.robot import Robot
+from services.executive.tasks import GoToTask, TouchTask
 from services.planning.behaviours.base import Actuators
 from services.planning.config import PlanningConfig
 from services.planning.learned import Learned
@@ -32,7 +33,7 @@ QUICK: dict[str, Any] = {"width": 160, "height": 120, "frame_rate_hz": 15.0}
 @pytest.mark.sim
 def test_what_hangs_before_the_robot_is_touched_in_turn() -> None:
     request = RehearsalRequest(
-        task="touch", label="red_can", then=("green_can", "blue_can", "yellow_ball", "red_can"), scene="targets",
+        task=TouchTask(label="red_can"), then=("green_can", "blue_can", "yellow_ball", "red_can"), scene="targets",
         trace=True, **QUICK,
     )  # fmt: skip
     result = rehearse(request)
@@ -48,7 +49,7 @@ def test_what_hangs_before_the_robot_is_touched_in_turn() -> None:
 
 @pytest.mark.sim
 def test_the_robot_stops_at_the_distance_that_was_asked() -> None:
-    request = RehearsalRequest(task="go-to", label="blue_can", distance_m=0.35, **QUICK)
+    request = RehearsalRequest(task=GoToTask(label="blue_can", distance_m=0.35), **QUICK)
     result = rehearse(request)
     assert result["outcome"] == "done"
     assert result["tasks"][0]["target_edge_m"] == pytest.approx(0.35, abs=0.015)

@@ -50,7 +50,7 @@ def test_overrides_are_values_as_in_toml_or_plain_text() -> None:
 
 @pytest.mark.parametrize("override", ["seed", "=3", "service..seed=3", "robot.name=robbie"])
 def test_an_override_that_is_none_says_so(override: str) -> None:
-    with pytest.raises(ConfigError, match=r"is no setting; write it as|is a value, not a table"):
+    with pytest.raises(ConfigError, match=r"is not a setting; write it as|is a value, not a table"):
         profiles.read("sim", [override])
 
 
@@ -85,8 +85,8 @@ def test_a_mistake_in_a_services_table_names_profile_table_and_field(tmp_path: P
         ('robot = "R 2"\nprocesses = ["planning"]', r"robot: Expected `str` matching regex"),
         ('robot = "r"\nprocesses = []', r"processes: Expected `array` of length >= 1"),
         ('robot = "r"\nprocesses = ["plannning"]', r"no process 'plannning'; known are"),
-        ('robot = "r"\nprocesses = ["planning", "planning"]', r"names one twice"),
-        ('robot = "r"\nprocesses = ["base", "sim"]', r"base and sim are both base"),
+        ('robot = "r"\nprocesses = ["planning", "planning"]', r"names a process twice"),
+        ('robot = "r"\nprocesses = ["base", "sim"]', r"base and sim both provide base"),
         ('robot = "r"\nprocesses = ["sim"]\nclock = "fast"', r"clock: Invalid enum value 'fast'"),
         ('robot = "r"\nprocesses = ["sim"]\n[service.simm]', r"no process 'simm'"),
         ('robot = "r"\nprocesses = ["sim"]\n[service.sim]\nlatency_s = -1', r"\[service.sim\]: latency_s: Expected"),

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 from robot_rig import RobotRig
+from spelled import asked
 
 from apps.rehearsal.rehearse import TaskRefusedError, rehearse
 from apps.rehearsal.request import RehearsalRequest
@@ -36,7 +37,7 @@ position_m = [1.2, -0.4]
 
 def small(task: str = "fetch", label: str = "red_can", **more: Any) -> RehearsalRequest:
     """With small frames, at half their rate."""
-    return RehearsalRequest(task=task, label=label, width=320, height=240, frame_rate_hz=15.0, **more)  # type: ignore[arg-type]
+    return RehearsalRequest(task=asked(task, label).task, width=320, height=240, frame_rate_hz=15.0, **more)
 
 
 @pytest.fixture(scope="module")
@@ -98,6 +99,15 @@ def test_what_cannot_be_asked_is_refused() -> None:
 def test_parking_needs_nothing_to_be_seen() -> None:
     result = rehearse(small(task="park", label=""))
     assert (result["outcome"], result["truth"]["collisions"]) == ("done", ())
+
+
+def test_a_rehearsal_is_of_the_robot_that_is_described(tmp_path: Path) -> None:
+    own = tmp_path / "own.toml"
+    own.write_text("[base]\nwheel_separation_m = 0.3\n")
+    result = rehearse(small(task="park", label="", measured=str(own)))
+    assert (result["outcome"], result["body"]["wheel_separation_m"]) == ("done", 0.3)
+    with pytest.raises(ConfigError, match=r"robot description .*nothing\.toml"):
+        rehearse(small(description=str(tmp_path / "nothing.toml")))
 
 
 # --- exact re-execution ---------------------------------------------------------------------------

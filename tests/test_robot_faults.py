@@ -50,7 +50,7 @@ async def test_the_emergency_stop_halts_a_driving_robot_and_holds_it_until_it_is
         assert (state.outcome, state.reason) == ("failed", "estop: emergency stop by test")
 
         for task, label in (("fetch", "red_can"), ("park", ""), ("put-down", "")):
-            refused = await rig.ask(task, label)  # type: ignore[arg-type]
+            refused = await rig.ask(task, label)
             assert refused.refusal == "estop"
             assert "cocoro reset" in refused.text
         await rig.advance(1.0)

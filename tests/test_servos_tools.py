@@ -1,4 +1,4 @@
-"""What is done with servos by hand: finding, numbering, zeros and limits; and what the doctor finds."""
+"""Manual work on servos: scanning, IDs, zeros and limits; and the doctor's checks."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import pytest
 from wire_servos import REPLY_S, ServoBench
 
 from apps.cli.main import main
+from apps.cli.servos import ServoWorkbench
 from cocoro.errors import RefusedError
 from cocoro.robot import SERVO_COUNT_RAD, Robot
 from services.base.doctor import check as check_base
@@ -69,7 +70,7 @@ def test_a_servo_gets_another_number_and_no_delay(bench: ServoBench, line: Servo
 
 
 def by_hand(bench: ServoBench, *counts: int) -> Callable[[str], None]:
-    """Somebody who turns the elbow to one position after another, as he is asked."""
+    """An operator who turns the elbow to the next position at each prompt."""
     left = list(counts)
 
     def turn(_: str) -> None:
@@ -137,6 +138,29 @@ def test_calibrating_writes_the_robots_own_file(
     assert (elbow.direction, elbow.centre_count) == (-1, 600.0)
 
 
+def test_a_calibration_is_shown_even_if_its_file_cannot_be_written(
+    bench: ServoBench, profile: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("builtins.input", by_hand(bench, 600, 500))
+    broken = profile.with_name("broken.toml")
+    broken.write_text("[[joint]\n")
+    assert main(["servos", "calibrate", "elbow", "--profile", str(profile), "--write", str(broken)]) == 2
+    shown = capsys.readouterr()
+    assert "elbow: direction = -1, centre_count = 600" in shown.out
+    assert '[[joint]]: name = "elbow", direction = -1, centre_count = 600.0' in shown.err
+    assert broken.read_text() == "[[joint]\n"
+
+
+def test_the_tools_take_another_robots_files(
+    bench: ServoBench, profile: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = tmp_path / "other.toml"
+    other.write_text('[[joint]]\nname = "elbow"\nid = 15\n')
+    assert ServoWorkbench.of(str(profile), None, measured=other).robot.joints["elbow"].id == 15
+    assert main(["servos", "limits", "elbow", "--profile", str(profile), "--description", str(tmp_path / "no")]) == 2
+    assert "robot description" in capsys.readouterr().err
+
+
 def test_a_scan_names_what_is_missing_and_writes_ports_where_it_is_told(
     bench: ServoBench, profile: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -197,8 +221,8 @@ def test_the_doctor_talks_to_the_create(tmp_path: Path) -> None:
         checks = {check.name: check for check in check_base(config, ROBOT, "robbie")}
         assert checks["Create"].text == "answers, passive mode"
         assert checks["battery"].text.startswith("85%, 15.8 V")
-        create.around.charge_mah = 100
-        create.around.drop_left = True
+        create.sensors.charge_mah = 100
+        create.sensors.drop_left = True
         checks = {check.name: check for check in check_base(config, ROBOT, "robbie")}
         assert "charge it" in checks["battery"].text
         assert checks["wheels"].state == "bad"
@@ -223,6 +247,10 @@ def test_the_whole_doctor_prints_a_line_a_check(
     checks = json.loads(capsys.readouterr().out)
     by_name = {check["name"]: check for check in checks}
     assert by_name["servo 5, elbow"]["state"] == "ok"
+    other = tmp_path / "other.toml"
+    other.write_text('[[joint]]\nname = "elbow"\nid = 15\n')
+    main(["doctor", str(profile), "--json", "--measured", str(other)])
+    assert "servo 15, elbow" in {check["name"] for check in json.loads(capsys.readouterr().out)}
     assert by_name["dynamixel-sdk"]["state"] == "ok"
     main(["doctor", str(profile)])
     assert len(capsys.readouterr().out.splitlines()) == len(checks)

@@ -172,8 +172,8 @@ def test_the_doctor_says_what_the_profile_needs_and_whether_it_is_there(
             patch.setattr(doctor, "_disk", lambda _: iter(()))
             return next(check for check in doctor.examine(profiles.read(profile)) if check.name == "shared memory")
 
-    assert told("replay", 1 << 30) == ("shared memory", "ok", "room for the 0.0 MB that the frames take")
-    assert told("sim", 1 << 30) == ("shared memory", "ok", "room for the 26.5 MB that the frames take")
+    assert told("replay", 1 << 30) == ("shared memory", "ok", "enough for the 0.0 MB of the frames")
+    assert told("sim", 1 << 30) == ("shared memory", "ok", "enough for the 26.5 MB of the frames")
     why = f"{shared.PLACE} has 16.0 MB free, 26.5 MB are needed (10.5 MB more): make room, or mount it larger"
     assert told("sim", 16_000_000) == ("shared memory", "note", f"{why}; until then {shared.COSTS}")
     claims = RunDir("calliope").claim("sim", ["kinect"])

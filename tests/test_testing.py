@@ -8,12 +8,13 @@ from typing import Any
 
 import msgspec
 import pytest
+from spelled import idle
 
 from cocoro import topics
 from cocoro.component import Implementation
 from cocoro.core import Output, Sample, Schedule, Take
 from cocoro.errors import CocoroError
-from cocoro.messages import BaseCommand, CancelRequest, Intent, Message, PlannerStatus, TaskReply
+from cocoro.messages import BaseCommand, CancelRequest, Message, PlannerStatus, TaskReply
 from cocoro.node import Node
 from cocoro.testing import CoreUnderTest, JumpingClock, ServiceUnderTest, execute_again, in_virtual_time
 from cocoro.topics import STEPS, Topic
@@ -59,7 +60,7 @@ async def test_what_is_fed_is_answered_and_what_was_fed_is_no_answer() -> None:
     async with ServiceUnderTest(ANSWERER, name="answerer") as service:
         assert service.alive
         assert service.running
-        service.feed(topics.INTENT, Intent())
+        service.feed(topics.INTENT, idle())
         service.feed(topics.PLAN, PlannerStatus(why="the test's own"))
         await service.advance(0.05)
         assert [status.why for status in service.outputs(topics.PLAN)] == ["1"]
@@ -82,7 +83,7 @@ async def test_time_passes_as_it_is_told_to() -> None:
 async def test_bad_input_is_counted_by_the_service() -> None:
     async with ServiceUnderTest(ANSWERER, name="answerer") as service:
         service.feed_raw(topics.INTENT, b"\xc1")
-        service.feed(topics.INTENT, Intent())
+        service.feed(topics.INTENT, idle())
         await service.settle()
         received = service.received(topics.INTENT)
         assert (received.count, received.rejected) == (1, 1)
@@ -121,7 +122,7 @@ def test_a_core_by_hand_gets_what_it_reads_and_nothing_else() -> None:
     core.feed(topics.BASE_COMMAND, BaseCommand(left_mps=0.0, right_mps=0.0))
     assert core.step() == []
     for _ in range(2):
-        core.feed(topics.INTENT, Intent())
+        core.feed(topics.INTENT, idle())
     assert [output.topic for output in core.step(after_s=0.1)] == [topics.PLAN, topics.PLAN]
     assert [status.step for status in core.outputs(topics.PLAN)] == [2, 2]
     assert core.now_ns == 1_100_000_000
@@ -131,7 +132,7 @@ async def recorded(config: Mapping[str, Any]) -> tuple[list[Any], dict[tuple[str
     """Steps of the component, and all that travelled meanwhile."""
     async with ServiceUnderTest(ANSWERER, config, name="answerer", record_steps=True) as service:
         for _ in range(5):
-            service.feed(topics.INTENT, Intent())
+            service.feed(topics.INTENT, idle())
             await service.advance(0.03)
         return service.outputs(STEPS.of("answerer")), service.tap.samples()
 

@@ -68,12 +68,12 @@ def test_a_file_that_is_no_toml_is_left_alone(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"broken.toml is not changed: not valid TOML") as refused:
         write_values(path, "joint", {"id": 1, "limits_deg": (-1.5, 2.0)}, "elbow")
     assert path.read_text() == "name = "
-    assert '[[joint]]\nname = "elbow"\nid = 1\nlimits_deg = [-1.5, 2.0]' in str(refused.value), "nothing is lost"
+    assert '[[joint]]: name = "elbow", id = 1, limits_deg = [-1.5, 2.0]' in str(refused.value), "nothing is lost"
 
 
 def test_a_file_that_cannot_be_written_gives_the_values_back(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    with pytest.raises(ConfigError, match=r"is not changed: File exists(.|\n)*baud = 57600"):
+    with pytest.raises(ConfigError, match=r"is not changed: File exists.*baud = 57600"):
         write_values(tmp_path / "file" / "own.toml", "network.arm", {"baud": 57600})
 
 

@@ -57,9 +57,9 @@ def test_its_tests_pass_and_it_is_clean(written: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "complaint"),
     [
-        ("Nearest", "is no name for a service"),
-        ("9lives", "is no name for a service"),
-        ("a/b", "is no name for a service"),
+        ("Nearest", "is not a valid name"),
+        ("9lives", "is not a valid name"),
+        ("a/b", "is not a valid name"),
         ("base", "there is a service base already (process sim)"),
         ("planning", "there is a service planning already"),
         ("numpy", "there is a Python module numpy already"),
@@ -80,7 +80,7 @@ def test_what_is_there_is_never_written_over(written: Path, capsys: pytest.Captu
     core = written / "depth_watch" / "core.py"
     core.write_text("mine")
     assert main(["new", "service", "depth-watch", "--into", str(written.parent)]) == 2
-    assert "is there already" in capsys.readouterr().err
+    assert "exists already" in capsys.readouterr().err
     assert core.read_text() == "mine"
 
 

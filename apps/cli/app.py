@@ -6,30 +6,11 @@ command is called, so it may import whatever it needs.
 
 from __future__ import annotations
 
-import asyncio
-import sys
-from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import typer
 from typer.core import TyperCommand, TyperGroup
 from typer.main import get_group
-
-from apps.cli.options import (
-    AdaptOption,
-    DistanceOption,
-    ForOption,
-    FramesOption,
-    JsonOption,
-    LatencyOption,
-    MeshOption,
-    ModelOption,
-    ObjectsOption,
-    ReachOption,
-    RobotChoice,
-    RobotOption,
-    TimeoutOption,
-)
 
 TASKS, WATCH, RUNNING, SAFETY = "Tasks", "Watching", "Starting and stopping", "Safety"
 CAPTURES, TOOLS, HARDWARE, LEARNING = "Captures", "Tools", "Hardware", "Learning"
@@ -45,9 +26,16 @@ class CommandRow(NamedTuple):
 
 
 COMMANDS = (
+    CommandRow("cancel", TASKS, "End the running task; the robot stands still."),
+    CommandRow("rehearse", TASKS, "Try a task in simulation: the whole robot in one process, in virtual time."),
     CommandRow("status", WATCH, "What runs, its health, what the robot does and why."),
     CommandRow("objects", WATCH, "The objects that the robot knows, and where it saw each last; `learn` adds one."),
     CommandRow("snapshot", WATCH, "Write a picture of what the robot sees now, with its detections drawn in."),
+    CommandRow(
+        "topics",
+        WATCH,
+        "List the topics and requests of all installed components: type, rate, age, quality of service, publisher.",
+    ),
     CommandRow("capture", CAPTURES, "Look at capture files, repair them, re-execute services on them."),
     CommandRow("record", CAPTURES, "Record what travels on the mesh into MCAP files, until Ctrl-C."),
     CommandRow("replay", CAPTURES, "Send a capture into the mesh again."),
@@ -65,7 +53,7 @@ COMMANDS = (
     CommandRow(
         "echo",
         TOOLS,
-        "What travels on a key, decoded, of whatever type it is; what a reader would reject is marked with its reason.",
+        "The messages of a key, decoded, of any type; a message that a reader would reject is marked with the reason.",
     ),
     CommandRow("hz", TOOLS, "Rate, jitter and amount of data on a key, as it arrives here, over the last seconds."),
     CommandRow("logs", TOOLS, "What the robot's processes on this machine wrote since their start, merged by time."),
@@ -76,10 +64,14 @@ COMMANDS = (
     CommandRow("servos", HARDWARE, "Find, set up, calibrate, hold and relax the servos; clear their faults."),
     CommandRow("kinect", HARDWARE, "Calibrate the Kinect; tilt it."),
     CommandRow(
-        "doctor", HARDWARE, "Look over a machine and its robot before a run; each line is well, or says what to do."
+        "doctor", HARDWARE, "Check a machine and its robot before a run; each line is well, or says what to do."
     ),
-    CommandRow("babble", LEARNING, "Move to learn: the arm before the eyes, the wheels before a target."),
-    CommandRow("learn", LEARNING, "Learn from what babbling saw: a model that the planner loads."),
+    CommandRow(
+        "babble",
+        LEARNING,
+        "Move to collect samples for learning: the arm with the hand in view, the wheels with a target.",
+    ),
+    CommandRow("learn", LEARNING, "Learn a model for the planner from the samples of babbling."),
     CommandRow(
         "experiment",
         LEARNING,
@@ -99,12 +91,16 @@ COMMANDS = (
 def load(name: str) -> TyperCommand | TyperGroup:
     """Imports the file of a command and returns the command."""
     match name:
+        case "cancel" | "rehearse":
+            from apps.cli.task_commands import app
         case "status":
             from apps.cli.status import app
         case "objects":
-            from apps.cli.objects_app import app
+            from apps.cli.objects import app
         case "snapshot":
             from apps.cli.snapshot import app
+        case "topics":
+            from apps.cli.topics import app
         case "capture":
             from apps.cli.capture import app
         case "record":
@@ -115,8 +111,10 @@ def load(name: str) -> TyperCommand | TyperGroup:
             from apps.cli.export import app
         case "top":
             from apps.cli.top import app
-        case "echo" | "new":
-            from apps.cli.tools_app import app
+        case "echo":
+            from apps.cli.echo import app
+        case "new":
+            from apps.cli.new import app
         case "hz":
             from apps.cli.hz import app
         case "logs":
@@ -128,9 +126,11 @@ def load(name: str) -> TyperCommand | TyperGroup:
         case "kinect":
             from apps.cli.kinect import app
         case "doctor":
-            from apps.cli.hardware_app import app
-        case "babble" | "learn":
-            from apps.cli.learning_app import app
+            from apps.cli.doctor import app
+        case "babble":
+            from apps.cli.babble import app
+        case "learn":
+            from apps.cli.learn import app
         case "experiment":
             from apps.cli.experiment import app
         case "up" | "down" | "run":
@@ -145,13 +145,27 @@ def load(name: str) -> TyperCommand | TyperGroup:
 
 
 class CommandGroup(TyperGroup):
-    """The group of all commands: help comes from COMMANDS, and a command is loaded when it is called."""
+    """The group of all commands: help comes from COMMANDS, and a command is loaded when it is called. Further commands
+    are made from the types of tasks."""
 
     def __init__(self, **attributes: Any) -> None:
         super().__init__(**attributes)
         for row in COMMANDS:
             listed = TyperCommand(row.name, help=row.summary, rich_help_panel=row.panel, hidden=row.hidden)
             self.add_command(listed)
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        from apps.cli.task_commands import task_names
+
+        return [*task_names(), *super().list_commands(ctx)]
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        command = super().get_command(ctx, cmd_name)
+        if command is not None:
+            return command
+        from apps.cli.task_commands import task_command
+
+        return task_command(cmd_name)
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         name, command, rest = super().resolve_command(ctx, args)
@@ -170,152 +184,3 @@ app = typer.Typer(
     "First `cocoro up sim --detach`, then `cocoro fetch red_can`, at last `cocoro down`.",
     epilog="Exit codes: 0 done, 1 the task failed, 2 bad usage, 3 refused or cancelled, 4 the mesh is not there.",
 )
-
-BodyOption = Annotated[str, typer.Option(metavar="nominal|worn", help="A body as drawn, or one that differs from it.")]
-
-
-# --- tasks ----------------------------------------------------------------------------------------
-
-
-def _task(where: tuple[str | None, str | None], as_json: bool, snapshot: Path | None = None, **request: Any) -> None:
-    """`request`: the fields of a TaskRequest."""
-    from apps.cli import tasks
-    from cocoro.messages import TaskRequest
-
-    sys.exit(asyncio.run(tasks.run(RobotChoice(*where), TaskRequest(**request), as_json, snapshot)))
-
-
-@app.command(rich_help_panel=TASKS)
-def fetch(
-    label: Annotated[str, typer.Argument(help="What to fetch; `cocoro objects` lists what the robot knows.")],
-    bring: Annotated[bool, typer.Option("--bring", help="Bring it to where the task began and put it down.")] = False,
-    timeout: TimeoutOption = None,
-    snapshot: Annotated[
-        Path | None, typer.Option(metavar="OUT.png", help="Write what the robot sees when it grasps.")
-    ] = None,
-    robot: RobotOption = None,
-    profile: MeshOption = None,
-    json: JsonOption = False,
-) -> None:
-    """Find an object, drive there, grasp it and lift it. Ctrl-C cancels it on the robot."""
-    _task((robot, profile), json, snapshot, task="fetch", label=label, bring=bring, timeout_s=timeout)
-
-
-@app.command(rich_help_panel=TASKS)
-def follow(
-    label: Annotated[str, typer.Argument(help="What to follow; `cocoro objects` lists what the robot knows.")],
-    for_: ForOption = None,
-    robot: RobotOption = None,
-    profile: MeshOption = None,
-    json: JsonOption = False,
-) -> None:
-    """Keep behind an object that moves, at a distance, until Ctrl-C or for a time."""
-    _task((robot, profile), json, task="follow", label=label, for_s=for_)
-
-
-@app.command(rich_help_panel=TASKS)
-def touch(
-    label: Annotated[str, typer.Argument(help="What to touch: something within the arm's reach.")],
-    timeout: TimeoutOption = None,
-    robot: RobotOption = None,
-    profile: MeshOption = None,
-    json: JsonOption = False,
-) -> None:
-    """Bring the open hand around something within reach, on the floor or in the air; the wheels stand."""
-    _task((robot, profile), json, task="touch", label=label, timeout_s=timeout)
-
-
-@app.command("go-to", rich_help_panel=TASKS)
-def go_to(
-    label: Annotated[str, typer.Argument(help="Where to go; `cocoro objects` lists what the robot knows.")],
-    distance: DistanceOption = 0.2,
-    timeout: TimeoutOption = None,
-    robot: RobotOption = None,
-    profile: MeshOption = None,
-    json: JsonOption = False,
-) -> None:
-    """Drive to an object and stop at a distance from it. Ctrl-C cancels it on the robot."""
-    _task((robot, profile), json, task="go-to", label=label, distance_m=distance, timeout_s=timeout)
-
-
-@app.command(rich_help_panel=TASKS)
-def park(
-    timeout: TimeoutOption = None, robot: RobotOption = None, profile: MeshOption = None, json: JsonOption = False
-) -> None:
-    """Fold the arm. Ctrl-C cancels it on the robot."""
-    _task((robot, profile), json, task="park", timeout_s=timeout)
-
-
-@app.command("put-down", rich_help_panel=TASKS)
-def put_down(
-    timeout: TimeoutOption = None, robot: RobotOption = None, profile: MeshOption = None, json: JsonOption = False
-) -> None:
-    """Set down what the hand holds. Ctrl-C cancels it on the robot."""
-    _task((robot, profile), json, task="put-down", timeout_s=timeout)
-
-
-@app.command(rich_help_panel=TASKS)
-def cancel(robot: RobotOption = None, profile: MeshOption = None) -> None:
-    """End the running task; the robot stands still."""
-    from apps.cli import tasks
-
-    sys.exit(asyncio.run(tasks.cancel(RobotChoice(robot, profile))))
-
-
-@app.command(rich_help_panel=TASKS)
-def rehearse(
-    task: Annotated[
-        str, typer.Argument(help="fetch, follow, touch, go-to, park, put-down, babble-arm or babble-wheels.")
-    ],
-    label: Annotated[str, typer.Argument(help="What to fetch, to follow, to touch or to go to.")] = "",
-    bring: Annotated[bool, typer.Option("--bring", help="Fetch: bring it to where the task began.")] = False,
-    for_: ForOption = None,
-    distance: DistanceOption = 0.2,
-    scene: Annotated[str, typer.Option(help="A scene's name, or its file.")] = "paper",
-    seed: Annotated[int, typer.Option(min=0, help="Everything that is drawn comes from it.")] = 0,
-    sensors: Annotated[
-        str, typer.Option(metavar="ideal|real", help="Perfect camera and body, or real ones.")
-    ] = "ideal",
-    body: BodyOption = "nominal",
-    model: ModelOption = None,
-    reach: ReachOption = None,
-    adapt: AdaptOption = False,
-    bend: Annotated[
-        float | None, typer.Option(min=0.0, metavar="SECONDS", help="Then somebody bends the forearm: 3 cm.")
-    ] = None,
-    count: Annotated[int, typer.Option(min=1, metavar="N", help="Babbling: how many samples or trials.")] = 1000,
-    samples: Annotated[Path | None, typer.Option(metavar="FILE", help="Babbling: where they are kept.")] = None,
-    latency: LatencyOption = None,
-    lockstep: Annotated[bool, typer.Option("--lockstep", help="One serial cycle over all, as in the paper.")] = False,
-    frames: FramesOption = None,
-    objects: ObjectsOption = None,
-    timeout: TimeoutOption = None,
-    picture: Annotated[
-        Path | None, typer.Option(metavar="OUT.png", help="Write what the robot saw when it grasped.")
-    ] = None,
-    record: Annotated[Path | None, typer.Option(metavar="OUT.mcap", help="Record everything.")] = None,
-    json: JsonOption = False,
-) -> None:
-    """Try a task in simulation: the whole robot in one process, in virtual time."""
-    from apps.cli import rehearse as rehearsing
-
-    options = {
-        "task": task, "label": label, "bring": bring, "for_s": for_, "scene": scene, "seed": seed, "sensors": sensors,
-        "distance_m": distance, "adapt": adapt, "bend_s": bend,
-        "body": body, "lockstep": lockstep, "timeout_s": timeout, "picture": None if picture is None else str(picture),
-        "record": None if record is None else str(record), "count": count, "reach": reach or "learned",
-        "model": None if model is None else str(model), "samples": None if samples is None else str(samples),
-        "objects": None if objects is None else str(objects),
-    }  # fmt: skip
-    sys.exit(rehearsing.rehearse(options, latency or [], frames, json))
-
-
-@app.command(rich_help_panel=WATCH)
-def topics(
-    markdown: Annotated[bool, typer.Option("--markdown", help="The whole page of the documentation.")] = False,
-    json: JsonOption = False,
-) -> None:
-    """What travels on the mesh: every key, its type, rate, quality of service and publisher."""
-    from apps.cli import topics as listing
-
-    print(listing.markdown() if markdown else listing.as_json() if json else listing.table(), end="")

@@ -1,23 +1,31 @@
-"""`cocoro doctor`: a machine and its robot, looked over before a run."""
+"""`cocoro doctor`: checks of the machine and of the robot's hardware before a run."""
 
 from __future__ import annotations
 
-import json
+import json as json_module
 import os
 import shutil
 import socket
+import sys
 import time
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import closing
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from apps.cli import doctor_stop, exits
+import typer
+
+from apps.cli import exits
+from apps.cli.options import DescriptionOption, JsonOption, MeasuredOption, ProfileArgument
+from apps.cli.stop_asking import addresses
 from cocoro.bus import shared
 from cocoro.checks import Check, bad, note, ok
 from cocoro.component import Component, load, machine_checks
 from cocoro.errors import ConfigError
 from cocoro.held_file import Holder
 from cocoro.robot import Robot
+from cocoro.stop.path import StopPoint
+from cocoro.stop.record import latch_dir, read
 from deploy import profiles
 from deploy.processes import shared_bytes
 from deploy.profiles import Profile
@@ -25,17 +33,34 @@ from deploy.rundir import RunDir
 
 RULES = Path("/etc/udev/rules.d/99-cocoro.rules")
 ENOUGH_GB = 1.0
+"""Free disk space below this is a problem."""
 MARKS = {"ok": "ok  ", "note": "note", "bad": "BAD "}
 SYNCHRONISED = Path("/run/systemd/timesync/synchronized")
 EARLIEST_S = 1_700_000_000
+"""A wall clock before this time (end of 2023) is wrong."""
+IN_MEMORY = ("tmpfs", "ramfs")
+"""File systems that a reboot empties."""
+
+app = typer.Typer()
 
 
-def doctor(profile_name: str, as_json: bool) -> int:
-    """Exit code 1 when something is not well."""
-    profile = profiles.read(profile_name)
+@app.command()
+def doctor(
+    profile: ProfileArgument = "robot",
+    description: DescriptionOption = None,
+    measured: MeasuredOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Check a machine and its robot before a run; each line is well, or says what to do. Exit code 1 if not."""
+    sys.exit(print_checks(profile, json, description, measured))
+
+
+def print_checks(profile_name: str, as_json: bool, description: Path | None, measured: Path | None) -> int:
+    """Prints all checks of a profile; the exit code is 1 when one found a problem."""
+    profile = profiles.read(profile_name).with_robot(description, measured)
     checks = list(examine(profile))
     if as_json:
-        print(json.dumps([check._asdict() for check in checks]))
+        print(json_module.dumps([check._asdict() for check in checks]))
     else:
         width = max(len(check.name) for check in checks)
         for check in checks:
@@ -44,7 +69,7 @@ def doctor(profile_name: str, as_json: bool) -> int:
 
 
 def examine(profile: Profile) -> Iterator[Check]:
-    """All checks that a profile's robot gives reason for."""
+    """All checks that apply to a profile."""
     run_dir = RunDir(profile.robot)
     yield from _libraries(profile)
     robot, own = _robot(profile)
@@ -61,27 +86,26 @@ def examine(profile: Profile) -> Iterator[Check]:
     for row in profile.rows():
         running = [service for service in row.services if service in claims]
         if running:
-            yield note(row.name, f"runs (pid {claims[running[0]].pid}): `cocoro status` tells how it is")
+            yield note(row.name, f"runs (pid {claims[running[0]].pid}): `cocoro status` shows its state")
         else:
             yield from _own_checks(row, profile, robot)
     yield _clock(profile)
     yield _shared_memory(profile, claims)
     yield from _disk(run_dir)
     yield from _mesh(profile, run_dir)
-    yield from doctor_stop.check(profile.robot)
+    yield from stop_checks(profile.robot)
 
 
 def _robot(profile: Profile) -> tuple[Robot, Check | None]:
-    """The description, and what there is to say of its files."""
-    files = [None if file is None else Path(file) for file in (profile.description, profile.measured)]
+    """The robot's description, and a check of its files."""
     try:
-        robot = Robot.load(*files)
+        robot = Robot.load(*profile.robot_files)
     except ConfigError as error:
         return Robot.load(), bad("robot's files", str(error))
     if profile.measured is not None:
         return robot, ok("robot's own file", profile.measured)
     if profile.clock == "real":
-        what = "none: zeros and limits are the drawing's; `cocoro servos calibrate` measures them"
+        what = "none: zeros and limits are nominal; `cocoro servos calibrate` measures them"
         return robot, note("robot's own file", what)
     return robot, None
 
@@ -105,48 +129,48 @@ def _own_checks(component: Component, profile: Profile, robot: Robot) -> Iterabl
 def _rules() -> Check:
     if RULES.exists():
         return ok("udev rules", str(RULES))
-    return bad("udev rules", f"not installed: sudo cp deploy/udev/{RULES.name} {RULES.parent}, then plug anew")
+    return bad("udev rules", f"not installed: sudo cp deploy/udev/{RULES.name} {RULES.parent}, then replug")
 
 
 def _priority() -> Iterator[Check]:
-    """Whether the base's guard may run before everything else."""
+    """Whether the base's guard may run at real-time priority."""
     import resource
 
     allowed = os.geteuid() == 0 or resource.getrlimit(resource.RLIMIT_RTPRIO)[0] > 0
     if allowed:
         yield ok("real-time priority", "allowed")
     else:
-        yield note("real-time priority", "not allowed: the unit file's LimitRTPRIO and LimitNICE give it")
+        yield note("real-time priority", "not allowed: LimitRTPRIO and LimitNICE in the unit file allow it")
 
 
 def _clock(profile: Profile) -> Check:
     if time.time() < EARLIEST_S:
-        return bad("clock", f"it is not {time.strftime('%Y')}: set it, or let timesyncd do so")
+        return bad("clock", f"it shows {time.strftime('%Y')}, which is wrong: set it, or enable systemd-timesyncd")
     if profile.mesh.connect and not SYNCHRONISED.exists():
-        return note("clock", "whether it is synchronised is not known; machines of one robot must agree to 0.1 s")
+        return note("clock", "not known to be synchronised; the clocks of a robot's machines must agree to 0.1 s")
     return ok("clock", time.strftime("%Y-%m-%d %H:%M:%S"))
 
 
 def _shared_memory(profile: Profile, claims: Mapping[str, Holder]) -> Check:
-    """Whether frames can be shared; they are copied when they cannot."""
+    """Whether there is shared memory for the frames; without it they are copied."""
     rows = profile.rows()
     wanted_bytes = shared_bytes(rows)
     if any(row.frames == "publishes" and set(row.services) & set(claims) for row in rows):
         return ok("shared memory", f"{sum(shared.segments().values()) / 1e6:.1f} MB in use")
     if why := shared.obstacle(wanted_bytes):
         return note("shared memory", f"{why}; until then {shared.COSTS}")
-    return ok("shared memory", f"room for the {wanted_bytes / 1e6:.1f} MB that the frames take")
+    return ok("shared memory", f"enough for the {wanted_bytes / 1e6:.1f} MB of the frames")
 
 
 def _disk(run_dir: RunDir) -> Iterator[Check]:
     for what, path in (("run directory", run_dir.root), ("logs", run_dir.logs)):
         there = next(folder for folder in (path, *path.parents) if folder.exists())
         if not os.access(there, os.W_OK):
-            yield bad(what, f"{there} cannot be written; choose another by COCORO_RUN_DIR or COCORO_LOG_DIR")
+            yield bad(what, f"{there} is not writable; set COCORO_RUN_DIR or COCORO_LOG_DIR to another directory")
             continue
         free_gb = shutil.disk_usage(there).free / 1e9
         text = f"{path}, {free_gb:.1f} GB free"
-        yield ok(what, text) if free_gb >= ENOUGH_GB else bad(what, f"{text}: make room")
+        yield ok(what, text) if free_gb >= ENOUGH_GB else bad(what, f"{text}: free some space")
 
 
 def _mesh(profile: Profile, run_dir: RunDir) -> Iterator[Check]:
@@ -165,4 +189,60 @@ def _reachable(endpoint: str) -> Check:
         with socket.create_connection((host.strip("[]"), int(port)), timeout=2.0):
             return ok("mesh", f"{endpoint} answers")
     except (OSError, ValueError) as error:
-        return bad("mesh", f"{endpoint} does not answer ({error}): is its router up, is the address right?")
+        return bad("mesh", f"{endpoint} does not answer ({error}): check its router and the address")
+
+
+# --- the emergency stop -----------------------------------------------------------------------------
+
+
+def stop_checks(robot: str) -> Iterator[Check]:
+    """Whether the stop path works, and where the latch is kept."""
+    yield _stop_path()
+    yield _latch(robot)
+
+
+def _stop_path() -> Check:
+    """Opens a stop point as a service does, and looks for it as `cocoro stop` does."""
+    name = f"doctor-{os.getpid()}"
+    try:
+        with closing(StopPoint(name, "doctor")):
+            found = addresses(name)
+    except OSError as error:
+        return bad("emergency stop", f"the stop path does not work ({error}): is /proc mounted?")
+    if not found:
+        return bad(
+            "emergency stop", "its addresses are missing in /proc/net/unix, so `cocoro stop` would not find them"
+        )
+    return ok("emergency stop", "the stop path works; every user of this machine may stop the robot")
+
+
+def _latch(robot: str) -> Check:
+    folder = latch_dir(robot)
+    there = next(path for path in (folder, *folder.parents) if path.exists())
+    if not there.is_dir() or not os.access(there, os.W_OK):
+        return bad(
+            "its latch",
+            f"{there} cannot be written, so the robot starts stopped; set COCORO_STATE_DIR",
+        )
+    if (kind := _filesystem(there)) in IN_MEMORY:
+        return bad(
+            "its latch",
+            f"{folder} is in memory ({kind}) and does not survive a reboot; set COCORO_STATE_DIR",
+        )
+    latched = (
+        [latch for file in sorted(folder.glob("[!.]*")) if (latch := read(file)).latched] if folder.is_dir() else []
+    )
+    if latched:
+        return note("its latch", f"latched by {latched[0].by}; `cocoro reset` releases it when the robot is up")
+    return ok("its latch", f"kept in {folder}")
+
+
+def _filesystem(path: Path) -> str:
+    """Type of the file system that holds a path; empty where /proc does not list it."""
+    try:
+        mounts = [line.split() for line in Path("/proc/self/mounts").read_text(errors="replace").splitlines()]
+    except OSError:
+        return ""
+    place = str(path.resolve())
+    over = [(row[1], row[2]) for row in mounts if place == row[1] or place.startswith(row[1].rstrip("/") + "/")]
+    return max(over, key=lambda row: len(row[0]), default=("", ""))[1]

@@ -13,11 +13,11 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from apps.cli import exits
-from apps.cli.options import FramesOption, frames_of
+from apps.cli.options import DescriptionOption, FramesOption, MeasuredOption, frames_of
 from apps.cli.terminal import table
-from apps.experiments.every import EXPERIMENTS, run
+from apps.experiments.experiments import EXPERIMENTS, run
+from apps.experiments.plan import ExperimentSettings
 from apps.experiments.runs import RunResult
-from apps.experiments.settings import ExperimentSettings
 from cocoro.errors import ConfigError
 
 EVERY = "all"
@@ -90,6 +90,8 @@ def experiment(
     body: Annotated[
         str, typer.Option(metavar="nominal|worn", help="A body that equals the nominal model, or differs from it.")
     ] = "worn",
+    description: DescriptionOption = None,
+    measured: MeasuredOption = None,
     frames: FramesOption = None,
     samples: Annotated[
         int,
@@ -105,12 +107,14 @@ def experiment(
     E1 hand-eye map, E2 reaching, E3 wheel distance, E4 navigation, E5 following, E6 fetching. Ctrl-C ends it; the same
     command continues.
     """
-    sys.exit(run_experiments(which, seeds, out, sensors, body, frames, samples, jobs, not no_plots))
+    sys.exit(
+        run_experiments(which, seeds, out, sensors, body, (description, measured), frames, samples, jobs, not no_plots)
+    )
 
 
 def run_experiments(
-    which: str, seeds: int, out: Path, sensors: str, body: str, frames: str | None, samples: int, jobs: int | None,
-    plots: bool,
+    which: str, seeds: int, out: Path, sensors: str, body: str, robot_files: tuple[Path | None, Path | None],
+    frames: str | None, samples: int, jobs: int | None, plots: bool,
 ) -> int:  # fmt: skip
     """Runs, writes the report, prints its tables; the exit code is 1 when a run failed.
 
@@ -122,10 +126,13 @@ def run_experiments(
     for name, value, known in (("sensors", sensors, ("ideal", "real")), ("body", body, ("nominal", "worn"))):
         if value not in known:
             raise ConfigError(f"--{name} {value}: known are {' and '.join(known)}")
+    description, measured = (None if file is None else str(file.resolve()) for file in robot_files)
     settings = ExperimentSettings(
         seeds=tuple(range(seeds)), out=out.resolve(), sensors="real" if sensors == "real" else "ideal",
         body="worn" if body == "worn" else "nominal", samples=samples, jobs=jobs or os.cpu_count() or 1,
+        description=description, measured=measured,
     )  # fmt: skip
+    settings.robot()  # refuses files that cannot be read before the first run
     if frames:
         settings = msgspec.structs.replace(settings, **frames_of(frames))
     progress = RunProgress(sys.stderr)

@@ -24,7 +24,6 @@ from cocoro.clock import NS
 from cocoro.errors import ConfigError
 from cocoro.messages import Message
 from cocoro.objects import Catalogue
-from cocoro.robot import Robot
 from cocoro.topics import TOPICS, Topic
 
 if TYPE_CHECKING:
@@ -176,12 +175,8 @@ async def view_mesh(choice: RobotChoice) -> int:
 
     rerun = library()
     async with joined(choice, frames=True) as link:
-        resolved = link.run_dir.resolved()
-        description, measured = (
-            Path(file) if (file := resolved.get(name)) else None for name in ("description", "measured")
-        )
         recording = opened(rerun)
-        watch(link.bus, link.robot, RerunScene(recording, Robot.load(description, measured), Catalogue.load()))
+        watch(link.bus, link.robot, RerunScene(recording, link.described(), Catalogue.load()))
         print("Ctrl-C ends it")
         with interrupt_event() as end:
             await end.wait()

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from apps.cli import exits
-from apps.cli.options import ProfileOption
+from apps.cli.options import DescriptionOption, MeasuredOption, ProfileOption
 from apps.cli.toml_files import write_values
 from cocoro.component import load
 from cocoro.errors import ConfigError, RefusedError
@@ -44,13 +44,15 @@ def calibrate(
         Path | None, typer.Option(metavar="FOLDER", help="Keep the views here, to calibrate from them again.")
     ] = None,
     profile: ProfileOption = "robot",
+    description: DescriptionOption = None,
+    measured: MeasuredOption = None,
     write: Annotated[
         Path | None,
         typer.Option("--write", metavar="FILE", help="Write the result into this file, not the robot's measured file."),
     ] = None,
 ) -> None:
     """Measure lenses, registration and depth curve from views of a chessboard. The robot must be down."""
-    sys.exit(calibrate_from_views(profile, board, square, views, source, keep, write))
+    sys.exit(calibrate_from_views(profile, board, square, views, source, keep, write, description, measured))
 
 
 @kinect.command()
@@ -64,13 +66,13 @@ def tilt(
 
 def calibrate_from_views(
     profile_name: str, size: str, square_mm: float, views: int, source: Path | None, keep: Path | None,
-    write: Path | None,
+    write: Path | None, description: Path | None = None, measured: Path | None = None,
 ) -> int:  # fmt: skip
     """Takes views or reads them from `source`, calibrates, and writes the result into the robot's measured file.
 
     Raises ConfigError for an impossible board or square, RefusedError while the Kinect's service runs.
     """
-    profile = profiles.read(profile_name)
+    profile = profiles.read(profile_name).with_robot(description, measured)
     robot, file = _robot(profile, write)
     board = calibration.Board(*_board(size), _square_m(square_mm))
 
@@ -111,8 +113,7 @@ def _config(profile: Profile) -> Any:
 
 def _robot(profile: Profile, write: Path | None) -> tuple[Robot, Path]:
     """The robot by its description, without earlier measurements of its Kinect; and its measured file."""
-    measured = None if profile.measured is None else Path(profile.measured)
-    description = None if profile.description is None else Path(profile.description)
+    description, measured = profile.robot_files
     return Robot.load(description), write or measured or Path(f"{profile.robot}-measured.toml")
 
 

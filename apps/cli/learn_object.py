@@ -14,12 +14,13 @@ import msgspec
 
 from apps.appearance.learn import LearnedObject, ObjectHints, learn
 from apps.cli import exits
-from apps.cli.learn_sight import CameraView, of_picture, of_robot, preview
+from apps.cli.camera_view import CameraView, of_picture, of_robot, preview
 from apps.cli.options import RobotChoice
 from apps.cli.toml_files import save, text_of, with_object
+from apps.pictures import save_png
 from cocoro.errors import ConfigError, naming
 from cocoro.objects import Catalogue, ObjectSpec
-from cocoro.picture import save_png
+from cocoro.robot import Robot
 
 LIVE = "live"
 FILE = "objects.toml"
@@ -38,9 +39,14 @@ class SaveOptions:
     as_json: bool
 
 
-async def learn_object(where: RobotChoice, source: str, wanted: ObjectHints, keeping: SaveOptions) -> int:
-    """Raises ConfigError for what cannot be, MeshError when the view is to be live and there is no robot."""
-    sight = await of_robot(where) if source == LIVE else of_picture(Path(source))
+async def learn_object(
+    where: RobotChoice, source: str, wanted: ObjectHints, keeping: SaveOptions, robot: Robot | None = None
+) -> int:
+    """Learn a look of an object and keep it. `robot`: whose camera took a picture file; None is the Calliope.
+
+    Raises ConfigError for what cannot be, MeshError when the view is to be live and there is no robot.
+    """
+    sight = await of_robot(where) if source == LIVE else of_picture(Path(source), robot or Robot.load())
     path = keeping.catalogue or sight.catalogue or Path(FILE)
     catalogue = Catalogue.from_text(text_of(path), str(path))
     before = catalogue.get(wanted.label)
@@ -178,7 +184,7 @@ def size_of(text: str | None) -> tuple[float, ...] | None:
     return sizes
 
 
-def wanted_of(label: str, **options: Any) -> ObjectHints:
+def hints_of(label: str, **options: Any) -> ObjectHints:
     """Raises ConfigError for a label or a shape that cannot be."""
     if not re.fullmatch(r"[a-z][a-z0-9_-]{0,63}", label):
         raise ConfigError(f"{label!r} is no label: small letters, digits, '_' and '-', a letter first: orange_box")

@@ -6,6 +6,7 @@ import asyncio
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 from apps.cli.options import RobotChoice
@@ -13,12 +14,14 @@ from cocoro.bus.base import Bus
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.errors import ConfigError, MeshError
 from cocoro.participant import Answer, Participant
+from cocoro.robot import Robot
 from cocoro.topics import Request
 from deploy import robot_time
 from deploy.rundir import RunDir, robots
 
 __all__ = ["Answer", "Link", "find", "joined", "within"]
 
+ROBOT_FILES = ("description", "measured")
 START = "start one with `cocoro up sim`"
 
 
@@ -34,6 +37,12 @@ class Link(Participant):
         self._private = private
         self.run_dir = run_dir
         self.robot = run_dir.robot
+
+    def described(self) -> Robot:
+        """The robot by the files that it was started with, if they are on this machine; else the Calliope. Raises
+        ConfigError."""
+        resolved = self.run_dir.resolved()
+        return Robot.load(*(Path(file) if (file := resolved.get(name)) else None for name in ROBOT_FILES))
 
     def unserved(self, request: Request[Any, Any]) -> str:
         return f"{self.robot} has no {request.server} running: {START}, `cocoro status` tells more"

@@ -51,14 +51,14 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _command(arguments: list[str]) -> int:
-    from typer.main import get_command
+    from typer.main import get_group
 
     from apps.cli.app import app
 
     if output.taken_over():
         output.log_to_stderr()
     try:
-        get_command(app)(args=arguments, prog_name="cocoro")  # calling `app` would replace sys.excepthook
+        get_group(app)(args=arguments, prog_name="cocoro")  # calling `app` would replace sys.excepthook
     except SystemExit as end:
         if _interrupted(end):  # typer has another exit code for it
             return _cancelled()

@@ -1,4 +1,4 @@
-"""`cocoro new service NAME`: a working component with its test, as a distribution of its own."""
+"""`cocoro new service NAME`: writes a distribution with a working component and its tests."""
 
 from __future__ import annotations
 
@@ -10,6 +10,9 @@ from collections.abc import Iterator
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path, PurePosixPath
+from typing import Annotated
+
+import typer
 
 from apps.cli import exits
 from cocoro.errors import ConfigError
@@ -18,14 +21,33 @@ from deploy import processes
 TEMPLATE = "templates/service"
 SUFFIX = ".template"
 NAME = r"[a-z][a-z0-9_-]{0,31}"
-"""A chunk of a key, and with '_' for '-' a Python package."""
+"""Valid names: a chunk of a key, and with '_' for '-' a Python package."""
 
 
-def service(name: str, into: Path) -> int:
-    """Write the component into a folder of its name. Raises ConfigError for a name that cannot be, or is taken."""
+app = typer.Typer()
+new = typer.Typer(no_args_is_help=True, help="Write a component from a template: `cocoro new service NAME`.")
+app.add_typer(new, name="new")
+
+
+@new.callback()
+def _new() -> None:
+    """Makes `new` a group of commands, although it has one."""
+
+
+@new.command()
+def service(
+    name: Annotated[str, typer.Argument(help="Name of the service, the first part of its keys: nearest.")],
+    into: Annotated[Path, typer.Option(metavar="DIR", help="The folder that its folder goes into.")] = Path(),
+) -> None:
+    """A working component with its test, as a package of your own: see docs/components.md."""
+    sys.exit(write_service(name, into))
+
+
+def write_service(name: str, into: Path) -> int:
+    """Writes the component into the folder `into`/`name`. Raises ConfigError for an invalid or taken name."""
     folder = into / name
     if folder.exists():
-        raise ConfigError(f"{folder} is there already; choose another name, or another place with --into")
+        raise ConfigError(f"{folder} exists already; choose another name, or another place with --into")
     package = package_of(name)
     words = {"name": name, "package": package, "class": "".join(part.capitalize() for part in re.split("[-_]+", name))}
     for path, text in files(words):
@@ -37,34 +59,34 @@ def service(name: str, into: Path) -> int:
             raise ConfigError(f"{target} cannot be written: {error.strerror}") from error
         print(target)
     hints = (
-        (f"pytest {folder}", "its tests"),
-        (f"pip install -e {folder}", "so that `cocoro` knows it"),
-        (f"cocoro run {name}", "beside a robot that is up"),
-        (f"cocoro echo {name}/travelled", "what it says"),
+        (f"pytest {folder}", "runs its tests"),
+        (f"pip install -e {folder}", "installs it"),
+        (f"cocoro run {name}", "runs it beside a robot that is up"),
+        (f"cocoro echo {name}/travelled", "prints its messages"),
     )
-    print(f"\nWhat it does is in {folder / package / 'core.py'}. Now:")
+    print(f"\nIts computation is in {folder / package / 'core.py'}. Next:")
     for command, what in hints:
         print(f"  {command:<{max(len(command) for command, _ in hints)}}  # {what}")
     return exits.DONE
 
 
 def package_of(name: str) -> str:
-    """The Python package of a component's name. Raises ConfigError when it cannot be, or is another's."""
+    """The Python package of a component. Raises ConfigError for a name that is not valid or is taken."""
     if not re.fullmatch(NAME, name):
-        raise ConfigError(f"{name!r} is no name for a service: small letters, digits, '_' and '-', a letter first")
+        raise ConfigError(f"{name!r} is not a valid name: small letters, digits, '_' and '-', a letter first")
     package = name.replace("-", "_")
     for row in processes.table().values():
         if name in (row.name, *row.services):
             raise ConfigError(f"there is a service {name} already (process {row.name}); choose another name")
     spec = None if keyword.iskeyword(package) else importlib.util.find_spec(package)
-    taken = spec is not None and spec.origin is not None  # a mere folder of that name is no module
+    taken = spec is not None and spec.origin is not None  # a folder without __init__.py is not taken
     if keyword.iskeyword(package) or package in sys.stdlib_module_names or taken:
         raise ConfigError(f"there is a Python module {package} already; choose another name")
     return package
 
 
 def files(words: dict[str, str]) -> Iterator[tuple[PurePosixPath, str]]:
-    """The template's files, filled in: where below the component's folder, and their text."""
+    """The files of the template with `words` filled in: path below the component's folder, and text."""
     for path, source in _walk(resources.files("apps").joinpath(TEMPLATE), PurePosixPath()):
         text = source.read_text(encoding="utf-8")
         for word, value in words.items():

@@ -65,6 +65,9 @@ ObjectsOption = Annotated[
         "--objects", metavar="FILE", help="Known objects instead of the project's own (`cocoro objects learn`)."
     ),
 ]
+BodyOption = Annotated[
+    str, typer.Option("--body", metavar="nominal|worn", help="A body like the nominal model, or one that differs.")
+]
 DescriptionOption = Annotated[
     Path | None,
     typer.Option("--description", metavar="FILE", help="Description of the robot, if it is not the Calliope."),
@@ -101,16 +104,6 @@ TimeoutOption = Annotated[
     float | None,
     typer.Option("--timeout", min=0.1, max=3600.0, metavar="SECONDS", help="Fail the task after this time."),
 ]
-ForOption = Annotated[
-    float | None, typer.Option("--for", min=0.1, max=3600.0, metavar="SECONDS", help="Follow for this time, then stop.")
-]
-DistanceOption = Annotated[
-    float,
-    typer.Option(
-        "--distance", min=0.0, max=5.0, metavar="METRES", help="go-to: from the robot's centre to the object's edge."
-    ),
-]
-
 # --- captures and topics --------------------------------------------------------------------------
 
 CaptureArgument = Annotated[Path, typer.Argument(metavar="FILE", help="A capture (MCAP file).")]

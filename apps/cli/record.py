@@ -24,7 +24,6 @@ from cocoro.errors import ConfigError
 from cocoro.installed import unrecorded
 from cocoro.messages import Recording
 from cocoro.node import Node
-from cocoro.robot import Robot
 from cocoro.topics import RECORDING
 from deploy import robot_time
 from services.capture.component import CAPTURE
@@ -73,11 +72,8 @@ async def record_mesh(choice: RobotChoice, settings: dict[str, Any], seconds: fl
         print(f"not recorded, as declared: {', '.join(left_out)}", file=sys.stderr)
     async with joined(choice, frames=True) as link:
         resolved = link.run_dir.resolved()
-        description, measured = (
-            Path(file) if (file := resolved.get(name)) else None for name in ("description", "measured")
-        )
         clock = FollowedClock() if resolved.get("clock") == "sim" else robot_time.clock(link.run_dir.path)
-        robot = Robot.load(description, measured)
+        robot = link.described()
         name = f"record-{os.getpid()}"
         async with Node(
             name, link.bus, clock, robot, robot_name=link.robot, module=CAPTURE.module, config=config

@@ -52,10 +52,9 @@ def _output_to_stderr() -> Iterator[None]:
 
 
 def request_of(options: dict[str, Any], latency: list[str], frames: str | None) -> RehearsalRequest:
+    """The request of the command's options. Raises ConfigError, which names the option that is wrong."""
     fields = {**options, "latency": latencies_of(latency), **(frames_of(frames) if frames else {})}
     fields["scene"] = scene_of(fields["scene"])
-    if fields["task"] in ("fetch", "follow", "touch", "go-to") and not fields["label"]:
-        raise ConfigError(f"{fields['task']} needs a label: cocoro rehearse {fields['task']} red_can")
     try:
         return msgspec.convert(fields, RehearsalRequest)
     except msgspec.ValidationError as error:

@@ -16,7 +16,15 @@ import typer
 
 from apps.cli import exits
 from apps.cli.link import Link, joined
-from apps.cli.options import JsonOption, MeshOption, ProfileOption, RobotChoice, RobotOption
+from apps.cli.options import (
+    DescriptionOption,
+    JsonOption,
+    MeasuredOption,
+    MeshOption,
+    ProfileOption,
+    RobotChoice,
+    RobotOption,
+)
 from apps.cli.terminal import StatusLine, print_table
 from apps.cli.toml_files import write_values
 from cocoro.component import load
@@ -90,9 +98,9 @@ async def request(choice: RobotChoice, action: str, joints: list[str]) -> int:
 
     Raises MeshError when a network's service is not running, ConfigError for an unknown joint.
     """
-    networks = _networks_of(joints)
     code = exits.DONE
     async with joined(choice) as link:
+        networks = _networks_of(joints, link.described())
         alive = await link.alive()
         missing = [network for network in networks if network not in alive]
         if missing:
@@ -115,9 +123,9 @@ async def _request_one(link: Link, network: str, action: str, joints: list[str])
     return exits.DONE
 
 
-def _networks_of(joints: list[str]) -> dict[str, list[str]]:
+def _networks_of(joints: list[str], robot: Robot) -> dict[str, list[str]]:
     """Joints by network; no joints stand for all of both networks. Raises ConfigError for an unknown joint."""
-    known = Robot.load().joints
+    known = robot.joints
     if unknown := [joint for joint in joints if joint not in known]:
         raise ConfigError(f"there is no joint {unknown[0]!r}; known are {', '.join(known)}")
     if not joints:
@@ -142,11 +150,12 @@ class ServoWorkbench:
     file: Path
 
     @classmethod
-    def of(cls, profile_name: str, write: Path | None) -> ServoWorkbench:
+    def of(
+        cls, profile_name: str, write: Path | None, description: Path | None = None, measured: Path | None = None
+    ) -> ServoWorkbench:
         """Raises ConfigError for a profile or a robot description that cannot be read."""
-        profile = profiles.read(profile_name)
-        description = None if profile.description is None else Path(profile.description)
-        measured = None if profile.measured is None else Path(profile.measured)
+        profile = profiles.read(profile_name).with_robot(description, measured)
+        description, measured = profile.robot_files
         existing = measured if measured is not None and measured.exists() else None
         robot = Robot.load(description, existing)
         config = profile.config("servos", load(named("servos")).config)
@@ -187,15 +196,19 @@ def scan(
     write: Annotated[
         Path | None, typer.Option("--write", metavar="FILE", help="Write the ports that were found into this profile.")
     ] = None,
+    description: DescriptionOption = None,
+    measured: MeasuredOption = None,
     json: JsonOption = False,
 ) -> None:
     """Find servos on every serial port, at every baud rate. The robot must be down."""
-    sys.exit(scan_ports(profile, port or [], baud or [], last, write, json))
+    bench = ServoWorkbench.of(profile, None, description, measured)
+    sys.exit(scan_ports(bench, port or [], baud or [], last, write, json))
 
 
-def scan_ports(profile: str, ports: list[str], bauds: list[int], last: int, write: Path | None, as_json: bool) -> int:
+def scan_ports(
+    bench: ServoWorkbench, ports: list[str], bauds: list[int], last: int, write: Path | None, as_json: bool
+) -> int:
     """Prints the servos that answer; the exit code is 1 when one of the robot's servos does not."""
-    bench = ServoWorkbench.of(profile, None)
     known = [port for port in dict.fromkeys(bench.ports.values()) if Path(port).exists()]
     resolved = {str(Path(port).resolve()) for port in known}
     wanted = ports or known + [port for port in tools.candidates() if str(Path(port).resolve()) not in resolved]
@@ -274,9 +287,11 @@ def calibrate(
     port: PortOption = None,
     baud: BaudOption = None,
     write: WriteOption = None,
+    description: DescriptionOption = None,
+    measured: MeasuredOption = None,
 ) -> None:
     """Measure a joint's zero and direction while you turn it by hand. The robot must be down."""
-    bench = ServoWorkbench.of(profile, write)
+    bench = ServoWorkbench.of(profile, write, description, measured)
     for joint in [bench.joint(name) for name in joints]:
         with bench.line(joint, port, baud) as line:
             bench.write(joint, tools.calibrate(line, joint, at, _wait_for_enter))
@@ -289,9 +304,11 @@ def limits(
     port: PortOption = None,
     baud: BaudOption = None,
     write: WriteOption = None,
+    description: DescriptionOption = None,
+    measured: MeasuredOption = None,
 ) -> None:
     """Measure a joint's limits while you turn it by hand from end to end. The robot must be down."""
-    bench = ServoWorkbench.of(profile, write)
+    bench = ServoWorkbench.of(profile, write, description, measured)
     for joint in [bench.joint(name) for name in joints]:
         with bench.line(joint, port, baud) as line:
             print(f"{joint.name} is limp: turn it from end to end, then press Enter")

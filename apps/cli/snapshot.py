@@ -102,7 +102,7 @@ class SnapshotTaker:
 
 
 def _write(out: Path, frame: Frame, detections: Detections | None) -> None:
-    from cocoro import picture  # imports the image library
+    from apps import pictures  # imports the image library
     from cocoro.objects import Catalogue
 
-    picture.save_png(picture.draw(frame, detections, Catalogue.load()), out)
+    pictures.save_png(pictures.draw(frame, detections, Catalogue.load()), out)

@@ -20,6 +20,7 @@ from apps.cli.snapshot import SnapshotTaker, check
 from cocoro.contact import RECOVERY_S, Contact, SleepDetector
 from cocoro.errors import CallTimeoutError, CocoroError
 from cocoro.messages import CancelRequest, TaskReply, TaskRequest, TaskState
+from cocoro.tasks import Task
 from cocoro.topics import CANCEL, LATCH, RUN, TASK
 
 USAGE_REFUSALS = ("unknown_label", "not_graspable", "bad_request")
@@ -28,8 +29,6 @@ UNSETTLED = ("not_alive", "estop")
 """Refusals that may be over in a moment: not everyone has been heard yet, or the emergency stop is not known yet."""
 SETTLE_S = 3.0
 ASK_AGAIN_S = 0.1
-SNAPSHOT_PHASE = "grasp"
-"""The picture is the last one of this phase: the claws have closed, the hand has not moved yet."""
 CANCEL_S = 10.0
 """How long a cancelled task may take to say its outcome."""
 EXECUTIVE = "executive"
@@ -38,7 +37,8 @@ LOOK_S = 0.2
 
 
 async def run(where: RobotChoice, request: TaskRequest, as_json: bool, picture: Path | None) -> int:
-    """Run a task to its outcome and return the exit code. `picture`: where to write what is seen at the grasp."""
+    """Run a task to its outcome and return the exit code. `picture`: file for the last picture of the task's snapshot
+    phase."""
     if picture is not None:
         check(picture)
     async with joined(where, frames=picture is not None) as link:
@@ -71,9 +71,10 @@ class Follower:
         self._contact = contact or Contact(link.run_dir.claimant_pid)
         self._link = link
         self._request = request
+        self._task: Task = request.task
         self._view = view
         self._picture = picture
-        self._name = f"{request.task} {request.label}".strip()
+        self._name = f"{self._task.name} {self._task.target}".strip()
         self._task_id = ""
         self._news: asyncio.Queue[TaskState | bool] = asyncio.Queue()
         """What the executive says; and whether its token is there, as that changes."""
@@ -135,10 +136,10 @@ class Follower:
             if isinstance(state, bool) or state.task_id != self._task_id:
                 continue
             if self._picture is not None:
-                if state.phase == SNAPSHOT_PHASE and camera is None:
+                if state.phase == self._task.snapshot_phase and camera is None:
                     camera = SnapshotTaker(self._link)
                     camera.open()
-                elif state.phase != SNAPSHOT_PHASE and camera is not None:
+                elif state.phase != self._task.snapshot_phase and camera is not None:
                     await self._take(camera, self._picture)
                     camera = None
             if state.outcome is not None:
@@ -168,7 +169,11 @@ class Follower:
     def _failed(self, reason: str) -> TaskState:
         """What is said when the executive does not say it."""
         return TaskState(
-            task_id=self._task_id, task=self._request.task, label=self._request.label, outcome="failed", reason=reason
+            task_id=self._task_id,
+            task=self._task.name,
+            label=self._task.target,
+            outcome="failed",
+            reason=reason,
         )
 
     async def _take(self, camera: SnapshotTaker, picture: Path) -> None:
@@ -195,7 +200,7 @@ class Follower:
     # --- the end ----------------------------------------------------------------------------------
 
     def _refused(self, reply: TaskReply) -> tuple[int, dict[str, object]]:
-        result = {"task": self._request.task, "label": self._request.label, "outcome": "refused"}
+        result = {"task": self._task.name, "label": self._task.target, "outcome": "refused"}
         print(f"cocoro: refused: {reply.text}", file=sys.stderr)
         code = exits.USAGE if reply.refusal in USAGE_REFUSALS else exits.REFUSED
         return code, result | {"reason": reply.refusal, "text": reply.text}

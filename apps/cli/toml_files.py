@@ -59,10 +59,9 @@ def write_values(path: Path, table: str, values: Mapping[str, Value], name: str 
         _replace(path, with_values(text, table, values, name))
     except (ConfigError, UnicodeDecodeError, OSError) as error:
         why = error.strerror if isinstance(error, OSError) else str(error)
-        lines = [f"[[{table}]]", f'name = "{name}"'] if name else [f"[{table}]"]
-        lines += [f"{key} = {_item(value).as_string()}" for key, value in values.items()]
-        by_hand = "\n".join(lines)
-        raise ConfigError(f"{path} is not changed: {why}; write the values by hand:\n{by_hand}") from error
+        heading, named = (f"[[{table}]]", {"name": name}) if name else (f"[{table}]", {})
+        lines = ", ".join(f"{key} = {_item(value).as_string()}" for key, value in {**named, **values}.items())
+        raise ConfigError(f"{path} is not changed: {why}; write by hand, in {heading}: {lines}") from error
 
 
 # --- known objects --------------------------------------------------------------------------------

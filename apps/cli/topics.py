@@ -6,12 +6,16 @@ import ast
 import json
 from collections.abc import Iterable
 from importlib import resources
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
+import typer
+
+from apps.cli.options import JsonOption
 from apps.cli.terminal import table as plain_table
 from cocoro.bus.base import Qos
 from cocoro.component import Component
 from cocoro.installed import all_requests, all_topics
+from cocoro.messages.actions import ACTIONS
 from cocoro.topics import REQUESTS, TOPICS, Request, Topic
 from deploy.processes import COMPONENTS, publishers, readers
 
@@ -26,8 +30,20 @@ QOS = {
 HEADS = ("topic", "type", "rate", "max age", "qos", "publisher", "recorded")
 
 
+app = typer.Typer()
+
+
+@app.command()
+def topics(
+    as_page: Annotated[bool, typer.Option("--markdown", help="The whole page of the documentation.")] = False,
+    json: JsonOption = False,
+) -> None:
+    """List the topics and requests of all installed components: type, rate, age, quality of service, publisher."""
+    print(markdown() if as_page else as_json() if json else table(), end="")
+
+
 def table() -> str:
-    """What is published and what can be asked on a robot with all that is installed here, as text."""
+    """The topics and requests of all installed components, as text."""
     topics = plain_table(HEADS, [_row(topic) for topic in all_topics()])
     request_heads = ("request", "question", "answer", "server", "time-out")
     return f"{topics}\n{plain_table(request_heads, [_request_row(request) for request in all_requests()])}"
@@ -90,6 +106,9 @@ def markdown() -> str:
         *(f"- `{request.name}`: {request.doc}" for request in REQUESTS),
         "\n## Types\n",
         *(_type_section(types[name]) for name in _with_parts(dict.fromkeys(mentioned), types)),
+        "## Actions\n",
+        "What the `action` of an `Intent` can be: a map with the action's name in `action`, and these fields.\n",
+        *(_type_section(types[kind.__name__]._replace(name=name)) for name, kind in ACTIONS.own.items()),
     ]
     return "\n".join(parts).rstrip() + "\n"
 

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from apps.learning import study
+from apps.learning import dataset, study
+from apps.learning.dataset import HandRow
 from apps.learning.lesson import sightings
 from cocoro.errors import ConfigError
-from cocoro.learning import dataset, model
-from cocoro.learning.dataset import HandRow
-from cocoro.learning.nominal_model import NominalModel
+from cocoro.learning import model
+from cocoro.learning.handmap import NominalModel
 from cocoro.robot import Robot
 
 if TYPE_CHECKING:
@@ -49,9 +49,8 @@ def sheet(columns: int = 1, rows: int = 1, *, width: float = 5.0, height: float 
     return figure, found
 
 
-def hand_places(samples: Path, learned: Path) -> Figure:
+def hand_places(samples: Path, learned: Path, robot: Robot) -> Figure:
     """Held-out places of the hand, from above and from the side: seen, by the nominal model, by the learned map."""
-    robot = Robot.load()
     nominal = NominalModel(robot)
     _, held = study.split(study.clean(sightings(dataset.read(samples, HandRow, robot).rows), nominal))
     arm = model.load(learned, robot).arm

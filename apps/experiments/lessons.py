@@ -9,13 +9,13 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from apps.learning import study
+from apps.learning import dataset, study
+from apps.learning.dataset import HandRow, WheelRow
 from apps.learning.lesson import learn_arm, learn_wheels, sightings
 from apps.learning.wheels import fit_wheels
 from cocoro.clock import NS
-from cocoro.learning import dataset, model
-from cocoro.learning.dataset import HandRow, WheelRow
-from cocoro.learning.nominal_model import NominalModel
+from cocoro.learning import model
+from cocoro.learning.handmap import NominalModel
 from cocoro.robot import Robot
 from services.planning.teaching import Adapter
 
@@ -23,12 +23,20 @@ SIZES = (100, 300, 1000, 2000)
 """Numbers of samples of the learning curves."""
 
 
-def learn(arm: str, wheels: str, into: str, method: str | None = None) -> dict[str, Any]:
+def load_robot(description: str | None = None, measured: str | None = None) -> Robot:
+    """The robot of these files; the Calliope where none is given. Raises ConfigError naming file and field."""
+    return Robot.load(*(None if file is None else Path(file) for file in (description, measured)))
+
+
+def learn(
+    arm: str, wheels: str, into: str, method: str | None = None, description: str | None = None,
+    measured: str | None = None,
+) -> dict[str, Any]:  # fmt: skip
     """Learns arm and wheels from two files of samples and writes the model to `into`.
 
     Returns every method's score (or that of `method` alone), learning curves and the fit of the wheels.
     """
-    robot, file = Robot.load(), Path(into)
+    robot, file = load_robot(description, measured), Path(into)
     file.unlink(missing_ok=True)
     _, report = learn_arm(Path(arm), file, robot, method=method)
     _, fit = learn_wheels(Path(wheels), file, robot)
@@ -65,9 +73,11 @@ def _babbled_s(rows: Sequence[HandRow]) -> float:
     return float(steps[steps > 0].sum()) / NS
 
 
-def bend(into: str, bent: str, bend_s: float) -> dict[str, Any]:
+def bend(
+    into: str, bent: str, bend_s: float, description: str | None = None, measured: str | None = None
+) -> dict[str, Any]:
     """Error of the learned map at each sighting of an arm that is bent after `bend_s`: fixed, and trained further."""
-    robot = Robot.load()
+    robot = load_robot(description, measured)
     arm = model.load(Path(into), robot).arm
     if arm is None:
         raise msgspec.ValidationError(f"{into} has no model of the arm")

@@ -13,12 +13,11 @@ from typing import Any
 
 import msgspec
 
+from apps.experiments.plan import ExperimentSettings
 from apps.experiments.results import ResultRow, Section
-from apps.experiments.settings import ExperimentSettings
 from cocoro.about import DISTRIBUTIONS
 from cocoro.errors import naming
-from cocoro.learning.dataset import fingerprint_of
-from cocoro.robot import Robot
+from cocoro.learning.handmap import fingerprint_of
 
 HEADS = ("measure", "who", "mean ± 95% CI", "worst", "unit", "wanted", "", "the paper's text")
 DOTS_PER_INCH = 90
@@ -54,7 +53,7 @@ def _manifest(settings: ExperimentSettings) -> dict[str, Any]:
             versions[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
             versions[name] = "not installed"
-    robot = Robot.load()
+    robot = settings.robot()
     return {
         "settings": {**msgspec.to_builtins(settings, enc_hook=str), "out": settings.out.name},
         "robot": robot.name,

@@ -54,19 +54,19 @@ class ResultRow(NamedTuple):
     held: bool | None = None
     paper: str = ""
     """The paper's text about this measure."""
-    said: str = ""
+    text: str = ""
     """Text in place of the mean, where a mean is misleading."""
 
     @property
     def mean(self) -> str:
-        if self.said:
-            return self.said
+        if self.text:
+            return self.text
         ci95 = self.values.ci95
-        return f"{self._text(self.values.mean)}" + ("" if ci95 != ci95 else f" ± {self._text(ci95)}")
+        return f"{self._number(self.values.mean)}" + ("" if ci95 != ci95 else f" ± {self._number(ci95)}")
 
     @property
     def worst(self) -> str:
-        return self._text(self.values.worst)
+        return self._number(self.values.worst)
 
     @property
     def verdict(self) -> str:
@@ -75,11 +75,11 @@ class ResultRow(NamedTuple):
     def data(self) -> dict[str, Any]:
         summary = {key: None if value != value else value for key, value in self.values._asdict().items()}
         return {
-            "measure": self.measure, "who": self.who, "unit": self.unit, "said": self.said, **summary,
+            "measure": self.measure, "who": self.who, "unit": self.unit, "text": self.text, **summary,
             "wanted": self.wanted, "held": self.held, "paper": self.paper,
         }  # fmt: skip
 
-    def _text(self, value: float) -> str:
+    def _number(self, value: float) -> str:
         return "" if value != value else f"{value:.{self.digits}f}"
 
 

@@ -1,5 +1,5 @@
-"""The runs that experiments are made of: each in a process of its own, as many at once as there are cores, each result
-kept on disk, so that the same command goes on where an earlier one was ended."""
+"""Performs the runs of experiments in worker processes, and keeps each result on disk, so that a repeated command
+continues where an earlier one was interrupted."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class ExperimentRun:
     """Name of its result's file in the folder `runs`."""
     kind: Literal["rehearse", "learn", "bend"]
     fields: dict[str, Any] = field(hash=False)
-    """Rehearse: of the request; else the arguments of the lesson of that name."""
+    """Rehearse: the request's fields; otherwise the arguments of the lesson of that name."""
     needs: tuple[str, ...] = ()
     """Names of the runs whose results it uses."""
 
@@ -168,4 +168,4 @@ def _used(run: ExperimentRun, results: Mapping[str, RunResult]) -> dict[str, str
 
 
 def _as_json(fields: dict[str, Any]) -> Any:
-    return json.loads(json.dumps(fields))
+    return json.loads(msgspec.json.encode(fields))

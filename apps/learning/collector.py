@@ -9,16 +9,15 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Generic, Self
 
-from cocoro.learning.dataset import HandRow, SampleFile, SampleRow, WheelRow, hand_header, wheel_header
-from cocoro.learning.nominal_model import arm_joints
+from apps.learning.dataset import HandRow, SampleFile, SampleRow, WheelRow, hand_header, wheel_header
+from cocoro.errors import ConfigError
+from cocoro.learning.handmap import arm_joints
 from cocoro.messages import HandSample, Message, WheelTrial
 from cocoro.robot import Robot
 from cocoro.topics import HAND_SAMPLES, WHEEL_TRIALS, Topic
 from cocoro.units import Vec3
 
 CELL_M = 0.05
-TOPICS: dict[str, Topic[Any]] = {"babble-arm": HAND_SAMPLES, "babble-wheels": WHEEL_TRIALS}
-"""What each task reports on."""
 
 
 class Coverage:
@@ -144,6 +143,13 @@ class WheelCollector(SampleCollector[WheelRow]):
             self._writer.append([row])
 
 
-def collector(task: str, path: Path, robot: Robot, target_height_m: float | None = None) -> SampleCollector[Any]:
-    """For the task 'babble-arm' or 'babble-wheels'; for the latter how high its target's centre stands."""
-    return HandCollector(path, robot) if task == "babble-arm" else WheelCollector(path, robot, target_height_m)
+def collector(
+    samples: Topic[Any], path: Path, robot: Robot, target_height_m: float | None = None
+) -> SampleCollector[Any]:
+    """The collector of what is reported on a topic (`Task.samples`). `target_height_m`: height of the centre of the
+    object that stands before the wheels, where it is known. Raises ConfigError for a topic that no file is made of."""
+    if samples.name == HAND_SAMPLES.name:
+        return HandCollector(path, robot)
+    if samples.name == WHEEL_TRIALS.name:
+        return WheelCollector(path, robot, target_height_m)
+    raise ConfigError(f"{samples.name}: there is no file format for these samples")

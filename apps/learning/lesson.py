@@ -11,17 +11,19 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from apps.learning import study
+from apps.learning import dataset, study
+from apps.learning.dataset import HandRow, WheelRow
 from apps.learning.study import METHODS, Method, Score, Sightings
 from apps.learning.wheels import WheelFit, fit_wheels
 from cocoro.errors import ConfigError
-from cocoro.learning import dataset, model
-from cocoro.learning.camera_tilt import eye_tilt
-from cocoro.learning.dataset import HandRow, WheelRow
+from cocoro.learning import model
+from cocoro.learning.handmap import NominalModel
 from cocoro.learning.model import BodyModel, Training, WheelModel
-from cocoro.learning.nominal_model import NominalModel
 from cocoro.robot import Robot
+from services.planning.head import CameraTilt
 
+LEAST_TRIALS = 4
+"""Fewest trials that tell the camera's tilt."""
 LEAST_SAMPLES = 50
 CURVE = (100, 300, 1000, 2000)
 
@@ -135,3 +137,13 @@ def _methods(search: bool, method: str | None) -> Sequence[Method]:
         names = "\n  ".join(one.name for one in methods)
         raise ConfigError(f"there is no method {method!r}; known are\n  {names}")
     return found
+
+
+def eye_tilt(trials: Sequence[WheelRow], height_m: float | None, robot: Robot) -> float | None:
+    """The median over wheel trials before a target whose centre is known to be so high; None where that is not known,
+    or too few trials tell how high it was seen."""
+    if height_m is None:
+        return None
+    eye = CameraTilt(robot)
+    found = [eye.tilt_of((*row.after_m, row.height_m), height_m) for row in trials if row.height_m is not None]
+    return float(np.median(found)) if len(found) >= LEAST_TRIALS else None

@@ -13,9 +13,9 @@ from math import atan2, cos, sin
 
 import numpy as np
 
+from apps.learning.dataset import WheelRow
 from cocoro.arrays import FloatArray
 from cocoro.frames import wrap_rad
-from cocoro.learning.dataset import WheelRow
 from cocoro.units import Vec2
 
 LEAST_TURN_RAD = 0.10

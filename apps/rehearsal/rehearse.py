@@ -14,8 +14,10 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+from msgspec.structs import replace
 
-from apps.learning.collector import TOPICS, SampleCollector, collector
+from apps.learning.collector import SampleCollector, collector
+from apps.pictures import draw, save_png
 from apps.rehearsal.lockstep import LOCKSTEP_PLANNER, LOCKSTEP_SETTINGS, LockstepCycle, LockstepNode
 from apps.rehearsal.request import RehearsalRequest
 from cocoro import topics
@@ -27,8 +29,8 @@ from cocoro.inbox import Stream
 from cocoro.messages import Detections, Frame, Recording, TaskReply, TaskRequest, TaskState
 from cocoro.node import Node
 from cocoro.objects import Catalogue
-from cocoro.picture import draw, save_png
 from cocoro.robot import Robot
+from cocoro.tasks import Task
 from cocoro.vloop import run_virtual
 from deploy.delayed import DelayedNode
 from deploy.processes import named, needs
@@ -50,6 +52,8 @@ def rehearse(request: RehearsalRequest) -> dict[str, Any]:
     unknown = sorted(set(request.latency) - set(PROCESSES))
     if unknown:
         raise ConfigError(f"--latency {unknown[0]}: no such service; known are {', '.join(PROCESSES)}")
+    if request.then and not hasattr(request.task, "label"):
+        raise ConfigError(f"then: {request.task.name} has no label that could change")
     if request.record is not None and Path(request.record).exists():
         raise ConfigError(f"--record {request.record}: there is such a file already")
     result = run_virtual(_Rehearsal(request).run())
@@ -68,16 +72,16 @@ class TaskRefusedError(CocoroError):
 class _Rehearsal:
     def __init__(self, request: RehearsalRequest) -> None:
         self._request = request
-        scene = find_scene(request.scene, request.seed, request.label)
-        labels = [item.label for item in scene.objects]
-        present = request.label if request.label in labels else ""
+        self._robot = Robot.load(*(Path(file) if file else None for file in (request.description, request.measured)))
+        self._task: Task = request.task
+        label = self._task.target
+        scene = find_scene(request.scene, request.seed, label)
+        present = label if label in [item.label for item in scene.objects] else ""
         self._judge: Judge | PursuitJudge = (
-            PursuitJudge(Robot.load(), scene, present)
-            if request.task == "follow" and present
-            else Judge(scene, present)
+            PursuitJudge(self._robot, scene, present) if self._task.pursuit_phase and present else Judge(scene, present)
         )
         self._scene = scene
-        self._body = body_of(Robot.load(), request.body, request.seed).robot
+        self._body = body_of(self._robot, request.body, request.seed).robot
         self._trace = Trace(self._body, present)
         self._steps: list[dict[str, Any]] = []
         """One by one, the tasks that came to an end."""
@@ -88,7 +92,7 @@ class _Rehearsal:
 
     async def run(self) -> dict[str, Any]:
         request = self._request
-        mesh, clock, robot = LocalMesh(), VirtualClock(), Robot.load()
+        mesh, clock, robot = LocalMesh(), VirtualClock(), self._robot
         cycle = LockstepCycle()
         async with AsyncExitStack() as stack:
             services = []
@@ -115,8 +119,9 @@ class _Rehearsal:
             operator.on(topics.PLAN, self._trace.status)
             operator.on(topics.TASK, self._trace.state)
             operator.on(topics.RECORDING.of(RECORDER), self._keep_recording)
-            if request.samples is not None and request.task in TOPICS:
-                self._collector = collector(request.task, Path(request.samples), robot, self._standing_height_m())
+            samples = self._task.samples
+            if request.samples is not None and samples is not None:
+                self._collector = collector(samples, Path(request.samples), robot, self._standing_height_m())
                 stack.enter_context(self._collector)
             task = asyncio.ensure_future(self._operate(operator))
             try:
@@ -144,7 +149,7 @@ class _Rehearsal:
                 field: getattr(request, field)
                 for field in ("scene", "seed", "sensors", "body", "width", "height", "frame_rate_hz")
             }
-            world |= {"target": request.label, "bend_at_s": request.bend_s}
+            world |= {"target": self._task.target, "bend_at_s": request.bend_s}
             return world | held
         if name == "planning":
             return {
@@ -160,21 +165,14 @@ class _Rehearsal:
         if request.picture is not None:
             operator.on(topics.FRAME, self._keep_frame)
             operator.on(topics.DETECTIONS, self._keep_seen)
-        for number, label in enumerate((request.label, *request.then)):
-            question = TaskRequest(
-                task=request.task,
-                label=label,
-                timeout_s=request.timeout_s,
-                bring=request.bring,
-                for_s=request.for_s,
-                distance_m=request.distance_m,
-                first=request.first,
-                count=request.count,
-            )
-            if self._collector is not None and number == 0:
-                operator.on(TOPICS[request.task], self._collector.take)
+        if self._collector is not None and self._task.samples is not None:
+            operator.on(self._task.samples, self._collector.take)
+        for label in (self._task.target, *request.then):
+            changes: dict[str, Any] = {"label": label} if label != self._task.target else {}
             if self._collector is not None:
-                question.first, question.count = self._collector.next, max(request.count - len(self._collector), 1)
+                left = request.task.count - len(self._collector)
+                changes |= {"first": self._collector.next, "count": max(left, 1)}
+            question = TaskRequest(task=replace(self._task, **changes), timeout_s=request.timeout_s)
             self._trace.begin(label)
             reply = await self._ask(operator, question)
             while reply.refusal in ("not_alive", "estop") and operator.now_ns() < START_S * NS:
@@ -189,15 +187,15 @@ class _Rehearsal:
         return state
 
     async def _watch(self, states: Stream[TaskState], task_id: str) -> TaskState:
-        pictured = self._request.picture is None
+        phase = ""
         async for state in states:
             if state.task_id != task_id:
                 continue
-            if isinstance(self._judge, PursuitJudge) and state.phase == "follow":
+            if isinstance(self._judge, PursuitJudge) and state.phase == self._task.pursuit_phase:
                 self._judge.begin()
-            if not pictured and state.phase == "lift":
+            if phase and phase == self._task.snapshot_phase != state.phase:
                 self._take_picture()
-                pictured = True
+            phase = state.phase
             if state.outcome is not None:
                 return state
         raise AssertionError("a stream has no end")
@@ -229,7 +227,7 @@ class _Rehearsal:
     def _standing_height_m(self) -> float | None:
         """Of the target's centre, as the robot knows the object."""
         catalogue = Catalogue.load(Path(self._request.objects) if self._request.objects else None)
-        known = catalogue.get(self._request.label)
+        known = catalogue.get(self._task.target)
         return known.size_m[2] / 2 if known is not None else None
 
     def _keep_recording(self, recording: Recording) -> None:
@@ -259,8 +257,8 @@ class _Rehearsal:
     def _result(self, state: TaskState) -> dict[str, Any]:
         request = self._request
         return {
-            "task": request.task,
-            "label": request.label,
+            "task": self._task.name,
+            "label": self._task.target,
             "scene": request.scene,
             "seed": request.seed,
             "sensors": request.sensors,

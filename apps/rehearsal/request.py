@@ -1,67 +1,64 @@
-"""What `cocoro rehearse` asks for: one task, in one process, in virtual time."""
+"""The request of a rehearsal: one task, and the simulated robot and scene that it is tried in."""
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 from msgspec import Meta
 
-from cocoro.messages import TaskName
+from services.executive.tasks import TASKS
 
 Sensors = Literal["ideal", "real"]
-Body = Literal["nominal", "worn"]
+BodyKind = Literal["nominal", "worn"]
 
 
 class RehearsalRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Two rehearsals of one request give equal results but for the wall time."""
+    """Two rehearsals of one request give equal results, except for the wall time."""
 
-    task: TaskName
-    label: str = ""
-    bring: bool = False
-    """Fetch: bring it back to where the task began."""
-    for_s: Annotated[float, Meta(gt=0, le=3600)] | None = None
-    """Follow: for so long."""
-    distance_m: Annotated[float, Meta(ge=0, le=5)] = 0.2
-    """Go-to: from the robot's centre to the target's nearest edge, over the floor."""
+    task: Any
+    """A `cocoro.tasks.Task`, or the map that it travels as."""
     then: tuple[str, ...] = ()
-    """The same task again, one after the other, with each of these labels; the first that fails is the last."""
-    first: Annotated[int, Meta(ge=0)] = 0
-    """Babbling: the number of its first draw."""
-    count: Annotated[int, Meta(ge=1, le=1_000_000)] = 1000
-    """Babbling: how many samples or trials."""
+    """Labels with which the same task is done again, one after the other. The first task that fails is the last."""
     samples: str | None = None
-    """Babbling: the file that they are appended to; with samples in it, babbling goes on where they end."""
+    """File that the samples of a task that reports some are appended to. The task goes on where the file ends."""
     scene: str = "paper"
     """A scene's name, or the path of a scene file."""
     seed: Annotated[int, Meta(ge=0)] = 0
     sensors: Sensors = "ideal"
-    body: Body = "nominal"
-    """Worn: lengths, joint zeros, camera, marker and wheels are off what the drawing says, as the seed says."""
+    body: BodyKind = "nominal"
+    """Worn: lengths, joint zeros, camera, marker and wheels differ from the nominal model, drawn by the seed."""
+    description: str | None = None
+    """File of a robot description in place of the Calliope's."""
+    measured: str | None = None
+    """File of the values measured on one robot; they replace the description's."""
     model: str | None = None
-    """The file of what was learned of the body."""
+    """File of the learned model."""
     reach: Literal["learned", "rigid"] = "learned"
-    """Rigid: whatever was learned of the arm."""
+    """Rigid: reach without the learned model of the arm."""
     see_hand: bool = False
-    """Reaching with the rigid body, bring it to where the hand is seen."""
+    """Correct the rigid body's reach by where the hand is seen."""
     adapt: bool = False
-    """What was learned of the arm goes on being taught at work."""
+    """Keep training the learned model of the arm at work."""
     bend_s: Annotated[float, Meta(ge=0)] | None = None
-    """When somebody bends the forearm, by 3 cm at the hand."""
+    """Time at which the forearm is bent, by 3 cm at the hand."""
     latency: dict[str, Annotated[float, Meta(ge=0, le=60)]] = {}
-    """Seconds that are added to every step of a service, by the service's name."""
+    """Seconds added to every step of a service, by its name."""
     lockstep: bool = False
-    """One serial cycle over all components, as the paper had it: the baseline to compare with."""
+    """One serial cycle over perception and planning, as in the paper: the baseline to compare with."""
     width: Annotated[int, Meta(ge=16, le=4096)] = 640
     height: Annotated[int, Meta(ge=16, le=4096)] = 480
     frame_rate_hz: Annotated[float, Meta(gt=0, le=120)] = 30.0
     timeout_s: Annotated[float, Meta(gt=0, le=3600)] | None = None
-    """Of the task, simulated seconds; None is the executive's own limit."""
+    """Time limit of the task, simulated seconds; None: the task's own."""
     picture: str | None = None
-    """Where to write what the robot saw at the grasp (PNG)."""
+    """File for the last picture of the task's snapshot phase (PNG)."""
     objects: str | None = None
-    """A file of known objects instead of the project's own."""
+    """File of known objects in place of the project's own."""
     trace: bool = False
-    """Have in the result how everything moved, by the truth and by the robot's own belief."""
+    """Add to the result how everything moved, by the truth and by the robot's own estimate."""
     record: str | None = None
-    """Where to record everything (MCAP), the steps of perception and planning too."""
+    """File to record everything to (MCAP), steps of perception and planning included."""
+
+    def __post_init__(self) -> None:
+        msgspec.structs.force_setattr(self, "task", TASKS.read(self.task))

@@ -22,7 +22,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from cocoro.capture.former import todays_name
+from cocoro.capture.former import todays_name, todays_payload
 from cocoro.capture.mcap import DamageError
 from cocoro.installed import topic_named
 from cocoro.messages import Frame, Message
@@ -120,7 +120,8 @@ def reader_of(name: str, schema: str | None) -> Read | None:
     topic = topic_named(name)
     if topic is not None and (schema is None or topic.type.__name__ in (schema, todays_name(schema))):
         kind: type[Message] = topic.type
-        return msgspec.msgpack.Decoder(kind).decode
+        decode = msgspec.msgpack.Decoder(kind).decode
+        return lambda payload: decode(todays_payload(kind.__name__, payload))
     if schema == Alive.__name__:
         return msgspec.msgpack.Decoder(Alive).decode
     if schema == LossyFrame.__name__:

@@ -17,10 +17,8 @@ from msgspec import Meta
 
 from cocoro.arrays import FloatArray
 from cocoro.errors import ConfigError
-from cocoro.learning.dataset import fingerprint_of
-from cocoro.learning.handmap import Coordinates, HandMap
+from cocoro.learning.handmap import Coordinates, HandMap, NominalModel, fingerprint_of
 from cocoro.learning.network import HyperplaneRbf
-from cocoro.learning.nominal_model import NominalModel
 from cocoro.messages import FiniteVec3
 from cocoro.robot import Robot
 
@@ -151,7 +149,7 @@ def arm_model(learned: HandMap, roll_rad: float, seen_m: FloatArray, training: T
     return ArmModel(
         joints=learned.joints,
         roll_rad=roll_rad,
-        over_drawing=learned.over_drawing,
+        over_drawing=learned.over_nominal,
         coordinates=learned.coordinates,
         centres=network.centres.tolist(),
         widths=network.widths.tolist(),
@@ -163,13 +161,13 @@ def arm_model(learned: HandMap, roll_rad: float, seen_m: FloatArray, training: T
 
 def hand_map(arm: ArmModel, robot: Robot, where: str = "arm") -> HandMap:
     """The map, ready to compute with. Raises ConfigError where its parts do not fit together."""
-    drawing = NominalModel(robot, arm.roll_rad)
+    nominal = NominalModel(robot, arm.roll_rad)
     try:
         centres, weights = np.array(arm.centres), np.array(arm.weights)
         network = HyperplaneRbf(centres, np.array(arm.widths), 3)
-        if weights.shape != network.weights.shape or arm.joints != drawing.joints:
+        if weights.shape != network.weights.shape or arm.joints != nominal.joints:
             raise ValueError(f"weights {weights.shape} for joints {', '.join(arm.joints)}")
     except ValueError as error:
         raise ConfigError(f"model {where}: its parts do not fit together: {error}") from error
     network.weights = weights
-    return HandMap(drawing, network, over_drawing=arm.over_drawing, coordinates=arm.coordinates)
+    return HandMap(nominal, network, over_nominal=arm.over_drawing, coordinates=arm.coordinates)

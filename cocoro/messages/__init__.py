@@ -1,8 +1,8 @@
-"""The typed messages of the mesh: SI units, named in the field (`_m`, `_rad`, `_mps`, `_ns`).
+"""The typed messages of the mesh, one file a service. Units are SI and stand in the field name (`_m`, `_rad`, `_mps`).
 
-Every message is a MessagePack map on the wire, validated when it is decoded. Positions are in the body
-frame unless the field says otherwise: x forward, y left, z up, origin on the floor between the drive
-wheels. A reader ignores fields that it does not know, so a field with a default may be added at any time.
+A message is a MessagePack map on the wire and is validated when it is decoded. Positions are in the body frame unless
+the field says otherwise: x forward, y left, z up, origin on the floor between the drive wheels. A reader ignores
+unknown fields, so a field with a default may be added at any time.
 """
 
 from __future__ import annotations
@@ -30,7 +30,6 @@ from cocoro.messages.executive import (
     Outcome,
     Phase,
     RefusalCode,
-    TaskName,
     TaskReply,
     TaskRequest,
     TaskState,
@@ -62,7 +61,6 @@ from cocoro.messages.perception import (
     Obstacles,
 )
 from cocoro.messages.planning import (
-    Behaviour,
     HandSample,
     Intent,
     LearnedModel,
@@ -90,7 +88,6 @@ __all__ = [
     "AboutRequest",
     "BaseCommand",
     "BaseState",
-    "Behaviour",
     "CancelRequest",
     "ClockTick",
     "Count",
@@ -133,7 +130,6 @@ __all__ = [
     "ServoState",
     "StepRecord",
     "TargetEstimate",
-    "TaskName",
     "TaskReply",
     "TaskRequest",
     "TaskState",

@@ -1,4 +1,4 @@
-"""How a recorder is getting on."""
+"""Messages of the recorder."""
 
 from __future__ import annotations
 
@@ -10,42 +10,42 @@ from cocoro.messages.common import Count, FiniteNonNegative, Message
 
 
 class DisturbedFile(msgspec.Struct, kw_only=True):
-    """Somebody moved or removed a file while it was being recorded."""
+    """A capture that was moved or removed while it was being written."""
 
     file: str
-    """The name that it was recorded under."""
+    """Path under which it was recorded."""
     became: Literal["moved", "removed"]
-    """A move to another disk is a copy and a removal."""
+    """A move to another disk counts as removed."""
     now: str = ""
-    """Where it was when that was noticed; '' when that is not known."""
+    """Path at which it was found; '' when unknown."""
     lost: Count = 0
-    """Messages that were in it, when it was removed."""
+    """Number of messages in a removed file."""
 
 
 class Recording(Message):
-    """How a recorder is getting on."""
+    """Progress of a recorder."""
 
     file: str = ""
-    """The MCAP file that is being written; '' when it is not on the disk any more."""
+    """The MCAP file that is being written; '' when it is no longer on disk."""
     messages: Count = 0
-    """Written since the recorder's start, over all its files, but for those that somebody removed meanwhile."""
+    """Messages written since the recorder's start to all its files, except removed ones."""
     size_bytes: Count = 0
-    """The same, as it takes room on the disk."""
+    """Size of these files on disk."""
     raw_bytes: Count = 0
-    """The same, before compression."""
+    """Size of these messages before compression."""
     waiting_bytes: Count = 0
-    """Received, not yet written."""
+    """Size of the messages that are received and not yet written."""
     dropped: dict[str, Count] = {}
-    """By key: received, but there was no room to keep them until the disk took them."""
+    """By key: messages that were received and dropped, because the buffer was full."""
     lost: dict[str, Count] = {}
-    """By key: gaps in the sequence, so sent and never received."""
+    """By key: messages that were sent and not received, from gaps in the sequence."""
     disturbed: tuple[DisturbedFile, ...] = ()
-    """The newest of those that somebody moved or removed while they were being recorded."""
+    """The most recent files that were moved or removed while they were being written."""
     removed: Count = 0
-    """Messages that were in the removed ones, all of them together."""
+    """Number of messages in all removed files."""
     longest_sync_ms: FiniteNonNegative = 0.0
-    """That the disk took to make sure of what it was given."""
+    """Longest time that the disk needed for a sync."""
     fault: str = ""
-    """Why nothing is recorded any more."""
+    """Why recording has stopped; empty while it works."""
     ended: bool = False
-    """The recorder has been told to end, and what it wrote is whole."""
+    """True when the recorder was stopped and its file is complete."""

@@ -1,4 +1,4 @@
-"""What every message has, and the numbers that messages are made of."""
+"""Fields of every message, and the numeric types of messages."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import msgspec
 from msgspec import Meta
 
 LARGEST = 1e12
-"""Beyond any quantity of a robot's in SI units: so large a number is a fault, and its square still a number."""
+"""Bound of all numbers in messages: beyond any quantity of a robot in SI units, and its square is still finite."""
 Finite = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
 """MessagePack can carry NaN and infinity; bounds refuse both when a message is decoded."""
 FiniteNonNegative = Annotated[float, Meta(ge=0, le=LARGEST)]
@@ -21,7 +21,7 @@ FiniteQuaternion = tuple[Finite, Finite, Finite, Finite]
 
 
 def require_finite(message: msgspec.Struct, *names: str) -> None:
-    """Refuse NaN and infinity in the named numbers or tuples already when a command is made."""
+    """Raises ValueError when one of the named fields (numbers or tuples of numbers) is NaN or infinite."""
     for name in names:
         value = getattr(message, name)
         if not all(map(math.isfinite, value if isinstance(value, tuple) else (value,))):
@@ -29,15 +29,15 @@ def require_finite(message: msgspec.Struct, *names: str) -> None:
 
 
 class Message(msgspec.Struct, kw_only=True):
-    """What every message says of itself; the node fills these three in when it publishes."""
+    """Base of all messages. The node sets the three fields when it publishes."""
 
     stamp_ns: int = 0
-    """When what the message tells was true, on the robot's clock. A publisher may set it earlier than now."""
+    """Time at which the content was true, on the robot's clock. A publisher may set it earlier than now."""
     seq: Count = 0
-    """Counts up by one for each message of one publisher on one key: a gap is a lost message."""
+    """Number of the message among those of one publisher on one key; a gap means lost messages."""
     incarnation: Count = 0
-    """Drawn anew at each start of the publisher, so that a restart is not mistaken for a loss."""
+    """Random number of the publisher's start, so that a restart is not taken for a loss."""
 
 
 LatchState = Literal["unknown", "released", "latched"]
-"""Of the emergency stop, as a service knows it. Unknown counts as latched: the hardware stays still."""
+"""State of the emergency stop in a service. Unknown counts as latched: the hardware stays still."""

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 from msgspec import Meta
 
-from cocoro.messages.common import Count, Finite, FiniteVec3, Message
+from cocoro.messages.common import Finite, FiniteVec3, Message
 from cocoro.messages.planning import TargetEstimate
 
-TaskName = Literal["fetch", "follow", "touch", "go-to", "park", "put-down", "babble-arm", "babble-wheels"]
 Outcome = Literal["done", "failed", "cancelled"]
 
 
@@ -39,19 +38,11 @@ class TaskState(Message):
 
 
 class TaskRequest(msgspec.Struct, kw_only=True):
-    task: TaskName
-    label: str = ""
+    task: Any
+    """A `cocoro.tasks.Task`; where it was received, the map that it travels as: the task's name in `task`, and its
+    fields."""
     timeout_s: Annotated[float, Meta(gt=0, le=3600)] | None = None
-    bring: bool = False
-    """Fetch: carry it to where the task began and put it down there."""
-    for_s: Annotated[float, Meta(gt=0, le=3600)] | None = None
-    """Follow: for so long; None is until cancelled."""
-    distance_m: Annotated[float, Meta(ge=0, le=5)] = 0.2
-    """Go-to: from the robot's centre to the target's nearest edge, over the floor."""
-    first: Count = 0
-    """Babbling: the number of its first draw, to go on where an earlier one ended."""
-    count: Annotated[int, Meta(ge=1, le=1_000_000)] = 1000
-    """Babbling: how many samples or trials make an end of it."""
+    """None: the task's own limit."""
 
 
 RefusalCode = Literal[

@@ -1,4 +1,4 @@
-"""Camera, base and servos: their states, their commands, and what they can be asked."""
+"""Messages of camera, base and servos: states, commands, requests."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Frame(Message):
     """RGB, 8 bits a channel, row-major: height x width x 3 bytes."""
     depth: memoryview
     """Raw 11-bit depth codes as little-endian uint16, row-major: height x width x 2 bytes; 2047 = no data.
-    The depth camera's own view: registration to the colour image is the reader's work."""
+    Seen from the depth camera; the reader registers it to the colour image."""
 
     def __post_init__(self) -> None:
         pixels = self.width * self.height
@@ -35,33 +35,33 @@ class BaseState(Message):
     """The Create: odometry since the service started, its bumpers and its health."""
 
     odometry_m: FiniteVec2
-    """x, y of the body in the odometry frame: where the body stood when the service started."""
+    """x, y of the body in the odometry frame, whose origin is the body's pose when the service started."""
     odometry_yaw_rad: Finite
     """Heading in the odometry frame, counter-clockwise, not wrapped."""
     speed_mps: Finite
-    """Forward speed, as odometry has it."""
+    """Forward speed by odometry."""
     turn_rate_radps: Finite
-    """Counter-clockwise, as odometry has it."""
+    """Turn rate by odometry, counter-clockwise."""
     bump_left: bool = False
     bump_right: bool = False
     wheel_drop: bool = False
     cliff: bool = False
     overcurrent: bool = False
     buttons: tuple[str, ...] = ()
-    """Those of the Create's own that are pressed: play, advance."""
+    """The pressed buttons of the Create: play, advance."""
     mode: Literal["off", "passive", "safe", "full"] = "full"
     battery_fraction: Annotated[float, Meta(ge=0, le=1)] = 1.0
     battery_v: FiniteNonNegative = 16.0
     charging: bool = False
     latch: LatchState = "unknown"
     stopped_by: str = ""
-    """Why the base refuses or zeroes wheel commands now ('' when it obeys): estop, latch unknown, bump,
-    cliff, wheel drop, overcurrent, no command, mode (the Create left the mode that obeys), link."""
+    """Why the base refuses or zeroes wheel commands ('' when it obeys): estop, latch unknown, bump, cliff, wheel drop,
+    overcurrent, no command, mode (the Create left its mode), link."""
 
 
 class BaseCommand(Message):
-    """Wheel speeds. Valid for 0.15 s at most, and for less the faster they are (`Base.patience_s`): a base that hears
-    nothing newer commands zero."""
+    """Wheel speeds. They are valid for 0.15 s, at higher speeds for less (`Base.patience_s`); then the base commands
+    zero."""
 
     left_mps: Finite
     right_mps: Finite
@@ -71,14 +71,14 @@ class BaseCommand(Message):
 
 
 class ServoState(Message):
-    """One servo network, read at one time; every tuple is in the order of `joints`."""
+    """The state of one servo network at one time. Every tuple is in the order of `joints`."""
 
     joints: tuple[str, ...]
     position_rad: tuple[Finite, ...]
-    """In the kinematic chain's own sense and zero (the common reference frame), not the servo's counts."""
+    """Joint angles with sign and zero of the kinematic chain, not the servo's counts."""
     speed_radps: tuple[Finite, ...]
     load: tuple[Finite, ...]
-    """Signed share of the stall torque, -1 to 1, positive where the motor pushes towards greater angles."""
+    """Share of the stall torque, -1 to 1; positive when the motor pushes towards greater angles."""
     temperature_c: tuple[Finite, ...] = ()
     voltage_v: tuple[Finite, ...] = ()
     torque_enabled: tuple[bool, ...] = ()
@@ -86,7 +86,7 @@ class ServoState(Message):
     """Latched faults, each 'joint: what', e.g. 'elbow: overload'."""
     latch: LatchState = "unknown"
     stopped_by: str = ""
-    """Why the network holds still whatever is commanded ('' when it obeys)."""
+    """Why the network ignores commands and holds still ('' when it obeys)."""
 
     def __post_init__(self) -> None:
         for name in ("position_rad", "speed_radps", "load"):
@@ -95,14 +95,14 @@ class ServoState(Message):
 
 
 class ServoCommand(Message):
-    """Goals for the named joints of one network; a joint that is not named keeps its goal. Valid for 0.15 s:
-    then an arm or neck joint that is still on its way holds where it is; the hand keeps its goal, so
-    that a held object stays held."""
+    """Goals for the named joints of one network; the other joints keep their goals. A command is valid for 0.15 s. Then
+    an arm or neck joint that still moves holds its position; the hand keeps its goal, so that it does not drop an
+    object."""
 
     joints: tuple[str, ...]
     goal_rad: tuple[Finite, ...]
     speed_radps: tuple[FiniteNonNegative, ...]
-    """Speed limit on the way to the goal. 0 means hold where it is (never 'full speed', as the servo has it)."""
+    """Speed limits of the motion. 0 holds the joint at its position (the servo itself takes 0 as full speed)."""
 
     def __post_init__(self) -> None:
         for name in ("goal_rad", "speed_radps"):
@@ -112,25 +112,25 @@ class ServoCommand(Message):
 
 
 class RecoverRequest(msgspec.Struct, kw_only=True):
-    """Put a Create that left its mode by itself (a cliff, a wheel drop, the charger) back into it."""
+    """Restores the mode of a Create that left it by itself (at a cliff, a wheel drop, the charger)."""
 
 
 class RecoverReply(msgspec.Struct, kw_only=True):
     recovered: bool
     text: str = ""
-    """Why not, and what to do."""
+    """The reason of a failure, and what to do."""
 
 
 class ServoRequest(msgspec.Struct, kw_only=True):
-    """Clear latched faults, let joints go limp, or hold them again where they are."""
+    """Clears latched faults, releases the torque of joints, or holds them at their positions."""
 
     action: Literal["clear", "relax", "hold"]
     joints: tuple[str, ...] = ()
-    """Of the network that is asked; empty is all of it."""
+    """Joints of the called network; empty means all of them."""
 
 
 class ServoReply(msgspec.Struct, kw_only=True):
     joints: tuple[str, ...] = ()
-    """For which it was done."""
+    """The joints on which the action succeeded."""
     text: str = ""
-    """What could not be done, and why."""
+    """The failures and their reasons."""

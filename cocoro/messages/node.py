@@ -1,4 +1,4 @@
-"""What every service says of itself: health, steps, exchanges, and what it was started with."""
+"""Messages of every service: health, step records, request records, and its configuration."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ class TopicHealth(msgspec.Struct, kw_only=True):
     count: Count = 0
     rate_hz: Finite = 0.0
     age_s: Finite | None = None
-    """Of the newest sample by its stamp, when the health was taken; None when there was none."""
+    """Age of the newest message by its stamp at the time of this report; None without a message."""
     skipped: Count = 0
-    """State that was overwritten by newer state before it was read."""
+    """State messages that a newer one replaced before they were read."""
     lost: Count = 0
-    """Gaps in the sequence: never arrived."""
+    """Messages missing from the sequence."""
     rejected: Count = 0
-    """Malformed, wrongly typed, oversized, out of order or untimely: counted, dropped."""
+    """Messages that were dropped as malformed, of a wrong type, oversized, out of order or untimely."""
     last_error: str = ""
-    """Why the last one was rejected."""
+    """The reason of the last rejection."""
     fault: str = ""
-    """Of a reader that has rejected messages of late: key, publisher, how many, why. For people."""
+    """Recent rejections of a reader, for people: key, publisher, count, reason."""
     unreadable: bool = False
-    """Of a reader: for longer than one can wait, all that came was rejected."""
+    """True when a reader has rejected every message for longer than it can wait."""
 
 
 class LoopHealth(msgspec.Struct, kw_only=True):
-    """Of a fixed-rate loop or a driven core, over the last health period."""
+    """Timing of a fixed-rate loop or of a driven core over the last health period."""
 
     name: str
     rate_hz: Finite = 0.0
@@ -39,7 +39,7 @@ class LoopHealth(msgspec.Struct, kw_only=True):
     period_p99_ms: Finite = 0.0
     step_median_ms: Finite = 0.0
     overruns: Count = 0
-    """Periods that were missed altogether since the start."""
+    """Number of periods without a step since the start."""
 
 
 class Health(Message):
@@ -49,7 +49,7 @@ class Health(Message):
     text: str = ""
     uptime_s: Finite = 0.0
     cpu_share: Finite = 0.0
-    """Of one core, over the last health period."""
+    """CPU time over the last health period, as a share of one core."""
     rss_mb: Finite = 0.0
     topics: tuple[TopicHealth, ...] = ()
     loops: tuple[LoopHealth, ...] = ()
@@ -57,25 +57,25 @@ class Health(Message):
 
 
 class StepRecord(Message):
-    """What one step of a pure core consumed and gave, in order: enough to execute it again exactly."""
+    """Inputs and outputs of one step of a pure core, in order. With it the step can be re-executed exactly."""
 
     now_ns: int
     core: str = ""
     consumed: tuple[tuple[str, int, int], ...] = ()
-    """(topic, incarnation, seq) in the order in which the core was given them."""
+    """(topic, incarnation, seq) of each input, in the order in which the core received them."""
     produced: tuple[tuple[str, int, int], ...] = ()
 
 
 class Exchange(Message):
-    """A request that a service was asked, and what it answered: only the two of them see it otherwise."""
+    """The record of a request and its answer, which otherwise only caller and server see."""
 
     request: str
-    """Its name, e.g. 'executive/run'."""
+    """Name of the request, e.g. 'executive/run'."""
     question: Any = None
-    """As it was asked; None when it could not be understood."""
+    """The decoded question; None when it could not be decoded."""
     answer: Any = None
     error: str = ""
-    """In place of an answer."""
+    """Text of the error that the caller received in place of an answer."""
     took_ms: FiniteNonNegative = 0.0
 
 
@@ -84,28 +84,28 @@ class AboutRequest(msgspec.Struct, kw_only=True):
 
 
 class AboutFile(msgspec.Struct, kw_only=True):
-    """A file that a service's configuration names: a learned model, known objects."""
+    """A file that a service's configuration names, such as a learned model."""
 
     field: str
-    """The configuration's field, e.g. 'objects'."""
+    """The field of the configuration that names it, e.g. 'objects'."""
     path: str
     sha256: str
-    """The file's fingerprint."""
+    """SHA-256 of the file, hexadecimal."""
     content: bytes = b""
     """Empty when the file is too large for a message."""
 
 
 class AboutReply(msgspec.Struct, kw_only=True):
-    """What a service is and what it was started with: all that its pure core can be made of again."""
+    """Identity and configuration of a service: everything from which its pure core can be constructed again."""
 
     service: str
     robot: str
     module: str = ""
-    """Python's name of the component; empty for what is none."""
+    """Python module of the component's implementation; empty for a participant that is no component."""
     config: Any = None
-    """The component's resolved Config, as a map."""
+    """The component's resolved configuration, as a map."""
     description: Any = None
-    """The robot description that it computes with, as a map."""
+    """The robot description that the service uses, as a map."""
     latency_s: FiniteNonNegative = 0.0
     record_steps: bool = False
     pid: int = 0

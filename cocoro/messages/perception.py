@@ -1,4 +1,4 @@
-"""What perception finds in a frame."""
+"""Messages of perception: known objects and the floor in one frame."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ class Detection(msgspec.Struct, kw_only=True):
     """Centroid in the colour image, pixels right and down from the top left pixel's centre."""
     area_px: Count
     box_px: tuple[int, int, int, int]
-    """left, top, right, bottom of the matching pixels, right and bottom exclusive."""
+    """Bounding box of the matching pixels: left, top, right, bottom; right and bottom exclusive."""
     depth_m: Finite | None = None
-    """Along the optical axis, of the visible surface; None when the depth image has none there."""
+    """Depth of the visible surface along the optical axis; None when the depth image has no value there."""
     position_m: FiniteVec3 | None = None
-    """The object's centre (visible surface carried inwards by the known radius), body frame as the body
-    stood at the frame's stamp; None without depth or without head angles for that stamp."""
+    """The object's centre (the visible surface moved inwards by the known radius) in the body frame at the frame's
+    stamp; None without depth or without head angles for that stamp."""
     note: str = ""
-    """Why there is no position, or what makes it doubtful: 'no depth', 'no head angles', 'occluded', 'cut'."""
+    """Why the position is missing or doubtful: 'no depth', 'no head angles', 'occluded', 'cut'."""
 
 
 class Detections(Message):
-    """All known objects in one frame. `stamp_ns` is the frame's stamp, not the time of publishing."""
+    """All known objects in one frame. `stamp_ns` is the frame's stamp."""
 
     frame_seq: Count
     frame_incarnation: Count
@@ -38,18 +38,18 @@ class Detections(Message):
     height: int
     pan_rad: Finite | None = None
     tilt_rad: Finite | None = None
-    """The head angles that were used: interpolated at the frame's stamp."""
+    """Head angles, interpolated at the frame's stamp, by which the objects were localised."""
     detections: tuple[Detection, ...] = ()
 
 
 class Obstacles(Message):
-    """What stands on the floor and where the floor is free, from one depth image; known objects included.
-    `stamp_ns` is the frame's. Body frame as the body stood then."""
+    """Occupied and free floor in one depth image; known objects count as occupied. `stamp_ns` is the frame's stamp, and
+    coordinates are in the body frame at that stamp."""
 
     points_m: Annotated[tuple[FiniteVec3, ...], Meta(max_length=4096)] = ()
-    """One a floor cell of 4 cm in which something stands: its middle x, y, and the height of the highest point seen."""
+    """One point for each occupied floor cell of 4 cm: x, y of its middle, z of the highest point in it."""
     free: Annotated[tuple[FiniteVec3, ...], Meta(max_length=1024)] = ()
-    """Rays over free floor from `origin_m`: bearing (rad, body frame), and from which to which distance (m) the floor
-    is seen; a ray ends before the first thing that stands in it."""
+    """Rays over free floor from `origin_m`: bearing (rad, body frame), nearest and farthest distance (m) at which the
+    floor is visible. A ray ends before the first obstacle on it."""
     origin_m: FiniteVec2 = (0.0, 0.0)
-    """Where the camera stood, on the floor."""
+    """The camera's position, projected on the floor."""

@@ -2,35 +2,27 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 import msgspec
 
-from cocoro.messages.common import Count, Finite, FiniteNonNegative, FiniteVec2, FiniteVec3, Message
-
-Behaviour = Literal[
-    "idle", "park", "search", "explore", "approach", "reach", "grasp", "lift", "carry", "place", "follow",
-    "touch", "go-to", "babble-arm", "babble-wheels",
-]  # fmt: skip
+from cocoro.messages.actions import ACTIONS
+from cocoro.messages.common import Count, Finite, FiniteVec2, FiniteVec3, Message
 
 
 class Intent(Message):
-    """What the executive wants of the planner. Repeated at the topic's rate: a planner that no longer hears
-    it stands still."""
+    """What the executive wants of the planner. Repeated at the topic's rate: a planner that no longer hears it stands
+    still."""
 
+    action: Any
+    """One of `cocoro.messages.actions`, or a third party's: a map with the action's name in `action`, and its fields.
+    A message whose action is unknown or has a bad field is rejected."""
     task_id: str = ""
     step: Count = 0
     """Counts the intents of one run of the executive, so that a status can say which one it answers."""
-    behaviour: Behaviour = "idle"
-    label: str = ""
-    place_m: FiniteVec2 | None = None
-    """For 'carry': where to put down, in the odometry frame."""
-    distance_m: FiniteNonNegative = 0.0
-    """For 'go-to': from the body's centre to the target's, over the floor, when it stands there."""
-    first: Count = 0
-    """For babbling: the number of its first draw."""
-    count: Count = 0
-    """For babbling: how many samples or trials make an end of it."""
+
+    def __post_init__(self) -> None:
+        self.action = ACTIONS.read(self.action)
 
 
 class TargetEstimate(msgspec.Struct, kw_only=True):
@@ -54,7 +46,8 @@ class PlannerStatus(Message):
 
     task_id: str = ""
     step: Count = 0
-    behaviour: Behaviour = "idle"
+    behaviour: str = "idle"
+    """The name of the action that it carries out."""
     state: Literal["running", "done", "failed"] = "running"
     reason: str = ""
     """For 'failed', a word that the executive acts on: lost, unreachable, blocked, slipped, no_grip, stale."""

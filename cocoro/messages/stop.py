@@ -8,7 +8,7 @@ from cocoro.messages.common import LatchState, Message
 
 
 class EstopRequest(msgspec.Struct, kw_only=True):
-    """Latch or release the emergency stop; every hardware service and the executive answer it."""
+    """Latches or releases the emergency stop. Every service that moves something, and the executive, answer it."""
 
     latched: bool
     by: str = ""
@@ -21,7 +21,7 @@ class EstopReply(msgspec.Struct, kw_only=True):
 
 
 class Latch(Message):
-    """The executive's word on the emergency stop; a restarted hardware service stays still until it hears it."""
+    """State of the emergency stop by the executive. A restarted hardware service stays still until it receives this."""
 
     state: LatchState
     by: str = ""

@@ -1,4 +1,4 @@
-"""Takes requests, runs one task at a time, and says what is going on."""
+"""Takes requests, runs one task at a time, and publishes its progress."""
 
 from __future__ import annotations
 
@@ -22,29 +22,20 @@ from cocoro.messages import (
     TaskRequest,
     TaskState,
 )
+from cocoro.messages.actions import TASK_GROUP, Idle
 from cocoro.node import Node
 from cocoro.objects import Catalogue
+from cocoro.tagged import added_by
+from cocoro.tasks import Task, TaskFailedError
 from services.executive.config import ExecutiveConfig
 from services.executive.estop import Estop
-from services.executive.skills import PlannerSkills, Skills, TaskFailedError
-from services.executive.tasks import babble_arm, babble_wheels, fetch, follow, go_to, park, put_down, touch
+from services.executive.skills import PlannerSkills
+from services.executive.tasks import TASKS
 
-Task = Callable[[Skills, TaskRequest, ExecutiveConfig], Awaitable[None]]
 Ending = tuple[Outcome, str | Awaitable[str]]
-"""A task's outcome and its reason, which may not be known yet when the outcome is."""
+"""A task's outcome and its reason, which may still have to be found out."""
 _CLOCK_STANDS_S = 1.0
-"""When 20 ms of the clock take longer than this, it stands still."""
-_VERY_LONG_S = 86_400.0
-TASKS: dict[str, Task] = {
-    "fetch": fetch,
-    "follow": follow,
-    "touch": touch,
-    "go-to": go_to,
-    "park": park,
-    "put-down": put_down,
-    "babble-arm": babble_arm,
-    "babble-wheels": babble_wheels,
-}
+"""A clock that takes longer than this for 20 ms stands still."""
 
 
 class Executive:
@@ -54,15 +45,15 @@ class Executive:
         self._catalogue = catalogue
         self._alive: set[str] = set()
         self._unreadable: dict[str, str] = {}
-        """By service, what it cannot read and why."""
+        """What a service cannot read and why, by service."""
         self._running: asyncio.Task[Any] | None = None
         self._ended: asyncio.Future[Ending] | None = None
-        """Of the running task: gets its outcome when something outside of it ends it."""
+        """Gets the running task's outcome when something outside of it ends it."""
         self._count = 0
         self.state = TaskState()
         self._base = node.latest(topics.BASE_STATE)
         self._publisher = node.publisher(topics.TASK)
-        self._skills = PlannerSkills(node, self._enter_phase, config.intent_hz, config.planner_silence_s)
+        self._skills = PlannerSkills(node, config, catalogue, self._enter_phase)
         self._estop = Estop(node, config.latch_hz, self._on_latch)
         node.watch_alive(self._on_alive)
         node.on(topics.HEALTH, self._on_health, service="*")
@@ -70,38 +61,41 @@ class Executive:
         node.serve(topics.CANCEL, self._cancel)
         node.serve(topics.OBJECTS, self._objects)
 
-    async def tell(self) -> None:
-        """Publish the task's progress for ever."""
+    async def publish_progress(self) -> None:
+        """Publish the task's progress until the service is ended."""
         async for _ in self._node.every(self._config.progress_hz, "progress"):
             self._publish()
 
     # --- requests ---------------------------------------------------------------------------------
 
     async def _run(self, request: TaskRequest) -> TaskReply:
-        refusal = self._refusal(request)
+        try:
+            task = TASKS.read(request.task)
+        except ValueError as error:
+            return TaskReply(accepted=False, refusal="bad_request", text=_with_faults(str(error)))
+        refusal = self._refusal(task)
         if refusal is not None:
             code, text = refusal
             return TaskReply(accepted=False, refusal=code, text=text)
-        if request.task == "go-to":  # people say it to the edge, which the planner does not know
-            request.distance_m += self._radius_m(request.label)
         self._count += 1
-        task_id = f"{request.task}-{self._node.now_ns()}-{self._count}"
-        self.state = TaskState(
-            task_id=task_id, task=request.task, label=request.label, phase="start", started_ns=self._node.now_ns()
-        )
+        now_ns = self._node.now_ns()
+        task_id = f"{task.name}-{now_ns}-{self._count}"
+        self.state = TaskState(task_id=task_id, task=task.name, label=task.target, phase="start", started_ns=now_ns)
         self._ended = asyncio.get_running_loop().create_future()
-        self._running = self._node.spawn(self._carry_out(request, self._ended))
+        timeout_s = request.timeout_s or task.limit_s(self._config)
+        self._running = self._node.spawn(self._carry_out(task, timeout_s, self._ended))
         return TaskReply(accepted=True, task_id=task_id)
 
-    def _refusal(self, request: TaskRequest) -> tuple[RefusalCode, str] | None:
-        if request.task in ("fetch", "follow", "touch", "go-to", "babble-wheels"):
-            known = self._catalogue.get(request.label)
-            fetching = request.task in ("fetch", "touch")
-            targets = [target.label for target in self._catalogue.targets if target.graspable or not fetching]
+    def _refusal(self, task: Task) -> tuple[RefusalCode, str] | None:
+        """Why a task cannot start now: a code, and a sentence that says what to do; None when it can."""
+        if task.needs_label:
+            known = self._catalogue.get(task.target)
+            grasping = task.needs_label == "graspable"
+            targets = ", ".join(item.label for item in self._catalogue.targets if item.graspable or not grasping)
             if known is None or known.marker:
-                return "unknown_label", f"unknown object {request.label!r}; known are {', '.join(targets)}"
-            if fetching and not known.graspable:
-                return "not_graspable", f"{request.label} does not fit into the hand; what does: {', '.join(targets)}"
+                return "unknown_label", f"unknown object {task.target!r}; known are {targets}"
+            if grasping and not known.graspable:
+                return "not_graspable", f"{task.target} does not fit into the hand; what does: {targets}"
         if self._running is not None:
             return "busy", f"{self._what()} is running; cancel it first (cocoro cancel)"
         if self._estop.state != "released":
@@ -111,33 +105,28 @@ class Executive:
             return "not_alive", f"{self._what_of(missing)}; see cocoro status"
         if self._unreadable:
             return "not_alive", f"{next(iter(self._unreadable.values()))}; see cocoro status"
-        if self._node.clock.stands:  # and what was heard last would seem fresh for as long as it does
+        if self._node.clock.stands:  # then messages of any age seem fresh
             return "not_alive", "the clock stands still; see cocoro status"
         battery = self._base.value.battery_fraction if self._base.value is not None else 1.0
-        if battery < self._config.battery_low and request.task != "put-down":
+        if battery < self._config.battery_low and task.needs_battery:
             return "battery", f"the battery is low ({battery:.0%}); charge the robot first"
         status = self._skills.status
         if status is None:
             return "not_alive", "the planner says nothing; see cocoro status"
         if status.body_m is None:
             return "not_alive", f"the planner does not know yet where the robot stands ({status.why})"
-        if request.task != "put-down" and status.holding:
+        if task.hand == "empty" and status.holding:
             return "holding", "the hand holds something; put it down first (cocoro put-down)"
-        if request.task == "put-down" and not status.holding:
+        if task.hand == "holding" and not status.holding:
             return "not_holding", "the hand holds nothing"
         return None
 
     def _what_of(self, missing: list[str]) -> str:
-        """What can be said of services that are not heard."""
+        """Which missing services have died, and which are only not heard."""
         dead = [service for service in missing if self._node.contact.dead(service)]
         unheard = [service for service in missing if service not in dead]
         texts = ((f"not alive: {', '.join(dead)}", dead), (f"no contact with {', '.join(unheard)}", unheard))
         return "; ".join(text for text, services in texts if services)
-
-    def _radius_m(self, label: str) -> float:
-        """From a known object's centre to its edge, over the floor."""
-        known = self._catalogue.get(label)
-        return max(known.size_m[:2]) / 2 if known is not None else 0.0
 
     async def _cancel(self, request: CancelRequest) -> TaskReply:
         if self._running is None or request.task_id not in ("", self.state.task_id):
@@ -163,17 +152,11 @@ class Executive:
 
     # --- the running task -------------------------------------------------------------------------
 
-    async def _carry_out(self, request: TaskRequest, ended: asyncio.Future[Ending]) -> None:
-        """From the request to the outcome. What ends it from outside says so by `ended` and never cancels this
-        coroutine, so that every task comes to its end, whenever that happens."""
-        timeout_s = request.timeout_s or self._config.task_timeout_s
-        if request.task == "follow" and request.timeout_s is None:
-            # It has no end of its own.
-            timeout_s = (request.for_s or _VERY_LONG_S) + self._config.search_timeout_s
-        elif request.task.startswith("babble") and request.timeout_s is None:
-            timeout_s = _VERY_LONG_S
-        self._skills.want("idle", "", self.state.task_id)
-        work = asyncio.ensure_future(TASKS[request.task](self._skills, request, self._config))
+    async def _carry_out(self, task: Task, timeout_s: float, ended: asyncio.Future[Ending]) -> None:
+        """Run a task from its acceptance to its outcome. An end from outside sets `ended` and never cancels this
+        coroutine, so that every task comes to its outcome."""
+        self._skills.want(Idle(), self.state.task_id)
+        work = asyncio.ensure_future(task.run(self._skills))
         timer = asyncio.ensure_future(self._node.sleep(timeout_s))
         outcome: Outcome
         reason: str | Awaitable[str]
@@ -192,12 +175,12 @@ class Executive:
         finally:
             work.cancel()
             timer.cancel()
-            self._skills.want("idle", "", self.state.task_id)
+            self._skills.want(Idle(), self.state.task_id)
         await self._come_to_rest()
         self._finish(outcome, reason if isinstance(reason, str) else await reason)
 
     def _outcome_of(self, work: asyncio.Future[None]) -> tuple[Outcome, str]:
-        """Of a task's function that has ended."""
+        """Outcome and reason of a routine that has ended."""
         error = work.exception()
         if error is None:
             return "done", ""
@@ -216,7 +199,7 @@ class Executive:
                 async with asyncio.timeout(_CLOCK_STANDS_S):
                     if not await self._node.sleep(0.02):
                         return
-            except TimeoutError:  # the simulator has died, and its clock stands still: so does all that it drove
+            except TimeoutError:  # the simulator has died: its clock stands still, and so do the wheels
                 return
 
     @staticmethod
@@ -235,7 +218,7 @@ class Executive:
         self._publish()
 
     def _end(self, outcome: Outcome, reason: str | Callable[[], Awaitable[str]]) -> None:
-        """End the running task from outside. Its reason may be found out while it ends."""
+        """End the running task from outside. `reason` may be a function that begins to find out the reason."""
         if self._running is not None and self._ended is not None and not self._ended.done():
             self._ended.set_result((outcome, reason if isinstance(reason, str) else reason()))
 
@@ -257,7 +240,7 @@ class Executive:
         return f"not_alive: {await self._node.contact.lost(service)}"
 
     def _on_health(self, health: Health) -> None:
-        """A service that can no longer read what it acts on is no better than a dead one; and it knows why."""
+        """End the task when a needed service can no longer read its input: it is as good as dead, and reports why."""
         if health.service not in (*self._config.needed, self._node.name):
             return
         fault = next((topic.fault for topic in health.topics if topic.unreadable), None)
@@ -297,3 +280,8 @@ class Executive:
                 state.text, state.distance_m = status.why, status.distance_m
         state.stamp_ns = self._node.now_ns()
         self._publisher.put(state)
+
+
+def _with_faults(text: str) -> str:
+    """Name the third parties' tasks that could not be loaded: one of them may be what was asked for."""
+    return "; ".join((text, *added_by(TASK_GROUP).faults))

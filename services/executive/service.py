@@ -12,11 +12,11 @@ from services.executive.executive import Executive
 
 
 async def run(node: Node, config: ExecutiveConfig) -> None:
-    """Take tasks for ever."""
+    """Take tasks until the service is ended."""
     catalogue = Catalogue.load(Path(config.objects) if config.objects else None)
     executive = Executive(node, config, catalogue)
     node.ready()
-    await executive.tell()
+    await executive.publish_progress()
 
 
 implementation = Implementation(ExecutiveConfig, run)

@@ -1,83 +1,49 @@
-"""What a task is written with: one awaitable step at a time, each ending in the planner's word on it."""
+"""The steps that tasks are made of (`cocoro.tasks.Skills`), carried out by the planner on the mesh."""
 
 from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
 from copy import copy
-from typing import Protocol
 
 from cocoro import topics
 from cocoro.clock import NS
-from cocoro.messages import Behaviour, Intent, PlannerStatus
+from cocoro.messages import Intent, PlannerStatus
+from cocoro.messages.actions import Action, Idle
 from cocoro.node import Node
-from cocoro.units import Vec2
+from cocoro.objects import Catalogue
+from cocoro.tasks import Limits, TaskFailedError
+from cocoro.units import Vec2, Vec3
+from services.executive.config import ExecutiveConfig
 
 LOOSE_S = 0.5
-"""A hand that feels nothing for so long has lost what it held. When the arm comes to rest the claws may feel nothing
-for a moment, and then want a quarter of a second until they trust their grip again."""
+"""A hand that feels nothing for longer has lost what it held. When the arm comes to rest the claws may feel nothing for
+a moment, and then need a quarter of a second until they trust their grip again."""
 
 LISTEN_S = 0.25
-"""At least so long nothing may come while this process runs, before the planner is said to be silent."""
-
-
-class TaskFailedError(Exception):
-    """A step, and with it perhaps the task, did not succeed: a reason to decide on, a text for people."""
-
-    def __init__(self, reason: str, text: str) -> None:
-        super().__init__(f"{reason}: {text}" if text else reason)
-        self.reason = reason
-        self.text = text
-
-
-class Skills(Protocol):
-    """The steps that tasks are made of."""
-
-    async def do(
-        self,
-        behaviour: Behaviour,
-        label: str = "",
-        *,
-        timeout_s: float,
-        place_m: Vec2 | None = None,
-        distance_m: float = 0.0,
-        first: int = 0,
-        count: int = 0,
-    ) -> PlannerStatus:
-        """Have the planner do something until it is done. Raises TaskFailedError with the planner's reason, or
-        `timed_out`, or `not_alive` when the planner falls silent."""
-
-    async def keep_doing(self, behaviour: Behaviour, label: str, *, until_s: float) -> None:
-        """Have the planner do something that has no end, until a time; raises as `do` does."""
-
-    async def watch_hold(self, seconds: float) -> None:
-        """Hold still for a while; raises TaskFailedError('slipped') when the hand loses what it holds."""
-
-    def place(self) -> Vec2:
-        """Where the body stands in the odometry frame."""
-
-    def now_s(self) -> float: ...
-
-    @property
-    def status(self) -> PlannerStatus | None: ...
+"""Shortest silence, while this process runs, after which the planner counts as silent."""
 
 
 class PlannerSkills:
-    """Skills by way of the planner on the mesh. `phase(name)` is told of each step."""
+    """Publishes intents and waits for the planner's answers. Calls `phase(name)` at the begin of each step."""
 
-    def __init__(self, node: Node, phase: Callable[[str], None], intent_hz: float, silence_s: float) -> None:
+    def __init__(self, node: Node, config: ExecutiveConfig, catalogue: Catalogue, phase: Callable[[str], None]) -> None:
         self._node = node
+        self._config = config
+        self._catalogue = catalogue
         self._phase = phase
-        self._silence_s = silence_s
         self._plan = node.latest(topics.PLAN)
         self._publisher = node.publisher(topics.INTENT)
         self._step = 0
-        self.intent = Intent()
-        node.spawn(self._repeat(intent_hz))
+        self.intent = Intent(action=Idle())
+        node.spawn(self._repeat(config.intent_hz))
+
+    @property
+    def limits(self) -> Limits:
+        return self._config
 
     @property
     def status(self) -> PlannerStatus | None:
-        """The planner's newest word, if it is not too old."""
         return self._plan.fresh()
 
     def place(self) -> Vec2:
@@ -86,31 +52,19 @@ class PlannerSkills:
             raise TaskFailedError("not_alive", "the planner does not say where the robot stands")
         return status.body_m
 
+    def size_m(self, label: str) -> Vec3:
+        known = self._catalogue.get(label)
+        if known is None:
+            raise KeyError(label)
+        return known.size_m
+
     def now_s(self) -> float:
         return self._node.now_ns() / NS
 
-    def want(
-        self,
-        behaviour: Behaviour,
-        label: str,
-        task_id: str,
-        place_m: Vec2 | None = None,
-        distance_m: float = 0.0,
-        first: int = 0,
-        count: int = 0,
-    ) -> None:
+    def want(self, action: Action, task_id: str) -> None:
         """Publish a new intent now; it is repeated until the next."""
         self._step += 1
-        self.intent = Intent(
-            task_id=task_id,
-            step=self._step,
-            behaviour=behaviour,
-            label=label,
-            place_m=place_m,
-            distance_m=distance_m,
-            first=first,
-            count=count,
-        )
+        self.intent = Intent(task_id=task_id, step=self._step, action=action)
         self._publish()
 
     def _publish(self) -> None:
@@ -120,33 +74,26 @@ class PlannerSkills:
         async for _ in self._node.every(rate_hz, "intent"):
             self._publish()
 
-    async def do(
-        self,
-        behaviour: Behaviour,
-        label: str = "",
-        *,
-        timeout_s: float,
-        place_m: Vec2 | None = None,
-        distance_m: float = 0.0,
-        first: int = 0,
-        count: int = 0,
-    ) -> PlannerStatus:
-        self._phase(behaviour)
-        self.want(behaviour, label, self.intent.task_id, place_m, distance_m, first, count)
+    async def do(self, action: Action, *, timeout_s: float) -> PlannerStatus:
+        self._begin(action)
         ended = await self._watch(self.now_s() + timeout_s)
         if ended is None:
             status = self.status
             why = status.why if status is not None else ""
-            raise TaskFailedError("timed_out", f"{behaviour} took over {timeout_s:g} s: {why}")
+            raise TaskFailedError("timed_out", f"{action.name} took over {timeout_s:g} s: {why}")
         return ended
 
-    async def keep_doing(self, behaviour: Behaviour, label: str, *, until_s: float) -> None:
-        self._phase(behaviour)
-        self.want(behaviour, label, self.intent.task_id)
+    async def keep_doing(self, action: Action, *, until_s: float) -> None:
+        self._begin(action)
         await self._watch(until_s)
 
+    def _begin(self, action: Action) -> None:
+        self._phase(action.name)
+        self.want(action, self.intent.task_id)
+
     async def _watch(self, until_s: float) -> PlannerStatus | None:
-        """Wait for the planner's word that what is wanted is done; None when it is not by then."""
+        """Wait until the planner reports the wanted action as done; None when it is not by `until_s`. Raises
+        TaskFailedError when it reports a failure."""
         while True:
             status = await self._next_status()
             if self._answers(status):
@@ -158,9 +105,9 @@ class PlannerSkills:
                 return None
 
     def _answers(self, status: PlannerStatus) -> bool:
-        """Whether a status is of what is wanted now; a planner that did not hear for a while is idle meanwhile."""
+        """Whether a status is about the wanted action. A planner that has missed the intents for a while is idle."""
         wanted = self.intent
-        return (status.task_id, status.step, status.behaviour) == (wanted.task_id, wanted.step, wanted.behaviour)
+        return (status.task_id, status.step, status.behaviour) == (wanted.task_id, wanted.step, wanted.action.name)
 
     async def watch_hold(self, seconds: float) -> None:
         self._phase("hold")
@@ -183,8 +130,8 @@ class PlannerSkills:
         while True:
             waiting = asyncio.ensure_future(self._plan.next())
             try:
-                # The last part is listened to anew: who was stopped meanwhile takes what came only after it wakes.
-                for part_s in (max(self._silence_s - LISTEN_S, 0.0), LISTEN_S):
+                # In two parts: a process that was suspended reads what arrived meanwhile only after it has woken.
+                for part_s in (max(self._config.planner_silence_s - LISTEN_S, 0.0), LISTEN_S):
                     began_s = self.now_s()
                     timer = asyncio.ensure_future(self._node.sleep(part_s))
                     try:
@@ -197,4 +144,4 @@ class PlannerSkills:
                 waiting.cancel()
             if self.now_s() - began_s < 2 * LISTEN_S:
                 raise TaskFailedError("not_alive", "the planner is silent")
-            # This process was itself stopped in that last part.
+            # Otherwise this process was itself suspended during the last part.

@@ -12,18 +12,17 @@ from cocoro.arrays import FloatArray
 from cocoro.clock import NS
 from cocoro.core import Output, Sample, Schedule, Take
 from cocoro.messages import BaseCommand, Intent, LearnedModel, PlannerStatus, ServoCommand
+from cocoro.messages.actions import Idle
 from cocoro.robot import Robot
 from cocoro.topics import Topic
 from services.planning.arm import ArmStep
-from services.planning.behaviours import BEHAVIOURS, Actuators, Behaviour, Idle, Plan, Snapshot
+from services.planning.behaviours import Actuators, Behaviour, Idling, Plan, Snapshot, behaviour_for
 from services.planning.config import PlanningConfig
 from services.planning.head import PAN, TILT
 from services.planning.learned import Learned
 from services.planning.reach import ARM
 from services.planning.state_estimator import StateEstimator
 
-_NEED_SIGHT = ("search", "explore", "approach", "carry", "follow", "go-to", "babble-arm", "babble-wheels")
-"""What drives, or looks for something: none of it without perception."""
 _STALE_NS = NS
 """A running behaviour fails when the robot's state has been missing for so long."""
 
@@ -38,8 +37,8 @@ class PlanningCore:
         self._config = config
         self._estimator = StateEstimator(config, robot)
         self.actuators = Actuators(robot, config)
-        self._intent = Intent()
-        self._behaviour: Behaviour = Idle()
+        self._intent = Intent(action=Idle())
+        self._behaviour: Behaviour = Idling(Idle())
         self._ended: Plan | None = None
         self._last_ns: int | None = None
         self._missing_since_ns: int | None = None
@@ -98,7 +97,7 @@ class PlanningCore:
         self._estimator.look_around(now_ns, self._own_hull)
         snapshot = Snapshot(now_ns, dt_s, self._estimator, body, self._estimator.angles(), self.actuators)
         plan = self._plan(snapshot)
-        if isinstance(self._behaviour, Idle):
+        if isinstance(self._behaviour, Idling):
             self.learned.rest()
         status = self._status(plan, snapshot)
         return [*self._commands(plan, snapshot), *plan.reports, Output(topics.PLAN, status)]
@@ -123,17 +122,16 @@ class PlanningCore:
 
     def _follow_intent(self, now_ns: int) -> None:
         fresh = self._estimator.fresh_intent(now_ns)
-        intent = fresh or Intent(task_id=self._intent.task_id, step=self._intent.step)
-        wanted = (intent.task_id, intent.step, intent.behaviour, intent.label)
-        current = (self._intent.task_id, self._intent.step, self._intent.behaviour, self._intent.label)
-        if wanted == current:
+        current = self._intent
+        intent = fresh or Intent(task_id=current.task_id, step=current.step, action=Idle())
+        if (intent.task_id, intent.step, intent.action) == (current.task_id, current.step, current.action):
             return
         self._intent = intent
         self._ended = None
         if fresh is None:
-            self._behaviour = Idle("the executive is silent")
+            self._behaviour = Idling(Idle(), "the executive is silent")
         else:
-            self._behaviour = BEHAVIOURS[intent.behaviour](intent)
+            self._behaviour = behaviour_for(intent.action)
 
     def _plan(self, snapshot: Snapshot) -> Plan:
         """Step the behaviour; once it has ended, hold still with its result."""
@@ -149,7 +147,7 @@ class PlanningCore:
             )
         plan = self._blind(snapshot) or self._behaviour.step(snapshot)
         self.slow_down(plan, snapshot)
-        if plan.state != "running" and not isinstance(self._behaviour, Idle):
+        if plan.state != "running" and not isinstance(self._behaviour, Idling):
             self._ended = plan
         return plan
 
@@ -157,8 +155,7 @@ class PlanningCore:
         """Drive no faster than from where the wheels stand in time if whoever was heard the longest ago is gone: one
         that is late makes the robot slower, one that is silent makes it stand."""
         driver, base = self.actuators.driver, self.actuators.robot.base
-        needs_sight = self._intent.behaviour in _NEED_SIGHT
-        who, age_s = self._estimator.oldest(snapshot.now_ns, sight=needs_sight)
+        who, age_s = self._estimator.oldest(snapshot.now_ns, sight=self._behaviour.needs_sight)
         if self._estimator.intent_age_s(snapshot.now_ns) > base.command_timeout_s:
             plan.base, plan.why = driver.pause(snapshot.dt_s), "standing still: the executive is silent"
             return
@@ -171,7 +168,7 @@ class PlanningCore:
     def _blind(self, snapshot: Snapshot) -> Plan | None:
         """What is done while perception is silent by what needs to see: nothing, and that for so long only. What it
         had begun goes on when perception speaks again."""
-        if self._intent.behaviour not in _NEED_SIGHT:
+        if not self._behaviour.needs_sight:
             return None
         blind_s = self._estimator.blind_s(snapshot.now_ns)
         if blind_s is None:
@@ -191,12 +188,12 @@ class PlanningCore:
         self._head_goal = None
         if self._missing_since_ns is None or now_ns < self._missing_since_ns:
             self._missing_since_ns = now_ns
-        failed = self._intent.behaviour != "idle" and now_ns - self._missing_since_ns > _STALE_NS
+        failed = not isinstance(self._intent.action, Idle) and now_ns - self._missing_since_ns > _STALE_NS
         body = self._estimator.body()
         status = PlannerStatus(
             task_id=self._intent.task_id,
             step=self._intent.step,
-            behaviour=self._intent.behaviour,
+            behaviour=self._intent.action.name,
             state="failed" if failed else "running",
             reason="stale" if failed else "",
             why=f"standing still: {why}",
@@ -208,14 +205,15 @@ class PlanningCore:
 
     def _status(self, plan: Plan, snapshot: Snapshot) -> PlannerStatus:
         x, y, z = self.actuators.reacher.position(snapshot.angles)
+        label = self._intent.action.target
         return PlannerStatus(
             task_id=self._intent.task_id,
             step=self._intent.step,
-            behaviour=self._intent.behaviour,
+            behaviour=self._intent.action.name,
             state=plan.state,
             reason=plan.reason,
             why=plan.why,
-            target=snapshot.target(self._intent.label) if self._intent.label else None,
+            target=snapshot.target(label) if label else None,
             distance_m=plan.distance_m,
             hand_m=(float(x), float(y), float(z)),
             holding=snapshot.holding,

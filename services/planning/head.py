@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from math import atan2, cos
+from math import atan2, cos, hypot, sin
 
 import numpy as np
 
+from cocoro.arrays import FloatArray
 from cocoro.robot import Robot
+from cocoro.units import Vec3
 from services.planning.config import HeadConfig
 
 PAN, TILT = "neck_pan", "neck_tilt"
@@ -70,3 +72,43 @@ class Sweep:
                 return pan, tilt
             self.swept += 1
         return self._corners[-1]
+
+
+class CameraTilt:
+    """Corrects positions that were computed with the nominal neck for a camera that is tilted against it.
+
+    A camera that is tilted too far up sees everything as if the room were turned about the neck's tilt axis: far things
+    too high, and things below it too far away. The first shows the angle, the second disturbs driving by sight
+    (derived). All positions are in the body frame, metres.
+    """
+
+    def __init__(self, robot: Robot, tilt_rad: float = 0.0) -> None:
+        """`tilt_rad`: the angle at the neck by which things are seen higher than they are."""
+        self._axis_x_m, _, self._axis_z_m = (
+            robot.chain("neck_tilt").position({"neck_pan": 0.0, "neck_tilt": 0.0}).tolist()
+        )
+        self.tilt_rad = tilt_rad
+
+    def straight(self, seen_m: Vec3) -> Vec3:
+        """The true position (x, y, z) of what is seen at `seen_m`."""
+        if self.tilt_rad == 0.0:
+            return seen_m
+        x, y, up = seen_m[0] - self._axis_x_m, seen_m[1], seen_m[2] - self._axis_z_m
+        level = hypot(x, y)
+        c, s = cos(self.tilt_rad), sin(self.tilt_rad)
+        share = (c * level + s * up) / max(level, 1e-6)
+        return self._axis_x_m + share * x, share * y, self._axis_z_m + c * up - s * level
+
+    def heights(self, seen_m: FloatArray) -> FloatArray:
+        """True heights above the floor (b,), metres, of what is seen at positions (b, 3)."""
+        level = np.hypot(seen_m[:, 0] - self._axis_x_m, seen_m[:, 1])
+        up = seen_m[:, 2] - self._axis_z_m
+        return np.asarray(self._axis_z_m + np.cos(self.tilt_rad) * up - np.sin(self.tilt_rad) * level)
+
+    def tilt_of(self, seen_m: Vec3, height_m: float) -> float:
+        """The tilt, radians, by one sighting of something of a known height."""
+        level, up = hypot(seen_m[0] - self._axis_x_m, seen_m[1]), seen_m[2] - self._axis_z_m
+        # It is as far from the tilt axis as it is seen, and at the known height.
+        away = hypot(level, up)
+        true_up = height_m - self._axis_z_m
+        return atan2(up, level) - atan2(true_up, max(away**2 - true_up**2, 1e-9) ** 0.5)

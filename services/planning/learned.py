@@ -12,12 +12,11 @@ from cocoro.arrays import FloatArray
 from cocoro.clock import NS
 from cocoro.errors import ConfigError
 from cocoro.learning import model as models
-from cocoro.learning.camera_tilt import CameraTilt
-from cocoro.learning.handmap import HandMap
+from cocoro.learning.handmap import HandMap, NominalModel
 from cocoro.learning.model import BodyModel
-from cocoro.learning.nominal_model import NominalModel
 from cocoro.robot import Robot
 from services.planning.config import HandSightConfig, PlanningConfig
+from services.planning.head import CameraTilt
 from services.planning.reach import HandModel
 from services.planning.reachability import ReachMesh
 from services.planning.state_estimator import PostureSighting
@@ -51,17 +50,17 @@ class LearnedHand:
         """As `Chain.jacobian`, for the joints of ARM in their order."""
         jac = self._drawn.jacobian(angles, joints)
         at = _arm(angles)
-        if self._map.over_drawing and self._map.coordinates == "cartesian":
+        if self._map.over_nominal and self._map.coordinates == "cartesian":
             jac[:3] += self._map.network.jacobian(at)
         else:
-            jac[:3] += self._map.jacobian(at) - self._map.drawing.jacobian(at)
+            jac[:3] += self._map.jacobian(at) - self._map.nominal.jacobian(at)
         return jac
 
     def _offset(self, angles: Mapping[str, float]) -> FloatArray:
         at = _arm(angles)
-        if self._map.over_drawing and self._map.coordinates == "cartesian":
+        if self._map.over_nominal and self._map.coordinates == "cartesian":
             return self._map.network.at(at)
-        return np.asarray(self._map.at(at) - self._map.drawing.at(at))
+        return np.asarray(self._map.at(at) - self._map.nominal.at(at))
 
 
 class SeenHand:
@@ -74,7 +73,7 @@ class SeenHand:
     def __init__(self, felt: HandModel, marker: HandMap | NominalModel, config: HandSightConfig) -> None:
         self._felt = felt
         self._marker = marker
-        self._roll_rad = (marker.drawing if isinstance(marker, HandMap) else marker).roll_rad
+        self._roll_rad = (marker.nominal if isinstance(marker, HandMap) else marker).roll_rad
         self._config = config
         self._correction = np.zeros(3)
         self._wanted = np.zeros(3)
@@ -156,7 +155,7 @@ class Learned:
         if self.map is None:
             return None
         at = _arm(angles)
-        return np.asarray(self.map.at(at) - self.map.drawing.at(at))
+        return np.asarray(self.map.at(at) - self.map.nominal.at(at))
 
     def rest(self) -> None:
         """Called while the robot does nothing, for what takes long."""

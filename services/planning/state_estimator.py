@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Mapping
 from itertools import compress
+from math import cos, sin
 from typing import Any, NamedTuple
 
 import msgspec
@@ -15,15 +16,14 @@ from cocoro.arrays import FloatArray
 from cocoro.clock import NS, is_fresh
 from cocoro.frames import Pose2
 from cocoro.history import History
-from cocoro.learning.camera_tilt import CameraTilt
 from cocoro.messages import BaseState, Detection, Detections, Intent, Message, Obstacles, ServoState
 from cocoro.robot import Robot
 from cocoro.topics import Topic
 from cocoro.units import Vec3
 from services.planning.config import PlanningConfig
+from services.planning.head import CameraTilt
 from services.planning.memory import TargetMemory
 from services.planning.surroundings import Surroundings
-from services.planning.turning import Turning
 
 _WAIT_FOR_ODOMETRY_NS = NS // 5
 FLOOR_M, FLOOR_PER_M = 0.040, 0.012
@@ -78,6 +78,44 @@ class PostureSighting(NamedTuple):
     area_px: int
     angles_rad: dict[str, float]
     """Of every joint."""
+
+
+class Turning:
+    """The base's odometry with a learned wheel distance in place of the nominal one.
+
+    The base computes its heading and turn rate from the wheels' travel and the nominal distance; here both are scaled,
+    and with the heading the direction of each stretch of its path. Path length and speed do not depend on the distance.
+    """
+
+    def __init__(self) -> None:
+        self.ratio = 1.0
+        """Nominal over learned wheel distance; 1 while nothing is learned."""
+        self._before: BaseState | None = None
+        self._pose = Pose2()
+
+    def pose(self, state: BaseState) -> Pose2:
+        """The body's pose in the odometry frame. Call it once for each state, in order."""
+        raw = Pose2(*state.odometry_m, state.odometry_yaw_rad)
+        before, self._before = self._before, state
+        anew = before is None or before.incarnation != state.incarnation or state.stamp_ns < before.stamp_ns
+        if anew or before is None:
+            self._pose = raw
+            return raw
+        then = Pose2(*before.odometry_m, before.odometry_yaw_rad)
+        if self.ratio == 1.0 and self._pose == then:
+            self._pose = raw
+            return raw
+        step = then.inverse().compose(raw)
+        # The chord is half the turn off the heading at its start, so another turn changes its direction.
+        extra_rad = (self.ratio - 1.0) * step.yaw_rad
+        c, s = cos(extra_rad / 2), sin(extra_rad / 2)
+        bent = Pose2(c * step.x_m - s * step.y_m, s * step.x_m + c * step.y_m, step.yaw_rad + extra_rad)
+        self._pose = self._pose.compose(bent)
+        return self._pose
+
+    def rate_radps(self, state: BaseState) -> float:
+        """The body's turn rate."""
+        return self.ratio * state.turn_rate_radps
 
 
 class StateEstimator:

@@ -14,8 +14,8 @@ import numpy as np
 
 from cocoro.arrays import FloatArray
 from cocoro.clock import NS
-from cocoro.learning.fitting import LeastSquares
 from cocoro.learning.handmap import HandMap
+from cocoro.learning.network import LeastSquares
 from services.planning.reach import ARM
 from services.planning.reachability import ReachMesh
 from services.planning.state_estimator import PostureSighting
@@ -43,9 +43,9 @@ class Adapter:
     def __init__(self, learned: HandMap, usual_m: float) -> None:
         """`usual_m`: the map's usual error, root mean square (of the held-out sightings)."""
         self.map = HandMap(
-            learned.drawing,
+            learned.nominal,
             learned.network.copy(),
-            over_drawing=learned.over_drawing,
+            over_nominal=learned.over_nominal,
             coordinates=learned.coordinates,
         )
         self.samples = 0
@@ -84,7 +84,7 @@ class Teacher:
     def __init__(self, learned: HandMap, usual_m: float, mesh: ReachMesh) -> None:
         self._adapter = Adapter(learned, usual_m)
         self._mesh = mesh
-        self._roll_rad = learned.drawing.roll_rad
+        self._roll_rad = learned.nominal.roll_rad
         self._places: list[FloatArray] = []
         self._last_ns: int | None = None
 

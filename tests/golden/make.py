@@ -17,6 +17,7 @@ from cocoro.capture.reader import Capture
 from cocoro.clock import NS
 from services.capture.file import Packer
 from services.capture.keys import KeyFilter
+from services.executive.tasks import FetchTask
 
 GOLDEN = Path(__file__).with_name("fetch.mcap")
 LENGTH_S = 6.0
@@ -28,7 +29,7 @@ def main() -> None:
         whole = Path(folder) / "fetch.mcap"
         rehearse(
             RehearsalRequest(
-                task="fetch", label="red_can", width=160, height=120, frame_rate_hz=10.0, record=str(whole)
+                task=FetchTask(label="red_can"), width=160, height=120, frame_rate_hz=10.0, record=str(whole)
             )
         )
         GOLDEN.unlink(missing_ok=True)

@@ -19,6 +19,7 @@ from apps.captures.export.files import making
 from apps.captures.export.geometry import CAMERA, Posture, about_z, conjugate, points, quaternion, rotated
 from apps.captures.export.story import catalogue_of, robot_of
 from apps.captures.rewrite import info_in
+from apps.pictures import describe
 from cocoro.capture.conventions import CaptureError
 from cocoro.capture.mcap import DamageError
 from cocoro.capture.reader import Capture, Record
@@ -36,7 +37,6 @@ from cocoro.messages import (
     Truth,
 )
 from cocoro.objects import ObjectSpec
-from cocoro.picture import describe
 from cocoro.units import Vec3
 from services.capture.file import Packer
 from services.capture.keys import KeyInfo, QueuedMessage

@@ -1,35 +1,45 @@
-"""What the planner can be asked to do. Each behaviour is a small state machine that is stepped at the planner's rate,
-says what it wants of base, head, arm and hand, and why, and ends as done or failed."""
+"""Behaviours: small state machines, one for each action, that are stepped at the planner's rate. Each step gives what
+base, head, arm and hand are to do, and why, until the behaviour is done or has failed."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from typing import Any
 
-from cocoro.messages import Intent
-from services.planning.behaviours.babbling import BabbleArm, BabbleWheels
+from cocoro.messages import actions
+from cocoro.messages.actions import Action
+from services.planning.behaviours.babbling import ArmBabbling, WheelBabbling
 from services.planning.behaviours.base import Actuators, Behaviour, Plan, Snapshot
-from services.planning.behaviours.driving import Approach, Carry, Follow
-from services.planning.behaviours.going import GoTo
-from services.planning.behaviours.handling import Close, Lift, Place, Reach
-from services.planning.behaviours.looking import Explore, Idle, Park, Search
-from services.planning.behaviours.touching import Touch
+from services.planning.behaviours.driving import Approaching, Carrying, Following
+from services.planning.behaviours.going import Going
+from services.planning.behaviours.handling import Closing, Lifting, PuttingDown, Reaching
+from services.planning.behaviours.looking import Exploring, Idling, Parking, Searching
+from services.planning.behaviours.touching import Touching
 
-__all__ = ["BEHAVIOURS", "Actuators", "Behaviour", "Idle", "Plan", "Snapshot"]
+__all__ = ["BEHAVIOURS", "Actuators", "Behaviour", "Idling", "Plan", "Snapshot", "behaviour_for"]
 
-BEHAVIOURS: Mapping[str, Callable[[Intent], Behaviour]] = {
-    "idle": lambda _intent: Idle(),
-    "park": lambda _intent: Park(),
-    "search": lambda intent: Search(intent.label),
-    "explore": lambda intent: Explore(intent.label),
-    "approach": lambda intent: Approach(intent.label),
-    "reach": lambda intent: Reach(intent.label),
-    "grasp": lambda _intent: Close(),
-    "lift": lambda _intent: Lift(),
-    "carry": lambda intent: Carry(intent.label, intent.place_m or (0.0, 0.0)),
-    "place": lambda _intent: Place(),
-    "follow": lambda intent: Follow(intent.label),
-    "touch": lambda intent: Touch(intent.label),
-    "go-to": lambda intent: GoTo(intent.label, intent.distance_m),
-    "babble-arm": lambda intent: BabbleArm(intent.first, intent.count),
-    "babble-wheels": lambda intent: BabbleWheels(intent.label, intent.first, intent.count),
+BEHAVIOURS: Mapping[type[Action], Callable[[Any], Behaviour]] = {
+    actions.Idle: Idling,
+    actions.Park: Parking,
+    actions.Search: Searching,
+    actions.Explore: Exploring,
+    actions.Approach: Approaching,
+    actions.Reach: Reaching,
+    actions.Close: Closing,
+    actions.Lift: Lifting,
+    actions.Carry: Carrying,
+    actions.PutDown: PuttingDown,
+    actions.Follow: Following,
+    actions.Touch: Touching,
+    actions.GoTo: Going,
+    actions.BabbleArm: ArmBabbling,
+    actions.BabbleWheels: WheelBabbling,
 }
+"""What carries out each of the project's actions. A third party's action makes its own behaviour."""
+
+
+def behaviour_for(action: Action) -> Behaviour:
+    """A new behaviour that carries out an action."""
+    make = BEHAVIOURS.get(type(action))
+    behaviour: Behaviour = make(action) if make is not None else action.behaviour()
+    return behaviour

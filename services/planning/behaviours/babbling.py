@@ -13,6 +13,7 @@ from cocoro.clock import NS
 from cocoro.core import Output
 from cocoro.frames import Pose2
 from cocoro.messages import BaseCommand, HandSample, WheelTrial
+from cocoro.messages.actions import BabbleArm, BabbleWheels
 from cocoro.topics import HAND_SAMPLES, WHEEL_TRIALS
 from cocoro.units import Vec2, Vec3
 from services.planning.behaviours.base import Plan, Snapshot
@@ -20,13 +21,14 @@ from services.planning.postures import Postures, sobol
 from services.planning.reach import ARM, HandPose
 
 
-class BabbleArm:
-    """Goes from draw to draw and reports the hand wherever its marker is really seen.
+class ArmBabbling:
+    """Moves the arm from draw to draw and reports the hand wherever its marker is really seen.
 
     From each posture the next draw is one that the drawing calls safe and seeable, and that a straight, safe way leads
     to. Where none of many is, it goes back the way it came. At last it goes home, from where the arm can be folded.
     """
 
+    needs_sight = True
     SPEED_RADPS = 0.7
     EVERY_NS = NS // 10
     """Sightings nearer in time than this are nearly the same."""
@@ -35,9 +37,9 @@ class BabbleArm:
     GIVE_UP = 60
     """After so many draws that no way leads to, it goes back."""
 
-    def __init__(self, first: int, count: int) -> None:
-        self._first = first
-        self._count = count
+    def __init__(self, action: BabbleArm) -> None:
+        self._first = first = action.first
+        self._count = action.count
         self._samples = 0
         self._draws: Iterator[tuple[int, FloatArray]] | None = None
         self._draw = first
@@ -153,13 +155,14 @@ class BabbleArm:
         return found
 
 
-class BabbleWheels:
+class WheelBabbling:
     """Pairs of trials (the paper's): both wheels turn for a while at drawn speeds, then as long at the opposite ones;
     before and after each the standing robot looks at a standing target.
 
     The head comes to every look from the same side, so that its backlash is the same each time and falls out.
     """
 
+    needs_sight = True
     SPEED_MPS = 0.15
     TURN_S = 1.0
     LOOKS = 8
@@ -173,9 +176,9 @@ class BabbleWheels:
     MOVED_M = 0.5
     """Further than this from where it began it does not go."""
 
-    def __init__(self, label: str, first: int, count: int) -> None:
-        self._label = label
-        self._count = count
+    def __init__(self, action: BabbleWheels) -> None:
+        self._label, first = action.label, action.first
+        self._count = action.count
         self._done = 0
         speeds = np.array([[-self.SPEED_MPS, self.SPEED_MPS]] * 2)
         self._draws = sobol(first // 2, speeds)

@@ -8,7 +8,7 @@ from math import atan2, cos, hypot, sin
 from cocoro.clock import NS
 from cocoro.frames import Pose2
 from cocoro.messages import BaseState, TargetEstimate
-from cocoro.units import Vec2
+from cocoro.messages.actions import Approach, Carry, Follow
 from services.planning.arm import ArmStep
 from services.planning.behaviours.base import Actuators, Plan, Snapshot, hand_place, planar_m
 from services.planning.course import Course, Move
@@ -61,12 +61,14 @@ class BackOff:
         return [(x, y) for x, y, _ in places]
 
 
-class Approach:
-    """Drive to where the arm reaches the target, around what is in the way; on the last stretch the hand gets ready
-    and comes down behind the target before it is near, so that it never comes down on it."""
+class Approaching:
+    """Drives around obstacles to where the arm reaches the target. On the last stretch the hand gets ready and comes
+    down behind the target before the robot is near, so that it never comes down on it."""
 
-    def __init__(self, label: str) -> None:
-        self._label = label
+    needs_sight = True
+
+    def __init__(self, action: Approach) -> None:
+        self._label = action.label
         self._course: Course | None = None
         self._back_off = BackOff()
         self._stalls = 0
@@ -194,12 +196,14 @@ class Approach:
         return arm.reach(goal, config.hand_speed_mps, angles, dt_s)._replace(arrived=False), move
 
 
-class Carry:
-    """Drive, with something in the hand, to where it is to be put down (odometry frame)."""
+class Carrying:
+    """Drives, with something in the hand, to where it is to be put down (odometry frame)."""
 
-    def __init__(self, label: str, place_m: Vec2) -> None:
-        self._label = label
-        self._place_m = place_m
+    needs_sight = True
+
+    def __init__(self, action: Carry) -> None:
+        self._label = action.label
+        self._place_m = action.place_m
         self._course: Course | None = None
         self._back_off = BackOff()
         self._loose_since_ns: int | None = None
@@ -236,12 +240,14 @@ class Carry:
         return plan
 
 
-class Follow:
-    """Keep a set distance to a moving target, head and base together: its velocity is fed forward, so that the
-    distance does not lag, and when it is lost the head looks where it was going before it searches."""
+class Following:
+    """Keeps a set distance to a moving target with head and base. The target's velocity is fed forward, so that the
+    distance does not lag. When the target is lost the head looks where it was going before it searches."""
 
-    def __init__(self, label: str) -> None:
-        self._label = label
+    needs_sight = True
+
+    def __init__(self, action: Follow) -> None:
+        self._label = action.label
         self._trail: deque[tuple[int, tuple[float, float]]] = deque(maxlen=400)
         self._sweep: Sweep | None = None
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from math import hypot
 
+from cocoro.messages.actions import GoTo
 from cocoro.units import Vec2
 from services.planning.behaviours.base import Plan, Snapshot
 from services.planning.behaviours.driving import BackOff
@@ -11,16 +12,17 @@ from services.planning.course import Course
 from services.planning.navigation import offset_to
 
 
-class GoTo:
-    """Drive, around what is in the way, until the target is straight ahead at a distance between the centres."""
+class Going:
+    """Drives around obstacles until the target is straight ahead, at a distance between the centres."""
 
+    needs_sight = True
     CREEP_MPS = 0.04
     NEAR_ENOUGH_M = 0.003
     """At last it creeps, for the driver's own tolerance is made for the arm, which makes up for it."""
 
-    def __init__(self, label: str, distance_m: float) -> None:
-        self._label = label
-        self._distance_m = distance_m
+    def __init__(self, action: GoTo) -> None:
+        self._label = action.label
+        self._distance_m = action.distance_m
         self._course: Course | None = None
         self._back_off = BackOff()
         self._creeping = False

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
+from cocoro.messages.actions import Close, Lift, PutDown, Reach
 from services.planning.behaviours.base import Plan, Snapshot, hand_place
 from services.planning.reach import HandPose
 from services.planning.reachability import Grasp
 
 
-class Reach:
-    """Bring the open claws around the target, from behind, along the hand's own axis."""
+class Reaching:
+    """Brings the open claws around the target, from behind, along the hand's own axis."""
 
+    needs_sight = False
     FREEZE_M = 0.08
     """From here on the hand covers the target: its place is held."""
     CLOSE_IN_M = 0.015
 
-    def __init__(self, label: str, *, touching: bool = False) -> None:
-        """`touching`: it will not be grasped, so it may be nearer or further than what is."""
-        self._label = label
+    def __init__(self, action: Reach, *, touching: bool = False) -> None:
+        """`touching`: the target is only touched, so it may be nearer or further than one that is grasped."""
+        self._label = action.label
         self._touching = touching
         self._frozen: Grasp | None = None
         self._inserting = False
@@ -64,10 +66,12 @@ class Reach:
         return plan
 
 
-class Close:
-    """Close both claws as one until something stops them (the paper's one degree of freedom)."""
+class Closing:
+    """Closes both claws together until something stops them (the paper's one degree of freedom)."""
 
-    def __init__(self) -> None:
+    needs_sight = False
+
+    def __init__(self, action: Close) -> None:
         self._since_ns: int | None = None
 
     def step(self, snapshot: Snapshot) -> Plan:
@@ -84,13 +88,14 @@ class Close:
         return plan
 
 
-class Lift:
-    """Straight up first, then in and up to where the arm carries with little torque."""
+class Lifting:
+    """Lifts straight up first, then in and up to where the arm carries with little torque."""
 
+    needs_sight = False
     STRAIGHT_M = 0.05
     SLIP_S = 0.3
 
-    def __init__(self) -> None:
+    def __init__(self, action: Lift) -> None:
         self._start: HandPose | None = None
         self._up = False
         self._loose_since_ns: int | None = None
@@ -122,10 +127,12 @@ class Lift:
         return plan
 
 
-class Place:
-    """Put down what is in the hand: lower it, open, back out, raise the empty hand."""
+class PuttingDown:
+    """Lowers what is in the hand, opens the hand, backs out and raises it."""
 
-    def __init__(self) -> None:
+    needs_sight = False
+
+    def __init__(self, action: PutDown) -> None:
         self._phase = 0
         self._start: HandPose | None = None
 

@@ -6,24 +6,32 @@ from math import atan2
 
 from cocoro.clock import NS
 from cocoro.frames import Pose2
+from cocoro.messages.actions import Explore, Idle, Park, Search
 from services.planning.behaviours.base import Plan, Snapshot, planar_m
 from services.planning.course import Course
 from services.planning.floor_map import CELL_M, SIZE
 from services.planning.head import PAN, TILT, Sweep
 
 
-class Idle:
-    """Stand still, at once, and hold everything as it is."""
+class Idling:
+    """Stands still and holds everything as it is."""
 
-    def __init__(self, why: str = "nothing is asked") -> None:
+    needs_sight = False
+
+    def __init__(self, action: Idle, why: str = "nothing is asked") -> None:
         self._why = why
 
     def step(self, snapshot: Snapshot) -> Plan:
         return Plan(snapshot.actuators.driver.halt(), snapshot.still(), self._why, state="done")
 
 
-class Park:
-    """Fold the arm up and look ahead."""
+class Parking:
+    """Folds the arm and looks ahead."""
+
+    needs_sight = False
+
+    def __init__(self, action: Park) -> None:
+        pass
 
     def step(self, snapshot: Snapshot) -> Plan:
         arm = snapshot.actuators.arm.park(snapshot.angles, snapshot.dt_s)
@@ -36,18 +44,19 @@ class Park:
         return plan
 
 
-class Search:
-    """Look where the target was last, then sweep the head over the whole surroundings. What shows up in the sweep is
-    looked at until it is confirmed."""
+class Searching:
+    """Looks where the target was last, then sweeps the head over the whole surroundings. A target that shows up in the
+    sweep is looked at until it is confirmed."""
 
+    needs_sight = True
     CONFIRMED = 2
     IN_VIEW_S = 0.2
     """A target is in view when its newest sighting is not older than this and perception's own lag."""
 
     BACK_M = 0.4
 
-    def __init__(self, label: str) -> None:
-        self._label = label
+    def __init__(self, action: Search) -> None:
+        self._label = action.label
         self._start: Pose2 | None = None
         self._sweep: Sweep | None = None
         self._looked_at_ns: int | None = None
@@ -102,14 +111,15 @@ class Search:
         return Plan(base, snapshot.still(), why)
 
 
-class Explore:
-    """Go to where most of what is hidden from here can be seen, and look from there: the next search begins there."""
+class Exploring:
+    """Drives to the place from which most of the hidden floor can be seen; the next search begins there."""
 
+    needs_sight = True
     NEAR_M, FAR_M = 0.5, 1.6
     SIGHT_M = 1.5
 
-    def __init__(self, label: str) -> None:
-        self._label = label
+    def __init__(self, action: Explore) -> None:
+        self._label = action.label
         self._course: Course | None = None
         self._goal: tuple[float, float] | None = None
 
@@ -126,7 +136,7 @@ class Explore:
         if (
             target is not None
             and target.age_s < 0.3
-            and snapshot.estimator.memory.sightings(self._label) >= Search.CONFIRMED
+            and snapshot.estimator.memory.sightings(self._label) >= Searching.CONFIRMED
         ):
             return Plan(snapshot.stand(), snapshot.still(), f"{self._label} came into view", state="done")
         arm = actuators.arm.park(snapshot.angles, snapshot.dt_s)

@@ -4,24 +4,26 @@ from __future__ import annotations
 
 from cocoro.clock import NS
 from cocoro.frames import Spherical, to_spherical, wrap_rad
+from cocoro.messages.actions import Reach, Touch
 from services.planning.behaviours.base import Plan, Snapshot, hand_place
-from services.planning.behaviours.handling import Reach
+from services.planning.behaviours.handling import Reaching
 from services.planning.reach import HandPose
 
 REACHED = Spherical(0.02, 0.034, 0.034)
 """The paper's: how far hand and target may be apart, egocentric: metres, azimuth and elevation in radians."""
 
 
-class Touch:
-    """Back from where the hand is, behind the target, around it; the base stands. It is reached when hand and target
-    are one place, as the robot sees and feels them, by the paper's measure."""
+class Touching:
+    """Backs the hand out, then brings it behind the target and around it; the base stands. The target is reached when
+    hand and target are in one place, as the robot sees and feels them, within the paper's limits."""
 
+    needs_sight = False
     IN_VIEW_S = 0.2
     LOOK_S = 1.5
 
-    def __init__(self, label: str) -> None:
-        self._label = label
-        self._reach = Reach(label, touching=True)
+    def __init__(self, action: Touch) -> None:
+        self._label = action.label
+        self._reach = Reaching(Reach(action.label), touching=True)
         self._back: HandPose | None = None
         self._begun = False
         self._seen = False
@@ -50,7 +52,7 @@ class Touch:
         target = snapshot.target(self._label)
         head = snapshot.look_at(target.position_m) if target is not None else None
         plan = Plan(snapshot.stand(), step, "backing the hand out first", head, distance_m=step.left)
-        if step.left < Reach.CLOSE_IN_M:
+        if step.left < Reaching.CLOSE_IN_M:
             self._back = None
         elif step.blocked:
             plan.state, plan.reason, plan.why = "failed", "blocked", "the hand's way out is blocked"

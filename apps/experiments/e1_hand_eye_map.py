@@ -1,4 +1,4 @@
-"""E1: the arm babbles and learns where its hand is seen; and goes on learning when it is bent."""
+"""E1: the arm babbles and learns the map from joint angles to the hand's place; then it is bent, and the map adapts."""
 
 from __future__ import annotations
 
@@ -6,46 +6,49 @@ from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
-from apps.experiments import bodies, figures
+from apps.experiments import figures, plan
 from apps.experiments.lessons import SIZES
+from apps.experiments.plan import ExperimentSettings
 from apps.experiments.results import Plot, Section, row
 from apps.experiments.runs import ExperimentRun, RunResult
-from apps.experiments.settings import ExperimentSettings
 from apps.learning.study import BEST, METHODS
+from services.executive.tasks import BabbleArmTask
 
 KEY, TITLE = "E1", "The hand-eye map, from babbling"
 BEND_S = 30.0
+"""Simulated time at which the forearm is bent."""
 BENT_SAMPLES = 450
 AFTER = 100
-"""So many sightings after the bend the adapted map is judged over the rest."""
+"""Number of sightings after the bend that are left out when the adapted map is judged."""
 
 
 def runs(settings: ExperimentSettings) -> list[ExperimentRun]:
     found = []
     for seed in settings.seeds:
-        found += bodies.learned(settings, seed)
+        found += plan.learned(settings, seed)
         bent = {
-            "task": "babble-arm", "count": BENT_SAMPLES, "samples": str(settings.bent_file(seed)), "bend_s": BEND_S,
+            "task": BabbleArmTask(count=BENT_SAMPLES), "samples": str(settings.bent_file(seed)), "bend_s": BEND_S,
             **settings.common(seed),
         }  # fmt: skip
         lesson = {"into": str(settings.model_file(seed)), "bent": str(settings.bent_file(seed)), "bend_s": BEND_S}
+        lesson |= settings.robot_files
         found.append(ExperimentRun(f"babble-bent-{seed}", "rehearse", bent))
         found.append(
-            ExperimentRun(f"bend-{seed}", "bend", lesson, needs=(f"babble-bent-{seed}", bodies.learned_name(seed)))
+            ExperimentRun(f"bend-{seed}", "bend", lesson, needs=(f"babble-bent-{seed}", plan.learned_name(seed)))
         )
     return found
 
 
 def section(settings: ExperimentSettings, results: Mapping[str, RunResult]) -> Section:
-    learned = {seed: results[bodies.learned_name(seed)] for seed in settings.seeds}
+    learned = {seed: results[plan.learned_name(seed)] for seed in settings.seeds}
     good = {seed: result for seed, result in learned.items() if "error" not in result}
     bent = [r for seed in settings.seeds if "error" not in (r := results[f"bend-{seed}"])]
     made = Section(KEY, TITLE, _about(good))
     by_name = {seed: {s["name"]: s for s in result["arm"]["scores"]} for seed, result in good.items()}
     chosen = [by_name[seed][result["arm"]["chosen"]]["held_out_m"] for seed, result in good.items()]
-    drawing = [scores["the drawing with its best constant offset"]["held_out_m"] for scores in by_name.values()]
+    baseline = [scores["the drawing with its best constant offset"]["held_out_m"] for scores in by_name.values()]
     cm = [100 * value for value in chosen]
-    ratio = [ours / theirs for ours, theirs in zip(chosen, drawing, strict=True)]
+    ratio = [ours / theirs for ours, theirs in zip(chosen, baseline, strict=True)]
     measure = "held-out error, RMS"
     made.rows.append(
         row(measure, "ours: the map that measures best", cm, "cm", digits=2, wanted="at most 0.6 in each seed",
@@ -54,8 +57,8 @@ def section(settings: ExperimentSettings, results: Mapping[str, RunResult]) -> S
     made.rows.append(
         row(
             measure,
-            "baseline: the drawing and its best constant hand offset",
-            [100 * d for d in drawing],
+            "baseline: the nominal model and its best constant hand offset",
+            [100 * error for error in baseline],
             "cm",
             digits=2,
         )
@@ -80,9 +83,9 @@ def section(settings: ExperimentSettings, results: Mapping[str, RunResult]) -> S
 
 def _about(good: Mapping[int, RunResult]) -> str:
     text = (
-        "The arm goes from Sobol draw to Sobol draw over its joints' range (±2.62 rad, within the joints' limits), the"
-        " head looks at the hand's marker, and each frame that shows it is a sample. Every fifth draw is held out,"
-        " whole. What is learned from the rest is judged on those."
+        "The arm moves from Sobol draw to Sobol draw over its joints' range (±2.62 rad, within the joints' limits), the"
+        " head looks at the hand's marker, and each frame that shows the marker is a sample. Every fifth draw is held"
+        " out with all its samples; the maps learn from the rest and are judged on the held-out ones."
     )
     if not good:
         return text
@@ -90,8 +93,8 @@ def _about(good: Mapping[int, RunResult]) -> str:
     babbled_s = sum(r["babbled_s"] for r in good.values()) / len(good)
     learn = sum(r["learn"] for r in good.values()) / len(good)
     return text + (
-        f" Of the draws {share:.0%} remain, to which a safe way leads and at which the marker may be seen. A seed's"
-        f" samples took {babbled_s / 60:.1f} simulated minutes; {learn:.0f} of them are learned from."
+        f" {share:.0%} of the draws are used: those that a safe path reaches and at which the marker can be seen. A"
+        f" seed's samples took {babbled_s / 60:.1f} simulated minutes; {learn:.0f} of them are for learning."
     )
 
 
@@ -105,8 +108,8 @@ def _bent_rows(bent: list[RunResult]) -> list[Any]:
     measure = f"error {AFTER} sightings after the arm was bent by 3 cm, and later"
     return [
         row("error before the bend", "ours", [mean_cm(r["fixed_m"][: r["bent_at"]]) for r in bent], "cm", digits=2),
-        row(measure, "ours, taught on (--adapt)", [late(r, "adapted_m") for r in bent], "cm", digits=2),
-        row(measure, "baseline: the map as it was", [late(r, "fixed_m") for r in bent], "cm", digits=2),
+        row(measure, "ours, trained further (--adapt)", [late(r, "adapted_m") for r in bent], "cm", digits=2),
+        row(measure, "baseline: the map, fixed", [late(r, "fixed_m") for r in bent], "cm", digits=2),
     ]
 
 
@@ -115,15 +118,15 @@ def _plots(settings: ExperimentSettings, good: Mapping[int, RunResult], bent: li
     if good:
         seed = next(iter(good))
         plots.append(
-            Plot("e1-hand", f"Where the hand was seen, where the drawing has it and where the learned map has it, on"
-                 f" the held-out draws of seed {seed}.",
-                 partial(figures.hand_places, settings.arm_file(seed), settings.model_file(seed)))
+            Plot("e1-hand", f"The hand on the held-out draws of seed {seed}: seen, by the nominal model, and by the"
+                 " learned map.",
+                 partial(figures.hand_places, settings.arm_file(seed), settings.model_file(seed), settings.robot()))
         )  # fmt: skip
         curves = [result["curves"] for result in good.values()]
         plots.append(Plot("e1-curves", "Held-out error against samples; the mean over the seeds, and all seeds.",
                           partial(figures.curves, curves)))  # fmt: skip
     if bent:
-        plots.append(Plot("e1-bend", "A sighting's error, when the forearm is bent by 3 cm at the hand (dotted): the"
-                          " map that is taught on, and the one that is not; the median over the seeds, smoothed.",
+        plots.append(Plot("e1-bend", "Error of each sighting when the forearm is bent by 3 cm at the hand (dotted): the"
+                          " map that is trained further, and the fixed one; the median over the seeds, smoothed.",
                           partial(figures.bend, bent)))  # fmt: skip
     return plots

@@ -16,13 +16,14 @@ from apps.appearance.learn import LearnedObject, ObjectView
 from apps.appearance.size import outline_of
 from apps.cli.link import Link, joined, within
 from apps.cli.options import RobotChoice
+from apps.pictures import colour_of, describe, draw
 from cocoro.arrays import ImageArray
 from cocoro.component import load as load_component
 from cocoro.core import Sample
 from cocoro.errors import ConfigError, MeshError
 from cocoro.messages import Detections, Frame, Message, ServoState
 from cocoro.objects import Catalogue
-from cocoro.picture import colour_of, describe, draw, load
+from cocoro.picture import load
 from cocoro.robot import Robot
 from cocoro.topics import ARM_STATE, FRAME
 from deploy import processes
@@ -47,7 +48,7 @@ class CameraView:
     """The file of known objects that the robot which is up was started with, if it was with one."""
 
 
-def of_picture(path: Path) -> CameraView:
+def of_picture(path: Path, robot: Robot) -> CameraView:
     """A picture file, taken to be the robot's camera's. Raises ConfigError when it is none."""
     if not path.is_file():
         raise ConfigError(f"there is no picture {path}; --from names a file, or says live")
@@ -62,7 +63,7 @@ def of_picture(path: Path) -> CameraView:
     frame = Frame(
         width=width, height=height, colour=colour.reshape(-1).data, depth=depth.view(np.uint8).data, stamp_ns=MS
     )
-    return CameraView(ObjectView(colour, Robot.load()), frame, None, None)
+    return CameraView(ObjectView(colour, robot), frame, None, None)
 
 
 async def of_robot(where: RobotChoice) -> CameraView:
@@ -70,16 +71,12 @@ async def of_robot(where: RobotChoice) -> CameraView:
     async with joined(where, frames=True) as link:
         resolved = link.run_dir.resolved()
         named = resolved.get("objects") or resolved.get("service", {}).get(PERCEPTION, {}).get("objects")
-        description, measured = (Path(file) if (file := resolved.get(name)) else None for name in DESCRIPTIONS)
-        robot = Robot.load(description, measured)
+        robot = link.described()
         frame, head = await _frame(link, robot.chain("camera").joints)
     pose = robot.chain("camera").pose(head)
     raw_depth = np.frombuffer(frame.depth, dtype="<u2").reshape(frame.height, frame.width)
     look = ObjectView(colour_of(frame), robot, raw_depth, pose)
     return CameraView(look, frame, head, Path(named) if named else None)
-
-
-DESCRIPTIONS = ("description", "measured")
 
 
 async def _frame(link: Link, joints: tuple[str, ...]) -> tuple[Frame, dict[str, float]]:

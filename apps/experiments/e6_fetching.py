@@ -1,4 +1,4 @@
-"""E6: one of three cans is found, driven to, grasped and lifted."""
+"""E6: the robot finds one of three cans, drives there, grasps it and lifts it."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ from functools import partial
 from math import ceil
 from typing import Any
 
-from apps.experiments import bodies, figures
+from apps.experiments import figures, plan
+from apps.experiments.plan import ExperimentSettings
 from apps.experiments.results import Plot, Section, row
 from apps.experiments.runs import ExperimentRun, RunResult
-from apps.experiments.settings import ExperimentSettings
+from services.executive.tasks import FetchTask
 
 KEY, TITLE = "E6", "Fetching"
 CANS = ("red_can", "green_can", "blue_can")
@@ -25,11 +26,11 @@ WAYS: dict[str, tuple[str, dict[str, Any]]] = {
 def runs(settings: ExperimentSettings) -> list[ExperimentRun]:
     found = []
     for seed in settings.seeds:
-        found += bodies.learned(settings, seed)
+        found += plan.learned(settings, seed)
         for way, (_, fields) in WAYS.items():
             for can in CANS:
                 name = f"fetch-{way}-{can}-{seed}"
-                found.append(bodies.with_model(settings, seed, name, **{"task": "fetch", "label": can, **fields}))
+                found.append(plan.with_model(settings, seed, name, task=FetchTask(label=can), **fields))
     return found
 
 
@@ -37,8 +38,8 @@ def section(settings: ExperimentSettings, results: Mapping[str, RunResult]) -> S
     made = Section(
         KEY,
         TITLE,
-        "The paper's scene: three cans at (1.5 m, 0°), (1.4 m, -45°) and (1 m, 45°), within 2 cm by the seed. Fetched"
-        " is one that is held 0.1 m high for 2 s, by the truth, with none knocked over.",
+        "The paper's scene: three cans at (1.5 m, 0°), (1.4 m, -45°) and (1 m, 45°), within 2 cm by the seed. A can"
+        " counts as fetched when it is truly held 0.1 m high for 2 s and no can was knocked over.",
     )
     total = len(settings.seeds) * len(CANS)
     phases: dict[str, list[RunResult]] = {}
@@ -49,22 +50,22 @@ def section(settings: ExperimentSettings, results: Mapping[str, RunResult]) -> S
         least = ceil(SHARE * total)
         ours = way == "learned"
         made.rows += [
-            row(f"fetched, of {total}", who, [], "", said=str(len(good)),
+            row(f"fetched, of {total}", who, [], "", text=str(len(good)),
                 wanted=f"at least {least}" if ours else "", held=len(good) >= least if ours else None,
                 paper="the real robot knocked some targets over" if ours else ""),
-            row("runs in which something was knocked over", who, [], "", said=str(knocked)),
+            row("runs in which something was knocked over", who, [], "", text=str(knocked)),
             row("time of a fetch", who, [result["sim_s"] for result in good], "s"),
         ]  # fmt: skip
         phases[who] = good
         for result in found:
             if result not in good:
-                why = result.get("error") or result.get("reason") or "not held, by the truth"
+                why = result.get("error") or result.get("reason") or "not held in truth"
                 made.notes.append(
                     f"Not fetched, {who}: {result.get('label', '?')}, seed {result.get('seed', '?')}: {why}."
                 )
     if any(phases.values()):
         made.plots.append(
-            Plot("e6-phases", "How long each phase of a fetch took, the mean over those that were held.",
+            Plot("e6-phases", "Mean duration of each phase, over the fetches whose can was held.",
                  partial(figures.phases, phases))
         )  # fmt: skip
     return made

@@ -1,4 +1,4 @@
-"""E5: a ball is carried round a square, and followed."""
+"""E5: a ball is carried round a square, and the robot follows it."""
 
 from __future__ import annotations
 
@@ -6,15 +6,17 @@ from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
-from apps.experiments import bodies, figures
+from apps.experiments import figures, plan
+from apps.experiments.plan import ExperimentSettings
 from apps.experiments.results import Plot, Section, row
 from apps.experiments.runs import ExperimentRun, RunResult
-from apps.experiments.settings import ExperimentSettings
+from services.executive.tasks import FollowTask
 
 KEY, TITLE = "E5", "Following"
 FOR_S = 33.0
-"""Once round: 8 m at 0.25 m/s, and a little."""
+"""Time of one round: 8 m at 0.25 m/s, and a little more."""
 LOST_S = 1.0
+"""Longest acceptable time without the ball in the picture."""
 WAYS: dict[str, tuple[str, dict[str, Any]]] = {
     "learned": ("ours", {}),
     "lockstep": ("baseline: lock-step", {"lockstep": True}),
@@ -24,13 +26,14 @@ WAYS: dict[str, tuple[str, dict[str, Any]]] = {
 def runs(settings: ExperimentSettings) -> list[ExperimentRun]:
     found = []
     for seed in settings.seeds:
-        found += bodies.learned(settings, seed)
+        found += plan.learned(settings, seed)
         for way, (_, fields) in WAYS.items():
             request = {
-                "task": "follow", "label": "blue_ball", "scene": "follow", "for_s": FOR_S,
+                "task": FollowTask(label="blue_ball", for_s=FOR_S),
+                "scene": "follow",
                 "trace": seed == settings.seeds[0],
-            }  # fmt: skip
-            found.append(bodies.with_model(settings, seed, f"follow-{way}-{seed}", **{**request, **fields}))
+            }
+            found.append(plan.with_model(settings, seed, f"follow-{way}-{seed}", **{**request, **fields}))
     return found
 
 
@@ -40,7 +43,7 @@ def section(settings: ExperimentSettings, results: Mapping[str, RunResult]) -> S
         TITLE,
         "A ball, 0.7 m high, starts 1 m ahead and is carried round a square of 8 m at 0.25 m/s. Gaps are from the"
         " robot's centre to the ball's nearest edge; lost is the longest time without the ball in the picture."
-        " All by the truth.",
+        " All values are the simulator's truth.",
     )
     for way, (who, _) in WAYS.items():
         truths = [r["truth"] for s in settings.seeds if (r := results[f"follow-{way}-{s}"]).get("outcome") == "done"]
@@ -52,13 +55,13 @@ def section(settings: ExperimentSettings, results: Mapping[str, RunResult]) -> S
             row("mean gap", who, [truth["mean_gap_m"] for truth in truths], "m", digits=2, paper=paper),
             row("widest gap", who, [truth["max_gap_m"] for truth in truths], "m", digits=2),
             row("lost for", who, lost, "s", digits=2, wanted="never over 1" if ours else "", held=held),
-            row("followed to the end, of " + str(len(settings.seeds)), who, [], "", said=str(len(truths))),
+            row("followed to the end, of " + str(len(settings.seeds)), who, [], "", text=str(len(truths))),
         ]
     seed = settings.seeds[0]
     traces = {WAYS[way][0]: result["trace"] for way in WAYS if "trace" in (result := results[f"follow-{way}-{seed}"])}
     if traces:
         made.plots.append(
-            Plot("e5-square", f"The ball's square and the robot's way after it, from above, seed {seed}.",
+            Plot("e5-square", f"The ball's square and the robot's path behind it, from above, seed {seed}.",
                  partial(figures.square, traces))
         )  # fmt: skip
     return made

@@ -18,6 +18,7 @@ from typing import Generic, TypeVar
 import msgspec
 
 from cocoro.errors import ConfigError, RefusedError
+from cocoro.learning.handmap import fingerprint_of
 from cocoro.messages import FiniteVec2, FiniteVec3
 from cocoro.robot import Robot
 
@@ -94,25 +95,6 @@ class Recorded(Generic[SampleRow]):
         for row in self.rows:
             digest.update(msgspec.json.encode(row))
         return digest.hexdigest()[:16]
-
-
-def fingerprint_of(robot: Robot) -> str:
-    """Of what places and turns are reckoned with: links, zeros of the joints, marker, wheels, camera. Robots that agree
-    in these have equal fingerprints, whatever else their descriptions say; what is as it is by default is left out, so
-    that a description that learns to say more stays the same."""
-    data = robot.to_data()
-    drawing = {
-        "link": data["link"],
-        "joint": [(row["name"], row["direction"], row["centre_count"]) for row in data["joint"]],
-        "marker": data["marker"],
-        "base": [data["base"][name] for name in ("wheel_separation_m", "wheel_radius_m")],
-        "kinect": {
-            field.name: data["kinect"][field.name]
-            for field in msgspec.structs.fields(robot.kinect)
-            if field.required or getattr(robot.kinect, field.name) != field.default
-        },
-    }
-    return hashlib.sha256(msgspec.json.encode(drawing, order="deterministic")).hexdigest()[:16]
 
 
 def read(path: Path, kind: type[SampleRow], robot: Robot | None = None) -> Recorded[SampleRow]:

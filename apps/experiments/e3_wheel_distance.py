@@ -1,4 +1,4 @@
-"""E3: the distance between the wheels, from babbling."""
+"""E3: the robot babbles with its wheels and learns the distance between them."""
 
 from __future__ import annotations
 
@@ -6,33 +6,32 @@ from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
-from apps.experiments import bodies, figures
+from apps.experiments import figures, plan
+from apps.experiments.plan import ExperimentSettings
 from apps.experiments.results import Plot, ResultRow, Section, row
 from apps.experiments.runs import ExperimentRun, RunResult
-from apps.experiments.settings import ExperimentSettings
-from cocoro.robot import Robot
 
 KEY, TITLE = "E3", "The distance between the wheels, from babbling"
 MEDIAN_M, WORST_M = 0.003, 0.008
 
 
 def runs(settings: ExperimentSettings) -> list[ExperimentRun]:
-    return [run for seed in settings.seeds for run in bodies.learned(settings, seed)]
+    return [run for seed in settings.seeds for run in plan.learned(settings, seed)]
 
 
 def section(settings: ExperimentSettings, results: Mapping[str, RunResult]) -> Section:
     good = [
-        (results[bodies.learned_name(seed)]["wheels"], results[f"babble-wheels-{seed}"]["body"])
+        (results[plan.learned_name(seed)]["wheels"], results[f"babble-wheels-{seed}"]["body"])
         for seed in settings.seeds
-        if "error" not in results[bodies.learned_name(seed)]
+        if "error" not in results[plan.learned_name(seed)]
     ]
     made = Section(
         KEY,
         TITLE,
-        f"A can 1.5 m ahead; {settings.trials} trials, in pairs of a Sobol draw within ±0.15 m/s a wheel for 1 s and"
-        " its reverse. The can is looked at before and after each.",
+        f"A can 1.5 m ahead; {settings.trials} trials, in pairs of a Sobol draw within ±0.15 m/s for each wheel for 1 s"
+        " and its reverse. The can is seen before and after each.",
     )
-    drawn_m = Robot.load().base.wheel_separation_m
+    nominal_m = settings.robot().base.wheel_separation_m
     for measure, key in (("wheel distance", "wheel_separation_m"), ("distance that turns it", "turning_separation_m")):
         axle = key == "wheel_separation_m"
         true_m = [body[key] for _, body in good]
@@ -41,19 +40,19 @@ def section(settings: ExperimentSettings, results: Mapping[str, RunResult]) -> S
             _row(measure, "ours: all trials at once", ours_m, true_m, wanted=axle),
             _row(measure, "the paper's median over the trials", [fit["median_m"] for fit, _ in good], true_m,
                  paper="6 cm (real) and 5 cm (virtual) over the true distance" if axle else ""),
-            _row(measure, "baseline: the drawing", [drawn_m] * len(good), true_m),
+            _row(measure, "baseline: the nominal model", [nominal_m] * len(good), true_m),
         ]  # fmt: skip
     made.notes.append(
-        "The wheel distance is that of the axle's ends. Wheels that roll up to 2% further or less than they are told to"
-        " turn the robot as if they stood nearer together or further apart; the distance that turns it is what odometry"
-        " and navigation want, and what they use. Ours for the axle is the same with the learned scale of the wheels"
-        " taken out."
+        "The wheel distance is the distance between the axle's ends. Wheels that roll up to 2% more or less than"
+        " commanded turn the robot as if they stood nearer together or further apart; odometry and navigation need and"
+        " use the distance that turns it. Our value for the axle is that distance without the learned scale of the"
+        " wheels."
     )
     if good:
         turning = [(fit, body["turning_separation_m"]) for fit, body in good]
         made.plots.append(
-            Plot("e3-trials", "What the trials so far say of the distance that turns the robot, less the truth: the fit"
-                 " to all of them, a line a seed; and the single trials' own estimates.",
+            Plot("e3-trials", "Error of the distance that turns the robot: of the fit to all trials so far, a line for"
+                 " each seed; and of the single trials' own estimates.",
                  partial(figures.wheel_trials, turning))
         )  # fmt: skip
     return made
@@ -68,6 +67,6 @@ def _row(
 ) -> ResultRow:
     mm = [1000 * abs(one - true) for one, true in zip(found_m, true_m, strict=True)]
     found = row(f"error of the {measure}", who, mm, "mm", paper=paper)
-    said = f"{found.mean}, median {found.values.median:.1f}"
+    text = f"{found.mean}, median {found.values.median:.1f}"
     held = found.values.median <= 1000 * MEDIAN_M and found.values.worst <= 1000 * WORST_M if wanted and mm else None
-    return found._replace(said=said, held=held, wanted="median at most 3, worst at most 8" if wanted else "")
+    return found._replace(text=text, held=held, wanted="median at most 3, worst at most 8" if wanted else "")

@@ -1,0 +1,239 @@
+"""The commands of tasks, made from their types: `cocoro NAME` on a robot, and `cocoro rehearse NAME`.
+
+`cocoro --help` needs this file, so the functions import what they need themselves.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import inspect
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import UnionType
+from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
+
+import msgspec
+import typer
+from msgspec import NODEFAULT, Meta
+from typer.core import TyperCommand, TyperGroup
+from typer.main import get_group
+
+from apps.cli.options import (
+    AdaptOption,
+    BodyOption,
+    DescriptionOption,
+    FramesOption,
+    JsonOption,
+    LatencyOption,
+    MeasuredOption,
+    MeshOption,
+    ModelOption,
+    ObjectsOption,
+    ReachOption,
+    RobotChoice,
+    RobotOption,
+    TimeoutOption,
+)
+from cocoro.errors import ConfigError
+from cocoro.tasks import Task
+from services.executive.tasks import TASKS
+
+PANEL = "Tasks"
+UNITS = {"_s": "SECONDS", "_m": "METRES", "_rad": "RADIANS", "_mps": "M/S"}
+"""Metavar by the unit that a field's name ends with."""
+
+_ANNOTATED: Any = Annotated
+"""`Annotated` for types that are only known at run time."""
+Shared = Callable[..., None]
+"""Carries out a task; its parameters after the first, the task, are the options that all its commands have."""
+
+
+# --- what the commands do -------------------------------------------------------------------------
+
+
+def operate(
+    task: Task,
+    timeout: TimeoutOption = None,
+    snapshot: Annotated[
+        Path | None, typer.Option(metavar="OUT.png", help="Write what the robot sees when it grasps.")
+    ] = None,
+    robot: RobotOption = None,
+    profile: MeshOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Ctrl-C cancels it on the robot."""
+    from apps.cli import tasks
+    from cocoro.messages import TaskRequest
+
+    request = TaskRequest(task=task, timeout_s=timeout)
+    sys.exit(asyncio.run(tasks.run(RobotChoice(robot, profile), request, json, snapshot)))
+
+
+def rehearse(
+    task: Task,
+    scene: Annotated[str, typer.Option(help="A scene's name, or its file.")] = "paper",
+    seed: Annotated[int, typer.Option(min=0, help="Seed of everything that is drawn at random.")] = 0,
+    sensors: Annotated[
+        str, typer.Option(metavar="ideal|real", help="Perfect camera and body, or real ones.")
+    ] = "ideal",
+    body: BodyOption = "nominal",
+    description: DescriptionOption = None,
+    measured: MeasuredOption = None,
+    model: ModelOption = None,
+    reach: ReachOption = None,
+    adapt: AdaptOption = False,
+    bend: Annotated[
+        float | None, typer.Option(min=0.0, metavar="SECONDS", help="Bend the forearm by 3 cm at this time.")
+    ] = None,
+    samples: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Keep the samples here; an existing file is continued.")
+    ] = None,
+    latency: LatencyOption = None,
+    lockstep: Annotated[bool, typer.Option("--lockstep", help="One serial cycle over all, as in the paper.")] = False,
+    frames: FramesOption = None,
+    objects: ObjectsOption = None,
+    timeout: TimeoutOption = None,
+    picture: Annotated[
+        Path | None, typer.Option(metavar="OUT.png", help="Write what the robot saw when it grasped.")
+    ] = None,
+    record: Annotated[Path | None, typer.Option(metavar="OUT.mcap", help="Record everything.")] = None,
+    json: JsonOption = False,
+) -> None:
+    """The whole robot is simulated in one process, in virtual time, and judged by the simulator's truth."""
+    from apps.cli import rehearse as rehearsing
+
+    options = {
+        "task": task, "scene": scene, "seed": seed, "sensors": sensors, "body": body, "model": _text(model),
+        "reach": reach or "learned", "adapt": adapt, "bend_s": bend, "samples": _text(samples), "lockstep": lockstep,
+        "description": _text(description), "measured": _text(measured),
+        "objects": _text(objects), "timeout_s": timeout, "picture": _text(picture), "record": _text(record),
+    }  # fmt: skip
+    sys.exit(rehearsing.rehearse(options, latency or [], frames, json))
+
+
+def _text(path: Path | None) -> str | None:
+    return None if path is None else str(path)
+
+
+# --- commands from types --------------------------------------------------------------------------
+
+
+def task_names() -> list[str]:
+    """The tasks that are commands of their own. `cocoro babble` runs those of the project's tasks that report samples,
+    because it keeps the samples."""
+    return [name for name, kind in TASKS.all().items() if kind.samples is None or name not in TASKS.own]
+
+
+def task_command(name: str) -> TyperCommand | None:
+    """The command of a task; None for a name that is none."""
+    return _command(name, operate) if name in task_names() else None
+
+
+class RehearsalGroup(TyperGroup):
+    """A command for each task."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        return list(TASKS.all())
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        return _command(cmd_name, rehearse) if cmd_name in TASKS.all() else None
+
+
+app = typer.Typer()
+app.add_typer(
+    typer.Typer(
+        cls=RehearsalGroup,
+        no_args_is_help=True,
+        help="Try a task in simulation: the whole robot in one process, in virtual time.",
+    ),
+    name="rehearse",
+)
+
+
+@app.command()
+def cancel(robot: RobotOption = None, profile: MeshOption = None) -> None:
+    """End the running task; the robot stands still."""
+    from apps.cli import tasks
+
+    sys.exit(asyncio.run(tasks.cancel(RobotChoice(robot, profile))))
+
+
+def _command(name: str, shared: Shared) -> TyperCommand:
+    made = typer.Typer()
+    made.command(name, rich_help_panel=PANEL)(command_of(TASKS.kind(name), shared))
+    made.callback()(lambda: None)
+    command = get_group(made).commands[name]
+    assert isinstance(command, TyperCommand)
+    return command
+
+
+def command_of(kind: type[Task], shared: Shared) -> Callable[..., None]:
+    """A function for typer: its parameters are a task's fields and the options that its commands share."""
+    left_out = {"task"}
+    if not kind.snapshot_phase:
+        left_out |= {"snapshot", "picture"}
+    if kind.samples is None:
+        left_out.add("samples")
+    hints = get_type_hints(shared, include_extras=True)
+    fields = [field for field in msgspec.structs.fields(kind) if _is_option(field)]
+    parameters = [_parameter(field) for field in fields]
+    parameters += [
+        parameter.replace(annotation=hints[name], kind=inspect.Parameter.KEYWORD_ONLY)
+        for name, parameter in inspect.signature(shared).parameters.items()
+        if name not in left_out
+    ]
+
+    def command(**given: Any) -> None:
+        values = {field.name: given.pop(field.name) for field in fields}
+        try:
+            task = TASKS.read({"task": kind.tag(), **values})
+        except ValueError as error:
+            raise ConfigError(str(error)) from error
+        shared(task, **given)
+
+    command.__name__ = kind.tag()
+    command.__doc__ = f"{inspect.cleandoc(kind.__doc__ or '')}\n\n{shared.__doc__}"
+    command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    command.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    return command
+
+
+def _is_option(field: msgspec.structs.FieldInfo) -> bool:
+    _, _, metas = _unwrapped(field.type)
+    return all((meta.extra or {}).get("option", True) for meta in metas)
+
+
+def _parameter(field: msgspec.structs.FieldInfo) -> inspect.Parameter:
+    """A field as typer has it: `label` is the argument, every other one an option, named without its unit."""
+    plain, optional, metas = _unwrapped(field.type)
+    text = next((meta.description for meta in metas if meta.description), None)
+    default = inspect.Parameter.empty if field.default is NODEFAULT else field.default
+    if field.name == "label":
+        annotation = _ANNOTATED[plain, typer.Argument(help=text)]
+        return inspect.Parameter(field.name, inspect.Parameter.KEYWORD_ONLY, annotation=annotation, default=default)
+    name, metavar = field.name, None
+    for unit, word in UNITS.items():
+        if name.endswith(unit):
+            name, metavar = name.removesuffix(unit), word
+    low = next((limit for meta in metas for limit in (meta.ge, meta.gt) if limit is not None), None)
+    high = next((limit for meta in metas for limit in (meta.le, meta.lt) if limit is not None), None)
+    option = typer.Option(f"--{name.replace('_', '-')}", help=text, min=low, max=high, metavar=metavar)
+    kind = plain | None if optional else plain
+    return inspect.Parameter(
+        field.name, inspect.Parameter.KEYWORD_ONLY, annotation=_ANNOTATED[kind, option], default=default
+    )
+
+
+def _unwrapped(annotation: Any) -> tuple[Any, bool, tuple[Meta, ...]]:
+    """The type behind `Annotated` and `| None`; whether None is allowed; and the `Meta` of it."""
+    optional = False
+    metas: tuple[Meta, ...] = ()
+    while get_origin(annotation) in (Annotated, Union, UnionType):
+        if get_origin(annotation) is Annotated:
+            annotation, *found = get_args(annotation)
+            metas += tuple(meta for meta in found if isinstance(meta, Meta))
+        else:
+            optional = True
+            (annotation,) = (part for part in get_args(annotation) if part is not type(None))
+    return annotation, optional, metas

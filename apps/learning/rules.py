@@ -1,0 +1,62 @@
+"""The paper's learning rule and its rule for outliers, and the folds of a cross-validation."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+import scipy
+from scipy.spatial import KDTree
+
+from cocoro.arrays import BoolArray, FloatArray, IntArray
+from cocoro.learning.network import HyperplaneRbf
+
+_BLOCK = 128
+"""Samples computed at a time."""
+NEIGHBOUR_M = 0.025
+"""The paper's: a sighting whose nearest neighbour is further away is an outlier."""
+SPARSE_FACTOR = 4.0
+
+
+def learn_in_order(network: HyperplaneRbf, inputs: FloatArray, targets: FloatArray, rate: float) -> None:
+    """The paper's rule: each sample once, in order. Changes the network. inputs (b, n), targets (b, k).
+
+    Block by block, exactly as sample by sample: with G the Gram matrix of a block's features, the errors E that the
+    rule meets one after the other are the solution of the triangular system (I + rate tril(G, -1)) E = T - Phi W, and
+    the weights then gain rate Phi' E (derived).
+    """
+    for start in range(0, len(inputs), _BLOCK):
+        phi = network.features(inputs[start : start + _BLOCK])
+        before = targets[start : start + _BLOCK] - phi @ network.weights
+        system = np.tril(rate * (phi @ phi.T), -1)
+        np.fill_diagonal(system, 1.0)
+        errors = scipy.linalg.solve_triangular(system, before, lower=True, unit_diagonal=True)
+        network.weights += rate * (phi.T @ errors)
+
+
+def folds(groups: IntArray, count: int) -> Iterable[tuple[BoolArray, BoolArray]]:
+    """`count` pairs of boolean masks (learn, check), whole groups in each: what is checked was never near to what was
+    learned. `groups` (b,) tells which samples belong together."""
+    names = np.unique(groups)
+    for number in range(count):
+        check = np.isin(groups, names[number::count])
+        yield ~check, check
+
+
+def inliers(places_m: FloatArray, limit_m: float = NEIGHBOUR_M) -> BoolArray:
+    """Which of the places (b, 3) have a neighbour within the limit; shape (b,).
+
+    The paper's 2.5 cm supposes sightings that lie densely. Where they do not, most of them would be outliers; so the
+    limit is never less than four times the median distance of neighbours (ours).
+    """
+    if len(places_m) < 2:
+        return np.ones(len(places_m), dtype=np.bool_)
+    nearest = np.asarray(KDTree(places_m).query(places_m, k=2)[0])[:, 1]
+    return np.asarray(nearest <= max(limit_m, SPARSE_FACTOR * float(np.median(nearest))))
+
+
+def plausible(errors_m: FloatArray, limit: float = 6.0) -> BoolArray:
+    """Which of the errors (b, 3) of a map are of the usual size; shape (b,). Usual is up to `limit` times their median
+    length: a wrong sighting in the midst of good ones has near neighbours and is found only so."""
+    size = np.linalg.norm(errors_m, axis=1)
+    return np.asarray(size <= limit * float(np.median(size)))

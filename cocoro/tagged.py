@@ -1,0 +1,95 @@
+"""Open families of types that travel by their tag, such as tasks and actions: the project's own, and third parties'."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from functools import cache
+from typing import Any, Generic, NamedTuple, TypeVar
+
+import msgspec
+
+T = TypeVar("T", bound="Tagged")
+
+
+class Tagged(msgspec.Struct, frozen=True):
+    """A member of such a family: a frozen struct whose map on the wire holds its tag."""
+
+    @classmethod
+    def tag(cls) -> str:
+        return str(cls.__struct_config__.tag)
+
+    @property
+    def name(self) -> str:
+        return self.tag()
+
+    @property
+    def target(self) -> str:
+        """The label of the object that it concerns; '' for none."""
+        return str(getattr(self, "label", ""))
+
+
+class Added(NamedTuple):
+    """What the entry points of a group point to."""
+
+    values: tuple[Any, ...]
+    faults: tuple[str, ...]
+    """Why others could not be loaded."""
+
+
+@cache
+def added_by(group: str) -> Added:
+    """Load the entry points of a group, once in a process. One that cannot be loaded costs itself only."""
+    from importlib.metadata import entry_points  # takes 40 ms to import, which most processes never need
+
+    values, faults = [], []
+    for point in entry_points(group=group):
+        try:
+            values.append(point.load())
+        except Exception as error:  # whatever a third party's module raises
+            owner = point.dist.name if point.dist else "an unknown distribution"
+            faults.append(f"entry point {point.name!r} of {owner} cannot be loaded: {type(error).__name__}: {error}")
+    return Added(tuple(values), tuple(faults))
+
+
+class Registry(Generic[T]):
+    """The types of one family by tag: the project's own, and those that third parties add."""
+
+    def __init__(self, word: str, own: Iterable[type[T]], others: Callable[[], Iterable[type[T]]]) -> None:
+        """`word` names a member in messages ("task"). `others` is called when a name is not one of the own types, and
+        when all are listed."""
+        self._word = word
+        self._own = {kind.tag(): kind for kind in own}
+        self._others = others
+
+    @property
+    def own(self) -> Mapping[str, type[T]]:
+        return self._own
+
+    def all(self) -> dict[str, type[T]]:
+        """Own types first. A third party's type with the name of an own one is left out."""
+        return {kind.tag(): kind for kind in self._others()} | self._own
+
+    def kind(self, name: object) -> type[T]:
+        """The type of a name. Raises ValueError, which lists the known names."""
+        found = self._own.get(name) if isinstance(name, str) else None
+        if found is None:
+            known = self.all()
+            if not isinstance(name, str) or name not in known:
+                raise ValueError(f"unknown {self._word} {name!r}; known are {', '.join(known)}")
+            found = known[name]
+        return found
+
+    def read(self, data: object) -> T:
+        """A member from the map that it travels as; a member stays as it is. Raises ValueError, which lists the known
+        names for an unknown one, and names the field that is wrong."""
+        if isinstance(data, Tagged):
+            return data  # type: ignore[return-value] # whoever made it chose the family
+        if not isinstance(data, Mapping):
+            raise ValueError(f"{self._word}: a map is expected, not {type(data).__name__}")
+        kind = self.kind(data.get(self._word))
+        try:
+            return msgspec.convert(data, kind)
+        except msgspec.ValidationError as error:
+            text, _, path = str(error).partition(" - at `$.")
+            field = path.rstrip("`")
+            raise ValueError(f"{kind.tag()}: {f'{field}: ' if field else ''}{text}") from error
