@@ -152,6 +152,7 @@ def test_help_imports_no_command() -> None:
     assert "services.executive.tasks" in modules, "the tasks' own types say what they are called"
 
 
+@pytest.mark.process
 def test_a_command_that_is_no_task_imports_no_task() -> None:
     code = "import sys; from apps.cli.main import main; main(['down', '--help']); print(*sys.modules, file=sys.stderr)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
@@ -181,6 +182,7 @@ def test_the_emergency_stop_knows_what_can_be_stopped() -> None:
     assert stoppable() == stop_asking.STOPPABLE
 
 
+@pytest.mark.process
 def test_a_foreign_package_that_hides_one_of_ours_is_named(tmp_path: Path) -> None:
     (tmp_path / "services").mkdir()
     (tmp_path / "services" / "__init__.py").touch()
