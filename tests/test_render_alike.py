@@ -1,5 +1,5 @@
-"""The renderers: the infrared projector's shadow, the same world from both, the same bytes anywhere, and what
-happens where OpenGL is missing."""
+"""The renderers: the infrared projector's shadow, agreement of both renderers, equal bytes in every process, and the
+case without OpenGL."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_without_a_projector_depth_has_no_shadows(renderer: Renderer) -> None:
 
 
 def test_the_projectors_shadow_lies_left_of_a_near_thing_as_wide_as_the_disparity(renderer: Renderer) -> None:
-    # The projector stands to the right of the depth camera, so what it misses is to the left.
+    # The projector is to the right of the depth camera, so the area without light is to the left.
     images = look(renderer, projector=True)
     u, v = pixel_of((1.8 - 0.1, 0.4, 0.2), moved(head(), np.array(ROBOT.kinect.depth_offset_m)))
     row = images.depth_m[round(v)]

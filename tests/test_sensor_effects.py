@@ -1,4 +1,4 @@
-"""The faults of a real Kinect, each at its stated size."""
+"""The errors of a real Kinect, each at its stated size."""
 
 from __future__ import annotations
 
@@ -154,7 +154,7 @@ def test_two_percent_of_the_edge_pixels_are_lost_and_none_elsewhere() -> None:
 
 
 def test_a_slanted_floor_with_noise_is_no_edge() -> None:
-    # Level gaze from the Kinect's height: the steepest codes a floor can show.
+    # A level camera at the Kinect's height: the largest change of codes that a floor can show.
     rows = np.arange(1, HEIGHT // 2 + 1)
     z = (0.73 * CAMERA.fy / rows)[:, None].repeat(WIDTH, axis=1).astype(np.float32)
     z = np.vstack([z, z])

@@ -1,4 +1,4 @@
-"""The servo service, from messages to bytes, at the ends of emulated lines, by the real clock."""
+"""The servo service from messages to bytes, at the ends of emulated lines, in real time."""
 
 from __future__ import annotations
 
@@ -285,6 +285,6 @@ def test_a_killed_service_leaves_an_arm_that_stops_by_itself(bench: ServoBench) 
         service.wait()
     killed_at = bench.call(lambda: servo.get(36))
     bench.emulator.until(lambda: servo.get(36) == servo.get(30))
-    # Where it keeps up, 0.2 s of travel; on a busy machine no more than it may be led ahead at all.
+    # Normally 0.2 s of travel; on a busy machine at most the upper bound for the point ahead of the joint.
     assert servo.get(36) - killed_at < (REACH_RAD + LEAD_S * 0.5) / SERVO_COUNT_RAD + 10
     assert servo.get(36) < 1000

@@ -1,4 +1,4 @@
-"""What is written for libfreenect's playback library, by its README's words."""
+"""Recordings for libfreenect's playback library have the format of its README."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The PyBullet world: its robot is the described one, its scene the given one, and it repeats itself to the bit."""
+"""The PyBullet world: its robot is the described one, its scene the given one, and it is repeatable to the bit."""
 
 from __future__ import annotations
 
