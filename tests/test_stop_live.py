@@ -119,7 +119,7 @@ def test_the_latch_outlives_the_death_of_everything_and_only_a_reset_releases_it
 
 def test_a_first_start_that_nobody_watches_comes_up_stopped(shell: Shell) -> None:
     said = up(shell, "--unattended")
-    assert "the emergency stop is latched by a first start that no person watched" in said
+    assert "the emergency stop is latched by a first start without a person" in said
     assert latch(shell) == "latched"
     assert robot(shell, "reset").returncode == exits.DONE
     assert latch(shell) == "released"

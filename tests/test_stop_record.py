@@ -25,7 +25,7 @@ def test_a_machine_that_never_knew_a_latch_is_released_by_a_person_only(folder: 
     assert [one.latched for one in said.values()] == [False, False]
     unwatched = prepare(tmp_path / "other", ["base", "arm"], by_hand=False)
     assert [one.latched for one in unwatched.values()] == [True, True]
-    assert unwatched["base"].by == "a first start that no person watched"
+    assert unwatched["base"].by == "a first start without a person"
 
 
 def test_a_record_that_is_missing_beside_others_is_latched(folder: Path) -> None:
