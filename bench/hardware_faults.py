@@ -280,7 +280,7 @@ class Campaign:
         return Trial("servo: power lost", lambda: self._call(lambda: servo.put(42, 30)), end, 0.5, ("does not answer",))
 
     def _feel(self, name: str, field_name: str, value: object, shown: str, *, stops: bool) -> Trial:
-        around = self._hardware.create.around
+        around = self._hardware.create.sensors
         before = getattr(around, field_name)
         return Trial(
             f"create: {name}", lambda: self._call(lambda: setattr(around, field_name, value)),

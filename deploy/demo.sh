@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# The simulated robot, as processes of its own, fetches the red can of the paper's scene. Leaves in out/ what it saw
-# at the grasp, the capture of it all, and the logs. Has a mesh of its own, so that it disturbs no robot that is up here.
+# The simulated robot fetches the red can in the paper's scene. Writes to out/ the picture at the grasp, the capture of
+# the run and the logs. It uses a separate mesh, so that it does not disturb a robot that is up on this machine.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 cocoro=$PWD/.venv/bin/cocoro

@@ -1,12 +1,12 @@
 #!/usr/bin/env bash
-# Makes .venv and installs the project into it, with the pinned versions. On Debian and Ubuntu it also installs
-# the GL libraries that the fast renderer needs; without them the simulator falls back to a slower renderer.
-# Does nothing when all that is done already.
+# Makes .venv and installs the project with pinned versions of its libraries. On Debian and Ubuntu it also installs the
+# GL libraries that the fast renderer needs; without them the simulator uses a slower renderer. Does nothing when
+# everything is installed already.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 python=${PYTHON:-python3}
 
-# A .venv knows its own path, so a checkout that has been moved needs a new one.
+# A .venv contains its own path, so a checkout that was moved needs a new one.
 installed=.venv/.installed
 wanted="$PWD $(cat pyproject.toml constraints.txt deploy/install.sh | sha256sum)"
 if [ "$(cat $installed 2>/dev/null)" = "$wanted" ] && .venv/bin/python -c '' 2>/dev/null; then
@@ -39,7 +39,7 @@ if [[ "$(cat $installed 2>/dev/null)" != "$PWD "* ]] || ! .venv/bin/python -m pi
     echo "Making .venv"
     rm -rf .venv
     if ! "$python" -m venv .venv 2>/dev/null; then
-        # Debian keeps the part that brings pip in a package of its own (python3-venv): let our own pip do it.
+        # On Debian the part of venv that installs pip is in a separate package (python3-venv): use this Python's pip.
         rm -rf .venv
         "$python" -m venv --without-pip .venv && "$python" -m pip --python .venv/bin/python install --quiet pip || {
             echo "A virtual environment cannot be made; on Debian: apt-get install python3-venv" >&2

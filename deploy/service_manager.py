@@ -1,4 +1,4 @@
-"""What a supervisor tells systemd, where that started it: sd_notify(3) and its watchdog."""
+"""Notifications to systemd, when it started the supervisor: sd_notify(3) and the watchdog."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from collections.abc import Callable
 from contextlib import suppress
 
 PETS = 3
-"""In each of the watchdog's periods: one that comes late, or is left out, is not yet too few."""
+"""Notifications per period of the watchdog, so that a late or missing one does no harm."""
 
 
 def notify(state: str) -> None:
-    """Send a line such as 'READY=1'; nothing where there is no systemd."""
+    """Send a line such as 'READY=1' to systemd, if that started this process."""
     address = os.environ.get("NOTIFY_SOCKET")
     if address:
         with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as notify:
@@ -21,20 +21,19 @@ def notify(state: str) -> None:
 
 
 def watchdog_s() -> float | None:
-    """The period of this process's watchdog (`WatchdogSec` of the unit); None when nobody watches."""
+    """Period of this process's watchdog (`WatchdogSec` of the unit); None without a watchdog."""
     if os.environ.get("WATCHDOG_PID", str(os.getpid())) != str(os.getpid()):
-        return None  # it is meant for another
+        return None  # the watchdog is for another process
     with suppress(ValueError):
         period_s = int(os.environ.get("WATCHDOG_USEC", "0")) / 1e6
         return period_s if period_s > 0 else None
     return None
 
 
-async def keep_watchdog(well: Callable[[], bool]) -> None:
-    """Tell the watchdog again and again that all is well, for as long as `well` says so. Returns at once when nobody
-    watches, and never otherwise."""
+async def keep_watchdog(works: Callable[[], bool]) -> None:
+    """Notify the watchdog periodically while `works()` is true. Returns only when there is no watchdog."""
     period_s = watchdog_s()
     while period_s is not None:
-        if well():
+        if works():
             notify("WATCHDOG=1")
         await asyncio.sleep(period_s / PETS)

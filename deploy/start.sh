@@ -1,4 +1,4 @@
 #!/usr/bin/env bash
-# Starts a robot's processes and returns when they are ready. Arguments are those of `cocoro up`: start.sh robot
+# Starts a robot's processes and returns when they are ready. The arguments are those of `cocoro up`: start.sh robot
 set -euo pipefail
 exec "$(dirname "$0")/../.venv/bin/cocoro" up --detach "$@"

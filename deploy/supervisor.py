@@ -1,7 +1,7 @@
-"""Starts the processes of a profile, watches them, and stops them again: what `cocoro up` runs.
+"""The supervisor, which `cocoro up` runs: starts the processes of a profile, watches them, and stops them.
 
 Detached it is `python -m deploy.supervisor --run-dir DIR --report-fd N`, with the resolved profile on its standard
-input; it tells through the pipe what it does until the robot is up, one JSON object a line.
+input. Until the robot is up it reports its progress through the pipe, one JSON object per line.
 """
 
 from __future__ import annotations
@@ -28,57 +28,57 @@ from cocoro.errors import CocoroError, ConfigError, RefusedError
 from cocoro.keys import alive_key, service_of
 from cocoro.stop.record import latch_dir, prepare
 from deploy import robot_time, service_manager
-from deploy.child import Child, StartError
 from deploy.launch import CRASHED
 from deploy.processes import shared_bytes, stoppable
 from deploy.profiles import Profile, from_data
 from deploy.quit import quit_process
 from deploy.rundir import RunDir
+from deploy.supervised_process import StartError, SupervisedProcess
 
 STOPPED, MISCONFIGURED, REFUSED = 0, 2, 3
-"""Exit codes, as of every command."""
+"""Exit codes, as for every command."""
 COMES_UP_STOPPED = "the robot comes up stopped, and `cocoro reset` releases it"
 LEFTOVER_S = 8.0
-"""How long the processes of a killed supervisor may take to notice it and end."""
+"""Time in which the processes of a killed supervisor must notice that and end."""
 
 log = logging.getLogger(__name__)
 
 
 class Supervisor:
-    """One robot's processes on this machine. `run` does it all."""
+    """The processes of one robot on this machine. Call `run`. Passes lines for people to `report`."""
 
     def __init__(
         self,
         profile: Profile,
         run_dir: RunDir,
-        tell: Callable[[str], None],
+        report: Callable[[str], None],
         on_up: Callable[[], None] = lambda: None,
         *,
         by_hand: bool = True,
     ) -> None:
-        """`by_hand`: a person started it, and not the machine at its own start."""
+        """`by_hand`: a person started it, not the machine when it booted."""
         self._profile = profile
         self._run_dir = run_dir
         self._by_hand = by_hand
         self._on_up = on_up
-        self._tell_people = tell
-        self._children: list[Child] = []
+        self._report_to_people = report
+        self._children: list[SupervisedProcess] = []
         self._stop = asyncio.Event()
         self._unshared = ""
-        """Why frames cannot all be shared, as it was before the processes were started."""
-        self._sleep_detector = SleepDetector(self._tell)
+        """Why not all frames fit into shared memory, as found before the processes were started."""
+        self._sleep_detector = SleepDetector(self._report)
 
     async def run(self) -> int:
-        """Start everything, stay until SIGINT or SIGTERM, stop everything. Returns the exit code.
+        """Start everything, wait for SIGINT or SIGTERM, stop everything. Returns the exit code.
 
-        Raises RefusedError when the robot is up already, ConfigError for a mesh that cannot be.
+        Raises RefusedError when the robot is up already, ConfigError when the mesh cannot be opened.
         """
         self._run_dir.make()
         held = self._run_dir.hold_supervisor(self._profile.name)
         try:
             self._log_to_file()
             await self._wait_for_leftovers()
-            shared.sweep()  # what dead processes left
+            shared.sweep()  # segments of dead processes
             self._unshared = shared.obstacle(shared_bytes(self._profile.rows()))
             self._run_dir.remember(msgspec.json.format(msgspec.json.encode(self._profile)))
             self._prepare_latches()
@@ -86,16 +86,16 @@ class Supervisor:
             with _signals(self._on_signal):
                 return await self._run()
         finally:
-            shared.sweep()  # of processes that were killed
+            shared.sweep()  # segments of processes that were killed
             held.release()
 
     async def _run(self) -> int:
         code = STOPPED
-        reader_fd, writer_fd = os.pipe()  # the children hold its reading end: it closes when this process ends
+        reader_fd, writer_fd = os.pipe()  # the children hold the reading end, and notice when this process ends
         try:
             async with await ZenohBus.open(self._run_dir.join_as("supervisor", self._profile.mesh)) as bus:
                 self._children = [
-                    Child(row, self._run_dir, reader_fd, self._tell, self._sleep_detector)
+                    SupervisedProcess(row, self._run_dir, reader_fd, self._report, self._sleep_detector)
                     for row in self._profile.rows()
                 ]
                 by_service = {service: child for child in self._children for service in child.row.services}
@@ -121,9 +121,9 @@ class Supervisor:
 
     async def _start_and_keep(self) -> int:
         starting = asyncio.gather(*(child.start() for child in self._children))
-        told = asyncio.ensure_future(self._stop.wait())
-        await asyncio.wait((starting, told), return_when=asyncio.FIRST_COMPLETED)
-        told.cancel()
+        stopping = asyncio.ensure_future(self._stop.wait())
+        await asyncio.wait((starting, stopping), return_when=asyncio.FIRST_COMPLETED)
+        stopping.cancel()
         if not starting.done():
             starting.cancel()
             with suppress(asyncio.CancelledError):
@@ -132,61 +132,62 @@ class Supervisor:
         try:
             starting.result()
         except StartError as error:
-            self._tell(str(error))
+            self._report(str(error))
             return error.code
         if self._unshared:
-            self._tell(f"no shared memory: {self._unshared}; {shared.COSTS}")
-        self._tell(f"{self._profile.robot} is up ({self._profile.name})")
+            self._report(f"no shared memory: {self._unshared}; {shared.COSTS}")
+        self._report(f"{self._profile.robot} is up ({self._profile.name})")
         self._on_up()
         service_manager.notify("READY=1")
         async with asyncio.TaskGroup() as group:
             keeping = [group.create_task(child.keep()) for child in self._children]
-            keeping.append(group.create_task(service_manager.keep_watchdog(self._attended)))
+            keeping.append(group.create_task(service_manager.keep_watchdog(self._works)))
             await self._stop.wait()
             for task in keeping:
                 task.cancel()
         return STOPPED
 
-    def _attended(self) -> bool:
-        """Whether everything that became of the processes has been noticed."""
-        return all(child.attended for child in self._children)
+    def _works(self) -> bool:
+        """Whether this supervisor has noticed the end of every process that has ended."""
+        return all(child.exit_noticed for child in self._children)
 
     async def _wait_for_leftovers(self) -> None:
-        """A killed supervisor's processes end by themselves: give them the time for it."""
+        """Wait for the processes of a killed supervisor, which end by themselves. Raises RefusedError when one does
+        not."""
         services = set(self._profile.services())
         deadline_s = asyncio.get_running_loop().time() + LEFTOVER_S
         while found := {service: by for service, by in self._run_dir.claims().items() if service in services}:
             if asyncio.get_running_loop().time() > deadline_s:
                 who = ", ".join(f"{service} ({by.name}, pid {by.pid})" for service, by in found.items())
-                raise RefusedError(f"of {self._profile.robot} there runs already: {who}; `cocoro down` ends it")
+                raise RefusedError(f"{self._profile.robot} runs already: {who}; `cocoro down` ends it")
             await asyncio.sleep(0.05)
 
     def _prepare_latches(self) -> None:
-        """See to it that the emergency stop's latch has its place on the disk before anything moves."""
+        """Prepare the emergency stop's record on the disk before anything moves."""
         services = {*self._profile.services()} & {*stoppable(), "executive"}
         folder = latch_dir(self._profile.robot)
         try:
             records = prepare(folder, services, by_hand=self._by_hand)
         except OSError as error:
-            self._tell(
+            self._report(
                 f"the emergency stop's latch cannot be kept in {folder}: {error.strerror or error}; {COMES_UP_STOPPED}"
             )
             return
-        latched = next((said for said in records.values() if said.latched), None)
+        latched = next((record for record in records.values() if record.latched), None)
         if latched is not None:
             when = f", {latched.when}" if latched.when else ""
-            self._tell(f"the emergency stop is latched by {latched.by}{when}; {COMES_UP_STOPPED}")
+            self._report(f"the emergency stop is latched by {latched.by}{when}; {COMES_UP_STOPPED}")
 
     def _on_signal(self, number: signal.Signals) -> None:
-        self._tell("still stopping" if self._stop.is_set() else f"stopping ({number.name})")
+        self._report("still stopping" if self._stop.is_set() else f"stopping ({number.name})")
         self._stop.set()
 
-    def _tell(self, text: str) -> None:
+    def _report(self, text: str) -> None:
         log.info("%s", text)
-        self._tell_people(text)
+        self._report_to_people(text)
 
     def _log_to_file(self) -> None:
-        handler = _log_handler(self._run_dir, self._tell_people)
+        handler = _log_handler(self._run_dir, self._report_to_people)
         handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)-7s supervisor: %(message)s"))
         log.handlers[:] = [handler]
         log.setLevel(logging.INFO)
@@ -194,35 +195,35 @@ class Supervisor:
 
 
 class _Log(logging.StreamHandler[IO[str]]):
-    """Says once that nothing can be written any more, and works on."""
+    """Reports once that the log cannot be written any more, and continues without it."""
 
-    def __init__(self, stream: IO[str], path: Path, tell: Callable[[str], None]) -> None:
+    def __init__(self, stream: IO[str], path: Path, report: Callable[[str], None]) -> None:
         super().__init__(stream)
         self._path = path
-        self._tell = tell
-        self._told = False
+        self._report = report
+        self._reported = False
 
     def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802 # the library's name
-        if not self._told:
-            self._told = True
-            self._tell(f"{self._path} cannot be written ({sys.exc_info()[1]}): the supervisor works on without")
+        if not self._reported:
+            self._reported = True
+            self._report(f"{self._path} cannot be written ({sys.exc_info()[1]}): the supervisor works on without")
 
 
-def _log_handler(run_dir: RunDir, tell: Callable[[str], None]) -> logging.Handler:
+def _log_handler(run_dir: RunDir, report: Callable[[str], None]) -> logging.Handler:
     try:
         file = run_dir.new_log("supervisor")
     except ConfigError as error:
-        tell(f"the supervisor runs without a log: {error}")
+        report(f"the supervisor runs without a log: {error}")
         return logging.NullHandler()
-    return _Log(io.TextIOWrapper(file, write_through=True), run_dir.log("supervisor"), tell)
+    return _Log(io.TextIOWrapper(file, write_through=True), run_dir.log("supervisor"), report)
 
 
 @contextmanager
 def _signals(handler: Callable[[signal.Signals], None]) -> Iterator[None]:
-    """Being told to end, and a closed terminal, go to `handler` for as long as this context lasts."""
+    """Within this context, pass SIGINT, SIGTERM and a closed terminal (SIGHUP) to `handler`."""
     loop = asyncio.get_running_loop()
     numbers = [signal.SIGINT, signal.SIGTERM]
-    if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:  # as nohup has it
+    if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:  # nohup ignores it
         numbers.append(signal.SIGHUP)
     for number in numbers:
         loop.add_signal_handler(number, handler, number)
@@ -236,28 +237,28 @@ def _signals(handler: Callable[[signal.Signals], None]) -> Iterator[None]:
 def supervise(
     profile: Profile,
     run_dir: RunDir,
-    tell: Callable[[str], None],
+    report: Callable[[str], None],
     on_up: Callable[[], None] = lambda: None,
     *,
     by_hand: bool = True,
 ) -> int:
-    """Run a robot in the foreground; returns the exit code. `tell` gets a line for people at a time."""
+    """Run a robot in the foreground; returns the exit code. Passes lines for people to `report`."""
 
     async def run() -> int:
-        return await Supervisor(profile, run_dir, tell, on_up, by_hand=by_hand).run()
+        return await Supervisor(profile, run_dir, report, on_up, by_hand=by_hand).run()
 
     try:
         return asyncio.run(run())
     except RefusedError as error:
-        tell(str(error))
+        report(str(error))
         return REFUSED
     except CocoroError as error:
-        tell(str(error))
+        report(str(error))
         return MISCONFIGURED
 
 
 class _Pipe:
-    """Tells the command that started this process, until the robot is up."""
+    """Reports to the command that started this process, until the robot is up."""
 
     def __init__(self, fd: int) -> None:
         self._file = os.fdopen(fd, "w", buffering=1)
@@ -271,14 +272,14 @@ class _Pipe:
             self._file.close()
 
     def _write(self, message: dict[str, object]) -> None:
-        with suppress(OSError, ValueError):  # nobody listens any more
+        with suppress(OSError, ValueError):  # the command has ended
             self._file.write(json.dumps(message) + "\n")
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m deploy.supervisor", description="Run a robot, detached.")
     parser.add_argument("--run-dir", type=Path, required=True, help="the robot's folder")
-    parser.add_argument("--report-fd", type=int, required=True, help="a pipe to tell through until the robot is up")
+    parser.add_argument("--report-fd", type=int, required=True, help="a pipe for reports until the robot is up")
     parser.add_argument("--unattended", action="store_true", help="no person started it")
     options = parser.parse_args()
     pipe = _Pipe(options.report_fd)
@@ -288,7 +289,7 @@ def main() -> int:
     by_hand = not options.unattended
     try:
         code = supervise(profile, run_dir, pipe.line, on_up=lambda: pipe.close(STOPPED), by_hand=by_hand)
-    except OSError as error:  # its traceback goes to supervisor.err, unless that is on the same full disk
+    except OSError as error:  # the traceback goes to supervisor.err, unless that is on the same full disk
         pipe.line(f"{error.filename or run_dir.path}: {error.strerror}; mend it, or choose another by COCORO_RUN_DIR")
         pipe.close(CRASHED)
         raise

@@ -1,4 +1,4 @@
-"""The simulator as a service: it stands in for kinect, base, arm and hand, key for key, and keeps the clock."""
+"""The simulator's service: replaces kinect, base, arm and hand on their topics, and drives the clock."""
 
 from __future__ import annotations
 
@@ -30,18 +30,18 @@ from sim.render import make_renderer
 from sim.world import Motors, World, message_motors
 
 TICK_HZ = 120
-"""The clock key's rate; the physics runs whole steps between ticks."""
+"""Rate of the clock topic. The physics runs a whole number of steps between ticks."""
 FRAME_LATENCY_S = 0.020
 STATE_LATENCY_S = 0.005
-"""From a stamp to its publishing, with real sensors."""
+"""Latencies from stamp to publication, with real sensors."""
 LATE_S = 0.1
-"""Further behind real time than this, simulated time slips instead of catching up."""
+"""When it is further behind real time than this, simulated time slips instead of catching up."""
 
 
 class SimConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     scene: str = "paper"
     target: str = ""
-    """An object that a random scene must have."""
+    """An object that a random scene must contain."""
     seed: Annotated[int, Meta(ge=0)] = 0
     sensors: Literal["ideal", "real"] = "ideal"
     width: Annotated[int, Meta(ge=16, le=4096)] = 640
@@ -50,22 +50,22 @@ class SimConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     state_rate_hz: Annotated[float, Meta(gt=0, le=120)] = 50.0
     physics_hz: Annotated[int, Meta(ge=TICK_HZ, multiple_of=TICK_HZ)] = 240
     pace: Annotated[float, Meta(ge=0.01, le=1)] = 1.0
-    """Simulated seconds a real second, in real time: less gives a busy machine time, or people time to watch."""
+    """Simulated seconds per real second: less gives a busy machine, or people who watch, more time."""
     battery_fraction: Annotated[float, Meta(ge=0, le=1)] = 1.0
-    """How full the base says that its battery is. It stays so."""
+    """Charge that the base reports; it does not change."""
     command_timeout_s: Annotated[float, Meta(gt=0)] | None = None
-    """Instead of the robot's own deadman; only the lock-step baseline asks for one."""
+    """Replaces the robot's deadman time; only the lock-step baseline does."""
     renderer: Literal["auto", "moderngl", "tiny"] = "auto"
     body: BodyKind = "nominal"
-    """Worn: the body differs from its drawing, as the seed says; no service knows how."""
+    """worn: the body differs from the nominal description by errors drawn from the seed, unknown to all services."""
     bend_at_s: Annotated[float, Meta(ge=0)] | None = None
-    """When somebody bends the forearm, by 3 cm at the hand."""
+    """Time at which the forearm is bent, by 3 cm at the hand."""
     motion: str = ""
-    """A file for how the body moves at each step of the physics (`sim.motion`); empty: none."""
+    """A file for the body's motion at each physics step (`sim.motion`); '' for none."""
 
 
 class _Outbox:
-    """Messages on their way: published when their latency is over, by simulated time."""
+    """Holds messages back until their latency, by simulated time, is over."""
 
     def __init__(self) -> None:
         self._waiting: list[tuple[int, int, Publisher[Any], Message]] = []
@@ -82,7 +82,7 @@ class _Outbox:
 
 
 class _Every:
-    """Says when something of a fixed rate is due, in whole physics steps."""
+    """Tells in which physics steps something with a fixed rate is due."""
 
     def __init__(self, rate_hz: float) -> None:
         self._rate_hz = rate_hz
@@ -119,11 +119,11 @@ class Simulator:
         node.drive_clock()
 
     def connect_camera(self, kinect: Node) -> None:
-        """Stand in for the camera alone."""
+        """Replace the camera only."""
         self._frames = kinect.publisher(topics.FRAME)
 
     def connect(self, kinect: Node, base: Node, arm: Node, hand: Node) -> None:
-        """Stand in for all of the robot's hardware."""
+        """Replace all of the robot's hardware."""
         world = self._world
         self.connect_camera(kinect)
         self._states = (
@@ -158,7 +158,7 @@ class Simulator:
         self._world.command_servos(network, command)
 
     def tick(self) -> None:
-        """One tick of the clock: some steps of physics, and what became due in them."""
+        """Advance the clock by one tick: run the physics steps in it, and publish what becomes due."""
         world = self._world
         for _ in range(self._config.physics_hz // TICK_HZ):
             world.step()
@@ -173,29 +173,29 @@ class Simulator:
             if self._frame_due.due(now_ns):
                 frame = self._kinect.capture(world.visual_poses(), world.camera_pose(), now_ns, world.light)
                 self._outbox.put(self._frames, frame, now_ns + self._frame_latency_ns)
-        self.tell_time()
+        self.publish_time()
         self._outbox.flush(world.time_ns)
         if self._motion is not None:
             self._motion.flush()
 
     def write_motion(self, path: Path) -> MotionWriter:
-        """Write how the body moves from now on; closed by leaving what this returns. Raises ConfigError."""
+        """Record the body's motion from now on, until the returned context manager is left. Raises ConfigError."""
         self._motion = MotionWriter(path, self._world)
         return self._motion
 
-    def tell_time(self) -> None:
+    def publish_time(self) -> None:
         sent = self._ticks.put(ClockTick(rate=self.rate), self._world.time_ns)
         self._clock.tick(sent.stamp_ns, sent.incarnation, self.rate)
 
 
 async def run(node: Node, config: SimConfig) -> None:
-    """Simulate for ever: in real time, or as the loop's virtual time goes."""
+    """Simulate for ever, in real time or in the event loop's virtual time."""
     with make_world(node.robot, config) as world:
         simulator = Simulator(node, config, world, make_kinect(node.robot, config, world))
         async with AsyncExitStack() as stack:
             hardware = [await stack.enter_async_context(node.sibling(name)) for name in SIM.services]
             simulator.connect(*hardware)
-            simulator.tell_time()  # before anybody is ready, so that nobody begins anything in a time that is over
+            simulator.publish_time()  # before any service is ready, so that none starts work in an epoch that ends
             for part in (node, *hardware):
                 part.ready(f"simulated, scene {world.scene.name}, {config.sensors} sensors")
             await keep_going(node, config, simulator)
@@ -209,7 +209,7 @@ def make_world(
     config: SimConfig,
     motors: Callable[[Robot, Mapping[str, float], BodyRealism], Motors] = message_motors,
 ) -> World:
-    """The scene with the robot in it."""
+    """Make the world: the scene with the robot in it."""
     return World(
         _with_timeout(robot, config.command_timeout_s),
         find_scene(config.scene, config.seed, config.target),
@@ -230,7 +230,7 @@ def make_kinect(robot: Robot, config: SimConfig, world: World) -> SimKinect:
 
 
 async def keep_going(node: Node, config: SimConfig, simulator: Simulator) -> None:
-    """Tick for ever, and with it the clock."""
+    """Tick for ever."""
     with ExitStack() as stack:
         if config.motion:
             stack.enter_context(simulator.write_motion(Path(config.motion)))
@@ -249,7 +249,7 @@ async def _in_virtual_time(simulator: Simulator, clock: Clock) -> None:
 
 
 async def _in_real_time(simulator: Simulator, pace: float) -> None:
-    """Keep up with the monotonic clock; where that cannot be done, let simulated time slip and say so in the rate."""
+    """Tick by the monotonic clock. When that is too fast for the machine, simulated time slips and the rate says so."""
     due_s = measured_s = time.monotonic()
     simulator.rate = pace
     tick_s = 1 / TICK_HZ / pace
@@ -269,7 +269,7 @@ async def _in_real_time(simulator: Simulator, pace: float) -> None:
 
 
 def _with_timeout(robot: Robot, timeout_s: float | None) -> Robot:
-    """The robot with another deadman, which is the same at all speeds."""
+    """The robot with another deadman time, equal at all speeds."""
     if timeout_s is None:
         return robot
     slow = robot.with_base(command_timeout_s=timeout_s, stand_within_s=timeout_s + 1.0)

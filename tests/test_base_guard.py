@@ -35,7 +35,7 @@ def test_it_wakes_the_create_stops_it_and_tells_what_it_measures(bench: Bench) -
     with guarded(bench) as service:
         report = service.report(link="up")
         assert bench.create.mode == SAFE
-        assert report["readings"][str(oi.VOLTAGE)] == bench.create.around.voltage_mv
+        assert report["readings"][str(oi.VOLTAGE)] == bench.create.sensors.voltage_mv
         assert set(map(int, report["readings"])) >= {oi.BUMPS, oi.MODE, *oi.CLIFFS}
 
 
@@ -125,7 +125,7 @@ def test_what_it_does_not_understand_it_does_not_do(bench: Bench, service: FakeS
 
 
 def test_the_bumper_lets_nothing_forward_and_turning_and_backing_pass(bench: Bench, service: FakeService) -> None:
-    bench.emulator.call(lambda: setattr(bench.create.around, "bump_left", True))
+    bench.emulator.call(lambda: setattr(bench.create.sensors, "bump_left", True))
     service.report(link="up")
     service.keep_asking(200, 100)
     bench.until_wheels(50, -50)
@@ -141,7 +141,7 @@ def test_a_bump_while_driving_stops_within_a_few_frames(bench: Bench, service: F
     bench.until_wheels(200, 200)
 
     def bump() -> int:
-        bench.create.around.bump_right = True
+        bench.create.sensors.bump_right = True
         return bench.create._now_ns
 
     pressed_ns = bench.emulator.call(bump)
@@ -151,11 +151,11 @@ def test_a_bump_while_driving_stops_within_a_few_frames(bench: Bench, service: F
 def test_a_create_that_its_own_safety_stopped_waits_for_somebodys_word(bench: Bench, service: FakeService) -> None:
     service.keep_asking(200, 200)
     bench.until_wheels(200, 200)
-    bench.emulator.call(lambda: setattr(bench.create.around, "drop_left", True))
+    bench.emulator.call(lambda: setattr(bench.create.sensors, "drop_left", True))
     report = service.report(link="fallen")
     assert report["why"] == "mode"
     assert bench.create.wheels_mmps == (0, 0)
-    bench.emulator.call(lambda: setattr(bench.create.around, "drop_left", False))
+    bench.emulator.call(lambda: setattr(bench.create.sensors, "drop_left", False))
     service.report(link="fallen")  # not by itself, though nothing keeps it any more
     service.send({"recover": True})
     service.report(link="up")
@@ -163,7 +163,7 @@ def test_a_create_that_its_own_safety_stopped_waits_for_somebodys_word(bench: Be
 
 
 def test_recovering_while_the_cause_is_still_there_does_not_help(bench: Bench, service: FakeService) -> None:
-    bench.emulator.call(lambda: setattr(bench.create.around, "charger", True))
+    bench.emulator.call(lambda: setattr(bench.create.sensors, "charger", True))
     service.report(link="fallen")
     service.send({"recover": True})
     service.report(link="waking")

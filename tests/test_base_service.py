@@ -162,7 +162,7 @@ async def test_odometry_tells_the_way_that_the_wheels_went(bench: Bench) -> None
 @in_real_time
 async def test_what_ails_the_create_is_said(bench: Bench) -> None:
     async with driven(bench) as base:
-        around = bench.create.around
+        around = bench.create.sensors
         around.charge_mah = 200
         await base.fault("battery is low: 7%")
         around.left_overcurrent = True
@@ -181,18 +181,18 @@ async def test_what_ails_the_create_is_said(bench: Bench) -> None:
 async def test_a_fallen_create_is_recovered_on_request(bench: Bench) -> None:
     async with driven(bench) as base:
         base.release()
-        bench.create.around.cliffs[2] = True
+        bench.create.sensors.cliffs[2] = True
         await base.state(lambda state: state.cliff)
         base.drive(0.1, 0.1)
         await base.state(
             lambda state: state.mode == "safe" and state.stopped_by == "cliff"
         )  # our own reflex kept it from falling
-        bench.create.around.drop_left = True
+        bench.create.sensors.drop_left = True
         await base.fault("`cocoro base recover`")
         reply = await base.service.ask(topics.RECOVER, RecoverRequest())
         assert not reply.recovered
         assert "wheel" in reply.text
-        bench.create.around.drop_left = bench.create.around.cliffs[2] = False
+        bench.create.sensors.drop_left = bench.create.sensors.cliffs[2] = False
         assert (await base.service.ask(topics.RECOVER, RecoverRequest())).recovered
         await base.wheels(100, 100)
 

@@ -10,9 +10,9 @@ import pytest
 from cocoro.clock import NS
 from cocoro.contact import BEAT_S, LATE_S, RECOVERY_S, Contact, SleepDetector
 from cocoro.testing import in_virtual_time
-from deploy.child import Child
 from deploy.processes import named
 from deploy.rundir import RunDir
+from deploy.supervised_process import SupervisedProcess
 
 
 class Steady:
@@ -125,10 +125,10 @@ class Watched:
         self.kept = Kept()
         self.told: list[str] = []
         detector = self.kept.sleep_detector
-        self.child = Child(named("perception"), RunDir("calliope", folder), 0, self.told.append, detector)
+        self.child = SupervisedProcess(named("perception"), RunDir("calliope", folder), 0, self.told.append, detector)
         self.child._process = _Process()  # type: ignore[assignment]
         self.child.on_alive("perception", True)
-        self.child._say_ready()
+        self.child._report_ready()
         self.told.clear()
 
 

@@ -15,11 +15,11 @@ from learning_arm import sightings
 
 from apps.cli.experiment import RunProgress
 from apps.cli.main import main
-from apps.experiments import bodies, lessons, report
-from apps.experiments.every import EXPERIMENTS
+from apps.experiments import lessons, plan, report
+from apps.experiments.experiments import EXPERIMENTS
+from apps.experiments.plan import ExperimentSettings
 from apps.experiments.results import summarise
 from apps.experiments.runs import ExperimentRun, RunResult, perform
-from apps.experiments.settings import ExperimentSettings
 from apps.learning.dataset import HandRow, SampleFile, WheelRow, hand_header, wheel_header
 from apps.learning.study import BEST
 from apps.rehearsal.request import RehearsalRequest
@@ -127,7 +127,7 @@ def learned(tmp_path_factory: pytest.TempPathFactory, robot: Robot) -> tuple[Exp
     """A body that has learned, and what its lesson says."""
     settings = ExperimentSettings(seeds=(0,), out=tmp_path_factory.mktemp("experiments"))
     arm_and_wheels(settings, robot)
-    run = bodies.learned(settings, 0)[-1]
+    run = plan.learned(settings, 0)[-1]
     return settings, lessons.learn(**run.fields, method=BEST.name)
 
 

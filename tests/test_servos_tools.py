@@ -221,8 +221,8 @@ def test_the_doctor_talks_to_the_create(tmp_path: Path) -> None:
         checks = {check.name: check for check in check_base(config, ROBOT, "robbie")}
         assert checks["Create"].text == "answers, passive mode"
         assert checks["battery"].text.startswith("85%, 15.8 V")
-        create.around.charge_mah = 100
-        create.around.drop_left = True
+        create.sensors.charge_mah = 100
+        create.sensors.drop_left = True
         checks = {check.name: check for check in check_base(config, ROBOT, "robbie")}
         assert "charge it" in checks["battery"].text
         assert checks["wheels"].state == "bad"

@@ -95,7 +95,7 @@ def test_groups_have_the_sizes_of_the_manual() -> None:
 def test_safe_mode_falls_back_to_passive_and_stops(field: str) -> None:
     wire = Wire()
     wire.say(131, 145, 0, 100, 0, 100)
-    setattr(wire.create.around, field, True)
+    setattr(wire.create.sensors, field, True)
     wire.wait(1)
     assert (wire.create.mode, wire.create.wheels_mmps) == (PASSIVE, (0, 0))
     wire.say(132, 145, 0, 100, 0, 100)
@@ -105,7 +105,7 @@ def test_safe_mode_falls_back_to_passive_and_stops(field: str) -> None:
 
 def test_a_cliff_stops_it_in_safe_mode_unless_it_backs_away() -> None:
     wire = Wire()
-    wire.create.around.cliffs[1] = True
+    wire.create.sensors.cliffs[1] = True
     wire.say(131, 145, 255, 156, 255, 156)
     wire.wait(1)
     assert (wire.create.mode, wire.create.wheels_mmps) == (SAFE, (-100, -100))

@@ -60,7 +60,7 @@ def test_a_servo_goes_to_the_goal_in_its_register_at_the_speed_in_its_register(
     elbow.motor.goal, elbow.motor.speed, elbow.motor.slope = start + 200, 43, 2
     run(world, 0.5)
     assert (elbow.count - start) * SERVO_COUNT_RAD == pytest.approx(0.5 * 0.5, abs=0.05)
-    assert elbow.senses[1] == pytest.approx(43, abs=5)
+    assert elbow.measurements[1] == pytest.approx(43, abs=5)
     run(world, 2.0)
     assert elbow.count == pytest.approx(start + 200, abs=3)
 

@@ -15,9 +15,9 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from apps.cli import exits
 from apps.cli.options import DescriptionOption, FramesOption, MeasuredOption, frames_of
 from apps.cli.terminal import table
-from apps.experiments.every import EXPERIMENTS, run
+from apps.experiments.experiments import EXPERIMENTS, run
+from apps.experiments.plan import ExperimentSettings
 from apps.experiments.runs import RunResult
-from apps.experiments.settings import ExperimentSettings
 from cocoro.errors import ConfigError
 
 EVERY = "all"

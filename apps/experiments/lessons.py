@@ -9,7 +9,6 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from apps.experiments.settings import load_robot
 from apps.learning import dataset, study
 from apps.learning.dataset import HandRow, WheelRow
 from apps.learning.lesson import learn_arm, learn_wheels, sightings
@@ -17,10 +16,16 @@ from apps.learning.wheels import fit_wheels
 from cocoro.clock import NS
 from cocoro.learning import model
 from cocoro.learning.nominal_model import NominalModel
+from cocoro.robot import Robot
 from services.planning.teaching import Adapter
 
 SIZES = (100, 300, 1000, 2000)
 """Numbers of samples of the learning curves."""
+
+
+def load_robot(description: str | None = None, measured: str | None = None) -> Robot:
+    """The robot of these files; the Calliope where none is given. Raises ConfigError naming file and field."""
+    return Robot.load(*(None if file is None else Path(file) for file in (description, measured)))
 
 
 def learn(

@@ -13,8 +13,8 @@ from typing import Any
 
 import msgspec
 
+from apps.experiments.plan import ExperimentSettings
 from apps.experiments.results import ResultRow, Section
-from apps.experiments.settings import ExperimentSettings
 from cocoro.about import DISTRIBUTIONS
 from cocoro.errors import naming
 from cocoro.learning.nominal_model import fingerprint_of

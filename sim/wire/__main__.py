@@ -1,6 +1,6 @@
-"""A Create and a Calliope's servos without a robot and without physics: `python -m sim.wire DIR` until Ctrl-C.
+"""Emulates a Create and a Calliope's servos without physics, until Ctrl-C: `python -m sim.wire DIR`.
 
-For first steps with the tools: DIR gets the ports `create`, `arm` and `hand`, and the socket `control` (see
+For first steps with the tools. It makes the ports `create`, `arm` and `hand` in DIR, and the socket `control` (see
 `sim.wire.control`).
 """
 
@@ -23,8 +23,10 @@ MODELS = {"arm": 28, "hand": 12}
 
 def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m sim.wire", description="Emulated hardware on pseudo-terminals.")
-    parser.add_argument("folder", type=Path, help="where the ports are to be")
-    parser.add_argument("--description", type=Path, metavar="FILE", help="description of the robot, if no Calliope")
+    parser.add_argument("folder", type=Path, help="folder for the ports")
+    parser.add_argument(
+        "--description", type=Path, metavar="FILE", help="description of a robot other than the Calliope"
+    )
     parser.add_argument("--measured", type=Path, metavar="FILE", help="values that were measured on this robot")
     options = parser.parse_args()
     folder: Path = options.folder

@@ -1,6 +1,6 @@
-"""Ask emulated hardware for faults and for what it does: JSON lines over a socket beside its ports.
+"""Control of the emulated hardware: injects faults and inspects devices, by JSON lines over a socket beside the ports.
 
-Each line is one `ControlRequest` by its "do"; each answer is {"ok": ...} or {"error": "..."}.
+Each line is one `ControlRequest`, chosen by its "do"; each answer is {"ok": ...} or {"error": "..."}.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ SOCKET = "control"
 
 
 class Disturb(msgspec.Struct, tag_field="do", tag="disturb", forbid_unknown_fields=True):
-    """Let something happen to the bytes of a line."""
+    """Disturb the bytes of a line; see `sim.wire.line.LineFault`."""
 
     line: str
     kind: FaultKind
@@ -36,48 +36,50 @@ class Disturb(msgspec.Struct, tag_field="do", tag="disturb", forbid_unknown_fiel
 
 
 class Unplug(msgspec.Struct, tag_field="do", tag="unplug", forbid_unknown_fields=True):
-    """Pull a line's adapter out."""
+    """Unplug a line's adapter."""
 
     line: str
 
 
 class Plug(msgspec.Struct, tag_field="do", tag="plug", forbid_unknown_fields=True):
+    """Plug a line's adapter in."""
+
     line: str
 
 
 class SetSensor(msgspec.Struct, tag_field="do", tag="feel", forbid_unknown_fields=True):
-    """Have the Create's sensors feel something: a field of `sim.wire.create.Surroundings`."""
+    """Set a sensor of the Create: a field of `sim.wire.create.CreateSensors`."""
 
     field: str
     value: bool | int | list[bool]
 
 
 class PowerCycle(msgspec.Struct, tag_field="do", tag="restart", forbid_unknown_fields=True):
-    """A brown-out: the Create's, or that of the servo with this ID."""
+    """Interrupt the power of the Create, or of the servo with this ID."""
 
     servo: int | None = None
 
 
 class Demo(msgspec.Struct, tag_field="do", tag="demo", forbid_unknown_fields=True):
-    """The Create leaves its mode for none of the reasons that it has."""
+    """Start a demo, so that the Create leaves its mode without a cause that its sensors show."""
 
 
 class Mute(msgspec.Struct, tag_field="do", tag="mute", forbid_unknown_fields=True):
-    """A servo's plug is out; it keeps its power."""
+    """Disconnect a servo from the line, or connect it again; it keeps its power."""
 
     servo: int
     value: bool = True
 
 
 class Trip(msgspec.Struct, tag_field="do", tag="trip", forbid_unknown_fields=True):
-    """A servo shuts down for an error bit, 32 for overload."""
+    """Shut a servo down with an error bit, such as 32 for overload."""
 
     servo: int
     error: int = 32
 
 
 class SetRegister(msgspec.Struct, tag_field="do", tag="put", forbid_unknown_fields=True):
-    """Set a servo's register, whatever it is."""
+    """Set any register of a servo."""
 
     servo: int
     address: int
@@ -85,14 +87,14 @@ class SetRegister(msgspec.Struct, tag_field="do", tag="put", forbid_unknown_fiel
 
 
 class Inspect(msgspec.Struct, tag_field="do", tag="look", forbid_unknown_fields=True):
-    """What the devices do, and when the wheels were asked for what since the last look."""
+    """Return the state of the devices, and the wheel commands since the last inspection with their times."""
 
 
 ControlRequest = Disturb | Unplug | Plug | SetSensor | PowerCycle | Demo | Mute | Trip | SetRegister | Inspect
 
 
 class Control:
-    """Carries out what is asked. `serve` it, or call `do` from any thread."""
+    """Carries out requests. Serve it by `ControlServer`, or call `do` from any thread."""
 
     def __init__(self, emulator: Emulator) -> None:
         self._emulator = emulator
@@ -101,26 +103,26 @@ class Control:
         buses = [device for device in devices if isinstance(device, EmulatedServoBus)]
         self._servos = [servo for bus in buses for servo in bus.servos]
 
-    def do(self, ask: ControlRequest) -> Any:
-        """The answer. Raises ValueError with what is wrong with the question."""
-        return self._emulator.call(lambda: self._do(ask))
+    def do(self, request: ControlRequest) -> Any:
+        """Carry out a request; returns the answer. Raises ValueError that says what is wrong with the request."""
+        return self._emulator.call(lambda: self._do(request))
 
-    def _do(self, ask: ControlRequest) -> Any:
+    def _do(self, request: ControlRequest) -> Any:
         now_ns = time.monotonic_ns()
-        match ask:
+        match request:
             case Disturb():
-                until_ns = now_ns + round(ask.for_s * NS)
-                self._line(ask.line).disturb(
-                    LineFault(ask.kind, ask.share, ask.way, until_ns, round(ask.delay_ms * 1e6))
+                until_ns = now_ns + round(request.for_s * NS)
+                self._line(request.line).disturb(
+                    LineFault(request.kind, request.share, request.way, until_ns, round(request.delay_ms * 1e6))
                 )
             case Unplug():
-                self._line(ask.line).port.unplug()
+                self._line(request.line).port.unplug()
             case Plug():
-                self._line(ask.line).port.plug()
+                self._line(request.line).port.plug()
             case SetSensor():
-                if not hasattr(self._base.around, ask.field):
-                    raise ValueError(f"a Create feels no {ask.field}")
-                setattr(self._base.around, ask.field, ask.value)
+                if not hasattr(self._base.sensors, request.field):
+                    raise ValueError(f"a Create has no sensor {request.field!r}")
+                setattr(self._base.sensors, request.field, request.value)
             case PowerCycle(servo=None):
                 self._base.power_cycle()
             case PowerCycle(servo=int(number)):
@@ -128,22 +130,22 @@ class Control:
             case Demo():
                 self._base.receive(bytes([135]), self._base.baud, now_ns)
             case Mute():
-                self._servo(ask.servo).mute = ask.value
+                self._servo(request.servo).mute = request.value
             case Trip():
-                self._servo(ask.servo).trip(ask.error)
+                self._servo(request.servo).trip(request.error)
             case SetRegister():
-                self._servo(ask.servo).put(ask.address, ask.value)
+                self._servo(request.servo).put(request.address, request.value)
             case Inspect():
-                return self._look(now_ns)
+                return self._inspect(now_ns)
         return True
 
-    def _look(self, now_ns: int) -> dict[str, Any]:
-        told: dict[str, Any] = {"now_ns": now_ns}
+    def _inspect(self, now_ns: int) -> dict[str, Any]:
+        state: dict[str, Any] = {"now_ns": now_ns}
         if self._create is not None:
             create = self._create
-            told["create"] = {"mode": create.mode, "wheels": create.wheels_mmps, "acted": list(create.acted)}
+            state["create"] = {"mode": create.mode, "wheels": create.wheels_mmps, "acted": list(create.acted)}
             create.acted.clear()
-        told["servos"] = {
+        state["servos"] = {
             servo.number: {
                 "position": servo.get(36),
                 "goal": servo.get(30),
@@ -155,7 +157,7 @@ class Control:
         }
         for servo in self._servos:
             servo.acted.clear()
-        return told
+        return state
 
     @property
     def _base(self) -> EmulatedCreate:
@@ -176,7 +178,7 @@ class Control:
 
 
 class ControlServer:
-    """Answers on a socket in the folder of the ports. Use it as a context manager."""
+    """Answers requests on a socket in the folder of the ports. A context manager."""
 
     def __init__(self, folder: Path, control: Control) -> None:
         self._path = folder / SOCKET
@@ -188,7 +190,7 @@ class ControlServer:
                 for line in self.rfile:
                     try:
                         answer: dict[str, Any] = {"ok": control.do(decoder.decode(line))}
-                    except ValueError as error:  # msgspec's are such
+                    except ValueError as error:  # also msgspec's errors
                         answer = {"error": str(error)}
                     self.wfile.write(msgspec.json.encode(answer) + b"\n")
 

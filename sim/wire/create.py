@@ -1,7 +1,8 @@
-"""An iRobot Create's firmware: bytes in, bytes out, wheels that were asked for. Pure.
+"""The firmware of an iRobot Create: received bytes to sent bytes and wheel speeds. Pure.
 
-Source: iRobot Create Open Interface manual. What it leaves open is decided so as to be hard on a driver: a lost byte
-shifts what follows, data bytes in an opcode's place are opcodes, and counts below a unit are forgotten when read.
+Source: iRobot Create Open Interface manual. Where it leaves something open, the choice is the harder one for a driver:
+a lost byte shifts the rest, data bytes in the place of an opcode are opcodes, and counts below a unit are lost when
+read.
 """
 
 from __future__ import annotations
@@ -19,27 +20,27 @@ FRAME_NS = 15_000_000
 RADIUS_MM = 165
 WHEEL_BASE_MM = 258.0
 BAUDS = (300, 600, 1200, 2400, 4800, 9600, 14400, 19200, 28800, 38400, 57600, 115200)
-"""By the code that opcode 129 takes."""
+"""Baud rates by the code that opcode 129 takes."""
 FIXED = {
     128: 0, 129: 1, 130: 0, 131: 0, 132: 0, 134: 0, 135: 0, 136: 1, 137: 4, 138: 1, 139: 3, 141: 1, 142: 1, 143: 0,
     144: 3, 145: 4, 147: 1, 150: 1, 151: 1, 153: 0, 154: 0, 155: 1, 156: 2, 157: 2, 158: 1,
 }  # fmt: skip
-"""Data bytes of the opcodes that always have the same number of them; the other bytes are none and are ignored."""
+"""Number of data bytes of each opcode with a fixed number. Bytes that are no opcode are ignored."""
 COUNTED = {140: (1, 2), 148: (0, 1), 149: (0, 1), 152: (0, 1)}
-"""Opcode: where the count stands among the data bytes, and how many bytes each unit of it has."""
+"""Opcodes with a variable number of data bytes: the index of the count among them, and the bytes per unit of it."""
 GROUPS = {0: (7, 26), 1: (7, 16), 2: (17, 20), 3: (21, 26), 4: (27, 34), 5: (35, 42), 6: (7, 42)}
 WORDS = {
     19: "h", 20: "h", 22: "H", 23: "h", 25: "H", 26: "H", 27: "H", 28: "H", 29: "H", 30: "H", 31: "H", 33: "H",
     39: "h", 40: "h", 41: "h", 42: "h",
 }  # fmt: skip
-"""Packets of two bytes; the others have one. 24 is signed."""
+"""Formats of the packets with two bytes; the others have one, unsigned except for packet 24."""
 DEMO_SPEED_MMPS = 200
 STRAIGHT = (-32768, 32767)
 
 
 @dataclass
 class CreateSensors:
-    """What the Create's sensors feel; set by whoever has it drive about."""
+    """Values of the Create's sensors. The plant and the tests set them."""
 
     bump_left: bool = False
     bump_right: bool = False
@@ -61,18 +62,18 @@ class CreateSensors:
 
 
 class EmulatedCreate:
-    """`receive` bytes, `advance` time (monotonic, ns), `roll` the wheels; `wheels_mmps` is what its motors are to do.
+    """The device at the end of a `sim.wire.emulator.Line`. Times are CLOCK_MONOTONIC.
 
-    The device at the end of a `sim.wire.emulator.Line`.
+    The line calls `receive` and `advance`; the plant drives the wheels at `wheels_mmps` and calls `roll`.
     """
 
     def __init__(self, wheel_base_mm: float = WHEEL_BASE_MM) -> None:
-        self.around = CreateSensors()
+        self.sensors = CreateSensors()
         self.powered = True
         self.wheels_mmps = (0, 0)
         """Left, right."""
         self.acted: list[tuple[int, tuple[int, int]]] = []
-        """When its wheels were asked for what, newest last; a log for tests, cleared by them."""
+        """Time (ns) and wheel speeds of each change, newest last: a log that tests read and clear."""
         self._wheel_base_mm = wheel_base_mm
         self._now_ns = 0
         self._boot()
@@ -88,33 +89,34 @@ class EmulatedCreate:
         self._out = bytearray()
         self._next_frame_ns = 0
         self._deaf: Callable[[], bool] | None = None
-        self._way_mm = self._turn_rad = 0.0
+        self._distance_mm = self._turn_rad = 0.0
         self._total_mm = self._total_rad = 0.0
         self._turn_wheels(0, 0)
 
     # --- the outside world --------------------------------------------------------------------------
 
     def power_cycle(self) -> None:
-        """Switched off and on, or a brown-out: off mode, nothing streamed, the baud rate as from the factory."""
+        """Restart it: off mode, no streaming, factory baud rate."""
         self._boot()
 
     def roll(self, left_m: float, right_m: float) -> None:
-        """What its wheels rolled, as its encoders measured it."""
-        way_mm = (left_m + right_m) * 500.0
+        """Add the distances that the wheel encoders measured."""
+        distance_mm = (left_m + right_m) * 500.0
         turn_rad = (right_m - left_m) * 1000.0 / self._wheel_base_mm
-        self._way_mm += way_mm
+        self._distance_mm += distance_mm
         self._turn_rad += turn_rad
-        self._total_mm += way_mm
+        self._total_mm += distance_mm
         self._total_rad += turn_rad
 
     def receive(self, data: bytes, baud: int, now_ns: int) -> None:
+        """Take bytes that were sent at this baud rate."""
         self._now_ns = now_ns
         if self.powered and baud == self.baud:
             self._input.extend(data)
             self._work()
 
     def advance(self, baud: int, now_ns: int) -> bytes:
-        """What a listener at this baud rate gets by now."""
+        """The bytes that a listener at this baud rate has received by now."""
         self._now_ns = now_ns
         if not self.powered:
             self._out.clear()
@@ -122,7 +124,7 @@ class EmulatedCreate:
         self._work()
         self._safety()
         if now_ns >= self._next_frame_ns:
-            # It keeps its own pace; where it was not asked for long, it goes on from now.
+            # It sends at its own pace; after a long pause of the calls it continues from now.
             self._next_frame_ns = max(self._next_frame_ns + FRAME_NS, now_ns - FRAME_NS)
             if self._streaming and self._stream:
                 self._send_frame()
@@ -132,18 +134,18 @@ class EmulatedCreate:
 
     @property
     def pending(self) -> bytes:
-        """What came of a command that is not whole yet."""
+        """The received bytes of an incomplete command."""
         return bytes(self._pending)
 
     @property
     def deaf(self) -> bool:
-        """It was told to wait for something (opcodes 155 to 158), and hears nothing until then."""
+        """Whether it waits for an event (opcodes 155 to 158), and ignores everything until then."""
         return self._deaf is not None
 
     # --- commands -----------------------------------------------------------------------------------
 
     def _work(self) -> None:
-        """Take commands from the input, as long as it listens."""
+        """Execute the commands in the input, unless it is deaf."""
         if self._deaf is not None and not self._deaf():
             self._deaf = None
         while self._input and self._deaf is None:
@@ -190,7 +192,7 @@ class EmulatedCreate:
             self._move(opcode, data)
 
     def _move(self, opcode: int, data: list[int]) -> None:
-        """The commands that passive mode ignores."""
+        """Execute a command that passive mode ignores."""
         if opcode == 145:
             right, left = _signed(data[0:2]), _signed(data[2:4])
             self._requested |= {41: _clip(right), 42: _clip(left)}
@@ -235,10 +237,11 @@ class EmulatedCreate:
             self.acted.append((self._now_ns, self.wheels_mmps))
 
     def _safety(self) -> None:
-        """Safe mode's own: a cliff while moving forward, or backward in a tight turn; a wheel drop; the charger."""
-        around = self.around
-        dropped = around.drop_left or around.drop_right or around.drop_caster
-        if self.mode == SAFE and (dropped or around.charger or (any(around.cliffs) and self._towards_a_cliff())):
+        """Leave safe mode at a cliff while driving forward (or backward in a tight turn), on a wheel drop, and at the
+        charger."""
+        sensors = self.sensors
+        dropped = sensors.drop_left or sensors.drop_right or sensors.drop_caster
+        if self.mode == SAFE and (dropped or sensors.charger or (any(sensors.cliffs) and self._towards_a_cliff())):
             self._enter(PASSIVE)
 
     def _towards_a_cliff(self) -> bool:
@@ -251,21 +254,21 @@ class EmulatedCreate:
         return left + right < 0 and radius_mm < RADIUS_MM
 
     def _event(self, event: int) -> bool:
-        around = self.around
+        sensors = self.sensors
         return {
-            1: around.drop_left or around.drop_right or around.drop_caster,
-            2: around.drop_caster,
-            3: around.drop_left,
-            4: around.drop_right,
-            5: around.bump_left or around.bump_right,
-            6: around.bump_left,
-            7: around.bump_right,
-            9: around.wall,
-            10: any(around.cliffs),
-            11: around.cliffs[0],
-            12: around.cliffs[1],
-            13: around.cliffs[2],
-            14: around.cliffs[3],
+            1: sensors.drop_left or sensors.drop_right or sensors.drop_caster,
+            2: sensors.drop_caster,
+            3: sensors.drop_left,
+            4: sensors.drop_right,
+            5: sensors.bump_left or sensors.bump_right,
+            6: sensors.bump_left,
+            7: sensors.bump_right,
+            9: sensors.wall,
+            10: any(sensors.cliffs),
+            11: sensors.cliffs[0],
+            12: sensors.cliffs[1],
+            13: sensors.cliffs[2],
+            14: sensors.cliffs[3],
             22: self.mode == PASSIVE,
         }.get(event, False)
 
@@ -281,34 +284,34 @@ class EmulatedCreate:
         return pack(f">{WORDS.get(packet, 'b' if packet == 24 else 'B')}", value)
 
     def _measure(self, packet: int) -> int:
-        around = self.around
+        sensors = self.sensors
         if packet == 19:
-            way, self._way_mm = int(self._way_mm), 0.0
-            return min(max(way, -32768), 32767)
+            distance, self._distance_mm = int(self._distance_mm), 0.0
+            return min(max(distance, -32768), 32767)
         if packet == 20:
             turn, self._turn_rad = int(degrees(self._turn_rad)), 0.0
             return min(max(turn, -32768), 32767)
         if packet in self._requested:
             return self._requested[packet]
         if 9 <= packet <= 12:
-            return int(around.cliffs[packet - 9])
+            return int(sensors.cliffs[packet - 9])
         return {
-            7: around.bump_right
-            | around.bump_left << 1
-            | around.drop_right << 2
-            | around.drop_left << 3
-            | around.drop_caster << 4,
-            8: int(around.wall),
-            14: around.right_overcurrent << 3 | around.left_overcurrent << 4,
+            7: sensors.bump_right
+            | sensors.bump_left << 1
+            | sensors.drop_right << 2
+            | sensors.drop_left << 3
+            | sensors.drop_caster << 4,
+            8: int(sensors.wall),
+            14: sensors.right_overcurrent << 3 | sensors.left_overcurrent << 4,
             17: 255,
-            18: around.buttons,
-            21: 2 if around.charger else 0,
-            22: around.voltage_mv,
-            23: around.current_ma,
-            24: around.temperature_c,
-            25: around.charge_mah,
-            26: around.capacity_mah,
-            34: 2 if around.charger else 0,
+            18: sensors.buttons,
+            21: 2 if sensors.charger else 0,
+            22: sensors.voltage_mv,
+            23: sensors.current_ma,
+            24: sensors.temperature_c,
+            25: sensors.charge_mah,
+            26: sensors.capacity_mah,
+            34: 2 if sensors.charger else 0,
             35: self.mode,
             38: len(self._stream),
         }.get(packet, 0)

@@ -1,7 +1,7 @@
-"""A bus of Dynamixel AX-12 and RX-28 servos, Protocol 1.0: bytes in, bytes out, motors that were told what. Pure.
+"""A bus of Dynamixel AX-12 and RX-28 servos, Protocol 1.0: received bytes to sent bytes and motor commands. Pure.
 
-Source: ROBOTIS AX-12 manual and the RX-28's e-manual (the same addresses). What they leave open is decided so as to
-be hard on a driver: writing a goal enables the torque, two servos of one ID talk over each other.
+Source: ROBOTIS AX-12 manual and the RX-28's e-manual (the same addresses). Where they leave something open, the choice
+is the harder one for a driver: writing a goal enables the torque, and two servos with one ID talk over each other.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ BROADCAST = 254
 PING, READ, WRITE, REG_WRITE, ACTION, RESET, SYNC_WRITE = 1, 2, 3, 4, 5, 6, 0x83
 VOLTAGE, ANGLE_LIMIT, OVERHEATING, RANGE, CHECKSUM, OVERLOAD, INSTRUCTION = (1 << bit for bit in range(7))
 GAP_NS = 100_000_000
-"""An instruction that pauses for so long between two of its bytes is given up."""
+"""An instruction with a longer pause between two of its bytes is dropped."""
 OVERLOAD_SHARE = 0.98
 BROWN_OUT_V = 6.0
 
@@ -26,10 +26,10 @@ class Cell(NamedTuple):
 
     size: int
     start: int
-    """As from the factory, or when the power comes on."""
+    """Factory value, or value at power-up."""
     low: int = 0
     high: int = -1
-    """What may be written; nothing may where `high` is below `low`."""
+    """Range of values that may be written; the cell is read-only when `high` is below `low`."""
 
 
 TABLE: dict[int, Cell] = {
@@ -43,35 +43,35 @@ TABLE: dict[int, Cell] = {
 }  # fmt: skip
 SIZE = 50
 ROM_END = 24
-"""Below it stands what survives without power."""
+"""Cells below this address keep their value without power."""
 MODELS = {12: {}, 28: {0: 28, 11: 80, 13: 240}}
-"""What differs from an AX-12, by model number."""
+"""Factory values that differ from an AX-12's, by model number."""
 
 
 @dataclass
 class Motor:
-    """What a servo's registers tell its motor to do."""
+    """The motor command in a servo's registers."""
 
     on: bool
     goal: int
     speed: int
-    """Counts of 0.111 rpm; 0 is as fast as it can."""
+    """Counts of 0.111 rpm; 0 is full speed."""
     limit: float
     """Share of the stall torque."""
     slope: int
-    """Counts from the goal within which it pushes with less than its limit."""
+    """Distance from the goal, counts, below which it pushes with less than its limit."""
     punch: float
 
 
 class EmulatedServo:
-    """One servo: its control table and what makes it shut down."""
+    """One servo: its control table, and the conditions under which it shuts down."""
 
     def __init__(self, number: int, model: int = 12, overload_s: float = 5.0) -> None:
         self.mute = False
-        """Its plug is out, or it is broken."""
+        """Whether it is unplugged or broken."""
         self.overload_s = overload_s
         self.acted: list[tuple[int, int, int]] = []
-        """(ns, address, value) of what was written to its registers; a log for tests, cleared by them."""
+        """(ns, address, value) of each register that was written: a log that tests read and clear."""
         self._cells = bytearray(SIZE)
         self._model = model
         self._registered: tuple[int, bytes] | None = None
@@ -86,7 +86,7 @@ class EmulatedServo:
             self.put(address, MODELS[self._model].get(address, cell.start))
 
     def power_up(self) -> None:
-        """What is not kept without power is as when it comes on; the shaft is where it is."""
+        """Restart it: volatile registers get their start values; the shaft does not move."""
         position = self.get(36)
         for address, cell in TABLE.items():
             if address >= ROM_END and address not in (42, 43):
@@ -131,7 +131,8 @@ class EmulatedServo:
         )
 
     def sense(self, position: int, speed: int, load: float, now_ns: int) -> None:
-        """What its shaft does: counts, counts of 0.111 rpm and share of the stall torque, the latter two signed."""
+        """Set what its shaft does: position (counts), signed speed (0.111 rpm) and signed load (share of stall
+        torque)."""
         self.put(36, min(max(position, 0), 1023))
         self.put(38, _signed(speed))
         self.put(40, _signed(round(load * 1023)))
@@ -145,7 +146,7 @@ class EmulatedServo:
             self.trip(OVERLOAD)
 
     def trip(self, error: int) -> None:
-        """Shut down for an error, if that is what register 18 says."""
+        """Raise an error, and shut down if register 18 says so."""
         self._tripped |= error
         if error & self.get(18):
             self.put(24, 0)
@@ -164,7 +165,7 @@ class EmulatedServo:
     # --- instructions -------------------------------------------------------------------------------
 
     def obey(self, instruction: int, data: bytes, now_ns: int) -> tuple[int, bytes]:
-        """Carry out an instruction; the error bits and data of the answer."""
+        """Carry out an instruction; returns the error bits and the data of the answer."""
         if self.error & OVERHEATING:
             self.trip(OVERHEATING)
         error, answer = 0, b""
@@ -192,7 +193,7 @@ class EmulatedServo:
         return self.error | error, answer
 
     def _write(self, address: int, values: bytes, now_ns: int) -> int:
-        """All of it or nothing; the error bits."""
+        """Write all values or none; returns the error bits."""
         changes: list[tuple[int, int]] = []
         end = address + len(values)
         at = address
@@ -220,34 +221,35 @@ class EmulatedServo:
 
 
 class EmulatedServoBus:
-    """Servos on one line; the device at the end of a `sim.wire.emulator.Line`."""
+    """The servos on one line: the device at the end of a `sim.wire.emulator.Line`. Times are CLOCK_MONOTONIC."""
 
     def __init__(self, servos: Iterable[EmulatedServo]) -> None:
         self.servos = list(servos)
         self._in = bytearray()
-        self._heard_ns = 0
+        self._received_ns = 0
         self._out: list[tuple[int, int, bytes]] = []
-        """(when, baud, bytes) of answers."""
+        """(ns, baud rate, bytes) of answers."""
 
     def by_number(self, number: int) -> EmulatedServo:
         return next(servo for servo in self.servos if servo.number == number)
 
     def receive(self, data: bytes, baud: int, now_ns: int) -> None:
-        if now_ns - self._heard_ns > GAP_NS:
+        """Take bytes that were sent at this baud rate."""
+        if now_ns - self._received_ns > GAP_NS:
             self._in.clear()
-        self._heard_ns = now_ns
+        self._received_ns = now_ns
         self._in += data
         while (packet := self._packet()) is not None:
             self._dispatch(packet, baud, now_ns)
 
     def advance(self, baud: int, now_ns: int) -> bytes:
-        """What a listener at this baud rate gets by now."""
+        """The bytes that a listener at this baud rate has received by now."""
         due = [answer for answer in self._out if answer[0] <= now_ns]
         self._out = [answer for answer in self._out if answer[0] > now_ns]
         return b"".join(data for _, at_baud, data in due if at_baud == baud)
 
     def _packet(self) -> bytes | None:
-        """The next whole packet, from its ID to its checksum."""
+        """The next complete packet, from its ID to its checksum; None when there is none."""
         while True:
             start = self._in.find(b"\xff\xff")
             if start < 0:
@@ -272,13 +274,13 @@ class EmulatedServoBus:
     def _dispatch(self, packet: bytes, baud: int, now_ns: int) -> None:
         number, _, instruction, *data, checksum = packet
         good = ~sum(packet[:-1]) & 0xFF == checksum
-        hearing = [servo for servo in self.servos if servo.baud == baud and servo.powered and not servo.mute]
+        listening = [servo for servo in self.servos if servo.baud == baud and servo.powered and not servo.mute]
         if number == BROADCAST:
             if good:
-                self._broadcast(hearing, instruction, bytes(data), now_ns)
+                self._broadcast(listening, instruction, bytes(data), now_ns)
             return
         answers = []
-        for servo in (servo for servo in hearing if servo.number == number):
+        for servo in (servo for servo in listening if servo.number == number):
             if not good:
                 error, answer = servo.error | CHECKSUM, b""
             else:
@@ -310,7 +312,7 @@ class EmulatedServoBus:
 
 
 def _all(values: Iterable[int]) -> int:
-    """What is on the line when several talk at once."""
+    """The byte on the line when several servos send at once."""
     value = 0xFF
     for one in values:
         value &= one
@@ -323,5 +325,5 @@ def _status(number: int, error: int, data: bytes) -> bytes:
 
 
 def _signed(value: int) -> int:
-    """Ten bits and the sign in the eleventh, as speed and load have it."""
+    """Encode a speed or load: ten bits, and the sign in the eleventh."""
     return min(abs(value), 1023) | (1024 if value < 0 else 0)

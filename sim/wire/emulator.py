@@ -1,4 +1,4 @@
-"""Runs emulated devices at the ends of their lines, by the machine's own clock, in one thread."""
+"""Runs emulated devices behind serial ports, by CLOCK_MONOTONIC, in one thread."""
 
 from __future__ import annotations
 
@@ -23,29 +23,29 @@ from sim.wire.line import Disturbance, LineFault, PseudoSerialPort
 T = TypeVar("T")
 
 TURN_S = 0.004
-"""It looks at the clock at least so often."""
+"""Longest time between two turns of the loop."""
 
 
 class Device(Protocol):
-    """What is at the end of a line."""
+    """A device at the end of a line."""
 
     def receive(self, data: bytes, baud: int, now_ns: int) -> None: ...
 
     def advance(self, baud: int, now_ns: int) -> bytes:
-        """What it sends by now, to a listener at this baud rate."""
+        """The bytes that a listener at this baud rate has received by now."""
 
 
 class Plant(Protocol):
-    """What the devices' motors move and their sensors feel."""
+    """The mechanics behind the devices: moved by their motors, and measured by their sensors."""
 
     def advance(self, now_ns: int) -> None: ...
 
     def fileno(self) -> int:
-        """A descriptor that becomes readable when there is something to do; -1 for none."""
+        """A descriptor that becomes readable when `advance` should be called; -1 for none."""
 
 
 class Line:
-    """A port, the device behind it, and what happens to the bytes in between."""
+    """A port, the device behind it, and the disturbances of the bytes in between."""
 
     def __init__(self, path: Path, device: Device, seed: int = 0) -> None:
         self.port = PseudoSerialPort(path)
@@ -62,6 +62,7 @@ class Line:
         self._to_driver.clear()
 
     def turn(self, now_ns: int) -> None:
+        """Carry bytes both ways."""
         data = self._to_device.carry(self.port.read(), now_ns)
         baud = self.port.baud
         if data:
@@ -70,13 +71,14 @@ class Line:
 
 
 class Emulator:
-    """Devices by name, on ports of these names in a folder. `run` it, or use it as a context manager: a thread."""
+    """Devices by name, on ports of these names in `folder`. Call `run`, or use it as a context manager, which runs it
+    in a thread."""
 
-    def __init__(self, folder: Path, devices: Mapping[str, Device], body: Plant, seed: int = 0) -> None:
+    def __init__(self, folder: Path, devices: Mapping[str, Device], plant: Plant, seed: int = 0) -> None:
         self.lines = {
             name: Line(folder / name, device, seed + number) for number, (name, device) in enumerate(devices.items())
         }
-        self._body = body
+        self._plant = plant
         self._jobs: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
         self._wake, self._waker = os.pipe()
         os.set_blocking(self._wake, False)
@@ -84,11 +86,11 @@ class Emulator:
         self._watches: list[tuple[Callable[[], object], Future[int]]] = []
 
     def run(self) -> None:
-        """Until `stop`."""
+        """Run until `stop`."""
         try:
             while self._take_jobs():
                 now_ns = time.monotonic_ns()
-                self._body.advance(now_ns)
+                self._plant.advance(now_ns)
                 for line in self.lines.values():
                     line.turn(now_ns)
                 self._watch(now_ns)
@@ -98,12 +100,13 @@ class Emulator:
                 line.port.close()
 
     def stop(self) -> None:
-        """From any thread."""
+        """End `run`. Thread-safe."""
         self._jobs.put(None)
         os.write(self._waker, b"!")
 
     def call(self, job: Callable[[], T]) -> T:
-        """Have something done between two turns of the thread, from another thread; what it gives or raises."""
+        """Run a job in the emulator's thread, between two turns, and wait for it. Returns or raises what the job
+        does."""
         future: Future[T] = Future()
 
         def work() -> None:
@@ -117,8 +120,8 @@ class Emulator:
         return future.result(10.0)
 
     def until(self, condition: Callable[[], object], timeout_s: float = 30.0) -> int:
-        """Wait until something is so, as it is looked at in each turn of the thread; when that was (monotonic, ns).
-        Raises TimeoutError when it does not come to be."""
+        """Wait until a condition, which is evaluated in each turn, holds; returns when (CLOCK_MONOTONIC, ns). Raises
+        TimeoutError when it does not hold in time."""
         future: Future[int] = Future()
         self.call(lambda: self._watches.append((condition, future)))
         try:
@@ -149,8 +152,8 @@ class Emulator:
                     future.set_result(now_ns)
 
     def _rest(self) -> None:
-        """Until something comes in, but not for long."""
-        waiting = [line.port.fileno() for line in self.lines.values()] + [self._body.fileno(), self._wake]
+        """Wait for input, at most `TURN_S`."""
+        waiting = [line.port.fileno() for line in self.lines.values()] + [self._plant.fileno(), self._wake]
         select.select([fd for fd in waiting if fd >= 0], [], [], TURN_S)
 
     def _take_jobs(self) -> bool:
@@ -166,14 +169,15 @@ class Emulator:
 
 WHEEL_MPS2 = 2.0
 FULL_SPEED = 530
-"""What a servo without load reaches, in counts of 0.111 rpm: 59 rpm."""
+"""Speed of a servo without load, 59 rpm, in counts of 0.111 rpm."""
 COUNTS_A_SPEED_COUNT = 0.111 * 360 / 60 / 300 * 1023
-"""Position counts a second for each count of speed."""
+"""Position counts per second for each count of speed."""
 STEP_NS = 50_000_000
 
 
 class SimplePlant:
-    """For tests and first steps. `blocked` servos do not turn, and strain."""
+    """A plant without physics: wheels ramp to their commanded speeds, servos turn towards their goals, and there are no
+    obstacles. `blocked` servos strain and do not turn."""
 
     def __init__(self, create: EmulatedCreate | None = None, *buses: EmulatedServoBus) -> None:
         self.wheels_mps = [0.0, 0.0]
@@ -184,7 +188,7 @@ class SimplePlant:
         self._then_ns: int | None = None
 
     def turn_by_hand(self, number: int, count: int) -> None:
-        """Somebody turns a limp servo."""
+        """Turn a limp servo to a position, counts, as an operator would."""
         for servo, shaft in self._shafts:
             if servo.number == number and not servo.motor.on:
                 shaft.count = float(count)

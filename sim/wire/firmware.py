@@ -1,6 +1,7 @@
-"""What the physics and the emulated firmware tell each other: datagrams over a socket pair, the newest counts.
+"""The emulated firmware's process, and the datagrams that it exchanges with the physics.
 
-They are processes of their own: firmware answers within a millisecond, and a frame takes the physics ten.
+`sim.wire.service` starts `python -m sim.wire.firmware --fd N DIR`, which ends when the other end of its socket closes.
+It is a separate process because firmware answers within a millisecond, while a frame takes the physics ten.
 """
 
 from __future__ import annotations
@@ -27,6 +28,8 @@ S = TypeVar("S", bound=msgspec.Struct)
 
 
 class ServoSetup(msgspec.Struct, array_like=True):
+    """A servo at the start."""
+
     number: int
     model: int
     overload_s: float
@@ -34,7 +37,7 @@ class ServoSetup(msgspec.Struct, array_like=True):
 
 
 class Setup(msgspec.Struct, array_like=True):
-    """The first datagram to the firmware: which devices there are, and how they stand."""
+    """The first datagram to the firmware: its devices and their state."""
 
     wheel_base_mm: float
     lines: dict[str, list[ServoSetup]]
@@ -42,6 +45,8 @@ class Setup(msgspec.Struct, array_like=True):
 
 
 class MotorOrder(msgspec.Struct, array_like=True):
+    """`sim.wire.dynamixel.Motor` as a message."""
+
     on: bool
     goal: int
     speed: int
@@ -51,7 +56,7 @@ class MotorOrder(msgspec.Struct, array_like=True):
 
 
 class MotorOrders(msgspec.Struct, array_like=True):
-    """From the firmware: what wheels and servos are to do."""
+    """Commands for wheels and servos, from the firmware to the physics."""
 
     left_mmps: int
     right_mmps: int
@@ -59,20 +64,21 @@ class MotorOrders(msgspec.Struct, array_like=True):
 
 
 class PlantState(msgspec.Struct, array_like=True):
-    """From the physics: what they did."""
+    """Measurements of wheels and servos, from the physics to the firmware."""
 
     time_ns: int
     left_m: float
-    """Since the start."""
+    """Distance since the start."""
     right_m: float
     bump_left: bool
     bump_right: bool
     shafts: dict[int, tuple[int, int, float]]
-    """Position, speed, load."""
+    """By servo ID: position (counts), speed (0.111 rpm) and load (share of stall torque)."""
 
 
 class Channel:
-    """One end of the socket pair; never blocks, and what finds no room is dropped: the next says it anew."""
+    """One end of the socket pair. It never blocks: a datagram that finds no room is dropped, since the next replaces
+    it."""
 
     def __init__(self, end: socket.socket) -> None:
         end.setblocking(False)
@@ -87,7 +93,7 @@ class Channel:
             self._end.send(msgspec.msgpack.encode(message))
 
     def newest(self, kind: type[S]) -> S | None:
-        """The last datagram that waits; None when there is none. `open` is false once the other end has closed."""
+        """The newest datagram; None when none waits. `open` becomes False once the other end has closed."""
         newest = b""
         while self.open:
             try:
@@ -107,14 +113,14 @@ class Channel:
 
 
 class LinkedPlant:
-    """The firmware's side: a body whose motions are made elsewhere."""
+    """The firmware's plant: its mechanics are simulated by the physics in the other process."""
 
     def __init__(self, channel: Channel, create: EmulatedCreate, lines: Mapping[str, EmulatedServoBus]) -> None:
         self._channel = channel
         self._create = create
         self._servos = {servo.number: servo for bus in lines.values() for servo in bus.servos}
         self._rolled_m: tuple[float, float] | None = None
-        self._told: MotorOrders | None = None
+        self._sent: MotorOrders | None = None
 
     def fileno(self) -> int:
         return self._channel.fileno()
@@ -124,23 +130,23 @@ class LinkedPlant:
         return self._channel.open
 
     def advance(self, now_ns: int) -> None:
-        senses = self._channel.newest(PlantState)
-        if senses is not None:
-            self._feel(senses)
+        state = self._channel.newest(PlantState)
+        if state is not None:
+            self._sense(state)
         orders = self._orders()
-        if orders != self._told:
-            self._told = orders
+        if orders != self._sent:
+            self._sent = orders
             self._channel.send(orders)
 
-    def _feel(self, senses: PlantState) -> None:
-        rolled_m = senses.left_m, senses.right_m
+    def _sense(self, state: PlantState) -> None:
+        rolled_m = state.left_m, state.right_m
         before_m = self._rolled_m or rolled_m
         self._rolled_m = rolled_m
         self._create.roll(rolled_m[0] - before_m[0], rolled_m[1] - before_m[1])
-        self._create.around.bump_left = senses.bump_left
-        self._create.around.bump_right = senses.bump_right
-        for number, shaft in senses.shafts.items():
-            self._servos[number].sense(*shaft, senses.time_ns)
+        self._create.sensors.bump_left = state.bump_left
+        self._create.sensors.bump_right = state.bump_right
+        for number, shaft in state.shafts.items():
+            self._servos[number].sense(*shaft, state.time_ns)
 
     def _orders(self) -> MotorOrders:
         left, right = self._create.wheels_mmps
@@ -153,7 +159,7 @@ def _order(motor: Motor) -> MotorOrder:
 
 
 def firmware(setup: Setup) -> tuple[EmulatedCreate, dict[str, EmulatedServoBus]]:
-    """The devices of a setup, as somebody left them: the Create off, the servos holding where they are."""
+    """Make the devices of a setup: the Create is off, the servos hold their positions."""
     lines = {}
     for name, rows in setup.lines.items():
         servos = []
@@ -171,7 +177,7 @@ PREFERRED = -10
 
 
 class _Ending(Emulator):
-    """Ends when its body is gone."""
+    """Ends when the physics has ended."""
 
     linked: LinkedPlant
 
@@ -181,12 +187,12 @@ class _Ending(Emulator):
 
 def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m sim.wire.firmware", description="Emulated firmware on wires.")
-    parser.add_argument("folder", type=Path, help="where the ports are to be")
+    parser.add_argument("folder", type=Path, help="folder for the ports")
     parser.add_argument("--fd", type=int, required=True, help="this process's end of a socket pair")
     options = parser.parse_args()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for who started it
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent
     with suppress(PermissionError):
-        os.nice(PREFERRED)  # firmware answers at once
+        os.nice(PREFERRED)  # firmware must answer within a millisecond
     channel = Channel(socket.socket(fileno=options.fd))
     select.select([channel], [], [], 30.0)
     setup = channel.newest(Setup)
@@ -194,9 +200,9 @@ def main() -> int:
         return 1
     create, lines = firmware(setup)
     devices: dict[str, Device] = {"create": create, **lines}
-    body = LinkedPlant(channel, create, lines)
-    emulator = _Ending(options.folder, devices, body, setup.seed)
-    emulator.linked = body
+    plant = LinkedPlant(channel, create, lines)
+    emulator = _Ending(options.folder, devices, plant, setup.seed)
+    emulator.linked = plant
     with ControlServer(options.folder, Control(emulator)):
         emulator.run()
     return 0

@@ -1,4 +1,4 @@
-"""A serial port that is none: a pseudo-terminal under a name of its own, that can be unplugged."""
+"""An emulated serial line: a pseudo-terminal that can be unplugged, and disturbances of the bytes on it."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ BAUDS = {
 
 
 class PseudoSerialPort:
-    """A driver opens `path`; this end reads and writes what goes over the wire."""
+    """A pseudo-terminal. A driver opens it at `path`; this object is the other end of the wire."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -29,13 +29,16 @@ class PseudoSerialPort:
         self.plug()
 
     def plug(self) -> None:
-        """Put the adapter in; nothing when it is in."""
+        """Plug the adapter in, unless it is."""
         if self._ends is not None:
             return
         ours, theirs = pty.openpty()
         tty.setraw(theirs)
         os.set_blocking(ours, False)
-        self._ends = ours, theirs  # theirs stays open, or the first reader's leaving would look like unplugging
+        self._ends = (
+            ours,
+            theirs,
+        )  # theirs stays open: otherwise a driver that closes the port would look like an unplugged adapter
         fresh = f".{self.path.name}.{os.getpid()}"
         with private.directory(self.path.parent, make=True) as folder:
             with suppress(FileNotFoundError):
@@ -44,7 +47,7 @@ class PseudoSerialPort:
             os.replace(fresh, self.path.name, src_dir_fd=folder, dst_dir_fd=folder)
 
     def unplug(self) -> None:
-        """Pull the adapter out: who has the port open sees it hang up."""
+        """Unplug the adapter: the port hangs up for the process that has it open."""
         if self._ends is None:
             return
         ends, self._ends = self._ends, None
@@ -61,7 +64,7 @@ class PseudoSerialPort:
 
     @property
     def baud(self) -> int:
-        """To which the driver set the port."""
+        """The baud rate that the driver has set; 0 while unplugged."""
         if self._ends is None:
             return 0
         return BAUDS.get(termios.tcgetattr(self._ends[0])[4], 0)
@@ -75,7 +78,7 @@ class PseudoSerialPort:
             return b""
 
     def write(self, data: bytes) -> None:
-        """What nobody reads is lost when the line is full."""
+        """Write bytes. When the line is full because nobody reads, they are lost."""
         if self._ends is not None and data:
             with suppress(BlockingIOError, OSError):
                 os.write(self._ends[0], data)
@@ -88,18 +91,18 @@ KINDS: tuple[FaultKind, ...] = ("lost", "corrupted", "truncated", "late", "repea
 
 @dataclass(frozen=True)
 class LineFault:
-    """A share of the bytes (lost, corrupted) or of the bursts (the others) suffers it, until a time."""
+    """A disturbance of a share of the bytes (lost, corrupted) or of the bursts (the other kinds), until a time."""
 
     kind: FaultKind
     share: float
     way: Direction
     until_ns: int
     delay_ns: int = 30_000_000
-    """For late ones."""
+    """Delay of late bursts."""
 
 
 class Disturbance:
-    """One direction of one line."""
+    """The disturbances in one direction of a line. All draws come from the seed."""
 
     def __init__(self, way: Direction, seed: int) -> None:
         self._way = way
@@ -115,7 +118,7 @@ class Disturbance:
         self._faults.clear()
 
     def carry(self, data: bytes, now_ns: int) -> bytes:
-        """What arrives now, of what is sent now and of what was held up. In order: nothing overtakes."""
+        """Send bytes now; returns the bytes that arrive now, which may include delayed ones. The order is kept."""
         self._faults = [fault for fault in self._faults if fault.until_ns > now_ns]
         due_ns = now_ns
         for fault in self._faults if data else ():

@@ -1,10 +1,13 @@
-"""A recording that libfreenect's playback library, fakenect, plays in the place of a Kinect.
+"""Records a simulated Kinect for libfreenect's playback library, fakenect: `python -m sim.wire.record FOLDER`.
 
-Written from its README: a folder with a file for each observation, named TYPE-SECONDS-TICKS, where TYPE is r for
-colour, d for depth, a for acceleration; SECONDS is when it arrived, by which it is paced, TICKS what the device's own
-clock said. Colour is a PPM and depth a PGM, both with their header on one line; the 16 bits of a depth are
-little-endian, as the device's own buffer has them, whatever PGM says. Acceleration is the bytes of libfreenect's
-freenect_raw_tilt_state. INDEX.txt holds the names, one a line, in the order in which they are played.
+The robot stands still in its scene, with its head at the given angles. Beside the recording, truth.json has the places
+of the objects in the robot's frame, and the head's angles.
+
+The format follows fakenect's README: a folder with a file for each observation, named TYPE-SECONDS-TICKS. TYPE is r for
+colour, d for depth, a for acceleration; SECONDS is the time of arrival, by which the player paces itself; TICKS is the
+device's clock. Colour is a PPM and depth a PGM, with headers of one line; depth is little-endian, as in the device's
+buffer, although PGM demands big-endian. Acceleration is the bytes of libfreenect's freenect_raw_tilt_state. INDEX.txt
+lists the names, one per line, in the order of playing.
 """
 
 from __future__ import annotations
@@ -33,11 +36,12 @@ WIDTH, HEIGHT = 640, 480
 TICKS_HZ = 60_000_000
 COUNTS_PER_G = 819
 LEVEL = struct.pack("<hhhbxi", 0, COUNTS_PER_G, 0, 0, 0)
-"""freenect_raw_tilt_state of a Kinect that stands level: x, y, z, tilt angle, tilt status."""
+"""freenect_raw_tilt_state of a level Kinect: x, y, z, tilt angle, tilt status."""
 
 
 class RecordingWriter:
-    """Use it as a context manager. Raises ConfigError where there is a recording already, or no place for one."""
+    """Writes a recording; a context manager. Raises ConfigError when the folder has a recording already, or cannot be
+    written."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -59,7 +63,7 @@ class RecordingWriter:
         self._index.close()
 
     def add(self, frame: Frame, at_ns: int | None = None) -> None:
-        """Write a frame. It was taken at `at_ns`, ns, by whatever clock; at its stamp where nothing is said."""
+        """Write a frame that was taken at `at_ns` by any clock; by default at its stamp."""
         if (frame.width, frame.height) != (WIDTH, HEIGHT):
             raise ConfigError(f"a Kinect's pictures are {WIDTH} x {HEIGHT}, not {frame.width} x {frame.height}")
         at_ns = frame.stamp_ns if at_ns is None else at_ns
@@ -80,13 +84,14 @@ RATE_HZ = 30
 HEAD = ("neck_pan", "neck_tilt")
 TURN_NS = 3 * NS
 START_NS = NS
-"""fakenect takes a time of 0 for none at all."""
+"""Time of the first frame; fakenect takes 0 for no time."""
 
 
 def record(
     folder: Path, robot: Robot, config: SimConfig, frames: int, *, pan_rad: float = 0.0, tilt_rad: float = 0.0
 ) -> dict[str, Any]:
-    """Write so many frames; where the objects are, by label, in the body frame, and the head's angles."""
+    """Write this many frames. Returns the truth: the places of the objects by label, in the body frame, m, and the
+    head's angles, rad."""
     config = msgspec.structs.replace(config, width=WIDTH, height=HEIGHT)
     with make_world(robot, config) as world, RecordingWriter(folder) as writer:
         kinect = make_kinect(robot, config, world)
@@ -94,15 +99,15 @@ def record(
         for number in range(frames):
             at_ns = START_NS + number * NS // RATE_HZ
             writer.add(kinect.capture(world.visual_poses(), world.camera_pose(), at_ns, world.light))
-        told = _truth(world)
-    (folder / "truth.json").write_text(json.dumps(told, indent=1) + "\n", encoding="ascii")
-    return told
+        truth = _truth(world)
+    (folder / "truth.json").write_text(json.dumps(truth, indent=1) + "\n", encoding="ascii")
+    return truth
 
 
 def _turn_head(world: World, pan_rad: float, tilt_rad: float) -> None:
     world.set_latch("released")
     while world.time_ns < TURN_NS:
-        if world.time_ns < TURN_NS - NS // 2:  # then it holds, and comes to rest
+        if world.time_ns < TURN_NS - NS // 2:  # afterwards it holds, and comes to rest
             goal = ServoCommand(
                 stamp_ns=world.time_ns, joints=HEAD, goal_rad=(pan_rad, tilt_rad), speed_radps=(1.5, 1.5)
             )

@@ -1,4 +1,4 @@
-"""The PyBullet robot's motors as firmware drives them: by registers and wheel speeds instead of messages."""
+"""The simulator behind wires: the real drivers talk to emulated firmware, which drives the PyBullet robot's motors."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ from sim.wire.firmware import Channel, MotorOrders, PlantState, ServoSetup, Setu
 from sim.world import NETWORKS, Motors, World
 
 LIMP_SHARE = 0.05
-"""What the gears of a limp servo resist with, as a share of its stall torque."""
+"""Friction of a limp servo's gears, as a share of its stall torque."""
 LIMP_RADPS = 1.0
 
 
 class WireServo(SimServo):
-    """Does what its registers say."""
+    """A servo whose motor is driven by registers."""
 
     def __init__(self, joint: Joint, angle_rad: float, backlash_rad: float) -> None:
         super().__init__(joint, angle_rad, backlash_rad)
-        # Stiff until the firmware speaks, so that the robot stands as it was left.
+        # It holds until the firmware sends orders, so that the robot keeps its posture.
         self.motor = Motor(on=True, goal=self.goal_count, speed=0, limit=1.0, slope=1, punch=1.0)
 
     def drive(self, speed_factor: float = 1.0) -> Drive:
@@ -49,14 +49,14 @@ class WireServo(SimServo):
         return Drive(self.angle_rad + error_rad, speed_radps, joint.torque_nm * motor.limit * share)
 
     @property
-    def senses(self) -> tuple[int, int, float]:
-        """Position, speed (counts) and load (share), in the servo's own sense of turning."""
+    def measurements(self) -> tuple[int, int, float]:
+        """Position (counts), speed (0.111 rpm) and load (share of stall torque), in the servo's sense of rotation."""
         sign = self.joint.direction
         return self.count, round(sign * self.speed_radps / SPEED_COUNT_RADPS), sign * self.load
 
 
 class WireNetwork(SimServoNetwork):
-    """Servos that hear nothing but their registers: commands, expiry and the emergency stop are the driver's."""
+    """Servos that are driven only by registers: the driver handles commands, expiry and the emergency stop."""
 
     def __init__(self, joints: Mapping[str, Joint], angles_rad: Mapping[str, float], backlash_deg: float) -> None:
         super().__init__(joints, angles_rad, keeps_goal=True, timeout_s=0.0, backlash_deg=backlash_deg)
@@ -67,13 +67,13 @@ class WireNetwork(SimServoNetwork):
 
 
 class WireBase(MobileBase):
-    """Wheels that turn as the Create's firmware asks, ramped as it does."""
+    """Wheels that turn at the speeds of the Create's firmware, with its ramp."""
 
     def __init__(self, base: Base) -> None:
         super().__init__(base, exact=True)
         self.asked_mps = (0.0, 0.0)
         self.counted_m = [0.0, 0.0]
-        """What each wheel's encoder has counted since the start."""
+        """Distance that each wheel's encoder has measured since the start."""
 
     def rolled(self, left_m: float, right_m: float, now_ns: int, dt_s: float) -> None:
         self.counted_m = [self.counted_m[0] + left_m, self.counted_m[1] + right_m]
@@ -83,7 +83,7 @@ class WireBase(MobileBase):
 
 
 class WireMotors:
-    """Makes a world's motors, and keeps hold of them. Give `make` to the world."""
+    """Makes a world's motors by `make`, and keeps references to them."""
 
     base: WireBase
     servos: dict[int, WireServo]
@@ -121,7 +121,7 @@ class WireSimulator(Simulator):
         if not self._channel.open:
             raise CocoroError("the emulated firmware has ended")
         super().tick()
-        self._tell()
+        self._send_state()
 
     def _obey(self, orders: MotorOrders) -> None:
         self._motors.base.asked_mps = orders.left_mmps / 1000.0, orders.right_mmps / 1000.0
@@ -130,7 +130,7 @@ class WireSimulator(Simulator):
                 order.on, order.goal, order.speed, order.limit, order.slope, order.punch
             )
 
-    def _tell(self) -> None:
+    def _send_state(self) -> None:
         base = self._motors.base
         left_m, right_m = base.counted_m
         self._channel.send(
@@ -140,7 +140,7 @@ class WireSimulator(Simulator):
                 right_m,
                 base.bumper.left,
                 base.bumper.right,
-                {number: servo.senses for number, servo in self._motors.servos.items()},
+                {number: servo.measurements for number, servo in self._motors.servos.items()},
             )
         )
 
@@ -179,8 +179,8 @@ async def run(node: Node, config: SimConfig) -> None:
             simulator = WireSimulator(node, config, world, kinect, motors, channel)
             async with node.sibling("kinect") as camera:
                 simulator.connect_camera(camera)
-                await asyncio.to_thread(select.select, [channel], [], [], START_S)  # its first orders: it is there
-                simulator.tell_time()
+                await asyncio.to_thread(select.select, [channel], [], [], START_S)  # its first orders show that it runs
+                simulator.publish_time()
                 for part in (node, camera):
                     part.ready(f"simulated behind wires, scene {world.scene.name}, {config.sensors} sensors")
                 await keep_going(node, config, simulator)

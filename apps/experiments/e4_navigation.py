@@ -7,10 +7,10 @@ from functools import partial
 from math import cos, isnan, radians, sin
 from typing import Any
 
-from apps.experiments import bodies, figures
+from apps.experiments import figures, plan
+from apps.experiments.plan import ExperimentSettings
 from apps.experiments.results import Plot, Section, row
 from apps.experiments.runs import ExperimentRun, RunResult
-from apps.experiments.settings import ExperimentSettings
 from services.executive.tasks import GoToTask
 
 KEY, TITLE = "E4", "Navigation"
@@ -41,7 +41,7 @@ def runs(settings: ExperimentSettings) -> list[ExperimentRun]:
         x, y = cos(radians(bearing)), sin(radians(bearing))
         (folder / f"ball{bearing:+d}.toml").write_text(_SCENE.format(x=x, y=y))
     for seed in settings.seeds:
-        found += bodies.learned(settings, seed)
+        found += plan.learned(settings, seed)
         for way, (_, fields) in WAYS.items():
             for bearing in BEARINGS_DEG:
                 scene = str(folder / f"ball{bearing:+d}.toml")
@@ -50,7 +50,7 @@ def runs(settings: ExperimentSettings) -> list[ExperimentRun]:
                     "scene": scene,
                     "trace": True,
                 }
-                found.append(bodies.with_model(settings, seed, _name(way, bearing, seed), **{**request, **fields}))
+                found.append(plan.with_model(settings, seed, _name(way, bearing, seed), **{**request, **fields}))
     return found
 
 

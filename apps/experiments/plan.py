@@ -1,4 +1,4 @@
-"""Settings of the experiments, and the files of each seed."""
+"""Settings of the experiments, the files of each seed, and the runs that all experiments need."""
 
 from __future__ import annotations
 
@@ -7,13 +7,11 @@ from typing import Any
 
 import msgspec
 
+from apps.experiments.lessons import load_robot
+from apps.experiments.runs import ExperimentRun
 from apps.rehearsal.request import BodyKind, Sensors
 from cocoro.robot import Robot
-
-
-def load_robot(description: str | None = None, measured: str | None = None) -> Robot:
-    """The robot of these files; the Calliope where none is given. Raises ConfigError naming file and field."""
-    return Robot.load(*(None if file is None else Path(file) for file in (description, measured)))
+from services.executive.tasks import BabbleArmTask, BabbleWheelsTask
 
 
 class ExperimentSettings(msgspec.Struct, frozen=True, kw_only=True):
@@ -63,3 +61,40 @@ class ExperimentSettings(msgspec.Struct, frozen=True, kw_only=True):
 
     def model_file(self, seed: int) -> Path:
         return self.out / "models" / f"seed-{seed}.json"
+
+
+# --- the runs that all experiments need ------------------------------------------------------------
+
+
+def babbled(settings: ExperimentSettings, seed: int) -> list[ExperimentRun]:
+    """Babbling of one body's arm and wheels."""
+    common = settings.common(seed)
+    arm = {"task": BabbleArmTask(count=settings.samples), "samples": str(settings.arm_file(seed)), **common}
+    wheels = {
+        "task": BabbleWheelsTask(label="red_can", count=settings.trials), "scene": "wheels",
+        "samples": str(settings.wheels_file(seed)), **common,
+    }  # fmt: skip
+    return [
+        ExperimentRun(f"babble-arm-{seed}", "rehearse", arm),
+        ExperimentRun(f"babble-wheels-{seed}", "rehearse", wheels),
+    ]
+
+
+def learned(settings: ExperimentSettings, seed: int) -> list[ExperimentRun]:
+    """Babbling of one body, and learning its model."""
+    fields = {
+        "arm": str(settings.arm_file(seed)), "wheels": str(settings.wheels_file(seed)),
+        "into": str(settings.model_file(seed)), **settings.robot_files,
+    }  # fmt: skip
+    runs = babbled(settings, seed)
+    return [*runs, ExperimentRun(learned_name(seed), "learn", fields, needs=tuple(run.name for run in runs))]
+
+
+def learned_name(seed: int) -> str:
+    return f"learn-{seed}"
+
+
+def with_model(settings: ExperimentSettings, seed: int, name: str, **fields: Any) -> ExperimentRun:
+    """A rehearsal with the model of a body; `fields` are further fields of the request."""
+    request = {**settings.common(seed), "model": str(settings.model_file(seed)), **fields}
+    return ExperimentRun(name, "rehearse", request, needs=(learned_name(seed),))

@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
-from apps.experiments import bodies, figures
+from apps.experiments import figures, plan
+from apps.experiments.plan import ExperimentSettings
 from apps.experiments.results import Plot, ResultRow, Section, row
 from apps.experiments.runs import ExperimentRun, RunResult
-from apps.experiments.settings import ExperimentSettings
 from services.executive.tasks import TouchTask
 
 KEY, TITLE = "E2", "Reaching four suspended targets"
@@ -29,12 +29,12 @@ REACHED = {"rho_m": 0.02, "azimuth_rad": 0.034, "elevation_rad": 0.034}
 def runs(settings: ExperimentSettings) -> list[ExperimentRun]:
     found = []
     for seed in settings.seeds:
-        found += bodies.learned(settings, seed)
+        found += plan.learned(settings, seed)
         for scene in SCENES:
             for way, (_, fields) in WAYS.items():
                 order = TARGETS * ROUNDS
                 found.append(
-                    bodies.with_model(
+                    plan.with_model(
                         settings, seed, _name(scene, way, seed), task=TouchTask(label=order[0]), then=list(order[1:]),
                         scene=scene, trace=seed == settings.seeds[0], **fields,
                     )

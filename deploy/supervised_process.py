@@ -1,4 +1,4 @@
-"""One process under the supervisor: started, awaited, started again by its policy, stopped."""
+"""One process under the supervisor: its start, its readiness, its restarts and its end."""
 
 from __future__ import annotations
 
@@ -19,46 +19,46 @@ from deploy.launch import CRASHED, MISCONFIGURED, REFUSED
 from deploy.processes import BACKOFF_LIMIT_S, SETTLED_S
 from deploy.rundir import RunDir
 
-SAID_WHY = (MISCONFIGURED, REFUSED)
-"""Exit codes with which a process's last line says it all."""
+EXPLAINED = (MISCONFIGURED, REFUSED)
+"""Exit codes of processes whose last line of output is the whole explanation."""
 LAST_BYTES = 8192
-"""As much of a log's end is looked at for its last words."""
+"""How much of a log's end is searched for its last lines."""
 ENVIRONMENT = {
-    # The matrices here are small: more threads would only take each other's processors, and jitter.
+    # Matrices are small here: more threads would compete for the processors and add jitter.
     **dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"),
-    "PYTHONUNBUFFERED": "1",  # so that the log has what a killed process printed
+    "PYTHONUNBUFFERED": "1",  # so that the log has the last output of a killed process
 }
-"""What a process gets unless the environment says otherwise."""
+"""Defaults for a process's environment variables."""
 
 
 class StartError(Exception):
-    """A process did not become ready. `code` is what to exit with for it."""
+    """A process did not become ready. `code` is the exit code for it."""
 
     def __init__(self, text: str, code: int = CRASHED) -> None:
         super().__init__(text)
-        self.code = code if code in SAID_WHY else CRASHED
+        self.code = code if code in EXPLAINED else CRASHED
 
 
-class Child:
-    """`start`, then `keep` for ever, then `stop`. `tell` gets what people should know, a line at a time."""
+class SupervisedProcess:
+    """Call `start`, then `keep` until the robot ends, then `stop`. Passes lines for people to `report`."""
 
     def __init__(
         self,
         row: Component,
         run_dir: RunDir,
         parent_fd: int,
-        tell: Callable[[str], None],
+        report: Callable[[str], None],
         sleep_detector: SleepDetector,
     ) -> None:
-        """`sleep_detector` knows whether this process was itself asleep."""
+        """`sleep_detector` tells whether the supervisor itself was asleep."""
         self.row = row
         self.restarts = 0
         self._run_dir = run_dir
         self._parent_fd = parent_fd
-        self._tell = tell
+        self._report = report
         self._sleep_detector = sleep_detector
-        self._doubt: asyncio.TimerHandle | None = None
-        """Says that it is silent, unless it is back by then."""
+        self._delayed_report: asyncio.TimerHandle | None = None
+        """Reports that the process is silent, unless it is back by then."""
         self._alive: set[str] = set()
         self._ready = asyncio.Event()
         self._was_ready = False
@@ -73,8 +73,8 @@ class Child:
         return self._process.pid if self._process is not None and not self._exit.done() else None
 
     @property
-    def attended(self) -> bool:
-        """Whether the end of its process, if it has ended, has been noticed here."""
+    def exit_noticed(self) -> bool:
+        """False when the process has ended and the event loop has not handled that yet."""
         if self._process is None or self._exit.done():
             return True
         try:
@@ -83,7 +83,7 @@ class Child:
             return False
 
     async def start(self) -> None:
-        """Start it, and return when it is ready. Raises StartError when it ends before, or takes too long."""
+        """Start the process and wait until it is ready. Raises StartError when it ends before or takes too long."""
         self._spawn()
         if not await self._becomes_ready():
             if self._exit.done():
@@ -93,48 +93,48 @@ class Child:
             raise StartError(
                 f"{self.row.name} was not ready after {self.row.start_s:g} s: no sign of {missing}{self._last_words()}"
             )
-        self._say_ready()
+        self._report_ready()
 
     async def keep(self) -> None:
-        """Start it again whenever its policy says so; returns when it does not."""
+        """Restart the process as its policy says; returns when it is not restarted any more."""
         while True:
             code = await asyncio.shield(self._exit)
             if self._stopping:
                 return
             lived_s = time.monotonic() - self._started_s
-            again = self.row.restart == "always" or (self.row.restart == "on-failure" and code != 0)
-            if not again:
-                self._tell(f"{self.row.name} {_ended(code)}; it is not restarted{self._last_words(code)}")
+            restarted = self.row.restart == "always" or (self.row.restart == "on-failure" and code != 0)
+            if not restarted:
+                self._report(f"{self.row.name} {_ended(code)}; it is not restarted{self._last_words(code)}")
                 return
             self.restarts = 1 if lived_s > SETTLED_S else self.restarts + 1
             wait_s = min(self.row.backoff_s * 2 ** (self.restarts - 1), BACKOFF_LIMIT_S)
-            self._tell(f"{self.row.name} {_ended(code)}; restart in {wait_s:g} s{self._last_words(code)}")
+            self._report(f"{self.row.name} {_ended(code)}; restart in {wait_s:g} s{self._last_words(code)}")
             await asyncio.sleep(wait_s)
             self._spawn()
             if await self._becomes_ready():
-                self._say_ready()
+                self._report_ready()
             elif not self._exit.done():
-                self._tell(f"{self.row.name} was not ready after {self.row.start_s:g} s: killed")
+                self._report(f"{self.row.name} was not ready after {self.row.start_s:g} s: killed")
                 self._signal(signal.SIGKILL)
 
     async def stop(self) -> None:
-        """SIGTERM, and SIGKILL when that is not obeyed in time. Returns when the process is gone."""
+        """End the process by SIGTERM, or by SIGKILL when it does not end in time. Returns when it has ended."""
         self._stopping = True
         if self.pid is None:
             return
         self._signal(signal.SIGTERM)
-        self._signal(signal.SIGCONT)  # a stopped process could not obey
+        self._signal(signal.SIGCONT)  # a stopped process could not handle SIGTERM
         with suppress(TimeoutError):
             await asyncio.wait_for(asyncio.shield(self._exit), self.row.stop_s)
         if self._exit.done():
-            self._tell(f"{self.row.name} stopped")
+            self._report(f"{self.row.name} stopped")
             return
         self._signal(signal.SIGKILL)
         await self._exit
-        self._tell(f"{self.row.name} did not stop within {self.row.stop_s:g} s: killed")
+        self._report(f"{self.row.name} did not stop within {self.row.stop_s:g} s: killed")
 
     def on_alive(self, service: str, alive: bool) -> None:
-        """The mesh tells of one of its services."""
+        """Take the liveliness of one of its services from the mesh."""
         if alive:
             self._alive.add(service)
         else:
@@ -144,29 +144,30 @@ class Child:
             self._ready.set()
         else:
             self._ready.clear()
-        self._say_silence(ready)
+        self._report_silence(ready)
 
-    def _say_silence(self, ready: bool) -> None:
-        """Say that it has fallen silent, or is back. Who was itself asleep gives it time before that is said of it."""
-        if self._doubt is not None and ready:
-            self._doubt.cancel()
-            self._doubt = None
+    def _report_silence(self, ready: bool) -> None:
+        """Report that the process is silent or back. After a sleep of the supervisor itself, silence is reported only
+        when it lasts."""
+        if self._delayed_report is not None and ready:
+            self._delayed_report.cancel()
+            self._delayed_report = None
         if not self._was_ready or self.pid is None or self._stopping or ready != self._silent:
             return
         if ready:
             self._silent = False
-            self._tell(f"{self.row.name} is back")
+            self._report(f"{self.row.name} is back")
         elif self._sleep_detector.look():
-            if self._doubt is None:
-                self._doubt = asyncio.get_running_loop().call_later(RECOVERY_S, self._say_silence_after_all)
+            if self._delayed_report is None:
+                self._delayed_report = asyncio.get_running_loop().call_later(RECOVERY_S, self._report_lasting_silence)
         else:
             self._silent = True
             missing = ", ".join(sorted(set(self.row.services) - self._alive))
-            self._tell(f"{self.row.name} is silent: no sign of {missing}")
+            self._report(f"{self.row.name} is silent: no sign of {missing}")
 
-    def _say_silence_after_all(self) -> None:
-        self._doubt = None
-        self._say_silence(self._alive >= set(self.row.services))
+    def _report_lasting_silence(self) -> None:
+        self._delayed_report = None
+        self._report_silence(self._alive >= set(self.row.services))
 
     # --- the process ------------------------------------------------------------------------------
 
@@ -189,31 +190,31 @@ class Child:
                 stderr=log,
                 env=ENVIRONMENT | os.environ,
                 pass_fds=(self._parent_fd,),
-                start_new_session=True,  # so that Ctrl-C in a terminal is for the supervisor alone
+                start_new_session=True,  # so that only the supervisor gets Ctrl-C of a terminal
             )
         pid_fd = os.pidfd_open(self._process.pid)
         loop.add_reader(pid_fd, self._on_exit, self._process, pid_fd)
 
     def _log(self) -> IO[bytes]:
-        """Where it writes what it does; nowhere, which is said, when its log cannot be written."""
+        """The process's log file. When it cannot be written, that is reported, and the output goes nowhere."""
         try:
             return self._run_dir.new_log(self.row.name)
         except ConfigError as error:
-            self._tell(f"{self.row.name} runs without a log: {error}")
+            self._report(f"{self.row.name} runs without a log: {error}")
             return os.fdopen(os.open(os.devnull, os.O_WRONLY), "wb")
 
     def _on_exit(self, process: subprocess.Popen[bytes], pid_fd: int) -> None:
         asyncio.get_running_loop().remove_reader(pid_fd)
         os.close(pid_fd)
         with suppress(ProcessLookupError, PermissionError):
-            os.killpg(process.pid, signal.SIGKILL)  # what it started itself; the number is its own until it is reaped
+            os.killpg(process.pid, signal.SIGKILL)  # its own children; the group's number is valid until it is reaped
         self._exit.set_result(process.wait())
         self._alive.clear()
         self._ready.clear()
         self._was_ready = False
 
     def _signal(self, number: signal.Signals) -> None:
-        if self._process is not None and not self._exit.done():  # not reaped yet, so the number is its own
+        if self._process is not None and not self._exit.done():  # it is not reaped yet, so the number is valid
             self._process.send_signal(number)
 
     async def _becomes_ready(self) -> bool:
@@ -222,13 +223,13 @@ class Child:
         ready.cancel()
         return self._ready.is_set() and not self._exit.done()
 
-    def _say_ready(self) -> None:
+    def _report_ready(self) -> None:
         self._was_ready, self._silent = True, False
         services = "" if self.row.services == (self.row.name,) else f" ({', '.join(self.row.services)})"
-        self._tell(f"{self.row.name}{services} ready in {time.monotonic() - self._started_s:.1f} s")
+        self._report(f"{self.row.name}{services} ready in {time.monotonic() - self._started_s:.1f} s")
 
     def _last_words(self, code: int | None = None) -> str:
-        """The end of its log, to be put after a sentence: of a mistake the line that tells it, else a few."""
+        """The end of the log, to append to a sentence: the line that explains the exit code, or the last few lines."""
         log = self._run_dir.log(self.row.name)
         try:
             file = self._run_dir.open_log(self.row.name)
@@ -237,7 +238,7 @@ class Child:
         with file:
             file.seek(max(file.seek(0, os.SEEK_END) - LAST_BYTES, 0))
             lines = [line for line in file.read().decode(errors="replace").splitlines() if line.strip()]
-        if code in SAID_WHY and lines:
+        if code in EXPLAINED and lines:
             return f": {lines[-1].partition(f'{self.row.name}: ')[2] or lines[-1]}"
         return "".join(f"\n    {line}" for line in (f"{log}:", *lines[-3:]))
 

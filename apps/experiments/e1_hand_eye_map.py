@@ -6,11 +6,11 @@ from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
-from apps.experiments import bodies, figures
+from apps.experiments import figures, plan
 from apps.experiments.lessons import SIZES
+from apps.experiments.plan import ExperimentSettings
 from apps.experiments.results import Plot, Section, row
 from apps.experiments.runs import ExperimentRun, RunResult
-from apps.experiments.settings import ExperimentSettings
 from apps.learning.study import BEST, METHODS
 from services.executive.tasks import BabbleArmTask
 
@@ -25,7 +25,7 @@ AFTER = 100
 def runs(settings: ExperimentSettings) -> list[ExperimentRun]:
     found = []
     for seed in settings.seeds:
-        found += bodies.learned(settings, seed)
+        found += plan.learned(settings, seed)
         bent = {
             "task": BabbleArmTask(count=BENT_SAMPLES), "samples": str(settings.bent_file(seed)), "bend_s": BEND_S,
             **settings.common(seed),
@@ -34,13 +34,13 @@ def runs(settings: ExperimentSettings) -> list[ExperimentRun]:
         lesson |= settings.robot_files
         found.append(ExperimentRun(f"babble-bent-{seed}", "rehearse", bent))
         found.append(
-            ExperimentRun(f"bend-{seed}", "bend", lesson, needs=(f"babble-bent-{seed}", bodies.learned_name(seed)))
+            ExperimentRun(f"bend-{seed}", "bend", lesson, needs=(f"babble-bent-{seed}", plan.learned_name(seed)))
         )
     return found
 
 
 def section(settings: ExperimentSettings, results: Mapping[str, RunResult]) -> Section:
-    learned = {seed: results[bodies.learned_name(seed)] for seed in settings.seeds}
+    learned = {seed: results[plan.learned_name(seed)] for seed in settings.seeds}
     good = {seed: result for seed, result in learned.items() if "error" not in result}
     bent = [r for seed in settings.seeds if "error" not in (r := results[f"bend-{seed}"])]
     made = Section(KEY, TITLE, _about(good))

@@ -6,10 +6,19 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Protocol
 
-from apps.experiments import arm_map, fetching, figures, following, going, reaching, report, wheel_distance
+from apps.experiments import (
+    e1_hand_eye_map,
+    e2_reaching,
+    e3_wheel_distance,
+    e4_navigation,
+    e5_following,
+    e6_fetching,
+    figures,
+    report,
+)
+from apps.experiments.plan import ExperimentSettings
 from apps.experiments.results import Section
 from apps.experiments.runs import ExperimentRun, RunDisplay, RunResult, perform
-from apps.experiments.settings import ExperimentSettings
 
 
 class Experiment(Protocol):
@@ -23,9 +32,8 @@ class Experiment(Protocol):
     def section(self, settings: ExperimentSettings, results: dict[str, RunResult]) -> Section: ...
 
 
-EXPERIMENTS: dict[str, Experiment] = {
-    module.KEY: module for module in (arm_map, reaching, wheel_distance, going, following, fetching)
-}
+MODULES = (e1_hand_eye_map, e2_reaching, e3_wheel_distance, e4_navigation, e5_following, e6_fetching)
+EXPERIMENTS: dict[str, Experiment] = {module.KEY: module for module in MODULES}
 
 
 def run(

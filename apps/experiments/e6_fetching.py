@@ -7,10 +7,10 @@ from functools import partial
 from math import ceil
 from typing import Any
 
-from apps.experiments import bodies, figures
+from apps.experiments import figures, plan
+from apps.experiments.plan import ExperimentSettings
 from apps.experiments.results import Plot, Section, row
 from apps.experiments.runs import ExperimentRun, RunResult
-from apps.experiments.settings import ExperimentSettings
 from services.executive.tasks import FetchTask
 
 KEY, TITLE = "E6", "Fetching"
@@ -26,11 +26,11 @@ WAYS: dict[str, tuple[str, dict[str, Any]]] = {
 def runs(settings: ExperimentSettings) -> list[ExperimentRun]:
     found = []
     for seed in settings.seeds:
-        found += bodies.learned(settings, seed)
+        found += plan.learned(settings, seed)
         for way, (_, fields) in WAYS.items():
             for can in CANS:
                 name = f"fetch-{way}-{can}-{seed}"
-                found.append(bodies.with_model(settings, seed, name, task=FetchTask(label=can), **fields))
+                found.append(plan.with_model(settings, seed, name, task=FetchTask(label=can), **fields))
     return found
 
 

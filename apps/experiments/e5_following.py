@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
-from apps.experiments import bodies, figures
+from apps.experiments import figures, plan
+from apps.experiments.plan import ExperimentSettings
 from apps.experiments.results import Plot, Section, row
 from apps.experiments.runs import ExperimentRun, RunResult
-from apps.experiments.settings import ExperimentSettings
 from services.executive.tasks import FollowTask
 
 KEY, TITLE = "E5", "Following"
@@ -26,14 +26,14 @@ WAYS: dict[str, tuple[str, dict[str, Any]]] = {
 def runs(settings: ExperimentSettings) -> list[ExperimentRun]:
     found = []
     for seed in settings.seeds:
-        found += bodies.learned(settings, seed)
+        found += plan.learned(settings, seed)
         for way, (_, fields) in WAYS.items():
             request = {
                 "task": FollowTask(label="blue_ball", for_s=FOR_S),
                 "scene": "follow",
                 "trace": seed == settings.seeds[0],
             }
-            found.append(bodies.with_model(settings, seed, f"follow-{way}-{seed}", **{**request, **fields}))
+            found.append(plan.with_model(settings, seed, f"follow-{way}-{seed}", **{**request, **fields}))
     return found
 
 

@@ -6,24 +6,24 @@ from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
-from apps.experiments import bodies, figures
+from apps.experiments import figures, plan
+from apps.experiments.plan import ExperimentSettings
 from apps.experiments.results import Plot, ResultRow, Section, row
 from apps.experiments.runs import ExperimentRun, RunResult
-from apps.experiments.settings import ExperimentSettings
 
 KEY, TITLE = "E3", "The distance between the wheels, from babbling"
 MEDIAN_M, WORST_M = 0.003, 0.008
 
 
 def runs(settings: ExperimentSettings) -> list[ExperimentRun]:
-    return [run for seed in settings.seeds for run in bodies.learned(settings, seed)]
+    return [run for seed in settings.seeds for run in plan.learned(settings, seed)]
 
 
 def section(settings: ExperimentSettings, results: Mapping[str, RunResult]) -> Section:
     good = [
-        (results[bodies.learned_name(seed)]["wheels"], results[f"babble-wheels-{seed}"]["body"])
+        (results[plan.learned_name(seed)]["wheels"], results[f"babble-wheels-{seed}"]["body"])
         for seed in settings.seeds
-        if "error" not in results[bodies.learned_name(seed)]
+        if "error" not in results[plan.learned_name(seed)]
     ]
     made = Section(
         KEY,
