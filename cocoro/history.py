@@ -18,8 +18,8 @@ DEFAULT_JUMP_BACK_NS = 500_000_000
 class History:
     """The newest samples of one state vector; gives its value at a time.
 
-    A sample of another incarnation (its publisher restarted), or with a stamp more than `jump_back_ns` before the newest
-    (a new epoch), first empties the history. A late or repeated sample is refused.
+    A sample of another incarnation (its publisher restarted), or with a stamp more than `jump_back_ns` before the
+    newest (a new epoch), first empties the history. A late or repeated sample is refused.
     """
 
     def __init__(

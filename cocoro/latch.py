@@ -28,7 +28,7 @@ STOP_KEPT_S, RESET_KEPT_S = 0.15, 0.6
 """Longest wait of the answer to a stop and to a reset for the disk; less than the caller waits for the answer."""
 
 
-class LatchKeeper:
+class ServiceLatch:
     """Keeps the latch of one service: serves `<service>/estop`, follows `executive/latch`, listens on the stop path.
 
     `changed(state, by)` is called in the event loop, before the answer to a request is sent. `halt()` is called in the
@@ -84,8 +84,8 @@ class LatchKeeper:
     # --- the stop path --------------------------------------------------------------------------------
 
     def _stopped(self, by: str) -> None:
-        """Called in the stop path's thread. The event loop latches afterwards in any case, so a reset between the two is
-        overridden within a moment. Many stops are one for the event loop."""
+        """Called in the stop path's thread. The event loop latches afterwards in any case, so a reset between the two
+        is overridden within a moment. Many stops are one for the event loop."""
         assert self._record is not None
         try:
             self._halt()
@@ -116,7 +116,9 @@ class LatchKeeper:
             self._reset_ns = self._node.now_ns()
             self._set("released", request.by)
         not_kept = await self._not_kept(STOP_KEPT_S if request.latched else RESET_KEPT_S)
-        return EstopReply(service=self._node.name, latch=self.state, text=not_kept)  # another request may have changed it meanwhile
+        return EstopReply(
+            service=self._node.name, latch=self.state, text=not_kept
+        )  # another request may have changed it meanwhile
 
     async def _not_kept(self, within_s: float) -> str:
         """Why the last state is not on the disk; '' when it is."""

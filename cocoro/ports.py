@@ -22,7 +22,8 @@ def wire_dir(robot: str) -> Path:
 
 
 def port_path(name: str, robot: str) -> str:
-    """The path to open for a port's name. Raises ConfigError for an emulated port whose folder is not this user's alone."""
+    """The path to open for a port's name. Raises ConfigError for an emulated port whose folder is not this user's
+    alone."""
     if not name.startswith(WIRE):
         return name
     folder = wire_dir(robot)

@@ -60,8 +60,8 @@ def directory(
 
 
 def open_file(path: Path, flags: int, *, mode: int = 0o600, make: bool = False, variable: str = RUN_DIR) -> int:
-    """Opens a regular file of this user in a directory that is this user's alone; `flags` as for `os.open`. With `make`,
-    missing directories are made. Returns the descriptor.
+    """Opens a regular file of this user in a directory that is this user's alone; `flags` as for `os.open`. With
+    `make`, missing directories are made. Returns the descriptor.
 
     Raises FileNotFoundError when it is missing, ConfigError and FullError as `directory` does.
     """

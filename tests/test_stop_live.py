@@ -136,7 +136,7 @@ def test_a_latch_that_cannot_be_kept_or_read_comes_up_stopped_and_says_why(
     assert latch(shell) == "latched"
     reset = robot(shell, "reset")
     assert reset.returncode == exits.DONE
-    assert "a restart will not remember this" in reset.stdout + reset.stderr
+    assert "a restart will forget this" in reset.stdout + reset.stderr
     stopped = robot(shell, "stop")
     assert "A RESTART WILL FORGET IT" in stopped.stdout + stopped.stderr
 

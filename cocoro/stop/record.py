@@ -109,8 +109,8 @@ class LatchRecord:
         threading.Thread(target=self._write_all, name=f"latch {path.name}", daemon=True).start()
 
     def keep(self, latched: bool, by: str) -> Future[str]:
-        """Starts to write a state, unless it is the present one. The future gives why it is not on the disk, or '' when it
-        is. From any thread."""
+        """Starts to write a state, unless it is the present one. The future gives why it is not on the disk, or '' when
+        it is. From any thread."""
         with self._lock:
             failed = self.last.done() and self.last.result()
             if failed or self.entry.latched != latched:
@@ -149,8 +149,8 @@ def _decoded(path: Path, data: bytes) -> LatchEntry:
     if len(data) != RECORD_BYTES or data[-1:] != b"\n" or data[:9] != f"{zlib.crc32(body):08x} ".encode():
         return _unreadable(path, "it is damaged")
     try:
-        data = json.loads(body)
-        return LatchEntry(bool(data["latched"]), str(data["by"]), str(data["when"]))
+        found = json.loads(body)
+        return LatchEntry(bool(found["latched"]), str(found["by"]), str(found["when"]))
     except (ValueError, TypeError, KeyError):
         return _unreadable(path, "it has an unknown format")
 
