@@ -21,9 +21,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from apps.learning.rules import learn_in_order
 from apps.learning.study import BEST, METHODS, Sightings, fit
-from cocoro.learning.fitting import LeastSquares
-from cocoro.learning.network import PAPER_RATE, HyperplaneRbf
-from cocoro.learning.nominal_model import NominalModel
+from cocoro.learning.handmap import NominalModel
+from cocoro.learning.network import PAPER_RATE, HyperplaneRbf, LeastSquares
 from cocoro.robot import Robot
 from services.planning.reachability import ReachMesh
 

@@ -1,4 +1,4 @@
-"""What a component is: a value that says what it speaks, what it needs and how it is run.
+"""Components: values that declare what a process reads, publishes and needs, and how it is run.
 
 A declaration is light: it names the module of the implementation, and only the process that runs the component imports
 that module. The declarations of this project are united in `deploy.processes`; third parties add theirs by entry point
@@ -32,7 +32,7 @@ Restart = Literal["never", "on-failure", "always"]
 
 @dataclass(frozen=True)
 class Implementation(Generic[C]):
-    """What a component's module gives, under the name `implementation`."""
+    """The value `implementation` of a component's module: its settings, its main coroutine, its core."""
 
     config: type[C]
     """A frozen msgspec struct; all fields have defaults, unknown fields are forbidden."""
@@ -44,7 +44,7 @@ class Implementation(Generic[C]):
 
 @dataclass(frozen=True, kw_only=True)
 class Component:
-    """One process: what it says and hears on the mesh, what it depends on, how it is run, what it may cost.
+    """One process: its topics and requests, its dependencies, how it is run, its budget.
 
     A topic or request with `{service}` in its name stands for each of this component's services where the component
     publishes or serves it, and for any service where the component reads or calls it. What every node does (health,
@@ -52,21 +52,21 @@ class Component:
     """
 
     name: str
-    """Of the process; also the name of its service unless `services` says otherwise."""
+    """The process's name, and by default that of its service."""
     module: str
-    """Has `implementation = Implementation(...)`; imported by `load` alone."""
+    """The module with `implementation = Implementation(...)`; only `load` imports it."""
     doc: str
     services: tuple[str, ...] = ()
-    """The services that it is; it is ready when all of them have declared their liveliness."""
+    """The services that it provides; it is ready when all of them have declared their liveliness."""
 
     reads: tuple[Topic[Any], ...] = ()
     publishes: tuple[Topic[Any], ...] = ()
     serves: tuple[Request[Any, Any], ...] = ()
     calls: tuple[Request[Any, Any], ...] = ()
     records: bool = False
-    """It hears every key of the robot, whatever `reads` says."""
+    """It hears every key of the robot, besides those of `reads`."""
     needs: tuple[str, ...] = ()
-    """Services that it cannot work without; what these need in turn is not repeated here."""
+    """Services that it cannot work without; without those that these need in turn."""
     moves: tuple[str, ...] = ()
     """Those of its services that move something. Each must serve the emergency stop."""
     hardware: bool = False
@@ -76,11 +76,11 @@ class Component:
     """The name of the `[service.NAME]` table that it is configured by, if that is not its own."""
     restart: Restart = "on-failure"
     backoff_s: float = 0.5
-    """Before the first restart; doubled for each further one, up to `deploy.processes.BACKOFF_LIMIT_S`."""
+    """Delay before the first restart; doubled for each further one, up to `deploy.processes.BACKOFF_LIMIT_S`."""
     start_s: float = 30.0
-    """It must be ready by then."""
+    """Time until it must be ready."""
     stop_s: float = 5.0
-    """From SIGTERM to SIGKILL."""
+    """Time from SIGTERM to SIGKILL."""
     frames: Literal["", "reads", "publishes"] = ""
     """Whether it publishes or reads frames: these travel in shared memory then. Otherwise they are copied, which costs
     more."""

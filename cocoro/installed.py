@@ -1,8 +1,8 @@
-"""What third parties have installed: their components, and with these the topics and requests beyond the project's own.
+"""Components of third parties, and all topics and requests: the project's own and those of third parties.
 
 A distribution adds a component by an entry point of the group `cocoro.components`: named as the component, with its
-`Component` as the value. A faulty entry point is a problem for whoever starts components (`ThirdParties.check`), and is
-left out for everyone else, so that it cannot stop a recorder or blind an operator's command.
+`Component` as the value. A faulty entry point is an error where components are started (`ThirdParties.check`).
+Everywhere else it is ignored, so that it cannot stop a recorder or disable an operator's command.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ class ThirdParties(NamedTuple):
     components: dict[str, Component]
     """By name; without those that are faulty."""
     topics: tuple[Topic[Any], ...]
-    """What they publish or read beyond the project's own topics."""
+    """Topics that they publish or read, without the project's own."""
     requests: tuple[Request[Any, Any], ...]
     problems: tuple[str, ...]
     """One for each faulty entry point."""
@@ -36,7 +36,7 @@ class ThirdParties(NamedTuple):
 @cache
 def third_parties() -> ThirdParties:
     """All installed components of third parties; found once in a process."""
-    from importlib.metadata import entry_points  # takes a while to import, and not everyone needs it
+    from importlib.metadata import entry_points  # slow to import, and rarely needed
 
     components: dict[str, Component] = {}
     topics: dict[str, Topic[Any]] = {}
@@ -54,7 +54,7 @@ def third_parties() -> ThirdParties:
             new_requests = _new((*component.serves, *component.calls), REQUESTS, requests)
         except ConfigError as error:
             problems.append(f"{where}: {error}")
-        except Exception as error:  # it is their code that runs here
+        except Exception as error:  # third-party code runs here
             problems.append(f"{where} cannot be loaded: {type(error).__name__}: {error}")
         else:
             components[component.name] = component

@@ -1,4 +1,4 @@
-"""What runs: the union of the project's own components and of those that third parties have installed.
+"""The union of the project's own components and of those that third parties have installed.
 
 Profiles name components, the supervisor starts each as a process, and everything else that depends on which components
 there are is derived from their declarations here.

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Everything that must hold: lint, format, types, import rules, tests. Goes on after a failure, so that one run tells
-# all; the tests come last. Arguments go to pytest.
+# Runs every check: lint, format, types, import rules, tests. It continues after a failure, so that one run shows all of
+# them; the tests come last. Arguments go to pytest.
 set -uo pipefail
 cd "$(dirname "$0")/.."
 PATH=$PWD/.venv/bin:$PATH
@@ -17,7 +17,7 @@ check mypy
 check lint-imports --no-logo
 [ ${#unclean[@]} = 0 ] || echo "NOT CLEAN: ${unclean[*]}"
 
-# Tests of real processes have the machine for themselves; the others, which go by virtual time, share it.
+# Tests of real processes run alone; the others go by virtual time and run in parallel.
 if [ $# = 0 ]; then
     echo "== pytest, what goes by virtual time, on two processors"
     pytest -rs -n 2 -m "not zenoh"

@@ -14,7 +14,7 @@ from cli_forks import Case, Ending
 from apps.cli import exits
 from apps.cli.app import COMMANDS as LISTED
 from apps.cli.app import load
-from apps.cli.task_app import task_command, task_names
+from apps.cli.task_commands import task_command, task_names
 
 GOLDEN = Path(__file__).parent / "golden" / "fetch.mcap"
 CODES = (exits.DONE, exits.FAILED, exits.USAGE, exits.REFUSED, exits.NO_MESH)

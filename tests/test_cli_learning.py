@@ -16,7 +16,7 @@ from apps.learning.collector import Coverage, HandCollector, WheelCollector, col
 from apps.learning.dataset import HandRow, SampleFile, WheelRow, hand_header, wheel_header
 from apps.learning.study import BEST
 from cocoro.learning import model
-from cocoro.learning.nominal_model import NominalModel
+from cocoro.learning.handmap import NominalModel
 from cocoro.messages import HandSample, TaskState, WheelTrial
 from cocoro.robot import Robot
 from cocoro.topics import HAND_SAMPLES

@@ -219,7 +219,7 @@ def test_objects_are_listed_with_where_they_were_seen(root: Path, capsys: pytest
     async def scenario(as_json: bool) -> int:
         async with robot("executive") as calliope:
             calliope.nodes["executive"].serve(OBJECTS, answer)
-            return await objects.objects(ANY, as_json)
+            return await objects.list_objects(ANY, as_json)
 
     assert asyncio.run(scenario(as_json=False)) == exits.DONE
     assert capsys.readouterr().out.splitlines()[1] == "red_can  cylinder  6.6 x 6.6 x 12.0  yes        -"
@@ -270,6 +270,7 @@ def test_a_snapshot_is_a_frame_with_what_was_detected_in_that_frame(
     assert out.read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.process
 def test_ctrl_c_on_a_running_fetch_cancels_the_task_on_the_robot(root: Path) -> None:
     cancelled: list[str] = []
 

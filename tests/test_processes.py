@@ -10,7 +10,7 @@ import msgspec
 import pytest
 from operator_shell import install_parts
 
-from apps.cli import estop
+from apps.cli import stop_asking
 from cocoro import topics
 from cocoro.component import Component
 from cocoro.component import load as load_component
@@ -93,7 +93,7 @@ def test_a_component_that_moves_something_answers_the_emergency_stop() -> None:
 def test_hardware_and_what_the_emergency_stop_stops_are_derived() -> None:
     assert processes.hardware() == ("kinect", "base", "arm", "hand")
     assert processes.stoppable() == ("base", "arm", "hand")
-    assert processes.stoppable() == estop.STOPPABLE  # which imports nothing, so it has its own
+    assert processes.stoppable() == stop_asking.STOPPABLE  # which imports nothing, so it has its own
     assert {*processes.hardware()} == {*processes.named("sim").services}
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from apps.cli import doctor_stop, stop_asking
+from apps.cli import doctor, stop_asking
 from cocoro.stop import record
 from cocoro.stop.record import RECORD_BYTES, LatchRecord, latch_dir, prepare, read
 
@@ -204,26 +204,26 @@ def test_the_place_outlives_a_reboot_and_is_the_same_for_the_unit_file_and_by_ha
 
 
 def test_the_doctor_says_where_the_latch_is_kept_and_that_it_is_latched() -> None:
-    path, latch = doctor_stop.check("robbie")
+    path, latch = doctor.stop_checks("robbie")
     assert (path.state, latch.state) == ("ok", "ok")
     assert str(latch_dir("robbie")) in latch.text
     prepare(latch_dir("robbie"), ["base"], by_hand=False)
-    _, latch = doctor_stop.check("robbie")
+    _, latch = doctor.stop_checks("robbie")
     assert (latch.state, "`cocoro reset`" in latch.text) == ("note", True)
 
 
 def test_the_doctor_warns_of_a_place_that_does_not_outlive_a_reboot_or_cannot_be_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert doctor_stop._filesystem(Path("/proc")) != "tmpfs"
-    monkeypatch.setattr(doctor_stop, "_filesystem", lambda _: "tmpfs")
-    assert [one.state for one in doctor_stop.check("robbie")] == ["ok", "bad"]
+    assert doctor._filesystem(Path("/proc")) != "tmpfs"
+    monkeypatch.setattr(doctor, "_filesystem", lambda _: "tmpfs")
+    assert [one.state for one in doctor.stop_checks("robbie")] == ["ok", "bad"]
     (tmp_path / "file").touch()
     monkeypatch.setenv(record.STATE_DIR, str(tmp_path / "file"))
-    assert "the robot starts stopped" in list(doctor_stop.check("robbie"))[1].text
+    assert "the robot starts stopped" in list(doctor.stop_checks("robbie"))[1].text
 
 
 def test_the_doctor_says_when_the_kernels_list_cannot_be_read(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stop_asking, "SOCKETS", "/nowhere/unix")
-    path, _ = doctor_stop.check("robbie")
+    path, _ = doctor.stop_checks("robbie")
     assert (path.state, "is /proc mounted?" in path.text) == ("bad", True)

@@ -61,7 +61,7 @@ def install(folder: Path) -> Path:
 
 @contextmanager
 def on_path(site: Path) -> Iterator[None]:
-    """What lies in a directory is installed, until the end of the context."""
+    """The distributions in a directory count as installed until the end of the context."""
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(site)
         forget_third_parties()

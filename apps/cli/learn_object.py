@@ -14,7 +14,7 @@ import msgspec
 
 from apps.appearance.learn import LearnedObject, ObjectHints, learn
 from apps.cli import exits
-from apps.cli.learn_sight import CameraView, of_picture, of_robot, preview
+from apps.cli.camera_view import CameraView, of_picture, of_robot, preview
 from apps.cli.options import RobotChoice
 from apps.cli.toml_files import save, text_of, with_object
 from apps.pictures import save_png
@@ -184,7 +184,7 @@ def size_of(text: str | None) -> tuple[float, ...] | None:
     return sizes
 
 
-def wanted_of(label: str, **options: Any) -> ObjectHints:
+def hints_of(label: str, **options: Any) -> ObjectHints:
     """Raises ConfigError for a label or a shape that cannot be."""
     if not re.fullmatch(r"[a-z][a-z0-9_-]{0,63}", label):
         raise ConfigError(f"{label!r} is no label: small letters, digits, '_' and '-', a letter first: orange_box")

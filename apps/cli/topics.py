@@ -38,12 +38,12 @@ def topics(
     as_page: Annotated[bool, typer.Option("--markdown", help="The whole page of the documentation.")] = False,
     json: JsonOption = False,
 ) -> None:
-    """What travels on the mesh: every key, its type, rate, quality of service and publisher."""
+    """List the topics and requests of all installed components: type, rate, age, quality of service, publisher."""
     print(markdown() if as_page else as_json() if json else table(), end="")
 
 
 def table() -> str:
-    """What is published and what can be asked on a robot with all that is installed here, as text."""
+    """The topics and requests of all installed components, as text."""
     topics = plain_table(HEADS, [_row(topic) for topic in all_topics()])
     request_heads = ("request", "question", "answer", "server", "time-out")
     return f"{topics}\n{plain_table(request_heads, [_request_row(request) for request in all_requests()])}"

@@ -13,7 +13,7 @@ from apps.learning.dataset import HandRow
 from apps.learning.lesson import sightings
 from cocoro.errors import ConfigError
 from cocoro.learning import model
-from cocoro.learning.nominal_model import NominalModel
+from cocoro.learning.handmap import NominalModel
 from cocoro.robot import Robot
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from typing import Any, Generic, Self
 
 from apps.learning.dataset import HandRow, SampleFile, SampleRow, WheelRow, hand_header, wheel_header
 from cocoro.errors import ConfigError
-from cocoro.learning.nominal_model import arm_joints
+from cocoro.learning.handmap import arm_joints
 from cocoro.messages import HandSample, Message, WheelTrial
 from cocoro.robot import Robot
 from cocoro.topics import HAND_SAMPLES, WHEEL_TRIALS, Topic

@@ -18,7 +18,7 @@ from typing import Generic, TypeVar
 import msgspec
 
 from cocoro.errors import ConfigError, RefusedError
-from cocoro.learning.nominal_model import fingerprint_of
+from cocoro.learning.handmap import fingerprint_of
 from cocoro.messages import FiniteVec2, FiniteVec3
 from cocoro.robot import Robot
 

@@ -17,10 +17,10 @@ from apps.learning.study import METHODS, Method, Score, Sightings
 from apps.learning.wheels import WheelFit, fit_wheels
 from cocoro.errors import ConfigError
 from cocoro.learning import model
-from cocoro.learning.camera_tilt import CameraTilt
+from cocoro.learning.handmap import NominalModel
 from cocoro.learning.model import BodyModel, Training, WheelModel
-from cocoro.learning.nominal_model import NominalModel
 from cocoro.robot import Robot
+from services.planning.head import CameraTilt
 
 LEAST_TRIALS = 4
 """Fewest trials that tell the camera's tilt."""

@@ -15,13 +15,17 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from apps.learning.outliers import inliers, plausible
-from apps.learning.rules import folds, learn_in_order
+from apps.learning.rules import folds, inliers, learn_in_order, plausible
 from cocoro.arrays import BoolArray, FloatArray, IntArray
-from cocoro.learning.fitting import LeastSquares
-from cocoro.learning.handmap import Coordinates, HandMap
-from cocoro.learning.network import PAPER_BASES, PAPER_RANGE_RAD, PAPER_RATE, PAPER_WIDTH_RAD, HyperplaneRbf
-from cocoro.learning.nominal_model import NominalModel
+from cocoro.learning.handmap import Coordinates, HandMap, NominalModel
+from cocoro.learning.network import (
+    PAPER_BASES,
+    PAPER_RANGE_RAD,
+    PAPER_RATE,
+    PAPER_WIDTH_RAD,
+    HyperplaneRbf,
+    LeastSquares,
+)
 
 PRIMING_SHARE = 0.1
 """Priming points count a tenth of a sighting, in rate or in weight."""
@@ -53,7 +57,7 @@ class Method:
 
     name: str
     rule: Literal["in order", "least squares"] = "least squares"
-    over_drawing: bool = True
+    over_nominal: bool = True
     """The network learns what the drawing leaves unexplained; else the whole map, primed by the drawing."""
     coordinates: Coordinates = "cartesian"
     bases: int = PAPER_BASES
@@ -67,11 +71,11 @@ class Method:
 
 BEST = Method("81 bases over the drawing, least squares")
 METHODS: tuple[Method, ...] = (
-    Method("the paper's rule, 81 bases", "in order", over_drawing=False),
-    Method("the paper's rule, spherical", "in order", over_drawing=False, coordinates="spherical"),
+    Method("the paper's rule, 81 bases", "in order", over_nominal=False),
+    Method("the paper's rule, spherical", "in order", over_nominal=False, coordinates="spherical"),
     Method("the paper's rule over the drawing", "in order"),
-    Method("81 bases, least squares", over_drawing=False),
-    Method("256 bases, least squares", over_drawing=False, bases=4, width_rad=1.05),
+    Method("81 bases, least squares", over_nominal=False),
+    Method("256 bases, least squares", over_nominal=False, bases=4, width_rad=1.05),
     BEST,
     Method("81 bases over the drawing, spherical", coordinates="spherical"),
     Method("16 bases over the drawing", bases=2, width_rad=2.5),
@@ -125,7 +129,7 @@ def begin(method: Method, drawing: NominalModel) -> tuple[HandMap, LeastSquares 
     learned, learner = _primed(method, drawing)
     network = learned.network.copy()
     return HandMap(
-        drawing, network, over_drawing=method.over_drawing, coordinates=method.coordinates
+        drawing, network, over_nominal=method.over_nominal, coordinates=method.coordinates
     ), None if learner is None else learner.copy(network)
 
 
@@ -134,9 +138,9 @@ def _primed(method: Method, drawing: NominalModel) -> tuple[HandMap, LeastSquare
     count = len(drawing.joints)
     ranges = np.tile([-PAPER_RANGE_RAD, PAPER_RANGE_RAD], (count, 1))
     network = HyperplaneRbf.spread([method.bases] * count, [method.width_rad] * count, ranges)
-    learned = HandMap(drawing, network, over_drawing=method.over_drawing, coordinates=method.coordinates)
+    learned = HandMap(drawing, network, over_nominal=method.over_nominal, coordinates=method.coordinates)
     learner = LeastSquares(network, method.doubt) if method.rule == "least squares" else None
-    if not method.over_drawing:
+    if not method.over_nominal:
         angles, places = drawing.priming()
         targets = learned.targets(angles, places)
         if learner is None:
@@ -193,7 +197,7 @@ def grid(rule: Literal["in order", "least squares"]) -> Sequence[Method]:
             if rule == "in order":
                 for rate in (0.025, 0.1, 0.3):
                     name = f"{bases**4} bases, sigma {width:g}, rate {rate:g}"
-                    found.append(Method(name, rule, over_drawing=False, bases=bases, width_rad=width, rate=rate))
+                    found.append(Method(name, rule, over_nominal=False, bases=bases, width_rad=width, rate=rate))
             else:
                 for doubt in (10.0, 100.0, 1000.0):
                     name = f"{bases**4} bases over the drawing, sigma {width:g}, doubt {doubt:g}"

@@ -18,8 +18,7 @@ from cocoro.keys import alive_key
 from cocoro.messages import Message, TopicHealth
 from cocoro.node import Node
 from cocoro.robot import Robot
-from cocoro.testing.declared import NotedBus
-from cocoro.testing.tap import Tap
+from cocoro.testing.mesh import NotedBus, Tap
 from cocoro.testing.virtual import settle
 from cocoro.topics import Request, Topic
 
@@ -29,7 +28,7 @@ R = TypeVar("R", bound=msgspec.Struct)
 
 
 class ServiceUnderTest:
-    """One component on a mesh of its own. Use it as an asynchronous context manager, in virtual time."""
+    """One component that runs on a mesh of its own. Use it as an asynchronous context manager, in virtual time."""
 
     def __init__(
         self,
@@ -60,13 +59,13 @@ class ServiceUnderTest:
             self._config = msgspec.convert(config or {}, implementation.config)
         self._clock = clock or VirtualClock()
         self.bus = NotedBus(self.mesh, self.robot.name)
-        """The service's own; `misdeclared(component, service.bus)` compares it with a declaration."""
+        """The bus of the service, for `misdeclared(component, service.bus)`."""
         self.node = Node(
             self.name, self.bus, self._clock, self.robot, record_steps=record_steps,
             module=module, config=self._config, latches=latches,
         )  # fmt: skip
         self.tester = Node("tester", self.mesh.join(), self._clock, self.robot)
-        """Another participant of the mesh, for what this class has no word for."""
+        """Another participant of the mesh, for everything that this class has no method for."""
         self.tap = Tap(self.mesh.join(), self.robot.name)
         self._others: dict[str, Handle] = {}
         self._work: asyncio.Future[None] | None = None
@@ -88,11 +87,11 @@ class ServiceUnderTest:
     # --- feeding ------------------------------------------------------------------------------------
 
     def feed(self, topic: Topic[M], message: M, stamp_ns: int | None = None) -> M:
-        """Publish to the service; stamped with now when neither the message nor `stamp_ns` says otherwise."""
+        """Publish to the service; stamped with `stamp_ns`, else with the message's own stamp, else with now."""
         return self.tester.publish(topic, message, stamp_ns)
 
     def feed_raw(self, topic: Topic[Any], payload: bytes) -> None:
-        """Publish bytes as they are: something malformed, say."""
+        """Publish bytes as they are, for example malformed ones."""
         self.mesh.publish(topic.key(self.robot.name), payload)
 
     async def ask(self, request: Request[Q, R], question: Q, timeout_s: float | None = None) -> R:
@@ -100,11 +99,11 @@ class ServiceUnderTest:
         return await self.tester.call(request, question, timeout_s)
 
     def serve(self, request: Request[Q, R], handler: Callable[[Q], Awaitable[R]]) -> None:
-        """Stand in for whoever answers the service's own requests."""
+        """Answer a request of the service."""
         self.tester.serve(request, handler)
 
     def others_live(self, *services: str) -> None:
-        """Have other services be alive."""
+        """Declare other services alive."""
         for service in services:
             self._others[service] = self.tester.bus.declare_alive(alive_key(self.robot.name, service))
 
@@ -114,7 +113,7 @@ class ServiceUnderTest:
     # --- time ---------------------------------------------------------------------------------------
 
     async def settle(self) -> None:
-        """Let the service take in what it was fed; no time passes. Raises what the service raised."""
+        """Let the service read its input; no time passes. Raises what the service raised."""
         await settle()
         self._check()
 
@@ -124,7 +123,7 @@ class ServiceUnderTest:
         await self.settle()
 
     async def until(self, content: Callable[[], object], timeout_s: float = 60.0) -> None:
-        """Let time pass until something holds; AssertionError when it does not come to be."""
+        """Let time pass until `content()` is true. Raises AssertionError when it is not after `timeout_s`."""
         end_ns = self.tester.now_ns() + round(timeout_s * NS)
         while not content():
             assert self.tester.now_ns() < end_ns, f"still not so after {timeout_s:g} s"
@@ -133,22 +132,22 @@ class ServiceUnderTest:
     # --- reading ------------------------------------------------------------------------------------
 
     def outputs(self, topic: Topic[M]) -> list[M]:
-        """All that was published on a topic, by the service and not by this test, since the start or `forget`."""
+        """All messages that the service published on a topic since the start, or since `forget`."""
         mine = self.tester.publisher(topic).incarnation
         return [message for message in self.tap.messages(topic) if message.incarnation != mine]
 
     def latest(self, topic: Topic[M]) -> M:
-        """The newest output; AssertionError when there is none."""
+        """The newest of `outputs`. Raises AssertionError when there is none."""
         outputs = self.outputs(topic)
         assert outputs, f"{self.name} has published nothing on {topic.name}"
         return outputs[-1]
 
     def forget(self) -> None:
-        """Read only what comes from now on."""
+        """Drop the outputs so far."""
         self.tap.forget()
 
     def received(self, topic: Topic[Any]) -> TopicHealth:
-        """How the service gets on with what arrives on a topic: counts of good, lost, skipped and rejected."""
+        """The service's counts of accepted, lost, skipped and rejected messages of a topic."""
         return self.node.inbox(topic).health(self.node.now_ns())
 
     @property
@@ -157,13 +156,13 @@ class ServiceUnderTest:
 
     @property
     def alive(self) -> bool:
-        """Whether its liveliness token is there."""
+        """Whether it has declared its liveliness."""
         return self.mesh.tokens[alive_key(self.robot.name, self.name)] > 0
 
     # --- ending -------------------------------------------------------------------------------------
 
     async def kill(self) -> None:
-        """End the service as SIGKILL would: at once, nothing said."""
+        """End the service as SIGKILL does."""
         self.bus.kill()
         await self._end()
 

@@ -1,4 +1,4 @@
-"""Tests that are coroutines, in virtual time."""
+"""Virtual time: tests that are coroutines, and a clock that jumps."""
 
 from __future__ import annotations
 
@@ -7,17 +7,18 @@ from collections.abc import Callable, Coroutine
 from functools import wraps
 from typing import Any, ParamSpec
 
+from cocoro.clock import NS, VirtualClock
 from cocoro.vloop import run_virtual
 
 P = ParamSpec("P")
 
 LIMIT_S = 3600.0
-"""Virtual seconds after which a test counts as stuck."""
+"""Virtual time after which a test counts as stuck, s."""
 _SETTLE_TURNS = 64
 
 
 def in_virtual_time(test: Callable[P, Coroutine[Any, Any, None]]) -> Callable[P, None]:
-    """A test that is a coroutine. Its sleeps and time-outs take no time; fixtures work as in any other test."""
+    """Decorator of a test that is a coroutine. Its sleeps and time-outs take no real time; fixtures work as usual."""
 
     @wraps(test)
     def run(*args: P.args, **kwargs: P.kwargs) -> None:
@@ -27,6 +28,39 @@ def in_virtual_time(test: Callable[P, Coroutine[Any, Any, None]]) -> Callable[P,
 
 
 async def settle() -> None:
-    """Let everything that can happen now happen; no time passes."""
+    """Run everything that is due now; no time passes."""
     for _ in range(_SETTLE_TURNS):
         await asyncio.sleep(0)
+
+
+class JumpingClock(VirtualClock):
+    """Follows the loop's virtual time, and can jump: back, as the clock of a restarted simulator, or ahead."""
+
+    def __init__(self) -> None:
+        self.epoch = 0
+        self._offset_ns = 0
+        self._jumped = asyncio.Event()
+
+    def now_ns(self) -> int:
+        return super().now_ns() + self._offset_ns
+
+    def jump_to(self, now_s: float) -> None:
+        """Set the clock, s. A jump back begins a new epoch; a jump ahead does not."""
+        now_ns = round(now_s * NS)
+        if now_ns < self.now_ns():
+            self.epoch += 1
+        self._offset_ns += now_ns - self.now_ns()
+        jumped, self._jumped = self._jumped, asyncio.Event()
+        jumped.set()
+
+    async def sleep_until(self, when_ns: int) -> bool:
+        epoch = self.epoch
+        await asyncio.sleep(0)
+        while (left_ns := when_ns - self.now_ns()) > 0 and self.epoch == epoch:
+            try:
+                async with asyncio.timeout(left_ns / NS):
+                    await self._jumped.wait()
+            except TimeoutError:
+                # The loop's time is a float: it may be a nanosecond short.
+                self._offset_ns += max(when_ns - self.now_ns(), 0)
+        return self.epoch == epoch

@@ -149,7 +149,7 @@ REPLY_S = 0.015
 
 SENTENCES = {
     errno.ENOENT: "there is no such port: is the adapter plugged in?",
-    errno.EACCES: "no permission: add the user to the group dialout, and log in anew",
+    errno.EACCES: "no permission: add the user to the group dialout, and log in again",
     errno.EAGAIN: "another program has it open",
     errno.EIO: "the adapter does not answer: is it plugged in?",
 }

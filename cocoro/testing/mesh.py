@@ -1,16 +1,60 @@
-"""Whether a component speaks as it declares: a bus that notes every topic and request that is used on it."""
+"""Observers of a mesh: all messages that travel, and what one component does on its bus."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from typing import Any
+from typing import Any, TypeVar, cast
 
-from cocoro.bus.base import Handle, OnBatch, OnSample, Qos, Reply, Server
+import msgspec
+
+from cocoro.bus.base import Handle, OnBatch, OnSample, Payload, Qos, Reply, Server
 from cocoro.bus.local import LocalBus, LocalMesh, LocalPublisher, LocalSubscription
 from cocoro.component import Component
+from cocoro.installed import topic_named
+from cocoro.keys import recorder_key
+from cocoro.messages import Message
 from cocoro.topics import ABOUT, CLOCK, EXCHANGES, HEALTH, STEPS, Request, Topic
 
+M = TypeVar("M", bound=Message)
+
 BY_EVERY_NODE = {row.name for row in (HEALTH, STEPS, EXCHANGES, ABOUT, CLOCK)}
+"""Topics and requests of the node itself, which components do not declare."""
+
+
+class Tap:
+    """Keeps all messages of one robot, in order for each topic, as they travel. It declares itself a recorder, because
+    a core whose steps are recorded waits for one."""
+
+    def __init__(self, bus: LocalBus, robot_name: str) -> None:
+        self._prefix = f"{robot_name}/"
+        self._payloads: dict[str, list[bytes]] = {}
+        self._decoded: dict[str, list[Message]] = {}
+        bus.subscribe(f"{robot_name}/**", Qos.EVENT, self._take, depth=1)
+        bus.declare_alive(recorder_key(robot_name, "tap"))
+
+    def _take(self, key: str, payload: Payload) -> None:
+        self._payloads.setdefault(key.removeprefix(self._prefix), []).append(bytes(payload))
+
+    def messages(self, topic: Topic[M]) -> list[M]:
+        """All messages of a topic so far. Raises msgspec.ValidationError for a message that is not valid."""
+        payloads, decoded = self._payloads.get(topic.name, []), self._decoded.setdefault(topic.name, [])
+        decoder = msgspec.msgpack.Decoder(topic.type)
+        decoded.extend(decoder.decode(payload) for payload in payloads[len(decoded) :])
+        return cast("list[M]", list(decoded))
+
+    def samples(self) -> dict[tuple[str, int, int], Message]:
+        """All messages by (topic, incarnation, sequence), as a StepRecord names them."""
+        topics: list[Topic[Any]] = [topic for topic in map(topic_named, self._payloads) if topic is not None]
+        return {
+            (topic.name, message.incarnation, message.seq): message
+            for topic in topics
+            for message in self.messages(topic)
+        }
+
+    def forget(self) -> None:
+        """Drop the messages so far."""
+        self._payloads.clear()
+        self._decoded.clear()
 
 
 class NotedBus(LocalBus):
