@@ -81,7 +81,7 @@ def test_a_directory_that_cannot_be_made_is_refused(directory: Path) -> None:
         ({"directory": Path("/run/caf\udce9")}, "must be UTF-8"),
         ({"directory": Path("/run/a"), "mode": "client"}, "without mode, listen and connect"),
         ({"directory": Path("/run/a"), "connect": ("tcp/127.0.0.1:1",)}, "without mode, listen and connect"),
-        ({}, "say a directory, or where to listen or connect"),
+        ({}, "give a directory, or endpoints to listen on or connect to"),
     ],
 )
 def test_a_configuration_that_cannot_be_is_refused(options: dict[str, Any], text: str) -> None:

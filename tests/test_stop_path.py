@@ -242,7 +242,7 @@ def test_what_fails_in_the_path_is_a_stop_that_nobody_is_told_was_heard_and_the_
     listen(point, halt, kept)
     assert [one.service for one in stop(robot, within_s=0.1).waiting] == ["base"]
     assert halted[1] == "the failure of its own path"
-    assert "the emergency stop's own path failed" in caplog.text
+    assert "the emergency stop's path failed" in caplog.text
     out_of_order = False
     assert not stop(robot).waiting, "it still hears"
     point.close()
