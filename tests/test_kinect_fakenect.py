@@ -22,15 +22,14 @@ from cocoro.topics import ARM_STATE, FRAME
 from services.kinect import doctor, tools
 from services.kinect.calibration import Board
 from services.kinect.camera import FreenectCamera
-from services.kinect.config import KinectConfig
-from services.kinect.device import RawFrame
+from services.kinect.device import KinectConfig, RawFrame
 from services.kinect.service import to_message
 from services.perception.config import PerceptionConfig
 from services.perception.core import PerceptionCore
 from sim.service import SimConfig
 from sim.wire.record import RATE_HZ, RecordingWriter, record
 
-pytestmark = pytest.mark.sim
+pytestmark = [pytest.mark.sim, pytest.mark.process]
 
 FRAMES = 12
 PATIENCE_S = 60.0

@@ -16,8 +16,7 @@ from cocoro.node import Node
 from cocoro.robot import Robot
 from cocoro.vloop import run_virtual
 from services.kinect import camera
-from services.kinect.config import KinectConfig
-from services.kinect.device import OnFault, RawFrame
+from services.kinect.device import KinectConfig, OnFault, RawFrame
 from services.kinect.freenect import LED
 from services.kinect.service import run
 
