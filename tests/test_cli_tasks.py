@@ -223,9 +223,7 @@ async def test_an_executive_that_is_lost_and_heard_again_says_the_outcome_itself
     executive.tell("end", 40.0, outcome="done")
     code, _ = await running
     assert code == exits.DONE
-    assert scene.out.getvalue().splitlines()[0] == (
-        "lost contact with executive: waiting for the executive"
-    )
+    assert scene.out.getvalue().splitlines()[0] == ("lost contact with executive: waiting for the executive")
 
 
 @with_claim
