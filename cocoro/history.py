@@ -102,6 +102,5 @@ class History:
         return self._stamps_ns[0] if self._stamps_ns else None
 
     def clear(self) -> None:
-        """Forget every sample."""
         self._stamps_ns.clear()
         self._values.clear()

@@ -360,6 +360,7 @@ def test_without_a_screen_one_line_says_what_to_do(
     assert len(err.splitlines()) == 1
 
 
+@pytest.mark.process
 def test_rerun_itself_takes_it(tmp_path: Path) -> None:
     pytest.importorskip("rerun", reason="Rerun is an extra, and not installed here")
     assert main(["export", str(GOLDEN), "--rrd", str(tmp_path / "out.rrd")]) == 0

@@ -77,6 +77,7 @@ with SampleFile(Path(sys.argv[1]), HandRow, robot, hand_header(robot, NominalMod
 """
 
 
+@pytest.mark.process
 def test_killed_in_the_middle_nothing_that_was_appended_is_lost(tmp_path: Path, robot: Robot) -> None:
     path = tmp_path / "arm.jsonl"
     command = [sys.executable, "-c", KILLED, str(path)]
