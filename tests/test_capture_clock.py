@@ -1,4 +1,4 @@
-"""Log times while somebody sets the wall clock, and while the machine sleeps."""
+"""Log times when the wall clock is set, and when the machine sleeps."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ HOUR_NS = 3600 * NS
 
 
 class Machine:
-    """Its two clocks. Each reading takes a moment, as on a machine."""
+    """A machine's two clocks. Each reading takes time, as on a real machine."""
 
     def __init__(self) -> None:
         self.steady_ns = 77 * NS

@@ -1,4 +1,4 @@
-"""Files that somebody moves or removes while they are being recorded."""
+"""Files that are moved or removed while they are recorded."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from services.capture.writer import KEPT_DISTURBED, LOOK_S, CaptureWriter, Limit
 
 
 class Watch:
-    """Time as a writer sees it."""
+    """The writer's clock."""
 
     def __init__(self) -> None:
         self.now_s = 100.0
@@ -29,7 +29,7 @@ class Watch:
 
 
 class Disturbed:
-    """A writer, and its file's fate."""
+    """A writer and its file."""
 
     def __init__(self, folder: Path, limits: Limits | None = None) -> None:
         self.watch = Watch()
@@ -43,7 +43,7 @@ class Disturbed:
             self.number += 1
 
     def flush(self) -> None:
-        """As it does ten times a second; long after the last look."""
+        """One of ten flushes a second, long after the last check."""
         self.watch.now_s += LOOK_S
         self.writer.flush()
 
@@ -52,7 +52,7 @@ class Disturbed:
 
 
 def only(folder: Path) -> Path:
-    """The one capture that is there."""
+    """The only capture in the folder."""
     (path,) = folder.glob("*.mcap")
     return path
 

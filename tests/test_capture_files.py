@@ -1,4 +1,4 @@
-"""The files that a recorder writes: what is in them, when a new one begins, and what is left when the disk refuses."""
+"""The files that a recorder writes: their contents, when a new one begins, and what remains when the disk refuses."""
 
 from __future__ import annotations
 
@@ -184,7 +184,7 @@ def test_the_oldest_captures_make_room_and_nothing_else_does(tmp_path: Path) -> 
 
 
 class Disk:
-    """Stands in for a disk of so many bytes: the write that does not fit is done in part, as a real one does it."""
+    """A disk with room for so many bytes. A write that does not fit is done in part, as on a real disk."""
 
     def __init__(self, room: int) -> None:
         self.room = room
@@ -282,7 +282,7 @@ def test_info_counts_rates_gaps_and_losses(tmp_path: Path) -> None:
 
 
 class Older(msgspec.Struct, kw_only=True):
-    """A BaseState of another time: it lacks fields, and has one that is no more."""
+    """A BaseState of an earlier version: it lacks some of today's fields and has one that is gone."""
 
     stamp_ns: int = 0
     seq: int = 0
