@@ -131,7 +131,7 @@ def test_what_is_known_is_only_replaced_or_added_to_when_that_is_said(
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
-        (["Cup", "--from", "photo.png"], "is no label"),
+        (["Cup", "--from", "photo.png"], "is not a label"),
         (["cup", "--from", "nowhere.png"], "there is no picture nowhere.png"),
         (["cup", "--from", "words.png"], "is no picture that can be read"),
         (["cup", "--from", "photo.png"], "give --size"),
@@ -140,7 +140,7 @@ def test_what_is_known_is_only_replaced_or_added_to_when_that_is_said(
         (["cup", "--from", "photo.png", "--size", "0x1"], "write it in metres"),
         (["cup", "--from", "photo.png", "--at", "middle"], "write it as U,V"),
         (["cup", "--from", "photo.png", "--box", "1,2,3"], "LEFT,TOP,RIGHT,BOTTOM"),
-        (["cup", "--from", "photo.png", "--at", "1,2", "--box", "1,2,3,4"], "say one of them"),
+        (["cup", "--from", "photo.png", "--at", "1,2", "--box", "1,2,3,4"], "not both"),
         (["cup", "--from", "photo.png", "--shape", "cone"], "cylinder, sphere or box"),
         (["cup", "--from", "photo.png", "--picture", "cup.jpg"], "name must end with .png"),
         (["cup", "--from", "photo.png", "--size", "0.1", "--catalogue", "words.png"], "words.png"),

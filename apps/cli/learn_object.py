@@ -1,4 +1,4 @@
-"""`cocoro objects learn LABEL`: a new object from a picture or from what the robot sees, shown before it is kept."""
+"""`cocoro objects learn LABEL`: learn an object from a picture or the robot's camera, and show it before it is saved."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from cocoro.robot import Robot
 
 LIVE = "live"
 FILE = "objects.toml"
-"""Where the user's catalogue goes unless it is said, or the robot that is up names one."""
+"""Default file of the user's catalogue, unless the running robot names one."""
 
 
 @dataclass(frozen=True)
 class SaveOptions:
-    """What is to become of what was learnt."""
+    """Where and how the result is saved."""
 
     catalogue: Path | None
     picture: Path | None
@@ -42,7 +42,7 @@ class SaveOptions:
 async def learn_object(
     where: RobotChoice, source: str, wanted: ObjectHints, keeping: SaveOptions, robot: Robot | None = None
 ) -> int:
-    """Learn a look of an object and keep it. `robot`: whose camera took a picture file; None is the Calliope.
+    """Learn an object from one view, show it, and save it. `robot`: the robot whose camera took a picture file.
 
     Raises ConfigError for what cannot be, MeshError when the view is to be live and there is no robot.
     """
@@ -67,13 +67,13 @@ async def learn_object(
         return exits.DONE
     saved = save(path, learnt.known)
     if not keeping.as_json:
-        print(f"saved in {path}, which has {len(saved)} objects now; {_how_to_use(path, sight.catalogue)}")
+        print(f"saved in {path}, which now has {len(saved)} objects; {_how_to_use(path, sight.catalogue)}")
     return exits.DONE
 
 
 def _confirmed(path: Path) -> bool:
     if not sys.stdin.isatty():
-        print("nothing is saved: look at the picture, then say it again with --yes")
+        print("nothing is saved: look at the picture, then repeat the command with --yes")
         return False
     answer = input(f"save it in {path}? [y/N] ").strip().lower()
     return answer in ("y", "yes")
@@ -81,22 +81,22 @@ def _confirmed(path: Path) -> bool:
 
 def _how_to_use(path: Path, used: Path | None) -> str:
     if used is not None and used.resolve() == path.resolve():
-        return "the robot that is up knows it after `cocoro down` and `cocoro up` again"
-    return f"a robot knows it that is started with `cocoro up sim --objects {path}`"
+        return "the running robot uses it after `cocoro down` and `cocoro up`"
+    return f"robots use it that are started with `cocoro up sim --objects {path}`"
 
 
 def _both(before: ObjectSpec, now: ObjectSpec) -> ObjectSpec:
-    """The old row with the new look's colours added to its own."""
+    """The old row with the colours of the new view added."""
     lab = tuple(dict.fromkeys((*before.lab, *now.lab)))
     shared = tuple(dict.fromkeys((*before.lab_by_shape, *now.lab_by_shape)))
     return msgspec.structs.replace(before, lab=lab, lab_by_shape=shared)
 
 
-# --- what it looks like ---------------------------------------------------------------------------
+# --- report ---------------------------------------------------------------------------------------
 
 
 def _show(sight: CameraView, learnt: LearnedObject, path: Path, picture: Path) -> list[str]:
-    """Write the picture; what the robot would say that it sees, with the new object in its catalogue."""
+    """Write the picture. Returns the detections in words of a perception that knows the new object."""
     with tempfile.TemporaryDirectory() as folder:
         draft = Path(folder) / "objects.toml"
         with naming(draft):
@@ -110,7 +110,7 @@ def _text(learnt: LearnedObject, seen: list[str], picture: Path) -> str:
     known, region = learnt.known, learnt.region
     sizes = " x ".join(f"{100 * side:.1f}" for side in known.size_m)
     measured = learnt.measured
-    how = "as you say" if measured is None else f"measured at {measured.distance_m:.2f} m"
+    how = "as given" if measured is None else f"measured at {measured.distance_m:.2f} m"
     red, green, blue = (round(255 * channel) for channel in known.rgb)
     lines = [
         f"{known.label}: {known.shape}, {sizes} cm ({how}), {1000 * known.mass_kg:.0f} g, "
@@ -119,7 +119,7 @@ def _text(learnt: LearnedObject, seen: list[str], picture: Path) -> str:
         f"  colour      rgb {red} {green} {blue}, chromaticity {learnt.range.chromaticity:.0f}, "
         f"{len(known.lab)} boxes in CIELAB{_shared(known)}",
         f"  matched     {learnt.matched_share:.0%} of the region's pixels, {learnt.elsewhere} other places",
-        f"  the robot   {', '.join(seen) if seen else 'would see nothing known here'}",
+        f"  the robot   {', '.join(seen) if seen else 'detects no known object'}",
         *(f"  beware      {warning}" for warning in learnt.warnings),
         f"  picture     {picture}",
     ]
@@ -127,7 +127,7 @@ def _text(learnt: LearnedObject, seen: list[str], picture: Path) -> str:
 
 
 def _shared(known: ObjectSpec) -> str:
-    return f", {len(known.lab_by_shape)} more that it shares" if known.lab_by_shape else ""
+    return f", {len(known.lab_by_shape)} more that other objects share" if known.lab_by_shape else ""
 
 
 def _report(learnt: LearnedObject, seen: list[str], picture: Path, path: Path, *, saved: bool) -> dict[str, Any]:
@@ -147,11 +147,11 @@ def _report(learnt: LearnedObject, seen: list[str], picture: Path, path: Path, *
     }
 
 
-# --- options that have a form of their own --------------------------------------------------------
+# --- values of options ---------------------------------------------------------------------------
 
 
 def pixel_of(text: str | None) -> tuple[int, int] | None:
-    """'320,240'."""
+    """Reads '320,240': (u, v), pixels. Raises ConfigError."""
     if text is None:
         return None
     if not re.fullmatch(r"\d+,\d+", text):
@@ -161,7 +161,7 @@ def pixel_of(text: str | None) -> tuple[int, int] | None:
 
 
 def box_of(text: str | None) -> tuple[int, int, int, int] | None:
-    """'300,200,360,320'."""
+    """Reads '300,200,360,320': (left, top, right, bottom), pixels. Raises ConfigError."""
     if text is None:
         return None
     if not re.fullmatch(r"\d+,\d+,\d+,\d+", text):
@@ -171,7 +171,7 @@ def box_of(text: str | None) -> tuple[int, int, int, int] | None:
 
 
 def size_of(text: str | None) -> tuple[float, ...] | None:
-    """'0.066x0.12', one to three numbers."""
+    """Reads '0.066x0.12', one to three lengths in metres. Raises ConfigError."""
     if text is None:
         return None
     if not re.fullmatch(r"\d*\.?\d+(x\d*\.?\d+){0,2}", text) or not all(sizes := tuple(map(float, text.split("x")))):
@@ -180,16 +180,18 @@ def size_of(text: str | None) -> tuple[float, ...] | None:
             "(a box)"
         )
     if max(sizes) > 2.0:
-        raise ConfigError(f"--size {text}: it is in metres, and nothing that large is an object to a robot")
+        raise ConfigError(f"--size {text}: it is in metres; objects are at most 2 m large")
     return sizes
 
 
 def hints_of(label: str, **options: Any) -> ObjectHints:
-    """Raises ConfigError for a label or a shape that cannot be."""
+    """Raises ConfigError for an impossible label or shape."""
     if not re.fullmatch(r"[a-z][a-z0-9_-]{0,63}", label):
-        raise ConfigError(f"{label!r} is no label: small letters, digits, '_' and '-', a letter first: orange_box")
+        raise ConfigError(
+            f"{label!r} is not a label: use small letters, digits, '_' and '-', a letter first: orange_box"
+        )
     if options["shape"] not in (None, "cylinder", "sphere", "box"):
-        raise ConfigError(f"--shape {options['shape']}: it is cylinder, sphere or box")
+        raise ConfigError(f"--shape {options['shape']}: known are cylinder, sphere and box")
     if options["at_px"] is not None and options["box_px"] is not None:
-        raise ConfigError("--at and --box: say one of them")
+        raise ConfigError("give --at or --box, not both")
     return ObjectHints(label=label, **options)
