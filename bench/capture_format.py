@@ -40,7 +40,7 @@ from cocoro.clock import NS
 from services.capture import file
 from services.capture.file import QUICK, Packer
 from services.capture.keys import QueuedMessage, info_of
-from services.capture.writer import CaptureWriter, Limits
+from services.capture.writer import CaptureWriter, FileLimits
 from services.executive.tasks import FetchTask
 
 SMALL_BYTES = 64 * 1024
@@ -63,7 +63,7 @@ def recorded(folder: Path, sensors: Literal["ideal", "real"], seconds: float) ->
 
 def write_here(made: list[QueuedMessage], out: Path) -> None:
     writer = CaptureWriter(
-        lambda _: out, Packer("zstd"), Limits(), lambda key, payload: info_of(key, "calliope", payload)
+        lambda _: out, Packer("zstd"), FileLimits(), lambda key, payload: info_of(key, "calliope", payload)
     )
     due_ns = made[0].log_ns
     for one in made:
@@ -111,7 +111,9 @@ def in_turn(times: int, **ways: Callable[[], object]) -> dict[str, float]:
 
 def peak_of_a_frame(folder: Path, frame: QueuedMessage) -> float:
     """Memory that writing one frame takes at the peak besides the frame, MB."""
-    writer = CaptureWriter(lambda _: folder / "peak.mcap", Packer("zstd"), Limits(), lambda *_: info_of(*_of(frame)))
+    writer = CaptureWriter(
+        lambda _: folder / "peak.mcap", Packer("zstd"), FileLimits(), lambda *_: info_of(*_of(frame))
+    )
     writer.put(frame)
     tracemalloc.start()
     writer.put(frame._replace(log_ns=frame.log_ns + 1))

@@ -21,12 +21,12 @@ from deploy.delayed import DelayedNode
 from deploy.processes import named
 from services.capture.file import Compression, Packer
 from services.capture.keys import KeyInfo, QueuedMessage, info_of
-from services.capture.writer import CaptureWriter, Limits
+from services.capture.writer import CaptureWriter, FileLimits
 
 ROBOT = Robot.load()
 STILL: dict[str, Any] = {"odometry_yaw_rad": 0.0, "speed_mps": 0.0, "turn_rate_radps": 0.0}
 
-FOR_EVER = Limits()
+FOR_EVER = FileLimits()
 
 Scenario = Callable[["Room"], Awaitable[None]]
 
@@ -81,7 +81,9 @@ def frame(number: int, width: int = 16, height: int = 12) -> Frame:
     return Frame(width=width, height=height, colour=memoryview(shade), depth=memoryview(shade[: 2 * width * height]))
 
 
-def writer(folder: Path, limits: Limits = FOR_EVER, compression: Compression = "zstd", **options: Any) -> CaptureWriter:
+def writer(
+    folder: Path, limits: FileLimits = FOR_EVER, compression: Compression = "zstd", **options: Any
+) -> CaptureWriter:
     """Writes one-1.mcap, one-2.mcap and so on."""
 
     def info(key: str, payload: bytes) -> KeyInfo:

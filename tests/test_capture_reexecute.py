@@ -28,7 +28,7 @@ from cocoro.core import Core, Output, Sample, Schedule, Take
 from cocoro.messages import Detections, PlannerStatus
 from services.capture.file import Packer
 from services.capture.keys import QueuedMessage, lossy
-from services.capture.writer import CaptureWriter, Limits
+from services.capture.writer import CaptureWriter, FileLimits
 from services.perception import service as perception
 from services.planning import service as planning
 from services.planning.config import PlanningConfig
@@ -178,7 +178,7 @@ def test_lossy_frames_are_no_inputs(tmp_path: Path) -> None:
     path = tmp_path / "lossy.mcap"
     with Capture.open(GOLDEN) as capture:
         infos = {key: info_in(capture, capture.keys[key][0]) for key in capture.keys}
-        out = CaptureWriter(lambda _: path, Packer("lz4"), Limits(), lambda key, _: infos[key], prepare=lossy(80))
+        out = CaptureWriter(lambda _: path, Packer("lz4"), FileLimits(), lambda key, _: infos[key], prepare=lossy(80))
         for name, entries in capture.metadata.items():
             out.remember(name, entries)
         for each in capture.messages():
@@ -194,7 +194,7 @@ def test_a_repeated_message_does_not_take_the_place_of_the_one_that_was_consumed
     path = tmp_path / "repeated.mcap"
     with Capture.open(GOLDEN) as capture:
         infos = {key: info_in(capture, capture.keys[key][0]) for key in capture.keys}
-        out = CaptureWriter(lambda _: path, Packer("lz4"), Limits(), lambda key, _: infos[key])
+        out = CaptureWriter(lambda _: path, Packer("lz4"), FileLimits(), lambda key, _: infos[key])
         for name, entries in capture.metadata.items():
             out.remember(name, entries)
         for each in capture.messages():
@@ -232,7 +232,7 @@ def of_an_older_version(out: Path, change: Callable[[dict[str, Any]], None] = la
         infos["calliope/planning/status"] = infos["calliope/planning/status"]._replace(
             schema=schema._replace(data=json.dumps(then).encode())
         )
-        written = CaptureWriter(lambda _: out, Packer("lz4"), Limits(), lambda key, _: infos[key])
+        written = CaptureWriter(lambda _: out, Packer("lz4"), FileLimits(), lambda key, _: infos[key])
         for name, entries in capture.metadata.items():
             written.remember(name, entries)
         for each in capture.messages():
@@ -288,7 +288,7 @@ def started_otherwise(out: Path, change: Callable[[dict[str, Any]], object]) -> 
     """The golden capture as if the planner had had other settings."""
     with Capture.open(GOLDEN) as capture:
         infos = {key: info_in(capture, capture.keys[key][0]) for key in capture.keys}
-        written = CaptureWriter(lambda _: out, Packer("lz4"), Limits(), lambda key, _: infos[key])
+        written = CaptureWriter(lambda _: out, Packer("lz4"), FileLimits(), lambda key, _: infos[key])
         for name, entries in capture.metadata.items():
             if name == "service/planning":
                 config = json.loads(entries["config"])

@@ -22,7 +22,7 @@ from apps.captures.rewrite import rewrite
 from cocoro.capture.mcap import MAGIC, PREFIX
 from cocoro.capture.reader import Capture
 from services.capture.file import CaptureFile, Packer
-from services.capture.writer import Limits, sync_and_close
+from services.capture.writer import FileLimits, sync_and_close
 
 CHUNK_CRC = PREFIX.size + 24
 """Offset of the checksum, 4 bytes, in a chunk record."""
@@ -301,7 +301,7 @@ def test_no_file_of_a_recorder_is_called_damaged(packed: bytes, tmp_path: Path) 
     with Capture.open(path) as capture:
         assert rewrite(capture, again, Packer("lz4")).problems == ()
     assert problems(again, again.read_bytes(), check=True) == []
-    limits = Limits(file_s=0.05)
+    limits = FileLimits(file_s=0.05)
     written = writer(tmp_path, limits)
     for n in range(40):
         written.put(entry("base/state", n))
