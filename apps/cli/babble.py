@@ -86,7 +86,7 @@ class BabbleDisplay:
         self._view.say(text)
 
     def result(self, text: str) -> None:
-        self._view.result(f"{text}; {self._kept.said}")
+        self._view.result(f"{text}; {self._kept.summary}")
 
     def close(self) -> None:
         self._view.close()
@@ -96,7 +96,7 @@ class BabbleDisplay:
         full = round(BAR * min(count / self._wanted, 1.0))
         new = count - self._had
         left = f", {_time((self._wanted - count) * elapsed_s / new)} left" if new else ""
-        return f"[{'#' * full}{'.' * (BAR - full)}] {count} of {self._wanted}: {self._kept.said}{left}"
+        return f"[{'#' * full}{'.' * (BAR - full)}] {count} of {self._wanted}: {self._kept.summary}{left}"
 
 
 class SampleWriter:
@@ -132,7 +132,7 @@ async def collect(
                 shown.result(f"{file} holds {len(kept)} already, which is enough")
                 return 0
             if len(kept):
-                shown.say(f"continuing {file}: {kept.said}")
+                shown.say(f"continuing {file}: {kept.summary}")
             samples: Any = link.inbox(task.samples)  # before the request, so that no sample is missed
             task = replace(task, first=kept.next, count=wanted - len(kept))
             follower = Follower(link, TaskRequest(task=task), shown, None)
