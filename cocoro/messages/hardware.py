@@ -95,9 +95,9 @@ class ServoState(Message):
 
 
 class ServoCommand(Message):
-    """Goals for the named joints of one network; the other joints keep their goals. A command is valid for the network's
-    `command_timeout_s`. Then an arm or neck joint that still moves holds its position; the hand keeps its goal, so that
-    it does not drop an object."""
+    """Goals for the named joints of one network; the other joints keep their goals. A command is valid for the
+    network's `command_timeout_s`. Then an arm or neck joint that still moves holds its position; the hand keeps its
+    goal, so that it does not drop an object."""
 
     joints: tuple[str, ...]
     goal_rad: tuple[Finite, ...]
