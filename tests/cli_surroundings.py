@@ -75,7 +75,7 @@ COMMANDS = dict(found for name, command in LOADED.items() for found in commands(
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What is wrong around a command."""
+    """Faults of a command's environment."""
 
     what: dict[str, Any] = field(default_factory=dict)
     """Fields of a Case; in `env` and `mounts` {root} is a folder of the test's own."""
@@ -135,7 +135,7 @@ SURROUNDINGS: dict[str, Surroundings] = {
     "a run directory too long for a file": Surroundings({"env": {"COCORO_RUN_DIR": "{root}/" + "x" * 300}}, same=False),
     "no /proc": Surroundings({"mounts": [("/proc", "size=64k")]}, lines=2),
 }
-"""What is independent of each other is tried at once."""
+"""Each row combines faults that do not depend on one another."""
 
 NEVER_SAID = (
     "Traceback", "Exception ignored", "internal error", "excepthook", "WARN", "Fatal", "Error in", "Aborted",
@@ -195,7 +195,7 @@ class Table:
 
 
 def wrong(ending: Ending, usual: Ending, surroundings: Surroundings) -> list[str]:
-    """What is not as it must be."""
+    """The requirements that the ending of a command misses."""
     found = []
     said = ending.out + ending.err
     lines = [line for line in ending.err.splitlines() if line.startswith("cocoro: ")]

@@ -28,7 +28,7 @@ class CommandRow(NamedTuple):
 COMMANDS = (
     CommandRow("cancel", TASKS, "End the running task; the robot stands still."),
     CommandRow("rehearse", TASKS, "Try a task in simulation: the whole robot in one process, in virtual time."),
-    CommandRow("status", WATCH, "What runs, its health, what the robot does and why."),
+    CommandRow("status", WATCH, "The running services, their health, the task and the planner's reason."),
     CommandRow("objects", WATCH, "The objects that the robot knows, and where it saw each last; `learn` adds one."),
     CommandRow("snapshot", WATCH, "Write a picture of what the robot sees now, with its detections drawn in."),
     CommandRow(
@@ -48,7 +48,7 @@ COMMANDS = (
     CommandRow(
         "top",
         TOOLS,
-        "What runs and what travels, live: cpu, memory, rates against nominal, ages, what was skipped, lost, rejected.",
+        "Services and topics, live: cpu, memory, rates against nominal, ages, and what was skipped, lost or rejected.",
     ),
     CommandRow(
         "echo",
@@ -56,7 +56,7 @@ COMMANDS = (
         "The messages of a key, decoded, of any type; a message that a reader would reject is marked with the reason.",
     ),
     CommandRow("hz", TOOLS, "Rate, jitter and amount of data on a key, as it arrives here, over the last seconds."),
-    CommandRow("logs", TOOLS, "What the robot's processes on this machine wrote since their start, merged by time."),
+    CommandRow("logs", TOOLS, "Logs of the robot's processes on this machine since their start, merged by time."),
     CommandRow("new", TOOLS, "Write a component from a template: `cocoro new service NAME`."),
     CommandRow(
         "base", HARDWARE, "Show the base: mode, battery, bumpers, odometry; `recover` puts it back into its mode."
@@ -83,7 +83,7 @@ COMMANDS = (
     CommandRow("down", RUNNING, "Stop a robot's processes."),
     CommandRow("run", RUNNING, "Run one process in this terminal, on the mesh of the profile."),
     CommandRow("estop", SAFETY, "Emergency stop, now: everything that moves stands still until `reset`."),
-    CommandRow("stop", SAFETY, "The same as estop.", hidden=True),
+    CommandRow("stop", SAFETY, "Short for estop.", hidden=True),
     CommandRow("reset", SAFETY, "Release the emergency stop."),
 )
 
