@@ -34,7 +34,7 @@ class DepthCoder:
         self._top_m = np.float32(last / STEPS_PER_M)
 
     def codes(self, depth_m: Float32Array) -> CodeArray:
-        """Codes of the same shape; 2047 for depths out of range, infinity and negative metres."""
+        """Codes (height, width) of depths, m; 2047 for depths out of range, infinity and negative metres."""
         steps = np.clip(depth_m, np.float32(0), self._top_m)
         steps *= np.float32(STEPS_PER_M)
         steps += np.float32(0.5)
@@ -55,7 +55,7 @@ class DepthNoise:
         self._bank = np.float32(sigma_per_m) * rng.standard_normal(self._size + NOISE_OFFSETS, dtype=np.float32)
 
     def add(self, depth_m: Float32Array, rng: np.random.Generator) -> Float32Array:
-        """Add sigma z^2 times a normal draw to each pixel (m); negative metres (no light there) become 0."""
+        """Add sigma z^2 times a normal draw to each pixel (height, width), m; negative metres (no light) become 0."""
         start = int(rng.integers(NOISE_OFFSETS))
         noise = self._bank[start : start + self._size].reshape(self._shape)
         z = np.clip(depth_m, np.float32(0), np.float32(10))  # 10 m is out of range; infinity has no square
@@ -73,6 +73,7 @@ class ByteNoise:
         self._less = np.maximum(-bank, 0).astype(np.uint8)
 
     def add(self, image: ImageArray, rng: np.random.Generator) -> ImageArray:
+        """Add noise to a picture (height, width, 3)."""
         start = int(rng.integers(NOISE_OFFSETS))
         more = self._more[start : start + self._size].reshape(image.shape)
         less = self._less[start : start + self._size].reshape(image.shape)
@@ -122,7 +123,9 @@ def motion_between(before: FloatArray, now: FloatArray, exposures: float) -> Cam
 
 
 def blur_along_motion(image: ImageArray, motion: CameraMotion, depth_m: Float32Array, camera: Camera) -> ImageArray:
-    """Blur a picture by averaging it over the exposure along each pixel's path.
+    """Blur a picture (height, width, 3) by averaging it over the exposure along each pixel's path.
+
+    `depth_m`: depth picture (height, width), m; negative and infinite values are allowed.
 
     The path is that of a plane facing the camera at the picture's median depth. That is exact for the camera's
     rotation, which makes nearly all of the blur, and good for its translation where things are near that depth. Objects
@@ -149,8 +152,8 @@ def blur_along_motion(image: ImageArray, motion: CameraMotion, depth_m: Float32A
 
 
 def drop_edges(codes: CodeArray, rng: np.random.Generator) -> CodeArray:
-    """Remove the data of 2 percent of the pixels at depth edges (next to a much nearer or farther pixel, or to one
-    without data). Changes and returns its argument."""
+    """Remove the data of 2 percent of the pixels (height, width) at depth edges (next to a much nearer or farther
+    pixel, or to one without data). Changes and returns its argument."""
     spread = cv2.morphologyEx(codes, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8))
     edges = np.flatnonzero(spread > EDGE_CODES)
     codes.reshape(-1)[edges[rng.random(edges.size) < EDGE_LOSS]] = NO_DATA
@@ -158,7 +161,7 @@ def drop_edges(codes: CodeArray, rng: np.random.Generator) -> CodeArray:
 
 
 def scale_channels(image: ImageArray, gains: FloatArray) -> ImageArray:
-    """Multiply each channel by its gain (3,); rounds and saturates."""
+    """Multiply each channel of a picture (height, width, 3) by its gain (3,); rounds and saturates."""
     return _bytes(cv2.transform(image, np.diag(gains)))
 
 

@@ -1,4 +1,4 @@
-"""The arm's true shape, finer than the planner's own: points all over the surfaces of the simulated body's parts."""
+"""The arm's true shape, finer than the planner's hull: points on the surfaces of the simulated body's parts."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class ArmShape:
         self._low, self._high = np.array(robot.kinect.mount_min_m), np.array(robot.kinect.mount_max_m)
 
     def points(self, angles_rad: Mapping[str, float]) -> FloatArray:
-        """Where they are in the body frame, (n, 3)."""
+        """Positions of the points in the body frame, (n, 3), m."""
         placed = []
         for link, points in self._points.items():
             pose = self._chains[link].pose(angles_rad)
@@ -30,7 +30,7 @@ class ArmShape:
         return np.vstack(placed)
 
     def depth_in_mount_m(self, angles_rad: Mapping[str, float]) -> float:
-        """How deep the deepest point is inside of the camera's mount; 0 outside."""
+        """Depth of the deepest point inside the camera's mount, m; 0 when all are outside."""
         points = self.points(angles_rad)
         inside = np.minimum(points - self._low, self._high - points).min(axis=1)
         return float(max(inside.max(), 0.0))

@@ -1,4 +1,4 @@
-"""Chessboards as a Kinect with given lenses sees them: drawn by tracing rays, so that every parameter is known."""
+"""Images of chessboards by a Kinect with given lenses, drawn by ray tracing, so that every parameter is known."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from services.kinect.lens import Lens
 WALL_M = 3.2
 WIDTH, HEIGHT = 640, 480
 FINE = 2
-"""Rays across a pixel of colour."""
+"""Rays across a colour pixel."""
 
 
 @dataclass(frozen=True)
 class Eyes:
-    """A Kinect's true figures."""
+    """The true parameters of a Kinect."""
 
     colour: LensValues
     depth: LensValues
@@ -39,7 +39,7 @@ class Eyes:
 
 
 def lying(turn_rad: Vec3, middle_m: Vec3, board: Board) -> tuple[FloatArray, FloatArray]:
-    """Rotation and place of a board whose middle is there."""
+    """Rotation and place of a board with this centre."""
     rotation = np.asarray(cv2.Rodrigues(np.array(turn_rad))[0], float)
     half = np.array([board.columns - 1, board.rows - 1, 0.0]) * board.square_m / 2
     return rotation, np.array(middle_m) - rotation @ half
@@ -53,7 +53,7 @@ class Painter:
         self._depth_rays = Lens(eyes.depth).rays(_grid(1)) @ eyes.turn.T
 
     def colour(self, rotation: FloatArray, place: FloatArray) -> ImageArray:
-        """With a little noise."""
+        """The colour image, with a little noise."""
         squares, _ = self._meet(self._colour_rays, np.zeros(3), rotation, place)
         inside = self._inside(squares)
         dark = (np.floor(squares).astype(int).sum(axis=1) % 2 == 0) & inside
@@ -64,7 +64,7 @@ class Painter:
         return picture
 
     def depth(self, rotation: FloatArray, place: FloatArray) -> CodeArray:
-        """Of the board before a wall, with a code's noise, as the depth camera sees it."""
+        """The depth image of the board in front of a wall, with noise of one code."""
         eyes = self._eyes
         squares, away = self._meet(self._depth_rays, np.array(eyes.place_m), rotation, place)
         wall = (WALL_M - eyes.place_m[2]) / self._depth_rays[:, 2]
@@ -75,7 +75,8 @@ class Painter:
     def _meet(
         self, rays: FloatArray, start: FloatArray, rotation: FloatArray, place: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Where rays meet the board's plane, in squares from its first corner, and how far along them."""
+        """Intersections of rays with the board's plane, in squares from its first corner, and their distances along the
+        rays."""
         normal = rotation[:, 2]
         away = normal @ (place - start) / (rays @ normal)
         points = (start + rays * away[:, None] - place) @ rotation
@@ -87,6 +88,6 @@ class Painter:
 
 
 def _grid(fine: int) -> FloatArray:
-    """The middles of the pixels' parts, row by row: (n, 2)."""
+    """Centres of the pixels' parts, row by row: (n, 2)."""
     v, u = np.mgrid[0 : HEIGHT * fine, 0 : WIDTH * fine]
     return (np.column_stack([u.ravel(), v.ravel()]) + 0.5) / fine - 0.5

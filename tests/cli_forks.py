@@ -34,11 +34,11 @@ from cocoro.errors import CocoroError
 PATIENCE_S = 60.0
 """Far more than any of the commands takes, on however busy a machine: it hangs."""
 NEW_MOUNTS, PRIVATE, RECURSIVE, READ_ONLY = 0x20000, 1 << 18, 1 << 14, 1
-"""Of unshare(2) and mount(2)."""
+"""Flags of unshare(2) and mount(2)."""
 LATER = 7
 TALKED = 3
 FULL = "size=4k"
-"""Of an empty file system: it is filled."""
+"""Options of a small file system, which is then filled."""
 NO_MOUNTS = 77
 """Exit code of a child that may not have mounts of its own."""
 
@@ -47,7 +47,7 @@ OFTEN = (
     "services.base.doctor", "services.capture.service", "services.kinect.doctor", "services.kinect.tools",
     "services.servos.doctor", "services.servos.tools", "apps.captures.export.foxglove", "apps.captures.export.video",
 )  # fmt: skip
-"""What commands import when they are called."""
+"""Modules that commands import when they are called."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class Case:
     deaf: bool = False
     """Ctrl-C is ignored."""
     fresh: bool = False
-    """With what the command imports of this project not yet imported."""
+    """Whether the project's modules must be imported again."""
     instead: tuple[str, str] | None = None
     """A function as `module:name`, and which of this file's is called in its place: `bug`, `talk` or `log`."""
 

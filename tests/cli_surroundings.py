@@ -14,7 +14,7 @@ from cli_forks import Case, Ending
 from apps.cli import exits
 from apps.cli.app import COMMANDS as LISTED
 from apps.cli.app import load
-from apps.cli.task_app import task_command, task_names
+from apps.cli.task_commands import task_command, task_names
 
 GOLDEN = Path(__file__).parent / "golden" / "fetch.mcap"
 CODES = (exits.DONE, exits.FAILED, exits.USAGE, exits.REFUSED, exits.NO_MESH)
@@ -75,7 +75,7 @@ COMMANDS = dict(found for name, command in LOADED.items() for found in commands(
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What is wrong around a command."""
+    """Faults of a command's environment."""
 
     what: dict[str, Any] = field(default_factory=dict)
     """Fields of a Case; in `env` and `mounts` {root} is a folder of the test's own."""
@@ -135,7 +135,7 @@ SURROUNDINGS: dict[str, Surroundings] = {
     "a run directory too long for a file": Surroundings({"env": {"COCORO_RUN_DIR": "{root}/" + "x" * 300}}, same=False),
     "no /proc": Surroundings({"mounts": [("/proc", "size=64k")]}, lines=2),
 }
-"""What is independent of each other is tried at once."""
+"""Each row combines faults that do not depend on one another."""
 
 NEVER_SAID = (
     "Traceback", "Exception ignored", "internal error", "excepthook", "WARN", "Fatal", "Error in", "Aborted",
@@ -195,7 +195,7 @@ class Table:
 
 
 def wrong(ending: Ending, usual: Ending, surroundings: Surroundings) -> list[str]:
-    """What is not as it must be."""
+    """The requirements that the ending of a command misses."""
     found = []
     said = ending.out + ending.err
     lines = [line for line in ending.err.splitlines() if line.startswith("cocoro: ")]

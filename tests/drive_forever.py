@@ -1,4 +1,4 @@
-"""A base service in a process of its own that is told to drive straight on: `python drive_forever.py PORT`."""
+"""A base service in a separate process that is commanded to drive straight: `python drive_forever.py PORT`."""
 
 from __future__ import annotations
 

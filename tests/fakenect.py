@@ -1,4 +1,4 @@
-"""Debian's playback library for Kinect recordings: found where it is installed, or else unpacked for the tests.
+"""Debian's playback library for Kinect recordings: the installed one, or one that is unpacked for the tests.
 
 Unpacked means: `apt-get download`, then `dpkg-deb -x` into a folder of the tests' own. Nothing of the system changes,
 and nobody need be root (but for fetching the lists of packages, where there are none yet).
@@ -20,7 +20,7 @@ DOWNLOAD_S, UPDATE_S = 30.0, 90.0
 
 
 def player(folder: Path) -> str:
-    """The library's path. Skips the test, saying why, where it is not to be had."""
+    """The library's path. Skips the test, with the reason, when the library is not available."""
     try:
         return find("", recording=True)
     except MissingLibraryError:
@@ -42,12 +42,12 @@ def player(folder: Path) -> str:
 
 
 def _download(folder: Path) -> str:
-    """Why it could not be had; '' when it could."""
+    """Why the library is not available; '' when it is."""
     return _run([*APT, "download", PACKAGE], folder, DOWNLOAD_S)
 
 
 def _run(command: list[str], folder: Path, limit_s: float) -> str:
-    """What went wrong, in short."""
+    """A short reason for a failure."""
     try:
         done = subprocess.run(
             command, cwd=folder, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=limit_s, check=False

@@ -6,7 +6,7 @@ import numpy as np
 
 from apps.learning.study import Sightings
 from cocoro.arrays import FloatArray
-from cocoro.learning.nominal_model import NominalModel
+from cocoro.learning.handmap import NominalModel
 from cocoro.robot import Robot
 from sim.realism import body_of
 

@@ -1,4 +1,4 @@
-"""A servo service in a process of its own that is told to turn the elbow: `python move_forever.py ARM HAND`."""
+"""A servo service in a separate process that is commanded to turn the elbow: `python move_forever.py ARM HAND`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A small world to take pictures of, for the tests of the renderers."""
+"""A small world to render, for the tests of the renderers."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def look(
     light: Lamp | None = None,
     projector: bool = False,
 ) -> Images:
-    """A frame as the Kinect takes it, kept beyond the next one."""
+    """A frame, copied so that it survives the next one."""
     pose = head() if camera_pose is None else camera_pose
     images = renderer.render(
         poses,
@@ -92,7 +92,7 @@ def reddish(colour: np.ndarray) -> np.ndarray:
 
 
 def floor_depth(camera: Camera, camera_pose: FloatArray) -> FloatArray:
-    """Along the optical axis to z = 0 in every pixel's direction, by the camera's own `ray`."""
+    """Depth of the floor (z = 0) in every pixel, (height, width), m, by the camera's `ray`."""
     across = np.array([camera.ray(u, 0) for u in range(camera.width)])
     down = np.array([camera.ray(0, v) for v in range(camera.height)])
     up = camera_pose[2, :3]
@@ -101,12 +101,12 @@ def floor_depth(camera: Camera, camera_pose: FloatArray) -> FloatArray:
 
 
 def stripe(column: int) -> np.ndarray:
-    """A black picture with one bright column."""
+    """A black image with one bright column."""
     picture = np.zeros((CAMERA.height, CAMERA.width, 3), np.uint8)
     picture[:, column] = 252
     return picture
 
 
 def profile(picture: np.ndarray) -> np.ndarray:
-    """The red of the middle row."""
+    """The red channel of the middle row."""
     return picture[CAMERA.height // 2, :, 0].astype(float)

@@ -1,4 +1,4 @@
-"""For how long a base turns its wheels on one word, at which speed: the driver, and the simulator's base."""
+"""How long a base turns its wheels on one command, by speed: the driver, and the simulator's base."""
 
 from __future__ import annotations
 

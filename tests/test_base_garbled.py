@@ -1,5 +1,5 @@
-"""Whatever garbled bytes have made of the Create before: on a line that is good again, its wheels stop when its service
-dies. The logic and the emulated firmware face each other, in virtual time."""
+"""The wheels stop when the service dies, whatever garbled bytes did to the Create before, once the line is good again.
+The guard's logic and the emulated firmware run against each other in virtual time."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SPEEDS = ((200, 200), (120, -120), (250, 110), (-80, -80))
 
 
 class Line:
-    """Guard logic and Create with a wire between them that takes its time, and that can be disturbed."""
+    """The guard's logic and a Create, with a wire between them that has a delay and can be disturbed."""
 
     def __init__(self, seed: int) -> None:
         self.draws = Random(seed)
@@ -48,7 +48,7 @@ class Line:
         self.logic.receive(self.create.advance(BAUD, self.now_ns), self.now_ns)
 
     def drives(self) -> bool:
-        """It goes as it was asked to, within a time; False when it hears nobody any more."""
+        """Wait until the wheels turn as asked; False when the Create is deaf or has another baud rate."""
         end_ns = self.now_ns + AGAIN_NS
         while self.now_ns < end_ns:
             self.turn()
@@ -60,7 +60,7 @@ class Line:
 
     @property
     def lost_to_the_world(self) -> bool:
-        """A garbled byte has told the Create to wait for something, or to use another baud rate."""
+        """Whether a garbled byte has made the Create wait for an event or change its baud rate."""
         return self.create.deaf or self.create.baud != BAUD
 
     def garble(self, kind: FaultKind, share: float, for_ns: int) -> None:
@@ -72,7 +72,7 @@ class Line:
         self.disturbed.clear()
 
     def stops_after_ns(self) -> int:
-        """From the death of the service on."""
+        """Advance from the death of the service on."""
         self.wanted = None
         self.logic.end(self.now_ns)
         began_ns = self.now_ns
@@ -84,11 +84,11 @@ class Line:
 
 
 def one(seed: int, kind: FaultKind) -> int | None:
-    """How long the wheels went on; None when nobody could have stopped them."""
+    """How long the wheels turned after the service's death; None when nothing could have stopped them."""
     line = Line(seed)
     assert line.drives()
     line.garble(kind, line.draws.uniform(0.003, 0.1), round(line.draws.uniform(100, 1500)) * MS)
-    # The service dies at any moment: when all is well again, or while the Create still puts itself together.
+    # The service dies at any moment, after the Create has recovered or before.
     if line.draws.random() < 0.5 and not line.drives():
         return None
     for _ in range(line.draws.randrange(20)):

@@ -1,4 +1,4 @@
-"""The guard of the Create's port, as a process at the end of an emulated wire: whatever happens, the wheels stop."""
+"""The guard of the Create's port, as a process at the end of an emulated wire: the wheels stop in every case."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from wire_base import DEADMAN_NS, MS, PATIENCE_NS, SAFE, Bench, FakeService, gua
 
 from services.base import oi
 
-pytestmark = pytest.mark.zenoh
+pytestmark = [pytest.mark.zenoh, pytest.mark.process]
 
 
 @pytest.fixture
@@ -24,7 +24,7 @@ def bench(tmp_path: Path) -> Iterator[Bench]:
 
 @pytest.fixture
 def service(bench: Bench) -> Iterator[FakeService]:
-    """An awake Create whose guard obeys."""
+    """A Create in its mode, with a guard that obeys."""
     with guarded(bench) as service:
         bench.until_awake()
         service.report(link="up")

@@ -1,4 +1,4 @@
-"""What the guard decides: when wheels may turn, what is asked of the Create when, and what is made of rubbish."""
+"""The guard's decisions: when wheels may turn, what is written to the Create, and how damaged input is handled."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ QUIET = dict.fromkeys(SHORT, 0) | {oi.MODE: 2}
 
 
 class Rig:
-    """A logic, a clock, and a Create that does what it is told."""
+    """The guard's logic, a clock, and a Create that obeys."""
 
     def __init__(self) -> None:
         self.logic = GuardLogic("safe", 200 * MS)
@@ -27,7 +27,7 @@ class Rig:
         self.logic.opened(self.now_ns)
 
     def frames(self, count: int, **changes: int) -> list[oi.Readings]:
-        """So many frames of 15 ms, and what the logic wrote meanwhile in `written`."""
+        """Pass this many frames of 15 ms; what the logic writes meanwhile is in `written`."""
         self.written = b""
         heard = []
         for _ in range(count):
@@ -105,7 +105,7 @@ def test_a_command_that_the_create_took_for_another_is_repeated_at_once(rig: Rig
 
 
 def test_a_create_that_takes_commands_for_the_rest_of_another_gets_more_than_it_can_take(rig: Rig) -> None:
-    """A garbled byte may have become the head of a script, which takes up to 255 bytes that follow."""
+    """A garbled byte may have become the start of a script, which swallows up to 255 following bytes."""
     rig.logic.ask(100, 100, rig.now_ns + 200 * MS, rig.now_ns)
     rig.frames(2)
     rig.logic.ask(0, 0, rig.now_ns + 200 * MS, rig.now_ns)

@@ -1,4 +1,4 @@
-"""The Open Interface's bytes are those of the manual, and nothing that is not whole is read as a frame."""
+"""The Open Interface's bytes are those of the manual, and only complete frames are accepted."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def test_a_value_that_the_manual_does_not_know_makes_the_frame_a_bad_one() -> No
 
 
 def test_a_frame_that_tells_a_packet_twice_is_a_bad_one() -> None:
-    """As long as the other list, with a sum that is right by chance."""
+    """A frame that is as long as the other list, with a sum that is right by chance."""
     good = frame(dict.fromkeys(SHORT, 0))
     body = good[:-1] + bytes([oi.VOLTAGE, 0, 1, oi.CURRENT, 0, 2])
     body = bytes([19, len(body) - 2]) + body[2:]

@@ -1,4 +1,4 @@
-"""The base service, from messages to bytes: with its guard, at the end of an emulated wire, by the real clock."""
+"""The base service from messages to bytes, with its guard, at the end of an emulated wire, in real time."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from cocoro.testing import ServiceUnderTest
 from services.base.service import BaseConfig, BaseService
 from sim.wire.line import LineFault
 
-pytestmark = pytest.mark.zenoh
+pytestmark = [pytest.mark.zenoh, pytest.mark.process]
 
 LONG_S = 30.0
 
@@ -35,25 +35,25 @@ def bench(tmp_path: Path) -> Iterator[Bench]:
 
 
 class Driven:
-    """The service under test, with what one does to a base."""
+    """The service under test, and the operations on a base."""
 
     def __init__(self, bench: Bench, service: ServiceUnderTest) -> None:
         self.bench = bench
         self.service = service
         self.commanded_ns = 0
-        """Monotonic, when it was commanded last."""
+        """CLOCK_MONOTONIC of the last command."""
         self._driving: asyncio.Task[None] | None = None
 
     def release(self) -> None:
         self.service.feed(topics.LATCH, Latch(state="released"))
 
     def drive(self, left_mps: float, right_mps: float) -> None:
-        """From now on, at 50 Hz."""
+        """Command wheel speeds from now on, at 50 Hz."""
         self.silence()
         self._driving = asyncio.ensure_future(self._drive(left_mps, right_mps))
 
     async def roll(self) -> None:
-        """Releases it and drives it on at 0.2 m/s; returns when its wheels turn so."""
+        """Release the stop and drive at 0.2 m/s; returns when the wheels turn at that speed."""
         self.release()
         self.drive(0.2, 0.2)
         await self.wheels(200, 200)
@@ -71,7 +71,7 @@ class Driven:
         return await asyncio.to_thread(self.bench.until_wheels, left, right)
 
     async def state(self, good: Callable[[BaseState], object]) -> BaseState:
-        """The next state that is so."""
+        """The next state for which the condition holds."""
         async with asyncio.timeout(LONG_S):
             async for state in self.service.tester.stream(topics.BASE_STATE):
                 if good(state):

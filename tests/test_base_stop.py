@@ -1,4 +1,4 @@
-"""The emergency stop's own path at the base: the guard hears it by itself, whatever the service above does."""
+"""The emergency stop's path at the base: the guard receives it directly, whatever the service above does."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from cocoro.robot import Robot
 from cocoro.stop.record import prepare, read
 from cocoro.testing import ServiceUnderTest
 
-pytestmark = pytest.mark.zenoh
+pytestmark = [pytest.mark.zenoh, pytest.mark.process]
 
 PATIENCE_S = 60.0
 
@@ -41,7 +41,7 @@ def bench(tmp_path: Path) -> Iterator[Bench]:
 
 @pytest.fixture
 def service(bench: Bench, name: str) -> Iterator[FakeService]:
-    """An awake Create whose guard obeys, and hears the emergency stop of a robot of this name."""
+    """A Create in its mode, with a guard that obeys, also the emergency stop of the robot with this name."""
     with guarded(bench, robot=name) as service:
         bench.until_awake()
         service.report(link="up")
@@ -49,7 +49,7 @@ def service(bench: Bench, name: str) -> Iterator[FakeService]:
 
 
 def stop(name: str) -> dict[str, int | None]:
-    """Say stop; when each service did, or None for those that did not say."""
+    """Send a stop; returns when each service stopped, None for those that did not answer."""
     with Asking(name) as asking:
         asking.go_on(time.monotonic() + PATIENCE_S)
         asking.hear_of_the_disk(time.monotonic() + PATIENCE_S)

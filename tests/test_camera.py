@@ -1,4 +1,4 @@
-"""The simulated Kinect: a perfect camera as `ideal`, and each of a real one's faults at its stated size."""
+"""The simulated Kinect: a perfect camera with `ideal` sensors, and each error of a real one at its stated size."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ LAMP = Lamp()
 
 
 class Painted:
-    """A renderer that shows whatever it was given."""
+    """A renderer that returns given images."""
 
     name = "painted"
 
@@ -134,7 +134,7 @@ def test_the_renderers_size_must_be_the_kinects() -> None:
         SimKinect(ROBOT, Painted(), width=640, height=480)
 
 
-# --- colour, as a real sensor sees it -------------------------------------------------------------
+# --- colour of a real sensor ----------------------------------------------------------------------
 
 
 def test_every_frame_has_noise_of_its_own() -> None:
@@ -180,7 +180,7 @@ def test_a_moving_camera_is_blurred_but_not_after_a_gap_or_a_step_back_in_time()
     assert peak((FRAME_NS, 0)) > 180
 
 
-# --- depth, as a real sensor measures it ----------------------------------------------------------
+# --- depth of a real sensor -----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("z_m", [0.6, 1.0, 2.0, 3.0])
@@ -210,7 +210,7 @@ def fingerprint(frame: Frame) -> str:
 
 
 def film(seed: int) -> list[str]:
-    """Three frames of a turning camera over a real scene, with the renderer that this machine has."""
+    """Three frames of a turning camera in a real scene, with this machine's renderer."""
     camera_ = ROBOT.camera.scaled(160, 120)
     can = Visual("can", "cylinder", (0.033, 0.12), (0.8, 0.04, 0.05))
     renderer = make_renderer([can], camera_)
@@ -226,11 +226,13 @@ def film(seed: int) -> list[str]:
     return prints
 
 
+@pytest.mark.sim
 def test_one_seed_gives_one_film_another_seed_another() -> None:
     assert film(3) == film(3)
     assert not set(film(3)) & set(film(4))
 
 
+@pytest.mark.process
 def test_another_process_takes_the_same_film() -> None:
     program = (
         f"import sys; sys.path.insert(0, {__file__.rpartition('/')[0]!r}); import test_camera as t; print(*t.film(3))"
@@ -246,6 +248,7 @@ def test_a_frames_noise_does_not_depend_on_how_many_were_taken_before() -> None:
     assert fingerprint(shoot(often, 5 * FRAME_NS)) == fingerprint(shoot(once, 5 * FRAME_NS))
 
 
+@pytest.mark.sim
 @pytest.mark.parametrize("size", [(640, 480), (320, 240)])
 def test_both_frame_sizes_show_the_can_where_it_is(size: tuple[int, int]) -> None:
     camera_: Camera = ROBOT.camera.scaled(*size)

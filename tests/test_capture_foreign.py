@@ -1,4 +1,4 @@
-"""Others read our captures: with libraries that know nothing of this project, by what docs/captures.md says."""
+"""Captures are read by libraries that know nothing of this project, as docs/captures.md describes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ UNREACHABLE = ("ENOTFOUND", "ECONNREFUSED", "ETIMEDOUT", "EAI_AGAIN", "ENETUNREA
 
 @pytest.fixture(scope="module")
 def expected() -> dict[str, tuple[str, int]]:
-    """By our own reader: each key's type and number of messages."""
+    """Each key's type and number of messages, by this project's reader."""
     with Capture.open(GOLDEN) as capture:
         counts = Counter(record.key for record in capture.messages())
         schemas = {key: capture.schema(channel) for key, (channel,) in capture.keys.items()}
@@ -58,7 +58,7 @@ def test_the_mcap_and_msgpack_libraries_read_everything_by_the_page(expected: di
 
 
 def _crc(entries: dict[str, str]) -> str:
-    """As the page has it."""
+    """As docs/captures.md defines it."""
     crc = 0
     for name in sorted(entries):
         if name != "crc32":
@@ -71,7 +71,7 @@ def _crc(entries: dict[str, str]) -> str:
 
 @pytest.fixture(scope="module")
 def reader(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """tests/foreign with its packages, which npm gets as the lock file says."""
+    """tests/foreign with its npm packages, at the versions of the lock file."""
     if shutil.which("node") is None or shutil.which("npm") is None:
         pytest.skip("node and npm are not installed: the npm packages cannot read the capture here")
     folder = tmp_path_factory.mktemp("foreign")
@@ -97,6 +97,7 @@ def _run(reader: Path, *words: str) -> dict[str, Any]:
     return found
 
 
+@pytest.mark.process
 @pytest.mark.parametrize("how", ["indexed", "stream"])
 def test_the_npm_packages_read_everything_by_the_page(
     how: str, reader: Path, expected: dict[str, tuple[str, int]]
@@ -114,6 +115,7 @@ def test_the_npm_packages_read_everything_by_the_page(
     assert found["frames"] == [[160, 120, 160 * 120 * 3, int(middle)] for middle in middles]
 
 
+@pytest.mark.process
 def test_the_npm_packages_read_what_a_killed_recorder_left(reader: Path, tmp_path: Path) -> None:
     killed = tmp_path / "killed.mcap"
     killed.write_bytes(GOLDEN.read_bytes()[: GOLDEN.stat().st_size // 2])
@@ -124,6 +126,7 @@ def test_the_npm_packages_read_what_a_killed_recorder_left(reader: Path, tmp_pat
     assert sum(counts.values()) > 1000
 
 
+@pytest.mark.process
 def test_what_is_exported_for_foxglove_is_by_foxgloves_own_schemas(reader: Path, tmp_path: Path) -> None:
     pytest.importorskip("foxglove", reason="foxglove-sdk is an extra, and not installed here")
     from apps.captures.export import foxglove

@@ -16,7 +16,7 @@ from apps.learning.collector import Coverage, HandCollector, WheelCollector, col
 from apps.learning.dataset import HandRow, SampleFile, WheelRow, hand_header, wheel_header
 from apps.learning.study import BEST
 from cocoro.learning import model
-from cocoro.learning.nominal_model import NominalModel
+from cocoro.learning.handmap import NominalModel
 from cocoro.messages import HandSample, TaskState, WheelTrial
 from cocoro.robot import Robot
 from cocoro.topics import HAND_SAMPLES
@@ -43,7 +43,7 @@ def arm_file(tmp_path: Path, robot: Robot) -> Path:
 
 
 def trial(number: int, turned_rad: float) -> WheelTrial:
-    """Of a body whose wheels stand as far apart as its drawing says."""
+    """A trial of a body whose wheel distance is the nominal one."""
     before = (1.5, 0.0)
     c, s = cos(turned_rad), sin(turned_rad)
     after = (1.5 * c, -1.5 * s)
@@ -60,7 +60,7 @@ def test_an_arms_samples_become_a_model_with_every_method_measured(
     report = json.loads(capsys.readouterr().out)
     assert report["chosen"] == BEST.name
     by_name = {score["name"]: score["held_out_m"] for score in report["scores"]}
-    assert by_name[BEST.name] < 0.6 * by_name["the drawing with its best constant offset"]
+    assert by_name[BEST.name] < 0.6 * by_name["the nominal model with its best constant offset"]
     arm = model.load(made, robot).arm
     assert arm is not None
     assert arm.training.scores["held_out_rms_m"] == by_name[BEST.name]
@@ -142,7 +142,7 @@ def test_wheel_trials_go_on_with_a_new_pair(tmp_path: Path, robot: Robot) -> Non
         kept.take(trial(4, 0.5))
         assert first == 2
         assert kept.next == 6
-        assert kept.said == "1 trials, 0.1 turns in all"
+        assert kept.summary == "1 trials, 0.1 turns in all"
 
 
 def test_progress_has_a_bar_the_coverage_and_the_time_that_is_left(tmp_path: Path, robot: Robot) -> None:

@@ -22,7 +22,7 @@ from cocoro.bus.endpoints import default
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.clock import RealClock
 from cocoro.errors import ConfigError
-from cocoro.latch import LatchKeeper
+from cocoro.latch import ServiceLatch
 from cocoro.messages import (
     BaseState,
     CancelRequest,
@@ -54,7 +54,7 @@ ANY = RobotChoice()
 class FakeRobot:
     """Services in one process, on the mesh of the robot's run directory."""
 
-    def __init__(self, nodes: dict[str, Node], latched_by: dict[str, LatchKeeper]) -> None:
+    def __init__(self, nodes: dict[str, Node], latched_by: dict[str, ServiceLatch]) -> None:
         self.nodes = nodes
         self.keepers = latched_by
 
@@ -72,7 +72,7 @@ async def robot(*services: str, without_latch: tuple[str, ...] = ()) -> AsyncIte
         for node in nodes.values():
             await stack.enter_async_context(node)
         keeping = [name for name in stoppable() if name in nodes and name not in without_latch]
-        keepers = {name: LatchKeeper(nodes[name], lambda *_: None) for name in keeping}
+        keepers = {name: ServiceLatch(nodes[name], lambda *_: None) for name in keeping}
         for node in nodes.values():
             node.ready("all is well")
         yield FakeRobot(nodes, keepers)
@@ -219,7 +219,7 @@ def test_objects_are_listed_with_where_they_were_seen(root: Path, capsys: pytest
     async def scenario(as_json: bool) -> int:
         async with robot("executive") as calliope:
             calliope.nodes["executive"].serve(OBJECTS, answer)
-            return await objects.objects(ANY, as_json)
+            return await objects.list_objects(ANY, as_json)
 
     assert asyncio.run(scenario(as_json=False)) == exits.DONE
     assert capsys.readouterr().out.splitlines()[1] == "red_can  cylinder  6.6 x 6.6 x 12.0  yes        -"
@@ -270,6 +270,7 @@ def test_a_snapshot_is_a_frame_with_what_was_detected_in_that_frame(
     assert out.read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.process
 def test_ctrl_c_on_a_running_fetch_cancels_the_task_on_the_robot(root: Path) -> None:
     cancelled: list[str] = []
 
@@ -309,7 +310,7 @@ def test_ctrl_c_on_a_running_fetch_cancels_the_task_on_the_robot(root: Path) -> 
 def test_of_several_robots_one_must_be_named(root: Path) -> None:
     async def scenario() -> None:
         async with robot("executive"), await ZenohBus.open(default("robbie", "robot")):
-            with pytest.raises(ConfigError, match=r"say which: --robot calliope, --robot robbie"):
+            with pytest.raises(ConfigError, match=r"--robot calliope, --robot robbie"):
                 await status.show_status(ANY, as_json=False)
 
     asyncio.run(scenario())

@@ -18,7 +18,7 @@ def test_every_piece_of_python_says_which_file_it_is() -> None:
     assert all(block.path for block in pieces)
 
 
-@pytest.mark.zenoh
+@pytest.mark.process
 @pytest.mark.sim
 def test_the_tutorial_works_word_for_word(tmp_path: Path) -> None:
     folder = tmp_path / "work"

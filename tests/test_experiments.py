@@ -23,7 +23,7 @@ from apps.experiments.runs import ExperimentRun, RunResult, perform
 from apps.learning.dataset import HandRow, SampleFile, WheelRow, hand_header, wheel_header
 from apps.learning.study import BEST
 from apps.rehearsal.request import RehearsalRequest
-from cocoro.learning.nominal_model import NominalModel
+from cocoro.learning.handmap import NominalModel
 from cocoro.robot import Robot
 
 # --- statistics ---------------------------------------------------------------------------------------
@@ -136,7 +136,7 @@ def test_a_lesson_tells_how_good_the_map_is_and_what_the_wheels_are(
 ) -> None:
     settings, result = learned
     assert settings.model_file(0).is_file()
-    assert {score["name"] for score in result["arm"]["scores"]} >= {"the drawing", result["arm"]["chosen"]}
+    assert {score["name"] for score in result["arm"]["scores"]} >= {"the nominal model", result["arm"]["chosen"]}
     assert result["wheels"]["separation_m"] == pytest.approx(0.255, abs=1e-3)
     assert set(result["curves"]["default"]) == set(result["curves"]["paper"])
     json.dumps(result, allow_nan=False)
@@ -171,7 +171,7 @@ FETCHED = {"held": True, "knocked_over": []}
 
 
 def made_up(run: ExperimentRun, lesson: RunResult) -> dict[str, Any]:
-    """What a run might have come to."""
+    """A plausible result of a run."""
     if run.kind == "learn":
         return lesson
     if run.kind == "bend":

@@ -1,4 +1,4 @@
-"""The judge, fed truths that are made by hand."""
+"""The judge, fed with handmade truths."""
 
 from __future__ import annotations
 
@@ -46,7 +46,8 @@ def truth(
     tilt_deg: dict[str, float] | None = None,
     collisions: tuple[str, ...] = (),
 ) -> Truth:
-    """All at their places but those that are given; `touching` is the red can's, tilts are about x."""
+    """A truth with all objects at their places except the given ones; `touching` is the red can's, tilts are about
+    x."""
     objects = []
     for label, place in (PLACES | (places or {})).items():
         half = radians((tilt_deg or {}).get(label, 0.0)) / 2

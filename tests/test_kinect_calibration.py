@@ -1,4 +1,4 @@
-"""Calibration from views of a chessboard that a Kinect of known figures sees; straightening by what was found."""
+"""Calibration from views of a chessboard by a Kinect with known parameters, and rectification with the result."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ EYES = Eyes(
 )
 VIEWS = 20
 CORNER_PX = 0.08
-"""What finding a corner is off by."""
+"""Error of a found corner."""
 
 
 def held(rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-    """A board somewhere in the colour picture, tilted somehow, all of it seen."""
+    """A board anywhere in the colour image, tilted in any direction, completely visible."""
     while True:
         away_m = rng.uniform(0.55, 1.3)
         turn = (rng.uniform(-0.7, 0.7), rng.uniform(-0.7, 0.7), rng.uniform(-0.3, 0.3))
@@ -79,7 +79,8 @@ def test_the_figures_come_out_as_they_are(found: Calibration) -> None:
 
 
 def test_depth_and_colour_are_brought_together_within_half_a_pixel_and_one_step(found: Calibration) -> None:
-    """Over all that the robot looks at: points at 0.6 to 2 m, through the true Kinect and back by what was found."""
+    """Errors over the robot's working range: points at 0.6 to 2 m, through the true Kinect and back by the
+    calibration."""
     rng = np.random.default_rng(1)
     rays = np.column_stack([rng.uniform(-0.45, 0.45, 2000), rng.uniform(-0.33, 0.33, 2000), np.ones(2000)])
     true_m = rays * rng.uniform(0.6, 2.0, (2000, 1))
@@ -115,7 +116,7 @@ def test_what_was_written_into_the_robots_file_straightens_its_pictures(
     wanted = Lens.of(robot.camera).pixels(points_m)
     off_px = min(np.linalg.norm(order - wanted, axis=1).max() for order in (corners, corners[::-1]))
     assert off_px < 1.0
-    # As readers of frames reckon: one pinhole, beside the colour camera and looking the same way.
+    # As readers of frames assume: a pinhole beside the colour camera that looks in the same direction.
     beside_m = points_m - robot.kinect.depth_offset_m
     u, v = np.rint(Lens.of(robot.camera).pixels(beside_m)).astype(int).T
     depth_m = robot.depth_m(straight.depth)[v, u]

@@ -1,4 +1,4 @@
-"""The Kinect's driver without a Kinect: pairing by time, and a library that does what a device would."""
+"""The Kinect's driver without a Kinect: pairing by time, and a library that behaves like a device."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from cocoro.clock import RealClock
 from cocoro.errors import ConfigError
 from services.kinect import grabber as grabbing
 from services.kinect.camera import FreenectCamera
-from services.kinect.config import KinectConfig
+from services.kinect.device import KinectConfig
 from services.kinect.freenect import (
     COLOUR_BYTES,
     DEPTH_BYTES,
@@ -42,7 +42,7 @@ TICKS_A_MS = 60_000
 def test_stamps_have_the_devices_evenness_and_our_time() -> None:
     clock, late_ms = DeviceClock(), [9, 3, 0, 14, 2, 30, 1]
     stamps = [clock.at((7 + 33 * n) * TICKS_A_MS, (1000 + 33 * n + late) * MS) for n, late in enumerate(late_ms)]
-    # From the picture on that came fastest they are its time, whatever the later ones' delays.
+    # From the image with the smallest delay on, the times have that delay, whatever the later delays are.
     assert stamps[2:] == pytest.approx([(1000 + 33 * n) * MS for n in range(2, 7)], abs=0.1 * MS)
 
 
@@ -98,7 +98,7 @@ def test_of_a_stream_without_the_other_no_more_than_two_pictures_are_kept() -> N
 
 
 class FakeLibrary:
-    """libfreenect over a device that is made of what a test says."""
+    """libfreenect with a device that the test defines."""
 
     def __init__(self) -> None:
         self.devices = 1
@@ -166,7 +166,7 @@ class FakeLibrary:
 
 @pytest.fixture
 def ends() -> Iterator[tuple[socket.socket, Grabber]]:
-    """The service's end of the channel, and the grabber with the other one."""
+    """The service's end of the channel, and the grabber with the other end."""
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     theirs.setblocking(False)
     ours.settimeout(10.0)
@@ -312,8 +312,9 @@ def test_a_library_that_is_not_there_or_is_another_is_said_with_the_package_to_i
         asyncio.run(open_it())
 
 
+@pytest.mark.process
 def test_a_process_that_ends_by_itself_is_told_and_started_again(tmp_path: Path) -> None:
-    """A library that ends its process, as the playback library does: here a folder where a recording should be."""
+    """A library that ends its process, as the playback library does; here because the folder is not a recording."""
 
     async def scenario() -> tuple[list[str], int]:
         faults: list[str] = []

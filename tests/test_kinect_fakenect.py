@@ -1,4 +1,4 @@
-"""The Kinect's driver against libfreenect's own playback library, with recordings of the simulated Kinect."""
+"""The Kinect's driver with libfreenect's playback library and recordings of the simulated Kinect."""
 
 from __future__ import annotations
 
@@ -22,15 +22,14 @@ from cocoro.topics import ARM_STATE, FRAME
 from services.kinect import doctor, tools
 from services.kinect.calibration import Board
 from services.kinect.camera import FreenectCamera
-from services.kinect.config import KinectConfig
-from services.kinect.device import RawFrame
+from services.kinect.device import KinectConfig, RawFrame
 from services.kinect.service import to_message
 from services.perception.config import PerceptionConfig
 from services.perception.core import PerceptionCore
 from sim.service import SimConfig
 from sim.wire.record import RATE_HZ, RecordingWriter, record
 
-pytestmark = pytest.mark.sim
+pytestmark = [pytest.mark.sim, pytest.mark.process]
 
 FRAMES = 12
 PATIENCE_S = 60.0
@@ -43,14 +42,14 @@ def library(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Of the paper's scene, with the sensor's faults: noise makes each picture another."""
+    """A recording of the paper's scene with a real sensor's errors: its noise makes each image unique."""
     folder = tmp_path_factory.mktemp("recordings") / "paper"
     record(folder, Robot.load(), SimConfig(sensors="real"), FRAMES, tilt_rad=-0.5)
     return folder
 
 
 def copied(recording: Path, folder: Path) -> Path:
-    """One that may be damaged."""
+    """A copy that a test may damage."""
     copy = folder / "copy"
     copy.mkdir()
     for file in recording.iterdir():
@@ -59,7 +58,7 @@ def copied(recording: Path, folder: Path) -> Path:
 
 
 def damage(file: Path, left_bytes: int) -> bytes:
-    """Cut a file short; what it was."""
+    """Truncate a file; returns its former contents."""
     whole = file.read_bytes()
     file.unlink()
     file.write_bytes(whole[:left_bytes])
@@ -67,7 +66,7 @@ def damage(file: Path, left_bytes: int) -> bytes:
 
 
 def pixels(recording: Path, kind: str) -> list[bytes]:
-    """What was written, by the format's own words: a line, then the pixels."""
+    """The pixels of a file of the recording: they follow the header line."""
     names = (recording / "INDEX.txt").read_text().splitlines()
     return [(recording / name).read_bytes().split(b"\n", 1)[1] for name in names if name.startswith(kind)]
 
@@ -82,7 +81,7 @@ class Played:
 def play(
     library: str, recording: Path, until: Callable[[Played], bool], on_fault: Callable[[], object] = int
 ) -> Played:
-    """Take pairs until it is enough. `on_fault` is called once, with the first real fault."""
+    """Take frames until the condition holds. Calls `on_fault` once, at the first real fault."""
 
     async def scenario() -> Played:
         played = Played()
@@ -119,7 +118,7 @@ def play(
 
 
 def number_of(shot: RawFrame, colours: list[bytes], depths: list[bytes]) -> int:
-    """Which picture of the recording it is; both its halves must be whole, and of one moment."""
+    """The number of the frame in the recording. Its colour and depth must be complete, and of the same moment."""
     number = colours.index(shot.colour.tobytes())
     assert shot.depth.astype("<u2").tobytes() == depths[number]
     return number
@@ -132,7 +131,7 @@ def test_every_pixel_is_right_each_pair_of_one_moment_and_the_pace_that_of_the_r
     assert played.faults[0] == "the Kinect is being opened"
     colours, depths = pixels(recording, "r"), pixels(recording, "d")
     numbers = [number_of(shot, colours, depths) for shot in played.shots]
-    # On a busy machine a pair may go by untaken; none comes twice or out of turn.
+    # On a busy machine a frame may be missed, but none comes twice or out of order.
     assert numbers == sorted(set(numbers))
     assert len(numbers) > FRAMES // 2
     assert played.took_s >= (FRAMES - 1) / RATE_HZ
@@ -229,7 +228,7 @@ def test_the_doctor_says_whether_pictures_come(library: str, recording: Path, tm
 
 
 def depth_step_m(robot: Robot, place_m: list[float]) -> float:
-    """What one code of depth is worth at a place, body frame: the camera stands about 0.7 m above the floor."""
+    """Depth step of one code at a place in the body frame, m: the camera is about 0.7 m above the floor."""
     away_m = float(np.linalg.norm(np.array(place_m) - [0.06, 0.0, 0.7]))
     a, b, _ = robot.kinect.depth_curve
     return a / b * (1.0 + (away_m / a) ** 2)

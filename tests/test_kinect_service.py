@@ -1,4 +1,4 @@
-"""The Kinect's shell over a driver that the test provides."""
+"""The Kinect service with a driver from the test."""
 
 from __future__ import annotations
 
@@ -16,14 +16,13 @@ from cocoro.node import Node
 from cocoro.robot import Robot
 from cocoro.vloop import run_virtual
 from services.kinect import camera
-from services.kinect.config import KinectConfig
-from services.kinect.device import OnFault, RawFrame
+from services.kinect.device import KinectConfig, OnFault, RawFrame
 from services.kinect.freenect import LED
 from services.kinect.service import run
 
 
 class _Two:
-    """A camera that gives two pairs and then nothing more."""
+    """A camera that yields two frames and then none."""
 
     def __init__(self, clock: Clock) -> None:
         self.closed = False
@@ -32,7 +31,7 @@ class _Two:
     async def frames(self) -> AsyncIterator[RawFrame]:
         for number in (1, 2):
             await self._clock.sleep_until(number * 33_000_000)
-            # Strided, as a driver that flips or crops would give it.
+            # Not contiguous, as from a driver that flips or crops images.
             colour = np.full((4, 12, 3), number, dtype=np.uint8)[:, ::2]
             yield RawFrame(self._clock.now_ns(), colour, np.full((4, 6), 700 + number, dtype=np.uint16))
         await asyncio.get_running_loop().create_future()

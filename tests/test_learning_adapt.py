@@ -7,7 +7,7 @@ import pytest
 from learning_arm import sightings
 
 from apps.learning.study import BEST, Sightings, errors_m, fit, rms, split
-from cocoro.learning.nominal_model import NominalModel
+from cocoro.learning.handmap import NominalModel
 from cocoro.robot import Robot
 from services.planning.teaching import Adapter
 from sim.realism import BEND_RAD

@@ -7,11 +7,11 @@ import pytest
 
 from apps.learning.dataset import WheelRow
 from apps.learning.lesson import LEAST_TRIALS, eye_tilt
-from cocoro.learning.camera_tilt import CameraTilt
 from cocoro.messages import Obstacles
 from cocoro.robot import Robot
 from cocoro.units import Vec3
 from services.planning.config import PlanningConfig
+from services.planning.head import CameraTilt
 from services.planning.state_estimator import StateEstimator
 
 

@@ -18,8 +18,8 @@ from apps.learning.dataset import HandRow, SampleFile, WheelRow, hand_header, wh
 from apps.learning.study import BEST, METHODS, fit
 from cocoro.errors import ConfigError, RefusedError
 from cocoro.learning import model
+from cocoro.learning.handmap import NominalModel
 from cocoro.learning.model import Training, WheelModel
-from cocoro.learning.nominal_model import NominalModel
 from cocoro.robot import Robot
 
 TRAINING = Training(data="0123456789abcdef", samples=600, method=BEST.name, scores={"held_out_rms_m": 0.0035})
@@ -65,7 +65,7 @@ KILLED = """
 import sys
 from pathlib import Path
 from apps.learning.dataset import HandRow, SampleFile, hand_header
-from cocoro.learning.nominal_model import NominalModel
+from cocoro.learning.handmap import NominalModel
 from cocoro.robot import Robot
 
 robot = Robot.load()
@@ -77,6 +77,7 @@ with SampleFile(Path(sys.argv[1]), HandRow, robot, hand_header(robot, NominalMod
 """
 
 
+@pytest.mark.process
 def test_killed_in_the_middle_nothing_that_was_appended_is_lost(tmp_path: Path, robot: Robot) -> None:
     path = tmp_path / "arm.jsonl"
     command = [sys.executable, "-c", KILLED, str(path)]
@@ -140,8 +141,8 @@ def test_samples_of_another_kind_robot_or_description_are_refused(tmp_path: Path
 @pytest.mark.parametrize(
     ("content", "text"),
     [
-        (b"", "nothing in it"),
-        (b"not json\n", "no file of samples"),
+        (b"", "it is empty"),
+        (b"not json\n", "not a file of samples"),
         (b'{"format":"cocoro.hand-samples","version":9,"robot":"calliope","drawing":""}\n', "version 9"),
     ],
 )
@@ -211,10 +212,10 @@ def test_every_wrong_model_is_refused_in_one_line_that_says_why(robot: Robot, le
     assert learned.wheels is not None
     short = msgspec.structs.replace(learned.arm, weights=learned.arm.weights[:-1])
     for data, who, text in (
-        (b"", robot, "damaged, or no model"),
-        (good[: len(good) // 2], robot, "damaged, or no model"),
-        (b"\x00\xff", robot, "damaged, or no model"),
-        (b"[1, 2]", robot, "damaged, or no model"),
+        (b"", robot, "damaged or no model"),
+        (good[: len(good) // 2], robot, "damaged or no model"),
+        (b"\x00\xff", robot, "damaged or no model"),
+        (b"[1, 2]", robot, "damaged or no model"),
         (flipped, robot, "checksum"),
         (_edited(good, format="holiday photos"), robot, "not a cocoro.model"),
         (_edited(good, version=0), robot, "older version, 0"),

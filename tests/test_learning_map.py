@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from learning_arm import NOISE_M, sightings, slope_by_differences
 
-from apps.learning.outliers import inliers
+from apps.learning.rules import inliers
 from apps.learning.study import (
     BEST,
     METHODS,
@@ -26,8 +26,7 @@ from apps.learning.study import (
     split,
 )
 from cocoro.frames import to_spherical
-from cocoro.learning.handmap import cartesian_of, spherical_of
-from cocoro.learning.nominal_model import NominalModel
+from cocoro.learning.handmap import NominalModel, cartesian_of, spherical_of
 from cocoro.robot import Robot
 
 
@@ -127,7 +126,7 @@ def test_the_grid_varies_bases_width_and_rate() -> None:
     methods = grid("in order")
     assert len(methods) == len({method.name for method in methods}) == 27
     assert {method.rate for method in methods} == {0.025, 0.1, 0.3}
-    assert not any(method.over_drawing for method in methods)
+    assert not any(method.over_nominal for method in methods)
     assert len({method.doubt for method in grid("least squares")}) == 3
 
 

@@ -7,8 +7,7 @@ import pytest
 from learning_arm import slope_by_differences
 
 from apps.learning.rules import learn_in_order
-from cocoro.learning.fitting import LeastSquares
-from cocoro.learning.network import HyperplaneRbf
+from cocoro.learning.network import HyperplaneRbf, LeastSquares
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from cocoro import topics
 from cocoro.arrays import FloatArray
 from cocoro.clock import NS
 from cocoro.core import Output, Sample
-from cocoro.learning.nominal_model import NominalModel
+from cocoro.learning.handmap import NominalModel
 from cocoro.messages import (
     BaseCommand,
     BaseState,

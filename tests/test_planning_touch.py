@@ -14,8 +14,8 @@ from apps.rehearsal.rehearse import rehearse
 from apps.rehearsal.request import RehearsalRequest
 from cocoro.arrays import FloatArray
 from cocoro.clock import NS
+from cocoro.learning.handmap import NominalModel
 from cocoro.learning.model import Training, arm_model, empty, encode
-from cocoro.learning.nominal_model import NominalModel
 from cocoro.robot import Robot
 from services.executive.tasks import GoToTask, TouchTask
 from services.planning.behaviours.base import Actuators

@@ -1,4 +1,4 @@
-"""The renderers: what stands where in the picture, exactly, and in what light."""
+"""The renderers: exact geometry, and light."""
 
 from __future__ import annotations
 
@@ -29,6 +29,8 @@ from sim.render import Images, Renderer, make_renderer
 from sim.render.interface import Visual
 from sim.render.room import FLOOR_RGB, OTHER_TILE_RGB, walls
 from sim.render.views import lamp_tint
+
+pytestmark = pytest.mark.sim
 
 # --- geometry -------------------------------------------------------------------------------------
 
@@ -78,7 +80,7 @@ def test_the_depth_camera_sees_from_its_own_place(gl: Renderer) -> None:
     row = round(pixel_of((1.5, 0.0, 0.09), head())[1])
     floor = floor_depth(CAMERA, head())[row]
     _, depth_u = np.nonzero((np.abs(images.depth_m[[row]] - floor) > 0.05)[:, 100:220])
-    # 25 mm to the left of the colour camera, so the can is further right in its picture.
+    # The depth camera is 25 mm to the left of the colour camera, so the can is further right in its image.
     shift_px = CAMERA.fx * 0.025 / images.depth_m[row, 160]
     assert depth_u.mean() + 100 - red_u.mean() == pytest.approx(shift_px, abs=0.6)
 

@@ -1,5 +1,5 @@
-"""The renderers: the infrared projector's shadow, the same world from both, the same bytes anywhere, and what
-happens where OpenGL is missing."""
+"""The renderers: the infrared projector's shadow, agreement of both renderers, equal bytes in every process, and the
+case without OpenGL."""
 
 from __future__ import annotations
 
@@ -30,6 +30,8 @@ from sim.camera import moved
 from sim.render import Images, Renderer, make_renderer
 from sim.render import gl as gl_module
 
+pytestmark = pytest.mark.sim
+
 # --- the infrared projector -----------------------------------------------------------------------
 
 
@@ -38,7 +40,7 @@ def test_without_a_projector_depth_has_no_shadows(renderer: Renderer) -> None:
 
 
 def test_the_projectors_shadow_lies_left_of_a_near_thing_as_wide_as_the_disparity(renderer: Renderer) -> None:
-    # The projector stands to the right of the depth camera, so what it misses is to the left.
+    # The projector is to the right of the depth camera, so the area without light is to the left.
     images = look(renderer, projector=True)
     u, v = pixel_of((1.8 - 0.1, 0.4, 0.2), moved(head(), np.array(ROBOT.kinect.depth_offset_m)))
     row = images.depth_m[round(v)]
@@ -115,6 +117,7 @@ def test_equal_inputs_give_equal_bytes_whatever_was_drawn_before(renderer: Rende
     assert fingerprint(look(renderer, projector=True)) == first
 
 
+@pytest.mark.process
 def test_equal_inputs_give_equal_bytes_in_another_process(renderer: Renderer) -> None:
     program = FRAME_OF_ITS_OWN.format(tests=str(__file__.rpartition("/")[0]), choice=renderer.name)
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
@@ -142,6 +145,7 @@ print(make_renderer([], Robot.load().camera).name)
 """
 
 
+@pytest.mark.process
 def test_a_missing_library_means_one_warning_and_the_slow_renderer() -> None:
     done = subprocess.run([sys.executable, "-c", NO_LIBRARY], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["tiny"]

@@ -1,4 +1,4 @@
-"""Scene files: what they may say, and what they are told when they are wrong."""
+"""Scene files: valid contents, and the error messages for invalid ones."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The faults of a real Kinect, each at its stated size."""
+"""The errors of a real Kinect, each at its stated size."""
 
 from __future__ import annotations
 
@@ -102,6 +102,7 @@ def test_what_is_farther_is_smeared_less_by_driving() -> None:
     assert widths[0] > widths[1] > widths[2]
 
 
+@pytest.mark.sim
 def test_the_blur_is_what_the_renderer_would_have_seen_over_the_exposure() -> None:
     can = Visual("can", "cylinder", (0.033, 0.12), (0.8, 0.04, 0.05))
     renderer = make_renderer([can], CAMERA)
@@ -154,7 +155,7 @@ def test_two_percent_of_the_edge_pixels_are_lost_and_none_elsewhere() -> None:
 
 
 def test_a_slanted_floor_with_noise_is_no_edge() -> None:
-    # Level gaze from the Kinect's height: the steepest codes a floor can show.
+    # A level camera at the Kinect's height: the largest change of codes that a floor can show.
     rows = np.arange(1, HEIGHT // 2 + 1)
     z = (0.73 * CAMERA.fy / rows)[:, None].repeat(WIDTH, axis=1).astype(np.float32)
     z = np.vstack([z, z])

@@ -1,4 +1,4 @@
-"""What systemd is told, and what its unit lets the robot do."""
+"""Notifications to systemd, and what its unit allows the robot to do."""
 
 from __future__ import annotations
 
@@ -21,7 +21,8 @@ from deploy.launch import ORPHAN_S
 
 UNIT = Path(__file__).parents[1] / "deploy" / "systemd" / "cocoro@.service"
 EXPOSED = 40
-"""Tenths of what `systemd-analyze security` gives a unit: 100 is all open. It was 85 without a sandbox."""
+"""Upper bound for ten times the score of `systemd-analyze security`: 100 is no protection; without a sandbox it was
+85."""
 
 
 class Manager:
@@ -36,7 +37,7 @@ class Manager:
         return self._socket.recv(4096).decode()
 
     def heard(self) -> list[str]:
-        """All that has come."""
+        """Everything that was received."""
         found = []
         self._socket.setblocking(False)
         try:
@@ -60,7 +61,7 @@ def manager(short_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Manag
 
 
 async def petted(seconds: float, well: list[bool]) -> None:
-    """Keep the watchdog for so long; `well` is what is said at each look, its last for ever."""
+    """Keep the watchdog for this long; `well` has the answer at each look, the last of them repeated."""
     looks = iter(well)
     now = [True]
 
@@ -98,6 +99,7 @@ def test_where_nobody_watches_nothing_is_kept(environment: dict[str, str], monke
     run_virtual(service_manager.keep_watchdog(lambda: True))
 
 
+@pytest.mark.process
 @pytest.mark.zenoh
 def test_a_supervisor_pets_the_watchdog_from_when_the_robot_is_up(
     manager: Manager, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -130,7 +132,7 @@ def unit() -> dict[str, list[str]]:
 
 
 def test_the_unit_hides_nothing_that_the_emergency_stop_comes_over(unit: dict[str, list[str]]) -> None:
-    """Abstract Unix sockets are those of the network namespace; /proc/net/unix lists them."""
+    """Abstract Unix sockets belong to the network namespace; /proc/net/unix lists them."""
     for name in ("PrivateNetwork", "NetworkNamespacePath", "JoinsNamespaceOf", "ProtectProc", "ProcSubset"):
         assert name not in unit, name
     assert "AF_UNIX" in unit["RestrictAddressFamilies"][0].split()
@@ -149,8 +151,9 @@ def test_the_unit_lets_the_robot_do_its_work(unit: dict[str, list[str]]) -> None
     assert int(unit["WatchdogSec"][0]) > 0
 
 
+@pytest.mark.process
 def test_the_unit_lets_processes_end_by_themselves_when_their_supervisor_has_died(unit: dict[str, list[str]]) -> None:
-    """Killed at once, base service and guard among them, a Create would drive on."""
+    """If base service and guard were killed together, a Create would drive on."""
     assert unit["KillMode"] == ["mixed"]
     (after,) = unit["ExecStopPost"]
     command = shlex.split(after)[-1].replace("$$", "$").replace("sleep", "echo waits")
@@ -174,6 +177,7 @@ def analyze(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run([command, *arguments], capture_output=True, text=True, check=False)
 
 
+@pytest.mark.process
 def test_the_unit_is_not_exposed() -> None:
     if "--offline" not in analyze("security", "--help").stdout:
         pytest.skip("this systemd-analyze looks at no files")
@@ -181,6 +185,7 @@ def test_the_unit_is_not_exposed() -> None:
     assert told.returncode == 0, told.stdout
 
 
+@pytest.mark.process
 def test_the_unit_has_no_setting_that_systemd_does_not_know(tmp_path: Path) -> None:
     copy = tmp_path / UNIT.name
     copy.write_text(UNIT.read_text().replace("/opt/cocoro/.venv/bin/cocoro", "/bin/true"))

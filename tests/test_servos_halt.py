@@ -1,4 +1,4 @@
-"""A servo line that is halted by the emergency stop's own path, while the event loop hangs."""
+"""A servo line that the emergency stop's path halts while the event loop hangs."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ HOLD = round(HOLD_RADPS / SPEED_RADPS)
 
 
 class Wire:
-    """Stands in for the bus: an elbow that moves on by one count each time it is read."""
+    """Replaces the bus: an elbow that moves by one count each time it is read."""
 
     strays = 0
 
@@ -26,7 +26,7 @@ class Wire:
         self.written: list[dict[int, tuple[int, int]]] = []
         self.position = 512
         self.misses = 0
-        """So many readings from now on get no answer."""
+        """How many of the next readings get no answer."""
         self._news = threading.Condition()
 
     def __enter__(self) -> Wire:
@@ -58,7 +58,7 @@ class Wire:
 
 
 def scenario(keeps_goal: bool, test: Callable[[ServoLine, Wire], None]) -> None:
-    """Run a test in the event loop's own thread, so that the loop does nothing meanwhile."""
+    """Run a test in the event loop's thread, so that the loop is blocked meanwhile."""
 
     async def run() -> None:
         wire = Wire()

@@ -1,4 +1,4 @@
-"""How a joint is led to its goal, and what a network of them makes of readings and commands: all without a wire."""
+"""The motion of a joint to its goal, and the core of a servo network, without a wire."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ COUNT = SERVO_COUNT_RAD
 
 
 class Led:
-    """A joint that does what its servo is told, 50 times a second."""
+    """A joint whose servo gets orders 50 times a second."""
 
     def __init__(self, joint: Joint = ELBOW, *, keeps_goal: bool = False, blocked_at_rad: float = 10.0) -> None:
         self.motion = JointMotion(joint, keeps_goal=keeps_goal)
@@ -39,7 +39,7 @@ class Led:
         self.motion.command(goal_rad, speed_radps, self.position_rad, self.now_ns + for_ms * MS)
 
     def run(self, seconds: float, dead: bool = False) -> None:
-        """`dead`: nobody writes to the servo any more, which goes on to what it was told last."""
+        """`dead`: the servo gets no more orders, and goes on to its last goal."""
         for _ in range(round(seconds * 50)):
             if not dead:
                 order = self.motion.order(self.position_rad, self.now_ns)
@@ -140,7 +140,7 @@ def reading(position: int = 512, *, error: int = 0, temperature_c: int = 40, vol
 
 
 class Net:
-    """A network of servos that answer; time in ms."""
+    """A network of servos that answer; times are in ms."""
 
     def __init__(self, name: str = "arm") -> None:
         joints = [ROBOT.joints[joint] for joint in ROBOT.network_joints(name)]
@@ -150,7 +150,7 @@ class Net:
         self.tasks: list[ServoTask] = []
 
     def cycle(self, ms: int = 20, **errors: int) -> None:
-        """All are read, and what is to be done is done."""
+        """Read all servos and do all tasks."""
         self.now_ns += ms * MS
         for number, one in self.net.joints.items():
             self.net.read(number, reading(error=errors.get(one.joint.name, 0)), self.now_ns)
@@ -174,7 +174,7 @@ class Net:
 
 @pytest.fixture
 def arm() -> Net:
-    """Met, released, holding."""
+    """A network whose servos were inspected, released and enabled."""
     arm = Net()
     arm.cycle()
     arm.net.set_latch("released")

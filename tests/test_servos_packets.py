@@ -1,4 +1,4 @@
-"""Answers of servos: found when they are whole, and nothing else is; registers read as what they mean."""
+"""Answers of servos: found when they are complete, and nothing else is; registers decoded correctly."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ STATUS = st.builds(status, st.integers(0, 253), st.integers(0, 127), st.binary(m
 
 
 class Recorder:
-    """A port that takes down what the SDK writes."""
+    """A port that records what the SDK writes."""
 
     is_using = False
 

@@ -1,4 +1,4 @@
-"""The servo service, from messages to bytes, at the ends of emulated lines, by the real clock."""
+"""The servo service from messages to bytes, at the ends of emulated lines, in real time."""
 
 from __future__ import annotations
 
@@ -274,6 +274,7 @@ def test_an_unknown_joint_in_the_configuration_is_refused() -> None:
     asyncio.run(asyncio.wait_for(scenario(), LONG_S))
 
 
+@pytest.mark.process
 def test_a_killed_service_leaves_an_arm_that_stops_by_itself(bench: ServoBench) -> None:
     script = Path(__file__).with_name("move_forever.py")
     service = subprocess.Popen([sys.executable, str(script), bench.port("arm"), bench.port("hand")])
@@ -285,6 +286,6 @@ def test_a_killed_service_leaves_an_arm_that_stops_by_itself(bench: ServoBench) 
         service.wait()
     killed_at = bench.call(lambda: servo.get(36))
     bench.emulator.until(lambda: servo.get(36) == servo.get(30))
-    # Where it keeps up, 0.2 s of travel; on a busy machine no more than it may be led ahead at all.
+    # Normally 0.2 s of travel; on a busy machine at most the upper bound for the point ahead of the joint.
     assert servo.get(36) - killed_at < (REACH_RAD + LEAD_S * 0.5) / SERVO_COUNT_RAD + 10
     assert servo.get(36) < 1000

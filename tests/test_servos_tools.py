@@ -1,4 +1,4 @@
-"""What is done with servos by hand: finding, numbering, zeros and limits; and what the doctor finds."""
+"""Manual work on servos: scanning, IDs, zeros and limits; and the doctor's checks."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def test_a_servo_gets_another_number_and_no_delay(bench: ServoBench, line: Servo
 
 
 def by_hand(bench: ServoBench, *counts: int) -> Callable[[str], None]:
-    """Somebody who turns the elbow to one position after another, as he is asked."""
+    """An operator who turns the elbow to the next position at each prompt."""
     left = list(counts)
 
     def turn(_: str) -> None:

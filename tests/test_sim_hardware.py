@@ -1,4 +1,4 @@
-"""The simulated servos and base behave as the hardware does: all of it without the physics engine."""
+"""The simulated servos and base behave like the hardware, tested without the physics engine."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def test_an_arm_joint_on_its_way_holds_when_its_command_expires() -> None:
     arm.expire(201 * MS)
     held = arm.servos["elbow"].drive().target_rad
     assert held == pytest.approx(0.3, abs=SERVO_COUNT_RAD)
-    # Once: it does not follow the joint when something pushes it.
+    # Only once: the goal does not follow the joint when something pushes it.
     arm.servos["elbow"].sense(0.2, 0.0, 0.0, now_ns=300 * MS)
     arm.expire(300 * MS)
     assert arm.servos["elbow"].drive().target_rad == pytest.approx(held)
@@ -200,7 +200,7 @@ def test_without_backlash_the_servo_drives_the_joint_to_its_goal_and_with_it_the
 
 
 def run(base: MobileBase, seconds: float, command: BaseCommand | None, start_ns: int = 0) -> tuple[int, float]:
-    """Let the wheels turn as asked; commands at 48 Hz. Returns the time and the fastest change of speed, m/s2."""
+    """Drive the wheels with commands at 48 Hz. Returns the time and the largest change of speed, m/s^2."""
     steepest, before = 0.0, base.ramp.left_mps
     for step in range(round(seconds * HZ)):
         now_ns = start_ns + step * 1_000_000_000 // HZ

@@ -1,4 +1,4 @@
-"""The record of the body's motion: a row for each step of the physics, which the world's own pose agrees with."""
+"""The file of the body's motion: a row for each physics step, in agreement with the world's pose."""
 
 from __future__ import annotations
 

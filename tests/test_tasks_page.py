@@ -17,7 +17,7 @@ def test_a_new_task_is_one_file_one_test_and_its_registration() -> None:
     assert files == ["nod/pyproject.toml", "nod/nod.py", "nod/test_nod.py"]
 
 
-@pytest.mark.zenoh
+@pytest.mark.process
 @pytest.mark.sim
 def test_the_page_works_word_for_word(tmp_path: Path) -> None:
     printed: list[str] = []

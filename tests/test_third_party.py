@@ -21,7 +21,7 @@ from third_party import NAME, install, on_path
 from apps.captures.player import Player
 from apps.captures.reexecute import reexecute
 from apps.captures.replay import Replay, played_keys
-from apps.cli.foreign import read
+from apps.cli.echo import read
 from apps.cli.listening import takes_frames
 from apps.cli.main import main
 from cocoro import topics
@@ -34,6 +34,8 @@ from cocoro.messages import BaseState, Message
 from cocoro.robot import Robot
 from cocoro.topics import Topic
 from deploy import processes
+
+pytestmark = pytest.mark.process  # pip installs the distribution
 
 KEY = f"calliope/{NAME}/travelled"
 

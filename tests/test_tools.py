@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from apps.cli import top_view
-from apps.cli.foreign import jsonable, lines, read
+from apps.cli.echo import jsonable, lines, read
 from apps.cli.hz import RateMeter, rows, size_text
 from apps.cli.listening import keyexpr_of, takes_frames
 from apps.cli.logs import LogTail, entries, files_of, robot_of

@@ -67,11 +67,11 @@ def on_mesh(command: Callable[[], Awaitable[int]]) -> int:
 def test_echo_prints_messages_of_types_that_it_knows_and_of_others(
     root: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert on_mesh(lambda: echo.echo(ANY, "guest/wave", 2, None, False, False)) == exits.DONE
+    assert on_mesh(lambda: echo.print_messages(ANY, "guest/wave", 2, None, False, False)) == exits.DONE
     head = "calliope/guest/wave  (unknown type)"
     assert capsys.readouterr().out.splitlines() == 2 * [head, "  height_m: 1.5", "  raw: <3 bytes>"]
 
-    assert on_mesh(lambda: echo.echo(ANY, "*/command", 4, None, True, False)) == exits.DONE
+    assert on_mesh(lambda: echo.print_messages(ANY, "*/command", 4, None, True, False)) == exits.DONE
     heard = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert len(heard) == 4
     good = [entry["message"]["left_mps"] for entry in heard if "problem" not in entry]
@@ -86,7 +86,7 @@ def test_echo_of_a_silent_key_says_so_and_exits_with_1_when_its_time_is_over(
     root: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(echo, "HINT_S", 0.05)
-    assert on_mesh(lambda: echo.echo(ANY, "no/thing", None, 0.3, False, False)) == exits.FAILED
+    assert on_mesh(lambda: echo.print_messages(ANY, "no/thing", None, 0.3, False, False)) == exits.FAILED
     out, err = capsys.readouterr()
     assert out == ""
     assert err.count("nothing on calliope/no/thing yet") == 1
@@ -153,6 +153,7 @@ def test_top_for_people_has_a_line_for_each_service_and_topic(root: Path, capsys
     assert any(line.startswith("base/command ") and "planning" in line for line in lines)
 
 
+@pytest.mark.process
 @pytest.mark.parametrize("command", [["top", "--json"], ["echo", "guest/wave"], ["hz", "**"]], ids=" ".join)
 def test_ctrl_c_ends_them_well(root: Path, command: list[str]) -> None:
     async def scenario() -> None:
@@ -169,6 +170,7 @@ def test_ctrl_c_ends_them_well(root: Path, command: list[str]) -> None:
     asyncio.run(scenario())
 
 
+@pytest.mark.process
 def test_logs_follow_a_process_over_its_restart(tmp_path: Path) -> None:
     with Shell(tmp_path) as cocoro:
         assert cocoro("up", cocoro.profile("good"), "--detach").returncode == 0

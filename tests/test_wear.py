@@ -1,4 +1,4 @@
-"""The worn body: how far it is from its drawing, that the seed alone decides, that the world is built from it."""
+"""The worn body: its distance from the nominal one; it depends on the seed alone, and the world is built from it."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_the_camera_is_mounted_off_by_a_degree_and_five_millimetres_at_most(robo
         between = np.linalg.inv(drawn) @ real
         turns.append(degrees(acos(min((np.trace(between[:3, :3]) - 1) / 2, 1.0))))
         mount = robot.chain("camera_mount").pose(dict.fromkeys(neck, 0.0))
-        # The turn is about the mount, from where the camera stands 28 mm off.
+        # The rotation is about the mount, which is 28 mm away from the camera.
         arm = (np.linalg.inv(mount) @ drawn)[:3, 3]
         shifts.append(np.linalg.norm(real[:3, 3] - drawn[:3, 3]) - np.linalg.norm(arm) * np.radians(turns[-1]))
     assert max(turns) <= 1.01

@@ -13,7 +13,7 @@ BAUD = 57600
 
 
 class Wire:
-    """A Create in passive mode at one's fingertips."""
+    """A Create in passive mode, with direct access to its bytes."""
 
     def __init__(self) -> None:
         self.create = EmulatedCreate()

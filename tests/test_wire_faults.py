@@ -1,4 +1,4 @@
-"""Faults of every sort at random moments of a moving robot: a small share of `python -m bench.hardware_faults`."""
+"""Faults of every kind at random moments of a moving robot: a few trials of `python -m bench.hardware_faults`."""
 
 from __future__ import annotations
 
@@ -7,9 +7,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
+pytestmark = pytest.mark.process
+
 COUNT = 16
 SLOWEST_MS = 800.0
-"""What a busy machine makes of 0.3 s."""
+"""Time in which the wheels must stand: 0.3 s, plus what a busy machine adds."""
 
 
 def bench(name: str, *arguments: str) -> str:

@@ -12,7 +12,7 @@ from operator_shell import Shell
 
 from deploy.rundir import RunDir
 
-pytestmark = [pytest.mark.zenoh, pytest.mark.sim]
+pytestmark = [pytest.mark.zenoh, pytest.mark.sim, pytest.mark.process]
 
 
 @pytest.fixture
@@ -23,7 +23,7 @@ def shell(tmp_path: Path) -> Iterator[Shell]:
 
 
 def ask(shell: Shell, **question: object) -> object:
-    """Of the emulated hardware."""
+    """The state of the emulated hardware."""
     with socket.socket(socket.AF_UNIX) as control:
         control.connect(str(shell.run_dir.path / "wire" / "control"))
         control.sendall(json.dumps(question).encode() + b"\n")

@@ -1,4 +1,4 @@
-"""The PyBullet robot behind its firmware: registers and wheel speeds move it, and what it does is felt."""
+"""The PyBullet robot behind its firmware: registers and wheel speeds move it, and its motion is measured."""
 
 from __future__ import annotations
 

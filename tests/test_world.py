@@ -1,4 +1,4 @@
-"""The PyBullet world: its robot is the described one, its scene the given one, and it repeats itself to the bit."""
+"""The PyBullet world: its robot is the described one, its scene the given one, and it is repeatable to the bit."""
 
 from __future__ import annotations
 
@@ -263,6 +263,7 @@ def test_two_worlds_in_one_process_do_not_meet() -> None:
     assert told == alone
 
 
+@pytest.mark.process
 def test_importing_the_simulator_writes_nothing() -> None:
     done = subprocess.run([sys.executable, "-c", "import sim.world"], capture_output=True, check=True, timeout=60)
     assert done.stdout == b""

@@ -1,4 +1,4 @@
-"""What the simulated hand holds it holds by friction alone."""
+"""The simulated hand holds objects by friction alone."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The simulated robot moves as it is commanded, and stops when it must."""
+"""The simulated robot moves as commanded, and stops when it must."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_the_base_goes_where_its_wheels_roll(empty: World, left_mps: float, righ
     assert truth.body_m[1] == pytest.approx(state.odometry_m[1], abs=0.005 * way_m)
     turned = state.odometry_yaw_rad - yaw_of(truth)
     assert (turned + pi) % (2 * pi) - pi == pytest.approx(0.0, abs=0.005 * max(1.0, abs(state.odometry_yaw_rad)))
-    # 3 s of commands, then the deadman's patience, and what the two ramps take off and give back.
+    # 3 s of commands, then the deadman time; the two ramps cancel.
     held_s = 3.0 + ROBOT.base.command_timeout_s - COMMAND_EVERY / 240
     assert state.odometry_yaw_rad == pytest.approx(
         (right_mps - left_mps) / ROBOT.base.wheel_separation_m * held_s, rel=0.01, abs=0.002
@@ -166,7 +166,7 @@ def test_real_wheels_differ_from_what_odometry_believes_and_ideal_ones_do_not() 
             errors.append(truth.body_m[0] - state.odometry_m[0])
             assert abs(truth.body_m[0] / state.odometry_m[0] - 1.0) < 0.03
             assert abs(yaw_of(truth)) < 0.05 * 0.84 / ROBOT.base.wheel_separation_m
-            # What the wheels were told is all that a Create's driver can know; here they did it.
+            # A Create's driver knows only the commanded wheel speeds; here the wheels followed them.
             held_s = 4.0 + ROBOT.base.command_timeout_s - COMMAND_EVERY / 240
             assert state.odometry_m[0] == pytest.approx(0.2 * held_s, rel=0.005)
     assert np.std(errors) > 0.001

@@ -7,12 +7,13 @@ import re
 import shutil
 import subprocess
 import sysconfig
-import tempfile
 import venv
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
+
+from places import short_folder
 
 ROOT = Path(__file__).parent.parent
 _BLOCK = re.compile(r"(?:`(?P<path>[\w./-]+)`:\n\n)?```(?P<language>\w+)\n(?P<text>.*?)```", re.DOTALL)
@@ -43,11 +44,11 @@ def reader(folder: Path) -> Iterator[dict[str, str]]:
         script = home / "bin" / command
         script.write_text(f'#!/bin/sh\nexec "{home}/bin/python" -P -m {module} "$@"\n')
         script.chmod(0o755)
-    run_dir = tempfile.mkdtemp(prefix="cocoro")  # short: sockets live there
+    run_dir = short_folder()
     environment = os.environ | {
         "PATH": f"{home}/bin:{os.environ['PATH']}",
         "PYTHONPATH": str(ROOT),
-        "COCORO_RUN_DIR": run_dir,
+        "COCORO_RUN_DIR": str(run_dir),
         "PIP_NO_BUILD_ISOLATION": "0",  # which is how pip spells "true" for an option that begins with "no"
         "PIP_NO_DEPS": "1",
         "PIP_DISABLE_PIP_VERSION_CHECK": "1",

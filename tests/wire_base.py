@@ -1,4 +1,4 @@
-"""A Create at the end of a pseudo-terminal and whoever drives it: what the tests of the base have in common."""
+"""A Create at the end of a pseudo-terminal, and a driver for it: the common part of the base's tests."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ MS = 1_000_000
 SAFE = 2
 DEADMAN_NS = 200 * MS
 PATIENCE_NS = 100 * MS
-"""What a busy machine may add to a deadline."""
+"""Time that a busy machine may add to a deadline."""
 
 
 def frame(readings: oi.Readings) -> bytes:
-    """A stream frame as the Create would send it."""
+    """A stream frame of the Create."""
     payload = b"".join(
         bytes([packet]) + value.to_bytes(oi.PACKETS[packet].size, "big", signed=oi.PACKETS[packet].signed)
         for packet, value in readings.items()
@@ -34,7 +34,7 @@ def frame(readings: oi.Readings) -> bytes:
 
 
 class Bench:
-    """An emulated Create, its line and its body; `with` it."""
+    """An emulated Create, its line and its plant; a context manager."""
 
     def __init__(self, folder: Path, seed: int = 0) -> None:
         self.create = EmulatedCreate()
@@ -51,11 +51,11 @@ class Bench:
         self.emulator.__exit__(None, None, None)
 
     def until_awake(self) -> None:
-        """The driver has put it into its mode and asks for its sensors."""
+        """Whether the driver has put the Create into its mode and requests its sensors."""
         self.emulator.until(lambda: self.create.mode == SAFE and self.create._streaming)
 
     def until_wheels(self, left: int, right: int) -> int:
-        """When the wheels were asked for this; ns, monotonic."""
+        """Wait for these wheel speeds; returns when they were commanded, CLOCK_MONOTONIC."""
         self.emulator.until(lambda: self.create.wheels_mmps == (left, right))
         return self.emulator.call(lambda: self.create.acted[-1][0])
 
@@ -64,7 +64,7 @@ class Bench:
 
 
 class FakeService:
-    """Stands in for the service: the other end of a guard's socket."""
+    """Replaces the service: the other end of a guard's socket."""
 
     def __init__(self, port: str, mode: str = "safe", robot: str = "") -> None:
         arguments = [port, "--mode", mode, *(["--robot", robot] if robot else [])]
@@ -74,9 +74,9 @@ class FakeService:
         self._asking = threading.Event()
         self._thread: threading.Thread | None = None
         self.asked_ns = 0
-        """When it asked last."""
+        """Time of the last request."""
         self.reset = 0
-        """How many emergency stops it says that have been reset."""
+        """Number of emergency stops that its requests report as reset."""
 
     def ask(self, left: int, right: int, for_s: float = 0.2) -> None:
         self.asked_ns = time.monotonic_ns()
@@ -87,14 +87,14 @@ class FakeService:
         self.channel.send(message if isinstance(message, bytes) else json.dumps(message).encode())
 
     def report(self, **wanted: object) -> dict[str, Any]:
-        """The next report that says this."""
+        """The next report with these values."""
         while True:
             report: dict[str, Any] = json.loads(self.channel.recv(65536))
             if all(report[name] == value for name, value in wanted.items()):
                 return report
 
     def keep_asking(self, left: int, right: int) -> None:
-        """Until `silence`."""
+        """Ask for these wheel speeds until `silence`."""
         self.silence()
         self._asking.clear()
 

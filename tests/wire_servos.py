@@ -1,4 +1,4 @@
-"""Servo lines at the end of pseudo-terminals and whoever moves them: what the tests of the servos have in common."""
+"""Servo lines at the end of pseudo-terminals, and a service for them: the common part of the servos' tests."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ T = TypeVar("T")
 MS = 1_000_000
 LONG_S = 30.0
 REPLY_S = 0.2
-"""A busy machine answers late."""
+"""Time limit for answers on a busy machine."""
 ARM, HAND = (1, 2, 3, 4, 5, 6), (7, 8, 9)
 STATE: dict[str, Topic[ServoState]] = {"arm": topics.ARM_STATE, "hand": topics.HAND_STATE}
 COMMAND: dict[str, Topic[ServoCommand]] = {"arm": topics.ARM_COMMAND, "hand": topics.HAND_COMMAND}
 
 
 class ServoBench:
-    """Two emulated lines with the Calliope's servos and a body without physics; `with` it."""
+    """Two emulated lines with the Calliope's servos and a plant without physics; a context manager."""
 
     def __init__(self, folder: Path, seed: int = 0, overload_s: float = 5.0) -> None:
         self.arm = EmulatedServoBus([EmulatedServo(number, 28, overload_s) for number in ARM])
@@ -52,7 +52,7 @@ class ServoBench:
         return next(servo for bus in (self.arm, self.hand) for servo in bus.servos if servo.number == number)
 
     def put(self, number: int, registers: Mapping[int, int]) -> None:
-        """Set registers of a servo, by address, between two of the line's packets."""
+        """Set registers of a servo, by address, between two packets."""
 
         def put() -> None:
             for address, value in registers.items():
@@ -64,12 +64,12 @@ class ServoBench:
         return self.emulator.call(job)
 
     async def until(self, condition: Callable[[], object]) -> int:
-        """When it is so; ns, monotonic."""
+        """Wait until the condition holds; returns when, CLOCK_MONOTONIC."""
         return await asyncio.to_thread(self.emulator.until, condition)
 
 
 class Moved:
-    """The service under test, with what one does to an arm."""
+    """The service under test, and the operations on an arm."""
 
     def __init__(self, bench: ServoBench, service: ServiceUnderTest) -> None:
         self.bench = bench
@@ -81,7 +81,7 @@ class Moved:
         self.service.feed(topics.LATCH, Latch(state="released"))
 
     def move(self, network: str, **goals: float) -> None:
-        """Towards these goals at 1 rad/s, commanded at 50 Hz from now on."""
+        """Move towards these goals at 1 rad/s, commanded at 50 Hz from now on."""
         self.silence(network)
         self._moving[network] = asyncio.ensure_future(self._move(network, goals))
 
@@ -97,7 +97,7 @@ class Moved:
             self.service.feed(COMMAND[network], command)
 
     async def state(self, network: str, good: Callable[[ServoState], object]) -> ServoState:
-        """The next state that is so."""
+        """The next state for which the condition holds."""
         async with asyncio.timeout(LONG_S):
             async for state in self.service.tester.stream(STATE[network]):
                 if good(state):
@@ -111,7 +111,7 @@ class Moved:
                     return
 
     async def without(self, network: str, text: str) -> None:
-        """Until none of its faults says this. On a busy machine others may come and go."""
+        """Wait until no fault has this text. On a busy machine other faults may come and go."""
         async with asyncio.timeout(LONG_S):
             async for health in self.service.tester.stream(topics.HEALTH.of(network)):
                 if not any(text in fault for fault in health.faults):
@@ -130,7 +130,7 @@ def angle(state: ServoState, joint: str) -> float:
 
 @asynccontextmanager
 async def moved(bench: ServoBench, **config: object) -> AsyncIterator[Moved]:
-    """The servo service on both lines, all servos met, the emergency stop released."""
+    """The servo service on both lines, all servos inspected, the emergency stop released."""
     settings = {"arm_port": bench.port("arm"), "hand_port": bench.port("hand"), "reply_s": REPLY_S} | config
     async with ServiceUnderTest("services.servos.service", settings, clock=RealClock()) as service:
         servos = Moved(bench, service)

@@ -1,4 +1,4 @@
-"""One who moves the simulated robot by hand in tests: commands, arm angles by least squares, a whole grasp."""
+"""An operator of the simulated robot in tests: commands, arm angles by least squares, a complete grasp."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ LEVEL = {"wrist_roll": pi / 2}
 OPEN = {"claw_left": -radians(20), "claw_right": radians(20)}
 SHUT = {"claw_left": radians(15), "claw_right": -radians(15)}
 READY = {"arm_base": 0.0, "shoulder": 1.2, "elbow": -1.8, "wrist_pitch": 0.5}
-"""Above the floor before the robot: where the search for arm angles starts."""
+"""A posture above the floor in front of the robot, where the search for arm angles starts."""
 COMMAND_EVERY = 5
 
 
@@ -32,7 +32,7 @@ class Operator:
         self.world = world
         self.judge = judge
         self.seen: set[str] = set()
-        """Collisions so far."""
+        """The collisions so far."""
         world.set_latch("released")
 
     def run(
@@ -68,7 +68,7 @@ class Operator:
     def reach(
         self, start_m: FloatArray, end_m: FloatArray, pitch_rad: float, seconds: float, arm: Mapping[str, float]
     ) -> dict[str, float]:
-        """Carry the pad centre along a line; returns the arm's angles at its end."""
+        """Move the pad centre along a line; returns the arm's angles at its end."""
         angles = dict(arm)
         points = 8
         for point in range(1, points + 1):
@@ -79,7 +79,7 @@ class Operator:
 
 def arm_angles(target_m: FloatArray, pitch_rad: float, start: Mapping[str, float]) -> dict[str, float]:
     """Damped least squares: arm angles that bring the pad centre to a point of the body frame, the roll axis
-    pitched so (up positive), the claws level."""
+    pitched by this angle (up positive), the claws level."""
     chain = ROBOT.chain("pad_centre")
     angles = {**start, **LEVEL}
     for _ in range(100):
@@ -120,7 +120,7 @@ def yaw_of(truth: Truth) -> float:
 def grasp_and_lift(
     world: World, at_m: tuple[float, float], pitch_rad: float, judge: Judge, height_m: float = 0.06
 ) -> Operator:
-    """Open, reach along the ground to `at_m`, close, lift to 0.25 m and wait 3 s."""
+    """Open the hand, reach along the ground to `at_m`, close, lift to 0.25 m and wait 3 s."""
     x, y = at_m
     operator = Operator(world, judge)
     before, there, high = (

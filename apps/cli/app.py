@@ -28,7 +28,7 @@ class CommandRow(NamedTuple):
 COMMANDS = (
     CommandRow("cancel", TASKS, "End the running task; the robot stands still."),
     CommandRow("rehearse", TASKS, "Try a task in simulation: the whole robot in one process, in virtual time."),
-    CommandRow("status", WATCH, "What runs, its health, what the robot does and why."),
+    CommandRow("status", WATCH, "The running services, their health, the task and the planner's reason."),
     CommandRow("objects", WATCH, "The objects that the robot knows, and where it saw each last; `learn` adds one."),
     CommandRow("snapshot", WATCH, "Write a picture of what the robot sees now, with its detections drawn in."),
     CommandRow(
@@ -48,15 +48,15 @@ COMMANDS = (
     CommandRow(
         "top",
         TOOLS,
-        "What runs and what travels, live: cpu, memory, rates against nominal, ages, what was skipped, lost, rejected.",
+        "Services and topics, live: cpu, memory, rates against nominal, ages, and what was skipped, lost or rejected.",
     ),
     CommandRow(
         "echo",
         TOOLS,
-        "What travels on a key, decoded, of whatever type it is; what a reader would reject is marked with its reason.",
+        "The messages of a key, decoded, of any type; a message that a reader would reject is marked with the reason.",
     ),
     CommandRow("hz", TOOLS, "Rate, jitter and amount of data on a key, as it arrives here, over the last seconds."),
-    CommandRow("logs", TOOLS, "What the robot's processes on this machine wrote since their start, merged by time."),
+    CommandRow("logs", TOOLS, "Logs of the robot's processes on this machine since their start, merged by time."),
     CommandRow("new", TOOLS, "Write a component from a template: `cocoro new service NAME`."),
     CommandRow(
         "base", HARDWARE, "Show the base: mode, battery, bumpers, odometry; `recover` puts it back into its mode."
@@ -64,10 +64,14 @@ COMMANDS = (
     CommandRow("servos", HARDWARE, "Find, set up, calibrate, hold and relax the servos; clear their faults."),
     CommandRow("kinect", HARDWARE, "Calibrate the Kinect; tilt it."),
     CommandRow(
-        "doctor", HARDWARE, "Look over a machine and its robot before a run; each line is well, or says what to do."
+        "doctor", HARDWARE, "Check a machine and its robot before a run; each line is well, or says what to do."
     ),
-    CommandRow("babble", LEARNING, "Move to learn: the arm before the eyes, the wheels before a target."),
-    CommandRow("learn", LEARNING, "Learn from what babbling saw: a model that the planner loads."),
+    CommandRow(
+        "babble",
+        LEARNING,
+        "Move to collect samples for learning: the arm with the hand in view, the wheels with a target.",
+    ),
+    CommandRow("learn", LEARNING, "Learn a model for the planner from the samples of babbling."),
     CommandRow(
         "experiment",
         LEARNING,
@@ -79,7 +83,7 @@ COMMANDS = (
     CommandRow("down", RUNNING, "Stop a robot's processes."),
     CommandRow("run", RUNNING, "Run one process in this terminal, on the mesh of the profile."),
     CommandRow("estop", SAFETY, "Emergency stop, now: everything that moves stands still until `reset`."),
-    CommandRow("stop", SAFETY, "The same as estop.", hidden=True),
+    CommandRow("stop", SAFETY, "Short for estop.", hidden=True),
     CommandRow("reset", SAFETY, "Release the emergency stop."),
 )
 
@@ -88,11 +92,11 @@ def load(name: str) -> TyperCommand | TyperGroup:
     """Imports the file of a command and returns the command."""
     match name:
         case "cancel" | "rehearse":
-            from apps.cli.task_app import app
+            from apps.cli.task_commands import app
         case "status":
             from apps.cli.status import app
         case "objects":
-            from apps.cli.objects_app import app
+            from apps.cli.objects import app
         case "snapshot":
             from apps.cli.snapshot import app
         case "topics":
@@ -107,8 +111,10 @@ def load(name: str) -> TyperCommand | TyperGroup:
             from apps.cli.export import app
         case "top":
             from apps.cli.top import app
-        case "echo" | "new":
-            from apps.cli.tools_app import app
+        case "echo":
+            from apps.cli.echo import app
+        case "new":
+            from apps.cli.new import app
         case "hz":
             from apps.cli.hz import app
         case "logs":
@@ -120,9 +126,11 @@ def load(name: str) -> TyperCommand | TyperGroup:
         case "kinect":
             from apps.cli.kinect import app
         case "doctor":
-            from apps.cli.hardware_app import app
-        case "babble" | "learn":
-            from apps.cli.learning_app import app
+            from apps.cli.doctor import app
+        case "babble":
+            from apps.cli.babble import app
+        case "learn":
+            from apps.cli.learn import app
         case "experiment":
             from apps.cli.experiment import app
         case "up" | "down" | "run":
@@ -147,7 +155,7 @@ class CommandGroup(TyperGroup):
             self.add_command(listed)
 
     def list_commands(self, ctx: Any) -> list[str]:
-        from apps.cli.task_app import task_names
+        from apps.cli.task_commands import task_names
 
         return [*task_names(), *super().list_commands(ctx)]
 
@@ -155,7 +163,7 @@ class CommandGroup(TyperGroup):
         command = super().get_command(ctx, cmd_name)
         if command is not None:
             return command
-        from apps.cli.task_app import task_command
+        from apps.cli.task_commands import task_command
 
         return task_command(cmd_name)
 

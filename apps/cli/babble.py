@@ -1,17 +1,20 @@
-"""`cocoro babble`: have the robot babble, and keep what it reports in a file that the next time goes on from."""
+"""`cocoro babble`: the robot babbles; the samples that it publishes are kept in a file that a later run continues."""
 
 from __future__ import annotations
 
-import json
+import asyncio
+import json as json_module
+import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+import typer
 from msgspec.structs import replace
 
 from apps.cli.interrupt import on_interrupt
 from apps.cli.link import Link, joined
-from apps.cli.options import RobotChoice
+from apps.cli.options import JsonOption, MeshOption, RobotChoice, RobotOption, SamplesOutOption
 from apps.cli.output import going_on
 from apps.cli.progress import TaskDisplay, task_display
 from apps.cli.tasks import Follower
@@ -25,9 +28,48 @@ from services.executive.tasks import BabbleArmTask, BabbleWheelsTask
 BAR = 20
 """Characters of the progress bar."""
 
+app = typer.Typer()
+babble = typer.Typer(
+    no_args_is_help=True,
+    help="Move to collect samples for learning: the arm with the hand in view, the wheels with a target.",
+)
+app.add_typer(babble, name="babble")
+
+
+@babble.command("arm")
+def babble_arm(
+    samples: Annotated[
+        int, typer.Option(min=1, max=1_000_000, metavar="N", help="Number of samples that the file is to hold.")
+    ] = 1000,
+    out: SamplesOutOption = Path("arm.jsonl"),
+    robot: RobotOption = None,
+    profile: MeshOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Move the arm about and look at the hand. Ctrl-C stops it; the same command continues, and no sample is lost."""
+    sys.exit(asyncio.run(collect(RobotChoice(robot, profile), BabbleArmTask(), samples, out, json)))
+
+
+@babble.command("wheels")
+def babble_wheels(
+    trials: Annotated[
+        int, typer.Option(min=1, max=100_000, metavar="N", help="Number of trials that the file is to hold.")
+    ] = 40,
+    target: Annotated[
+        str, typer.Option(metavar="LABEL", help="A known object that stands 1.5 m in front of the robot.")
+    ] = "red_can",
+    out: SamplesOutOption = Path("wheels.jsonl"),
+    robot: RobotOption = None,
+    profile: MeshOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Turn the wheels to and fro in front of a target. The robot needs half a metre around it. Ctrl-C stops it."""
+    task = BabbleWheelsTask(label=target)
+    sys.exit(asyncio.run(collect(RobotChoice(robot, profile), task, trials, out, json)))
+
 
 class BabbleDisplay:
-    """Shows the samples beside what the task says: a bar, the coverage, and the time that is left at this rate."""
+    """Shows the samples with the task's progress: a bar, the coverage, and the time left at this rate."""
 
     def __init__(self, view: TaskDisplay, kept: SampleCollector[Any], wanted: int) -> None:
         self._view = view
@@ -44,7 +86,7 @@ class BabbleDisplay:
         self._view.say(text)
 
     def result(self, text: str) -> None:
-        self._view.result(f"{text}; {self._kept.said}")
+        self._view.result(f"{text}; {self._kept.summary}")
 
     def close(self) -> None:
         self._view.close()
@@ -54,11 +96,11 @@ class BabbleDisplay:
         full = round(BAR * min(count / self._wanted, 1.0))
         new = count - self._had
         left = f", {_time((self._wanted - count) * elapsed_s / new)} left" if new else ""
-        return f"[{'#' * full}{'.' * (BAR - full)}] {count} of {self._wanted}: {self._kept.said}{left}"
+        return f"[{'#' * full}{'.' * (BAR - full)}] {count} of {self._wanted}: {self._kept.summary}{left}"
 
 
 class SampleWriter:
-    """Keeps what is reported. When the file takes no more, it cancels: the robot need not move for nothing."""
+    """Writes samples into the file; cancels the task when the file takes no more, so that the robot stops."""
 
     def __init__(self, kept: SampleCollector[Any], cancel: Callable[[], None]) -> None:
         self.failure: OSError | None = None
@@ -74,36 +116,38 @@ class SampleWriter:
                 self._cancel()
 
 
-async def babble(
-    where: RobotChoice, task: BabbleArmTask | BabbleWheelsTask, wanted: int, file: Path, as_json: bool
+async def collect(
+    choice: RobotChoice, task: BabbleArmTask | BabbleWheelsTask, wanted: int, file: Path, as_json: bool
 ) -> int:
-    """Babble until the file holds `wanted` samples or trials. Ctrl-C stops the robot and keeps them. Returns the exit
-    code; raises ConfigError or RefusedError for a file that cannot be continued."""
-    async with joined(where) as link:
+    """Babbles until the file holds `wanted` samples or trials; returns the exit code. Ctrl-C stops the robot.
+
+    Raises ConfigError or RefusedError for a file that cannot be continued, CocoroError for one that cannot be written.
+    """
+    async with joined(choice) as link:
         robot = await description(link)
         height_m = await _standing_height(link, task.target) if task.target else None
         with collector(task.samples, file, robot, height_m) as kept:
             shown = BabbleDisplay(task_display(as_json), kept, wanted)
             if len(kept) >= wanted:
-                shown.result(f"{file} holds enough already")
+                shown.result(f"{file} holds {len(kept)} already, which is enough")
                 return 0
             if len(kept):
-                shown.say(f"going on from {file}: {kept.said}")
-            samples: Any = link.inbox(task.samples)  # before the task is asked for, so that nothing is missed
+                shown.say(f"continuing {file}: {kept.summary}")
+            samples: Any = link.inbox(task.samples)  # before the request, so that no sample is missed
             task = replace(task, first=kept.next, count=wanted - len(kept))
             follower = Follower(link, TaskRequest(task=task), shown, None)
-            keeper = SampleWriter(kept, follower.cancel)
-            samples.add(lambda _key, message: keeper.take(message))
+            writer = SampleWriter(kept, follower.cancel)
+            samples.add(lambda _key, message: writer.take(message))
             with on_interrupt(follower.interrupt), going_on():
                 code, result = await follower.run()
-            if keeper.failure is not None:
+            if writer.failure is not None:
                 raise CocoroError(
-                    f"samples {file}: {keeper.failure.strerror}, so babbling was cancelled; make room there, and the "
-                    f"same command goes on with the {len(kept)} that it has"
+                    f"samples {file}: {writer.failure.strerror}, so babbling was cancelled; make room there, and the "
+                    f"same command continues with the {len(kept)} samples that it has"
                 )
             result |= {"file": str(file), "samples": len(kept)}
     if as_json:
-        print(json.dumps(result))
+        print(json_module.dumps(result))
     return code
 
 
@@ -117,7 +161,7 @@ async def description(link: Link) -> Robot:
     """The description that the planner of a running robot computes with."""
     reply = await link.call(ABOUT.of("planning"), AboutRequest())
     if reply.description is None:
-        raise MeshError(f"{link.robot}: the planner does not say what robot it is")
+        raise MeshError(f"{link.robot}: the planner does not report a robot description; see `cocoro status`")
     return Robot.from_data(reply.description, f"description of {link.robot}")
 
 

@@ -2,22 +2,30 @@
 
 from __future__ import annotations
 
-import json
+import json as json_module
 import os
 import shutil
 import socket
+import sys
 import time
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import closing
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from apps.cli import doctor_stop, exits
+import typer
+
+from apps.cli import exits
+from apps.cli.options import DescriptionOption, JsonOption, MeasuredOption, ProfileArgument
+from apps.cli.stop_asking import addresses
 from cocoro.bus import shared
 from cocoro.checks import Check, bad, note, ok
 from cocoro.component import Component, load, machine_checks
 from cocoro.errors import ConfigError
 from cocoro.held_file import Holder
 from cocoro.robot import Robot
+from cocoro.stop.path import StopPoint
+from cocoro.stop.record import latch_dir, read
 from deploy import profiles
 from deploy.processes import shared_bytes
 from deploy.profiles import Profile
@@ -30,14 +38,29 @@ MARKS = {"ok": "ok  ", "note": "note", "bad": "BAD "}
 SYNCHRONISED = Path("/run/systemd/timesync/synchronized")
 EARLIEST_S = 1_700_000_000
 """A wall clock before this time (end of 2023) is wrong."""
+IN_MEMORY = ("tmpfs", "ramfs")
+"""File systems that a reboot empties."""
+
+app = typer.Typer()
 
 
-def doctor(profile_name: str, as_json: bool, description: Path | None = None, measured: Path | None = None) -> int:
-    """Print all checks of a profile. Returns exit code 1 when one found a problem."""
+@app.command()
+def doctor(
+    profile: ProfileArgument = "robot",
+    description: DescriptionOption = None,
+    measured: MeasuredOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Check a machine and its robot before a run; each line is well, or says what to do. Exit code 1 if not."""
+    sys.exit(print_checks(profile, json, description, measured))
+
+
+def print_checks(profile_name: str, as_json: bool, description: Path | None, measured: Path | None) -> int:
+    """Prints all checks of a profile; the exit code is 1 when one found a problem."""
     profile = profiles.read(profile_name).with_robot(description, measured)
     checks = list(examine(profile))
     if as_json:
-        print(json.dumps([check._asdict() for check in checks]))
+        print(json_module.dumps([check._asdict() for check in checks]))
     else:
         width = max(len(check.name) for check in checks)
         for check in checks:
@@ -70,7 +93,7 @@ def examine(profile: Profile) -> Iterator[Check]:
     yield _shared_memory(profile, claims)
     yield from _disk(run_dir)
     yield from _mesh(profile, run_dir)
-    yield from doctor_stop.check(profile.robot)
+    yield from stop_checks(profile.robot)
 
 
 def _robot(profile: Profile) -> tuple[Robot, Check | None]:
@@ -167,3 +190,59 @@ def _reachable(endpoint: str) -> Check:
             return ok("mesh", f"{endpoint} answers")
     except (OSError, ValueError) as error:
         return bad("mesh", f"{endpoint} does not answer ({error}): check its router and the address")
+
+
+# --- the emergency stop -----------------------------------------------------------------------------
+
+
+def stop_checks(robot: str) -> Iterator[Check]:
+    """Whether the stop path works, and where the latch is kept."""
+    yield _stop_path()
+    yield _latch(robot)
+
+
+def _stop_path() -> Check:
+    """Opens a stop point as a service does, and looks for it as `cocoro stop` does."""
+    name = f"doctor-{os.getpid()}"
+    try:
+        with closing(StopPoint(name, "doctor")):
+            found = addresses(name)
+    except OSError as error:
+        return bad("emergency stop", f"the stop path does not work ({error}): is /proc mounted?")
+    if not found:
+        return bad(
+            "emergency stop", "its addresses are missing in /proc/net/unix, so `cocoro stop` would not find them"
+        )
+    return ok("emergency stop", "the stop path works; every user of this machine may stop the robot")
+
+
+def _latch(robot: str) -> Check:
+    folder = latch_dir(robot)
+    there = next(path for path in (folder, *folder.parents) if path.exists())
+    if not there.is_dir() or not os.access(there, os.W_OK):
+        return bad(
+            "its latch",
+            f"{there} cannot be written, so the robot starts stopped; set COCORO_STATE_DIR",
+        )
+    if (kind := _filesystem(there)) in IN_MEMORY:
+        return bad(
+            "its latch",
+            f"{folder} is in memory ({kind}) and does not survive a reboot; set COCORO_STATE_DIR",
+        )
+    latched = (
+        [latch for file in sorted(folder.glob("[!.]*")) if (latch := read(file)).latched] if folder.is_dir() else []
+    )
+    if latched:
+        return note("its latch", f"latched by {latched[0].by}; `cocoro reset` releases it when the robot is up")
+    return ok("its latch", f"kept in {folder}")
+
+
+def _filesystem(path: Path) -> str:
+    """Type of the file system that holds a path; empty where /proc does not list it."""
+    try:
+        mounts = [line.split() for line in Path("/proc/self/mounts").read_text(errors="replace").splitlines()]
+    except OSError:
+        return ""
+    place = str(path.resolve())
+    over = [(row[1], row[2]) for row in mounts if place == row[1] or place.startswith(row[1].rstrip("/") + "/")]
+    return max(over, key=lambda row: len(row[0]), default=("", ""))[1]

@@ -21,7 +21,7 @@ from rich.text import Text
 from apps.cli import exits
 from apps.cli.interrupt import interrupt_event
 from apps.cli.link import joined
-from apps.cli.listening import Ear, keyexpr_of, takes_frames
+from apps.cli.listening import KeyListener, keyexpr_of, takes_frames
 from apps.cli.options import JsonOption, KeyArgument, MeshOption, RobotChoice, RobotOption
 from apps.cli.terminal import table
 from cocoro.bus.base import Payload
@@ -160,7 +160,7 @@ async def show_rates(choice: RobotChoice, text: str, window_s: float, once: bool
     """Measures until interrupted, or with `once` over one window; the exit code is 1 when nothing arrived in it."""
     meters: dict[str, RateMeter] = {}
     async with joined(choice, frames=takes_frames(text)) as link:
-        ear = Ear(link, keyexpr_of(text, link.robot))
+        ear = KeyListener(link, keyexpr_of(text, link.robot))
         with interrupt_event() as end, _view(as_json, once) as view:
             show_s = time.monotonic() + (window_s if once else SHOW_S)
             while not end.is_set():

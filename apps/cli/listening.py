@@ -1,4 +1,4 @@
-"""Hearing any key of a robot's mesh, those that this project does not know among them."""
+"""Subscribes to any keys of a robot's mesh, including keys that this project does not know."""
 
 from __future__ import annotations
 
@@ -14,41 +14,41 @@ from cocoro.errors import ConfigError
 from cocoro.installed import topic_named
 
 DEPTH = 64
-"""Samples of one key that may wait for this process's loop."""
+"""Payloads of one key that may wait for this process's loop."""
 WAITING = 2000
-"""Samples that may wait for a slow terminal."""
+"""Payloads that may wait for a slow terminal."""
 
 
-class Heard(NamedTuple):
+class ReceivedPayload(NamedTuple):
     key: str
     payload: Payload
     at_s: float
-    """When it came, on this machine's monotonic clock."""
+    """Time of arrival on this machine's monotonic clock, s."""
 
 
 def keyexpr_of(text: str, robot: str) -> str:
-    """What an operator writes, with or without the robot's name, as a key expression of the robot's keys.
+    """The key expression of a key that an operator wrote with or without the robot's name.
 
-    Raises ConfigError for what is none.
+    Raises ConfigError for an invalid key.
     """
     chunks = text.split("/")
     if not text or any(not chunk or ("*" in chunk and chunk not in ("*", "**")) for chunk in chunks):
-        raise ConfigError(f"{text!r} is no key; write it as base/state, */health or ** (`cocoro topics` lists them)")
+        raise ConfigError(f"{text!r} is not a key; write it as base/state, */health or ** (`cocoro topics` lists them)")
     return text if chunks[0] == robot else f"{robot}/{text}"
 
 
 def takes_frames(text: str) -> bool:
-    """Whether frames may be among what an operator wants to hear."""
+    """Whether frames may be among the messages of this key."""
     topic = topic_named(text)
     return topic is None or topic.qos is Qos.FRAME
 
 
-class Ear:
-    """Everything that arrives on a key expression from now on. What nobody takes in time is dropped and counted."""
+class KeyListener:
+    """Collects what arrives on a key expression; payloads that are not taken in time are dropped and counted."""
 
     def __init__(self, link: Link, keyexpr: str) -> None:
         self.keyexpr = keyexpr
-        self._waiting: deque[Heard] = deque()
+        self._waiting: deque[ReceivedPayload] = deque()
         self._arrived = asyncio.Event()
         self._overflowed = 0
         self._subscription = link.bus.subscribe(keyexpr, Qos.STATE, self._take, depth=DEPTH)
@@ -57,22 +57,22 @@ class Ear:
         if len(self._waiting) >= WAITING:
             self._waiting.popleft()
             self._overflowed += 1
-        self._waiting.append(Heard(key, payload, time.monotonic()))
+        self._waiting.append(ReceivedPayload(key, payload, time.monotonic()))
         self._arrived.set()
 
     @property
     def dropped(self) -> int:
         return self._subscription.skipped + self._overflowed
 
-    def take(self) -> list[Heard]:
-        """All that waits."""
-        heard = list(self._waiting)
+    def take(self) -> list[ReceivedPayload]:
+        """Removes and returns all waiting payloads."""
+        waiting = list(self._waiting)
         self._waiting.clear()
         self._arrived.clear()
-        return heard
+        return waiting
 
     async def wait(self, end: asyncio.Event, timeout_s: float | None = None) -> bool:
-        """Until something waits; False when the end comes first, or the time is over."""
+        """Waits for a payload; returns False when `end` is set or the time has passed before."""
         arrived, ended = asyncio.ensure_future(self._arrived.wait()), asyncio.ensure_future(end.wait())
         await asyncio.wait((arrived, ended), timeout=timeout_s, return_when=asyncio.FIRST_COMPLETED)
         for task in (arrived, ended):

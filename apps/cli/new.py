@@ -10,6 +10,9 @@ from collections.abc import Iterator
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path, PurePosixPath
+from typing import Annotated
+
+import typer
 
 from apps.cli import exits
 from cocoro.errors import ConfigError
@@ -21,8 +24,27 @@ NAME = r"[a-z][a-z0-9_-]{0,31}"
 """Valid names: a chunk of a key, and with '_' for '-' a Python package."""
 
 
-def service(name: str, into: Path) -> int:
-    """Write the component into the folder `into`/`name`. Raises ConfigError for an invalid or taken name."""
+app = typer.Typer()
+new = typer.Typer(no_args_is_help=True, help="Write a component from a template: `cocoro new service NAME`.")
+app.add_typer(new, name="new")
+
+
+@new.callback()
+def _new() -> None:
+    """Makes `new` a group of commands, although it has one."""
+
+
+@new.command()
+def service(
+    name: Annotated[str, typer.Argument(help="Name of the service, the first part of its keys: nearest.")],
+    into: Annotated[Path, typer.Option(metavar="DIR", help="The folder that its folder goes into.")] = Path(),
+) -> None:
+    """A working component with its test, as a package of your own: see docs/components.md."""
+    sys.exit(write_service(name, into))
+
+
+def write_service(name: str, into: Path) -> int:
+    """Writes the component into the folder `into`/`name`. Raises ConfigError for an invalid or taken name."""
     folder = into / name
     if folder.exists():
         raise ConfigError(f"{folder} exists already; choose another name, or another place with --into")

@@ -30,7 +30,7 @@ app = typer.Typer()
 
 @app.command()
 def status(robot: RobotOption = None, profile: MeshOption = None, json: JsonOption = False) -> None:
-    """What runs, its health, what the robot does and why. Exit code 1 when something that should run does not."""
+    """The running services, their health, the task and the planner's reason. Exit code 1 when a service is missing."""
     sys.exit(asyncio.run(show_status(RobotChoice(robot, profile), json)))
 
 

@@ -45,7 +45,7 @@ def top(
     profile: MeshOption = None,
     json: JsonOption = False,
 ) -> None:
-    """What runs and what travels, live: cpu, memory, rates against nominal, ages, what was skipped, lost, rejected.
+    """Services and topics, live: cpu, memory, rates against nominal, ages, and what was skipped, lost or rejected.
 
     Ctrl-C ends it. Counts are since the start; a value that is wrong now, or grows and should not, is red.
     """

@@ -15,7 +15,7 @@ from apps.learning.lesson import learn_arm, learn_wheels, sightings
 from apps.learning.wheels import fit_wheels
 from cocoro.clock import NS
 from cocoro.learning import model
-from cocoro.learning.nominal_model import NominalModel
+from cocoro.learning.handmap import NominalModel
 from cocoro.robot import Robot
 from services.planning.teaching import Adapter
 

@@ -17,7 +17,7 @@ from apps.experiments.plan import ExperimentSettings
 from apps.experiments.results import ResultRow, Section
 from cocoro.about import DISTRIBUTIONS
 from cocoro.errors import naming
-from cocoro.learning.nominal_model import fingerprint_of
+from cocoro.learning.handmap import fingerprint_of
 
 HEADS = ("measure", "who", "mean ± 95% CI", "worst", "unit", "wanted", "", "the paper's text")
 DOTS_PER_INCH = 90

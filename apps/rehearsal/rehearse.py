@@ -264,7 +264,7 @@ class _Rehearsal:
             "sensors": request.sensors,
             "lockstep": request.lockstep,
             "model": self._trace.model,
-            **({} if self._collector is None else {"samples": len(self._collector), "said": self._collector.said}),
+            **({} if self._collector is None else {"samples": len(self._collector), "said": self._collector.summary}),
             "outcome": state.outcome,
             "reason": state.reason,
             "sim_s": round(state.elapsed_s, 3),

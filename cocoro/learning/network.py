@@ -1,27 +1,33 @@
-"""The hyperplane radial basis function network (Guenther and Micci Barreca 1997), and its exact Jacobian.
+"""The hyperplane radial basis function network (Guenther and Micci Barreca 1997), its Jacobian, and least squares.
 
 Inputs x (n), centres mu_j (m of them), widths sigma (n): c_j = (x - mu_j) / sigma, g_j = exp(-|c_j|^2 / 2),
 h_j = g_j / sum g, y_k = sum_j h_j (w_kj + sum_i v_kji c_ji). Linear in its weights: with the features
-phi = (h_1 .. h_m, h_1 c_11 .. h_m c_mn), y = phi W. Equations: the design's, derived where the paper's were lost.
+phi = (h_1 .. h_m, h_1 c_11 .. h_m c_mn), y = phi W. Where the paper's equations were lost, they are derived.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cocoro.arrays import FloatArray
 
 PAPER_RANGE_RAD = 2.62
 PAPER_BASES = 3
-"""A joint; 81 for the arm's four."""
+"""Bases per joint; 81 for the arm's four joints."""
 PAPER_WIDTH_RAD = 1.57
 PAPER_RATE = 0.025
 
 
 class HyperplaneRbf:
-    """A network of `centres` (m, n) and `widths_rad` (n,) with `outputs` outputs, that begins as zero everywhere."""
+    """A network with `centres` (m, n), `widths` (n,) and `outputs` outputs; its weights start at zero.
+
+    Inputs, centres and widths have one unit (radians for joint angles); outputs have that of the targets it learns.
+    """
 
     def __init__(self, centres: FloatArray, widths: FloatArray, outputs: int) -> None:
         self.centres = np.ascontiguousarray(centres, dtype=np.float64)
@@ -38,8 +44,8 @@ class HyperplaneRbf:
     def spread(
         cls, bases: Sequence[int], widths: Sequence[float], ranges: FloatArray, outputs: int = 3
     ) -> HyperplaneRbf:
-        """Bases evenly over a box: so many along each input, from its low to its high end (`ranges`, (n, 2)); a single
-        one stands in the middle."""
+        """Bases evenly spaced over a box: `bases` along each input, from low to high end of `ranges` (n, 2). A single
+        basis is in the middle."""
         axes = [
             np.linspace(low, high, count) if count > 1 else np.array([(low + high) / 2])
             for count, (low, high) in zip(bases, ranges, strict=True)
@@ -49,7 +55,7 @@ class HyperplaneRbf:
 
     @classmethod
     def paper(cls, inputs: int = 4, outputs: int = 3) -> HyperplaneRbf:
-        """The paper's: 3 bases a joint over +-2.62 rad, sigma 1.57."""
+        """The paper's network: 3 bases per joint over +-2.62 rad, sigma 1.57 rad."""
         ranges = np.tile([-PAPER_RANGE_RAD, PAPER_RANGE_RAD], (inputs, 1))
         return cls.spread([PAPER_BASES] * inputs, [PAPER_WIDTH_RAD] * inputs, ranges, outputs)
 
@@ -103,7 +109,7 @@ class HyperplaneRbf:
         return other
 
     def _activate_one(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """h (m,) and c (m, n): as `_activate`, but as quick as can be for one input."""
+        """h (m,) and c (m, n) for one input: a faster `_activate`."""
         c = (x - self.centres) * self._scale
         exponent = (c * c).dot(self._minus_half)
         exponent -= exponent.max()
@@ -114,5 +120,51 @@ class HyperplaneRbf:
         """h (b, m) and c (b, m, n)."""
         c = (x[:, None, :] - self.centres) / self.widths
         exponent = -0.5 * np.einsum("bmn,bmn->bm", c, c)
-        g = np.exp(exponent - exponent.max(axis=1, keepdims=True))  # far from every centre, the nearest still counts
+        g = np.exp(exponent - exponent.max(axis=1, keepdims=True))  # far from all centres the nearest one decides
         return g / g.sum(axis=1, keepdims=True), c
+
+
+class LeastSquares:
+    """Regularised least squares on a network's weights, one sample at a time or many at once.
+
+    The network's weights at the start are the prior mean. `doubt` is the prior variance of each weight as a multiple of
+    a sample's variance, so 1 / doubt is the ridge parameter. Samples one by one and all at once give the same weights
+    up to rounding. Source: recursive least squares, which is the Kalman filter of a static state (Kalman 1960).
+    """
+
+    def __init__(self, network: HyperplaneRbf, doubt: float = 100.0) -> None:
+        self.network = network
+        count = len(network.weights)
+        self._covariance = doubt * np.eye(count)
+        """Covariance of the weights in units of a sample's variance, (m (1 + n), m (1 + n))."""
+
+    def copy(self, network: HyperplaneRbf) -> LeastSquares:
+        """A learner in the same state, for a copy of the network."""
+        other = copy(self)
+        other.network = network
+        other._covariance = self._covariance.copy()
+        return other
+
+    def add(self, x: FloatArray, target: FloatArray) -> FloatArray:
+        """Learns one sample, input (n,) and target (k,). Returns the error before that, (k,), in the target's unit."""
+        phi = self.network.features(x[None])[0]
+        gain = self._covariance @ phi
+        step = gain / (1.0 + float(phi @ gain))
+        error: FloatArray = target - phi @ self.network.weights
+        self._covariance -= np.multiply.outer(gain, step)
+        self.network.weights += np.multiply.outer(step, error)
+        return error
+
+    def add_all(self, inputs: FloatArray, targets: FloatArray, weight: float | FloatArray = 1.0) -> None:
+        """Learns inputs (b, n) and targets (b, k) at once. Each counts as `weight` samples: (b,), or one for all."""
+        phi = self.network.features(inputs)
+        scale = np.broadcast_to(np.asarray(weight, dtype=np.float64), len(phi))
+        information = np.linalg.inv(self._covariance)
+        scaled = phi * scale[:, None]
+        self._covariance = _symmetric(np.linalg.inv(information + scaled.T @ phi))
+        errors = targets - phi @ self.network.weights
+        self.network.weights += self._covariance @ (scaled.T @ errors)
+
+
+def _symmetric(matrix: NDArray[Any]) -> FloatArray:
+    return np.asarray((matrix + matrix.T) / 2)

@@ -203,10 +203,12 @@ class _DepthCamera(NamedTuple):
 
     @property
     def turn_rad(self) -> FloatArray:
+        """Rotation vector of the depth camera in the colour camera's frame, (3,)."""
         return self.values[6:9]
 
     @property
     def place_m(self) -> FloatArray:
+        """Place of the depth camera in the colour camera's frame, (3,)."""
         return self.values[9:12]
 
     @property
@@ -224,7 +226,7 @@ class _DepthCamera(NamedTuple):
         return self.place_m + rays * depth[:, None], depth
 
     def codes(self, depth_m: FloatArray) -> FloatArray:
-        """Depths, m, to codes."""
+        """Codes of depths (n,), m."""
         a, b, c = self.curve
         codes: FloatArray = b * (np.arctan(depth_m / a) - c)
         return codes

@@ -21,8 +21,7 @@ from cocoro.child import ChildProcess, wait_or_kill
 from cocoro.clock import NS, Clock
 from cocoro.errors import ConfigError
 from services.kinect import freenect, grabber
-from services.kinect.config import KinectConfig
-from services.kinect.device import DepthCamera, DriverFactory, OnFault, RawFrame
+from services.kinect.device import DepthCamera, DriverFactory, KinectConfig, OnFault, RawFrame
 from services.kinect.freenect import HEIGHT, LED, WIDTH, ImageKind
 
 log = logging.getLogger("cocoro.kinect")

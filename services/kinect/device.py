@@ -1,17 +1,35 @@
-"""The interface of a depth camera's driver."""
+"""The interface of a depth camera's driver, and the settings of the Kinect service."""
 
 from __future__ import annotations
 
 from collections.abc import AsyncIterator, Callable
-from typing import NamedTuple, Protocol
+from typing import Annotated, NamedTuple, Protocol
+
+import msgspec
+from msgspec import Meta
 
 from cocoro.arrays import CodeArray, ImageArray
 from cocoro.clock import Clock
-from services.kinect.config import KinectConfig
 from services.kinect.freenect import LED
 
 OnFault = Callable[[str], None]
 """Called with a sentence that says why no frames come, and with '' when they come again."""
+
+
+class KinectConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The settings of the Kinect service."""
+
+    device: str = "freenect"
+    """Name of the driver."""
+    library: str = ""
+    """Path of a libfreenect; by default the system's."""
+    recording: str = ""
+    """Folder of a fakenect recording that is played in a loop instead of a device."""
+    tilt_deg: Annotated[float, Meta(ge=-30, le=30)] = 0.0
+    """Angle of the device's own tilt motor. The robot's description assumes 0."""
+    latency_s: Annotated[float, Meta(ge=0, le=0.2)] = 0.033
+    """Least time from the middle of an exposure to the arrival of its image: half an exposure, read-out and transfer.
+    An estimate that has not been measured on a device."""
 
 
 class RawFrame(NamedTuple):
@@ -34,7 +52,8 @@ class DepthCamera(Protocol):
     def tilt(self, angle_rad: float) -> None:
         """Move the device's own tilt motor. The Calliope's stays at 0, since its neck tilts."""
 
-    def led(self, led: LED) -> None: ...
+    def led(self, led: LED) -> None:
+        """Set the device's light."""
 
     def close(self) -> None: ...
 

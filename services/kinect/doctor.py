@@ -10,7 +10,7 @@ from cocoro.clock import RealClock
 from cocoro.errors import ConfigError
 from cocoro.robot import Robot
 from services.kinect.camera import open_device
-from services.kinect.config import KinectConfig
+from services.kinect.device import KinectConfig
 
 __all__ = ["check"]
 

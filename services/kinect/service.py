@@ -13,8 +13,7 @@ from cocoro.faults import FaultReporter
 from cocoro.messages import Frame
 from cocoro.node import Node
 from services.kinect.camera import open_device
-from services.kinect.config import KinectConfig
-from services.kinect.device import RawFrame
+from services.kinect.device import KinectConfig, RawFrame
 from services.kinect.lens import Straightener
 
 

@@ -21,8 +21,7 @@ from cocoro.picture import load as load_picture
 from cocoro.picture import save as save_picture
 from services.kinect.calibration import Board, BoardView, find_corners
 from services.kinect.camera import open_device
-from services.kinect.config import KinectConfig
-from services.kinect.device import DepthCamera, RawFrame
+from services.kinect.device import DepthCamera, KinectConfig, RawFrame
 from services.kinect.lens import NO_DATA
 
 STILL_PX = 0.7
@@ -163,7 +162,8 @@ async def _tilt(config: KinectConfig, angle_rad: float) -> None:
 
 
 def save(folder: Path, number: int, colour: ImageArray, depth: CodeArray) -> None:
-    """Save a view as two PNG files; the depth has 16 bits. Raises ConfigError when they cannot be written."""
+    """Save a view as two PNG files: colour (height, width, 3), and depth codes (height, width) with 16 bits. Raises
+    ConfigError when they cannot be written."""
     for kind, picture in (("colour", cv2.cvtColor(colour, cv2.COLOR_RGB2BGR)), ("depth", depth)):
         file = folder / f"view-{number:02}-{kind}.png"
         try:

@@ -1,35 +1,40 @@
-"""Where the head looks: sweeping when the target is lost, fixating it when it is seen."""
+"""The head: sweeps to search, fixates what is seen, and the tilt error of its camera."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from math import atan2, cos
+from math import atan2, cos, hypot, sin
 
 import numpy as np
 
+from cocoro.arrays import FloatArray
 from cocoro.robot import Robot
+from cocoro.units import Vec3
 from services.planning.config import HeadConfig
 
 PAN, TILT = "neck_pan", "neck_tilt"
 
 
 class Gaze:
-    """Solves for the pan and tilt that bring a point of the body frame into the centre of the image."""
+    """Computes the pan and tilt that bring a point into the centre of the image."""
 
     def __init__(self, robot: Robot, config: HeadConfig) -> None:
         self._chain = robot.chain("camera")
         self._limits = [robot.joints[PAN].limits_rad, config.tilt_range_rad]
 
     def at(self, point_m: tuple[float, float, float], start: Mapping[str, float]) -> tuple[float, float]:
-        """(pan, tilt) in radians, within the limits; Newton's method from the present angles (derived): the neck's axes
-        are nearly those of the image, so each angle is corrected by its own image angle."""
+        """(pan, tilt), rad, within the limits, for a point (x, y, z), body frame, metres.
+
+        Newton's method from the angles in `start` (derived): the neck's axes are nearly those of the image, so each
+        angle is corrected by its own image angle.
+        """
         pan, tilt = start.get(PAN, 0.0), start.get(TILT, 0.0)
         point = np.array([*point_m, 1.0])
         for _ in range(5):
             pose = self._chain.pose({PAN: pan, TILT: tilt})
             x, y, z = pose[:3, :3].T @ (point[:3] - pose[:3, 3])
             if z < 1e-3:
-                # Behind the camera: turn by the bearing first, from a level look.
+                # Behind the camera: first turn by the bearing, with a level camera.
                 pan, tilt = pan + atan2(-x, z), 0.0
                 continue
             pan -= atan2(x, z * max(cos(tilt), 0.2))
@@ -41,9 +46,11 @@ class Gaze:
 
 
 class Sweep:
-    """A fixed pattern over the whole pan range at two tilts, one for the floor far off, one for the floor near by.
-    What lies ahead comes first: a little to one side, all the way to the other, back at the near tilt, and last what is
-    left of the first side."""
+    """A fixed pattern over the whole pan range at two tilts, for the far and the near floor.
+
+    It begins ahead: a little to one side, all the way to the other, back at the near tilt, and last the rest of the
+    first side.
+    """
 
     def __init__(self, config: HeadConfig, pan_rad: float) -> None:
         self._config = config
@@ -52,7 +59,7 @@ class Sweep:
         far, near = config.sweep_tilts_rad
         self._corners = [(ahead, far), (-reach, far), (-reach, near), (reach, near), (reach, far), (ahead, far)]
         self.swept = 0
-        """Corners that were reached."""
+        """Number of corners reached."""
 
     @property
     def done(self) -> bool:
@@ -63,10 +70,50 @@ class Sweep:
         return self.swept / len(self._corners)
 
     def next(self, pan_rad: float, tilt_rad: float) -> tuple[float, float]:
-        """(pan, tilt) to go to now."""
+        """(pan, tilt), rad, to go to now."""
         while not self.done:
             pan, tilt = self._corners[self.swept]
             if abs(pan - pan_rad) > 0.05 or abs(tilt - tilt_rad) > 0.05:
                 return pan, tilt
             self.swept += 1
         return self._corners[-1]
+
+
+class CameraTilt:
+    """Corrects positions that were computed with the nominal neck for a camera that is tilted against it.
+
+    A camera that is tilted too far up sees everything as if the room were turned about the neck's tilt axis: far things
+    too high, and things below it too far away. The first shows the angle, the second disturbs driving by sight
+    (derived). All positions are in the body frame, metres.
+    """
+
+    def __init__(self, robot: Robot, tilt_rad: float = 0.0) -> None:
+        """`tilt_rad`: the angle at the neck by which things are seen higher than they are."""
+        self._axis_x_m, _, self._axis_z_m = (
+            robot.chain("neck_tilt").position({"neck_pan": 0.0, "neck_tilt": 0.0}).tolist()
+        )
+        self.tilt_rad = tilt_rad
+
+    def straight(self, seen_m: Vec3) -> Vec3:
+        """The true position (x, y, z) of what is seen at `seen_m`."""
+        if self.tilt_rad == 0.0:
+            return seen_m
+        x, y, up = seen_m[0] - self._axis_x_m, seen_m[1], seen_m[2] - self._axis_z_m
+        level = hypot(x, y)
+        c, s = cos(self.tilt_rad), sin(self.tilt_rad)
+        share = (c * level + s * up) / max(level, 1e-6)
+        return self._axis_x_m + share * x, share * y, self._axis_z_m + c * up - s * level
+
+    def heights(self, seen_m: FloatArray) -> FloatArray:
+        """True heights above the floor (b,), metres, of what is seen at positions (b, 3)."""
+        level = np.hypot(seen_m[:, 0] - self._axis_x_m, seen_m[:, 1])
+        up = seen_m[:, 2] - self._axis_z_m
+        return np.asarray(self._axis_z_m + np.cos(self.tilt_rad) * up - np.sin(self.tilt_rad) * level)
+
+    def tilt_of(self, seen_m: Vec3, height_m: float) -> float:
+        """The tilt, radians, by one sighting of something of a known height."""
+        level, up = hypot(seen_m[0] - self._axis_x_m, seen_m[1]), seen_m[2] - self._axis_z_m
+        # It is as far from the tilt axis as it is seen, and at the known height.
+        away = hypot(level, up)
+        true_up = height_m - self._axis_z_m
+        return atan2(up, level) - atan2(true_up, max(away**2 - true_up**2, 1e-9) ** 0.5)

@@ -12,13 +12,12 @@ import numpy as np
 from cocoro.arrays import FloatArray
 from cocoro.core import Output
 from cocoro.frames import Pose2
-from cocoro.learning.camera_tilt import CameraTilt
 from cocoro.messages import BaseCommand, TargetEstimate
 from cocoro.robot import Robot
 from services.planning.arm import ArmController, ArmStep
 from services.planning.config import PlanningConfig
 from services.planning.hand import Grip
-from services.planning.head import Gaze
+from services.planning.head import CameraTilt, Gaze
 from services.planning.navigation import Driver
 from services.planning.reach import ARM, HandPose, Reacher
 from services.planning.reachability import Reachability
