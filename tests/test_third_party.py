@@ -16,7 +16,7 @@ from typing import Any
 import msgspec
 import pytest
 from capture_rig import STILL, Room, all_of, record
-from third_party import NAME, install, on_path
+from third_party import NAME, forget_third_parties, install, on_path
 
 from apps.captures.player import Player
 from apps.captures.reexecute import reexecute
@@ -29,7 +29,7 @@ from cocoro.bus.base import Qos
 from cocoro.capture.reader import Capture
 from cocoro.component import Component, load
 from cocoro.errors import ConfigError
-from cocoro.installed import third_parties, topic_named
+from cocoro.installed import topic_named
 from cocoro.messages import BaseState, Message
 from cocoro.robot import Robot
 from cocoro.topics import Topic
@@ -175,8 +175,7 @@ def test_a_topic_of_a_taken_name_is_an_error_and_does_not_disturb(
 ) -> None:
     clash = Topic(name, Other, Qos.STATE, 1.0, 3.0, "Clashes.")
     monkeypatch.setattr(import_module(NAME), "component", replace(odometer, publishes=(clash,)))
-    third_parties.cache_clear()
-    processes.table.cache_clear()
+    forget_third_parties()
     try:
         with pytest.raises(ConfigError, match=rf"'{NAME}' of cocoro-{NAME}: its topic {name} differs from the one"):
             processes.named(NAME)
@@ -186,5 +185,4 @@ def test_a_topic_of_a_taken_name_is_an_error_and_does_not_disturb(
         assert NAME not in {component.name for component in processes.components()}
         assert main(["topics"]) == 0
     finally:
-        third_parties.cache_clear()
-        processes.table.cache_clear()
+        forget_third_parties()

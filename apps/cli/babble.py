@@ -13,7 +13,7 @@ import typer
 from msgspec.structs import replace
 
 from apps.cli.interrupt import on_interrupt
-from apps.cli.link import Link, joined
+from apps.cli.link import MeshLink, joined
 from apps.cli.options import JsonOption, MeshOption, RobotChoice, RobotOption, SamplesOutOption
 from apps.cli.output import going_on
 from apps.cli.progress import TaskDisplay, task_display
@@ -151,13 +151,13 @@ async def collect(
     return code
 
 
-async def _standing_height(link: Link, label: str) -> float | None:
+async def _standing_height(link: MeshLink, label: str) -> float | None:
     """Height of the centre of a known object that stands on the floor, m; None for an unknown one."""
     reply = await link.call(OBJECTS, ObjectsRequest())
     return next((known.size_m[2] / 2 for known in reply.objects if known.label == label), None)
 
 
-async def description(link: Link) -> Robot:
+async def description(link: MeshLink) -> Robot:
     """The description that the planner of a running robot computes with."""
     reply = await link.call(ABOUT.of("planning"), AboutRequest())
     if reply.description is None:

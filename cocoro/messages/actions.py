@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
+from cocoro.entry_points import added_to
 from cocoro.messages.common import Count, FiniteNonNegative, FiniteVec2
-from cocoro.tagged import Registry, Tagged, added_by
+from cocoro.tagged import Registry, Tagged
 
 TASK_GROUP = "cocoro.tasks"
 """The entry point group of third parties' tasks, which may bring actions of their own."""
@@ -117,7 +118,7 @@ class BabbleWheels(Action, frozen=True, tag="babble-wheels"):
 
 
 def _brought() -> Iterator[type[Action]]:
-    for task in added_by(TASK_GROUP).values:
+    for _, task, _ in added_to(TASK_GROUP).added:
         yield from getattr(task, "brings", ())
 
 
