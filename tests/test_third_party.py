@@ -119,6 +119,13 @@ def test_a_topic_that_is_declared_so_is_not_recorded(rejected: dict[str, Any]) -
         assert KEY in capture.keys
 
 
+def test_record_reports_what_is_not_recorded(
+    odometer: Component, root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["record", "--out", str(tmp_path)]) == 4  # there is no robot in this run directory
+    assert f"not recorded, as declared: {NAME}/scratch\n" in capsys.readouterr().err
+
+
 def test_it_is_exported(rejected: dict[str, Any], tmp_path: Path) -> None:
     assert main(["export", str(rejected["path"]), "--csv", str(tmp_path)]) == 0
     with (tmp_path / f"{NAME}_travelled.csv").open() as table:
