@@ -65,7 +65,7 @@ class Inbox(Generic[M]):
     def deliver(self, key: str, payload: Payload) -> None:
         """The bus's callback. A payload that cannot be accepted is counted and dropped."""
         if len(payload) > self.topic.max_bytes:
-            self._reject(key, f"{len(payload)} bytes, at most {self.topic.max_bytes} are accepted")
+            self._reject(key, f"{len(payload)} bytes, at most {self.topic.max_bytes} are taken")
             return
         try:
             message = self._decoder.decode(payload)
