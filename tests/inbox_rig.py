@@ -14,11 +14,11 @@ from cocoro.topics import Topic
 
 KEY = "calliope/key"
 FAR = 2**62
-"""A number that no message and no stamp comes to."""
+"""A number beyond those of all messages and stamps."""
 
 
 class StillClock(VirtualClock):
-    """A clock that stands at the time that a test sets."""
+    """A clock that stands at a time set by the test."""
 
     stands = True
 
