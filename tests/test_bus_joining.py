@@ -1,4 +1,4 @@
-"""Joining a mesh over zenoh: the register of who is in it, the ways to configure it, and meeting whoever is there."""
+"""Joining a mesh over zenoh: the register of members, the configuration, and the connection to those present."""
 
 from __future__ import annotations
 

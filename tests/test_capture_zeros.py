@@ -245,7 +245,7 @@ def test_an_attachment_without_its_checksum_is_damaged_in_a_repaired_file_of_a_r
         assert any("attachment 'notes.txt'" in each for each in problems(path, zeroed(data, start, end - start), True))
 
 
-# --- anybody's ------------------------------------------------------------------------------------
+# --- of other recorders ------------------------------------------------------------------------------------
 
 
 def others(path: Path, **options: Any) -> bytes:

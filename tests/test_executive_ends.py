@@ -1,4 +1,4 @@
-"""What ends an executive's task from outside: an operator, a death, silence, a mistake, a clock that begins anew."""
+"""External ends of an executive's task: an operator, a death, silence, an error, a restarted clock."""
 
 from __future__ import annotations
 

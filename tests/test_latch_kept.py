@@ -1,4 +1,4 @@
-"""The latch of a service in a process of its own: the stop path halts it, its record outlives it."""
+"""The latch of a service in a separate process: the stop path halts it, and its record outlives it."""
 
 from __future__ import annotations
 
