@@ -105,11 +105,11 @@ class Robot:
         return await self.service.ask(topics.ESTOP.of("executive"), EstopRequest(latched=latched, by="test"))
 
     def state(self) -> TaskState:
-        """What was said last of a task; nothing of any when nothing was said."""
+        """The newest published state of a task; an empty one when there is none."""
         return (self.service.outputs(topics.TASK) or [TaskState()])[-1]
 
     async def outcome(self) -> TaskState:
-        """Of the task that was begun last."""
+        """Outcome of the task that was begun last."""
 
         def over() -> bool:
             state = self.state()

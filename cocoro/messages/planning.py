@@ -11,7 +11,7 @@ from cocoro.messages.common import Count, Finite, FiniteVec2, FiniteVec3, Messag
 
 
 class Intent(Message):
-    """The action that the executive asks for. It is repeated at the topic's rate; without it the planner stands still."""
+    """The action that the executive asks for, repeated at the topic's rate. Without it the planner stands still."""
 
     action: Any
     """One of `cocoro.messages.actions`, or a third party's: a map with the action's name in `action`, and its fields.
@@ -88,8 +88,8 @@ class ModelReply(msgspec.Struct, kw_only=True):
 
 
 class HandSample(Message):
-    """Sample of the arm's babbling: joint angles and place of the hand's marker at the frame's stamp, which is also this
-    message's stamp."""
+    """Sample of the arm's babbling: joint angles and place of the hand's marker at the frame's stamp, which is this
+    message's stamp, too."""
 
     draw: Count
     """Number of the draw that the arm moved to."""
