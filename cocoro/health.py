@@ -1,4 +1,4 @@
-"""What a node measures of itself for its health message: counts and rates, loop periods, CPU and memory."""
+"""Measurements for a node's health message: counts and rates, loop periods, CPU and memory."""
 
 from __future__ import annotations
 

@@ -295,7 +295,7 @@ class Following:
         return Plan(snapshot.stand(), arm, "lost it: searching", head, distance_m=planar_m(target))
 
     def _ignored(self, now_ns: int) -> tuple[tuple[float, float, float], ...]:
-        """Circles (x, y, radius), odometry frame, m, around recent places of the target, which the map may still show."""
+        """Circles (x, y, radius), odometry frame, m, around recent places of the target: the map may still show it."""
         while self._trail and now_ns - self._trail[0][0] > 8 * NS:
             self._trail.popleft()
         return tuple((x, y, 0.15) for _, (x, y) in list(self._trail)[::10]) + tuple(
