@@ -107,7 +107,7 @@ class Task(Tagged, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_fi
     needs_label: ClassVar[Literal["", "known", "graspable"]] = ""
     """Whether the object that `label` names must be known, or known and graspable."""
     hand: ClassVar[Literal["empty", "holding", "any"]] = "empty"
-    """What the hand must be when the task starts."""
+    """State of the hand in which the task may start."""
     needs_battery: ClassVar[bool] = True
     """False: the task may start with a low battery."""
     snapshot_phase: ClassVar[str] = ""

@@ -1,4 +1,4 @@
-"""External ends of an executive's task: an operator, a death, silence, an error, a restarted clock."""
+"""Ends of a task from outside: an operator, a death, silence, a mistake, a clock that restarts."""
 
 from __future__ import annotations
 

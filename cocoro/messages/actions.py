@@ -14,7 +14,7 @@ TASK_GROUP = "cocoro.tasks"
 
 
 class Action(Tagged, frozen=True, tag_field="action"):
-    """What the planner is to do until it is done. A behaviour of `services.planning.behaviours` carries it out."""
+    """One thing for the planner to do. A behaviour of `services.planning.behaviours` carries it out."""
 
     def behaviour(self) -> Any:
         """A new behaviour that carries out this action. Third parties' actions implement it; those of the project are

@@ -45,7 +45,7 @@ class Executive:
         self._catalogue = catalogue
         self._alive: set[str] = set()
         self._unreadable: dict[str, str] = {}
-        """What a service cannot read and why, by service."""
+        """By service: the input that it cannot read, and the reason."""
         self._running: asyncio.Task[Any] | None = None
         self._ended: asyncio.Future[Ending] | None = None
         """Gets the running task's outcome when something outside of it ends it."""
