@@ -22,8 +22,8 @@ CONTENDER = Path(__file__).with_name("faults_claims.py")
 
 
 @pytest.fixture
-def run_dir(tmp_path: Path) -> RunDir:
-    return RunDir("robbie", tmp_path)
+def run_dir(short_path: Path) -> RunDir:
+    return RunDir("robbie", short_path)
 
 
 class Contender:
