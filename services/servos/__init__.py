@@ -1,1 +1,1 @@
-"""Dynamixel servos: their registers (`table`), packets, port and bus; motion and networks; the service."""
+"""The Dynamixel servos: registers (`table`), bus, the line's thread, motion and network (the pure cores), the service."""
