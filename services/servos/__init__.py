@@ -1,1 +1,1 @@
-"""The Dynamixel servos: registers (`table`), bus, the line's thread, motion and network (the pure cores), the service."""
+"""The Dynamixel servos: registers (`table`), bus, the thread of a line, motion and network (pure), and the service."""
