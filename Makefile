@@ -1,6 +1,6 @@
 PYTHON ?= python3
 
-.PHONY: demo test install clean
+.PHONY: demo test unit install clean
 
 install:
 	@PYTHON=$(PYTHON) deploy/install.sh
@@ -10,6 +10,9 @@ demo: install
 
 test: install
 	@deploy/test.sh
+
+unit: install
+	@.venv/bin/pytest -n 2 -m "not process and not sim and not zenoh"
 
 clean:
 	rm -rf .venv out run build *.egg-info

@@ -13,7 +13,7 @@ Everything that a component's author needs can be imported from here; each name 
   coroutine in virtual time.
 - The robot: `Robot` is the description of its body, `Catalogue` of `ObjectSpec`s the objects that it knows, `History` a
   state over time, `Pose2` a pose on the floor.
-- Safety: `LatchKeeper` keeps the emergency stop's latch of a service that moves something; `Contact` finds out what
+- Safety: `ServiceLatch` keeps the emergency stop's latch of a service that moves something; `Contact` finds out what
   became of a service that is no longer heard.
 - Errors: `CocoroError` and its kinds; a command prints their text without a traceback.
 
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from cocoro.frames import Pose2
     from cocoro.history import History
     from cocoro.inbox import Inbox, Latest, Stream
-    from cocoro.latch import LatchKeeper
+    from cocoro.latch import ServiceLatch
     from cocoro.messages import Message
     from cocoro.node import Node
     from cocoro.objects import Catalogue, ObjectSpec
@@ -64,7 +64,6 @@ __all__ = [
     "History",
     "Implementation",
     "Inbox",
-    "LatchKeeper",
     "Latest",
     "MeshError",
     "Message",
@@ -82,6 +81,7 @@ __all__ = [
     "Robot",
     "Sample",
     "Schedule",
+    "ServiceLatch",
     "Stream",
     "Take",
     "Topic",
@@ -101,7 +101,7 @@ _MODULES = {
     "frames": ("Pose2",),
     "history": ("History",),
     "inbox": ("Inbox", "Latest", "Stream"),
-    "latch": ("LatchKeeper",),
+    "latch": ("ServiceLatch",),
     "messages": ("Message",),
     "node": ("Node",),
     "objects": ("Catalogue", "ObjectSpec"),

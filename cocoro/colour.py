@@ -1,4 +1,4 @@
-"""Colours as the catalogue of known objects counts them: true CIELAB, and boxes in it."""
+"""Colours of the catalogue of known objects: CIELAB, and boxes in it."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ Lab = Float32Array
 
 
 def lab_of(colour: ImageArray) -> Lab:
-    """8-bit sRGB (..., 3) to true CIELAB, D65: L 0 to 100, a and b about -128 to 127."""
+    """8-bit sRGB (..., 3) to CIELAB (D65) (..., 3): L 0 to 100, a and b about -128 to 127."""
     flat = np.ascontiguousarray(colour).reshape(1, -1, 3).astype(np.float32) / np.float32(255)
     return np.asarray(cv2.cvtColor(flat, cv2.COLOR_RGB2Lab), dtype=np.float32).reshape(colour.shape)
 
 
 def in_boxes(boxes: Iterable[LabBox], lab: Lab) -> BoolArray:
-    """Whether each colour (..., 3) lies in any of the boxes."""
+    """Whether each CIELAB colour (..., 3) is in any of the boxes; shape (...)."""
     found = np.zeros(lab.shape[:-1], dtype=np.bool_)
     channels = [np.ascontiguousarray(lab[..., number]) for number in range(3)]
     for box in boxes:
@@ -32,5 +32,5 @@ def in_boxes(boxes: Iterable[LabBox], lab: Lab) -> BoolArray:
 
 
 def matches(known: ObjectSpec, lab: Lab, *, by_shape: bool = False) -> BoolArray:
-    """Whether each colour (..., 3) is the object's; with `by_shape` also when it is one that it shares."""
+    """Whether each CIELAB colour (..., 3) is the object's, with `by_shape` also one that it shares; shape (...)."""
     return in_boxes(known.lab + known.lab_by_shape if by_shape else known.lab, lab)

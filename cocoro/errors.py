@@ -1,4 +1,4 @@
-"""The errors that a user can cause or must know of; the CLI shows their text and no traceback."""
+"""Errors that a user can cause or must know of; commands print their text without a traceback."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from os import PathLike, fspath
 
 @contextmanager
 def naming(path: PathLike[str]) -> Iterator[None]:
-    """While a file is written: the system says which file could not be opened, but not which could not be written."""
+    """Adds the path to an OSError in the block: the system names a file that cannot be opened, not one that cannot be
+    written."""
     try:
         yield
     except OSError as error:
@@ -19,24 +20,24 @@ def naming(path: PathLike[str]) -> Iterator[None]:
 
 
 class CocoroError(Exception):
-    """What went wrong, where, and what to do about it, in one sentence or two."""
+    """The text says what is wrong, where, and what to do, in one or two sentences."""
 
 
 class ConfigError(CocoroError):
-    """A file or an option has a wrong value; the text names the file and the field."""
+    """A file or an option has a wrong value. The text names the file and the field."""
 
 
 class MeshError(CocoroError):
-    """The mesh, or the service that is asked, is not there."""
+    """The mesh, or the called service, does not exist."""
 
 
 class CallTimeoutError(MeshError):
-    """Nobody answered a request in time."""
+    """No service answered a request in time."""
 
 
 class RemoteError(CocoroError):
-    """The service that was asked answered with an error; the text is the service's own."""
+    """The called service answered with an error, whose text this is."""
 
 
 class RefusedError(CocoroError):
-    """What was asked cannot be now, because of something that is there already; the text says what."""
+    """The request conflicts with something that runs already. The text names it."""

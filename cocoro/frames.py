@@ -14,13 +14,13 @@ from cocoro.units import Vec3
 
 
 def wrap_rad(angle_rad: float) -> float:
-    """The same direction within -pi (exclusive) to pi (inclusive)."""
+    """The equivalent angle in (-pi, pi]."""
     turns = (angle_rad + pi) % (2 * pi) - pi
     return pi if turns == -pi else turns
 
 
 class Spherical(NamedTuple):
-    """Egocentric spherical coordinates, as the paper's localisation gives them ('Localisation')."""
+    """Egocentric spherical coordinates, as in the paper ('Localisation')."""
 
     rho_m: float
     """Distance from the frame's origin."""
@@ -45,7 +45,7 @@ def to_cartesian(spherical: Spherical) -> Vec3:
 
 
 class Pose2(NamedTuple):
-    """Where a child frame stands in its parent frame, on the plane of the floor: an element of SE(2).
+    """Pose of a child frame in its parent frame on the plane of the floor: an element of SE(2).
 
     With the body's odometry as `odom_from_body`: `odom_from_body.apply(p)` is where a point that the body
     sees at p is in the odometry frame, and `later.inverse().compose(earlier)` carries what was seen from the

@@ -1,4 +1,4 @@
-"""A state read as history: bounded, ordered by stamp, interpolated, and honest about its gaps."""
+"""A history of a state: bounded, ordered by stamp, interpolated, with explicit gaps."""
 
 from __future__ import annotations
 
@@ -11,16 +11,15 @@ import numpy as np
 from cocoro.arrays import FloatArray
 
 DEFAULT_CAPACITY = 256
-"""About five seconds of a 50 Hz state."""
+"""Five seconds of a 50 Hz state."""
 DEFAULT_JUMP_BACK_NS = 500_000_000
 
 
 class History:
-    """The newest samples of one state vector, for asking what it was at a given time.
+    """The newest samples of one state vector, for its value at a given time.
 
-    A sample of another incarnation (its publisher restarted) or one whose stamp lies more than `jump_back_ns`
-    before the newest (its clock began a new epoch) empties the history first: what was before has no
-    place on the new time line. A sample that is merely late or repeated is refused.
+    A sample of another incarnation (its publisher restarted) or with a stamp more than `jump_back_ns` before the newest
+    one (its clock began a new epoch) empties the history first. A late or repeated sample is refused.
     """
 
     def __init__(
@@ -31,8 +30,8 @@ class History:
         capacity: int = DEFAULT_CAPACITY,
         jump_back_ns: int = DEFAULT_JUMP_BACK_NS,
     ) -> None:
-        """Vectors have `width` components. The `angular` ones (radians) are unwrapped on entry, each to within
-        half a turn of the one before, so that interpolating from 179 to -179 degrees does not pass through 0."""
+        """Vectors have `width` components. The `angular` ones, rad, are unwrapped to within half a turn of the sample
+        before, so that interpolation from 179 to -179 degrees does not pass through 0."""
         if capacity < 2:
             raise ValueError(f"a history of {capacity} samples cannot be interpolated")
         self._width = width
@@ -43,15 +42,15 @@ class History:
         self._stamps_ns: list[int] = []
         self._values: list[FloatArray] = []
         self.resets = 0
-        """Times that a restart or a jump back of the clock emptied it."""
+        """Number of times that a restart or a clock that jumped back emptied it."""
         self.refused = 0
-        """Samples that came late or twice."""
+        """Number of late and repeated samples."""
 
     def __len__(self) -> int:
         return len(self._stamps_ns)
 
     def add(self, stamp_ns: int, values: Sequence[float] | FloatArray, incarnation: int = 0) -> bool:
-        """Append one sample; False when it is late or repeated and was refused. ValueError on a wrong width."""
+        """Append `values` (width,); False when the sample is late or repeated. Raises ValueError for a wrong width."""
         vector = np.array(values, dtype=np.float64)
         if vector.shape != (self._width,):
             raise ValueError(f"a vector of {self._width} was expected, not shape {vector.shape}")
@@ -76,8 +75,8 @@ class History:
     def at(self, stamp_ns: int, max_gap_ns: int) -> FloatArray | None:
         """The vector at a time, linearly interpolated between the two samples around it; shape (width,).
 
-        None when the time is outside of what is held (nothing is extrapolated) or when the two samples lie
-        more than `max_gap_ns` apart. A sample of exactly that stamp is returned as it is.
+        None when the time is outside of the history (nothing is extrapolated) or when the two samples are more than
+        `max_gap_ns` apart.
         """
         after = bisect_left(self._stamps_ns, stamp_ns)
         if after == len(self._stamps_ns):
@@ -94,15 +93,14 @@ class History:
 
     @property
     def newest(self) -> tuple[int, FloatArray] | None:
-        """The last sample, (stamp_ns, vector); None when there is none."""
+        """The last sample, (stamp_ns, vector (width,)); None when there is none."""
         return (self._stamps_ns[-1], self._values[-1].copy()) if self._stamps_ns else None
 
     @property
     def oldest_ns(self) -> int | None:
-        """The stamp of the first sample still held; None when there is none."""
+        """The stamp of the first sample in the history; None when there is none."""
         return self._stamps_ns[0] if self._stamps_ns else None
 
     def clear(self) -> None:
-        """Forget every sample."""
         self._stamps_ns.clear()
         self._values.clear()

@@ -28,8 +28,7 @@ class Link:
     offset_rad: float
 
     def fixed(self) -> FloatArray:
-        """4 x 4 transform from the link's frame to its parent's at joint angle minus offset, i.e. before the
-        joint's own turn."""
+        """Transform (4, 4), metres, from the link's frame to its parent's before the joint's own turn."""
         ct, st = cos(self.theta_rad), sin(self.theta_rad)
         ca, sa = cos(self.alpha_rad), sin(self.alpha_rad)
         return np.array(
@@ -43,13 +42,13 @@ class Link:
 
 
 def turn_z(angle_rad: float) -> FloatArray:
-    """4 x 4 rotation about z."""
+    """Rotation about z as a transform (4, 4)."""
     c, s = cos(angle_rad), sin(angle_rad)
     return np.array((c, -s, 0.0, 0.0, s, c, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0)).reshape(4, 4)
 
 
 def cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Vector product of two of shape (3,); `np.cross` takes ten times as long to find out that they are two."""
+    """Vector product (3,) of two vectors (3,); ten times faster than `np.cross`."""
     (ax, ay, az), (bx, by, bz) = a.tolist(), b.tolist()
     return np.array((ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx))
 
@@ -74,7 +73,7 @@ class Chain:
         self._steps = [(row.fixed(), row.joint, row.offset_rad) for row in rows]
 
     def pose(self, angles_rad: Mapping[str, float]) -> FloatArray:
-        """4 x 4 transform from the tip's frame to the root's. `angles_rad` has every joint of the chain."""
+        """Transform (4, 4), metres, from the tip's frame to the root's. `angles_rad` has every joint of the chain."""
         total = _HERE
         for fixed, joint, offset in self._steps:
             total = total @ fixed
@@ -83,11 +82,11 @@ class Chain:
         return total if total is not _HERE else total.copy()
 
     def position(self, angles_rad: Mapping[str, float]) -> FloatArray:
-        """The tip's origin in the root's frame, shape (3,)."""
+        """The tip's origin (3,), metres, in the root's frame."""
         return self.pose(angles_rad)[:3, 3]
 
     def jacobian(self, angles_rad: Mapping[str, float], joints: Iterable[str] | None = None) -> FloatArray:
-        """Geometric Jacobian of the tip, shape (6, n): rows 0-2 linear (m/rad), 3-5 angular, root's frame.
+        """Geometric Jacobian of the tip, shape (6, n): rows 0-2 linear (m/rad), 3-5 angular (rad/rad), root's frame.
 
         Columns follow `joints` (those of the chain by default); a joint outside the chain has a zero column.
         """
@@ -130,7 +129,7 @@ class Tree:
         self._steps = [(row.name, row.parent, row.fixed(), row.joint, row.offset_rad) for row in rows.values()]
 
     def poses(self, angles_rad: Mapping[str, float]) -> dict[str, FloatArray]:
-        """4 x 4 transforms from each link's frame on the way to the tips to the root's, by the link's name."""
+        """Transforms (4, 4), metres, from the frame of each link on the way to the tips to the root's, by link name."""
         poses: dict[str, FloatArray] = {self._root: _HERE.copy()}
         for name, parent, fixed, joint, offset in self._steps:
             pose = poses[parent] @ fixed

@@ -1,9 +1,9 @@
-"""The emergency stop's latch, as every service that moves something keeps it.
+"""The emergency stop's latch, kept by every service that moves something.
 
-Three ways lead to it, and each latches: the stop path (`cocoro.stop`), a request on the mesh, and the executive's
-word. A service comes up latched when its record on disk says so or cannot be read. Otherwise it comes up with the
-latch unknown, which counts as latched, and learns it from the executive's word or from an operator's request. What is
-latched is released only by an operator's reset, never by the executive's word.
+Each of three ways latches: the stop path (`cocoro.stop`), a request on the mesh, and the executive's latch topic. A
+service starts latched when its record on disk says so or cannot be read. Otherwise it starts with the latch unknown,
+which counts as latched, and learns the state from the executive's topic or an operator's request. A latched service is
+released only by an operator's reset, never by the executive's topic.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from cocoro.stop.path import StopPoint, listen
 from cocoro.stop.record import LatchRecord
 
 IN_FLIGHT_NS = NS // 2
-"""For so long after a reset a word from before it may still arrive; it is not listened to."""
+"""After a reset, latch messages from before it may still arrive for this long; they are ignored."""
 STOP_KEPT_S, RESET_KEPT_S = 0.15, 0.6
-"""How long the answer to a stop and to a reset waits for the disk: less than who asked waits for the answer."""
+"""Longest wait of the answer to a stop and to a reset for the disk; less than the caller waits for the answer."""
 
 
-class LatchKeeper:
-    """Keeps the latch of one service: serves `<service>/estop`, follows `executive/latch`, hears the stop path.
+class ServiceLatch:
+    """Keeps the latch of one service: serves `<service>/estop`, follows `executive/latch`, listens on the stop path.
 
-    `changed(state, by)` is called in the event loop, before the answer to a request goes out. `halt()` is called at
-    once when the stop path is used, in that path's thread: it must stop what moves even if the event loop hangs, be
-    brief, and bear being called while anything else happens. `changed` follows as soon as the loop gets to it.
+    `changed(state, by)` is called in the event loop, before the answer to a request is sent. `halt()` is called in the
+    stop path's thread as soon as a stop arrives there: it must stop what moves even if the event loop hangs, be brief,
+    and be safe at any time. `changed` follows as soon as the event loop runs.
     """
 
     def __init__(
@@ -44,7 +44,7 @@ class LatchKeeper:
         *,
         follows: bool = True,
     ) -> None:
-        """`follows` is False for the executive, whose own word it is that the others follow."""
+        """`follows` is False for the executive, which publishes the latch topic itself."""
         self.state: LatchState = "unknown"
         self._node = node
         self._changed = changed
@@ -53,27 +53,27 @@ class LatchKeeper:
         self._record: LatchRecord | None = None
         self._lock = threading.Lock()
         self._stopped_by: str | None = None
-        """Who used the stop path, while the loop does not know of it yet."""
+        """Sender of a stop on the stop path that the event loop has not handled yet."""
         self._reset_ns: int | None = None
         if node.latches is not None:
             self._record = LatchRecord(node.latches / node.name)
-            if self._record.said.latched:
-                said = self._record.said
-                self._set("latched", f"{said.by}{f', {said.when}' if said.when else ''}")
+            if self._record.entry.latched:
+                entry = self._record.entry
+                self._set("latched", f"{entry.by}{f', {entry.when}' if entry.when else ''}")
             point = StopPoint(node.robot_name, node.name)
             node.keep(point)
             listen(point, self._stopped, self._keep_latched)
-        node.serve(topics.ESTOP.of(node.name), self._asked)
+        node.serve(topics.ESTOP.of(node.name), self._requested)
         if follows:
-            node.on(topics.LATCH, self._heard)
+            node.on(topics.LATCH, self._on_latch)
 
     def stop(self, by: str) -> None:
-        """Latch, in the event loop: another part of the service was told to stop."""
+        """Latches, in the event loop, because another part of the service was stopped."""
         if self.state != "latched":
             self._set("latched", by)
 
-    def word(self, state: LatchState, by: str) -> None:
-        """Take another's word for it: it releases only what is unknown, and it may be from before a reset."""
+    def follow(self, state: LatchState, by: str) -> None:
+        """Takes over another service's latch state. It can latch, but release only an unknown latch."""
         if state == "released" and self.state == "unknown":
             self._set("released", by)
         elif state == "latched" and self.state != "latched":
@@ -84,17 +84,17 @@ class LatchKeeper:
     # --- the stop path --------------------------------------------------------------------------------
 
     def _stopped(self, by: str) -> None:
-        """In the stop path's thread. The loop latches afterwards in any case, so a reset that comes between the two
-        undoes nothing for longer than a moment. However many stops come, the loop has one to see to."""
+        """Called in the stop path's thread. The event loop latches afterwards in any case, so a reset between the two
+        is overridden within a moment. Many stops are one for the event loop."""
         assert self._record is not None
         try:
             self._halt()
         finally:
-            self._record.keep(True, by)  # before the loop knows, so that no reset can come first
+            self._record.keep(True, by)  # before the event loop knows, so that no reset can come first
             with self._lock:
                 is_first, self._stopped_by = self._stopped_by is None, self._stopped_by or by
             if is_first:
-                with suppress(RuntimeError):  # the loop has ended, and with it what could move anything
+                with suppress(RuntimeError):  # the event loop has ended, and with it all motion
                     self._loop.call_soon_threadsafe(self._latch)
 
     def _latch(self) -> None:
@@ -103,34 +103,36 @@ class LatchKeeper:
         self._set("latched", by or "")
 
     def _keep_latched(self, _by: str) -> Future[str]:
-        """The write that `_stopped` began, or one after it."""
+        """The write that `_stopped` started, or a later one."""
         assert self._record is not None
         return self._record.last
 
     # --- the mesh -------------------------------------------------------------------------------------
 
-    async def _asked(self, request: EstopRequest) -> EstopReply:
+    async def _requested(self, request: EstopRequest) -> EstopReply:
         if request.latched:
             self._set("latched", request.by)
         else:
             self._reset_ns = self._node.now_ns()
             self._set("released", request.by)
         not_kept = await self._not_kept(STOP_KEPT_S if request.latched else RESET_KEPT_S)
-        return EstopReply(service=self._node.name, latch=self.state, text=not_kept)  # another may have come meanwhile
+        return EstopReply(
+            service=self._node.name, latch=self.state, text=not_kept
+        )  # another request may have changed it meanwhile
 
     async def _not_kept(self, within_s: float) -> str:
-        """Why the disk has not what was set last, or ''."""
+        """Why the last state is not on the disk; '' when it is."""
         if self._record is None:
             return ""
         try:
             why = await asyncio.wait_for(asyncio.shield(asyncio.wrap_future(self._record.last)), within_s)
         except TimeoutError:
-            why = f"{self._record.path}: the disk has not taken it within {within_s:g} s"
-        return f"a restart will not remember this: {why}" if why else ""
+            why = f"{self._record.path}: not written within {within_s:g} s"
+        return f"a restart will forget this: {why}" if why else ""
 
-    def _heard(self, latch: Latch) -> None:
+    def _on_latch(self, latch: Latch) -> None:
         if is_fresh(latch.stamp_ns, self._node.now_ns(), topics.LATCH.max_age_s):
-            self.word(latch.state, latch.by)
+            self.follow(latch.state, latch.by)
 
     # --- both -----------------------------------------------------------------------------------------
 
@@ -139,6 +141,6 @@ class LatchKeeper:
         if self._record is not None:
             self._record.keep(state == "latched", by)
         self._changed(state, by)
-        if state != before:  # last, since a log may hang
+        if state != before:  # last, since logging may block
             level = logging.WARNING if state == "latched" else logging.INFO
             self._node.log.log(level, "emergency stop %s by %s", state, by or "?")

@@ -1,4 +1,4 @@
-"""The catalogue of known objects: their shape, size and colour, read from one TOML file (`objects.toml`)."""
+"""The catalogue of known objects: shape, size and colour, from one TOML file (`objects.toml`)."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ DEFAULT_FILE = "objects.toml"
 
 
 class LabBox(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A box in true CIELAB units (D65): L 0 to 100, a and b about -128 to 127; both ends are inside."""
+    """A box in CIELAB (D65): L 0 to 100, a and b -128 to 127; both ends are inside."""
 
     low: Vec3
     high: Vec3
@@ -40,21 +40,21 @@ class ObjectSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     label: Label
     shape: Literal["cylinder", "sphere", "box"]
     radius_m: Positive | None = None
-    """Cylinder and sphere."""
+    """For a cylinder and a sphere."""
     height_m: Positive | None = None
-    """Cylinder."""
+    """For a cylinder."""
     box_m: tuple[Positive, Positive, Positive] | None = msgspec.field(default=None, name="size_m")
-    """Box: full x, y, z; `size_m` in the file."""
+    """For a box: full x, y, z; `size_m` in the file."""
     mass_kg: Positive = 0.2
     graspable: bool = False
     marker: bool = False
-    """The ball on the robot's own hand."""
+    """It is the ball on the robot's own hand."""
     rgb: tuple[Share, Share, Share]
-    """Surface colour under full white light, sRGB, 0 to 1 a channel."""
+    """Surface colour under full white light, sRGB, each 0 to 1."""
     lab: Annotated[tuple[LabBox, ...], Meta(min_length=1)]
-    """A pixel is the object's when any of these boxes holds its colour."""
+    """A pixel belongs to the object if any of these boxes contains its colour."""
     lab_by_shape: tuple[LabBox, ...] = ()
-    """Colours that it shares with another object: they count only for a detector that tells the two apart by shape."""
+    """Colours that it shares with another object; only a detector that distinguishes the two by shape uses them."""
 
     def __post_init__(self) -> None:
         wanted = {"cylinder": {"radius_m", "height_m"}, "sphere": {"radius_m"}, "box": {"size_m"}}[self.shape]
@@ -83,7 +83,7 @@ class ObjectSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 
     @property
     def planar_radius_m(self) -> float:
-        """Of the upright object seen from above; for a box the circle of equal area."""
+        """Radius of the upright object seen from above; for a box that of the circle of equal area."""
         if self.box_m is not None:
             return float((self.box_m[0] * self.box_m[1] / pi) ** 0.5)
         assert self.radius_m is not None
@@ -113,7 +113,7 @@ class Catalogue:
 
     @classmethod
     def from_text(cls, text: str, where: str) -> Catalogue:
-        """Read what stands in a catalogue's file; `where` it is from, for messages. Raises ConfigError as `load`."""
+        """Read a catalogue's text; `where` it is from, for messages. Raises ConfigError like `load`."""
         try:
             rows = msgspec.convert(tomllib.loads(text), _CatalogueFile).object
         except tomllib.TOMLDecodeError as error:
@@ -129,12 +129,12 @@ class Catalogue:
                 raise ConfigError(f"known objects {where}: {table}: {_field(error)}") from error
             for earlier in objects:
                 if known.label == earlier.label:
-                    raise ConfigError(f"known objects {where}: {table}: label: it is taken by an earlier object")
+                    raise ConfigError(f"known objects {where}: {table}: label: an earlier object has it already")
                 if known.marker and earlier.marker:
-                    raise ConfigError(f"known objects {where}: {table}: marker: {earlier.label} is the marker")
+                    raise ConfigError(f"known objects {where}: {table}: marker: {earlier.label} is the marker already")
             objects.append(known)
         if not objects:
-            raise ConfigError(f"known objects {where}: there is no [[object]] in it")
+            raise ConfigError(f"known objects {where}: it has no [[object]]")
         return cls(tuple(objects))
 
     @property
@@ -143,7 +143,7 @@ class Catalogue:
 
     @property
     def targets(self) -> tuple[ObjectSpec, ...]:
-        """Every object but the hand's marker."""
+        """All objects except the hand's marker."""
         return tuple(known for known in self.objects if not known.marker)
 
     @property
@@ -167,7 +167,7 @@ class Catalogue:
 
 
 def own_text() -> str:
-    """The project's own catalogue, as it is written."""
+    """The text of the project's own catalogue."""
     return resources.files("cocoro").joinpath(DEFAULT_FILE).read_text()
 
 

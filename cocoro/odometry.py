@@ -1,10 +1,10 @@
-"""Odometry of a Create: what it was told to do, corrected by what little it reports.
+"""Odometry of a Create: integrated wheel commands, corrected by its coarse reports.
 
-A Create reports its way in whole millimetres and its turn in whole degrees since it was last asked, and forgets
-the rest (iRobot Create Open Interface, packets 19 and 20). Asked often, a slow arc reads as straight ahead;
-asked rarely, the pose lags. So between reports the commanded wheel speeds are integrated, with the ramp that the
-Create puts on them, and each report only says within which interval the truth lies: what was integrated
-since the last report is clamped into it. (Derived; the problem is known from the drivers of this base.)
+A Create reports its path in whole millimetres and its turn in whole degrees since the last request, and drops the rest
+(iRobot Create Open Interface, packets 19 and 20). Requested often, a slow arc reads as straight ahead; requested
+rarely, the pose lags. Between reports the commanded wheel speeds are therefore integrated, with the Create's own ramp,
+and the integral since the last report is clamped into the interval that the report allows (derived; the problem is
+known from other drivers of this base).
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ from math import cos, sin
 from cocoro.robot import Base
 
 REPORT_PERIOD_S = 0.2
-"""How often to ask for way and turn: at 5 Hz a report's unit is small beside what it counts."""
+"""Period of requests for path and turn: at 5 Hz the unit of a report is small against its value."""
 MILLIMETRE_M = 1e-3
 DEGREE_RAD = 0.017453292519943295
 
 
 class WheelRamp:
-    """The wheels' speeds on their way to what was commanded: clipped, at limited acceleration."""
+    """Wheel speeds that follow the commanded ones: clipped, with limited acceleration."""
 
     def __init__(self, base: Base) -> None:
         self._limit_mps = base.max_wheel_speed_mps
@@ -36,7 +36,7 @@ class WheelRamp:
 
 
 class Odometry:
-    """Pose of the body in the frame in which it started, and its speeds."""
+    """The body's pose in the frame in which it started, and its speeds."""
 
     def __init__(self, base: Base) -> None:
         self._separation_m = base.wheel_separation_m
@@ -52,7 +52,7 @@ class Odometry:
         self._report_yaw_rad = 0.0
 
     def advance(self, left_m: float, right_m: float, dt_s: float) -> None:
-        """Carry the pose along by what each wheel rolled in `dt_s`, metres: an arc."""
+        """Advance the pose by the arc that the wheels' travel in `dt_s` gives."""
         way_m = (left_m + right_m) / 2
         turn_rad = (right_m - left_m) / self._separation_m
         heading = self.yaw_rad + turn_rad / 2
@@ -66,12 +66,12 @@ class Odometry:
         self.turn_rate_radps = turn_rad / dt_s
 
     def unreported(self) -> None:
-        """The Create's report of the time since the last was lost: what was integrated stands as it is."""
+        """Accept the integral since the last report, because the Create's report was lost."""
         self._way_m = self._turn_rad = 0.0
         self._report_x_m, self._report_y_m, self._report_yaw_rad = self.x_m, self.y_m, self.yaw_rad
 
     def report(self, distance_mm: int, angle_deg: int) -> None:
-        """Correct what was integrated since the last report by what the Create says of the same time."""
+        """Correct the integral since the last report by the Create's report of that time."""
         way_m = _within(self._way_m, distance_mm, MILLIMETRE_M)
         turn_rad = _within(self._turn_rad, angle_deg, DEGREE_RAD)
         extra_m, extra_rad = way_m - self._way_m, turn_rad - self._turn_rad
@@ -80,7 +80,7 @@ class Odometry:
         self.unreported()
 
     def _correct(self, extra_m: float, extra_rad: float) -> None:
-        """Bend and stretch the path since the last report: the missing turn is spread evenly along it."""
+        """Bend and stretch the path since the last report, with the missing turn spread evenly along it."""
         dx, dy = self.x_m - self._report_x_m, self.y_m - self._report_y_m
         c, s = cos(extra_rad / 2), sin(extra_rad / 2)
         dx, dy = c * dx - s * dy, s * dx + c * dy
@@ -91,9 +91,9 @@ class Odometry:
 
 
 def _within(value: float, count: int, unit: float) -> float:
-    """`value` clamped to what a count of whole units, rounded towards zero, can stand for.
+    """`value` clamped to the interval of values that round towards zero to this count of units.
 
-    A count of 0 where two units or more were expected refutes the expectation: nothing moved.
+    A count of 0 where two units or more were expected means that nothing moved: then it is 0.
     """
     if count == 0 and abs(value) >= 2 * unit:
         return 0.0
@@ -103,6 +103,7 @@ def _within(value: float, count: int, unit: float) -> float:
 
 
 def _chord_per_arc(turn_rad: float) -> float:
+    """Length of an arc's chord as a share of the arc."""
     half = turn_rad / 2
     return sin(half) / half if abs(half) > 1e-6 else 1.0
 

@@ -1,4 +1,4 @@
-"""Picture files as OpenCV has them: reading and writing that reports errors."""
+"""Reading and writing picture files with OpenCV, with errors reported."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from cocoro.errors import CocoroError
 
 
 def save(image: NDArray[Any], path: Path) -> None:
-    """Write an image as OpenCV has it (BGR, or depth) as PNG; one that did not get whole does not stay. Raises OSError,
+    """Write an image (BGR (h, w, 3), or depth (h, w)) as PNG; a partly written file is removed. Raises OSError,
     and CocoroError when it cannot be encoded."""
     done, encoded = cv2.imencode(".png", image)
     if not done:
@@ -27,9 +27,9 @@ def save(image: NDArray[Any], path: Path) -> None:
 
 
 def load(path: Path, flags: int = cv2.IMREAD_COLOR) -> NDArray[Any] | None:
-    """A picture file as OpenCV has it (BGR, or what the flags say); None when it is none. Raises OSError.
+    """Read a picture file as BGR (h, w, 3), or by `flags`; None when it is no picture. Raises OSError.
 
-    OpenCV's own reading of files crashes for a name that is no UTF-8.
+    OpenCV crashes on file names that are not UTF-8, so the file is read here.
     """
     data = np.frombuffer(path.read_bytes(), dtype=np.uint8)
     return cv2.imdecode(data, flags) if data.size else None

@@ -13,16 +13,17 @@ from cocoro.checks import Check, bad, note, ok
 WIRE = "wire:"
 RULES = "deploy/udev/99-cocoro.rules"
 LATENCY_MS = 1
-"""An FTDI adapter keeps bytes back for so long; as it comes, 16 ms, and each servo's answer waits for it."""
+"""Wanted latency timer of an FTDI adapter, ms. Its default is 16 ms, and each servo's answer waits for it."""
 
 
 def wire_dir(robot: str) -> Path:
-    """Where the simulator puts its emulated ports."""
+    """The folder of the simulator's emulated ports."""
     return default_run_dir() / robot / "wire"
 
 
 def port_path(name: str, robot: str) -> str:
-    """The path to open. Raises ConfigError for an emulated port in a folder that is not this user's alone."""
+    """The path to open for a port's name. Raises ConfigError for an emulated port whose folder is not this user's
+    alone."""
     if not name.startswith(WIRE):
         return name
     folder = wire_dir(robot)
@@ -32,12 +33,11 @@ def port_path(name: str, robot: str) -> str:
 
 
 def check_port(what: str, name: str, robot: str, *, quick: bool) -> list[Check]:
-    """Whether a port is there and may be used; with `quick`, whether its adapter hands bytes on at once. The first
-    check tells whether it can be opened."""
+    """Checks that a port exists and may be opened (the first check), and with `quick` the adapter's latency timer."""
     path = port_path(name, robot)
     port = Path(path)
     if not port.exists() and name.startswith(WIRE):
-        return [note(f"{what} port", f"{name} is emulated, and there while the robot is up")]
+        return [note(f"{what} port", f"{name} is emulated; it exists while the robot is up")]
     if not port.exists():
         return [bad(f"{what} port", f"there is no {path}: plug the adapter in; its name comes from {RULES}")]
     if not os.access(port, os.R_OK | os.W_OK):
@@ -47,13 +47,13 @@ def check_port(what: str, name: str, robot: str, *, quick: bool) -> list[Check]:
     if quick and latency_ms is not None:
         text = f"{latency_ms} ms"
         if latency_ms > LATENCY_MS:
-            text += f", should be {LATENCY_MS}: install {RULES}, then plug the adapter in anew"
+            text += f", should be {LATENCY_MS}: install {RULES}, then plug the adapter in again"
         checks.append((ok if latency_ms <= LATENCY_MS else bad)(f"{what} adapter's latency", text))
     return checks
 
 
 def _latency_ms(port: Path) -> int | None:
-    """Of an FTDI adapter; None where there is no such setting."""
+    """The latency timer of an FTDI adapter, ms; None where there is none."""
     with suppress(OSError, ValueError):
         return int(Path(f"/sys/bus/usb-serial/devices/{port.resolve().name}/latency_timer").read_text())
     return None

@@ -1,17 +1,16 @@
-"""Directories and files that are this user's alone, in places that other users of the machine share (/tmp, /run).
+"""Directories and files that are this user's alone, in places that the machine's users share (/tmp, /run).
 
-Another user can put a link or a directory of his own where ours is to be. So every path is walked from the root by
-directory descriptors, nothing is made or written before all directories on the way have been looked at, and what is
-refused has not been touched:
+Another user could put a link or a directory in place of ours. So every path is walked from the root by directory
+descriptors, and nothing is made or written before all directories on the way have been checked:
 
-- a directory on the way belongs to root or to this user, and others may not write to it, unless it keeps what is in it
-  from being replaced (the sticky bit, as /tmp has it);
-- a link on the way is followed only when it belongs to root or to this user and nobody else may write beside it;
-- the last directory is no link, belongs to this user, and nobody else may write to it; a file in it is a regular file
-  of this user's, and is never opened through a link.
+- A directory on the way belongs to root or this user, and others may not write to it, unless it has the sticky bit,
+  which keeps its entries from being replaced (as /tmp has).
+- A link on the way is followed only when it belongs to root or this user and no other user may write beside it.
+- The last directory is no link, belongs to this user, and no other user may write to it. A file in it is a regular file
+  of this user and is never opened through a link.
 
-Root is a user like any other here: it refuses what is not its own. Who operates another user's robot becomes that user
-(`sudo -u USER`), and does not reach into his directory as root.
+Root is a user like any other here and is refused other users' directories: to operate another user's robot, become that
+user (`sudo -u USER`).
 """
 
 from __future__ import annotations
@@ -27,19 +26,19 @@ from pathlib import Path
 from cocoro.errors import ConfigError
 
 RUN_DIR = "COCORO_RUN_DIR"
-"""Environment variable with the place of the run directories."""
+"""Environment variable with the place of the run directory."""
 LINKS = 40
-"""As many links on one way are followed; the kernel's own limit."""
+"""Links that are followed on one path; the kernel's own limit."""
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
 _WALK = os.O_PATH | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
 
 
 class FullError(ConfigError):
-    """Nothing more can be written there: no space, no inodes, no quota, or mounted for reading alone."""
+    """Nothing more can be written: no space, no inodes, no quota, or a read-only file system."""
 
 
 def full(error: OSError) -> bool:
-    """Whether it says that a place takes no more."""
+    """Whether an error means that nothing more can be written (see `FullError`)."""
     return error.errno in FULL
 
 
@@ -47,11 +46,11 @@ def full(error: OSError) -> bool:
 def directory(
     path: Path, *, make: bool = False, own: bool = True, mode: int = 0o700, variable: str = RUN_DIR
 ) -> Iterator[int]:
-    """Gives the descriptor of a directory that is safe to use. With `make`, it and those above are made where they are
-    missing. With `own=False`, it need not be this user's alone, only one on the way to such a one.
+    """Yields the descriptor of a safe directory. With `make`, missing directories are made. With `own=False` the rules
+    for directories on the way apply to it instead of those for the last one.
 
-    Raises FileNotFoundError when there is none and none is to be made, ConfigError for one that is not to be trusted
-    or cannot be had (`variable` says how to choose another), FullError where none can be made for want of space.
+    Raises FileNotFoundError when it is missing, ConfigError when it is not safe or cannot be opened (`variable` is the
+    environment variable that chooses another place), FullError when it cannot be made for lack of space.
     """
     fd = _open_directory(path, make, own, mode, variable)
     try:
@@ -61,8 +60,8 @@ def directory(
 
 
 def open_file(path: Path, flags: int, *, mode: int = 0o600, make: bool = False, variable: str = RUN_DIR) -> int:
-    """The descriptor of a regular file of this user's in a directory of this user's alone; `flags` as of `os.open`.
-    With `make`, directories that are missing are made (the file with os.O_CREAT).
+    """Opens a regular file of this user in a directory that is this user's alone; `flags` as for `os.open`. With
+    `make`, missing directories are made. Returns the descriptor.
 
     Raises FileNotFoundError when it is missing, ConfigError and FullError as `directory` does.
     """
@@ -78,7 +77,7 @@ def open_file(path: Path, flags: int, *, mode: int = 0o600, make: bool = False, 
     try:
         found = os.fstat(fd)
         if not stat.S_ISREG(found.st_mode):
-            raise _refusal(path, "it is no regular file", variable)
+            raise _refusal(path, "it is not a regular file", variable)
         if found.st_uid != os.geteuid():
             raise _refusal(path, _belongs(found.st_uid), variable)
         if flags & os.O_TRUNC:
@@ -90,7 +89,7 @@ def open_file(path: Path, flags: int, *, mode: int = 0o600, make: bool = False, 
 
 
 def write(path: Path, data: bytes) -> None:
-    """Write a whole file: whoever reads it finds the old content or the new. Raises ConfigError, FullError."""
+    """Replaces a file atomically. Raises ConfigError, FullError."""
     fresh = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         fd = open_file(fresh, os.O_CREAT | os.O_WRONLY | os.O_TRUNC, make=True)
@@ -105,7 +104,7 @@ def write(path: Path, data: bytes) -> None:
 
 
 def read(path: Path, limit_bytes: int) -> bytes:
-    """What is in a file, at most so much. Raises FileNotFoundError when it is missing, ConfigError as `open_file`."""
+    """Reads a file, at most `limit_bytes`. Raises FileNotFoundError, ConfigError as `open_file` does."""
     with os.fdopen(open_file(path, os.O_RDONLY), "rb") as file:
         return file.read(limit_bytes)
 
@@ -157,13 +156,13 @@ def _step(fd: int, name: str, make: bool, mode: int) -> int:
     except FileNotFoundError:
         if not make:
             raise
-    with suppress(FileExistsError):  # somebody makes it at the same time
+    with suppress(FileExistsError):  # another process makes it at the same time
         os.mkdir(name, mode, dir_fd=fd)
     return os.open(name, _WALK, dir_fd=fd)
 
 
 def _link(fd: int, name: str) -> tuple[Path, int] | None:
-    """Where a link leads, and whose it is; None for what is no link."""
+    """The target of a link and its owner; None when it is no link."""
     try:
         return Path(os.readlink(name, dir_fd=fd)), os.stat(name, dir_fd=fd, follow_symlinks=False).st_uid
     except OSError:
@@ -175,12 +174,12 @@ def _trusted() -> tuple[int, int]:
 
 
 def _writable(found: os.stat_result) -> bool:
-    """Whether others may put something there."""
+    """Whether every user may write to it."""
     return bool(found.st_mode & 0o002)
 
 
 def _distrust(found: os.stat_result, last: bool) -> str | None:
-    """Why a directory is not to be used; the last one of a way must be this user's alone."""
+    """Why a directory is not safe, None when it is; the last one of a path must be this user's alone."""
     if found.st_uid not in ((os.geteuid(),) if last else _trusted()):
         return _belongs(found.st_uid)
     if last and found.st_mode & 0o022:
@@ -199,7 +198,7 @@ def _belongs(uid: int) -> str:
 
 
 def refusal(path: Path, error: OSError, variable: str = RUN_DIR) -> ConfigError:
-    """What to raise for a file or directory that cannot be had."""
+    """The exception for a file or directory that cannot be opened, made or written."""
     return _refusal(path, error.strerror, variable, error)
 
 

@@ -1,7 +1,7 @@
-"""An asyncio event loop whose time is virtual: when nothing is ready, time jumps to the next timer.
+"""An asyncio event loop with virtual time: when no callback is ready, time jumps to the next timer.
 
-Sleeps and time-outs cost no real time, and a run is deterministic: callbacks run in the order in which they were
-scheduled, timers of equal deadline included. No threads and no real I/O may be awaited here.
+Sleeps and time-outs take no real time. A run is deterministic: callbacks run in the order in which they were scheduled,
+also timers with equal deadlines. Threads and real I/O must not be awaited.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ T = TypeVar("T")
 
 
 class NothingScheduledError(RuntimeError):
-    """Every task waits for something that can never happen: no timer and no callback is left."""
+    """All tasks wait, and no timer or callback is left that could wake one."""
 
 
 class _Selector(selectors.DefaultSelector):
-    """Never waits: a wait with a time-out moves the loop's time instead."""
+    """Moves the loop's time instead of waiting."""
 
     loop: VirtualTimeLoop
 
@@ -37,7 +37,7 @@ class _Selector(selectors.DefaultSelector):
 
 
 class _Timer(asyncio.TimerHandle):
-    """Breaks ties between equal deadlines by the order of scheduling (a heap alone does not)."""
+    """A timer; equal deadlines are ordered by the time of scheduling, which a heap alone does not do."""
 
     order: int
 
@@ -48,7 +48,7 @@ class _Timer(asyncio.TimerHandle):
 
 
 class VirtualTimeLoop(asyncio.SelectorEventLoop):
-    """See the module. `time()` starts at 0."""
+    """`time()` starts at 0."""
 
     _scheduled: list[asyncio.TimerHandle]
     _check_closed: Callable[[], None]
@@ -65,10 +65,10 @@ class VirtualTimeLoop(asyncio.SelectorEventLoop):
         return self._virtual_s
 
     def advance(self) -> None:
-        """Jump to the next timer's deadline."""
+        """Moves time to the next timer's deadline."""
         if self._scheduled:
             self._virtual_s = max(self._virtual_s, self._scheduled[0].when())
-            # The loop runs what is due before `time + resolution`: with one ulp, this deadline and none after it.
+            # The loop runs timers due before `time + resolution`: with one ulp, those of this deadline alone.
             self._clock_resolution = math.ulp(self._virtual_s)
 
     def call_at(  # type: ignore[override] # the stubs type the arguments as a tuple variable

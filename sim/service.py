@@ -16,7 +16,7 @@ from msgspec import Meta
 from cocoro import topics
 from cocoro.clock import NS, Clock
 from cocoro.component import Implementation
-from cocoro.latch import LatchKeeper
+from cocoro.latch import ServiceLatch
 from cocoro.messages import BaseCommand, BaseState, ClockTick, LatchState, Message, ServoCommand
 from cocoro.node import Node
 from cocoro.publisher import Publisher
@@ -144,7 +144,7 @@ class Simulator:
         def halt() -> None:
             self._world.set_latch("latched", node.name)
 
-        LatchKeeper(node, changed, halt)
+        ServiceLatch(node, changed, halt)
 
     def _base_state(self) -> BaseState:
         state = self._world.base_state()

@@ -1,74 +1,78 @@
-"""What all tests share."""
+"""Fixtures and settings for all tests. The tiers and their markers are in `tiers.py`."""
 
 from __future__ import annotations
 
+import os
 import signal
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+
+# As the robot's own processes have it, and before numpy is imported: two workers with two threads each spin in vain.
+os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 import pytest
 from bus_rig import Local, Mesh, Zenoh
 from hypothesis import HealthCheck, settings
 from pictures import renderer_of
+from places import in_short_folder
 
 from cocoro.bus import shared
 from cocoro.robot import Robot
 from sim.render import Renderer
 
-pytest_plugins = ["clock_rig"]
+pytest_plugins = ["clock_rig", "tiers"]
 
-# The same examples at every run, and none that fails because the machine was busy.
+# Every run draws the same examples, and no example fails because the machine is busy.
 settings.register_profile(
     "repeatable", derandomize=True, database=None, deadline=None, suppress_health_check=[HealthCheck.too_slow]
 )
 settings.load_profile("repeatable")
 
-# A shell's background job ignores Ctrl-C, and so would all that is started from here.
+# A shell starts background jobs with SIGINT ignored, and the processes of tests would inherit that.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope="session")
 def robot() -> Robot:
-    """The Calliope as it is described."""
+    """The Calliope by its description file, not calibrated."""
     return Robot.load()
 
 
 @pytest.fixture
 def short_path() -> Iterator[Path]:
-    """Sockets live there."""
-    with tempfile.TemporaryDirectory(prefix="cocoro") as folder:
-        yield Path(folder)
+    """A folder for sockets."""
+    with in_short_folder() as folder:
+        yield folder
 
 
 @pytest.fixture
 def root(short_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The run directories' place, for this process and those that it starts."""
+    """The folder of the run directories, for this process and those that it starts."""
     monkeypatch.setenv("COCORO_RUN_DIR", str(short_path))
     return short_path
 
 
 @pytest.fixture
-def directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Where the processes of one robot's mesh will meet: sockets will live there."""
-    return tmp_path_factory.mktemp("m") / "robot"
+def directory(short_path: Path) -> Path:
+    """The directory of one robot's mesh, before its first process makes it."""
+    return short_path / "robot"
 
 
 @pytest.fixture(params=["local", pytest.param("zenoh", marks=pytest.mark.zenoh)])
-def mesh(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Mesh:
-    """Either bus."""
-    return Local() if request.param == "local" else Zenoh(tmp_path_factory.mktemp("m"))
+def mesh(request: pytest.FixtureRequest, short_path: Path) -> Mesh:
+    """Each of the two buses in turn."""
+    return Local() if request.param == "local" else Zenoh(short_path)
 
 
 @pytest.fixture(autouse=True)
 def latches_of_this_test(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each test begins on a machine that never knew an emergency stop."""
+    """Give each test its own folder for latch records, so that it begins with none latched."""
     monkeypatch.setenv("COCORO_STATE_DIR", str(tmp_path_factory.mktemp("state")))
 
 
 @pytest.fixture(scope="session", autouse=True)
 def captures_of_tests(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """What robots of tests record goes with the tests."""
+    """Have robots of tests record into pytest's temporary folder."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("COCORO_CAPTURE_DIR", str(tmp_path_factory.mktemp("captures")))
         yield

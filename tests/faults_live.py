@@ -10,7 +10,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import tempfile
 from collections import defaultdict
 from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager, suppress
@@ -21,6 +20,7 @@ from typing import Any, TypeVar
 
 import msgspec
 from operator_shell import PATIENCE_S, Running
+from places import short_folder
 from spelled import asked
 
 from cocoro import topics
@@ -249,7 +249,7 @@ async def live(
     folder: Path, *, name: str = "calliope", scene: Path | str = "paper", mesh: str = "", **sim: Any
 ) -> AsyncIterator[LiveRobot]:
     """A robot that is up, and goes down at the end. `sim`: settings of the simulator beside `SLOW`."""
-    root = Path(tempfile.mkdtemp(prefix="cocoro"))  # short: sockets live there
+    root = short_folder()
     robot = LiveRobot(name, root, folder)
     robot.profile.write_text(profile_text(name, {**SLOW, "scene": str(scene), **sim}, mesh))
     try:

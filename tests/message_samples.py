@@ -1,8 +1,9 @@
-"""Any message of any type, for property-based tests: as plain data, the way it travels."""
+"""Messages of every type for property-based tests, as plain data: as MessagePack decodes them."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import cache
 from typing import Any
 
 import msgspec
@@ -21,7 +22,12 @@ Path = tuple[str | int, ...]
 
 
 def data_of(kind: type[msgspec.Struct]) -> st.SearchStrategy[Data]:
-    """Plain data that is a good message of that type."""
+    """Plain data of valid messages of a type."""
+    return _data_of(kind)
+
+
+@cache
+def _data_of(kind: type[msgspec.Struct]) -> st.SearchStrategy[Data]:
     fields = _fields(inspect.type_info(kind))
     if issubclass(kind, Frame):
         return st.builds(_frame, fields, st.integers(1, 4), st.integers(1, 4))
@@ -34,7 +40,7 @@ def data_of(kind: type[msgspec.Struct]) -> st.SearchStrategy[Data]:
 
 
 def numbers_in(data: Any, path: Path = ()) -> Iterator[Path]:
-    """Where the floating point numbers are."""
+    """The paths of all floating point numbers."""
     if isinstance(data, float):
         yield path
     for key, value in _children(data):
@@ -42,7 +48,7 @@ def numbers_in(data: Any, path: Path = ()) -> Iterator[Path]:
 
 
 def leaves_in(data: Any, path: Path = ()) -> Iterator[Path]:
-    """Where everything is that is no map and no list."""
+    """The paths of all values that are neither map nor list."""
     children = list(_children(data))
     if path and not children:
         yield path
@@ -51,7 +57,7 @@ def leaves_in(data: Any, path: Path = ()) -> Iterator[Path]:
 
 
 def replaced(data: Any, path: Path, value: Any) -> Any:
-    """The same with another value at one place."""
+    """A copy with another value at one path."""
     if not path:
         return value
     if isinstance(data, dict):
@@ -77,7 +83,7 @@ def _frame(fields: Data, width: int, height: int) -> Data:
 
 
 def _servos(kind: type[Message], fields: Data, joints: int) -> Data:
-    """As many values as joints."""
+    """Make the fields per joint as long as `joints`."""
     per_joint = ("goal_rad", "speed_radps") if kind is ServoCommand else ("position_rad", "speed_radps", "load")
     names = {"joints": [f"joint_{number}" for number in range(joints)]}
     return fields | names | {name: [(fields[name] or [0.5])[0]] * joints for name in per_joint}

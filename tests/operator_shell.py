@@ -7,10 +7,11 @@ import queue
 import shutil
 import subprocess
 import sys
-import tempfile
 import threading
 from pathlib import Path
 from types import TracebackType
+
+from places import short_folder
 
 from deploy.rundir import RunDir, Target
 
@@ -97,7 +98,7 @@ class Shell:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.root = Path(tempfile.mkdtemp(prefix="cocoro"))  # short: sockets live there
+        self.root = short_folder()
         self.run_dir = RunDir("robbie", self.root)
         self.prefix: list[str] = []
         """In front of every command, as that which has it run in a namespace."""

@@ -46,6 +46,7 @@ def test_an_unknown_name_is_an_attribute_error() -> None:
         cocoro.Nothing  # type: ignore[attr-defined] # noqa: B018
 
 
+@pytest.mark.process
 def test_importing_the_package_alone_loads_none_of_its_modules() -> None:
     code = "import sys, cocoro; print(*[name for name in sys.modules if name.startswith('cocoro.')])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

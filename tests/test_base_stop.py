@@ -23,7 +23,7 @@ from cocoro.robot import Robot
 from cocoro.stop.record import prepare, read
 from cocoro.testing import ServiceUnderTest
 
-pytestmark = pytest.mark.zenoh
+pytestmark = [pytest.mark.zenoh, pytest.mark.process]
 
 PATIENCE_S = 60.0
 

@@ -37,6 +37,7 @@ async def test_members_that_join_at_once_are_all_connected_exactly_once(director
     assert left_in(directory) == ["lock"]
 
 
+@pytest.mark.process
 @scenario
 async def test_the_register_says_who_is_there_and_forgets_the_dead(directory: Path) -> None:
     assert members(directory) == []
@@ -80,7 +81,7 @@ def test_a_directory_that_cannot_be_made_is_refused(directory: Path) -> None:
         ({"directory": Path("/run/caf\udce9")}, "must be UTF-8"),
         ({"directory": Path("/run/a"), "mode": "client"}, "without mode, listen and connect"),
         ({"directory": Path("/run/a"), "connect": ("tcp/127.0.0.1:1",)}, "without mode, listen and connect"),
-        ({}, "say a directory, or where to listen or connect"),
+        ({}, "give a directory, or endpoints to listen on or connect to"),
     ],
 )
 def test_a_configuration_that_cannot_be_is_refused(options: dict[str, Any], text: str) -> None:
@@ -105,6 +106,7 @@ def test_a_robot_s_name_must_do_as_path_and_key(robot: str, tmp_path: Path) -> N
         default(robot, "base", tmp_path)
 
 
+@pytest.mark.process
 def test_a_fork_does_not_take_its_parent_out_of_the_mesh(directory: Path) -> None:
     script = """
 import atexit, os
@@ -137,6 +139,7 @@ async def test_where_nobody_is_the_error_says_what_to_start(directory: Path) -> 
     assert members(directory) == []
 
 
+@pytest.mark.process
 @scenario
 async def test_what_dead_processes_left_is_no_mesh(directory: Path) -> None:
     async with child(directory, "base") as base:
@@ -147,6 +150,7 @@ async def test_what_dead_processes_left_is_no_mesh(directory: Path) -> None:
             await ZenohBus.open(local(directory), expect_mesh=True)
 
 
+@pytest.mark.process
 @scenario
 async def test_the_death_of_the_first_member_leaves_a_mesh_that_others_can_join(directory: Path) -> None:
     async with child(directory, "first") as first, child(directory, "second") as second:
@@ -169,6 +173,7 @@ async def test_the_death_of_the_first_member_leaves_a_mesh_that_others_can_join(
                 assert await who(witness) == ["second", "third"]
 
 
+@pytest.mark.process
 @scenario
 async def test_a_member_that_has_stopped_is_named_and_does_not_keep_others_from_joining(
     directory: Path, caplog: pytest.LogCaptureFixture
@@ -185,6 +190,7 @@ async def test_a_member_that_has_stopped_is_named_and_does_not_keep_others_from_
             assert await who(bus) == ["base", "stuck"]
 
 
+@pytest.mark.process
 @scenario
 async def test_joining_that_is_cancelled_leaves_nothing_behind(directory: Path) -> None:
     async with child(directory, "stuck") as stuck:
@@ -224,8 +230,8 @@ async def test_who_cannot_have_the_register_s_lock_joins_all_the_same(directory:
 
 
 @scenario
-async def test_two_robots_on_one_machine_never_meet(tmp_path_factory: pytest.TempPathFactory) -> None:
-    run_dir = tmp_path_factory.mktemp("m")
+async def test_two_robots_on_one_machine_never_meet(short_path: Path) -> None:
+    run_dir = short_path
     async with (
         await ZenohBus.open(default("one", "base", run_dir)) as one,
         await ZenohBus.open(default("two", "base", run_dir)) as two,

@@ -19,6 +19,7 @@ from cocoro.errors import CallTimeoutError, MeshError
 # Processes that die or stop
 
 
+@pytest.mark.process
 @scenario
 async def test_a_killed_process_is_known_to_be_dead_at_once(directory: Path) -> None:
     # With a lease this long, only the broken connection can tell.
@@ -33,6 +34,7 @@ async def test_a_killed_process_is_known_to_be_dead_at_once(directory: Path) -> 
         assert await who(bus) == []
 
 
+@pytest.mark.process
 @scenario
 async def test_a_reader_that_has_stopped_stalls_nobody_and_is_back_when_it_goes_on(directory: Path) -> None:
     count = 60
@@ -80,6 +82,7 @@ async def test_a_reader_that_has_stopped_stalls_nobody_and_is_back_when_it_goes_
             await saying
 
 
+@pytest.mark.process
 @scenario
 async def test_a_caller_is_not_kept_by_a_server_that_has_stopped(directory: Path) -> None:
     async with child(directory, "base") as base, child(directory, "stuck") as stuck:
@@ -108,6 +111,7 @@ ENDINGS = {
 }
 
 
+@pytest.mark.process
 @pytest.mark.parametrize("ending", ENDINGS)
 @scenario
 async def test_a_process_ends_cleanly_with_a_session_that_is_busy(directory: Path, ending: str) -> None:

@@ -162,6 +162,7 @@ def takes_no_entries(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "open", open_)
 
 
+@pytest.mark.process
 @scenario
 async def test_a_command_needs_no_room_in_a_full_directory(
     directory: Path, request: pytest.FixtureRequest, caplog: pytest.LogCaptureFixture
@@ -226,6 +227,7 @@ async def joining_s(config: ZenohConfig) -> float:
         return time.monotonic() - started_s
 
 
+@pytest.mark.process
 @scenario
 async def test_a_crowd_of_idle_connections_keeps_nobody_out(directory: Path) -> None:
     """They need not speak zenoh; the directory is private, so that only this user's processes can be such."""

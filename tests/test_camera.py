@@ -226,11 +226,13 @@ def film(seed: int) -> list[str]:
     return prints
 
 
+@pytest.mark.sim
 def test_one_seed_gives_one_film_another_seed_another() -> None:
     assert film(3) == film(3)
     assert not set(film(3)) & set(film(4))
 
 
+@pytest.mark.process
 def test_another_process_takes_the_same_film() -> None:
     program = (
         f"import sys; sys.path.insert(0, {__file__.rpartition('/')[0]!r}); import test_camera as t; print(*t.film(3))"
@@ -246,6 +248,7 @@ def test_a_frames_noise_does_not_depend_on_how_many_were_taken_before() -> None:
     assert fingerprint(shoot(often, 5 * FRAME_NS)) == fingerprint(shoot(once, 5 * FRAME_NS))
 
 
+@pytest.mark.sim
 @pytest.mark.parametrize("size", [(640, 480), (320, 240)])
 def test_both_frame_sizes_show_the_can_where_it_is(size: tuple[int, int]) -> None:
     camera_: Camera = ROBOT.camera.scaled(*size)

@@ -70,9 +70,9 @@ def test_the_tally_of_another_file_is_not_believed(
         found = info_of(path, capsys, 0, *options)
         assert (found["messages"], found["checked"], found["problems"]) == (count, True, [])
         assert sum(key["messages"] for key in found["keys"]) == count
-        assert found["notes"] == ["its metadata 'tally' is not of this file, so its messages were counted"]
+        assert found["notes"] == ["its metadata 'tally' belongs to another file, so the messages were counted"]
     assert main(["capture", "info", str(path)]) == 0
-    assert "note: its metadata 'tally' is not of this file" in capsys.readouterr().out
+    assert "note: its metadata 'tally' belongs to another file" in capsys.readouterr().out
     assert main(["capture", "repair", str(path)]) == 0
     again = info_of(path.with_suffix(".repaired.mcap"), capsys)
     assert (again["messages"], again["checked"], again["notes"]) == (count, False, [])
@@ -320,7 +320,7 @@ def test_attachments_become_files_in_their_folder_and_nowhere_else(
     }  # fmt: skip
     assert sorted(path.name for path in tmp_path.iterdir()) == ["attached.mcap", "out"]
     assert main(["export", str(attached), "--attachments", str(folder)]) == 1
-    assert "is there already" in capsys.readouterr().err
+    assert "exists; remove it" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -194,5 +194,5 @@ def test_a_damaged_capture_is_mended_as_far_as_it_goes(
     found = {_told(each) for each in all_of(mended)}
     assert found < original
     assert len(found) > len(original) / 2
-    with Capture.open(path) as capture, pytest.raises(CaptureError, match="is there already"):
+    with Capture.open(path) as capture, pytest.raises(CaptureError, match="exists; remove it"):
         rewrite(capture, mended, Packer("zstd"))

@@ -231,14 +231,14 @@ def test_without_foxglove_one_line_says_how_to_install_it(
 
 def test_an_export_does_not_write_over_a_file(exported: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """It might be the capture."""
-    with Capture.open(GOLDEN) as capture, pytest.raises(CaptureError, match="is there already"):
+    with Capture.open(GOLDEN) as capture, pytest.raises(CaptureError, match="exists; remove it"):
         video.export(capture, exported / "film.mp4")
     for form in ("--video", "--foxglove", "--rrd"):
         assert main(["export", str(GOLDEN), form, str(exported / "film.mp4")]) == 1
-        assert "is there already" in capsys.readouterr().err
+        assert "exists; remove it" in capsys.readouterr().err
     before = GOLDEN.read_bytes()
     assert main(["export", str(GOLDEN), "--csv", str(exported / "more"), "--rrd", str(GOLDEN)]) == 1
-    assert "is there already" in capsys.readouterr().err
+    assert "exists; remove it" in capsys.readouterr().err
     assert GOLDEN.read_bytes() == before
     assert not (exported / "more").exists()  # all are looked at before the first is made
 
@@ -360,6 +360,7 @@ def test_without_a_screen_one_line_says_what_to_do(
     assert len(err.splitlines()) == 1
 
 
+@pytest.mark.process
 def test_rerun_itself_takes_it(tmp_path: Path) -> None:
     pytest.importorskip("rerun", reason="Rerun is an extra, and not installed here")
     assert main(["export", str(GOLDEN), "--rrd", str(tmp_path / "out.rrd")]) == 0

@@ -311,8 +311,8 @@ def test_an_old_capture_is_read_by_the_stated_rules(tmp_path: Path) -> None:
             capture.read(bad)
         assert capture.decode(bad)["turn_rate_radps"] == "fast"
         (key,) = report(capture).keys
-    assert "horn is no more: passed by" in key.changed
-    assert "battery_v is new: takes its default" in key.changed
+    assert "horn is gone: ignored" in key.changed
+    assert "battery_v is new: gets its default" in key.changed
     assert "turn_rate_radps has changed" in key.changed
 
 

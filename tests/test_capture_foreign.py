@@ -97,6 +97,7 @@ def _run(reader: Path, *words: str) -> dict[str, Any]:
     return found
 
 
+@pytest.mark.process
 @pytest.mark.parametrize("how", ["indexed", "stream"])
 def test_the_npm_packages_read_everything_by_the_page(
     how: str, reader: Path, expected: dict[str, tuple[str, int]]
@@ -114,6 +115,7 @@ def test_the_npm_packages_read_everything_by_the_page(
     assert found["frames"] == [[160, 120, 160 * 120 * 3, int(middle)] for middle in middles]
 
 
+@pytest.mark.process
 def test_the_npm_packages_read_what_a_killed_recorder_left(reader: Path, tmp_path: Path) -> None:
     killed = tmp_path / "killed.mcap"
     killed.write_bytes(GOLDEN.read_bytes()[: GOLDEN.stat().st_size // 2])
@@ -124,6 +126,7 @@ def test_the_npm_packages_read_what_a_killed_recorder_left(reader: Path, tmp_pat
     assert sum(counts.values()) > 1000
 
 
+@pytest.mark.process
 def test_what_is_exported_for_foxglove_is_by_foxgloves_own_schemas(reader: Path, tmp_path: Path) -> None:
     pytest.importorskip("foxglove", reason="foxglove-sdk is an extra, and not installed here")
     from apps.captures.export import foxglove

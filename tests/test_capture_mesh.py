@@ -88,6 +88,7 @@ async def heard_by_a_recorder(bus: ZenohBus) -> None:
     watch.close()
 
 
+@pytest.mark.process
 def test_a_killed_recorder_leaves_all_but_the_last_moment(short_path: Path) -> None:
     draw = random.Random(5)
 
@@ -116,6 +117,7 @@ def test_a_killed_recorder_leaves_all_but_the_last_moment(short_path: Path) -> N
     asyncio.run(scenario())
 
 
+@pytest.mark.process
 def test_a_recording_ends_well_when_it_is_told_to(short_path: Path) -> None:
     async def scenario() -> None:
         async with robot(short_path) as (bus, _):
@@ -135,6 +137,7 @@ def test_a_recording_ends_well_when_it_is_told_to(short_path: Path) -> None:
     asyncio.run(scenario())
 
 
+@pytest.mark.process
 @pytest.mark.parametrize("became", ["moved", "removed"])
 def test_a_recording_whose_file_is_taken_away_goes_on_in_the_next_one_and_says_what_is_on_the_disk(
     became: str, short_path: Path
@@ -230,6 +233,7 @@ def test_a_recorder_whose_wall_clock_is_set_goes_on_as_if_it_had_not_been_and_no
     )
 
 
+@pytest.mark.process
 def test_a_recorder_without_a_place_to_write_says_so_and_exits_with_1(short_path: Path) -> None:
     (short_path / "file").write_text("no folder")
 
@@ -244,6 +248,7 @@ def test_a_recorder_without_a_place_to_write_says_so_and_exits_with_1(short_path
     asyncio.run(scenario())
 
 
+@pytest.mark.process
 def test_replay_refuses_a_mesh_with_a_robot_and_plays_where_there_is_none(short_path: Path) -> None:
     path = record(short_path / "drive.mcap", drive)
 
@@ -268,6 +273,7 @@ def test_replay_refuses_a_mesh_with_a_robot_and_plays_where_there_is_none(short_
     asyncio.run(played())
 
 
+@pytest.mark.process
 def test_replay_is_worked_by_the_keyboard(short_path: Path) -> None:
     path = record(short_path / "drive.mcap", drive)
     ours, theirs = os.openpty()

@@ -253,9 +253,9 @@ def test_outputs_of_an_older_version_are_compared_by_the_fields_that_both_have(
     assert result.first is None, result.first
     assert result.equal == result.steps > 250
     assert result.changed == (
-        "calliope/planning/status: mood is no more: passed by",
-        "calliope/planning/status: model is new: takes its default",
-        "calliope/planning/status: TargetEstimate.sigma_m is new: takes its default",
+        "calliope/planning/status: mood is gone: ignored",
+        "calliope/planning/status: model is new: gets its default",
+        "calliope/planning/status: TargetEstimate.sigma_m is new: gets its default",
         "calliope/executive/intent: Intent has changed: its former shape is converted",
     )
     assert main(["capture", "reexecute", str(path), "--service", "planning", "--tolerance", "0.001"]) == 0
@@ -276,8 +276,8 @@ def test_what_differs_is_found_in_a_capture_of_an_older_version_too(tmp_path: Pa
     ("service", "words"),
     [
         ("executive", "has no pure core"),
-        ("nobody", "does not say what nobody was started with; it does of arm, base, capture, executive"),
-        ("planning", r"no steps of planning; have them recorded by record_steps = true"),
+        ("nobody", "no configuration of nobody; services with one: arm, base, capture, executive"),
+        ("planning", r"no steps of planning; set record_steps = true"),
     ],
 )
 def test_a_capture_that_does_not_have_what_it_takes_is_told_of(service: str, words: str, tmp_path: Path) -> None:
@@ -312,7 +312,7 @@ def test_a_setting_that_has_come_since_takes_its_default(tmp_path: Path) -> None
 
 def test_a_setting_that_is_no_more_ends_it_with_its_name(tmp_path: Path) -> None:
     path = started_otherwise(tmp_path / "older.mcap", lambda config: config.update(mood=3))
-    with pytest.raises(CaptureError, match=r"older\.mcap: what planning was started with cannot be had again: .*mood"):
+    with pytest.raises(CaptureError, match=r"older\.mcap: the start of planning cannot be repeated: .*mood"):
         again(path, "planning")
 
 

@@ -6,12 +6,12 @@ import json
 import os
 import subprocess
 import sys
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+from places import in_short_folder
 
 from apps.cli import app, stop_asking
 from apps.cli.main import PACKAGES, main
@@ -34,8 +34,8 @@ ROOT = Path(__file__).parent.parent
 
 @pytest.fixture(autouse=True)
 def no_robot_here(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    with tempfile.TemporaryDirectory(prefix="cocoro") as folder:  # a short path: sockets could live there
-        monkeypatch.setenv("COCORO_RUN_DIR", folder)
+    with in_short_folder() as folder:
+        monkeypatch.setenv("COCORO_RUN_DIR", str(folder))
         yield
 
 
@@ -142,6 +142,7 @@ def test_the_topics_page_of_the_documentation_is_up_to_date(capsys: pytest.Captu
     assert capsys.readouterr().out == page, "make it anew: cocoro topics --markdown > docs/topics.md"
 
 
+@pytest.mark.process
 def test_help_imports_no_command() -> None:
     code = "import sys; from apps.cli.main import main; main(['--help']); print(*sys.modules, file=sys.stderr)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
@@ -151,6 +152,7 @@ def test_help_imports_no_command() -> None:
     assert "services.executive.tasks" in modules, "the tasks' own types say what they are called"
 
 
+@pytest.mark.process
 def test_a_command_that_is_no_task_imports_no_task() -> None:
     code = "import sys; from apps.cli.main import main; main(['down', '--help']); print(*sys.modules, file=sys.stderr)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
@@ -164,6 +166,7 @@ def test_a_commands_own_help_begins_with_its_line_of_the_list(row: app.CommandRo
     assert command.hidden == row.hidden
 
 
+@pytest.mark.process
 def test_the_emergency_stop_imports_next_to_nothing() -> None:
     code = "import sys; from apps.cli import main, estop; estop.by_path('nobody'); print(*sys.modules)"
     done = subprocess.run([sys.executable, "-S", "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
@@ -179,6 +182,7 @@ def test_the_emergency_stop_knows_what_can_be_stopped() -> None:
     assert stoppable() == stop_asking.STOPPABLE
 
 
+@pytest.mark.process
 def test_a_foreign_package_that_hides_one_of_ours_is_named(tmp_path: Path) -> None:
     (tmp_path / "services").mkdir()
     (tmp_path / "services" / "__init__.py").touch()

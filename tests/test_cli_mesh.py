@@ -22,7 +22,7 @@ from cocoro.bus.endpoints import default
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.clock import RealClock
 from cocoro.errors import ConfigError
-from cocoro.latch import LatchKeeper
+from cocoro.latch import ServiceLatch
 from cocoro.messages import (
     BaseState,
     CancelRequest,
@@ -54,7 +54,7 @@ ANY = RobotChoice()
 class FakeRobot:
     """Services in one process, on the mesh of the robot's run directory."""
 
-    def __init__(self, nodes: dict[str, Node], latched_by: dict[str, LatchKeeper]) -> None:
+    def __init__(self, nodes: dict[str, Node], latched_by: dict[str, ServiceLatch]) -> None:
         self.nodes = nodes
         self.keepers = latched_by
 
@@ -72,7 +72,7 @@ async def robot(*services: str, without_latch: tuple[str, ...] = ()) -> AsyncIte
         for node in nodes.values():
             await stack.enter_async_context(node)
         keeping = [name for name in stoppable() if name in nodes and name not in without_latch]
-        keepers = {name: LatchKeeper(nodes[name], lambda *_: None) for name in keeping}
+        keepers = {name: ServiceLatch(nodes[name], lambda *_: None) for name in keeping}
         for node in nodes.values():
             node.ready("all is well")
         yield FakeRobot(nodes, keepers)
@@ -270,6 +270,7 @@ def test_a_snapshot_is_a_frame_with_what_was_detected_in_that_frame(
     assert out.read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.process
 def test_ctrl_c_on_a_running_fetch_cancels_the_task_on_the_robot(root: Path) -> None:
     cancelled: list[str] = []
 

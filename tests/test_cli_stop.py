@@ -226,6 +226,7 @@ def test_nothing_that_another_process_says_or_calls_itself_reaches_the_terminal_
     assert "\x1b" not in said.out + said.err
 
 
+@pytest.mark.process
 @pytest.mark.parametrize("streams", ["closed", "full"])
 def test_who_cannot_be_told_has_stopped_the_robot_all_the_same(services: Services, streams: str) -> None:
     services("base", "arm", "hand")

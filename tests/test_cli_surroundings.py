@@ -12,7 +12,6 @@ import os
 import signal
 import subprocess
 import sys
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -22,6 +21,7 @@ import numpy as np
 import pytest
 from cli_forks import FULL, NO_MOUNTS, TALKED, Forks
 from cli_surroundings import ARGUMENTS, COMMANDS, GOLDEN, NOT_UTF8, SURROUNDINGS, Surroundings, Table, wrong
+from places import in_short_folder
 
 from apps.captures.rewrite import rewrite
 from apps.cli import exits
@@ -33,8 +33,7 @@ from services.capture.file import Packer
 
 @pytest.fixture(scope="module")
 def root() -> Iterator[Path]:
-    with tempfile.TemporaryDirectory(prefix="cocoro") as folder:
-        path = Path(folder)
+    with in_short_folder() as path:
         (path / "disk").mkdir()
         (path / "broken").symlink_to("nowhere")
         picture = np.full((60, 80, 3), 200, np.uint8)
@@ -69,6 +68,7 @@ def test_no_arguments_are_kept_for_commands_that_are_gone() -> None:
     assert set(ARGUMENTS) <= set(COMMANDS)
 
 
+@pytest.mark.process
 @pytest.mark.parametrize("name", SURROUNDINGS)
 def test_every_command_ends_in_words_and_with_its_exit_code(name: str, table: Table) -> None:
     surroundings = SURROUNDINGS[name]
@@ -83,6 +83,7 @@ def test_every_command_ends_in_words_and_with_its_exit_code(name: str, table: Ta
     assert not failures, "\n".join(failures)
 
 
+@pytest.mark.process
 def test_so_it_does_in_the_locale_of_c(table: Table, root: Path) -> None:
     """Where Python takes every file name for ASCII, and prints nothing else."""
     surroundings = Surroundings({"encoding": "ascii"}, odd="für")
@@ -94,6 +95,7 @@ def test_so_it_does_in_the_locale_of_c(table: Table, root: Path) -> None:
     assert "für" in endings["export"].out  # as the bytes that the name has
 
 
+@pytest.mark.process
 def test_all_is_well_where_nothing_is_wrong(table: Table) -> None:
     """So that the table is not one of commands that all fail alike."""
     well = {command for command in COMMANDS if table.usual(command).code == exits.DONE}
@@ -121,6 +123,7 @@ def interrupted(table: Table, command: str, share: float, **what: Any) -> list[s
     return [f"cocoro {command}, call {at} of {calls}: {problem}:\n{ending.err}" for problem in found]
 
 
+@pytest.mark.process
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_at_any_time_ends_a_command_as_cancelled(number: signal.Signals, table: Table) -> None:
     which = list(COMMANDS) if number == signal.SIGINT else list(COMMANDS)[:: len(SPREAD) - 1]
@@ -133,6 +136,7 @@ def test_a_signal_at_any_time_ends_a_command_as_cancelled(number: signal.Signals
     assert not failures, "\n".join(failures)
 
 
+@pytest.mark.process
 @pytest.mark.parametrize("command", ["topics", "stop", "status"])
 def test_a_signal_while_it_imports_ends_it_in_silence(command: str, table: Table) -> None:
     failures = [
@@ -143,6 +147,7 @@ def test_a_signal_while_it_imports_ends_it_in_silence(command: str, table: Table
     assert not failures, "\n".join(failures)
 
 
+@pytest.mark.process
 def test_being_told_to_end_does_so_where_ctrl_c_is_ignored(table: Table) -> None:
     """As in the background of a script."""
     ending = table.play("topics", Surroundings({"at_call": 100, "number": signal.SIGTERM, "deaf": True}))
@@ -152,6 +157,7 @@ def test_being_told_to_end_does_so_where_ctrl_c_is_ignored(table: Table) -> None
 # --- what is nobody's mistake ---------------------------------------------------------------------
 
 
+@pytest.mark.process
 def test_a_bug_is_one_line_and_its_traceback_can_be_had(table: Table) -> None:
     bug = {"instead": ("apps.cli.topics:table", "bug")}
     ending = table.play("topics", Surroundings(bug))
@@ -166,6 +172,7 @@ def test_a_bug_is_one_line_and_its_traceback_can_be_had(table: Table) -> None:
     assert told.err.endswith(ending.err)
 
 
+@pytest.mark.process
 def test_what_is_logged_is_a_line_each(table: Table) -> None:
     logs = {"instead": ("apps.cli.topics:table", "log")}
     ending = table.play("topics", Surroundings(logs))
@@ -186,6 +193,7 @@ def line_of(text: str) -> int:
     return next(number for number, line in enumerate(lines, 1) if text in line)
 
 
+@pytest.mark.process
 def test_an_emergency_stop_goes_on_though_nobody_hears_of_it(table: Table) -> None:
     talking = {"instead": ("apps.cli.estop:main", "talk")}
     for place in ("closed", "full", "gone"):
@@ -206,6 +214,7 @@ WRITERS = {
 """Commands that write files without a robot."""
 
 
+@pytest.mark.process
 @pytest.mark.parametrize(("command", "arguments"), [(name, each) for name, row in WRITERS.items() for each in row])
 def test_what_is_written_has_any_name_and_says_when_the_disk_is_full(
     command: str, arguments: str, table: Table, root: Path
@@ -224,6 +233,7 @@ def test_what_is_written_has_any_name_and_says_when_the_disk_is_full(
     assert "pictures" not in ending.out
 
 
+@pytest.mark.process
 @pytest.mark.parametrize("command", ["run executive", "down", "up --detach", "status", "doctor sim"])
 def test_a_run_directory_on_a_full_disk_is_named(command: str, table: Table, root: Path) -> None:
     disk = f"{root}/disk"
@@ -242,6 +252,7 @@ def test_a_run_directory_on_a_full_disk_is_named(command: str, table: Table, roo
 COMMAND = f"{sys.executable} -m apps.cli.main"
 
 
+@pytest.mark.process
 @pytest.mark.parametrize(
     ("shell", "code", "said"),
     [

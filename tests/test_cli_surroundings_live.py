@@ -15,7 +15,7 @@ from operator_shell import PATIENCE_S, Shell
 
 from apps.cli import exits
 
-pytestmark = pytest.mark.zenoh
+pytestmark = pytest.mark.process
 
 
 @pytest.fixture

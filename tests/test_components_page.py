@@ -8,13 +8,13 @@ import shutil
 import subprocess
 import sys
 import sysconfig
-import tempfile
 import venv
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import pytest
+from places import short_folder
 
 ROOT = Path(__file__).parent.parent
 PAGE = ROOT / "docs" / "components.md"
@@ -45,11 +45,11 @@ def environment(tmp_path: Path) -> Iterator[dict[str, str]]:
         script = home / "bin" / command
         script.write_text(f'#!/bin/sh\nexec "{home}/bin/python" -P -m {module} "$@"\n')
         script.chmod(0o755)
-    run_dir = tempfile.mkdtemp(prefix="cocoro")  # short: sockets live there
+    run_dir = short_folder()
     yield os.environ | {
         "PATH": f"{home}/bin:{os.environ['PATH']}",
         "PYTHONPATH": str(ROOT),
-        "COCORO_RUN_DIR": run_dir,
+        "COCORO_RUN_DIR": str(run_dir),
         "PIP_NO_BUILD_ISOLATION": "0",  # which is how pip spells "true" for an option that begins with "no"
         "PIP_NO_DEPS": "1",
         "PIP_DISABLE_PIP_VERSION_CHECK": "1",
@@ -72,7 +72,7 @@ def test_every_piece_of_python_says_which_file_it_is() -> None:
     assert all(block.path for block in pieces)
 
 
-@pytest.mark.zenoh
+@pytest.mark.process
 @pytest.mark.sim
 def test_the_tutorial_works_word_for_word(tmp_path: Path, environment: dict[str, str]) -> None:
     folder = tmp_path / "work"

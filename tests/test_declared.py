@@ -79,6 +79,7 @@ async def _until(content: Callable[[], object]) -> None:
         await asyncio.sleep(LOOK_S)
 
 
+@pytest.mark.process
 @pytest.mark.zenoh
 def test_the_base_speaks_as_it_declares(tmp_path: Path) -> None:
     async def scenario() -> list[str]:
@@ -123,6 +124,7 @@ async def test_the_kinect_speaks_as_it_declares(monkeypatch: pytest.MonkeyPatch)
         assert misdeclared(KINECT, service.bus) == []
 
 
+@pytest.mark.process
 @pytest.mark.zenoh
 @pytest.mark.sim
 def test_the_simulator_behind_wires_speaks_as_it_declares(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,7 +16,7 @@ from spelled import asked
 from cocoro import topics
 from deploy.processes import hardware
 
-pytestmark = [pytest.mark.zenoh, pytest.mark.sim]
+pytestmark = [pytest.mark.zenoh, pytest.mark.sim, pytest.mark.process]
 
 ZERO_S = 0.22
 """From the moment of the fault until nothing but zero is commanded."""

@@ -74,6 +74,7 @@ def looked_at(run_dir: RunDir) -> Iterator[None]:
         onlooker.join()
 
 
+@pytest.mark.process
 @pytest.mark.parametrize("services", [(SIM,), (SIM, SIM), ("executive", "executive"), (SIM, SIM, SIM)])
 def test_of_those_that_claim_at_once_exactly_one_gets_it_even_while_somebody_looks(
     run_dir: RunDir, services: tuple[str, ...]
@@ -93,6 +94,7 @@ def test_of_those_that_claim_at_once_exactly_one_gets_it_even_while_somebody_loo
     assert run_dir.claims() == {}
 
 
+@pytest.mark.process
 def test_a_simulator_and_the_hardware_it_stands_in_for_never_run_side_by_side(run_dir: RunDir) -> None:
     with contenders(run_dir, SIM, "base", "arm,hand") as processes, looked_at(run_dir):
         for _ in range(100):
@@ -105,6 +107,7 @@ def test_a_simulator_and_the_hardware_it_stands_in_for_never_run_side_by_side(ru
             assert [process.says() for process in processes] == ["over"] * 3
 
 
+@pytest.mark.process
 @pytest.mark.zenoh
 @pytest.mark.parametrize(("process", "first"), [("executive", "executive"), ("sim", "arm")])
 def test_of_two_that_start_at_once_one_runs_and_one_is_refused_in_a_line(

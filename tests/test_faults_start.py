@@ -13,7 +13,7 @@ from operator_shell import Shell
 
 from apps.cli import exits
 
-pytestmark = [pytest.mark.zenoh, pytest.mark.sim]
+pytestmark = [pytest.mark.sim, pytest.mark.process]
 
 
 @pytest.fixture

@@ -89,6 +89,7 @@ def free_port() -> int:
         return port
 
 
+@pytest.mark.process
 @pytest.mark.zenoh
 def test_two_robots_behind_one_router_each_do_their_own(tmp_path: Path) -> None:
     async def scenario() -> None:

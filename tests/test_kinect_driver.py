@@ -312,6 +312,7 @@ def test_a_library_that_is_not_there_or_is_another_is_said_with_the_package_to_i
         asyncio.run(open_it())
 
 
+@pytest.mark.process
 def test_a_process_that_ends_by_itself_is_told_and_started_again(tmp_path: Path) -> None:
     """A library that ends its process, as the playback library does; here because the folder is not a recording."""
 

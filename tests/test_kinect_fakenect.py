@@ -29,7 +29,7 @@ from services.perception.core import PerceptionCore
 from sim.service import SimConfig
 from sim.wire.record import RATE_HZ, RecordingWriter, record
 
-pytestmark = pytest.mark.sim
+pytestmark = [pytest.mark.sim, pytest.mark.process]
 
 FRAMES = 12
 PATIENCE_S = 60.0

@@ -9,7 +9,7 @@ import pytest
 from cocoro import topics
 from cocoro.bus.local import LocalMesh
 from cocoro.clock import NS, VirtualClock
-from cocoro.latch import LatchKeeper
+from cocoro.latch import ServiceLatch
 from cocoro.messages import EstopReply, EstopRequest, Latch, LatchState
 from cocoro.node import Node
 from cocoro.robot import Robot
@@ -43,7 +43,7 @@ class Base:
             await self.node.__aexit__()
         self.node = Node("base", self.mesh.join(), self.clock, ROBOT)
         await self.node.__aenter__()
-        self.keeper = LatchKeeper(self.node, lambda state, by: self.changes.append((state, by)))
+        self.keeper = ServiceLatch(self.node, lambda state, by: self.changes.append((state, by)))
 
     async def word(self, state: LatchState, stamp_ns: int | None = None) -> LatchState:
         """The executive says it; what the keeper makes of it."""

@@ -17,7 +17,7 @@ from apps.cli.stop_asking import Asking
 from cocoro import topics
 from cocoro.bus.local import LocalMesh
 from cocoro.clock import RealClock
-from cocoro.latch import LatchKeeper
+from cocoro.latch import ServiceLatch
 from cocoro.messages import EstopReply, EstopRequest, Latch, LatchState
 from cocoro.node import Node
 from cocoro.robot import Robot
@@ -37,7 +37,7 @@ class Base:
         self.changes: list[tuple[LatchState, str]] = []
         self.halts = 0
         self._news = asyncio.Event()
-        self.keeper = LatchKeeper(node, self.changed, self.halt)
+        self.keeper = ServiceLatch(node, self.changed, self.halt)
 
     def changed(self, state: LatchState, by: str) -> None:
         self.changes.append((state, by))
@@ -122,7 +122,7 @@ def test_what_died_latched_comes_up_latched_and_is_released_by_the_owner_only(fo
         async with base(folder) as it:
             assert it.keeper.state == "latched"
             assert it.changes[0][1].startswith(f"operator (user {os.getuid()}, pid {os.getpid()}), 20")
-            it.keeper.word("released", "executive")
+            it.keeper.follow("released", "executive")
             assert it.keeper.state == "latched"
             assert await it.ask(latched=False) == EstopReply(service="base", latch="released")
         async with base(folder) as it:
@@ -174,7 +174,7 @@ def test_a_disk_that_does_not_take_it_is_told_and_holds_nothing_up(
             assert (point.kept, point.why_not_kept) == (False, f"{folder}/base: No space left on device")
             reply = await it.ask(latched=True)
             assert reply.latch == "latched"
-            assert reply.text == f"a restart will not remember this: {folder}/base: No space left on device"
+            assert reply.text == f"a restart will forget this: {folder}/base: No space left on device"
 
     asyncio.run(scenario())
 
@@ -239,11 +239,11 @@ def test_a_disk_that_hangs_holds_up_no_answer_on_the_mesh(folder: Path, monkeypa
             question = EstopRequest(latched=True, by="operator")
             reply = await it.operator.call(topics.ESTOP.of("base"), question, ROUND_S)
             assert reply.latch == "latched"
-            assert "the disk has not taken it within" in reply.text
+            assert "not written within" in reply.text
             question = EstopRequest(latched=False, by="operator")
             reply = await it.operator.call(topics.ESTOP.of("base"), question)
             assert reply.latch == "released"
-            assert "the disk has not taken it within" in reply.text
+            assert "not written within" in reply.text
             go_on.set()
 
     asyncio.run(scenario())

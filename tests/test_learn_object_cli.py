@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
-import shutil
 import sys
-import tempfile
 from pathlib import Path
 
 import cv2
@@ -177,12 +175,12 @@ def test_sizes_are_one_to_three_lengths() -> None:
     ]  # fmt: skip
 
 
+@pytest.mark.process
 @pytest.mark.zenoh
 def test_the_live_view_brings_depth_and_the_heads_angles(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    short_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    run_dir = tempfile.mkdtemp(prefix="cocoro")  # short: sockets live there
-    monkeypatch.setenv("COCORO_RUN_DIR", run_dir)
+    monkeypatch.setenv("COCORO_RUN_DIR", str(short_path))
     none = (0.0, 0.0)
 
     async def see(camera: Node, arm: Node) -> None:
@@ -208,7 +206,6 @@ def test_the_live_view_brings_depth_and_the_heads_angles(
 
     assert asyncio.run(scenario()) == 0
     out = capsys.readouterr().out
-    shutil.rmtree(run_dir)
     assert "cup: cylinder, 6." in out
     assert "the robot   cup 1." in out  # found by perception, and localised
     cup = Catalogue.load(Path("objects.toml"))["cup"]

@@ -28,7 +28,7 @@ from cocoro.topics import Topic
 from deploy.processes import hardware, stoppable
 from deploy.rundir import RunDir
 
-pytestmark = [pytest.mark.zenoh, pytest.mark.sim]
+pytestmark = [pytest.mark.zenoh, pytest.mark.sim, pytest.mark.process]
 
 UNDER_WAY_S = 0.1
 """What messages may take on a busy machine, and one period of the truth."""

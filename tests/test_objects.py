@@ -93,7 +93,7 @@ def test_an_error_names_file_table_and_field(tmp_path: Path, was: str, becomes: 
 
 
 def test_a_label_and_the_marker_are_given_once(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"\[\[object\]\] 2 \(ball\): label: it is taken"):
+    with pytest.raises(ConfigError, match=r"\[\[object\]\] 2 \(ball\): label: an earlier object has it"):
         load(tmp_path, BALL + BALL)
     marker = BALL.replace("rgb", "marker = true\nrgb")
     with pytest.raises(ConfigError, match="marker: ball is the marker"):

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 from perception_scenes import CATALOGUE, MS, ROBOT, STAMP_NS, Scene, Thing, block, error_mm, facing, known, seen, the
 
 from services.perception.config import PerceptionConfig
+from services.perception.image import ImageSighting
 from services.perception.localise import Localiser
 from services.perception.shapes import distance_from, signed_distance
-from services.perception.sighting import ImageSighting
 from sim.realism import Sensors
 from sim.scene import Light
 

@@ -228,9 +228,9 @@ def test_what_is_no_regular_file_is_refused_and_waits_for_nobody(tmp_path: Path,
     run_dir.make()
     file = run_dir.path / "supervisor"
     os.mkfifo(file) if kind == "fifo" else file.mkdir()
-    with pytest.raises(ConfigError, match="it is no regular file"):
+    with pytest.raises(ConfigError, match="it is not a regular file"):
         run_dir.supervisor()
-    with pytest.raises(ConfigError, match=r"it is no regular file|Is a directory"):
+    with pytest.raises(ConfigError, match=r"it is not a regular file|Is a directory"):
         run_dir.hold_supervisor("sim")
 
 

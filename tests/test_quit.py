@@ -20,6 +20,7 @@ def ended(script: str, *arguments: Path) -> tuple[int, str, str]:
     return run.returncode, run.stdout, run.stderr
 
 
+@pytest.mark.process
 def test_it_ends_with_its_code_after_threads_exit_functions_and_what_was_printed() -> None:
     script = """
 import atexit, threading
@@ -40,11 +41,13 @@ quit_process(3)
     assert ended(script) == (3, "worked exit function ", "")
 
 
+@pytest.mark.process
 def test_nobody_to_read_its_last_words_changes_no_exit_code() -> None:
     script = "import sys; from deploy.quit import quit_process; print('words'); sys.stdout.close(); quit_process(0)"
     assert ended(script)[0] == 0
 
 
+@pytest.mark.process
 def test_what_it_could_not_print_is_an_error() -> None:
     script = "from deploy.quit import quit_process; print('words'); quit_process(0)"
     buffered = os.environ | {"PYTHONUNBUFFERED": ""}
@@ -84,6 +87,7 @@ print("done")
 """
 
 
+@pytest.mark.process
 @pytest.mark.zenoh
 def test_a_thread_of_zenoh_that_comes_back_late_aborts_nothing(short_path: Path) -> None:
     assert ended(CAUGHT_IN_A_CALLBACK + "quit_process(0)", short_path) == (0, "done\n", "")

@@ -30,6 +30,8 @@ from sim.render.interface import Visual
 from sim.render.room import FLOOR_RGB, OTHER_TILE_RGB, walls
 from sim.render.views import lamp_tint
 
+pytestmark = pytest.mark.sim
+
 # --- geometry -------------------------------------------------------------------------------------
 
 

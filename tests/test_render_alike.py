@@ -30,6 +30,8 @@ from sim.camera import moved
 from sim.render import Images, Renderer, make_renderer
 from sim.render import gl as gl_module
 
+pytestmark = pytest.mark.sim
+
 # --- the infrared projector -----------------------------------------------------------------------
 
 
@@ -115,6 +117,7 @@ def test_equal_inputs_give_equal_bytes_whatever_was_drawn_before(renderer: Rende
     assert fingerprint(look(renderer, projector=True)) == first
 
 
+@pytest.mark.process
 def test_equal_inputs_give_equal_bytes_in_another_process(renderer: Renderer) -> None:
     program = FRAME_OF_ITS_OWN.format(tests=str(__file__.rpartition("/")[0]), choice=renderer.name)
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
@@ -142,6 +145,7 @@ print(make_renderer([], Robot.load().camera).name)
 """
 
 
+@pytest.mark.process
 def test_a_missing_library_means_one_warning_and_the_slow_renderer() -> None:
     done = subprocess.run([sys.executable, "-c", NO_LIBRARY], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["tiny"]

@@ -102,6 +102,7 @@ def test_what_is_farther_is_smeared_less_by_driving() -> None:
     assert widths[0] > widths[1] > widths[2]
 
 
+@pytest.mark.sim
 def test_the_blur_is_what_the_renderer_would_have_seen_over_the_exposure() -> None:
     can = Visual("can", "cylinder", (0.033, 0.12), (0.8, 0.04, 0.05))
     renderer = make_renderer([can], CAMERA)

@@ -99,6 +99,7 @@ def test_where_nobody_watches_nothing_is_kept(environment: dict[str, str], monke
     run_virtual(service_manager.keep_watchdog(lambda: True))
 
 
+@pytest.mark.process
 @pytest.mark.zenoh
 def test_a_supervisor_pets_the_watchdog_from_when_the_robot_is_up(
     manager: Manager, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -150,6 +151,7 @@ def test_the_unit_lets_the_robot_do_its_work(unit: dict[str, list[str]]) -> None
     assert int(unit["WatchdogSec"][0]) > 0
 
 
+@pytest.mark.process
 def test_the_unit_lets_processes_end_by_themselves_when_their_supervisor_has_died(unit: dict[str, list[str]]) -> None:
     """If base service and guard were killed together, a Create would drive on."""
     assert unit["KillMode"] == ["mixed"]
@@ -175,6 +177,7 @@ def analyze(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run([command, *arguments], capture_output=True, text=True, check=False)
 
 
+@pytest.mark.process
 def test_the_unit_is_not_exposed() -> None:
     if "--offline" not in analyze("security", "--help").stdout:
         pytest.skip("this systemd-analyze looks at no files")
@@ -182,6 +185,7 @@ def test_the_unit_is_not_exposed() -> None:
     assert told.returncode == 0, told.stdout
 
 
+@pytest.mark.process
 def test_the_unit_has_no_setting_that_systemd_does_not_know(tmp_path: Path) -> None:
     copy = tmp_path / UNIT.name
     copy.write_text(UNIT.read_text().replace("/opt/cocoro/.venv/bin/cocoro", "/bin/true"))

@@ -274,6 +274,7 @@ def test_an_unknown_joint_in_the_configuration_is_refused() -> None:
     asyncio.run(asyncio.wait_for(scenario(), LONG_S))
 
 
+@pytest.mark.process
 def test_a_killed_service_leaves_an_arm_that_stops_by_itself(bench: ServoBench) -> None:
     script = Path(__file__).with_name("move_forever.py")
     service = subprocess.Popen([sys.executable, str(script), bench.port("arm"), bench.port("hand")])

@@ -67,6 +67,7 @@ def test_who_publishes_the_frames_says_so_in_the_process_table() -> None:
     ]
 
 
+@pytest.mark.process
 @needs_root
 @pytest.mark.zenoh
 @pytest.mark.parametrize(("kind", "publishers", "readers"), [("publisher", 1, 0), ("reader", 0, 1), ("plain", 0, 0)])
@@ -127,6 +128,7 @@ os._exit(0)
 """
 
 
+@pytest.mark.process
 @needs_root
 @pytest.mark.zenoh
 @pytest.mark.parametrize(
@@ -256,6 +258,7 @@ async def test_room_for_a_session_but_not_for_frames_is_said_once(
     assert [record.message for record in caplog.records] == [f"robot/frame: {publisher.trouble}"]
 
 
+@pytest.mark.process
 @needs_root
 @pytest.mark.zenoh
 def test_what_fills_between_the_look_and_the_taking_ends_nothing(directory: Path) -> None:

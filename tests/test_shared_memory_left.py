@@ -66,6 +66,7 @@ def test_a_process_gives_back_what_it_alone_holds(place: Path) -> None:
     assert list(place.iterdir()) == []
 
 
+@pytest.mark.process
 def test_what_another_process_holds_too_is_left_to_it(place: Path) -> None:
     both = segment(place)
     hold = "import fcntl, sys; f = open(sys.argv[1]); fcntl.flock(f, fcntl.LOCK_SH); print(flush=True); input()"
@@ -95,6 +96,7 @@ def test_a_pool_that_is_given_up_leaves_nothing(needs_pool: None) -> None:
     assert not any(path.exists() for path in taken)
 
 
+@pytest.mark.process
 @needs_root
 @pytest.mark.zenoh
 def test_a_live_process_s_segments_survive_the_sweep_of_what_a_killed_one_left(directory: Path) -> None:

@@ -242,7 +242,7 @@ def test_what_fails_in_the_path_is_a_stop_that_nobody_is_told_was_heard_and_the_
     listen(point, halt, kept)
     assert [one.service for one in stop(robot, within_s=0.1).waiting] == ["base"]
     assert halted[1] == "the failure of its own path"
-    assert "the emergency stop's own path failed" in caplog.text
+    assert "the emergency stop's path failed" in caplog.text
     out_of_order = False
     assert not stop(robot).waiting, "it still hears"
     point.close()
@@ -295,6 +295,7 @@ def test_nobody_else_reaches_the_line_on_which_a_point_answers(robot: str) -> No
     deaf.close()
 
 
+@pytest.mark.process
 @pytest.mark.parametrize("free", [1, 2, 3, 1500], ids=lambda free: f"{free}-files-left")
 def test_a_caller_that_has_nearly_all_its_files_open_stops_the_robot(robot: str, free: int) -> None:
     """Also one whose next file has a number that select(2) cannot take."""
@@ -319,6 +320,7 @@ def test_names_that_make_no_address_are_refused() -> None:
         StopPoint("r" * 100, "base")
 
 
+@pytest.mark.process
 @needs_root
 def test_another_user_without_any_variable_can_stop_the_robot(robot: str) -> None:
     code = (
@@ -330,6 +332,7 @@ def test_another_user_without_any_variable_can_stop_the_robot(robot: str) -> Non
         assert halted["base"] == [f"operator (user 65534, pid {stranger.pid})"]
 
 
+@pytest.mark.process
 @needs_root
 def test_an_address_that_names_another_user_is_that_of_who_made_it(robot: str) -> None:
     """So what he answers, or does not, is told of a robot of his."""
@@ -349,6 +352,7 @@ def test_an_address_that_names_another_user_is_that_of_who_made_it(robot: str) -
             liar.kill()
 
 
+@pytest.mark.process
 @needs_root
 def test_where_the_kernel_does_not_tell_whose_an_address_is_only_the_answers_of_the_named_user_count(
     robot: str, monkeypatch: pytest.MonkeyPatch

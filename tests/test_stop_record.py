@@ -25,7 +25,7 @@ def test_a_machine_that_never_knew_a_latch_is_released_by_a_person_only(folder: 
     assert [one.latched for one in said.values()] == [False, False]
     unwatched = prepare(tmp_path / "other", ["base", "arm"], by_hand=False)
     assert [one.latched for one in unwatched.values()] == [True, True]
-    assert unwatched["base"].by == "a first start that no person watched"
+    assert unwatched["base"].by == "a first start without a person"
 
 
 def test_a_record_that_is_missing_beside_others_is_latched(folder: Path) -> None:
@@ -40,11 +40,11 @@ def test_a_record_that_is_missing_beside_others_is_latched(folder: Path) -> None
 def test_what_is_kept_is_what_the_next_process_reads(folder: Path) -> None:
     prepare(folder, ["base"], by_hand=True)
     before = LatchRecord(folder / "base")
-    assert not before.said.latched
+    assert not before.entry.latched
     assert before.keep(True, "operator (user 7, pid 8)").result(PATIENCE_S) == ""
     after = LatchRecord(folder / "base")
-    assert (after.said.latched, after.said.by) == (True, "operator (user 7, pid 8)")
-    assert after.said.when
+    assert (after.entry.latched, after.entry.by) == (True, "operator (user 7, pid 8)")
+    assert after.entry.when
     assert prepare(folder, ["base"], by_hand=True)["base"].latched, "a start releases nothing"
     assert after.keep(False, "operator").result(PATIENCE_S) == ""
     assert not read(folder / "base").latched
@@ -73,8 +73,8 @@ def test_rubbish_is_latched_says_why_and_is_put_right_by_the_next_word(folder: P
     prepare(folder, ["base"], by_hand=True)
     (folder / "base").write_bytes(content)
     kept = LatchRecord(folder / "base")
-    assert kept.said.latched
-    assert kept.said.by == f"the record {folder}/base, which cannot be read: it is damaged"
+    assert kept.entry.latched
+    assert kept.entry.by == f"the record {folder}/base, which cannot be read: it is damaged"
     assert kept.keep(False, "operator").result(PATIENCE_S) == ""
     assert not read(folder / "base").latched
 
@@ -82,8 +82,8 @@ def test_rubbish_is_latched_says_why_and_is_put_right_by_the_next_word(folder: P
 def test_a_missing_record_is_latched_and_made_by_the_next_word(folder: Path) -> None:
     folder.mkdir(parents=True)
     kept = LatchRecord(folder / "base")
-    assert kept.said.latched
-    assert "No such file" in kept.said.by
+    assert kept.entry.latched
+    assert "No such file" in kept.entry.by
     assert kept.keep(False, "operator").result(PATIENCE_S) == ""
     assert not read(folder / "base").latched
 
@@ -117,12 +117,12 @@ def test_what_could_not_be_read_is_not_said_to_be_on_the_disk_unless_it_is_writt
     folder.parent.mkdir(parents=True)
     folder.touch()  # a file where a folder should be
     kept = LatchRecord(folder / "base")
-    assert kept.said.latched
+    assert kept.entry.latched
     assert kept.keep(True, "operator").result(PATIENCE_S)
     folder.unlink()
     folder.mkdir()
     assert kept.keep(True, "operator").result(PATIENCE_S) == ""
-    assert read(folder / "base") == kept.said._replace(when=read(folder / "base").when)
+    assert read(folder / "base") == kept.entry._replace(when=read(folder / "base").when)
 
 
 def test_a_write_that_fails_in_a_way_of_which_nobody_thought_is_not_the_last(

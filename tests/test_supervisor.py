@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from operator_shell import PATIENCE_S, Shell
 
-pytestmark = pytest.mark.zenoh
+pytestmark = pytest.mark.process
 
 
 @pytest.fixture

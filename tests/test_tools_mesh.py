@@ -153,6 +153,7 @@ def test_top_for_people_has_a_line_for_each_service_and_topic(root: Path, capsys
     assert any(line.startswith("base/command ") and "planning" in line for line in lines)
 
 
+@pytest.mark.process
 @pytest.mark.parametrize("command", [["top", "--json"], ["echo", "guest/wave"], ["hz", "**"]], ids=" ".join)
 def test_ctrl_c_ends_them_well(root: Path, command: list[str]) -> None:
     async def scenario() -> None:
@@ -169,6 +170,7 @@ def test_ctrl_c_ends_them_well(root: Path, command: list[str]) -> None:
     asyncio.run(scenario())
 
 
+@pytest.mark.process
 def test_logs_follow_a_process_over_its_restart(tmp_path: Path) -> None:
     with Shell(tmp_path) as cocoro:
         assert cocoro("up", cocoro.profile("good"), "--detach").returncode == 0

@@ -40,6 +40,7 @@ def test_a_new_service_has_core_shell_settings_messages_row_and_test(written: Pa
     assert project["entry-points"]["cocoro.components"] == {"depth-watch": "depth_watch:component"}
 
 
+@pytest.mark.process
 def test_its_tests_pass_and_it_is_clean(written: Path) -> None:
     def run(*command: str) -> subprocess.CompletedProcess[str]:
         return subprocess.run(

@@ -12,7 +12,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -21,6 +20,7 @@ from typing import Any
 
 import pytest
 from operator_shell import PATIENCE_S, Running
+from places import short_folder
 from robot_rig import RobotRig
 from wall_clock import NoPreloadError, WallClock
 from wire_base import MS, Bench
@@ -173,7 +173,7 @@ class Driven:
 
 @contextmanager
 def driven(wall: WallClock, folder: Path) -> Iterator[Driven]:
-    root = Path(tempfile.mkdtemp(prefix="cocoro"))  # short: sockets live there
+    root = short_folder()
     try:
         with Bench(folder) as bench:
             robot = Driven(bench, wall, root, folder)
@@ -186,6 +186,7 @@ def driven(wall: WallClock, folder: Path) -> Iterator[Driven]:
         shutil.rmtree(root)
 
 
+@pytest.mark.process
 @pytest.mark.zenoh
 def test_the_stepped_clock_steps_wall_time_alone(wall: WallClock) -> None:
     code = (
@@ -204,6 +205,7 @@ def test_the_stepped_clock_steps_wall_time_alone(wall: WallClock) -> None:
     assert all(0 < b - a < 100 for a, b in zip(before[1:], after[1:], strict=True))
 
 
+@pytest.mark.process
 @pytest.mark.zenoh
 def test_steps_of_the_wall_clock_disturb_no_drive_and_lengthen_no_deadman(wall: WallClock, tmp_path: Path) -> None:
     with driven(wall, tmp_path) as robot:
@@ -225,6 +227,7 @@ def test_steps_of_the_wall_clock_disturb_no_drive_and_lengthen_no_deadman(wall: 
         assert robot.rejected() == []
 
 
+@pytest.mark.process
 @pytest.mark.zenoh
 def test_a_process_that_is_started_again_after_a_step_has_the_robot_s_time(wall: WallClock, tmp_path: Path) -> None:
     with driven(wall, tmp_path) as robot:

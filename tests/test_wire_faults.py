@@ -7,6 +7,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
+pytestmark = pytest.mark.process
+
 COUNT = 16
 SLOWEST_MS = 800.0
 """Time in which the wheels must stand: 0.3 s, plus what a busy machine adds."""

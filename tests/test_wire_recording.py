@@ -55,6 +55,7 @@ def test_pictures_of_another_size_are_refused(tmp_path: Path) -> None:
         writer.add(frame(0, 320, 240))
 
 
+@pytest.mark.process
 def test_a_folder_that_holds_a_recording_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / "INDEX.txt").write_text("precious\n")
     with pytest.raises(ConfigError, match="holds a recording already"):

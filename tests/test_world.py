@@ -263,6 +263,7 @@ def test_two_worlds_in_one_process_do_not_meet() -> None:
     assert told == alone
 
 
+@pytest.mark.process
 def test_importing_the_simulator_writes_nothing() -> None:
     done = subprocess.run([sys.executable, "-c", "import sim.world"], capture_output=True, check=True, timeout=60)
     assert done.stdout == b""

@@ -1,1 +1,1 @@
-"""What is done with captures: replay, re-execution, export, rewriting, reports."""
+"""Applications on capture files: reports, replay, re-execution, export, repair."""

@@ -1,4 +1,4 @@
-"""Whether two messages mean the same, and if not, where they differ first."""
+"""Compares recorded messages and schemas with today's."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from functools import cache
 from typing import Any, NamedTuple
 
 EXACT = re.compile(r"(_ns|seq|incarnation|_id|step)$")
-"""Names of numbers that no computation makes: they have no tolerance."""
+"""Names of fields that are not computed; they have no tolerance."""
 NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
 
 
 class Difference(NamedTuple):
     path: str
-    """Of the field: 'detections[0].position_m[1]'."""
+    """Path of the field, such as 'detections[0].position_m[1]'."""
     recorded: Any
     now: Any
 
@@ -29,10 +29,10 @@ class Difference(NamedTuple):
 
 
 def difference(recorded: Any, now: Any, tolerance: float = 0.0) -> Difference | None:
-    """The first difference between two values made of maps, lists, texts, bytes and numbers; None when there is none.
+    """The first difference between two values made of maps, lists, texts, bytes and numbers; None when they are equal.
 
-    Numbers are equal when they differ by no more than `tolerance` times the largest of 1 and both of them; so are the
-    numbers within texts. With 0 they must be the same numbers, to the bit but for the sign of zero.
+    Two numbers are equal when they differ by at most `tolerance` times the largest of 1 and their absolute values;
+    numbers within texts likewise. With a tolerance of 0 they must be equal to the bit, except for the sign of zero.
     """
     return _difference(recorded, now, tolerance, "")
 
@@ -91,12 +91,12 @@ def _short(value: Any) -> str:
 class Change(NamedTuple):
     text: str
     readable: bool
-    """Whether messages of the recorded schema can still be read as today's type, by the rules above; None of a change
-    of a field's type is sure, so that counts as not."""
+    """Whether recorded messages can still be read as today's type, by the rules of `cocoro.capture.types`. False for a
+    changed field type, which may or may not fit."""
 
 
 def changes(recorded: bytes, today: bytes) -> list[Change]:
-    """What is different in today's schema, in words. Empty when nothing is that a reader could notice."""
+    """Differences of today's JSON schema from the recorded one that a reader could notice."""
     try:
         old, new = json.loads(recorded), json.loads(today)
     except ValueError:
@@ -115,14 +115,14 @@ def _object_changes(old: Mapping[str, Any], new: Mapping[str, Any], where: str) 
     before, after = old.get("properties", {}), new.get("properties", {})
     required = set(new.get("required", ()))
     for name in sorted(set(before) - set(after)):
-        yield Change(f"{where}{name} is no more: passed by", readable=True)
+        yield Change(f"{where}{name} is gone: ignored", readable=True)
     for name in sorted(set(after) - set(before)):
         if name in required:
             yield Change(f"{where}{name} is new and has no default", readable=False)
         else:
-            yield Change(f"{where}{name} is new: takes its default", readable=True)
+            yield Change(f"{where}{name} is new: gets its default", readable=True)
     for name in sorted(set(before) & set(after)):
-        if not _fits(_plain(before[name]), _plain(after[name])):
+        if not _fits(_comparable(before[name]), _comparable(after[name])):
             yield Change(f"{where}{name} has changed", readable=False)
 
 
@@ -134,8 +134,8 @@ def _fits(old: Any, new: Any) -> bool:
 
 
 def known_to(recorded: bytes, value: Any) -> Any:
-    """A message, made of maps and lists, without the fields that a recorded schema does not have; all of it, where
-    that is no schema."""
+    """A message, made of maps and lists, without the fields that the recorded schema lacks; the whole message when the
+    schema cannot be parsed."""
     root = _parsed(recorded)
     return value if root is None else _known(root, root, value)
 
@@ -163,7 +163,7 @@ def _known(root: Mapping[str, Any], node: Any, value: Any) -> Any:
 
 
 def _resolved(root: Mapping[str, Any], node: Any, value: Any) -> Mapping[str, Any]:
-    """Behind its references; of several, the one that may be meant."""
+    """The schema node behind references, and of alternatives the one that fits the value's kind."""
     if not isinstance(node, dict):
         return {}
     if "$ref" in node:
@@ -176,8 +176,10 @@ def _resolved(root: Mapping[str, Any], node: Any, value: Any) -> Mapping[str, An
     return node
 
 
-def _plain(node: Any) -> Any:
-    """Without what does not bear on whether a value fits."""
+def _comparable(node: Any) -> Any:
+    """The node without descriptions, titles and defaults, which do not affect whether a value fits."""
     if isinstance(node, dict):
-        return {name: _plain(value) for name, value in node.items() if name not in ("description", "title", "default")}
-    return [_plain(item) for item in node] if isinstance(node, list) else node
+        return {
+            name: _comparable(value) for name, value in node.items() if name not in ("description", "title", "default")
+        }
+    return [_comparable(item) for item in node] if isinstance(node, list) else node

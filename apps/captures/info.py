@@ -1,4 +1,4 @@
-"""The report on a capture: its channels with their counts, rates, gaps and losses, and where it came from."""
+"""Reports on a capture: channels with counts, rates, gaps and losses, and the capture's origin."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ MESSAGE_HEAD_BYTES = mcap.MESSAGE_HEAD.size
 
 
 class KeyReport(msgspec.Struct, kw_only=True):
-    """One channel of a key; most keys have one."""
+    """One channel. Most keys have one."""
 
     key: str
     channel: int
-    """Its number in the file."""
+    """Number in the file."""
     encoding: str
-    """Message encoding, as the file has it."""
+    """Message encoding."""
     type: str
-    """The recorded schema's name; '' where there is none."""
+    """Name of the recorded schema; '' without one."""
     messages: int
     rate_hz: float
     size_bytes: int
@@ -41,11 +41,11 @@ class KeyReport(msgspec.Struct, kw_only=True):
     longest_gap_from_s: float
     """Since the capture's start."""
     lost: int = 0
-    """Sent and never received: gaps in the sequence, since the recorder's start."""
+    """Gaps in the sequence numbers, since the recorder's start."""
     dropped: int = 0
-    """Received, and not written for want of room, since the recorder's start."""
+    """Received but not written because the queue was full, since the recorder's start."""
     changed: tuple[str, ...] = ()
-    """What is different in today's type."""
+    """Differences of today's type from the recorded schema, in words."""
 
 
 class AttachmentReport(msgspec.Struct, kw_only=True):
@@ -61,12 +61,12 @@ class CaptureReport(msgspec.Struct, kw_only=True):
     path: str
     size_bytes: int
     raw_bytes: int
-    """Before compression; 0 when that is not known."""
+    """Before compression; 0: unknown."""
     closed: bool
     ending: str
-    """Why it may be shorter than the run was; '' when it was closed."""
+    """Why the capture may be shorter than the run; '' when it was closed."""
     checked: bool
-    """Every byte was read for this report, and not only what the file says of itself."""
+    """The counts come from reading every byte, not from the file's own statements."""
     problems: tuple[str, ...]
     robot: str
     start_ns: int
@@ -76,16 +76,19 @@ class CaptureReport(msgspec.Struct, kw_only=True):
     keys: tuple[KeyReport, ...]
     attachments: tuple[AttachmentReport, ...]
     notes: tuple[str, ...]
-    """Contradictions and records that are passed by, in words; no damage."""
+    """Contradictions and skipped records, in words. They are no damage."""
     metadata: dict[str, dict[str, Any]]
 
 
 def report(capture: Capture, check: bool = False) -> CaptureReport:
-    """Report on a capture. The counts of a whole capture are those of its own tally (checksums vouch for it), where
-    that agrees with its statistics and chunks. Of any other capture, and with `check`, all is read and counted."""
-    told = _told_tallies(capture) if capture.whole and capture.summarised else None
-    tallies = told if told is not None and not check else _counted(capture)
-    checked = check or tallies is not told
+    """Report on a capture.
+
+    For a complete capture the counts come from its tally, where that agrees with the statistics and chunks.
+    Otherwise, and with `check`, all messages are read and counted. Raises CaptureError when the disk fails.
+    """
+    stated = _stated_tallies(capture) if capture.whole and capture.summarised else None
+    tallies = stated if stated is not None and not check else _counted(capture)
+    checked = check or tallies is not stated
     if checked:
         capture.check()
     notes = [*capture.notes, *_contradictions(capture)]
@@ -119,28 +122,28 @@ def report(capture: Capture, check: bool = False) -> CaptureReport:
         ),
         notes=tuple(notes),
         metadata={
-            name: {entry: _plain(value) for entry, value in entries.items()}
+            name: {entry: _parsed_json(value) for entry, value in entries.items()}
             for name, entries in capture.metadata.items()
             if name != TALLY or not capture.follows_conventions
         },
     )
 
 
-def _told_tallies(capture: Capture) -> dict[int, KeyTally] | None:
-    """By channel, as the tally has it; None where it is not of this file: metadata may have been copied from another.
-    It agrees with the statistics on each channel's messages and on the first and last time, and with the chunks on how
-    many bytes there are."""
+def _stated_tallies(capture: Capture) -> dict[int, KeyTally] | None:
+    """The tally by channel number; None when it does not belong to this file, since metadata may have been copied from
+    another one. It must agree with the statistics on each channel's messages and on the first and last log time,
+    and with the chunks on the number of bytes."""
     entries, statistics = capture.metadata.get(TALLY), capture.statistics
     if entries is None or statistics is None:
         return None
     try:
-        told = msgspec.json.decode(entries["keys"], type=dict[str, KeyTally])
+        stated = msgspec.json.decode(entries["keys"], type=dict[str, KeyTally])
     except (KeyError, msgspec.MsgspecError):
         return None
     names = tally_names(capture.channels)
-    if told.keys() != set(names.values()):
+    if stated.keys() != set(names.values()):
         return None
-    tallies = {id: told[name] for id, name in names.items()}
+    tallies = {id: stated[name] for id, name in names.items()}
     busy = [tally for tally in tallies.values() if tally.messages]
     first_ns = min((tally.first_ns for tally in busy), default=0)
     last_ns = max((tally.last_ns for tally in busy), default=0)
@@ -162,7 +165,7 @@ def _counted(capture: Capture) -> dict[int, KeyTally]:
 
 
 def _contradictions(capture: Capture) -> list[str]:
-    """False statements of the file about itself, in words. MCAP readers do not look at them, so they are no damage."""
+    """False statements of the file about itself, in words. MCAP readers ignore them, so they are no damage."""
     if capture.problems:
         return []
     found = []
@@ -170,24 +173,25 @@ def _contradictions(capture: Capture) -> list[str]:
         capture.follows_conventions
         and TALLY in capture.metadata
         and capture.summarised
-        and _told_tallies(capture) is None
+        and _stated_tallies(capture) is None
     ):
-        found.append(f"its metadata {TALLY!r} is not of this file, so its messages were counted")
+        found.append(f"its metadata {TALLY!r} belongs to another file, so the messages were counted")
     return found
 
 
 def missing_of(capture: Capture) -> tuple[dict[str, int], dict[str, int]]:
-    """By key, dropped and lost: what a whole file says at its end, else what the recorder said last on the mesh."""
-    told = capture.metadata.get(TALLY)
+    """Dropped and lost messages by key, from the tally of a complete file, else from the recorder's last progress
+    message."""
+    stated = capture.metadata.get(TALLY)
     try:
-        if told is not None:
+        if stated is not None:
             counts = dict[str, int]
-            return msgspec.json.decode(told["dropped"], type=counts), msgspec.json.decode(told["lost"], type=counts)
+            return msgspec.json.decode(stated["dropped"], type=counts), msgspec.json.decode(stated["lost"], type=counts)
         dropped: dict[str, int] = {}
         lost: dict[str, int] = {}
         for record in capture.messages(f"*/{RECORDING.name.partition('/')[2]}"):
-            said = capture.decode(record)
-            dropped, lost = said["dropped"], said["lost"]
+            progress = capture.decode(record)
+            dropped, lost = progress["dropped"], progress["lost"]
         return dropped, lost
     except (KeyError, TypeError, msgspec.MsgspecError, DamageError):
         return {}, {}
@@ -199,7 +203,7 @@ def _key_report(
     span_s = (tally.last_ns - tally.first_ns) / NS
     schema = capture.schema(channel)
     key = capture.channels[channel].topic
-    first = channel == capture.keys[key][0]  # what is missing is counted by key
+    first = channel == capture.keys[key][0]  # missing messages are counted by key, so they go to its first channel
     return KeyReport(
         key=key,
         channel=channel,
@@ -217,7 +221,7 @@ def _key_report(
 
 
 def changed_since(capture: Capture, channel: int) -> list[str]:
-    """Differences between the recorded schema of a channel and today's type of its key, in words."""
+    """Differences of today's type of a channel's key from the recorded schema, in words."""
     schema, key = capture.schema(channel), capture.channels[channel].topic
     topic = topic_named(key.removeprefix(f"{capture.robot}/"))
     if schema is None or topic is None or capture.channels[channel].metadata.get("publisher") == MADE_HERE:
@@ -225,15 +229,15 @@ def changed_since(capture: Capture, channel: int) -> list[str]:
     if schema.name == LossyFrame.__name__:
         return []
     if todays_name(schema.name) != topic.type.__name__:
-        return [f"it carries {topic.type.__name__} today"]
+        return [f"its type is {topic.type.__name__} today"]
     if is_former(schema.name, schema.data):
         return [f"{schema.name} has changed: its former shape is converted"]
     kind: type[Message] = topic.type
     return [change.text for change in changes(schema.data, schema_of(kind).data)]
 
 
-def _plain(value: str) -> Any:
-    """Metadata that is JSON, as what it says."""
+def _parsed_json(value: str) -> Any:
+    """Parse metadata that is JSON; other text stays as it is."""
     if value[:1] in ("{", "["):
         try:
             return json.loads(value)

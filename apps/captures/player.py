@@ -1,4 +1,4 @@
-"""A capture's time line: where it stands, how fast it goes, and what is due. Pure: it is told what time it is."""
+"""A capture's time line: position, rate and the messages that are due. Pure: the caller passes the time."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from cocoro.topics import FRAME
 
 SLOWEST, FASTEST = 0.01, 100.0
 SHORTEST_PASS_NS = NS // 100
-"""Of a loop: what has no length is not played without a breath."""
+"""Lowest duration of one pass of a loop, so that a capture without length does not loop without pause."""
 AT_ONCE = 256
-"""Messages that one `due` gives at most, so that nobody else has to wait for long."""
+"""Limit for the messages of one `due`, so that the event loop is not blocked."""
 
 
 class Player:
-    """Plays records by the spacing of their log times. All times given to it are seconds of one steady clock."""
+    """Plays records at the spacing of their log times. All `now_s` are seconds of one steady clock."""
 
     def __init__(
         self,
@@ -31,8 +31,8 @@ class Player:
         loop: bool = False,
         paused: bool = False,
     ) -> None:
-        """`start_s` and `end_s` are seconds of the capture; `chosen(key)` says which keys are played. What recorders
-        noted is not, since nobody published it."""
+        """`start_s` and `end_s` are seconds from the capture's start. `chosen(key)` selects the played keys. A
+        recorder's own notes are not played, since no component published them."""
         self.keys = tuple(key for key in capture.keys if chosen(key))
         self._channels = [
             id
@@ -43,7 +43,7 @@ class Player:
         self.loop = loop
         self.paused = paused
         self.passes = 0
-        """Times that the time line has gone back: by the loop or by hand."""
+        """How often the time line has gone back, by the loop or by `seek`."""
         self._capture = capture
         self._start_ns = capture.start_ns + round(start_s * NS)
         self._end_ns = capture.end_ns if end_s is None else capture.start_ns + round(end_s * NS) - 1
@@ -58,7 +58,7 @@ class Player:
 
     @property
     def ended(self) -> bool:
-        """Nothing is left, and nobody waits there to go back."""
+        """Nothing is left to play, and the player neither loops nor is paused."""
         return not self._next and not self.loop and not self.paused
 
     @property
@@ -66,7 +66,7 @@ class Player:
         return (self._capture.end_ns - self._capture.start_ns) / NS
 
     def position_s(self, now_s: float) -> float:
-        """Seconds of the capture."""
+        """Seconds from the capture's start."""
         return (min(self._now_ns(now_s), self._end_ns) - self._capture.start_ns) / NS
 
     def position_ns(self, now_s: float) -> int:
@@ -76,7 +76,7 @@ class Player:
     # --- what is due ------------------------------------------------------------------------------
 
     def due(self, now_s: float) -> list[Record]:
-        """What is to be sent now, in order; at most `AT_ONCE`."""
+        """The messages to send now, in order, at most `AT_ONCE`."""
         if self._anchor_s is None:
             self._anchor_s = now_s
         if self._stepping:
@@ -92,7 +92,7 @@ class Player:
         return found
 
     def wait_s(self, now_s: float) -> float | None:
-        """Until something is due; None while it stands still."""
+        """Seconds until the next message is due; None while paused or ended."""
         if self._stepping:
             return 0.0
         if self.paused or self.ended:
@@ -114,12 +114,12 @@ class Player:
     # --- by hand ----------------------------------------------------------------------------------
 
     def toggle(self, now_s: float) -> None:
-        """Pause, or go on."""
+        """Pause or continue."""
         self._anchor(now_s, self._now_ns(now_s))
         self.paused = not self.paused
 
     def step(self, now_s: float) -> None:
-        """Pause, after all up to the next picture (or the next message, where there are no pictures)."""
+        """Pause after the next picture, or after the next message of a capture without pictures."""
         if not self.paused:
             self.toggle(now_s)
         self._stepping = True
@@ -129,7 +129,7 @@ class Player:
         self.rate = min(max(rate, SLOWEST), FASTEST)
 
     def seek(self, now_s: float, to_s: float) -> None:
-        """Go to a second of the capture, within what is played."""
+        """Go to a second from the capture's start, limited to the played part."""
         to_ns = min(max(self._capture.start_ns + round(to_s * NS), self._start_ns), self._end_ns)
         if to_ns < self._now_ns(now_s):
             self.passes += 1

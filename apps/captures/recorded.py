@@ -1,4 +1,4 @@
-"""A service's steps as they were recorded: what each consumed and gave, found in a capture in one pass."""
+"""A service's recorded starts and steps: its configurations, and what each step consumed and produced."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ from deploy import processes
 from services.capture.recorder import KeyCounts, counts_of
 
 MessageId = tuple[str, int, int]
-"""Topic, incarnation, sequence: what a StepRecord calls a message by."""
+"""Topic, incarnation, sequence number: a StepRecord's reference to a message."""
 
 LATE_NS = 3 * NS
-"""A message that is recorded so long after the step that speaks of it is not waited for."""
+"""A step waits for its messages only up to this log time after its own."""
 
 
 class FoundMessage(NamedTuple):
-    """A message of a step, with the capture that it is in."""
+    """A message of a step, and the capture that contains it."""
 
     capture: Capture
     record: Record
@@ -49,11 +49,11 @@ class RecordedStep(NamedTuple):
     record: StepRecord
     log_ns: int
     messages: dict[MessageId, FoundMessage]
-    """What the captures have of those that were consumed and produced."""
+    """The consumed and produced messages that the captures contain."""
 
 
 def steps_of(captures: Sequence[Capture], service: str) -> list[tuple[int, StepRecord]]:
-    """Log time and content of every record of a step. Raises CaptureError when there is none, or one cannot be read."""
+    """Log time and content of every recorded step. Raises CaptureError when there is none, or one cannot be read."""
     found = []
     for capture in captures:
         for record in capture.messages(f"{capture.robot}/{STEPS.of(service).name}"):
@@ -65,14 +65,15 @@ def steps_of(captures: Sequence[Capture], service: str) -> list[tuple[int, StepR
             found.append((record.log_ns, step))
     if not found:
         raise CaptureError(
-            f"{captures[0].path}: it has no steps of {service}; have them recorded by record_steps = true "
-            f"in the profile's [service.{service}]"
+            f"{captures[0].path}: it has no steps of {service}; set record_steps = true "
+            f"in the profile's [service.{service}] to record them"
         )
     return found
 
 
 def with_messages(captures: Sequence[Capture], steps: Sequence[tuple[int, StepRecord]]) -> Iterator[RecordedStep]:
-    """The steps in order, each as soon as all is there that it speaks of, or as soon as that will not come any more."""
+    """The steps in order, found in one pass. Each comes when all its messages are found, or when the missing ones can
+    no longer come."""
     wanted: set[MessageId] = set()
     for _, step in steps:
         wanted.update(step.consumed, step.produced)
@@ -88,9 +89,9 @@ def with_messages(captures: Sequence[Capture], steps: Sequence[tuple[int, StepRe
                 continue
             if record.key not in counts:
                 counts[record.key] = counts_of(record.key, capture.robot)
-            in_sequence = counts[record.key].hear(head)
+            in_sequence = counts[record.key].count(head)
             name = (record.key.removeprefix(f"{capture.robot}/"), head.incarnation, head.seq)
-            # Of several messages with one number readers take the one that is in sequence, and so does this.
+            # Several messages may claim one number. Readers take the one that is in sequence, and so does this.
             if name in wanted and (in_sequence or name not in known) and not _lossy(capture, record):
                 known[name] = FoundMessage(capture, record)
             while waiting and (_complete(waiting[0][1], known) or record.log_ns > waiting[0][0] + LATE_NS):
@@ -111,7 +112,7 @@ def _complete(step: StepRecord, known: dict[MessageId, FoundMessage]) -> bool:
 
 
 def _taken(step: tuple[int, StepRecord], known: dict[MessageId, FoundMessage], wanted: set[MessageId]) -> RecordedStep:
-    """Each message belongs to one step, so it need not be kept any more; nor is it when it comes late."""
+    """Remove a step's messages from `known` and `wanted`: each message belongs to one step."""
     log_ns, record = step
     names = (*record.consumed, *record.produced)
     wanted.difference_update(names)
@@ -120,7 +121,7 @@ def _taken(step: tuple[int, StepRecord], known: dict[MessageId, FoundMessage], w
 
 
 def _lossy(capture: Capture, record: Record) -> bool:
-    """A frame that was kept with loss is not what the step was given."""
+    """A lossy frame is not what the step consumed."""
     schema = capture.schema(record.channel)
     return schema is not None and schema.name == LossyFrame.__name__
 
@@ -139,37 +140,37 @@ class Origin:
     latency_s: float
 
     def core(self) -> Core:
-        """A new core, as it was at the start."""
+        """A new core in its initial state."""
         assert self.implementation.core is not None
         return self.implementation.core(self.robot, self.config)
 
 
 @contextmanager
 def origins(captures: Sequence[Capture], service: str) -> Iterator[list[Origin]]:
-    """Every start of a service that the captures tell of, in order. Within the context its files are there.
+    """Every recorded start of a service, in order. The files of its configuration exist while the context lasts.
 
-    Raises CaptureError when there is none, or when its core cannot be made here.
+    Raises CaptureError when no start is recorded, or its core cannot be made today.
     """
-    told = [entries for capture in captures for entries in capture.every_metadata(f"service/{service}")]
-    starts = [entries for n, entries in enumerate(told) if entries not in told[:n]]
+    recorded = [entries for capture in captures for entries in capture.every_metadata(f"service/{service}")]
+    starts = [entries for n, entries in enumerate(recorded) if entries not in recorded[:n]]
     path = captures[0].path
     if not starts:
         there = sorted({name[8:] for capture in captures for name in capture.metadata if name.startswith("service/")})
         raise CaptureError(
-            f"{path}: it does not say what {service} was started with; it does of {', '.join(there) or 'none'}"
+            f"{path}: it has no configuration of {service}; services with one: {', '.join(there) or 'none'}"
         )
     with tempfile.TemporaryDirectory(prefix="cocoro-") as folder:
         try:
             made = [_origin(service, entries, Path(folder) / str(n)) for n, entries in enumerate(starts)]
         except (KeyError, TypeError, ValueError, ConfigError) as error:
-            raise CaptureError(f"{path}: what {service} was started with cannot be had again: {error}") from error
+            raise CaptureError(f"{path}: the start of {service} cannot be repeated: {error}") from error
         yield made
 
 
 def recorded_file(capture: Capture, service: str, field: str, load: Callable[[Path | None], T]) -> T:
-    """What a loader makes of a file that a service was configured with, as it was then (None: not told)."""
-    told = json.loads(capture.metadata.get(f"service/{service}", {}).get("files", "[]"))
-    content = next((base64.b64decode(file["content"]) for file in told if file["field"] == field), b"")
+    """Load a file of a service's configuration from its recorded content; `load(None)` when none was recorded."""
+    recorded = json.loads(capture.metadata.get(f"service/{service}", {}).get("files", "[]"))
+    content = next((base64.b64decode(file["content"]) for file in recorded if file["field"] == field), b"")
     if not content:
         return load(None)
     with tempfile.NamedTemporaryFile(suffix=".toml") as copy:
@@ -189,19 +190,20 @@ def _origin(service: str, entries: Mapping[str, str], folder: Path) -> Origin:
         raise ConfigError(f"no component that is installed here has the module {module!r}")
     implementation = load_component(component)
     if implementation.core is None:
-        raise CaptureError(f"{service} cannot be executed again: {module} has no pure core")
+        raise CaptureError(f"{service} cannot be re-executed: {module} has no pure core")
     for file in json.loads(entries["files"]):
         settings[file["field"]] = _same_file(file, folder, settings.get(file["field"]))
     try:
         config = msgspec.convert(settings, implementation.config)
     except msgspec.ValidationError as error:
-        raise ConfigError(f"it was configured for another version: {error}") from error
+        raise ConfigError(f"its configuration does not fit today's component: {error}") from error
     robot = Robot.from_data(json.loads(entries["description"]), "the recorded robot description")
     return Origin(service, implementation, robot, config, float(entries["latency_s"]))
 
 
 def _same_file(file: Mapping[str, str], folder: Path, configured: str | None) -> str | None:
-    """What to configure so that the file is the one of then: what was, if that is still it, else the recorded copy."""
+    """The configured path, when the file there is still the recorded one; otherwise a copy of the recorded file. Raises
+    ConfigError when there is neither."""
     content = base64.b64decode(file["content"])
     try:
         if configured is not None:
@@ -213,7 +215,9 @@ def _same_file(file: Mapping[str, str], folder: Path, configured: str | None) ->
     if hashlib.sha256(today).hexdigest() == file["sha256"]:
         return configured
     if not content:
-        raise ConfigError(f"it needs the file {file['path']} of sha256 {file['sha256']}, which is not here")
+        raise ConfigError(
+            f"the file {file['path']} with sha256 {file['sha256']} is missing, and the capture has no copy"
+        )
     folder.mkdir(exist_ok=True)
     copy = folder / Path(file["path"]).name
     copy.write_bytes(content)

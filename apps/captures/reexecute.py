@@ -1,8 +1,8 @@
-"""Exact re-execution: a service's pure core over the inputs that each recorded step consumed, its outputs compared
-with the recorded ones by meaning.
+"""Re-execution: runs a service's pure core on the inputs of each recorded step and compares its outputs with the
+recorded ones.
 
-A step whose inputs the capture lacks cannot be executed: it is counted as such, and never as equal. The core goes on
-with what there is; a difference in a later step is told with that in mind.
+A step whose inputs the capture lacks is counted as not executable, never as equal. The core continues without them,
+and a later difference is reported with that caveat.
 """
 
 from __future__ import annotations
@@ -27,50 +27,50 @@ from cocoro.messages import Message
 
 class FirstDifference(msgspec.Struct, kw_only=True):
     step: int
-    """The recorded step's sequence number."""
+    """Sequence number of the recorded step."""
     at_s: float
-    """Seconds of the capture."""
+    """Seconds from the capture's start."""
     now_ns: int
     text: str
     after_missing: bool
-    """A step before it could not be executed, which may be why."""
+    """An earlier step was not executable, which may be the cause."""
 
 
 class ReexecutionResult(msgspec.Struct, kw_only=True):
     service: str
     steps: int = 0
     equal: int = 0
-    """Steps whose every output is the recorded one."""
+    """Steps whose outputs all equal the recorded ones."""
     differing: int = 0
     not_executable: int = 0
     outputs: int = 0
-    """Compared."""
+    """Compared outputs."""
     reasons: dict[str, int] = {}
-    """Why steps could not be executed, and how often."""
+    """Reasons why steps were not executable, with counts."""
     first: FirstDifference | None = None
     tolerance: float = 0.0
     recorded_s: float = 0.0
-    """From the first step to the last."""
+    """Time from the first step to the last."""
     wall_s: float = 0.0
     cpu_s: float = 0.0
-    """Of this process's processors; less than `wall_s` where others wanted them too."""
+    """CPU time of this process; below `wall_s` on a busy machine."""
     changed: tuple[str, ...] = ()
-    """What is different in the types of its messages since; outputs are compared by the fields that both have."""
+    """Changed types of the compared messages, in words. Outputs are compared by the fields of both types."""
     problems: tuple[str, ...] = ()
-    """What of the captures could not be read."""
+    """Unreadable parts of the captures."""
 
     @property
     def speed(self) -> float:
-        """Times real time."""
+        """As a multiple of real time."""
         return self.recorded_s / self.wall_s if self.wall_s else 0.0
 
 
 def reexecute(
     captures: Sequence[Capture], service: str, tolerance: float = 0.0, compare: bool = True
 ) -> ReexecutionResult:
-    """Execute a service again over a run's captures, given in order; without `compare` just to see how fast it goes.
+    """Execute a service again on a run's captures, given in order. Without `compare` only the speed is measured.
 
-    Raises CaptureError when they do not have what that takes: its steps, its configuration, a component with a core.
+    Raises CaptureError when the captures lack the service's steps or configuration, or it has no pure core.
     """
     started, cpu_started = time.perf_counter(), time.process_time()
     with origins(captures, service) as made:
@@ -98,9 +98,9 @@ class _Reexecution:
         self._core: Core | None = None
         self._latency_ns = 0
         self._inputs_missed = False
-        self._looked_at: set[tuple[Path, int]] = set()
+        self._noted: set[tuple[Path, int]] = set()
         self.changed: dict[str, None] = {}
-        self._encoder = msgspec.msgpack.Encoder(enc_hook=_plain)
+        self._encoder = msgspec.msgpack.Encoder(enc_hook=_python_number)
 
     def execute(self, step: RecordedStep) -> None:
         record = step.record
@@ -115,7 +115,7 @@ class _Reexecution:
         samples, missing = self._samples(core, step)
         try:
             outputs = core.step(samples, record.now_ns)
-        except Exception as error:  # whatever it is, it is the finding
+        except Exception as error:  # a failing core is a result, too
             outputs, failure = (), f"the core fails: {type(error).__name__}: {error}"
         else:
             failure = ""
@@ -133,7 +133,7 @@ class _Reexecution:
             self.result.equal += 1
 
     def _begin(self, incarnation: int) -> None:
-        """The service was started: a new core, with what it was configured with then."""
+        """The service was started: make a new core with the configuration of that start."""
         origin = self._made[min(self._starts, len(self._made) - 1)]
         self._core = origin.core()
         self._latency_ns = round(origin.latency_s * NS)
@@ -142,7 +142,7 @@ class _Reexecution:
         self._inputs_missed = False
 
     def _samples(self, core: Core, step: RecordedStep) -> tuple[list[Sample], str]:
-        """What the core is given, and why that is not all that it was given then ('' when it is)."""
+        """The core's inputs, and which of the recorded inputs is missing and why ('' when none is)."""
         topics = {topic.name: topic for topic in core.reads}
         samples, missing = [], ""
         for name in step.record.consumed:
@@ -152,7 +152,7 @@ class _Reexecution:
             elif found is None:
                 missing = f"the capture lacks an input of {name[0]}"
             else:
-                self._look_at(found)
+                self._note_change(found)
                 try:
                     message = found.capture.read(found.record)
                     assert isinstance(message, Message)
@@ -162,18 +162,18 @@ class _Reexecution:
         return samples, missing
 
     def _compare(self, step: RecordedStep, outputs: Sequence[Output]) -> tuple[str, str]:
-        """Why the step's outputs cannot be compared, and what is different first; '' for nothing."""
+        """Why the outputs cannot be compared, and the first difference; '' for none."""
         produced = step.record.produced
         given, now = [name[0] for name in produced], [output.topic.name for output in outputs]
         if given != now:
-            return "", f"it gave {', '.join(given) or 'nothing'} and gives {', '.join(now) or 'nothing'}"
+            return "", f"it produced {', '.join(given) or 'nothing'} and now produces {', '.join(now) or 'nothing'}"
         for name, output in zip(produced, outputs, strict=True):
             found = step.messages.get(name)
             if found is None and not output.topic.recorded:
                 continue
             if found is None:
                 return f"the capture lacks an output on {name[0]}", ""
-            self._look_at(found)
+            self._note_change(found)
             self.result.outputs += 1
             payload = self._encoded(name, output, step.record.now_ns)
             if payload == found.record.payload:
@@ -187,7 +187,7 @@ class _Reexecution:
         return "", ""
 
     def _encoded(self, name: MessageId, output: Output, now_ns: int) -> bytes:
-        """As the node published it, or would have."""
+        """The payload as the node would have published it."""
         message = output.message
         if message.stamp_ns == 0:
             message.stamp_ns = now_ns + self._latency_ns
@@ -195,7 +195,7 @@ class _Reexecution:
         return self._encoder.encode(message)
 
     def _difference(self, found: FoundMessage, payload: bytes) -> str:
-        """By meaning, and by the fields that the type had then and has today."""
+        """The first difference in the fields that both the recorded and today's type have."""
         recorded = found.capture.read(found.record)
         now = found.capture.read(found.record._replace(payload=memoryview(payload)))
         plain = [msgspec.to_builtins(message, builtin_types=(bytes, memoryview)) for message in (recorded, now)]
@@ -205,11 +205,11 @@ class _Reexecution:
         unlike = difference(plain[0], plain[1], self._tolerance or 0.0)
         return "" if unlike is None else unlike.text
 
-    def _look_at(self, found: FoundMessage) -> None:
-        """Whether the type of its key has changed since."""
+    def _note_change(self, found: FoundMessage) -> None:
+        """Note whether the type of a message's key has changed."""
         key, channel = found.record.key, found.record.channel
-        if (found.capture.path, channel) not in self._looked_at:
-            self._looked_at.add((found.capture.path, channel))
+        if (found.capture.path, channel) not in self._noted:
+            self._noted.add((found.capture.path, channel))
             self.changed.update(dict.fromkeys(f"{key}: {text}" for text in changed_since(found.capture, channel)))
 
     def _cannot(self, reason: str, count: int = 1, inputs: bool = True) -> None:
@@ -231,15 +231,15 @@ class _Reexecution:
             )
 
 
-def _plain(value: object) -> Any:
-    """As the node's publisher does it."""
+def _python_number(value: object) -> Any:
+    """numpy numbers as Python's, as in the node's publisher."""
     if isinstance(value, np.generic):
         return value.item()
     raise TypeError(f"a {type(value).__name__} cannot be sent")
 
 
 def describe_result(result: ReexecutionResult) -> list[str]:
-    """What came of it, a fact a line."""
+    """One line per fact."""
     within = f" within {result.tolerance:g}" if result.tolerance else ""
     compared = f"{result.service}: {result.steps} steps, {result.outputs} outputs compared{within}: "
     verdict = "every one equal" if result.equal == result.steps else f"{result.equal} steps equal"
@@ -251,11 +251,11 @@ def describe_result(result: ReexecutionResult) -> list[str]:
         doubt = " (after a step that could not be executed, which may be why)" if first.after_missing else ""
         lines.append(f"  first in step {first.step}, at {first.at_s:.3f} s: {first.text}{doubt}")
     if result.not_executable:
-        lines.append(f"  {result.not_executable} steps not re-executable")
+        lines.append(f"  {result.not_executable} steps not executable")
         lines += [f"    {count}: {reason}" for reason, count in _by_count(result.reasons)]
     lines += [f"  changed since, {change}" for change in result.changed]
     lines += [f"  not read: {problem}" for problem in result.problems]
-    times = f"{result.wall_s:.1f} s ({result.cpu_s:.1f} s of processor)"
+    times = f"{result.wall_s:.1f} s ({result.cpu_s:.1f} s of CPU time)"
     lines.append(f"  {result.recorded_s:.1f} s in {times}: {result.speed:.1f} times real time")
     return lines
 

@@ -1,4 +1,9 @@
-"""A capture sent into a mesh again, as it was or as the robot's hardware alone."""
+"""Publishes a capture on a mesh again, all of it or the hardware's topics alone.
+
+Readers reject a message that they have had from the same start of a publisher. So from the second pass on, each
+message gets another incarnation, and so does every reference to a message: fields named `*incarnation`, and the
+lists of a StepRecord. In the first pass payloads are sent unchanged.
+"""
 
 from __future__ import annotations
 
@@ -23,18 +28,16 @@ from services.capture.keys import KeyFilter
 
 SIMULATOR = "sim"
 HARDWARE_TOPICS = (FRAME, BASE_STATE, ARM_STATE, HAND_STATE)
-"""What a robot's hardware says."""
+"""What a robot's hardware publishes."""
 LINGER_S = 0.5
-"""After the last message: leaving the mesh would cut off what is still on its way out."""
+"""Pause after the last message: leaving the mesh discards what is not sent yet."""
 TICK_S = 1 / 120
-"""Of a clock that is made here, for a capture that has none."""
+"""Period of the generated clock, for a capture without one."""
 
 
 def played_keys(capture: Capture, only: Iterable[str], hardware: bool) -> frozenset[str]:
-    """What of a capture is played: everything that components published, but for what recorders said of themselves.
-
-    Raises ConfigError when that is nothing.
-    """
+    """The keys of a capture that are played: all that components published, except what recorders published about
+    themselves. Raises ConfigError when there is none."""
     robot = capture.robot
     recorders = {service_of(key) for key in capture.keys if key.endswith(RECORDING.name.partition("}")[2])}
     choice = KeyFilter(robot, only)
@@ -49,36 +52,36 @@ def played_keys(capture: Capture, only: Iterable[str], hardware: bool) -> frozen
     if hardware:
         keys &= {topic.key(robot) for topic in (*HARDWARE_TOPICS, CLOCK)}
     if not keys:
-        raise ConfigError(f"{capture.path}: of what is asked for it has nothing to play")
+        raise ConfigError(f"{capture.path}: nothing to play: it has none of the selected keys")
     return frozenset(keys)
 
 
 def services_of(keys: Iterable[str]) -> frozenset[str]:
-    """Whose keys these are."""
+    """The services that publish these keys."""
     return frozenset(service_of(key) for key in keys)
 
 
 async def refuse_if_alive(bus: Bus, robot: str, services: frozenset[str]) -> None:
-    """Raises RefusedError when a robot of that name is there, or anyone whose keys are to be played."""
+    """Raises RefusedError when a robot of this name is alive, or a service whose keys are to be played."""
     alive = {service_of(key) for key in await bus.alive(alive_key(robot))}
     hardware = sorted(alive & {*processes.hardware(), SIMULATOR})
     if hardware:
         raise RefusedError(
-            f"a robot named {robot} is alive ({', '.join(hardware)}), and a capture is not played into its mesh; "
+            f"a robot named {robot} is alive ({', '.join(hardware)}), and a replay would mix with its messages; "
             f"`cocoro down --robot {robot}` stops it"
         )
     if others := sorted(alive & services):
         raise RefusedError(
-            f"{', '.join(others)} of {robot} is alive, and its keys are to be played; "
-            f"stop it, or leave its keys out by --only or --hardware"
+            f"{', '.join(others)} of {robot} is alive and publishes keys of this replay; "
+            f"stop it, or leave these keys out with --only or --hardware"
         )
 
 
 class Replay:
-    """Plays on a bus until the capture's end, or for ever. `player` may be worked meanwhile; tell `changed` then."""
+    """Plays on a bus until the capture ends. After each change of `player` from outside, call `changed`."""
 
     def __init__(self, bus: Bus, capture: Capture, player: Player, *, hardware: bool = False) -> None:
-        """With `hardware` the liveliness of the hardware's services is there too, and always a clock."""
+        """With `hardware` the hardware's services are declared alive, and there is always a clock."""
         self.sent = 0
         self._bus = bus
         self._capture = capture
@@ -92,7 +95,7 @@ class Replay:
         self._incarnation = bus.new_incarnation()
 
     def changed(self) -> None:
-        """The player was worked by hand."""
+        """The player was paused, moved or its rate was changed."""
         self._changed.set()
 
     async def run(self) -> None:
@@ -111,7 +114,7 @@ class Replay:
                 passes = self._player.passes
                 records = self._player.due(loop.time())
                 if ticking is not None and self._player.passes != passes:
-                    self._tick()  # the new epoch begins before what is of it
+                    self._tick()  # the new epoch must begin before its messages
                 for record in records:
                     self._send(record)
                 if self._player.ended:
@@ -141,7 +144,7 @@ class Replay:
         self.sent += 1
 
     def _payload(self, record: Record) -> bytes | memoryview:
-        """As it was published; a message of a former shape in today's, a lossy frame as a frame."""
+        """The payload as it was published; one of a former type in today's shape, a lossy frame expanded to a Frame."""
         schema = self._capture.schema(record.channel)
         if schema is None:
             return record.payload
@@ -153,7 +156,7 @@ class Replay:
             return record.payload
 
     def _publisher(self, key: str) -> RawPublisher:
-        """Everything is played as events are: what a live mesh may leave out under load, a replay may not."""
+        """All keys are published as events, so that none is dropped under load."""
         publisher = self._publishers.get(key)
         if publisher is None:
             publisher = self._publishers[key] = self._bus.publisher(key, Qos.EVENT)
@@ -165,7 +168,7 @@ class Replay:
             await asyncio.sleep(TICK_S)
 
     def _tick(self) -> None:
-        """A real robot's capture has no clock: its stamps are of the system's, as the log times are."""
+        """Publish the clock. A real robot's capture has none; its stamps and its log times are both system time."""
         clock = ClockTick(
             stamp_ns=self._player.position_ns(asyncio.get_running_loop().time()),
             seq=self._ticks,
@@ -178,12 +181,13 @@ class Replay:
 
 
 _BITS = 48
-"""Incarnations are drawn from so many."""
+"""Incarnations are random numbers of this many bits."""
 _PARTS = ("consumed", "produced")
 
 
 def restarted(payload: bytes | memoryview, passes: int) -> bytes | memoryview:
-    """The payload for a time line that has gone back so often. What is no MessagePack map stays as it is."""
+    """The payload with the incarnations of another start, for `passes` > 0. Anything but a MessagePack map stays as it
+    is."""
     if passes == 0:
         return payload
     try:
@@ -194,7 +198,7 @@ def restarted(payload: bytes | memoryview, passes: int) -> bytes | memoryview:
 
 
 def with_rate(payload: bytes | memoryview, rate: float) -> bytes | memoryview:
-    """A clock's message, where time goes `rate` times as fast as it was recorded."""
+    """A ClockTick with its rate multiplied by `rate`."""
     if rate == 1.0:
         return payload
     try:

@@ -1,6 +1,8 @@
-"""A capture written anew: whole where it was not, and perhaps shorter or packed tighter. Payloads stay as they are, and
-so do channels and schemas with their numbers, metadata and attachments; records of kinds that are not MCAP's own are
-left out. A file of another profile keeps that, and nothing of this project's conventions is put into it."""
+"""Writes a capture again: complete where it was damaged, and on request shortened or compressed harder.
+
+Payloads, channels and schemas with their numbers, metadata and attachments stay as they are; records of kinds that
+MCAP does not define are left out. A file of another profile keeps it and gets none of this project's conventions.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,7 @@ from services.capture.keys import KeyInfo
 from services.capture.writer import sync_and_close
 
 REPAIRED = "repaired"
-"""The metadata record of what was written anew, and had not been whole: what was wrong with it."""
+"""Metadata of a repaired capture: what was wrong with the original."""
 
 
 class Rewritten(NamedTuple):
@@ -28,9 +30,9 @@ class Rewritten(NamedTuple):
     attachments: int
     size_bytes: int
     problems: tuple[str, ...]
-    """Parts of the original that could not be read, and so are missing."""
+    """Parts of the original that could not be read and are missing."""
     notes: tuple[str, ...]
-    """Records of the original that are not of MCAP's own kinds, and so were left out."""
+    """Records of the original that were left out because MCAP does not define their kind."""
 
 
 def rewrite(
@@ -42,10 +44,13 @@ def rewrite(
     start_ns: int | None = None,
     end_ns: int | None = None,
 ) -> Rewritten:
-    """Write what can be read of a capture to a new file; with `keep` only the messages that it says, and their
-    channels. Raises CaptureError, and leaves no half of a file then."""
+    """Write everything readable of a capture to a new file; with `keep` only the messages for which it is true, and
+    their channels. `start_ns` and `end_ns` are log times, the end exclusive.
+
+    Raises CaptureError, and then leaves no file.
+    """
     if out.exists():
-        raise CaptureError(f"{out} is there already; remove it, or choose another name")
+        raise CaptureError(f"{out} exists; remove it, or choose another name")
     try:
         file = CaptureFile(out, packer, capture.profile)
     except OSError as error:
@@ -70,7 +75,7 @@ def _copied(
     start_ns: int | None,
     end_ns: int | None,
 ) -> int:
-    """How many messages."""
+    """Returns the number of messages."""
     for name, entries in capture.metadata_records:
         file.metadata(name, entries)
     if keep is None:
@@ -105,7 +110,7 @@ def _copied(
 
 
 def info_in(capture: Capture, channel: int) -> KeyInfo:
-    """Encoding, schema and metadata of a channel, as a capture has them."""
+    """Encoding, schema and metadata of a capture's channel."""
     found, schema = capture.channels[channel], capture.schema(channel)
     kind = None if schema is None else TypeSchema(schema.name, schema.encoding, schema.data)
     return KeyInfo(found.message_encoding, kind, dict(found.metadata))

@@ -1,9 +1,9 @@
-"""Where the mesh is, and how a process gets into it: no multicast, no daemon, no guessing.
+"""The place of the mesh, and how a process joins it: without multicast, daemon or discovery.
 
-On one machine the mesh is a directory. Every process listens on a Unix socket there and connects to all that came
-before it (see `members`), so all of them hear each other directly, at the least latency, and there is no process
-whose death takes the mesh with it. Two robots have two directories and never meet; the directory is its owner's
-alone, so nobody else on the machine can drive the robot. Across machines, `client` mode speaks through routers.
+On one machine the mesh is a directory. Each process listens on a Unix socket in it and connects to all processes that
+joined before (see `cocoro.bus.register`). So all pairs are connected directly, with the least latency, and no single
+process can take the mesh down. Two robots have two directories and never meet. The directory is its owner's alone, so
+no other user can drive the robot. Across machines, `client` mode goes through routers.
 """
 
 from __future__ import annotations
@@ -21,28 +21,31 @@ from cocoro.errors import ConfigError
 LONGEST_SOCKET_PATH = 100
 """Bytes; the kernel takes 107 on Linux and 103 on macOS."""
 FORBIDDEN = "#?;"
-"""What would end the path in an endpoint."""
+"""Characters that end the path in a zenoh endpoint."""
 
 
 @dataclass(frozen=True)
 class ZenohConfig:
-    """How one process joins. Either a directory, or endpoints such as 'tcp/127.0.0.1:7447', never both."""
+    """How one process joins: by a directory, or by endpoints such as 'tcp/127.0.0.1:7447', never both.
+
+    Raises ConfigError for a combination or a directory that cannot be used.
+    """
 
     name: str
-    """What the process is called in the register and in logs."""
+    """The process's name in the register and in logs."""
     directory: Path | None = None
     mode: Literal["peer", "client", "router"] = "peer"
-    """A client speaks through the router that it connects to. A peer speaks with just those that it connects to or
-    that connect to it: nobody is discovered."""
+    """A client communicates through the router that it connects to. A peer communicates with the processes that it
+    connects to or that connect to it, and discovers no others."""
     listen: tuple[str, ...] = ()
     connect: tuple[str, ...] = ()
     lease_s: float = 4.0
-    """How long a process may be silent (stopped, cut off) before its liveliness tokens drop. A killed one's drop
-    at once."""
+    """Time of silence (stopped, cut off) after which a process's liveliness tokens drop. Those of a killed process drop
+    immediately."""
     patience_s: float = 1.0
-    """How long opening waits for the mesh, and for a member of it that does not answer."""
+    """Longest wait for the mesh, or for a member that does not answer, when joining."""
     shared_memory: bool = False
-    """Whether it publishes frames or reads them: then they travel in shared memory, where that can be had."""
+    """Whether the process publishes or reads frames, which travel in shared memory where there is any."""
     options: Mapping[str, Any] = field(default_factory=dict)
     """Further zenoh options by path ('transport/link/tls/...'), for certificates and access control."""
 
@@ -58,21 +61,18 @@ class ZenohConfig:
             if any("\udc80" <= c <= "\udcff" for c in path):
                 raise ConfigError(f"mesh directory {path}: the path must be UTF-8, choose another by COCORO_RUN_DIR")
         elif not self.listen and not self.connect:
-            raise ConfigError(f"mesh of {self.name}: say a directory, or where to listen or connect")
+            raise ConfigError(f"mesh of {self.name}: give a directory, or endpoints to listen on or connect to")
 
     @property
     def where(self) -> str:
-        """In words, for errors."""
+        """The mesh's place, for error messages."""
         return str(self.directory) if self.directory else ", ".join(self.connect or self.listen)
 
 
 def default(robot: str, name: str, run_dir: Path | None = None) -> ZenohConfig:
-    """The mesh of a robot that lives on this machine: a directory for it below the run directory.
+    """The mesh of a robot on this machine: the robot's directory in the run directory (`default_run_dir` by default).
 
-    The run directory is, in this order: the argument, $COCORO_RUN_DIR, `cocoro` in $XDG_RUNTIME_DIR, a directory
-    of this user's in the system's place for temporary files. What is in it must be this user's alone (see
-    `cocoro.private`).
-    Raises ConfigError for a robot's name that cannot be part of a path and of a key.
+    Raises ConfigError for a robot name that cannot be part of a path and of a key.
     """
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", robot):
         raise ConfigError(f"robot name {robot!r}: use letters, digits, '_', '-' and '.', and begin with no sign")
@@ -80,6 +80,8 @@ def default(robot: str, name: str, run_dir: Path | None = None) -> ZenohConfig:
 
 
 def default_run_dir() -> Path:
+    """$COCORO_RUN_DIR, else `cocoro` in $XDG_RUNTIME_DIR, else a directory of this user in the place for temporary
+    files. Its content must be this user's alone (see `cocoro.private`)."""
     if explicit := os.environ.get("COCORO_RUN_DIR"):
         return Path(explicit).absolute()
     if runtime := os.environ.get("XDG_RUNTIME_DIR"):

@@ -1,4 +1,4 @@
-"""Opening and closing zenoh sessions without blocking the loop, and without a session outliving its interpreter."""
+"""Opens and closes zenoh sessions without blocking the event loop, and closes them before the interpreter ends."""
 
 from __future__ import annotations
 
@@ -24,60 +24,60 @@ log = logging.getLogger(__name__)
 T = TypeVar("T")
 
 LEAVE_S = 2.0
-"""How long leaving the mesh may take before it is given up; the process can end all the same."""
+"""Longest wait for leaving the mesh; the process can end without it."""
 LAST_TURN_S = 0.02
-"""For threads of zenoh's that wait for the interpreter while the process ends."""
+"""Time that zenoh's threads get to return from callbacks when the process ends."""
 FRAGMENT_WAIT_US = 25_000
-"""How long a large sample without shared memory may wait for a receiver on this machine that does not read."""
+"""Longest wait of a large sample without shared memory for a receiver on this machine that does not read."""
 
 PACKETS = 16
-"""May wait for the network in each priority, which is all that zenoh allows. An express sample is a packet by itself,
-and a service publishes several at once: of zenoh's usual 2, a busy processor would lose some."""
+"""Packets that may wait for the network, per priority; zenoh's maximum. Each express sample is a packet, and a service
+publishes several together: with zenoh's default of 2, a busy machine would lose some."""
 ACCEPT_PENDING = 500
 ACCEPT_MS = 3000
 SHARED_MEMORY = "transport/shared_memory/enabled"
 NO_SEGMENT = "shm segment"
-"""In what zenoh says when it could not make one."""
+"""Part of zenoh's error when it could not make a segment."""
 SMALL_PRIORITIES = ("control", "real_time", "interactive_high", "interactive_low", "data_high", "data")
 
 
 _SOURCE = re.compile(r" at /\S+\.rs:\d+\.?")
-"""Where in zenoh an error arose; of no use to who reads it."""
+"""The place in zenoh's source at the end of its errors."""
 
 
 def no_mesh(config: ZenohConfig) -> MeshError:
     if config.mode == "client":
-        return MeshError(f"no mesh at {config.where}: no router answers there; start it, or put the [mesh] right")
+        return MeshError(f"no mesh at {config.where}: no router answers there; start it, or correct the [mesh] table")
     return MeshError(f"no mesh at {config.where}: start one with `cocoro up`")
 
 
 def options(config: ZenohConfig, identity: str, listen: list[str], connect: list[str]) -> dict[str, Any]:
-    """The options of a zenoh session by path. What is not said here is zenoh's default."""
+    """The options of a zenoh session, by path; all others have zenoh's defaults."""
     local = config.directory is not None
     patience_ms = round(config.patience_s * 1000)
     chosen: dict[str, Any] = {
         "id": identity,
         "mode": config.mode,
         "scouting/multicast/enabled": False,
-        # Everyone connects to everyone, by the register or by the configured endpoints, and to nobody else.
+        # Connections are made by the register or the configured endpoints, and no others.
         "scouting/gossip/enabled": False,
-        # The longest that opening as a peer waits for its endpoints. A router would wait all of it, always.
+        # Longest wait of a peer for its endpoints. A router would always wait for all of it.
         "scouting/delay": patience_ms if config.mode == "peer" else 0,
-        # Zenoh's own wait for what the others declared now and then misses its end and takes all of the delay, so
-        # the bus itself waits for their tokens, which come last; in a directory it knows whose.
+        # Zenoh's own wait for the others' declarations sometimes misses the last one and takes all of the delay. The
+        # bus instead waits for the members' tokens, which are declared last (`ZenohBus._settle`).
         "open/return_conditions": {"connect_scouted": not local, "declares": False},
         "listen/endpoints": listen,
         "connect/endpoints": connect,
         "connect/timeout_ms": patience_ms if config.mode == "client" else -1,
         "connect/retry": {"period_init_ms": 20, "period_max_ms": 2000, "period_increase_factor": 2},
-        # Who connects and says nothing takes one of so many places, for so long: of a thousand idle connections none
-        # keeps a new session out for longer, and what they take is far from all that a process may have open.
+        # An idle connection takes one of ACCEPT_PENDING places for at most ACCEPT_MS, so idle connections delay a new
+        # session by no more, and their sockets are far fewer than a process may have open.
         "transport/unicast/accept_pending": ACCEPT_PENDING,
         "transport/unicast/accept_timeout": ACCEPT_MS,
         "transport/link/tx/lease": round(config.lease_s * 1000),
         "transport/link/tx/queue/size": dict.fromkeys(SMALL_PRIORITIES, PACKETS),
         SHARED_MEMORY: config.shared_memory,
-        # Frames have pools of their own (see `pool`).
+        # Each publisher of frames has its own pool (`declared.SharedPool`).
         "transport/shared_memory/transport_optimization/enabled": False,
     }
     if local:
@@ -85,11 +85,11 @@ def options(config: ZenohConfig, identity: str, listen: list[str], connect: list
     return {**chosen, **config.options}
 
 
-_UNASKED = "the process did not ask for it (`frames` of its row in the process table)"
+_UNASKED = "the process did not ask for it (`frames` of its component)"
 
 
 class Opened(NamedTuple):
-    """A session, and why it does without shared memory; empty when it has it."""
+    """A session, and why it has no shared memory; empty when it has."""
 
     session: zenoh.Session
     unshared: str
@@ -99,16 +99,16 @@ class Opened(NamedTuple):
 
 
 def open_session(config: ZenohConfig, chosen: dict[str, Any]) -> Opened:
-    """Blocks for at most the configuration's patience. MeshError, ConfigError.
+    """Opens a session; blocks for at most `patience_s`. Raises MeshError, ConfigError.
 
-    A session that is to have shared memory and cannot opens without, which is said in the log."""
+    When shared memory is asked for and cannot be had, the session opens without it, and a warning is logged."""
     if not chosen[SHARED_MEMORY]:
         return Opened(_open(config, chosen), _UNASKED if not config.shared_memory else "the mesh's options say so")
     why = shared.obstacle(shared.SESSION_BYTES)
     if not why:
         try:
             return Opened(_open(config, chosen), "")
-        except MeshError as error:  # others have filled it since
+        except MeshError as error:  # other processes have filled it since
             if NO_SEGMENT not in f"{error} {error.__cause__}":
                 raise
             shared.drop_failed()
@@ -131,7 +131,7 @@ def _open(config: ZenohConfig, chosen: dict[str, Any]) -> zenoh.Session:
             raise no_mesh(config) from error
         what = _SOURCE.sub("", str(error))
         if "Address already in use" in what:
-            what = "another process listens there already; end that one, or let the [mesh] say another place"
+            what = "another process listens there already; end that one, or choose another endpoint in the [mesh] table"
         raise MeshError(f"mesh of {config.name} at {', '.join(config.listen) or config.where}: {what}") from error
 
 
@@ -140,8 +140,8 @@ def close_session(session: zenoh.Session) -> None:
 
 
 async def in_thread(work: Callable[[], T], undo: Callable[[T], None] | None = None) -> T:
-    """Await work that blocks, in a daemon thread, so that it cannot keep the process from ending.
-    Work that nobody waits for any more when it is done is undone."""
+    """Runs blocking work in a daemon thread, which cannot keep the process from ending, and returns its result. If the
+    caller was cancelled meanwhile, `undo` is called with the result."""
     loop = asyncio.get_running_loop()
     future: asyncio.Future[T] = loop.create_future()
 
@@ -169,9 +169,9 @@ async def in_thread(work: Callable[[], T], undo: Callable[[T], None] | None = No
 
 
 class ExitGuard:
-    """Zenoh must not call back into an interpreter that is taken apart (`deploy.quit` tells why): sessions that the
-    program forgot are closed before, and a thread of zenoh's that is about to call gets its turn. A program that
-    would be sure ends by `quit_process`."""
+    """Closes forgotten sessions before the interpreter is finalized, and lets zenoh's threads return from callbacks:
+    zenoh must not call back into an interpreter that is being finalized (see `deploy.quit`). Only a program that ends
+    by `quit_process` is safe from that in all cases."""
 
     def __init__(self) -> None:
         self._leaves: set[Callable[[], None]] = set()
@@ -188,7 +188,7 @@ class ExitGuard:
 
     def _leave_all(self) -> None:
         if os.getpid() != self._process:
-            return  # a fork's sessions are its parent's
+            return  # the sessions of a forked process belong to its parent
         threads = [threading.Thread(target=leave, daemon=True) for leave in list(self._leaves)]
         for thread in threads:
             thread.start()

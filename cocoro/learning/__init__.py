@@ -1,1 +1,1 @@
-"""What the robot learns of its own body by moving and looking: pure, no I/O but for the two file formats."""
+"""The learned model of the robot's own body: network, hand-eye map, and the model's file."""

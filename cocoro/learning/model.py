@@ -1,7 +1,7 @@
-"""What was learned, on disk and on the mesh: one JSON document, checked before it is believed.
+"""The learned model on disk and on the mesh: one JSON document with a checksum.
 
-It says its version, its robot, the drawing that it stands on, what it was trained on and how good it is. A document
-that is damaged, foreign or of another version is refused with one line that says which.
+It names its version, its robot, the fingerprint of the robot description it was learned with, its training data and its
+scores. A document that is damaged, of another robot or of another version is refused with one line that says which.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ BoundedNonNegative = Annotated[float, Meta(ge=0, le=LARGEST_WEIGHT)]
 
 
 class Training(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What it was learned from, and how good it was found to be."""
+    """Training data and scores."""
 
     data: str
     """Fingerprint of the samples."""
     samples: Annotated[int, Meta(ge=0)]
     method: str
     scores: dict[str, float]
-    """By name, with the unit in it: held_out_rms_m, drawing_offset_rms_m."""
+    """By name, which ends with the unit: held_out_rms_m, drawing_offset_rms_m."""
 
 
 class ArmModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -47,28 +47,31 @@ class ArmModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     joints: tuple[str, ...]
     roll_rad: Weight
     over_drawing: bool
+    """The network adds to the nominal model; else it is the whole map."""
     coordinates: Coordinates
     centres: list[list[Weight]]
     widths: list[Annotated[float, Meta(gt=0, le=100)]]
     weights: list[list[Weight]]
     seen_m: list[FiniteVec3]
-    """Where the hand was seen: what the reachability mesh is made of."""
+    """Positions where the hand was seen; the reachability mesh is made of them."""
     training: Training
 
 
 class WheelModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The learned wheel distance and camera tilt."""
+
     separation_m: Annotated[float, Meta(gt=0.01, lt=10)]
     eye_tilt_rad: Annotated[float, Meta(ge=-0.5, le=0.5)] = 0.0
-    """By how much the eye sees things higher than they are, as an angle at the neck."""
+    """Angle at the neck by which the camera sees things higher than they are."""
     training: Training
 
 
 class BodyModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Each part may be missing: then the drawing's own serves."""
+    """The learned parts; the nominal model replaces a missing one."""
 
     robot: str
     drawing: str
-    """Fingerprint of the robot description that it stands on."""
+    """Fingerprint of the robot description that it was learned with (`fingerprint_of`)."""
     arm: ArmModel | None = None
     wheels: WheelModel | None = None
 
@@ -77,37 +80,38 @@ class _Document(msgspec.Struct, frozen=True, kw_only=True):
     format: str
     version: int
     checksum: str
-    """Of `model`'s bytes as they stand."""
+    """First 16 hex digits of the SHA-256 of `model`'s bytes."""
     model: msgspec.Raw
 
 
 def empty(robot: Robot) -> BodyModel:
-    """Nothing learned yet."""
+    """A model without parts."""
     return BodyModel(robot=robot.name, drawing=fingerprint_of(robot))
 
 
 def encode(model: BodyModel) -> bytes:
+    """The document of a model, as files and messages carry it."""
     body = msgspec.json.encode(model)
     checksum = hashlib.sha256(body).hexdigest()[:16]
     return msgspec.json.encode(_Document(format=FORMAT, version=VERSION, checksum=checksum, model=msgspec.Raw(body)))
 
 
 def decode(data: bytes, robot: Robot, where: str) -> BodyModel:
-    """Read what `encode` gave. Raises ConfigError with one line: damaged, foreign, or of another version."""
+    """Read a document of `encode`; `where` it is from. Raises ConfigError: damaged, another robot's or version."""
     try:
         document = msgspec.json.decode(data, type=_Document)
     except msgspec.MsgspecError as error:
-        raise ConfigError(f"model {where}: it is damaged, or no model at all ({error})") from error
+        raise ConfigError(f"model {where}: it is damaged or no model ({error})") from error
     if document.format != FORMAT:
         raise ConfigError(f"model {where}: it is a {document.format!r}, not a {FORMAT}")
     if document.version != VERSION:
         age = "an older" if document.version < VERSION else "a newer"
         raise ConfigError(
-            f"model {where}: it is of {age} version, {document.version}; this program reads version {VERSION}:"
-            " learn it anew (cocoro learn)"
+            f"model {where}: it has {age} version, {document.version}; this program reads version {VERSION}:"
+            " learn it again (`cocoro learn`)"
         )
     if hashlib.sha256(bytes(document.model)).hexdigest()[:16] != document.checksum:
-        raise ConfigError(f"model {where}: it is damaged (its checksum is wrong): learn it anew (cocoro learn)")
+        raise ConfigError(f"model {where}: it is damaged (its checksum is wrong): learn it again (`cocoro learn`)")
     try:
         model = msgspec.json.decode(document.model, type=BodyModel)
     except msgspec.MsgspecError as error:
@@ -115,14 +119,16 @@ def decode(data: bytes, robot: Robot, where: str) -> BodyModel:
     if model.robot != robot.name:
         raise ConfigError(f"model {where}: it is of robot {model.robot!r}, this one is {robot.name!r}")
     if model.drawing != fingerprint_of(robot):
-        raise ConfigError(f"model {where}: it stands on another description of {robot.name}: learn it anew")
+        raise ConfigError(
+            f"model {where}: it was learned with another description of {robot.name}: learn it again (`cocoro learn`)"
+        )
     if model.arm is not None:
         hand_map(model.arm, robot, where)
     return model
 
 
 def load(path: Path, robot: Robot) -> BodyModel:
-    """Raises ConfigError as `decode` does, or when the file cannot be read."""
+    """Read a file. Raises ConfigError like `decode`, or when the file cannot be read."""
     try:
         data = path.read_bytes()
     except OSError as error:
@@ -131,7 +137,7 @@ def load(path: Path, robot: Robot) -> BodyModel:
 
 
 def save(model: BodyModel, path: Path) -> None:
-    """Write it whole or not at all. Raises ConfigError when it cannot be written."""
+    """Replace the file as a whole. Raises ConfigError when it cannot be written."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         beside = path.with_name(f".{path.name}.{os.getpid()}")
@@ -145,6 +151,7 @@ def save(model: BodyModel, path: Path) -> None:
 
 
 def arm_model(learned: HandMap, roll_rad: float, seen_m: FloatArray, training: Training) -> ArmModel:
+    """The arm's part of a model. `seen_m`: positions (b, 3), body frame, metres, where the marker was seen."""
     network = learned.network
     return ArmModel(
         joints=learned.joints,
@@ -160,7 +167,7 @@ def arm_model(learned: HandMap, roll_rad: float, seen_m: FloatArray, training: T
 
 
 def hand_map(arm: ArmModel, robot: Robot, where: str = "arm") -> HandMap:
-    """The map, ready to compute with. Raises ConfigError where its parts do not fit together."""
+    """The map, ready for computing. Raises ConfigError when its parts do not fit together."""
     nominal = NominalModel(robot, arm.roll_rad)
     try:
         centres, weights = np.array(arm.centres), np.array(arm.weights)

@@ -1,12 +1,12 @@
-"""The emergency stop's own path: from whoever says stop to every process that moves something, beside the mesh.
+"""The emergency stop's own path, beside the mesh: from a `cocoro stop` to every process that moves something.
 
-It needs no shared memory, no disk, no register, no router, no name service and no environment variable, and nothing
-but Python's standard library.
+It needs no shared memory, disk, register, router, name service or environment variable, and only Python's standard
+library.
 
-- `path`: where a process that moves something listens, and what it does when somebody says stop.
-- `asking`: how to say stop to all of them, and what they answered.
-- `record`: the latch on disk, which outlives every process and a reboot.
+- `path`: the receiving side, in each process that moves something.
+- `record`: the latch on disk, which survives every process and a reboot.
+- `apps.cli.stop_asking`: the sending side.
 
-Everybody who can log in to the robot's machine may stop it. Only its owner may reset it, since a reset goes over the
-mesh, whose directory is the owner's alone.
+Every user of the robot's machine may stop it. Only its owner may reset it, since a reset goes over the mesh, whose
+directory is the owner's alone.
 """

@@ -1,10 +1,10 @@
-"""Where a process that moves something hears the emergency stop: a datagram socket in Linux's abstract namespace.
+"""The receiving side of the emergency stop: a datagram socket in Linux's abstract namespace per service.
 
-The address is `\\0cocoro-stop/UID/ROBOT/SERVICE/RANDOM`. The kernel lists all of them in /proc/net/unix, for every
-user, so nobody has to be told where to look; the random end keeps others from taking an address first. There are no
-connections, so nobody can use them up. **Every datagram that arrives is a stop**, whatever it says: who floods the
-address has stopped the robot. A datagram's text is only the name by which the sender calls himself; who he is says
-the kernel (SCM_CREDENTIALS, unix(7)).
+The address is `\\0cocoro-stop/UID/ROBOT/SERVICE/RANDOM`. The kernel lists all addresses in /proc/net/unix, for every
+user, so no register is needed; the random part keeps other programs from taking an address first. There are no
+connections that could be used up. **Every datagram is a stop**, whatever its text: flooding the address stops the
+robot. The text is only the name that the sender gives itself; its user and process come from the kernel
+(SCM_CREDENTIALS, unix(7)).
 """
 
 from __future__ import annotations
@@ -24,25 +24,25 @@ LONGEST_ADDRESS = 107
 """Bytes after the leading zero (unix(7))."""
 TEXT_BYTES = 256
 WAITING_FOR_THE_DISK = 32
-"""So many who asked are told when the latch is on the disk; more of them are a flood."""
+"""Senders that get a second answer when the latch is on the disk; more at a time are a flood."""
 FAILURE_S = 0.1
-"""A path that goes on failing halts so often."""
+"""Pause after a failure of the path; each failure halts."""
 _CREDENTIALS = struct.Struct("3i")
 
 
 class Asked(NamedTuple):
-    """One stop that came in."""
+    """One received stop."""
 
     by: str
-    """Who said it, for people: 'operator (user 1000, pid 4711)'."""
+    """The sender, for people: 'operator (user 1000, pid 4711)'."""
     answer_to: bytes
-    """The asker's address; empty when he wants no answer."""
+    """The sender's address; empty when it wants no answer."""
 
 
 class StopPoint:
-    """One service's address, to be read by the process that moves it.
+    """The address of one service, in the process that moves it.
 
-    Raises OSError when there is no such socket to be had: what cannot be stopped must not move.
+    Raises OSError when no such socket can be made: what cannot be stopped must not move.
     """
 
     def __init__(self, robot: str, service: str) -> None:
@@ -59,7 +59,7 @@ class StopPoint:
         return self._socket.fileno()
 
     def take(self, *, wait: bool) -> Asked | None:
-        """The next stop; None when there is none (with `wait` only after `close`)."""
+        """The next stop; None when there is none. With `wait` it blocks, and returns None only after `close`."""
         try:
             text, ancillary, _, sender = self._socket.recvmsg(
                 TEXT_BYTES, socket.CMSG_SPACE(_CREDENTIALS.size), 0 if wait else socket.MSG_DONTWAIT
@@ -75,24 +75,24 @@ class StopPoint:
         return Asked(_who(text, ancillary), sender if isinstance(sender, bytes) else b"")
 
     def latched(self, asked: Asked, at_ns: int) -> None:
-        """Answer that what this process moves was stopped, then (CLOCK_MONOTONIC)."""
+        """Answers that this process stopped what it moves at `at_ns` (CLOCK_MONOTONIC)."""
         self._answer(asked, f"latched {self.service} {at_ns}")
 
     def kept(self, asked: Asked, why_not: str = "") -> None:
-        """Answer that the latch is on the disk, or why it is not."""
+        """Answers that the latch is on the disk, or why it is not."""
         self._answer(asked, f"unkept {self.service} {why_not}" if why_not else f"kept {self.service}")
 
     def keeps_nothing(self, asked: Asked) -> None:
-        """Answer that another process keeps the latch of what this one moves."""
+        """Answers that another process keeps the latch of what this one moves."""
         self._answer(asked, f"keepless {self.service}")
 
     def _answer(self, asked: Asked, text: str) -> None:
         if asked.answer_to:
-            with suppress(OSError):  # the asker has gone, or does not read: that must hold nothing up
+            with suppress(OSError):  # the sender has gone or does not read, which must delay nothing
                 self._socket.sendto(text.encode()[:TEXT_BYTES], socket.MSG_DONTWAIT, asked.answer_to)
 
     def close(self) -> None:
-        """From now on nobody listens; a `take` that waits returns."""
+        """Stops listening; a waiting `take` returns."""
         self.closed = True
         with suppress(OSError):
             self._socket.shutdown(socket.SHUT_RDWR)
@@ -100,20 +100,20 @@ class StopPoint:
 
 
 def _who(text: bytes, ancillary: list[tuple[int, int, bytes]]) -> str:
-    said = "".join(c for c in text.decode(errors="replace")[:40] if c.isprintable()).strip() or "somebody"
+    name = "".join(c for c in text.decode(errors="replace")[:40] if c.isprintable()).strip() or "unknown sender"
     for level, kind, data in ancillary:
         if (level, kind) == (socket.SOL_SOCKET, socket.SCM_CREDENTIALS) and len(data) >= _CREDENTIALS.size:
             pid, uid, _ = _CREDENTIALS.unpack_from(data)
-            return f"{said} (user {uid}, pid {pid})"
-    return said
+            return f"{name} (user {uid}, pid {pid})"
+    return name
 
 
 def listen(point: StopPoint, halt: Callable[[str], None], keep: Callable[[str], Future[str]]) -> None:
-    """Hear stops in a thread of their own until the point is closed, whatever the event loop and the disk do.
+    """Receives stops in a thread until the point is closed, independently of the event loop and the disk.
 
-    `halt(by)` stops what the service moves; it is called in that thread and must be brief. `keep(by)` begins to write
-    the latch to the disk; the future tells why it could not be kept, or ''. Whatever fails here is a stop of its own
-    that nobody is told was heard, and the thread goes on: what cannot be stopped must not move.
+    `halt(by)` stops what the service moves; it is called in that thread and must be brief. `keep(by)` starts to write
+    the latch to the disk; its future gives why it is not on the disk, or ''. Any failure here also halts, without an
+    answer, and the thread goes on: what cannot be stopped must not move.
     """
     room = threading.BoundedSemaphore(WAITING_FOR_THE_DISK)
 
@@ -123,7 +123,7 @@ def listen(point: StopPoint, halt: Callable[[str], None], keep: Callable[[str], 
                 if (asked := point.take(wait=True)) is not None:
                     halt(asked.by)
                     point.latched(asked, time.monotonic_ns())
-                    _tell_when_kept(point, asked, keep(asked.by), room)
+                    _answer_when_kept(point, asked, keep(asked.by), room)
             except Exception:
                 with suppress(Exception):
                     halt("the failure of its own path")
@@ -133,19 +133,20 @@ def listen(point: StopPoint, halt: Callable[[str], None], keep: Callable[[str], 
     threading.Thread(target=hear, name=f"stop {point.service}", daemon=True).start()
 
 
-def _tell_when_kept(point: StopPoint, asked: Asked, kept: Future[str], room: threading.BoundedSemaphore) -> None:
-    """Answer once more when the disk is done, without waiting for it; where it hangs, not for all who ask meanwhile."""
+def _answer_when_kept(point: StopPoint, asked: Asked, kept: Future[str], room: threading.BoundedSemaphore) -> None:
+    """Answers again when the write is done, without waiting; while the disk hangs, for `WAITING_FOR_THE_DISK`
+    senders."""
 
-    def tell(kept: Future[str]) -> None:
+    def answer(kept: Future[str]) -> None:
         room.release()
         point.kept(asked, kept.result())
 
     if room.acquire(blocking=False):
-        kept.add_done_callback(tell)
+        kept.add_done_callback(answer)
 
 
 def _log_failure(service: str) -> None:
-    import logging  # the guard, which has no use for it, is to start quickly
+    import logging  # imported here, since the guard of the wheels must start quickly
 
     with suppress(Exception):
-        logging.getLogger(f"cocoro.{service}").exception("the emergency stop's own path failed; it halted")
+        logging.getLogger(f"cocoro.{service}").exception("the emergency stop's path failed, so it halted")

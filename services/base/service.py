@@ -12,7 +12,7 @@ from msgspec import Meta
 from cocoro import topics
 from cocoro.component import Implementation
 from cocoro.faults import FaultReporter
-from cocoro.latch import LatchKeeper
+from cocoro.latch import ServiceLatch
 from cocoro.messages import BaseCommand, LatchState, RecoverReply, RecoverRequest
 from cocoro.node import Node
 from cocoro.ports import port_path
@@ -47,7 +47,7 @@ class BaseService:
         """Count of emergency stops that the guard received, and how many of them were reset."""
         self._epoch = node.clock.epoch
         self._changed = asyncio.Event()
-        self._latch = LatchKeeper(node, self._latched, self._halt)
+        self._latch = ServiceLatch(node, self._latched, self._halt)
         node.on(topics.BASE_COMMAND, self._commanded)
         node.serve(topics.RECOVER, self._recover)
 

@@ -1,1 +1,1 @@
-"""The recorder: everything that travels on the mesh, into MCAP files (see `cocoro.capture`)."""
+"""The recorder: writes everything that travels on the mesh into MCAP files (format and reading: `cocoro.capture`)."""

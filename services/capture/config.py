@@ -1,4 +1,4 @@
-"""What of the mesh is recorded, and where to; a profile's `[service.capture]` table sets these."""
+"""The recorder's configuration: the `[service.capture]` table of a profile."""
 
 from __future__ import annotations
 
@@ -13,41 +13,41 @@ from cocoro.units import Positive
 from services.capture.file import Compression
 
 FOLDER = "COCORO_CAPTURE_DIR"
-"""Environment variable: where captures go when the configuration does not say."""
+"""Environment variable with the captures' folder, used when the configuration names none."""
 
 
 class CaptureConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     folder: str | None = None
-    """Where the files go, one after another; made when it is not there. By default $COCORO_CAPTURE_DIR, else
-    `cocoro/captures` in $XDG_STATE_HOME (~/.local/state)."""
+    """Folder of the files; created when it is missing. Default: $COCORO_CAPTURE_DIR, else `cocoro/captures` in
+    $XDG_STATE_HOME (~/.local/state)."""
     file: str | None = None
-    """All into this one file instead, which must not be there yet; then nothing is rotated."""
+    """One file for everything instead, without rotation. It must not exist yet."""
     only: tuple[str, ...] = ()
-    """Key expressions, with or without the robot's name, or `frames`; none means everything."""
+    """Key expressions, with or without the robot's name, or `frames`. Empty: everything."""
     without: tuple[str, ...] = ()
-    """Likewise; stronger than `only`."""
+    """As `only`, for keys to leave out; overrides `only`."""
 
     compression: Compression = "zstd"
-    """Of chunks, without loss. What does not shrink by it is stored as it is."""
+    """Lossless compression of chunks. A chunk that does not shrink is stored uncompressed."""
     level: Annotated[int, Meta(ge=1, le=19)] = 1
-    """Of zstd: 1 is quick, 19 is thorough and slow."""
+    """zstd level: 1 is fast, 19 thorough and slow."""
     jpeg_quality: Annotated[int, Meta(ge=1, le=100)] | None = None
-    """Keep the frames' colour as JPEG, with loss: far smaller, good to look at, no use to execute perception anew."""
+    """Store the frames' colour as JPEG of this quality: far smaller, but perception cannot be re-executed from it."""
 
     rotate_mb: Positive = 2000.0
     rotate_s: Positive = 600.0
-    """A new file is begun at this size or length, whichever comes first."""
+    """A new file starts at this size or length, whichever comes first."""
     keep_gb: Positive | None = None
-    """With every new file the oldest of this robot's captures in the folder are deleted until the rest take no more."""
+    """With each new file the oldest captures of this robot are deleted until those in the folder take no more."""
     min_free_mb: Annotated[float, Meta(ge=0)] = 500.0
-    """Recording stops before it leaves the disk less room."""
+    """Recording stops before it leaves less room on the disk."""
 
     memory_mb: Positive = 128.0
-    """What may wait for the disk. Beyond it messages are dropped, large ones first, and counted."""
+    """Limit for messages that wait for the disk. Beyond it messages are dropped, large ones first, and counted."""
     flush_s: Annotated[float, Meta(gt=0, le=0.2)] = 0.1
-    """The death of this process loses what came in this long, and a little more."""
+    """When this process dies, the messages of about this time are lost."""
     sync_s: Annotated[float, Meta(gt=0, le=0.8)] = 0.5
-    """A loss of power loses what came in this long, and what the disk took to sync before."""
+    """When power fails, the messages of about this time are lost, and those of the disk's last sync."""
 
 
 def folder_of(config: CaptureConfig) -> Path:

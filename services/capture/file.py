@@ -1,17 +1,17 @@
-"""Writes one MCAP file. After each `flush` everything added so far is in the operating system's hands.
+"""Writes one MCAP file. After each `flush` the operating system has everything that was added.
 
-The format is encoded here because the `mcap` package's writer has one zstd level, mixes frames and small messages in
-one chunk and takes 1.2 times (ideal sensors) to 1.8 times (real sensors) the processor time, 1.2 to 1.4 times without
-frames (`python bench/capture_format.py files`).
+The file is encoded here because the `mcap` package's writer takes 1.2 times (ideal sensors) to 1.8 times (real
+sensors) the processor time, 1.2 to 1.4 times without frames (`python bench/capture_format.py files`). It also has
+one zstd level and mixes frames with small messages in one chunk.
 
-A frame is copied once, behind its message's head, so writing 1.54 MB takes up to 3.08 MB more memory at the peak,
-packed bytes included. The copy pays: a frame joined and packed as one piece takes 1.74 ms (3.26 ms with noisy sensors),
-and 1.99 ms (3.71 ms) when zstd is given head and payload one after the other
-(`python bench/capture_format.py records`).
+A frame is copied once, behind its message's head, so writing 1.54 MB needs up to 3.08 MB more memory at the peak,
+packed bytes included. In return a frame that is joined and packed as one piece takes 1.74 ms (3.26 ms with noisy
+sensors), against 1.99 ms (3.71 ms) when zstd gets head and payload one after the other (`python
+bench/capture_format.py records`).
 
-Chunks are packed by zstd at level 1 by default. Measured on frames of the simulated Kinect of 1.5 MB, one core
-(`python bench/capture.py frames`): zstd makes ideal frames 25 times smaller in 1.0 ms and noisy ones 2.1 times in
-2.1 ms; lz4 11 times in 0.6 ms and 1.3 times in 0.9 ms. Both cost less than writing the bytes that they save.
+Compression is measured on frames of the simulated Kinect, 1.5 MB each, on one core (`python bench/capture.py
+frames`): zstd at level 1 makes ideal frames 25 times smaller in 1.0 ms and noisy ones 2.1 times in 2.1 ms; lz4 11
+times in 0.6 ms and 1.3 times in 0.9 ms. Both cost less than writing the bytes that they save.
 """
 
 from __future__ import annotations
@@ -53,17 +53,17 @@ from cocoro.capture.conventions import CHECKSUM, MAKER, PROFILE, TALLY, KeyTally
 Compression = Literal["zstd", "lz4", "none"]
 COMPRESSIONS: tuple[Compression, ...] = get_args(Compression)
 WORTH = 0.95
-"""What does not become smaller than this share of itself is stored as it is: then reading it costs nothing."""
+"""A chunk that does not shrink to this share of its size is stored uncompressed, so that reading it is free."""
 QUICK = zstandard.ZstdCompressionParameters.from_level(1, window_log=17, hash_log=12, chain_log=12, min_match=7)
-"""Level 1 with a table that fits a processor's nearest memory, and no short matches: for frames 6% less time, and
-nothing lost in size."""
+"""zstd level 1 with a table that fits the level 1 cache, and without short matches: 6% less time for frames at the
+same size."""
 
 
 class Packer:
-    """Packs chunks. Not for use by two threads at once."""
+    """Compresses chunks. Not thread-safe."""
 
     def __init__(self, compression: Compression, level: int = 1) -> None:
-        """`level` is zstd's: 1 is quick, 19 is thorough."""
+        """`level` is the zstd level: 1 is fast, 19 thorough."""
         self._name = "" if compression == "none" else compression
         self._pack: Callable[[bytes | memoryview], bytes] | None = None
         if compression == "zstd" and level == 1:
@@ -74,7 +74,7 @@ class Packer:
             self._pack = lz4.frame.compress
 
     def pack(self, raw: bytes) -> tuple[str, bytes]:
-        """The compression's name in MCAP ('' for none), and the packed bytes."""
+        """Returns the compression's name in MCAP ('' for none) and the compressed bytes."""
         if self._pack is None:
             return "", raw
         packed = self._pack(raw)
@@ -83,35 +83,35 @@ class Packer:
 
 LIBRARY = f"{MAKER} {versions().get('cocoro-mesh', '')}".strip()
 LARGE_BYTES = 64 * 1024
-"""A payload from this size on gets a chunk of its own, so that readers of small things can pass it by."""
+"""A payload of this size or more gets a chunk of its own, so that readers of small messages can skip it."""
 FULL_BYTES = 512 * 1024
 """A chunk of small messages is closed at this size."""
 
 
 class _Chunk:
-    """A chunk that is being gathered."""
+    """The chunk that is being filled."""
 
     def __init__(self) -> None:
         self.parts: list[bytes] = []
         self.places: dict[int, list[int]] = defaultdict(list)
-        """By channel: log time and offset of one message after another."""
+        """Per channel: log time and offset, alternating, one pair per message."""
         self.size_bytes = 0
         self.start_ns = 0
         self.end_ns = 0
 
 
 class CaptureFile:
-    """Append to a new file. Raises OSError when the disk does not take it; the file then ends with its last whole
-    record, and can be read. One thread at a time, but for `fileno`."""
+    """Appends to a new file. Methods raise OSError when the disk refuses; the file then ends with its last complete
+    record and is readable. Not thread-safe, except `fileno`."""
 
     def __init__(self, path: Path, packer: Packer, profile: str = PROFILE) -> None:
-        """The file must not exist yet."""
+        """Raises FileExistsError when the file exists."""
         self.path = path
         self.size_bytes = 0
         self.raw_bytes = 0
-        """Size of the chunks before compression."""
+        """Uncompressed size of the chunks."""
         self.tallies: dict[int, KeyTally] = {}
-        """By channel."""
+        """By channel number."""
         self._packer = packer
         self._profile = profile
         self._fd = os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY | os.O_CLOEXEC, 0o644)
@@ -122,7 +122,7 @@ class CaptureFile:
         self._attached: list[AttachmentIndex] = []
         self._chunk = _Chunk()
         self._pending: list[bytes] = []
-        """Schemas and channels that the next chunk begins with."""
+        """Schemas and channels to write at the start of the next chunk."""
         try:
             self._write([mcap.MAGIC, packed(Header(profile, LIBRARY))])
         except OSError:
@@ -135,24 +135,24 @@ class CaptureFile:
 
     @property
     def attachments(self) -> int:
-        """How many it has."""
+        """Number of attachments."""
         return len(self._attached)
 
     def schema(self, schema: Schema) -> None:
-        """Make a schema known, before its first channel. One of an id that is known already is passed by."""
+        """Declare a schema before its first channel. A known id is ignored."""
         if schema.id not in self._schemas:
             self._schemas[schema.id] = schema
             self._pending.append(packed(schema))
 
     def channel(self, channel: Channel) -> None:
-        """Make a channel known, before its first message. One of an id that is known already is passed by."""
+        """Declare a channel before its first message. A known id is ignored."""
         if channel.id not in self._channels:
             self._channels[channel.id] = channel
             self.tallies[channel.id] = KeyTally()
             self._pending.append(packed(channel))
 
     def add(self, channel_id: int, sequence: int, log_ns: int, publish_ns: int, payload: bytes) -> None:
-        """A message of a channel that is known. Log times must not go back."""
+        """Add a message of a declared channel. Log times must not decrease."""
         head = message_head(channel_id, sequence & 0xFFFFFFFF, log_ns, max(publish_ns, 0) & (1 << 64) - 1, len(payload))
         self.tallies[channel_id].add(log_ns, len(payload))
         if len(payload) >= LARGE_BYTES:
@@ -175,15 +175,16 @@ class CaptureFile:
             self.flush()
 
     def flush(self) -> None:
-        """Give everything to the system: the death of this process loses nothing of it."""
+        """Hand everything to the operating system, so that the death of this process loses nothing of it."""
         chunk, self._chunk = self._chunk, _Chunk()
         if chunk.parts:
             self._write_chunk(b"".join(chunk.parts), chunk.places, chunk.start_ns, chunk.end_ns)
 
     def metadata(self, name: str, entries: Mapping[str, str]) -> None:
-        """Write a metadata record; by this project's conventions with a checksum over it, since MCAP gives it none."""
-        told = {**entries, CHECKSUM: checksum(entries)} if self._profile == PROFILE else dict(entries)
-        record = packed(Metadata(name, told))
+        """Write a metadata record, with a checksum where the file has this project's profile; MCAP itself has none for
+        metadata."""
+        written = {**entries, CHECKSUM: checksum(entries)} if self._profile == PROFILE else dict(entries)
+        record = packed(Metadata(name, written))
         self._metadata.append(MetadataIndex(self.size_bytes, len(record), name))
         self._write([record])
 
@@ -197,24 +198,24 @@ class CaptureFile:
         self._attached.append(index)
 
     def tally(self, dropped: Mapping[str, int], lost: Mapping[str, int]) -> None:
-        """Write what there is of each key, and what by key is missing; before `finish`."""
+        """Write the counts by channel, and the dropped and lost messages by key. To be called before `finish`."""
         self.flush()
         names = tally_names(self._channels)
-        told = {names[channel_id]: msgspec.to_builtins(tally) for channel_id, tally in self.tallies.items()}
-        entries = {"keys": json.dumps(told), "dropped": json.dumps(dict(dropped)), "lost": json.dumps(dict(lost))}
+        tallies = {names[channel_id]: msgspec.to_builtins(tally) for channel_id, tally in self.tallies.items()}
+        entries = {"keys": json.dumps(tallies), "dropped": json.dumps(dict(dropped)), "lost": json.dumps(dict(lost))}
         self.metadata(TALLY, entries)
 
     def finish(self) -> int:
-        """Make the file whole, with its summary. Returns its descriptor, to be synced and closed."""
+        """Write the summary and footer. Returns the file descriptor, which the caller syncs and closes."""
         self.flush()
-        if self._pending:  # of channels that have no messages
+        if self._pending:  # channels without messages
             self._write(self._pending)
             self._pending.clear()
         self._write(self._ending())
         return self._fd
 
     def abandon(self) -> None:
-        """Close the file as it is: readable, but without a summary."""
+        """Close the file as it is: readable, but without summary."""
         os.close(self._fd)
 
     # --- writing ----------------------------------------------------------------------------------
@@ -246,7 +247,7 @@ class CaptureFile:
         self.raw_bytes += len(raw)
 
     def _ending(self) -> list[bytes]:
-        end = packed(DataEnd(0))  # without a checksum over all the data: each chunk has its own
+        end = packed(DataEnd(0))  # no checksum over all data: each chunk has its own
         start = self.size_bytes + len(end)
         groups: list[tuple[Opcode, Sequence[McapRecord]]] = [
             (Opcode.SCHEMA, list(self._schemas.values())),
@@ -282,7 +283,7 @@ class CaptureFile:
         )
 
     def _write(self, parts: Sequence[bytes | memoryview]) -> None:
-        """All of it, or none: what the disk took of it before it refused is taken back."""
+        """Write all parts or none: on an error the file is cut back to its size before."""
         left = [memoryview(part) for part in parts if len(part)]
         try:
             while left:
@@ -299,7 +300,7 @@ class CaptureFile:
 
 
 def packed(*records: McapRecord) -> bytes:
-    """Records with their prefixes, one after another."""
+    """Encode records with their prefixes."""
     builder = RecordBuilder()
     for record in records:
         record.write(builder)
@@ -307,36 +308,32 @@ def packed(*records: McapRecord) -> bytes:
 
 
 def ended(builder: RecordBuilder) -> bytes:
-    """Take the bytes that a builder has gathered."""
+    """Returns the bytes that a builder has gathered, and empties it."""
     data: bytes = builder.end()
     return data
 
 
 def footer(summary: bytes, summary_start: int, offsets_start: int) -> bytes:
-    """`summary` is the whole of the summary section, whose checksum goes in here."""
+    """Encode the footer with the checksum of the whole summary section."""
     return packed(Footer(summary_start, offsets_start, mcap.footer_crc(summary, summary_start, offsets_start)))
 
 
 def message_head(channel_id: int, sequence: int, log_ns: int, publish_ns: int, payload_bytes: int) -> bytes:
-    """Pack the prefix and the fields of a message; the payload follows.
-
-    By hand: about 4 times as fast as the package on messages of 220 bytes.
-    """
+    """Encode a message's prefix and fields; the payload follows. About 4 times as fast as the package on messages of
+    220 bytes."""
     length = mcap.MESSAGE_FIELDS.size + payload_bytes
     return mcap.MESSAGE_HEAD.pack(Opcode.MESSAGE, length, channel_id, sequence, log_ns, publish_ns)
 
 
 def message_index(channel_id: int, entries: Sequence[int]) -> bytes:
-    """`entries` are log time and offset in the chunk's records before compression, of one message after another.
-
-    By hand: 9 times as fast as the package on indices of 20 messages.
-    """
+    """Encode a channel's message index. `entries` alternates log time and offset in the uncompressed chunk. 9 times as
+    fast as the package on indices of 20 messages."""
     content = struct.pack(f"<HI{len(entries)}Q", channel_id, 8 * len(entries), *entries)
     return mcap.PREFIX.pack(Opcode.MESSAGE_INDEX, len(content)) + content
 
 
 def chunk_head(head: mcap.ChunkHead) -> bytes:
-    """Pack a chunk's prefix and the fields before its records; the (packed) records follow."""
+    """Encode a chunk's prefix and head; the packed records follow."""
     name = head.compression.encode()
     fields = mcap.CHUNK_FIELDS.pack(head.start_ns, head.end_ns, head.raw_bytes, head.crc, len(name))
     content = fields + name + mcap.LENGTH.pack(head.packed_bytes)

@@ -1,4 +1,4 @@
-"""keys"""
+"""Which keys are recorded, and as what: key filter, channel information, lossy frames."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from cocoro.messages import Frame, Message
 from cocoro.topics import FRAME
 
 FRAMES = "frames"
-"""In place of a key expression: all that carries pictures."""
+"""Stands for all keys that carry pictures, in place of a key expression."""
 
 
 class KeyInfo(NamedTuple):
-    """What stands in a channel beside its key."""
+    """Encoding, schema and metadata of a channel."""
 
     encoding: str
     schema: TypeSchema | None
@@ -31,7 +31,7 @@ class KeyInfo(NamedTuple):
 
 
 def info_of(key: str, robot: str, payload: bytes | memoryview) -> KeyInfo:
-    """Of a key on the mesh: from the table of topics; what is not in it is judged by its first payload."""
+    """Channel information of a key: from the topic table, else guessed from the first payload."""
     topic = topic_named(key.removeprefix(f"{robot}/")) if key.startswith(f"{robot}/") else None
     if topic is not None:
         rate = "" if topic.rate_hz is None else f"{topic.rate_hz:g}"
@@ -59,9 +59,10 @@ def _encoding(payload: bytes | memoryview) -> str:
 
 
 class KeyFilter:
-    """Which keys an operator means: those of `only` (all, when there is none), but for those of `without`.
+    """The set of keys that an operator selects: those matching `only` (all when it is empty) except those matching
+    `without`.
 
-    Each is a key expression with or without the robot's name, or `frames`. Raises ConfigError for what is none.
+    Both are key expressions with or without the robot's name, or `frames`. Raises ConfigError for anything else.
     """
 
     def __init__(self, robot: str, only: Iterable[str] = (), without: Iterable[str] = ()) -> None:
@@ -86,17 +87,17 @@ _decoder = msgspec.msgpack.Decoder(Frame)
 
 
 def lossy(quality: int) -> Callable[[QueuedMessage], PreparedMessage]:
-    """Makes lossy frames of frames; everything else passes."""
+    """Returns a function that replaces frames by lossy frames of this JPEG quality and leaves other messages alone."""
 
-    def prepare(entry: QueuedMessage) -> PreparedMessage:
-        if not entry.key.endswith(f"/{FRAME.name}"):
-            return PreparedMessage(entry, None)
+    def prepare(message: QueuedMessage) -> PreparedMessage:
+        if not message.key.endswith(f"/{FRAME.name}"):
+            return PreparedMessage(message, None)
         try:
-            frame = _decoder.decode(entry.payload)
+            frame = _decoder.decode(message.payload)
         except (msgspec.MsgspecError, ValueError):
-            return PreparedMessage(entry, None)
+            return PreparedMessage(message, None)
         payload = msgspec.msgpack.encode(compress(frame, quality))
-        return PreparedMessage(entry._replace(payload=payload), schema_of(LossyFrame))
+        return PreparedMessage(message._replace(payload=payload), schema_of(LossyFrame))
 
     return prepare
 
@@ -124,14 +125,14 @@ class QueuedMessage(NamedTuple):
     publish_ns: int
     payload: bytes
     info: KeyInfo | None = None
-    """What to write of the key, where that is not to be seen from the payload."""
+    """Channel information, where the topic table and the payload do not give it."""
     channel: int | None = None
-    """A number, where the key may have several channels; it is not the number in the file."""
+    """Distinguishes several channels of one key. It is not the channel number in the file."""
 
 
 class PreparedMessage(NamedTuple):
-    """What is written in place of an entry."""
+    """A message as it is to be written."""
 
-    entry: QueuedMessage
+    message: QueuedMessage
     schema: TypeSchema | None
-    """In place of the key's own, where the payload is of another type now."""
+    """Schema of the payload where it differs from the key's."""

@@ -1,4 +1,5 @@
-"""The clock of a recording: Unix time when it begins, and from then on a clock that nobody sets."""
+"""The clock of log times: Unix time at the start of the recording, advanced by a clock that cannot be set
+(CLOCK_BOOTTIME)."""
 
 from __future__ import annotations
 
@@ -12,20 +13,20 @@ import msgspec
 from cocoro.clock import NS, steady_ns
 
 WALL_CLOCK = "wall_clock"
-"""The metadata record that tells how the wall clock was set while the recording went on."""
+"""Metadata record with the steps of the wall clock during the recording."""
 STEP_NS = NS // 100
-"""A wall clock that is off by less than this has not been set: the two clocks are not read in one moment."""
+"""A smaller offset is not a step of the wall clock: the two clocks are read one after the other."""
 TOGETHER_NS = NS // 1000
-"""Two readings further apart than this were not taken in one moment."""
+"""Two readings that took longer than this are useless for a comparison."""
 TRIES = 3
 KEPT_STEPS = 100
 
 
 class WallClockStep(msgspec.Struct, frozen=True):
-    """Somebody set the wall clock."""
+    """The wall clock was set."""
 
     log_ns: int
-    """Log time at which it was noticed."""
+    """Log time at which the step was noticed."""
     by_s: float
     """Positive: forward."""
 
@@ -34,11 +35,11 @@ class _Reading(NamedTuple):
     offset_ns: int
     """Wall clock minus boot time."""
     apart_ns: int
-    """How far off it may be."""
+    """Bound of the offset's error."""
 
 
 class LogClock:
-    """`at` gives a message its log time. `look` from time to time, to notice that the wall clock has been set."""
+    """Gives messages their log times by `at`. `look` must be called regularly, to notice steps of the wall clock."""
 
     def __init__(self, wall_ns: Callable[[], int] = time.time_ns, steady_ns: Callable[[], int] = steady_ns) -> None:
         self._wall_ns = wall_ns
@@ -48,14 +49,15 @@ class LogClock:
         self._count = 0
 
     def at(self, steady_ns: int) -> int:
-        """The log time, in nanoseconds, of what came in at a time of `steady_ns`."""
+        """The log time of a message that arrived at this time of `boottime_ns`, both in ns."""
         return steady_ns + self._start.offset_ns
 
     def now_ns(self) -> int:
         return self.at(self._steady_ns())
 
     def look(self) -> WallClockStep | None:
-        """How the wall clock was set since the last look; None when it was not, or when that cannot be told now."""
+        """The step of the wall clock since the last call; None without a step, or when the readings are too far apart
+        to tell."""
         reading = self._read()
         by_ns = reading.offset_ns - self._newest.offset_ns
         if reading.apart_ns > TOGETHER_NS or abs(by_ns) < STEP_NS:
@@ -67,7 +69,7 @@ class LogClock:
         return step
 
     def metadata(self) -> dict[str, str]:
-        """The record `WALL_CLOCK`, as it is to be written after each step."""
+        """The record `WALL_CLOCK`, to be written after each step."""
         return {
             "steps": json.dumps(msgspec.to_builtins(self._steps)),
             "count": str(self._count),

@@ -1,4 +1,5 @@
-"""Hears all that travels on one robot's mesh and hands it to a sink, with what happened besides."""
+"""Receives everything on one robot's mesh and hands it to a sink, with liveliness, configurations and wall-clock
+steps."""
 
 from __future__ import annotations
 
@@ -28,22 +29,22 @@ from services.capture.log_clock import WALL_CLOCK, LogClock, describe_step
 from services.capture.sink import RecordingProgress, RecordingSink
 from services.capture.writer import Missing, describe_disturbance
 
-TELL_S = 1.0
-"""How often the recorder tells how it is getting on."""
-TRIES, ASK_AGAIN_S = 10, 1.0
-"""How often a service is asked what it was started with, and how long after it did not answer."""
-LISTEN_S = 0.02
-"""How often what was heard is fetched; each message is stamped when it comes in."""
-LOOK_S = 0.1
-"""How often it looks whether a fault has come up, and whether somebody has set the wall clock."""
+REPORT_S = 1.0
+"""Period of the progress messages."""
+TRIES, RETRY_S = 10, 1.0
+"""How often a service is asked for its configuration, and the pause before the next try."""
+FETCH_S = 0.02
+"""Period at which received messages are fetched. Each was stamped on arrival."""
+POLL_S = 0.1
+"""Period of the checks for new faults and for steps of the wall clock."""
 
 
 class KeyCounts:
-    """How many messages of one key arrived, were lost on the way, and were dropped."""
+    """Messages of one key that arrived, were lost on the way, or were dropped."""
 
     def __init__(self, rate_hz: float) -> None:
-        """`rate_hz`: the nominal rate, by which a jump of the sequence numbers is judged."""
-        self.heard = 0
+        """`rate_hz` is the nominal rate; a jump of sequence numbers is judged by it."""
+        self.arrived = 0
         self.dropped = 0
         self._rate_hz = rate_hz
         self._source = SequenceTracker()
@@ -52,10 +53,10 @@ class KeyCounts:
     def lost(self) -> int:
         return self._source.gaps
 
-    def hear(self, head: MessageHead) -> bool:
-        """Count a message. Returns whether its sequence number can be right, by the rules of `cocoro.stream_checks`;
-        gaps before one that cannot are no losses."""
-        self.heard += 1
+    def count(self, head: MessageHead) -> bool:
+        """Count a message. Returns whether its sequence number is plausible by the rules of `cocoro.stream_checks`;
+        the gap before an implausible number is no loss."""
+        self.arrived += 1
         source = self._source
         if head.incarnation != source.incarnation:
             source.begin(head.incarnation)
@@ -76,7 +77,7 @@ def counts_of(key: str, robot: str) -> KeyCounts:
 
 
 class Ledger:
-    """The counts of every key that is recorded."""
+    """The counts of every recorded key."""
 
     def __init__(self, robot: str, chosen: KeyFilter) -> None:
         self._robot = robot
@@ -92,7 +93,7 @@ class Ledger:
         return self._counts[key]
 
     def missing(self) -> Missing:
-        """Keys with dropped or lost messages. Any thread may call this; the numbers may lag by a message."""
+        """Keys with dropped or lost messages. Thread-safe; the numbers may lag by a message."""
         counts = [(key, count) for key, count in list(self._counts.items()) if count is not None]
         return Missing(
             dropped={key: count.dropped for key, count in counts if count.dropped},
@@ -101,10 +102,11 @@ class Ledger:
 
 
 class Recorder:
-    """`start` it, and `tell` for ever; `close` takes its ears off the mesh, and `end` says how it went."""
+    """Usage: `start`, then `report` until cancelled, `close` to stop receiving, and `end` after the sink has been
+    closed."""
 
     def __init__(self, node: Node, ledger: Ledger, sink: RecordingSink, log_clock: LogClock | None) -> None:
-        """Without `log_clock`, log times are the node's (virtual) time."""
+        """Without `log_clock`, log times are the node's virtual time."""
         self._node = node
         self._ledger = ledger
         self._sink = sink
@@ -125,8 +127,8 @@ class Recorder:
         if left_out := unrecorded():
             self._node.log.info("not recorded, as declared: %s", ", ".join(left_out))
         self._remember_run()
-        # Nothing is dropped before this loop has seen it; the sink bounds what may wait.
-        self._handles.append(bus.listen(f"{robot}/**", self._on_lot, LISTEN_S))
+        # The bus drops nothing before this loop has fetched it; the sink limits what may wait.
+        self._handles.append(bus.listen(f"{robot}/**", self._on_batch, FETCH_S))
         self._handles.append(bus.watch_alive(f"{robot}/**", self._on_alive))
         self._handles.append(bus.declare_alive(recorder_key(robot, self._node.name)))
 
@@ -134,33 +136,33 @@ class Recorder:
         for handle in self._handles:
             handle.close()
 
-    async def tell(self) -> None:
-        """Say on the mesh how the recording goes, and at once when it has stopped."""
-        fault, told_s = "", -TELL_S
+    async def report(self) -> None:
+        """Publish progress every REPORT_S, and immediately after a new fault."""
+        fault, reported_s = "", -REPORT_S
         loop = asyncio.get_running_loop()
         while True:
             progress = self._sink.progress()
             if progress.fault != fault or progress.disturbed != self._disturbed:
-                fault, told_s = progress.fault, -TELL_S
-                self._complain(progress)
-            self._look_at_clock()
-            if loop.time() - told_s >= TELL_S:
-                told_s = loop.time()
-                self.say(ended=False)
-            await asyncio.sleep(LOOK_S)
+                fault, reported_s = progress.fault, -REPORT_S
+                self._report_faults(progress)
+            self._check_wall_clock()
+            if loop.time() - reported_s >= REPORT_S:
+                reported_s = loop.time()
+                self.publish_progress(ended=False)
+            await asyncio.sleep(POLL_S)
 
     def end(self) -> None:
-        """Say how it went, when the sink has been closed."""
+        """Log and publish the result, after the sink has been closed."""
         progress = self._sink.progress()
         if progress.disturbed != self._disturbed:
-            self._complain(progress)
+            self._report_faults(progress)
         self._node.log.info(
             "%d messages are recorded, the last of them in %s", progress.messages, progress.file or "no file"
         )
-        self.say(ended=True)
+        self.publish_progress(ended=True)
 
-    def _complain(self, progress: RecordingProgress) -> None:
-        """Have it known what is wrong, or has been."""
+    def _report_faults(self, progress: RecordingProgress) -> None:
+        """Log new faults and put all of them into the node's health."""
         for file in progress.disturbed:
             if file not in self._disturbed:
                 self._node.log.error("%s", describe_disturbance(file))
@@ -173,57 +175,57 @@ class Recorder:
         elif progress.removed:
             self._node.degraded("messages are lost")
 
-    def _look_at_clock(self) -> None:
-        """Note in the capture, and say, when somebody has set the wall clock."""
+    def _check_wall_clock(self) -> None:
+        """Write a step of the wall clock into the capture and the log."""
         step = None if self._log_clock is None else self._log_clock.look()
         if step is not None and self._log_clock is not None:
-            self._node.log.warning("the wall clock was %s: log times go on as if it had not been", describe_step(step))
+            self._node.log.warning("the wall clock was %s: log times are not affected", describe_step(step))
             self._sink.remember(WALL_CLOCK, self._log_clock.metadata())
 
-    def say(self, ended: bool) -> None:
-        """Say once how it goes, or how it went."""
+    def publish_progress(self, ended: bool) -> None:
+        """Publish the progress once."""
         missing, progress = self._ledger.missing(), self._sink.progress()
         self._node.publish(
             RECORDING.of(self._node.name),
             Recording(**progress._asdict(), dropped=dict(missing.dropped), lost=dict(missing.lost), ended=ended),
         )
 
-    # --- what is heard ----------------------------------------------------------------------------
+    # --- what is arrived ----------------------------------------------------------------------------
 
-    def _on_lot(self, lot: list[Received]) -> None:
-        for key, payload, heard_ns in lot:
+    def _on_batch(self, batch: list[Received]) -> None:
+        for key, payload, arrival_ns in batch:
             if key == self._clock_key:
-                self._tick(payload)
+                self._advance_clock(payload)
             counts = self._ledger.counts(key)
             if counts is None:
                 continue
             try:
                 head = self._head.decode(payload)
             except (msgspec.MsgspecError, ValueError, RecursionError):
-                head = MessageHead(seq=counts.heard)
-            counts.hear(head)
-            self._put(counts, key, head.seq, head.stamp_ns, payload, None, heard_ns)
+                head = MessageHead(seq=counts.arrived)
+            counts.count(head)
+            self._put(counts, key, head.seq, head.stamp_ns, payload, None, arrival_ns)
 
-    def _tick(self, payload: Payload) -> None:
-        """Who hears everything need not be woken for the time besides."""
+    def _advance_clock(self, payload: Payload) -> None:
+        """The recorder receives every key, so the clock needs no subscription."""
         if self._clock is None:
             return
         with suppress(msgspec.MsgspecError, ValueError, RecursionError):
-            time_is = self._time.decode(payload)
-            self._clock.tick(time_is.stamp_ns, time_is.incarnation, time_is.rate)
+            tick = self._time.decode(payload)
+            self._clock.tick(tick.stamp_ns, tick.incarnation, tick.rate)
 
     def _on_alive(self, key: str, alive: bool) -> None:
         counts = self._ledger.counts(key)
         changed, self._alive[key] = self._alive.get(key) != alive, alive
         if counts is not None and changed:
-            message = Alive(alive=alive, seq=counts.heard, stamp_ns=self._node.now_ns())
-            counts.heard += 1
+            message = Alive(alive=alive, seq=counts.arrived, stamp_ns=self._node.now_ns())
+            counts.arrived += 1
             data = msgspec.msgpack.encode(message)
             self._put(counts, key, message.seq, message.stamp_ns, data, ALIVE_INFO, None)
         _, _, rest = key.partition("/")
         service, _, what = rest.partition("/")
         if alive and what == "alive" and service != self._node.name:
-            self._node.spawn(self._ask(service))
+            self._node.spawn(self._ask_configuration(service))
 
     def _put(
         self,
@@ -233,38 +235,38 @@ class Recorder:
         stamp_ns: int,
         payload: Payload,
         info: KeyInfo | None,
-        heard_ns: int | None,
+        arrival_ns: int | None,
     ) -> None:
-        # When it was heard (None is now); each later than the last, so that the order can be told by it.
-        log_ns = self._newest_ns = max(self._log_ns(heard_ns), self._newest_ns + 1)
+        # Log times strictly increase, so that they give the order of arrival. Without `arrival_ns` the time is now.
+        log_ns = self._newest_ns = max(self._log_ns(arrival_ns), self._newest_ns + 1)
         data = payload if isinstance(payload, bytes) else bytes(payload)
         if not self._sink.offer(QueuedMessage(key, sequence, log_ns, stamp_ns or log_ns, data, info)):
             counts.dropped += 1
 
-    def _log_ns(self, heard_ns: int | None) -> int:
+    def _log_ns(self, arrival_ns: int | None) -> int:
         if self._log_clock is None:
             return self._node.now_ns()
-        return self._log_clock.now_ns() if heard_ns is None else self._log_clock.at(heard_ns)
+        return self._log_clock.now_ns() if arrival_ns is None else self._log_clock.at(arrival_ns)
 
-    # --- what is known besides --------------------------------------------------------------------
+    # --- metadata ----------------------------------------------------------------------------------
 
-    async def _ask(self, service: str) -> None:
-        """What a service that has come up was started with; again, when it is too busy to say so at once."""
+    async def _ask_configuration(self, service: str) -> None:
+        """Ask a service that has appeared for its configuration; retry while it is too busy to answer."""
         alive_at = alive_key(self._node.robot_name, service)
         for _ in range(TRIES):
             try:
                 reply = await self._node.call(ABOUT.of(service), AboutRequest())
             except RemoteError as error:
-                self._node.log.info("%s cannot say what it was started with: %s", service, error)
+                self._node.log.info("%s does not state its configuration: %s", service, error)
                 return
             except MeshError:
-                await asyncio.sleep(ASK_AGAIN_S)
+                await asyncio.sleep(RETRY_S)
                 if not self._alive.get(alive_at):
                     return
             else:
                 self._sink.remember(f"service/{service}", _entries(reply))
                 return
-        self._node.log.warning("%s does not say what it was started with", service)
+        self._node.log.warning("%s has not stated its configuration", service)
 
     def _remember_run(self) -> None:
         node, clock = self._node, self._log_clock
@@ -286,7 +288,7 @@ class Recorder:
 
 
 def _entries(about: AboutReply) -> dict[str, str]:
-    """As metadata: texts stay as they are, everything else is JSON."""
+    """As metadata: text as it is, everything else as JSON."""
     entries: dict[str, Any] = msgspec.to_builtins(about, builtin_types=(bytes,))
     for file in entries["files"]:
         file["content"] = base64.b64encode(file["content"]).decode()

@@ -1,4 +1,4 @@
-"""The recorder as a service."""
+"""The recorder as a service: file names, rotation limits and retention."""
 
 from __future__ import annotations
 
@@ -24,8 +24,10 @@ from services.capture.writer import MB, CaptureWriter, Limits, sync_and_close
 
 
 async def run(node: Node, config: CaptureConfig, log_clock: LogClock | None = None) -> None:
-    """Record until cancelled. A disk that does not take it is a fault that the mesh hears of, not the end. `log_clock`
-    is of use in real time alone, and made when there is none."""
+    """Record until cancelled. When the disk refuses, that is reported as a fault and the service keeps running.
+
+    `log_clock` is used in real time only; by default a new one.
+    """
     ledger = Ledger(node.robot_name, KeyFilter(node.robot_name, config.only, config.without))
     virtual = node.clock.virtual
     if virtual:
@@ -43,7 +45,7 @@ async def run(node: Node, config: CaptureConfig, log_clock: LogClock | None = No
     try:
         recorder.start()
         node.ready()
-        await recorder.tell()
+        await recorder.report()
     finally:
         recorder.close()
         if isinstance(sink, ThreadedSink):
@@ -74,7 +76,7 @@ def _writer(
 
 
 def _place(robot: str, config: CaptureConfig, started: datetime) -> Callable[[int], Path]:
-    """Where the nth file goes."""
+    """The path of the nth file, as a function of n from 1 on."""
     if config.file is not None:
         path = Path(config.file)
         return lambda _: path
@@ -91,7 +93,7 @@ def _place(robot: str, config: CaptureConfig, started: datetime) -> Callable[[in
 
 
 def file_name(robot: str, started: datetime, number: int) -> str:
-    """Of a run's nth file; names sort by time, as the wall clock told it when the run began."""
+    """The name of a run's nth file. Names sort by the wall clock's time at the start of the run."""
     return f"{_run(robot, started)}-{number:03}.mcap"
 
 
@@ -100,16 +102,17 @@ def _run(robot: str, started: datetime) -> str:
 
 
 def captures(folder: Path, robot: str) -> list[Path]:
-    """The files of these names, oldest first."""
+    """A robot's captures in a folder, oldest first."""
     pattern = re.compile(rf"{re.escape(robot)}-\d{{8}}T\d{{6}}Z-\d{{3,}}\.mcap")
     return sorted(path for path in folder.glob("*.mcap") if pattern.fullmatch(path.name))
 
 
 def make_room(folder: Path, robot: str, keep_bytes: int, started: datetime | None = None) -> list[Path]:
-    """Delete the oldest captures until the others take no more than this; never the newest. Returns those deleted.
+    """Delete the oldest captures until the others take at most `keep_bytes`, but never the newest one. Returns the
+    deleted.
 
-    The files of the run that goes on, begun at `started`, are the newest, in the order of their numbers, whatever the
-    wall clock said when the others were begun.
+    The current run's files, which began at `started`, count as the newest, in the order of their numbers, whatever
+    the wall clock said when others were begun.
     """
     own = "" if started is None else f"{_run(robot, started)}-"
     files = sorted(captures(folder, robot), key=lambda path: _age(path, own))
@@ -127,7 +130,7 @@ def make_room(folder: Path, robot: str, keep_bytes: int, started: datetime | Non
 
 
 def _age(path: Path, own: str) -> tuple[bool, int, str]:
-    """Sorts the oldest first."""
+    """Sort key, oldest first."""
     if own and path.name.startswith(own):
         return True, int(path.stem.rpartition("-")[2]), path.name
     return False, 0, path.name

@@ -1,4 +1,4 @@
-"""Where entries go: to the disk from a thread of its own, or, in virtual time, at once."""
+"""Queues between the recorder and the disk: a writer thread in real time, direct writing in virtual time."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from services.capture.writer import CaptureWriter
 log = logging.getLogger(__name__)
 
 POLL_S = 0.02
-"""How often the thread looks for entries: it takes many at once, and the loop never has to wake it."""
+"""Period at which the thread takes all queued messages, so that the loop never has to wake it."""
 RESERVE_BYTES = 16 * 1024 * 1024
-"""For small messages, when the large ones have filled the rest."""
+"""Room for small messages when large ones have filled the queue."""
 
 
 class RecordingProgress(NamedTuple):
@@ -33,26 +33,27 @@ class RecordingProgress(NamedTuple):
     waiting_bytes: int = 0
     longest_sync_ms: float = 0.0
     fault: str = ""
-    """Why nothing is written any more."""
+    """Why recording has stopped; '' while it works."""
     disturbed: tuple[DisturbedFile, ...] = ()
     removed: int = 0
 
 
 class RecordingSink(Protocol):
-    def offer(self, entry: QueuedMessage) -> bool:
-        """Whether it was taken; there may be no room. What comes after a fault is taken and forgotten."""
+    def offer(self, message: QueuedMessage) -> bool:
+        """Returns whether the message was taken; False when the queue is full. After a fault messages are taken and
+        discarded."""
 
     def remember(self, name: str, entries: Mapping[str, str]) -> None:
-        """Metadata of the run."""
+        """Write metadata of the run."""
 
     def progress(self) -> RecordingProgress: ...
 
     def close(self) -> None:
-        """Write what waits, and make the file whole. Blocks."""
+        """Write everything queued and complete the file. Blocks."""
 
 
 class DirectSink:
-    """Writes at once, for virtual time: there is no thread, and no hurry."""
+    """Writes each message directly, for virtual time."""
 
     def __init__(self, make: Callable[[Callable[[int], None] | None], CaptureWriter], flush_s: float) -> None:
         self._writer: CaptureWriter | None = None
@@ -62,12 +63,12 @@ class DirectSink:
         with self._guarded():
             self._writer = make(None)
 
-    def offer(self, entry: QueuedMessage) -> bool:
+    def offer(self, message: QueuedMessage) -> bool:
         if self._writer is not None and not self._fault:
             with self._guarded():
-                self._writer.put(entry)
-                if entry.log_ns - self._flushed_ns >= self._flush_ns:
-                    self._flushed_ns = entry.log_ns
+                self._writer.put(message)
+                if message.log_ns - self._flushed_ns >= self._flush_ns:
+                    self._flushed_ns = message.log_ns
                     self._writer.flush()
         return True
 
@@ -92,7 +93,7 @@ class DirectSink:
 
 
 class ThreadedSink:
-    """Keeps what is offered until its thread has written it, within a bound."""
+    """Queues messages, up to a limit, for a thread that writes them."""
 
     def __init__(
         self,
@@ -101,13 +102,13 @@ class ThreadedSink:
         flush_s: float,
         sync_s: float,
     ) -> None:
-        """`make(release)` opens the writer, in the thread: what is slow or fails there does not hold up the loop."""
+        """`make(release)` opens the writer. It runs in the thread, so that a slow disk does not block the loop."""
         self._make = make
         self._capacity_bytes = capacity_bytes
         self._flush_s = flush_s
         self._waiting: deque[QueuedMessage | tuple[str, Mapping[str, str]]] = deque()
-        self._taken_bytes = 0  # by the loop
-        self._done_bytes = 0  # by the thread: each number has one writer, so no lock is needed
+        self._taken_bytes = 0  # written by the loop only
+        self._done_bytes = 0  # written by the thread only, so no lock is needed
         self._fault = ""
         self._writer: CaptureWriter | None = None
         self._closing = threading.Event()
@@ -115,15 +116,15 @@ class ThreadedSink:
         self._thread = threading.Thread(target=self._run, name="capture writer", daemon=True)
         self._thread.start()
 
-    def offer(self, entry: QueuedMessage) -> bool:
+    def offer(self, message: QueuedMessage) -> bool:
         if self._fault:
             return True
-        size = len(entry.payload)
+        size = len(message.payload)
         room = self._capacity_bytes + (RESERVE_BYTES if size < LARGE_BYTES else 0)
         if self._taken_bytes - self._done_bytes + size > room:
             return False
         self._taken_bytes += size
-        self._waiting.append(entry)
+        self._waiting.append(message)
         return True
 
     def remember(self, name: str, entries: Mapping[str, str]) -> None:
@@ -157,7 +158,7 @@ class ThreadedSink:
                     return
 
     def _write(self, writer: CaptureWriter) -> None:
-        """What waits now; and flush meanwhile, when that is much."""
+        """Write the queued messages, with a flush whenever `flush_s` has passed."""
         flush_at_s = time.monotonic() + self._flush_s
         for _ in range(len(self._waiting)):
             item = self._waiting.popleft()
@@ -177,7 +178,7 @@ class ThreadedSink:
 
 
 class Syncer:
-    """Has the disk make sure of what it was given, again and again; in a thread of its own, since that takes long."""
+    """Calls fdatasync periodically, in a thread of its own because that blocks."""
 
     def __init__(
         self,
@@ -186,7 +187,7 @@ class Syncer:
         sync: Callable[[int], None] = os.fdatasync,
         wait: Callable[[threading.Event, float], bool] = threading.Event.wait,
     ) -> None:
-        """`current` tells the file that is being written."""
+        """`current` returns the descriptor of the open file."""
         self.longest_ms = 0.0
         self.count = 0
         self._period_s = period_s
@@ -201,7 +202,7 @@ class Syncer:
         self._thread.start()
 
     def release(self, fd: int) -> None:
-        """A file that is whole: sync it and close it, soon."""
+        """Take over a completed file: sync and close it soon."""
         self._whole.append(fd)
 
     def run(self) -> None:
@@ -212,9 +213,9 @@ class Syncer:
                 return
 
     def sync(self) -> None:
-        """Sync the current file, and those that are whole."""
+        """Sync the open file and the completed ones."""
         current = self._current()
-        with suppress(OSError):  # it has just been closed, and then it was released
+        with suppress(OSError):  # closed meanwhile, and so released to the queue below
             if current is not None:
                 fd = os.dup(current)
                 try:
@@ -229,7 +230,7 @@ class Syncer:
                 os.close(fd)
 
     def close(self) -> None:
-        """Sync what is left."""
+        """Sync the rest."""
         self._closing.set()
         if self._thread.is_alive():
             self._thread.join()
@@ -237,28 +238,28 @@ class Syncer:
 
     def _timed(self, fd: int) -> None:
         started = time.perf_counter()
-        with suppress(OSError):  # what the disk cannot keep, the writer will hear of
+        with suppress(OSError):  # the writer gets the same error
             self._sync(fd)
         self.count += 1
         self.longest_ms = max(self.longest_ms, (time.perf_counter() - started) * 1e3)
 
 
 class _FaultReporter:
-    """Turns a CaptureError into a fault that is told; so too a bug, so that the recorder says that it is dead."""
+    """Reports a CaptureError, or any other exception, as the recorder's fault, so that it does not die silently."""
 
-    def __init__(self, tell: Callable[[str], None]) -> None:
-        self._tell = tell
+    def __init__(self, report: Callable[[str], None]) -> None:
+        self._report = report
 
     def __enter__(self) -> None:
         return None
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> bool:
         if isinstance(error, CaptureError):
-            self._tell(f"recording has stopped: {error}")
+            self._report(f"recording has stopped: {error}")
             return True
         if isinstance(error, Exception):
             log.exception("the recorder has failed", exc_info=error)
-            self._tell(f"the recorder has failed: {type(error).__name__}: {error}")
+            self._report(f"the recorder has failed: {type(error).__name__}: {error}")
             return True
         return False
 

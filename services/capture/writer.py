@@ -1,4 +1,4 @@
-"""A run's captures: one MCAP file after another, each whole in itself, without a message lost in between."""
+"""Writes a run's captures: MCAP files one after another, each complete in itself, with no message lost in between."""
 
 from __future__ import annotations
 
@@ -20,22 +20,22 @@ from services.capture.keys import KeyInfo, PreparedMessage, QueuedMessage
 
 MB = 1_000_000
 LOOK_S = 1.0
-"""How often it is looked whether the file is still where it was made."""
+"""Period of the check whether the file is still at its path."""
 KEPT_DISTURBED = 20
 
 
 ChannelName = str | tuple[str, int]
-"""A channel of a writer: the key, or the key and a number where the key may have several."""
+"""Identifies a channel: the key, or key and number where a key has several channels."""
 
 
 @dataclass(frozen=True)
 class Limits:
-    """When a file is closed and the next one begun, and when to stop."""
+    """When the next file is begun, and when recording stops."""
 
     file_bytes: float = float("inf")
     file_s: float = float("inf")
     min_free_bytes: int = 0
-    """Recording stops when the disk has less room left, so that the robot has some."""
+    """Recording stops when the disk has less room left, to leave some for the robot."""
 
 
 def sync_and_close(fd: int) -> None:
@@ -46,15 +46,15 @@ def sync_and_close(fd: int) -> None:
 
 
 class Missing(NamedTuple):
-    """By key: what did not get into the captures."""
+    """Messages that are not in the captures, by key."""
 
     dropped: Mapping[str, int]
     lost: Mapping[str, int]
 
 
 class CaptureWriter:
-    """Takes entries in order of their log times. Raises CaptureError when the disk does not take them; what was
-    written until then is closed as well as can be, and the writer is of no more use."""
+    """Takes messages in the order of their log times. Raises CaptureError when the disk refuses; the file is then
+    closed as completely as possible, and the writer must not be used any more."""
 
     def __init__(
         self,
@@ -67,8 +67,8 @@ class CaptureWriter:
         prepare: Callable[[QueuedMessage], PreparedMessage] | None = None,
         monotonic_s: Callable[[], float] = time.monotonic,
     ) -> None:
-        """`place(n)` is the nth file's path, from 1 on; `info(key, payload)` says what to write of a key; `release`
-        gets the descriptor of a file that is whole; `prepare` may put something else in an entry's place."""
+        """`place(n)` is the path of the nth file, from 1 on. `info(key, payload)` gives a new channel's information.
+        `release` takes the descriptor of a completed file. `prepare` may replace each message."""
         self._place = place
         self._packer = packer
         self._limits = limits
@@ -82,22 +82,22 @@ class CaptureWriter:
         self._infos: dict[ChannelName, KeyInfo] = {}
         self._channels: dict[ChannelName, int] = {}
         self._schemas: dict[TypeSchema, int] = {}
-        """The numbers of channels and schemas in this file."""
+        """Numbers of channels and schemas in the current file."""
         self._number = 0
         self._first_ns: int | None = None
         self._closed_bytes = 0
         self._closed_raw_bytes = 0
         self._ended: CaptureFile | None = None
-        """The last one that is closed."""
+        """The file that was closed last."""
         self.messages = 0
-        """Written, but for those of files that were removed while they were being written."""
+        """Written messages, without those of files that were removed during recording."""
         self.removed = 0
-        """Those of such files."""
+        """Messages in files that were removed during recording."""
         self.disturbed: tuple[DisturbedFile, ...] = ()
-        """The newest of the files that were moved or removed while they were being written."""
+        """The newest files that were moved or removed during recording."""
         self.file = self._open()
         self.where = str(self.file.path)
-        """Where the file is that is being written, or was written last; '' when it is not on the disk any more."""
+        """Path of the current or last file; '' when it is no longer on the disk."""
 
     @property
     def size_bytes(self) -> int:
@@ -107,42 +107,42 @@ class CaptureWriter:
     def raw_bytes(self) -> int:
         return self._closed_raw_bytes + (0 if self._ended is self.file else self.file.raw_bytes)
 
-    def put(self, entry: QueuedMessage) -> None:
+    def put(self, message: QueuedMessage) -> None:
         if self._first_ns is None:
-            self._first_ns = entry.log_ns
+            self._first_ns = message.log_ns
         elif (
-            self.file.size_bytes >= self._limits.file_bytes or entry.log_ns - self._first_ns >= self._limits.file_s * NS
+            self.file.size_bytes >= self._limits.file_bytes
+            or message.log_ns - self._first_ns >= self._limits.file_s * NS
         ):
             self._rotate()
-            self._first_ns = entry.log_ns
+            self._first_ns = message.log_ns
         schema = None
         if self._prepare is not None:
-            entry, schema = self._prepare(entry)
+            message, schema = self._prepare(message)
         try:
-            name: ChannelName = entry.key if entry.channel is None else (entry.key, entry.channel)
-            channel = self._channels.get(name) or self._channel(name, entry, schema)
-            self.file.add(channel, entry.sequence, entry.log_ns, entry.publish_ns, entry.payload)
+            name: ChannelName = message.key if message.channel is None else (message.key, message.channel)
+            channel = self._channels.get(name) or self._channel(name, message, schema)
+            self.file.add(channel, message.sequence, message.log_ns, message.publish_ns, message.payload)
         except OSError as error:
             raise self._failed(error) from error
         self.messages += 1
 
-    def _channel(self, name: ChannelName, entry: QueuedMessage, schema: TypeSchema | None) -> int:
-        """Make a key known to the file."""
+    def _channel(self, name: ChannelName, message: QueuedMessage, schema: TypeSchema | None) -> int:
+        """Declare a channel in the current file."""
         info = self._infos.get(name)
         if info is None:
-            info = entry.info or self._info(entry.key, entry.payload)
+            info = message.info or self._info(message.key, message.payload)
             info = self._infos[name] = info if schema is None else info._replace(schema=schema)
         schema_id = 0
         if info.schema is not None:
             schema_id = self._schemas.setdefault(info.schema, len(self._schemas) + 1)
             self.file.schema(Schema(schema_id, info.schema.data, info.schema.encoding, info.schema.name))
         channel = self._channels[name] = len(self._channels) + 1
-        self.file.channel(Channel(channel, entry.key, info.encoding, info.metadata, schema_id))
+        self.file.channel(Channel(channel, message.key, info.encoding, info.metadata, schema_id))
         return channel
 
     def flush(self) -> None:
-        """Give everything to the system; and see whether the file is still where it was made, and whether the disk has
-        room for more."""
+        """Hand everything to the operating system; check that the file is at its path and the disk has room."""
         try:
             self.file.flush()
             self._look()
@@ -157,7 +157,7 @@ class CaptureWriter:
             )
 
     def remember(self, name: str, entries: Mapping[str, str]) -> None:
-        """Metadata for this file and those that follow. What is remembered already is not written again."""
+        """Write metadata into this file and all later ones. Unchanged metadata is not written again."""
         if self._metadata.get(name) == entries:
             return
         self._metadata[name] = dict(entries)
@@ -167,15 +167,15 @@ class CaptureWriter:
             raise self._failed(error) from error
 
     def close(self) -> None:
-        """Make the file whole."""
+        """Complete the file."""
         try:
             self._finish(self.file)
         except OSError as error:
             self._abandon(self.file)
-            raise _told(error, self.file.path) from error
+            raise _error(error, self.file.path) from error
 
     def _look(self) -> None:
-        """Go on in a new file when somebody has moved or removed this one."""
+        """Begin a new file when the current one was moved or removed."""
         now_s = self._monotonic_s()
         if now_s < self._look_at_s:
             return
@@ -194,7 +194,7 @@ class CaptureWriter:
             except FileExistsError:
                 if self._place(self._number + 1) == path:
                     raise
-                return self._open()  # another recorder, begun in the same moment, has taken the name
+                return self._open()  # another recorder that began at the same time has this name
             try:
                 for name, entries in self._metadata.items():
                     file.metadata(name, entries)
@@ -203,11 +203,11 @@ class CaptureWriter:
                 file.abandon()
                 raise
         except OSError as error:
-            raise _told(error, path) from error
+            raise _error(error, path) from error
         return file
 
     def _rotate(self) -> None:
-        """The next file stands before the last one ends."""
+        """Open the next file before the current one is closed, so that no message is lost."""
         before = self.file
         try:
             after = self._open()
@@ -234,7 +234,7 @@ class CaptureWriter:
         file.abandon()
 
     def _account(self, file: CaptureFile) -> None:
-        """See, once, what has become of a file that gets no more, before it is closed."""
+        """Find out, once, where a file is before it is closed, and update the counts."""
         if self._ended is file:
             return
         found = locate(file.path, file.fileno())
@@ -252,20 +252,20 @@ class CaptureWriter:
             self.disturbed = (*self.disturbed, disturbed)[-KEPT_DISTURBED:]
 
     def _failed(self, error: OSError) -> CaptureError:
-        """Leave the file as good as it can be."""
+        """Complete the file as far as possible."""
         try:
             self._finish(self.file)
         except OSError:
             self._abandon(self.file)
-        return _told(error, self.file.path)
+        return _error(error, self.file.path)
 
 
-def _told(error: OSError, path: Path) -> CaptureError:
+def _error(error: OSError, path: Path) -> CaptureError:
     return CaptureError(f"{path}: {error.strerror or error}")
 
 
 def _sync_folder(folder: Path) -> None:
-    """A new file's name is lost with the power as its bytes are."""
+    """Makes the new file's directory message survive a loss of power."""
     fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(fd)
@@ -276,29 +276,29 @@ def _sync_folder(folder: Path) -> None:
 class FileLocation(NamedTuple):
     state: Literal["there", "moved", "removed"]
     path: str
-    """Where it is; '' when it was removed, or when the system does not tell where it was moved."""
+    """The current path; '' when the file was removed, or the system does not know where it was moved."""
 
 
 def locate(path: Path, fd: int) -> FileLocation:
-    """Whether the file that is open as `fd` still has its path. A move to another disk is a copy and a removal, and so
-    it looks here: the copy may lack what was written last."""
+    """Whether the open file `fd` is still at its path. A move to another disk is a copy and a removal, and is reported
+    as a removal: the copy may lack what was written last."""
     mine = os.fstat(fd)
     try:
         if os.path.samestat(path.stat(), mine):
             return FileLocation("there", str(path))
     except (FileNotFoundError, NotADirectoryError):
         pass
-    except OSError:  # a folder that must not be looked into, a disk that does not answer: nothing is known
+    except OSError:  # no permission, or the disk does not answer: assume that it is there
         return FileLocation("there", str(path))
     now = _name(fd, mine)
-    # A network file system keeps what is removed under such a name for as long as it is open.
+    # A network file system keeps a removed file under such a name while it is open.
     if mine.st_nlink == 0 or Path(now).name.startswith(".nfs"):
         return FileLocation("removed", "")
     return FileLocation("moved", now)
 
 
 def describe_disturbance(file: DisturbedFile) -> str:
-    """A line for people."""
+    """One line for an operator."""
     if file.became == "removed":
         return (
             f"{file.file} was removed (or moved to another disk) while it was recorded: {file.lost} messages are lost"
@@ -308,7 +308,7 @@ def describe_disturbance(file: DisturbedFile) -> str:
 
 
 def _name(fd: int, mine: os.stat_result) -> str:
-    """The name that the system knows a descriptor's file by; '' when that is not the file's name any more."""
+    """The name that the system has for an open descriptor; '' when another file has that name now."""
     try:
         name = Path(f"/proc/self/fd/{fd}").readlink()
         return str(name) if os.path.samestat(name.stat(), mine) else ""

@@ -8,7 +8,7 @@ from typing import Any
 
 from cocoro import topics
 from cocoro.clock import NS
-from cocoro.latch import LatchKeeper
+from cocoro.latch import ServiceLatch
 from cocoro.messages import BaseState, Latch, LatchState, ServoState
 from cocoro.node import Node
 from cocoro.topics import Topic
@@ -34,7 +34,7 @@ class Estop:
         self._heard: dict[str, LatchState] = {}
         self._all_unknown_since_ns: int | None = None
         self._said: LatchState = "unknown"
-        self._keeper = LatchKeeper(node, self._turned, follows=False)
+        self._keeper = ServiceLatch(node, self._turned, follows=False)
         for service, topic in _STATES.items():
             node.on(topic, partial(self._hardware, service))
         node.spawn(self._tell(rate_hz))
@@ -52,20 +52,20 @@ class Estop:
         latch = state.latch
         self._heard[service] = latch
         if latch == "latched":
-            self._keeper.word("latched", f"{service}, which was latched already")
+            self._keeper.follow("latched", f"{service}, which was latched already")
         elif self._said == "unknown" and set(self._heard) == set(_STATES):
             said = set(self._heard.values())
             if said == {"unknown"}:
                 self._nobody_knows()
             elif "latched" not in said:
-                self._keeper.word("released", next(name for name, one in self._heard.items() if one == "released"))
+                self._keeper.follow("released", next(name for name, one in self._heard.items() if one == "released"))
 
     def _nobody_knows(self) -> None:
         now_ns = self._node.now_ns()
         if self._all_unknown_since_ns is None or now_ns < self._all_unknown_since_ns:
             self._all_unknown_since_ns = now_ns
         elif now_ns - self._all_unknown_since_ns > _COLD_START_NS:
-            self._keeper.word("released", "cold start")
+            self._keeper.follow("released", "cold start")
 
     def _turned(self, state: LatchState, by: str) -> None:
         if state != self._said:

@@ -1,6 +1,6 @@
-"""Perception: which known objects a frame shows, and where they stand in the body frame.
+"""Perception: finds the known objects in each frame, and their positions in the body frame.
 
-`image` a frame as arrays, with its depth registered where it is asked for; `colours` which objects' colour a
-pixel has; `blob` and `paper` the detectors; `shapes` and `localise` from pixels and depth to the
-object's centre; `core` the service's maths over time; `service` its shell.
+`image`: a frame as arrays, depth registered on demand, and what detectors return. `colours`: which objects' colours
+each pixel has. `blob` and `paper`: the detectors. `shapes` and `localise`: from pixels and depth to an object's
+centre. `floor`: obstacles and free floor. `core`: the service's computation. `service`: its shell.
 """

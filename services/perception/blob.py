@@ -1,8 +1,8 @@
-"""The default detector: one connected blob of the object's colour, of a size that fits its distance.
+"""The default detector: finds one connected blob of the object's colour whose size fits its distance.
 
-What it does where the paper's fails: a second region of the same colour does not pull the centroid; noise and
-specks are cleaned away; depth is registered and comes from a robust window; a patch or a wall of the right
-colour has the wrong size; and colour without depth is said to have none.
+Compared with the paper's detector: a second region of the same colour does not shift the centroid; noise is
+removed; depth is registered and is the median of a window; patches and walls of the right colour are rejected by
+size; a blob without depth is reported without depth.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ from cocoro.arrays import MaskArray
 from cocoro.objects import Catalogue, ObjectSpec
 from services.perception.colours import ColourTable
 from services.perception.config import PerceptionConfig
-from services.perception.image import PixelBox, RgbdImage
+from services.perception.image import ImageSighting, PixelBox, RgbdImage
 from services.perception.region import ColourRegion, components
 from services.perception.shapes import area_range_m2, counted_px, reach_m
-from services.perception.sighting import ImageSighting
 
 NEAREST_M = 0.3
-"""A blob without depth is no larger than the object is from here: nearer, little of it fits into the image."""
+"""The size limit of a blob without depth is the object's size at this distance. Nearer objects hardly fit into the
+image."""
 MAX_STRETCH = 1.5
-"""Of a blob's diagonal, over that of the whole object's outline."""
+"""Largest ratio of a blob's diagonal to that of the whole object's outline."""
 
 
 class BlobDetector:
@@ -35,7 +35,7 @@ class BlobDetector:
 
     def detect(self, image: RgbdImage) -> list[ImageSighting]:
         classes = self._table.classify(image.colour)
-        # Which rows and columns have a pixel of which object: one pass for all of them.
+        # Rows and columns that contain each object's colours, in one pass for all objects.
         rows, columns = np.bitwise_or.reduce(classes, axis=1), np.bitwise_or.reduce(classes, axis=0)
         sightings = []
         for bit, known in enumerate(self._catalogue):
@@ -52,11 +52,12 @@ class BlobDetector:
     def _find(
         self, known: ObjectSpec, mask: MaskArray, origin: tuple[int, int], image: RgbdImage
     ) -> ImageSighting | None:
-        """The object in the part of the image whose first pixel is `origin` and whose matching pixels are `mask`."""
+        """Find one object. `mask` has its matching pixels, shape (height, width), and covers the part of the image
+        whose first pixel is `origin`, (column, row)."""
         parts = _clean_components(mask, origin, image, self._config.min_area_px * image.scale**2)
         if not parts:
             return None
-        fit = _Fit(known, image, self._config)
+        fit = _SizeFit(known, image, self._config)
         regions: list[ColourRegion] = []
         plausible: list[ColourRegion] = []
         for part in parts:
@@ -85,8 +86,8 @@ class BlobDetector:
         )
 
 
-class _Fit:
-    """How well a region's size goes with one known object at the region's own distance."""
+class _SizeFit:
+    """Compares a region's size with that of one known object at the region's distance."""
 
     def __init__(self, known: ObjectSpec, image: RgbdImage, config: PerceptionConfig) -> None:
         camera = image.camera
@@ -109,31 +110,31 @@ class _Fit:
         return region.area_px > most or region.diagonal_px > self._diagonal_px(depth_m)
 
     def whole(self, region: ColourRegion) -> bool:
-        """It may be the whole object; without depth, for all that is known."""
+        """Whether it may be the whole object. A region without depth passes if it is not too large."""
         if region.area_px < self._min_area_px or self.too_large(region):
             return False
         return not self.too_small(region, self._config.min_share)
 
     def partly_hidden(self, region: ColourRegion) -> bool:
-        """It may be a part of the object, whose rest the image's edge or something nearer hides."""
+        """Whether it may be part of the object, with the rest beyond the image's edge or behind something nearer."""
         if region.area_px < 2 * self._min_area_px or self.too_small(region, self._config.min_hidden_share):
             return False
         return region.cut or region.hidden
 
     def too_small(self, region: ColourRegion, share: float = 0.85) -> bool:
-        """It has a smaller share of the pixels that the whole object would have at that depth."""
+        """Whether it has less than `share` of the pixels that the whole object would have at its depth."""
         return region.depth_m is not None and region.area_px < share * self._pixels(self._least_m2, region.depth_m)
 
     def score(self, region: ColourRegion) -> tuple[bool, float, int]:
-        """Greater is better: with depth before without, then by how near it comes to the expected size."""
+        """Greater is better: regions with depth first, then those closest to the expected size."""
         if region.depth_m is None:
             return False, 0.0, region.area_px
         expected_px = self._pixels(sqrt(self._least_m2 * self._greatest_m2), region.depth_m)
-        # Half-octave steps: among those of about the right size the larger, that is nearer, one wins.
+        # In half-octave steps, so that among regions of about the right size the largest, the nearest, wins.
         return True, -round(2 * abs(log(region.area_px / expected_px, 2))), region.area_px
 
     def completed(self, best: ColourRegion, regions: list[ColourRegion]) -> ColourRegion:
-        """With the other pieces of the same object, where something before it parts it in two."""
+        """The region joined with other pieces of the same object, which something in front of it separates."""
         for other in regions:
             if other is best or best.depth_m is None or other.depth_m is None:
                 continue
@@ -147,7 +148,7 @@ class _Fit:
 def _clean_components(
     mask: MaskArray, origin: tuple[int, int], image: RgbdImage, min_area_px: float
 ) -> list[tuple[MaskArray, PixelBox]]:
-    """The mask's connected regions, after specks and threads of noise are opened away."""
+    """The mask's connected regions, after opening has removed specks and threads of noise."""
     if cv2.countNonZero(mask) < min_area_px:
         return []
     opened = cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((3, 3), dtype=np.uint8))

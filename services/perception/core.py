@@ -1,4 +1,4 @@
-"""Perception's pure core: frames and head angles in, detections out, fused by the frame's stamp."""
+"""Perception's pure core: turns frames and head angles into detections, fused by the frame's stamp."""
 
 from __future__ import annotations
 
@@ -17,21 +17,20 @@ from cocoro.topics import ARM_STATE, DETECTIONS, FRAME, OBSTACLES, Topic
 from services.perception.blob import BlobDetector
 from services.perception.config import PerceptionConfig
 from services.perception.floor import FloorScanner
-from services.perception.image import RgbdImage
+from services.perception.image import Detector, ImageSighting, RgbdImage
 from services.perception.localise import Localiser
 from services.perception.paper import PaperDetector
-from services.perception.sighting import Detector, ImageSighting
 
 NS = 1_000_000_000
 MAX_PENDING = 8
-"""Frames that wait for head angles; one more and the oldest goes out without."""
+"""Frames that may wait for head angles. Beyond it the oldest is published without positions."""
 
 DETECTORS: dict[str, Callable[[Catalogue, PerceptionConfig], Detector]] = {"blob": BlobDetector, "paper": PaperDetector}
 
 
 @dataclass(frozen=True)
 class _Pending:
-    """What was seen in one frame, until the head angles of its stamp are known. The pixels are not kept."""
+    """The sightings of one frame, which waits for the head angles of its stamp. Its pixels are not kept."""
 
     stamp_ns: int
     frame_seq: int
@@ -39,15 +38,15 @@ class _Pending:
     camera: Camera
     sightings: tuple[ImageSighting, ...]
     floor_depth_m: Float32Array | None
-    """The depth on a coarse grid, where the floor is due to be scanned."""
+    """Depth on a coarse grid, m, shape (rows, columns); None when no floor scan is due."""
     deadline_ns: int
 
 
 class PerceptionCore:
-    """Detects at once when a frame arrives; localises with the head angles interpolated at the frame's stamp.
+    """Detects when a frame arrives, and localises with the head angles interpolated at the frame's stamp.
 
-    A frame that arrives before the arm's state has passed its stamp waits, `bracket_wait_s` at most by the
-    steps' now; then its detections go out without positions. Detections go out in the order of their frames.
+    A frame whose stamp is newer than the arm's last state waits, at most `bracket_wait_s`; then its detections are
+    published without positions. Detections are published in the order of their frames.
     """
 
     def __init__(self, robot: Robot, config: PerceptionConfig, catalogue: Catalogue) -> None:
@@ -62,9 +61,9 @@ class PerceptionCore:
         self._floor_ns: int | None = None
         self._now_ns = 0
         self.stale_frames = 0
-        """Frames that were too old when they came, and were not looked at."""
+        """Frames that were ignored because they were too old."""
         self.unlocalised_frames = 0
-        """Frames whose detections went out without head angles."""
+        """Frames whose detections were published without head angles."""
 
     @property
     def reads(self) -> Mapping[Topic[Any], Take]:
@@ -75,7 +74,7 @@ class PerceptionCore:
         return Schedule(rate_hz=None, triggers=(FRAME, ARM_STATE))
 
     def step(self, inputs: Sequence[Sample], now_ns: int) -> Sequence[Output]:
-        if now_ns < self._now_ns:  # a new epoch of the clock: what was before means nothing now
+        if now_ns < self._now_ns:  # the clock restarted: the earlier epoch's data are meaningless
             self._pending.clear()
             self._head.clear()
             self._floor_ns = None

@@ -1,7 +1,8 @@
-"""What stands on the floor and where it is free, from one depth image.
+"""Finds obstacles and free floor in a depth image.
 
-Each depth pixel of a coarse grid becomes a point of the body frame; near the floor's height it is floor, above it
-something stands. The tolerance grows with the distance as the sensor's noise and the head angles' error do (derived).
+Each depth pixel of a coarse grid becomes a point in the body frame. Near the floor's height it is floor, above it
+an obstacle. The tolerance grows with the distance, as the sensor's noise and the error of the head angles do
+(derived).
 """
 
 from __future__ import annotations
@@ -17,9 +18,9 @@ from services.perception.image import RgbdImage
 CELL_M = 0.04
 _RAY_DEG = 2.0
 _BEFORE_M = 0.06
-"""Free floor ends so much before what stands in it."""
+"""Free floor ends this far before an obstacle."""
 _MIN_POINTS = 2
-"""A single point above the floor is noise."""
+"""Fewer points above the floor in a cell are noise."""
 _MOST_CELLS = 600
 _RAYS = round(360 / _RAY_DEG)
 
@@ -32,13 +33,16 @@ class FloorScanner:
         self._directions: dict[tuple[int, int], FloatArray] = {}
 
     def sample(self, image: RgbdImage) -> Float32Array:
-        """Depth, metres, on a coarse grid (80 x 60 whatever the resolution); NaN without data. Kept until the head
-        angles of the frame are known."""
+        """Depth on a coarse grid of 80 x 60 pixels at any resolution, m, shape (rows, columns); NaN without data."""
         step = max(image.width // 80, 1)
         return self._robot.depth_m(image.raw_depth[step // 2 :: step, step // 2 :: step])
 
     def scan(self, depth_m: Float32Array, width: int, height: int, camera_pose: FloatArray) -> Obstacles:
-        """The message, its stamp left to the caller. `camera_pose`: colour camera in the body frame, 4 x 4."""
+        """Obstacles and free floor in the body frame, without a stamp.
+
+        `depth_m` is from `sample`, m, shape (rows, columns), of a frame of `width` x `height` pixels. `camera_pose`
+        is the colour camera's pose in the body frame, 4 x 4, m.
+        """
         config = self._config
         rotation = camera_pose[:3, :3]
         origin = camera_pose[:3, 3] + rotation @ self._offset_m
@@ -65,7 +69,7 @@ class FloorScanner:
         )
 
     def _rays(self, shape: tuple[int, ...], width: int, height: int) -> FloatArray:
-        """Directions of the grid's pixels, depth camera's frame, z = 1; shape (rows, columns, 3)."""
+        """Directions of the grid's pixels in the depth camera's frame, z = 1, shape (rows, columns, 3)."""
         rays = self._directions.get((width, height))
         if rays is None:
             camera = self._robot.camera.scaled(width, height)
@@ -77,7 +81,8 @@ class FloorScanner:
 
 
 def _cells(points: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Middles (n, 2) of the floor cells in which enough points stand, and the highest point in each, (n,)."""
+    """Centres of the floor cells with enough points, m, shape (n, 2), and the highest point in each, m, shape (n,).
+    `points` has shape (k, 3), m."""
     if not len(points):
         return np.zeros((0, 2)), np.zeros(0)
     numbers, inverse, counts = np.unique(
@@ -92,7 +97,8 @@ def _cells(points: FloatArray) -> tuple[FloatArray, FloatArray]:
 def _free(
     ray: IntArray, distance: FloatArray, floor: BoolArray, standing: BoolArray
 ) -> tuple[tuple[float, float, float], ...]:
-    """Bearing, nearest and farthest floor of each ray, ended before the first thing that stands on it."""
+    """Bearing, rad, and the nearest and farthest free floor, m, of each ray with floor; a ray ends before the first
+    obstacle."""
     nearest, farthest = np.full(_RAYS, np.inf), np.zeros(_RAYS)
     np.minimum.at(nearest, ray[floor], distance[floor])
     np.maximum.at(farthest, ray[floor], distance[floor])

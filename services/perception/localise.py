@@ -1,8 +1,8 @@
-"""From what a detector saw to where the object stands in the body frame.
+"""Computes an object's position in the body frame from a sighting.
 
-The visible surface is not the object: a can's visible centroid stands 19 to 33 mm before its axis, and moves by 5
-to 10 mm when a hand comes before it. So the known shape is fitted, upright, to the surface points that are
-visible, and to the rays beside it that are known to pass freely. Hidden parts say nothing and shift nothing.
+The visible surface is not the object: the visible centroid of a can is 19 to 33 mm in front of its axis, and moves
+by 5 to 10 mm when a hand is in front of it. So the upright known shape is fitted to the visible surface points and
+to the rays beside it that are known to be free. Hidden parts are no evidence and shift nothing.
 """
 
 from __future__ import annotations
@@ -18,27 +18,26 @@ from cocoro.messages import Detection
 from cocoro.objects import Catalogue, ObjectSpec
 from cocoro.robot import Camera, Robot
 from cocoro.units import Vec3
-from services.perception.image import PixelBox
+from services.perception.image import Evidence, ImageSighting, PixelBox
 from services.perception.region import depth_doubt_m
 from services.perception.shapes import counted_px, distance_from, reach_m, seen_area_m2, signed_distance
-from services.perception.sighting import Evidence, ImageSighting
 
 ITERATIONS = 12
 SETTLED_M = 1e-4
 MIN_SURFACE_POINTS = 12
 PRIOR = np.eye(3) / 0.05**2
-"""The first guess, the surface pushed inwards, may be 5 cm off: it settles only what no evidence does."""
+"""Inverse covariance of the first guess, 1/m2: it may be 5 cm off and decides only what the evidence leaves open."""
 RAY_SAMPLES = 5
 RAY_DOUBT_M, RAY_DOUBT_RAD = 0.001, 0.002
-"""How far the outline may be off: at a distance about a pixel."""
+"""Standard deviation of the outline: a constant, and about a pixel at the object's distance."""
 HUBER = 1.5
 SAME_PLACE = 0.5
-"""Overlap of two boxes, common area over area together."""
+"""Overlap of two boxes (intersection over union) from which they show one place."""
 UNDER_FLOOR_M, UNDER_FLOOR_PER_M = 0.03, 0.03
-"""How far under the floor something may seem to reach: where it is, and more at a distance, since the camera's
-mounting is not known exactly."""
+"""How far below the floor an object may seem to reach, as a constant and per distance, since the camera's mounting is
+not known exactly."""
 SIZE_DOUBT = 0.2
-"""How far the number of pixels may be off, as a share (its logarithm), where nothing hides any."""
+"""Standard deviation of the logarithm of the pixel count of an object that is not hidden."""
 
 
 class Localiser:
@@ -47,19 +46,21 @@ class Localiser:
         self._chain = robot.chain("camera")
         self._occluded_share = occluded_share
         self.joints = self._chain.joints
-        """The head's joints, in the order of `camera_pose`'s angles."""
+        """The head's joints, in the order of the angles for `camera_pose`."""
 
     def camera_pose(self, angles_rad: FloatArray) -> FloatArray:
-        """4 x 4, camera frame (x right, y down, z forward) to body frame."""
+        """The pose of the camera's frame (x right, y down, z forward) in the body frame, 4 x 4, m. `angles_rad` has
+        shape (joints,)."""
         return self._chain.pose(dict(zip(self.joints, angles_rad, strict=True)))
 
     def locate(
         self, sightings: Sequence[ImageSighting], camera: Camera, angles_rad: FloatArray | None
     ) -> list[Detection]:
-        """The detections as they are published: with the centre's position, or with a note of why there is none.
+        """Detections with the centre's position in the body frame, or with a note why there is none. `angles_rad` has
+        shape (joints,); None when the head angles are unknown.
 
-        Where two objects share a colour, both may have been sighted in one place: the one stays whose shape and size
-        go better with it.
+        Of two objects with a common colour that are seen in one place, the one stays whose shape and size fit
+        better.
         """
         pose = None if angles_rad is None else self.camera_pose(angles_rad)
         placed = [self._place(sighting, camera, pose) for sighting in sightings]
@@ -70,7 +71,7 @@ class Localiser:
         ]
 
     def _underground(self, detection: Detection) -> bool:
-        """It is a part of something that is taken for the part of another thing, which would reach into the floor."""
+        """Whether the object would reach below the floor: then it is part of another, larger thing of its colour."""
         if detection.position_m is None or not detection.note:
             return False
         x, y, z = detection.position_m
@@ -79,7 +80,7 @@ class Localiser:
 
     def _place(self, sighting: ImageSighting, camera: Camera, pose: FloatArray | None) -> _Placed:
         position: Vec3 | None = None
-        fit: _Fit | None = None
+        fit: _ShapeFit | None = None
         note = ""
         if sighting.depth_m is None:
             note = "no depth"
@@ -98,7 +99,7 @@ class Localiser:
             if evidence is not None:
                 whole = not (sighting.cut or sighting.hidden)
                 size_misfit = _size_misfit(sighting.area_px, least_px, most_px) if whole else 0.0
-                fit = _Fit(misfit, size_misfit, evidence.count)
+                fit = _ShapeFit(misfit, size_misfit, evidence.count)
             occluded = sighting.area_px < self._occluded_share * least_px
             note = "cut" if sighting.cut else "occluded" if occluded else ""
         detection = Detection(
@@ -114,21 +115,21 @@ class Localiser:
         return _Placed(detection, fit)
 
 
-class _Fit(NamedTuple):
+class _ShapeFit(NamedTuple):
     misfit: float
-    """Of one piece of evidence, in the mean: half the squared residual against its own doubt, Huber's beyond some."""
+    """Mean misfit per piece of evidence: half the squared residual over its standard deviation, by Huber's loss."""
     size_misfit: float
-    """Of the number of pixels, likewise."""
+    """The same for the pixel count."""
     pieces: int
 
 
 class _Placed(NamedTuple):
     detection: Detection
-    fit: _Fit | None
-    """None where no shape was fitted."""
+    fit: _ShapeFit | None
+    """None when no shape was fitted."""
 
     def displaces(self, other: _Placed) -> bool:
-        """It is another object in the same place, and goes better with what is seen there."""
+        """Whether this is another object in the same place that fits better."""
         if self is other or self.fit is None or other.fit is None:
             return False
         if _overlap(self.detection.box_px, other.detection.box_px) < SAME_PLACE:
@@ -143,16 +144,18 @@ def _size_misfit(area_px: float, least_px: float, most_px: float) -> float:
 
 
 def _overlap(a: PixelBox, b: PixelBox) -> float:
-    """What two boxes have in common, as a share of what they cover together."""
+    """Intersection over union."""
     across, down = min(a[2], b[2]) - max(a[0], b[0]), min(a[3], b[3]) - max(a[1], b[1])
     common = max(across, 0) * max(down, 0)
     return common / ((a[2] - a[0]) * (a[3] - a[1]) + (b[2] - b[0]) * (b[3] - b[1]) - common)
 
 
 def first_guess(known: ObjectSpec, surface_m: FloatArray, pose: FloatArray) -> FloatArray:
-    """The object's centre, body frame, from one point of its visible surface (camera frame), shape (3,).
+    """A first estimate of the object's centre in the body frame, m, shape (3,).
 
-    The point is pushed inwards by the radius: along the ray for a sphere, horizontally for what stands upright.
+    `surface_m` is a point on its visible surface in the camera's frame, m, shape (3,); `pose` the camera's pose in
+    the body frame, 4 x 4. The point is moved inwards by the radius: along the ray for a sphere, horizontally for
+    upright shapes.
     """
     point: FloatArray = pose[:3, :3] @ surface_m + pose[:3, 3]
     inwards: FloatArray = point - pose[:3, 3]
@@ -162,14 +165,15 @@ def first_guess(known: ObjectSpec, surface_m: FloatArray, pose: FloatArray) -> F
 
 
 def fit_centre(known: ObjectSpec, evidence: Evidence, pose: FloatArray, start: FloatArray) -> tuple[FloatArray, float]:
-    """The centre, body frame, of the upright shape that goes best with the evidence, shape (3,), and its misfit.
+    """The centre of the upright shape that fits the evidence best, body frame, m, shape (3,), and its mean misfit.
 
-    Gauss-Newton on signed distances, with Huber weights: surface points want distance 0, each against its
-    depth's doubt; a ray of the outline wants to meet the shape; a ray beside it wants not to enter the shape
-    before the depth that it is free to. The latter two are one-sided. Derived.
+    `pose` is the camera's pose in the body frame, 4 x 4; `start` the first guess, m, shape (3,). Gauss-Newton on
+    signed distances with Huber weights. Residuals: a surface point's distance from the shape, over its depth's
+    standard deviation; the distance by which a ray of the outline misses the shape; the depth by which a free ray
+    beside it enters the shape. The latter two are one-sided. Derived.
     """
     rotation, origin = pose[:3, :3], pose[:3, 3]
-    guess = start - origin  # from here on everything is relative to the camera, in the body's directions
+    guess = start - origin  # relative to the camera from here on, in the body's directions
     surface = evidence.surface_m @ rotation.T
     rays = _Rays(known, evidence, rotation, guess)
     seen, met = len(surface), len(surface) + len(evidence.outline)
@@ -197,10 +201,10 @@ def fit_centre(known: ObjectSpec, evidence: Evidence, pose: FloatArray, start: F
 
 
 class _Rays:
-    """The evidence's rays, and where each comes nearest to the shape. Points are relative to the camera.
+    """The evidence's rays and the point of each that is nearest to the shape, relative to the camera, m.
 
-    Along a ray the distance from a convex shape is convex: a coarse look once, then a fine one around the place
-    that was nearest before, which follows the centre as it moves.
+    Along a ray the distance from a convex shape is convex: after one coarse search, a fine search around the last
+    nearest point follows the centre as it moves.
     """
 
     def __init__(self, known: ObjectSpec, evidence: Evidence, rotation: FloatArray, guess: FloatArray) -> None:
@@ -214,7 +218,8 @@ class _Rays:
         self._fine_steps = steps * 1.5 / (RAY_SAMPLES - 1)
 
     def nearest(self, centre: FloatArray) -> FloatArray:
-        """The point of each ray, of its free part, that is nearest to (or deepest in) the shape there, (n, 3)."""
+        """The point in each ray's free part that is nearest to the shape, or deepest in it, m, shape (n, 3). `centre`
+        has shape (3,)."""
         self._depth = self._nearest_depth(self._depth[:, None] + self._fine_steps, centre)
         return self._depth[:, None] * self.directions
 
@@ -226,7 +231,8 @@ class _Rays:
 
 
 def expected_area_px(known: ObjectSpec, centre: FloatArray, camera: Camera, pose: FloatArray) -> float:
-    """Pixels that the whole object covers from here: its silhouette's solid angle, over that of a pixel."""
+    """Number of pixels that the whole object covers: the solid angle of its silhouette over that of a pixel. `centre`
+    is in the body frame, m, shape (3,); `pose` the camera's, 4 x 4."""
     to_camera = pose[:3, 3] - centre
     distance = float(np.linalg.norm(to_camera))
     depth = float(-to_camera @ pose[:3, 2])

@@ -1,8 +1,8 @@
-"""The paper's detector ('Object identification'), as the baseline to compare with.
+"""The paper's detector (section 'Object identification'), as a baseline.
 
-CIELAB ranges; the image in 5 x 5 tiles; present when the fullest tile has more than 64 matching pixels; the
-centroid is the median of all matching pixels; depth is the depth image's value at that same pixel. Its known
-weaknesses are kept: two regions of one colour give a centroid between them, and the depth is not registered.
+CIELAB ranges; the image in 5 x 5 tiles; an object is present when its fullest tile has more than 64 matching
+pixels; the centroid is the median of all matching pixels, and the depth is the depth image's value at that pixel.
+Its weaknesses are kept: two regions of one colour give a centroid between them, and depth is not registered.
 """
 
 from __future__ import annotations
@@ -15,8 +15,7 @@ import numpy as np
 from cocoro.arrays import ImageArray
 from cocoro.objects import Catalogue, ObjectSpec
 from services.perception.config import PerceptionConfig
-from services.perception.image import RgbdImage
-from services.perception.sighting import ImageSighting
+from services.perception.image import ImageSighting, RgbdImage
 
 
 class PaperDetector:
@@ -48,7 +47,7 @@ class PaperDetector:
 
 
 def _eight_bit(lab: tuple[float, float, float]) -> tuple[float, float, float]:
-    """True CIELAB to OpenCV's 8-bit form."""
+    """CIELAB in OpenCV's 8-bit form."""
     return lab[0] * 255 / 100, lab[1] + 128, lab[2] + 128
 
 

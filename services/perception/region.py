@@ -9,21 +9,20 @@ import cv2
 import numpy as np
 
 from cocoro.arrays import BoolArray, Float32Array, FloatArray, MaskArray
-from services.perception.image import PixelBox, RgbdImage
-from services.perception.sighting import Evidence
+from services.perception.image import Evidence, PixelBox, RgbdImage
 
 MIN_DEPTH_PIXELS = 6
 MIN_DEPTH_SHARE = 0.4
-"""With depth on fewer of its pixels a region has none. Past an object too near to be measured the depth camera sees up
-to 25 mm of what lies behind it, 0.38 of a can: that depth is not the object's."""
+"""A region with depth on a smaller share of its pixels has none. Past an object that is too near to be measured, the
+depth camera sees up to 25 mm of the background, 0.38 of a can, which is not the object's depth."""
 NEARER_STEP_M = 0.015
-"""What stands so much nearer than the region right beside it may hide some of it."""
+"""Something nearer than the region by this much may hide part of it."""
 NEARER_SHARE = 0.12
 UNKNOWN_SHARE = 0.45
 UNKNOWN_WITHIN_M = 1.0
-"""Of a region's outline: next to something nearer, or next to no data, for more of the object to be hidden there. No
-data counts beside near regions alone, where it may be the robot's own hand, too near to be measured; farther
-away it is what lies out of range. An infrared shadow takes less of an outline."""
+"""Shares of the outline beside something nearer, or beside no data, from which more of the object may be hidden. No
+data counts only beside regions within 1 m, where it may be the robot's own hand, too near to be measured; farther
+away it is beyond the sensor's range. An infrared shadow takes a smaller share."""
 MAX_SURFACE_POINTS = 140
 MAX_RAYS = 40
 
@@ -31,12 +30,14 @@ _AROUND = np.ones((3, 3), dtype=np.uint8)
 
 
 def depth_doubt_m(depth_m: Any) -> Any:
-    """How far a depth may be off: noise and quantisation of the sensor, growing with the square of the distance."""
+    """Standard deviation of a depth, m, for depths in m of any shape: the sensor's noise and quantisation, growing
+    with its square."""
     return 0.003 + 0.0025 * depth_m**2
 
 
 class ColourRegion:
-    """`mask` (uint8, non-zero inside) and `box`, its place in the image, have a margin around the region."""
+    """A region of the image. `mask` is uint8, non-zero inside, shape of `box`; `box` is its place in the image with a
+    margin, px."""
 
     def __init__(self, mask: MaskArray, box: PixelBox, image: RgbdImage) -> None:
         self.mask = mask
@@ -52,7 +53,7 @@ class ColourRegion:
 
     @staticmethod
     def margin_px(image: RgbdImage) -> int:
-        """What is kept around a region: the ring of `surroundings` and a pixel to spare."""
+        """The margin around a region: the ring of `surroundings` and one pixel."""
         return _ring_px(image) + 2
 
     @property
@@ -68,12 +69,13 @@ class ColourRegion:
 
     @cached_property
     def depth(self) -> Float32Array:
-        """Registered, of `box`; NaN without data."""
+        """Registered depth of `box`, m; NaN without data."""
         return self.image.depth_m(self.box)
 
     @cached_property
     def depth_m(self) -> float | None:
-        """Of the visible surface: the median of the region's middle, or of all of it when the middle has too little."""
+        """Depth of the visible surface, m: the median of the region's middle, or of all of it when the middle has too
+        little data. None without enough data."""
         inside = (self.mask > 0) & np.isfinite(self.depth)
         enough = max(MIN_DEPTH_PIXELS, MIN_DEPTH_SHARE * self.area_px)
         if np.count_nonzero(inside) < enough:
@@ -88,7 +90,7 @@ class ColourRegion:
 
     @cached_property
     def surroundings(self) -> BoolArray:
-        """A ring just outside of the outline, where neither blended pixels nor the cleaning's one pixel reach."""
+        """A ring outside of the outline, shape of `box`, beyond blended pixels and the pixel that cleaning removes."""
         ring = 2 * _ring_px(self.image) + 1
         outer = cv2.dilate(self.mask, np.ones((ring, ring), dtype=np.uint8))
         inner = cv2.dilate(self.mask, _AROUND)
@@ -96,7 +98,7 @@ class ColourRegion:
 
     @cached_property
     def hidden(self) -> bool:
-        """Something nearer stands along enough of the outline to hide more of the same thing."""
+        """Something nearer is along enough of the outline to hide more of the object."""
         around = self.surroundings
         total = np.count_nonzero(around)
         if total == 0:
@@ -113,7 +115,7 @@ class ColourRegion:
         return bool(nearer >= NEARER_SHARE * total or unknown >= UNKNOWN_SHARE * total)
 
     def split_by_depth(self) -> list[tuple[MaskArray, PixelBox]]:
-        """The region cut where its depth jumps: an object before a wall of its colour, one can before another."""
+        """The region cut where its depth jumps, for example an object before a wall of its colour."""
         depth = np.nan_to_num(self.depth, nan=0.0)
         far = np.asarray(cv2.dilate(depth, _AROUND))
         near = np.asarray(cv2.erode(np.where(depth > 0, depth, np.float32(99)), _AROUND))
@@ -123,7 +125,7 @@ class ColourRegion:
         )
 
     def evidence(self, reach_m: float) -> Evidence | None:
-        """What fits an object that reaches `reach_m` from its centre; None without depth."""
+        """Evidence for fitting an object that reaches `reach_m` from its centre; None without depth."""
         if self.depth_m is None:
             return None
         core = np.asarray(cv2.erode(self.mask, _AROUND))
@@ -137,7 +139,7 @@ class ColourRegion:
         return Evidence(surface[:, :3] * surface[:, 3:], outline[:, :3], around[:, :3], free_to_m)
 
     def _rays(self, where: BoolArray, at_most: int) -> FloatArray:
-        """Directions with z = 1, and depth, of some of the pixels; (n, 4)."""
+        """Directions with z = 1, and depth, m, of at most so many of the pixels in `where`; shape (n, 4)."""
         camera = self.image.camera
         rows, columns = np.nonzero(where)
         if len(rows) > at_most:
@@ -154,9 +156,10 @@ class ColourRegion:
 def components(
     mask: MaskArray, origin: tuple[int, int], image: RgbdImage, min_area_px: float, at_most: int = 8
 ) -> list[tuple[MaskArray, PixelBox]]:
-    """The largest connected regions of a mask whose first pixel is the image's `origin`, each with a margin around."""
+    """The largest connected regions of a mask, each with a margin, and their boxes in the image. `mask` covers the
+    part of the image whose first pixel is `origin`, (column, row)."""
     _, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8, ltype=cv2.CV_32S)
-    by_area = 1 + np.argsort(-stats[1:, cv2.CC_STAT_AREA], kind="stable")  # 0 is what is not in the mask
+    by_area = 1 + np.argsort(-stats[1:, cv2.CC_STAT_AREA], kind="stable")  # label 0 is the background
     found = []
     for i in by_area[:at_most]:
         left, top, width, height, area = (int(value) for value in stats[i])

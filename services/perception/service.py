@@ -1,4 +1,4 @@
-"""Perception's shell: the core, driven by the node."""
+"""Perception's shell: the node drives the core."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from services.perception.core import PerceptionCore
 
 
 def core(robot: Robot, config: PerceptionConfig) -> PerceptionCore:
-    """Perception's maths. Raises ConfigError for a bad file of known objects."""
-    # A frame takes a few milliseconds: spreading it over threads would only take the other services' cores.
+    """Returns perception's core. Raises ConfigError for a bad catalogue file."""
+    # A frame takes a few milliseconds; several threads would only take the other services' cores.
     cv2.setNumThreads(1)
     return PerceptionCore(robot, config, Catalogue.load(Path(config.objects) if config.objects else None))
 
 
 async def run(node: Node, config: PerceptionConfig) -> None:
-    """Look at every frame that arrives, until cancelled. Raises ConfigError for a bad file of known objects."""
+    """Process every frame until cancelled. Raises ConfigError for a bad catalogue file."""
     await node.drive(core(node.robot, config))
 
 

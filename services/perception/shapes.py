@@ -1,4 +1,4 @@
-"""The known shapes as signed distances, for fitting them to points and for knowing how large they look."""
+"""Known shapes as signed distances, for fitting to points, and their expected size in the image."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ from cocoro.objects import ObjectSpec
 
 
 def distance_from(known: ObjectSpec, offsets_m: FloatArray) -> FloatArray:
-    """Distance from the upright object's surface, negative inside, for points (..., 3) relative to its centre, z up.
+    """Signed distance from the upright object's surface, m, negative inside, shape (...). `offsets_m` are points
+    relative to its centre, z up, shape (..., 3).
 
-    A box, whose yaw nobody knows, counts as the cylinder of equal base and height.
+    A box counts as the cylinder of equal base area and height, since its yaw is unknown.
     """
     squares = offsets_m * offsets_m
     planar2 = squares[..., 0] + squares[..., 1]
@@ -27,7 +28,7 @@ def distance_from(known: ObjectSpec, offsets_m: FloatArray) -> FloatArray:
 
 
 def signed_distance(known: ObjectSpec, offsets_m: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """`distance_from` for points (n, 3), with its gradient (n, 3)."""
+    """`distance_from` for points of shape (n, 3): distances, m, shape (n,), and their gradient, shape (n, 3)."""
     if known.shape == "sphere":
         length = np.sqrt((offsets_m * offsets_m).sum(axis=1))
         return length - known.planar_radius_m, offsets_m / np.maximum(length, 1e-9)[:, None]
@@ -37,7 +38,7 @@ def signed_distance(known: ObjectSpec, offsets_m: FloatArray) -> tuple[FloatArra
     radial, vertical = np.maximum(beside, 0.0), np.maximum(above, 0.0)
     outside = np.sqrt(radial * radial + vertical * vertical)
     within = np.maximum(beside, above)
-    # Inside, the nearer of mantle and lid alone counts.
+    # Inside, the nearer one of side and lid counts.
     deep = within <= 0.0
     mantle = beside >= above
     share = np.where(deep, 1.0, outside)
@@ -50,14 +51,14 @@ def signed_distance(known: ObjectSpec, offsets_m: FloatArray) -> tuple[FloatArra
 
 
 def reach_m(known: ObjectSpec) -> float:
-    """Radius of the ball around the object."""
+    """Radius of the circumscribed sphere, m."""
     if known.shape == "sphere":
         return known.planar_radius_m
     return hypot(known.planar_radius_m, known.size_m[2] / 2)
 
 
 def seen_area_m2(known: ObjectSpec, elevation_sine: float) -> float:
-    """Area of the object's silhouette (orthographic), seen from `elevation_sine` above the horizontal (0 to 1)."""
+    """Area of the object's orthographic silhouette, m2, seen from `elevation_sine` (0 to 1) above the horizontal."""
     radius = known.planar_radius_m
     if known.shape == "sphere":
         return pi * radius**2
@@ -66,12 +67,12 @@ def seen_area_m2(known: ObjectSpec, elevation_sine: float) -> float:
 
 
 def counted_px(area_px: float) -> float:
-    """Of an outline that encloses so many pixels, how many are found: about half of those along the edge are blended
-    with what lies behind, or cleaned away. Measured on rendered frames."""
+    """Number of pixels that are found of an outline that encloses `area_px`: about half of those along the edge are
+    blended with the background or removed by cleaning. Measured on rendered frames."""
     return area_px - min(2.0 * sqrt(area_px), 0.5 * area_px)
 
 
 def area_range_m2(known: ObjectSpec) -> tuple[float, float]:
-    """Least and greatest silhouette between the level view and 60 degrees from above."""
+    """Smallest and largest silhouette, m2, for elevations from 0 to 60 degrees."""
     areas = [seen_area_m2(known, sine) for sine in (0.0, 0.3, 0.5, 0.7, 0.866)]
     return min(areas), max(areas)

@@ -1,9 +1,9 @@
 """The arm's trajectories: unfolding, folding, and moving the hand to a pose, one step at a time.
 
-Between the folded (parked) pose and the space before the robot the arm goes by way of two poses: folded out in the
-plane that it parks in (the hand's thin side to the camera mount, until it is out), then swung to the front with the
-hand level, so that it passes over what stands there. All references are kept as commanded angles: feeding back the
-servos' coarse positions would only add their steps to the motion.
+Between the parked pose and the space in front of the robot the arm passes two poses: unfolded in the plane that it
+parks in (the hand's thin side towards the camera mount), then swung to the front with the hand level, so that it passes
+over obstacles. References are commanded angles: feedback of the servos' coarse positions would add their steps to the
+motion.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from services.planning.reach import ARM, HandPose, Reacher
 
 ROLL = "wrist_roll"
 _OUT = {"shoulder": 1.9, "elbow": -2.3, "wrist_pitch": 0.4}
-"""Folded out: the hand points away from the arm base, level, 0.2 m up and 0.36 m out."""
+"""Unfolded: the hand points away from the arm base, level, 0.2 m up and 0.36 m out."""
 _SIDE_RAD = 0.6
-"""With the arm base turned further than this the arm is in the plane that it parks in."""
+"""Arm base angle beyond which the arm is in the plane that it parks in."""
 _NEAR_RAD = 0.06
 _FRONT_RAD = -0.087
 _ASTRAY_RAD = 0.6
-"""At work the hand is never pitched so far off what it is to be, nor the elbow below it."""
+"""Pitch error beyond which only babbling leaves the hand."""
 
 
 class ArmStep(NamedTuple):
@@ -37,7 +37,7 @@ class ArmStep(NamedTuple):
     speed_radps: FloatArray
     roll_rad: float
     left: float
-    """What is left: metres for a hand pose, radians for joint poses."""
+    """Remaining distance: metres for a hand pose, radians for joint angles."""
     arrived: bool
     blocked: bool = False
 
@@ -52,23 +52,23 @@ class ArmController:
         self._reference: dict[str, float] | None = None
         self._stalled_s = 0.0
         self._astray = False
-        """Where babbling left the arm no way of the hand leads back, but one of the joints does."""
+        """The arm is where babbling left it: it returns by joint angles, not by a path of the hand."""
         self._clearance_m: float | None = None
-        """Of the reference, where it is known."""
+        """Clearance of the reference, if it is known."""
 
     @property
     def reference(self) -> dict[str, float] | None:
-        """The commanded angles (ARM and the wrist roll); None before the first measurement."""
+        """The commanded angles of ARM and the wrist roll, rad; None before the first measurement."""
         return self._reference
 
     def resync(self) -> None:
-        """Start from the measured angles at the next step: something else has moved or stopped the arm."""
+        """Start from the measured angles at the next step, because the arm was moved or stopped otherwise."""
         self._reference = None
         self._stalled_s = 0.0
         self._clearance_m = None
 
     def folded(self, angles: Mapping[str, float]) -> bool:
-        """Whether the arm is in, or near, the plane that it parks in."""
+        """Whether the arm is in or near the plane that it parks in."""
         return angles["arm_base"] > _SIDE_RAD
 
     def parked(self, angles: Mapping[str, float]) -> bool:
@@ -80,7 +80,7 @@ class ArmController:
         return ArmStep(goal, np.full(4, 0.5), reference[ROLL], 0.0, True)
 
     def park(self, measured: Mapping[str, float], dt_s: float) -> ArmStep:
-        """Fold the arm up beside the camera mount."""
+        """One step of folding the arm beside the camera mount."""
         reference = self._sync(measured, dt_s)
         if not self.folded(reference):
             pose = self._reacher.pose(reference)
@@ -105,7 +105,7 @@ class ArmController:
         return self._joints(self._park | {ROLL: 0.0}, dt_s)
 
     def reach(self, goal: HandPose, speed_mps: float, measured: Mapping[str, float], dt_s: float) -> ArmStep:
-        """Move the hand towards a pose in front of the robot; unfolds the arm first where it is folded."""
+        """One step of the hand towards a pose in front of the robot; a folded arm is unfolded first."""
         reference = self._sync(measured, dt_s)
         stage: dict[str, float] | None = None
         if self.folded(reference):
@@ -130,7 +130,7 @@ class ArmController:
     def towards(
         self, goals: Mapping[str, float], speed_radps: float, measured: Mapping[str, float], dt_s: float
     ) -> ArmStep:
-        """Move the named joints together to their goals along the straight way in joint space."""
+        """One step of the named joints together to their goals (rad), straight in joint space."""
         self._astray = True
         self._sync(measured, dt_s)
         return self._joints(goals, dt_s, speed_radps)
@@ -141,7 +141,7 @@ class ArmController:
 
     @property
     def stalled(self) -> bool:
-        """Something has held a joint up for a while: it does not follow."""
+        """Whether a joint has lagged behind its goal for `stall_s`."""
         return self._stalled_s > self._config.stall_s
 
     def _sync(self, measured: Mapping[str, float], dt_s: float) -> dict[str, float]:
@@ -159,7 +159,7 @@ class ArmController:
         return self._reference
 
     def _joints(self, goals: Mapping[str, float], dt_s: float, speed_radps: float | None = None) -> ArmStep:
-        """Move the named joints together to their goals, the others stay."""
+        """One step of the named joints to their goals; the others stay."""
         assert self._reference is not None
         gaps = {name: goal - self._reference[name] for name, goal in goals.items()}
         widest = max(abs(gap) for gap in gaps.values())
@@ -187,7 +187,7 @@ class ArmController:
         return self._commit(trial, left, dt_s, arrived=arrived)
 
     def _commit(self, trial: dict[str, float], left: float, dt_s: float, *, arrived: bool) -> ArmStep:
-        """Take a step unless it brings the arm nearer to what it must not touch."""
+        """Take a step, unless it brings the arm nearer to an obstacle than `clearance_m`."""
         assert self._reference is not None
         clearance_m = self.clearance.of(trial)
         before_m = self._clearance_m if self._clearance_m is not None else self.clearance.of(self._reference)
@@ -196,7 +196,7 @@ class ArmController:
             trial = self._reference
         goal = np.array([trial[name] for name in ARM])
         moved = np.abs(goal - np.array([self._reference[name] for name in ARM]))
-        # A little faster than the reference, so that a servo that lags can catch up.
+        # Faster than the reference, so that a lagging servo can catch up.
         speed = np.maximum(1.5 * moved / dt_s, 0.3)
         self._reference = trial
         self._clearance_m = before_m if blocked else clearance_m

@@ -1,8 +1,8 @@
-"""The way to a target: on an arc where that is free, else around what stands there to a place from where it is free.
+"""The path to a target: an arc where that is free, else a detour to a pose from which it is free.
 
-Planned on the floor map for the round body with the arm folded; the last stretch, with the hand out, is an arc along
-which the arm's own footprint must be free too. Every wheel command passes `guard`, which never lets the robot run
-further than it can stop before something.
+Paths are planned on the floor map for the round body with the arm folded. On the last stretch the hand is extended, so
+the arm's footprint must be free too. `guarded` checks every wheel command: the robot must be able to stop before it
+reaches an obstacle.
 """
 
 from __future__ import annotations
@@ -26,30 +26,30 @@ _LOOKAHEAD_M = 0.35
 
 
 class Move(NamedTuple):
-    """What the course wants now."""
+    """The motion that the course wants now."""
 
     speed_mps: float
     turn_radps: float
     left_m: float
-    """Still to drive, by the way that is taken."""
+    """Remaining length of the chosen path."""
     why: str
     direct: bool
-    """On the last stretch: the hand may get ready."""
+    """On the last stretch: the hand may be extended."""
     arrived: bool = False
     blocked: bool = False
     look_at: tuple[float, float] | None = None
-    """A place ahead, in the odometry frame, that nobody has looked at yet."""
+    """A place ahead, odometry frame, that the camera has not seen yet."""
 
 
 class Detour(NamedTuple):
-    """A place to go to first, and the way there, odometry frame."""
+    """An intermediate pose and the path to it, odometry frame."""
 
     before: Pose2
     path: tuple[tuple[float, float], ...]
 
 
 class Course:
-    """One drive to a target. `aim_m` is where in the body frame the target shall end."""
+    """One drive to a target, which ends with the target at `aim_m`, body frame."""
 
     def __init__(
         self,
@@ -61,9 +61,12 @@ class Course:
         arrive_m: float | None = None,
         swing_m: FloatArray | None = None,
     ) -> None:
-        """When the hand is out: on the `last` stretch only, all the way, or never. `arrive_m`: near enough, from
-        whichever side; by default the driver's own tolerances count. `swing_m`: the floor places (n, 2), body frame,
-        over which a folded arm unfolds; before the last stretch there must be room for that."""
+        """`arm`: where the arm is extended: on the `last` stretch, all the way (`out`), or nowhere (`folded`).
+
+        `arrive_m`: distance from the aim that counts as arrived; None: the driver's tolerances. `swing_m`: floor
+        positions (n, 2), body frame, metres, that the arm sweeps while it unfolds; they must be free before the last
+        stretch.
+        """
         self._swing = swing_m
         self._config = config.navigation
         self._aim_m = aim_m
@@ -71,7 +74,7 @@ class Course:
         self._arrive_m = arrive_m
         self._stretch_m = 0.0 if arm == "folded" else self._config.last_stretch_m
         self._body_m = robot.base.chassis_diameter_m / 2
-        # The hand's footprint with open claws, along the arm's line before the robot.
+        # Footprint of the hand with open claws along the arm's line in front of the robot.
         reach = () if arm == "folded" else np.arange(0.22, aim_m[0] + 0.09, 0.04)
         self._arm = np.array([[x, aim_m[1]] for x in reach]).reshape(-1, 2)
         self._glance: tuple[tuple[float, float], int] | None = None
@@ -92,7 +95,7 @@ class Course:
         *,
         folded: bool = False,
     ) -> Move:
-        """One step towards a target (odometry frame). `folded`: the arm has yet to unfold."""
+        """One step towards a target (odometry frame). `folded`: the arm is not unfolded yet."""
         self._folded = folded
         x, y, _ = body.inverse().apply((*target_m, 0.0))
         offset = offset_to((x, y), self._aim_m)
@@ -124,7 +127,7 @@ class Course:
     ) -> None:
         x, y, _ = body.inverse().apply((*target_m, 0.0))
         preview = [body.compose(pose) for pose in driver.preview((x, y), self._aim_m)]
-        # Once on the last stretch, with the hand out, it takes more to turn back than it took to start.
+        # Hysteresis: on the last stretch, with the hand extended, smaller margins do.
         share = 0.5 if self._last_stretch else 1.0
         if self._free(preview, fields, share, arm_from_m=self._stretch_m) and self._unfolds_on(preview, fields):
             self._detour = None
@@ -136,10 +139,10 @@ class Course:
         self._detour = self._around(target_m, body, around, fields)
 
     def _free(self, poses: list[Pose2], fields: Fields, share: float, arm_from_m: float) -> bool:
-        """Whether body and, over the last `arm_from_m`, the hand pass all poses with that share of their margins."""
+        """Whether body and (over the last `arm_from_m`) hand pass all poses with this share of their margins."""
         centres = np.array([[pose.x_m, pose.y_m] for pose in poses])
         clearance = fields.body.at(centres) - self._body_m
-        # From where it stands the robot may leave, however near something is.
+        # The robot may always leave the place where it stands.
         leaving = np.hypot(*(centres - centres[0]).T) < 0.10
         if (clearance[~leaving] < share * self._config.clearance_m).any():
             return False
@@ -152,7 +155,7 @@ class Course:
         return True
 
     def _unfolds_on(self, poses: list[Pose2], fields: Fields) -> bool:
-        """Whether the arm, where it is folded still, finds room to unfold before it must be out."""
+        """Whether a folded arm has room to unfold before it must be extended."""
         if not self._folded or self._swing is None:
             return True
         end = poses[-1]
@@ -160,7 +163,7 @@ class Course:
         return any(self.roomy(pose, fields) for pose in early[:: max(len(early) // 6, 1)])
 
     def roomy(self, pose: Pose2, fields: Fields) -> bool:
-        """Whether the arm can unfold at a pose without meeting anything that is known."""
+        """Whether the arm can unfold at a pose without touching a known obstacle."""
         if self._swing is None:
             return True
         return bool((fields.arm.at(placed(self._swing, pose)) > self._config.swing_room_m).all())
@@ -168,7 +171,7 @@ class Course:
     def _around(
         self, target_m: tuple[float, float], body: Pose2, around: Surroundings, fields: Fields
     ) -> Detour | None:
-        """The cheapest pose before the target from which the last stretch is free, and the way there."""
+        """The cheapest pose before the target from which the last stretch is free, and the path to it."""
         config = self._config
         radius = self._body_m + config.clearance_m
         routes = around.routes(fields.body, body, radius, config.comfort_m)
@@ -209,14 +212,14 @@ class Course:
         )
 
     def _arm_free(self, pose: Pose2, fields: Fields, half_m: float, *, near_end: bool) -> bool:
-        """Whether the hand passes a pose. Carried high, it passes over the known objects; near the end it is low."""
+        """Whether the hand passes a pose. Carried high it passes over known objects; near the end it is low."""
         if not len(self._arm) or not (near_end or self._arm_out):
             return True
         field = fields.arm if self._arm_out and not near_end else fields.body
         return not (field.at(placed(self._arm, pose)) < half_m).any()
 
     def _still_good(self, detour: Detour, fields: Fields, target_m: tuple[float, float]) -> bool:
-        """Whether the way is still free and still leads to before the target."""
+        """Whether the path is still free and still ends in front of the target."""
         end = detour.before.compose(Pose2(self._stretch_m))
         aim = end.apply((*self._aim_m, 0.0))
         if hypot(aim[0] - target_m[0], aim[1] - target_m[1]) > 0.06:
@@ -238,7 +241,7 @@ class Course:
         if left_m < 0.06 or (len(rest) <= 2 and left_m < 0.12):
             turn = wrap_rad(detour.before.yaw_rad - body.yaw_rad)
             if abs(turn) < 0.08:
-                # Here the last stretch begins, whether or not the next plan would see it so.
+                # The last stretch begins here, whatever the next plan finds.
                 self._detour, self._last_stretch = None, True
             return Move(0.0, 1.8 * turn, left_m, f"{turn:+.2f} rad to turn before the last stretch", False), rest
         ahead = np.hypot(rest[:, 0] - body.x_m, rest[:, 1] - body.y_m)
@@ -263,7 +266,7 @@ class Course:
         driver: Driver,
         now_ns: int,
     ) -> Move:
-        """Look where nobody has looked, and stop before what is there."""
+        """Look at unseen places ahead, and stop before obstacles. `ahead`: path (n, 2), odometry frame, metres."""
         gaps = np.hypot(ahead[:, 0] - body.x_m, ahead[:, 1] - body.y_m)
         near = ahead[(gaps > 0.30) & (gaps < 1.1)]
         hidden = around.unseen(near) if len(near) else np.zeros(0, dtype=bool)
@@ -272,7 +275,7 @@ class Course:
             if self._glance is None or hypot(self._glance[0][0] - x, self._glance[0][1] - y) > 0.1:
                 self._glance = (x, y), now_ns
             if now_ns - self._glance[1] > self._config.glance_s * NS:
-                # Looked at for long enough: something hides it, and nothing was seen to stand there.
+                # Something hides the place, and no obstacle was seen there.
                 around.floor.pass_over((x, y))
             move = move._replace(look_at=(x, y))
             if hypot(x - body.x_m, y - body.y_m) < 0.55 and move.speed_mps > 0:
@@ -290,7 +293,7 @@ class Course:
         return move
 
     def guarded(self, move: Move, body: Pose2, fields: Fields, driver: Driver) -> bool:
-        """Whether driving on would bring body or hand to something before the robot could stop."""
+        """Whether body or hand would reach an obstacle before the robot could stop."""
         if move.speed_mps == 0.0:
             return False
         poses = [body.compose(pose) for pose in driver.stopping_poses(move.speed_mps, move.turn_radps)]

@@ -1,7 +1,8 @@
-"""What is known of the floor around the robot: where it is free, where something stands, where nobody has looked.
+"""Map of the floor around the robot: free, occupied, or not seen yet.
 
-An evidence grid in the odometry frame (derived): rays over free floor take evidence away, points that stand up from
-it add. It moves along with the robot; what falls off its edge is forgotten.
+An evidence grid in the odometry frame (derived from occupancy grids, Elfes 1989): rays over free floor decrease the
+evidence of their cells, points above the floor increase it. The map moves with the robot; cells beyond its edge are
+dropped.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ SIZE = 160
 """Cells along each side: 8 m."""
 _HIT, _FREE, _MOST, _LEAST, _OCCUPIED = 2, 1, 8, -4, 4
 _EDGE_CELLS = 40
-"""Nearer to the edge than this, the map moves along with the robot."""
+"""The map moves when the robot is nearer to its edge than this."""
 
 
 class FloorMap:
@@ -29,21 +30,21 @@ class FloorMap:
         self._evidence = np.zeros((SIZE, SIZE), dtype=np.int8)
         self._looked = np.zeros((SIZE, SIZE), dtype=bool)
         self._corner = np.array([-SIZE // 2, -SIZE // 2])
-        """Cell numbers of the array's first cell, counted from the odometry frame's origin."""
+        """Index of the array's first cell, counted in cells from the odometry frame's origin."""
         self.changes = 0
-        """Counts up with every update."""
+        """Number of updates."""
 
     def clear(self) -> None:
         self._evidence[:] = 0
         self._looked[:] = False
         self.changes += 1
 
-    # --- what is seen -----------------------------------------------------------------------------
+    # --- updates ----------------------------------------------------------------------------------
 
     def enter(self, seen: Obstacles, body: Pose2, own: tuple[FloatArray, FloatArray] | None) -> None:
-        """One depth image's floor and obstacles, seen from a pose of the body.
+        """Enter one depth image's floor and obstacles, seen from the body's pose in the odometry frame.
 
-        `own` are the centres (n, 3) and radii (n,) of the robot's own hull in the body frame: what is inside is itself.
+        `own`: centres (n, 3) and radii (n,) of the robot's own hull, body frame, metres; points inside are dropped.
         """
         self._follow(body)
         origin = np.array(body.apply((*seen.origin_m, 0.0))[:2])
@@ -59,18 +60,18 @@ class FloorMap:
         self.changes += 1
 
     def bump(self, places_m: Sequence[tuple[float, float]]) -> None:
-        """Something was touched at these places of the odometry frame, seen or not."""
+        """Mark places (odometry frame) as occupied because the robot touched something there."""
         for _ in range(3):
             self._add(np.array(places_m), _HIT)
         self.changes += 1
 
     def pass_over(self, place_m: tuple[float, float]) -> None:
-        """Count the floor within 10 cm of a place as looked at."""
+        """Count the floor within 10 cm of a place (odometry frame) as seen."""
         self._looked |= self._disc(*place_m, 0.10)
 
     @staticmethod
     def _along(rays: FloatArray, origin: FloatArray, yaw_rad: float) -> FloatArray:
-        """Points every half cell along the rays (bearing, near, far), odometry frame."""
+        """Points (n, 2), odometry frame, every cell along the rays (m, 3): bearing rad, near m, far m."""
         steps = np.arange(0.0, float(rays[:, 2].max()), CELL_M)
         inside = (steps[None, :] >= rays[:, 1:2]) & (steps[None, :] <= rays[:, 2:3])
         directions = np.stack([np.cos(rays[:, 0] + yaw_rad), np.sin(rays[:, 0] + yaw_rad)], axis=1)
@@ -78,7 +79,7 @@ class FloorMap:
         return points
 
     def _add(self, points_m: FloatArray, evidence: int) -> None:
-        """Add evidence, once a cell however many points fall into it."""
+        """Add evidence to the cells of points (n, 2), once per cell."""
         index = self._index(points_m)
         index = index[((index >= 0) & (index < SIZE)).all(axis=1)]
         flat = np.unique(index[:, 0] * SIZE + index[:, 1])
@@ -98,35 +99,35 @@ class FloorMap:
         self._evidence, self._looked = evidence, looked
         self._corner = self._corner + shift
 
-    # --- what is asked ----------------------------------------------------------------------------
+    # --- queries ---------------------------------------------------------------------------------
 
     def _index(self, points_m: FloatArray) -> IntArray:
         index: IntArray = np.floor(np.asarray(points_m)[:, :2] / CELL_M).astype(np.int64) - self._corner
         return index
 
     def centre(self, row: int, column: int) -> tuple[float, float]:
-        """A cell's middle, odometry frame."""
+        """A cell's centre (x, y), odometry frame, metres."""
         x, y = ((np.array([row, column]) + self._corner) + 0.5) * CELL_M
         return float(x), float(y)
 
     def cell(self, x_m: float, y_m: float) -> tuple[int, int] | None:
-        """The cell of a place; None beyond the map."""
+        """The (row, column) of a place, odometry frame; None beyond the map."""
         row, column = self._index(np.array([[x_m, y_m]]))[0]
         return (int(row), int(column)) if 0 <= row < SIZE and 0 <= column < SIZE else None
 
     def occupied(self, ignore: Sequence[tuple[float, float, float]] = ()) -> BoolArray:
-        """Where something stands; (SIZE, SIZE), rows along x. `ignore`: discs (x, y, radius) that do not count."""
+        """Occupied cells, (SIZE, SIZE), rows along x. Discs (x, y, radius) in `ignore` (metres) count as free."""
         cells: BoolArray = self._evidence >= _OCCUPIED
         for x, y, radius in ignore:
             cells &= ~self._disc(x, y, radius)
         return cells
 
     def looked_at(self) -> BoolArray:
-        """Where the floor, or what stands on it, was seen."""
+        """Cells that were seen, (SIZE, SIZE)."""
         return self._looked
 
     def add_discs(self, cells: BoolArray, discs: Sequence[tuple[float, float, float]]) -> BoolArray:
-        """The same with discs (x, y, radius) that count as occupied."""
+        """The cells (SIZE, SIZE) with discs (x, y, radius), odometry frame, metres, added."""
         for x, y, radius in discs:
             cells = cells | self._disc(x, y, radius)
         return cells
@@ -139,7 +140,7 @@ class FloorMap:
 
 
 class ClearanceField:
-    """Distance from any place to the nearest occupied cell."""
+    """Distance from any place to the nearest occupied cell (`metres`, (SIZE, SIZE))."""
 
     def __init__(self, floor: FloorMap, occupied: BoolArray) -> None:
         self._floor = floor
@@ -148,12 +149,12 @@ class ClearanceField:
         self.metres: FloatArray = (
             np.full((SIZE, SIZE), 9.0)
             if distance is None
-            # From cell middle to cell middle: the occupied cell's own half is taken off.
+            # Distances between cell centres, less half the occupied cell.
             else np.maximum(np.asarray(distance, dtype=np.float64) * CELL_M - CELL_M / 2, 0.0)
         )
 
     def at(self, places_m: FloatArray) -> FloatArray:
-        """Clearance at places (n, 2) of the odometry frame, metres, shape (n,); far where the map ends."""
+        """Distances (n,), metres, at places (n, 2), odometry frame; 9 m beyond the map."""
         index = self._floor._index(places_m)
         inside = ((index >= 0) & (index < SIZE)).all(axis=1)
         clearance = np.full(len(index), 9.0)
@@ -162,14 +163,14 @@ class ClearanceField:
 
 
 def _inside(points: FloatArray, centres: FloatArray, radii: FloatArray) -> BoolArray:
-    """Which points (n, 3) lie within any of the balls, seen from above: nothing stands where the robot itself is."""
+    """Which points (n, 3) lie within any of the balls (m, 3), (m,) seen from above, shape (n,)."""
     gaps = np.linalg.norm(points[:, None, :2] - centres[None, :, :2], axis=2) - radii[None, :]
     inside: BoolArray = (gaps < 0.0).any(axis=1)
     return inside
 
 
 def _overlap(shift: IntArray) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
-    """Where to and where from to copy an array that moves by `shift` cells."""
+    """Destination and source slices for an array that moves by `shift` (2,) cells."""
     to, source = [], []
     for step in shift:
         step = int(step)

@@ -1,4 +1,4 @@
-"""The claws: one degree of freedom, both together; and whether they hold something."""
+"""The claws, moved together as one degree of freedom, and whether they hold something."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ CLAWS = ("claw_left", "claw_right")
 
 
 class Grip:
-    """Commands the claws, each by its opening angle, and feels what they hold.
+    """Commands the claws by their opening angles and detects by their load whether they hold something.
 
-    Closing goes past contact at full torque. Once something has stopped the claws, `clamp` sets each claw's goal
-    a fixed angle past where it stopped: within the servos' compliance slope the torques then balance, and what
-    is held stays where it was grasped instead of drifting with the pair.
+    Closing goes past contact at full torque. When an object has stopped the claws, `clamp` sets each claw's goal a
+    fixed angle past the contact: within the servos' compliance slope the torques then balance, and the object stays
+    where it was grasped instead of drifting with the pair.
     """
 
     def __init__(self, robot: Robot, config: HandConfig) -> None:
@@ -30,7 +30,7 @@ class Grip:
         self._goals = dict.fromkeys(CLAWS, -self._config.close_rad)
 
     def clamp(self, hand: ServoState) -> None:
-        """Hold what has stopped the claws."""
+        """Hold the object that has stopped the claws."""
         self._goals = {
             name: angle - self._config.clamp_rad for name, angle in zip(CLAWS, self.opening(hand), strict=True)
         }
@@ -63,7 +63,7 @@ class Grip:
         return min(self.opening(hand)) > self._config.open_rad - 0.08
 
     def feel(self, hand: ServoState, now_ns: int) -> None:
-        """Take a measurement; a hold must last to count."""
+        """Take a measurement: a grip counts once it has lasted `settle_s`."""
         if self._pressed(hand) and sum(self.opening(hand)) > 2 * (0.06 - self._config.close_rad):
             if self._held_since_ns is None:
                 self._held_since_ns = now_ns
@@ -71,11 +71,11 @@ class Grip:
             self._held_since_ns = None
 
     def holding(self, now_ns: int) -> bool:
-        """The claws have been stopped by something for long enough."""
+        """Whether the claws have held something for `settle_s`."""
         return self._held_since_ns is not None and (now_ns - self._held_since_ns) / 1e9 >= self._config.settle_s
 
     def _pressed(self, hand: ServoState) -> bool:
-        """Both claws push inwards, and nothing gives way between them: they may swing together, not close."""
+        """Whether both claws push inwards without closing; they may swing together."""
         loads = dict(zip(hand.joints, hand.load, strict=True))
         speeds = dict(zip(hand.joints, hand.speed_radps, strict=True))
         pushing = all(-self._opens[name] * loads[name] >= self._config.grip_load for name in CLAWS)

@@ -1,4 +1,4 @@
-"""Where the head looks: sweeping when the target is lost, fixating it when it is seen."""
+"""The head: sweeps to search, fixates what is seen, and the tilt error of its camera."""
 
 from __future__ import annotations
 
@@ -16,22 +16,25 @@ PAN, TILT = "neck_pan", "neck_tilt"
 
 
 class Gaze:
-    """Solves for the pan and tilt that bring a point of the body frame into the centre of the image."""
+    """Computes the pan and tilt that bring a point into the centre of the image."""
 
     def __init__(self, robot: Robot, config: HeadConfig) -> None:
         self._chain = robot.chain("camera")
         self._limits = [robot.joints[PAN].limits_rad, config.tilt_range_rad]
 
     def at(self, point_m: tuple[float, float, float], start: Mapping[str, float]) -> tuple[float, float]:
-        """(pan, tilt) in radians, within the limits; Newton's method from the present angles (derived): the neck's axes
-        are nearly those of the image, so each angle is corrected by its own image angle."""
+        """(pan, tilt), rad, within the limits, for a point (x, y, z), body frame, metres.
+
+        Newton's method from the angles in `start` (derived): the neck's axes are nearly those of the image, so each
+        angle is corrected by its own image angle.
+        """
         pan, tilt = start.get(PAN, 0.0), start.get(TILT, 0.0)
         point = np.array([*point_m, 1.0])
         for _ in range(5):
             pose = self._chain.pose({PAN: pan, TILT: tilt})
             x, y, z = pose[:3, :3].T @ (point[:3] - pose[:3, 3])
             if z < 1e-3:
-                # Behind the camera: turn by the bearing first, from a level look.
+                # Behind the camera: first turn by the bearing, with a level camera.
                 pan, tilt = pan + atan2(-x, z), 0.0
                 continue
             pan -= atan2(x, z * max(cos(tilt), 0.2))
@@ -43,9 +46,11 @@ class Gaze:
 
 
 class Sweep:
-    """A fixed pattern over the whole pan range at two tilts, one for the floor far off, one for the floor near by.
-    What lies ahead comes first: a little to one side, all the way to the other, back at the near tilt, and last what is
-    left of the first side."""
+    """A fixed pattern over the whole pan range at two tilts, for the far and the near floor.
+
+    It begins ahead: a little to one side, all the way to the other, back at the near tilt, and last the rest of the
+    first side.
+    """
 
     def __init__(self, config: HeadConfig, pan_rad: float) -> None:
         self._config = config
@@ -54,7 +59,7 @@ class Sweep:
         far, near = config.sweep_tilts_rad
         self._corners = [(ahead, far), (-reach, far), (-reach, near), (reach, near), (reach, far), (ahead, far)]
         self.swept = 0
-        """Corners that were reached."""
+        """Number of corners reached."""
 
     @property
     def done(self) -> bool:
@@ -65,7 +70,7 @@ class Sweep:
         return self.swept / len(self._corners)
 
     def next(self, pan_rad: float, tilt_rad: float) -> tuple[float, float]:
-        """(pan, tilt) to go to now."""
+        """(pan, tilt), rad, to go to now."""
         while not self.done:
             pan, tilt = self._corners[self.swept]
             if abs(pan - pan_rad) > 0.05 or abs(tilt - tilt_rad) > 0.05:

@@ -1,4 +1,4 @@
-"""What the planner reaches and drives with: the rigid body, or what the robot has learned of itself."""
+"""The body model that the planner reaches and drives with: the nominal one, or the learned one."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from services.planning.teaching import Teacher
 from services.planning.teaching import arm_angles as _arm
 
 USUAL_M = 0.005
-"""A map's error where its model does not tell it."""
+"""Error of a map whose model has no score."""
 NOTHING_LEARNED = "rigid body: nothing learned"
 
 
 class LearnedHand:
-    """The pads' centre by the learned map: where the drawing has it, moved as the map moves the marker.
+    """The pads' centre by the learned map: its nominal position, moved as the map moves the marker.
 
-    The map knows where the marker is seen, and nothing of the hand's direction, which stays the drawing's.
+    The map gives positions of the marker only, so the hand's direction stays nominal. See `HandModel` for the methods.
     """
 
     def __init__(self, robot: Robot, learned: HandMap) -> None:
@@ -47,7 +47,7 @@ class LearnedHand:
         return np.asarray(self._drawn.position(angles) + self._offset(angles))
 
     def jacobian(self, angles: Mapping[str, float], joints: Iterable[str]) -> FloatArray:
-        """As `Chain.jacobian`, for the joints of ARM in their order."""
+        """Jacobian (6, 4), as `Chain.jacobian`, for the joints of ARM in their order."""
         jac = self._drawn.jacobian(angles, joints)
         at = _arm(angles)
         if self._map.over_nominal and self._map.coordinates == "cartesian":
@@ -64,10 +64,10 @@ class LearnedHand:
 
 
 class SeenHand:
-    """The hand as it is felt, brought to where it is seen (the paper's DIRECT: seen while in view, else felt).
+    """The computed hand with a slow correction towards where its marker is seen. See `HandModel` for the methods.
 
-    What is seen never replaces what is felt: it is what moves a slow correction of it. So nothing jumps when the marker
-    comes into view or is hidden, however far the two are apart; a correction that is not renewed fades.
+    The paper's DIRECT switches between the seen and the computed hand. The correction instead avoids jumps when the
+    marker comes into view or is hidden, however far the two are apart. Without new sightings it decays.
     """
 
     def __init__(self, felt: HandModel, marker: HandMap | NominalModel, config: HandSightConfig) -> None:
@@ -82,7 +82,7 @@ class SeenHand:
 
     @property
     def correction_m(self) -> FloatArray:
-        """Added to where the hand is felt, shape (3,)."""
+        """Correction of the computed hand position, (3,), metres."""
         return self._correction
 
     def pose(self, angles: Mapping[str, float]) -> FloatArray:
@@ -97,11 +97,11 @@ class SeenHand:
         return self._felt.jacobian(angles, joints)
 
     def seen(self, now_ns: int) -> bool:
-        """Whether the hand was seen lately."""
+        """Whether the hand was seen within `lately_s`."""
         return self._seen_ns is not None and now_ns - self._seen_ns < self._config.lately_s * NS
 
     def step(self, sightings: Iterable[PostureSighting], now_ns: int) -> None:
-        """Take the marker's sightings of this step of the planner, and let the correction follow."""
+        """Enter the marker's sightings of this planner step, and move the correction."""
         config = self._config
         dt_s = 0.0 if self._now_ns is None else min(max((now_ns - self._now_ns) / NS, 0.0), 0.1)
         self._now_ns = now_ns
@@ -120,7 +120,7 @@ class SeenHand:
 
 
 class Learned:
-    """What is known beyond the drawing, and the sentence that says so."""
+    """The learned parts of the body model in use, and their description for the status."""
 
     def __init__(self, robot: Robot, config: PlanningConfig) -> None:
         self._robot = robot
@@ -130,47 +130,47 @@ class Learned:
         self.separation_m: float | None = None
         self.camera_tilt = CameraTilt(robot)
         self.hand: SeenHand | None = None
-        """None: the rigid body, unseen."""
+        """None: the nominal model, uncorrected by sight."""
         self.map: HandMap | None = None
         self.mesh: ReachMesh | None = None
-        """Where the hand was seen; None where nothing was learned of the arm."""
+        """Mesh of the positions where the hand was seen; None where the arm was not learned."""
         self._teacher: Teacher | None = None
         self._use(None)
 
     @property
     def text(self) -> str:
-        """For the status: with what the robot reaches, and what was refused last."""
+        """For the status: the model in use, and the last refusal."""
         text = f"{self._text}; {self._teacher.text}" if self._teacher is not None else self._text
         return f"{text} ({self._refusal})" if self._refusal else text
 
     def step(self, sightings: Sequence[PostureSighting], now_ns: int) -> None:
-        """Take the marker's sightings of this step of the planner."""
+        """Enter the marker's sightings of this planner step."""
         if self._teacher is not None:
             self._teacher.step(sightings)
         if self.hand is not None:
             self.hand.step(sightings, now_ns)
 
     def offset_m(self, angles: Mapping[str, float]) -> FloatArray | None:
-        """By how much the hand is seen beside where the drawing has it, shape (3,); None where nothing was learned."""
+        """Seen less nominal position of the marker, (3,), metres; None where the arm was not learned."""
         if self.map is None:
             return None
         at = _arm(angles)
         return np.asarray(self.map.at(at) - self.map.nominal.at(at))
 
     def rest(self) -> None:
-        """Called while the robot does nothing, for what takes long."""
+        """Do work that takes long; called while the robot is idle."""
         if self._teacher is not None:
             self._teacher.rest()
 
     def load(self, path: str) -> None:
-        """The model in a file; one that is refused changes nothing but the text."""
+        """Take over the model in a file. A refused one changes only the text."""
         try:
             self._take(models.load(Path(path), self._robot))
         except ConfigError as error:
             self._refusal = str(error)
 
     def take(self, content: bytes) -> None:
-        """A model that came over the mesh; likewise."""
+        """Take over a model that came by the mesh, like `load`."""
         try:
             self._take(models.decode(content, self._robot, "from the mesh"))
         except ConfigError as error:

@@ -1,7 +1,7 @@
 """Target memory: where each known object is, in the odometry frame, and how it moves.
 
-Per object a constant-velocity Kalman filter (derived), the same for the three axes. Sightings enter with the
-time of their frame; an unseen object is carried by odometry because its place is kept in the odometry frame.
+One constant-velocity Kalman filter (Kalman 1960) per object, equal for the three axes. Sightings enter with the time of
+their frame. Positions are in the odometry frame, so odometry carries an object that is not seen.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from cocoro.messages import TargetEstimate
 from services.planning.config import MemoryConfig
 
 _SURE = 3
-"""Sightings after which something is taken to be there."""
+"""Sightings after which an object counts as existing."""
 _AGREE = 3
-"""So many outliers in a row that agree with one another move the memory to their place."""
+"""Consecutive outliers in agreement that move the object to their position."""
 
 
 @dataclass
 class Track:
-    """One object's filter. Positions in the odometry frame, metres; `covariance` of (position, velocity)."""
+    """One object's filter. Positions (3,): odometry frame, metres; `covariance` (2, 2): position and velocity."""
 
     position_m: FloatArray
     stamp_ns: int
@@ -34,7 +34,7 @@ class Track:
     covariance: FloatArray = field(default_factory=lambda: np.diag([1e-4, 1e-2]))
     sightings: int = 1
     surprise: float = 1.0
-    """Smoothed normalised innovation: above 1 the object moves more than was expected of it."""
+    """Smoothed normalised innovation; above 1 the object moves more than expected."""
     outliers: list[FloatArray] = field(default_factory=list)
 
 
@@ -50,7 +50,7 @@ class TargetMemory:
         self._tracks.pop(label, None)
 
     def see(self, label: str, position_m: FloatArray, distance_m: float, stamp_ns: int, *, doubtful: bool) -> None:
-        """One sighting: the object's centre in the odometry frame at the frame's stamp."""
+        """Enter a sighting: the object's centre (3,), odometry frame, metres, at the frame's stamp."""
         config = self._config
         sigma_m = config.sigma_m + config.sigma_per_m * distance_m
         if doubtful:
@@ -92,7 +92,7 @@ class TargetMemory:
     def _outlier(
         self, label: str, track: Track, position_m: FloatArray, stamp_ns: int, sigma_m: float, doubtful: bool
     ) -> None:
-        """A sighting far from where the object should be: something else, or it was moved."""
+        """A sighting far from the expected position: another object, or this one was moved."""
         if doubtful:
             return
         if track.outliers and np.linalg.norm(position_m - track.outliers[-1]) > 2 * self._config.gate_m:
@@ -102,7 +102,7 @@ class TargetMemory:
             self._tracks[label] = Track(np.mean(track.outliers, axis=0), stamp_ns, sigma_m)
 
     def estimate(self, label: str, body: Pose2, now_ns: int) -> TargetEstimate | None:
-        """What is believed of an object now, seen from the body's pose in the odometry frame."""
+        """The estimate of an object now, in the frame of the body's pose; None for an unknown one."""
         track = self._tracks.get(label)
         if track is None:
             return None
@@ -121,12 +121,12 @@ class TargetMemory:
         )
 
     def sightings(self, label: str) -> int:
-        """How often the object was seen where it is believed to be."""
+        """Number of sightings that support the object's position."""
         track = self._tracks.get(label)
         return track.sightings if track else 0
 
     def all(self, body: Pose2, now_ns: int, *, sure: bool = False) -> tuple[TargetEstimate, ...]:
-        """Everything in memory; `sure`: only what was seen often enough to be there, for a single sighting may be a
+        """The estimates of all objects; `sure`: only of those that were seen repeatedly, since one sighting may be a
         mistake."""
         least = _SURE if sure else 1
         labels = [label for label, track in sorted(self._tracks.items()) if track.sightings >= least]
@@ -135,5 +135,5 @@ class TargetMemory:
 
 
 def _moved(track: Track, dt_s: float, fade_s: float) -> FloatArray:
-    """The place after `dt_s`, the velocity fading: the integral of v exp(-t / fade)."""
+    """The position (3,) after `dt_s` with a decaying velocity: the integral of v exp(-t / fade)."""
     return track.position_m + track.velocity_mps * fade_s * (1.0 - exp(-dt_s / fade_s))

@@ -1,4 +1,4 @@
-"""Egocentric navigation: arcs that bring a target to a given place beside the robot.
+"""Egocentric navigation: arcs that bring a target to a given position in the body frame.
 
 The paper's arc to a target at planar (rho, phi) has radius R = rho / (2 sin phi) (derived). Here the target is not
 to end under the robot's centre but on a line parallel to its heading, `aim_m` = (x, y) in the body frame, since the arm
@@ -19,16 +19,16 @@ from services.planning.config import NavigationConfig
 
 @dataclass(frozen=True)
 class Offset:
-    """What is left of a drive."""
+    """The rest of a drive."""
 
     ahead_m: float
-    """Still to drive, negative when the target is too near."""
+    """Distance to drive; negative when the target is too near."""
     heading_rad: float
-    """Still to turn, counter-clockwise positive."""
+    """Angle to turn, counter-clockwise positive."""
 
 
 def offset_to(target_m: tuple[float, float], aim_m: tuple[float, float]) -> Offset:
-    """From where the target is to where it shall be, both in the body frame."""
+    """The rest of a drive from the target's position and its wanted position, both (x, y), body frame."""
     x, y = target_m
     rho = max(hypot(x, y), abs(aim_m[1]) + 1e-3)
     aim_bearing = asin(aim_m[1] / rho)
@@ -37,7 +37,7 @@ def offset_to(target_m: tuple[float, float], aim_m: tuple[float, float]) -> Offs
 
 
 class Driver:
-    """Turns what is left of a drive into wheel speeds, with bounded acceleration."""
+    """Converts the rest of a drive into wheel speeds, with bounded acceleration."""
 
     def __init__(self, config: NavigationConfig, base: Base) -> None:
         self._config = config
@@ -47,7 +47,7 @@ class Driver:
         self._turn_radps = 0.0
 
     def turn_with(self, separation_m: float | None) -> None:
-        """The wheels' distance as it was learned; None is the drawing's."""
+        """Use a learned wheel distance; None is the nominal one."""
         self._separation_m = separation_m if separation_m is not None else self._base.wheel_separation_m
 
     def reset(self) -> None:
@@ -65,13 +65,13 @@ class Driver:
         )
 
     def law(self, offset: Offset) -> tuple[float, float]:
-        """Speed and turn rate of the arc for what is left, before the limits of acceleration."""
+        """Speed and turn rate of the arc for the rest of the drive, before the acceleration limits."""
         config = self._config
         ahead, heading = offset.ahead_m, offset.heading_rad
         if abs(ahead) <= config.distance_tolerance_m:
             speed = 0.0
         else:
-            # Never faster than what can be braked within what is left.
+            # Slow enough to brake within the remaining distance.
             speed = copysign(min(config.max_speed_mps, sqrt(config.acceleration_mps2 * abs(ahead))), ahead)
         if abs(heading) > config.turn_in_place_rad:
             speed = 0.0
@@ -83,7 +83,7 @@ class Driver:
         return speed, min(max(turn, -config.max_turn_radps), config.max_turn_radps)
 
     def preview(self, target_m: tuple[float, float], aim_m: tuple[float, float]) -> list[Pose2]:
-        """The poses, in the body frame of now, that the arc will pass, every 0.1 s; as far as 20 s."""
+        """The poses along the arc in the present body frame, every 0.1 s for at most 20 s."""
         poses = [Pose2()]
         for _ in range(200):
             x, y, _z = poses[-1].inverse().apply((*target_m, 0.0))
@@ -95,7 +95,7 @@ class Driver:
         return poses
 
     def stopping_poses(self, speed_mps: float, turn_radps: float) -> list[Pose2]:
-        """The poses, in the body frame of now, over the time that it takes to react and stop from a speed."""
+        """The poses, in the present body frame, while the robot reacts and stops."""
         time_s = 0.25 + abs(speed_mps) / self._config.acceleration_mps2 * 0.6
         steps = max(2, round(time_s / 0.08))
         poses = [Pose2()]
@@ -104,8 +104,8 @@ class Driver:
         return poses[1:]
 
     def command(self, speed_mps: float, turn_radps: float, dt_s: float, *, brisk: bool = False) -> BaseCommand:
-        """Approach a speed and turn rate within the acceleration limits (`brisk`: twice those, for pursuit); scaled
-        together when a wheel saturates, which keeps the arc."""
+        """Approach a speed and turn rate within the acceleration limits; `brisk`: within twice the limits, for pursuit.
+        When a wheel saturates, both wheels are scaled, which keeps the arc."""
         config = self._config
         more = 2.0 if brisk else 1.0
         self._speed_mps = _approach(self._speed_mps, speed_mps, more * config.acceleration_mps2 * dt_s)
@@ -120,7 +120,7 @@ class Driver:
         return BaseCommand(left_mps=left, right_mps=right)
 
     def within(self, command: BaseCommand, limit_mps: float) -> BaseCommand:
-        """A command made slower, on the same arc, until no wheel is faster than a limit; it goes on from there."""
+        """Scale a command on its arc until no wheel exceeds a limit; the next command continues from there."""
         faster_mps = max(abs(command.left_mps), abs(command.right_mps))
         if faster_mps <= limit_mps:
             return command
@@ -130,8 +130,8 @@ class Driver:
         return BaseCommand(left_mps=share * command.left_mps, right_mps=share * command.right_mps)
 
     def pause(self, dt_s: float) -> BaseCommand:
-        """Zero, for as long as somebody is silent; then it goes on from what the base's own ramp has left of its speed
-        by then."""
+        """A zero command while a publisher is silent. The next command continues from the speed that the base's own
+        ramp has left."""
         half = self._turn_radps * self._separation_m / 2
         faster_mps = max(abs(self._speed_mps - half), abs(self._speed_mps + half))
         left_mps = max(faster_mps - self._base.wheel_acceleration_mps2 * dt_s, 0.0)
@@ -141,7 +141,7 @@ class Driver:
         return BaseCommand(left_mps=0.0, right_mps=0.0)
 
     def halt(self) -> BaseCommand:
-        """Zero at once: the base's own ramp is all that there is between this and standing."""
+        """A zero command without a ramp of the planner; the base's own ramp remains."""
         self.reset()
         return BaseCommand(left_mps=0.0, right_mps=0.0)
 

@@ -1,4 +1,4 @@
-"""Which postures the arm may babble into, and along which ways: clear of the robot itself and of the floor."""
+"""Postures that the arm may babble into and paths between them, clear of the robot and the floor; and the draws."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from services.planning.clearance import Clearance
 from services.planning.reach import ARM
 
 RANGE_RAD = 2.62
-"""The paper's, a joint."""
+"""The paper's range of each joint."""
 MARGIN_M = 0.03
-"""The body may differ from its drawing by a centimetre or two."""
+"""Clearance of a safe posture: the body may differ from the nominal model by a centimetre or two."""
 WAY_RAD = 0.12
-"""A way is checked this often, by its widest joint."""
+"""Largest step of a joint between the checked postures of a path."""
 OWN_ARM_M = 0.02
-"""Least distance of the hand from the hull of the own upper arm."""
+"""Least distance of the hand from the hull of the upper arm."""
 
 
 class Postures:
-    """Angles are in the order of ARM; the wrist roll is level, the claws as they are."""
+    """Judges postures (4,), rad, in the order of ARM, with the wrist roll level."""
 
     def __init__(self, robot: Robot) -> None:
         limits = np.array([robot.joints[name].limits_rad for name in ARM])
@@ -41,13 +41,13 @@ class Postures:
         self._nearest_m = robot.kinect.min_range_m
 
     def marker_m(self, angles: Mapping[str, float]) -> tuple[float, float, float]:
-        """Where the drawing has the marker, body frame, for the angles of all joints."""
+        """The marker's nominal position (x, y, z), body frame, metres, for the angles of all joints."""
         chain, marker = self._marker
         x, y, z = (chain.pose(angles) @ marker)[:3].tolist()
         return x, y, z
 
     def safe(self, posture: FloatArray) -> bool:
-        """Nothing is nearer than the margin: mount, chassis, floor, Kinect, and the hand to the arm it hangs on."""
+        """Whether mount, chassis, floor and Kinect are further than the margin, and the hand from the upper arm."""
         angles = self._angles(posture)
         if self._clearance.of(angles) < MARGIN_M:
             return False
@@ -58,12 +58,12 @@ class Postures:
         shoulder, elbow = (chain.position(angles) for chain in self._upper)
         along = elbow - shoulder
         hand = centres[self._hand_from :] - shoulder
-        share = np.clip(hand @ along / (along @ along), -0.3, 1.0)  # the shoulder's bracket stands behind it
+        share = np.clip(hand @ along / (along @ along), -0.3, 1.0)  # the shoulder's bracket is behind the axis
         away = np.linalg.norm(hand - share[:, None] * along, axis=1) - radii[self._hand_from :]
         return float(away.min()) > self._from_upper_arm_m
 
     def seeable(self, posture: FloatArray) -> bool:
-        """The drawing has the marker where the camera might see it: not too near, and not behind the hand."""
+        """Whether the camera might see the marker: not too near, and not hidden by the hand (nominal model)."""
         chain, marker = self._marker
         pose = chain.pose(self._angles(posture))
         to_camera = self._head - (pose @ marker)[:3]
@@ -72,7 +72,7 @@ class Postures:
         return distance_m > self._nearest_m and float(pose[:3, 1] @ to_camera) > -0.1 * distance_m
 
     def clear_way(self, start: FloatArray, end: FloatArray) -> bool:
-        """Every posture on the straight way in joint space is safe; the start itself need not be."""
+        """Whether all postures on the straight path in joint space are safe; the start need not be."""
         count = int(np.ceil(float(np.abs(end - start).max()) / WAY_RAD))
         return all(self.safe(start + (end - start) * step / count) for step in range(1, count + 1))
 
@@ -81,15 +81,17 @@ class Postures:
 
 
 def sobol(first: int, ranges: FloatArray) -> Iterator[tuple[int, FloatArray]]:
-    """(number, point) from the draw `first` on, for ever; points (n,) within `ranges` (n, 2). Equal numbers, equal
-    points. Number 0, the sequence's own first, is a corner of the box like any other."""
+    """Sobol draws (Sobol 1967) from number `first` on, without end: (number, point (n,) within `ranges` (n, 2)).
+
+    Equal numbers give equal points, so babbling can continue where it ended. Number 0 is a corner of the box.
+    """
     engine = scipy.stats.qmc.Sobol(len(ranges), scramble=False)
     if first:
         engine.fast_forward(first)
     low, high = ranges.T
     number = first
     while True:
-        # Two at a time: the engine warns of a first draw alone, which would not be balanced.
+        # Two at a time: the engine warns about a single first draw, which is not balanced.
         for share in engine.random(2):
             yield number, np.asarray(low + share * (high - low))
             number += 1

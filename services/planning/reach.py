@@ -1,5 +1,6 @@
-"""Rigid-body reaching: the hand moved in cylindrical coordinates about the arm base's axis by the damped pseudo-inverse
-of the Jacobian, within the joint limits (the paper's 'Motor planning for reaching' with the model's own Jacobian)."""
+"""Reaching: the hand moves in cylindrical coordinates about the arm base's axis by the damped pseudo-inverse of the
+Jacobian (Nakamura and Hanafusa 1986), within the joint limits. It is the paper's 'Motor planning for reaching' with the
+Jacobian of the model in use."""
 
 from __future__ import annotations
 
@@ -17,7 +18,7 @@ ARM = ("arm_base", "shoulder", "elbow", "wrist_pitch")
 
 
 class HandPose(NamedTuple):
-    """Where the pads' centre is and how the hand is pitched, about the arm base's vertical axis."""
+    """Position of the pads' centre and pitch of the hand, about the arm base's vertical axis."""
 
     radius_m: float
     azimuth_rad: float
@@ -25,10 +26,10 @@ class HandPose(NamedTuple):
     height_m: float
     """Above the floor."""
     pitch_rad: float
-    """Of the hand's own axis, up positive."""
+    """Pitch of the hand's axis, up positive."""
 
     def towards(self, goal: HandPose, step_m: float, step_rad: float) -> HandPose:
-        """A pose nearer to the goal: no coordinate moves further than its step, all arrive together."""
+        """A pose nearer to the goal: no coordinate moves further than its step, and all arrive together."""
         gaps = [g - v for g, v in zip(goal, self, strict=True)]
         gaps[1] = wrap_rad(gaps[1])
         scale = max(
@@ -41,20 +42,20 @@ class HandPose(NamedTuple):
 
 
 class HandModel(Protocol):
-    """Where the pads' centre is: the drawing's chain, or what was learned of it."""
+    """Kinematics of the pads' centre, nominal or learned. Angles are by joint, rad."""
 
     def pose(self, angles: Mapping[str, float]) -> FloatArray:
-        """4 x 4, hand to body frame."""
+        """Transform (4, 4) from the hand's frame to the body frame, metres."""
 
     def position(self, angles: Mapping[str, float]) -> FloatArray:
-        """Body frame, shape (3,)."""
+        """Position (3,), body frame, metres."""
 
     def jacobian(self, angles: Mapping[str, float], joints: Iterable[str]) -> FloatArray:
-        """Shape (6, n), as `Chain.jacobian`."""
+        """Jacobian (6, n), as `Chain.jacobian`: m/rad and rad/rad."""
 
 
 class Reacher:
-    """Forward and inverse kinematics of the hand, from the robot description."""
+    """Forward and inverse kinematics of the hand, nominal or learned."""
 
     def __init__(self, robot: Robot, damping: float) -> None:
         self._rigid = robot.chain("pad_centre")
@@ -65,11 +66,11 @@ class Reacher:
         self.level_roll_rad = robot.claw.level_roll_rad
 
     def use(self, hand: HandModel | None) -> None:
-        """Reach with this from now on; None is the rigid body."""
+        """Reach with this model; None is the nominal one."""
         self._pad = hand if hand is not None else self._rigid
 
     def position(self, angles: Mapping[str, float]) -> FloatArray:
-        """The pads' centre, body frame, shape (3,)."""
+        """Position (3,) of the pads' centre, body frame, metres."""
         return self._pad.position(angles)
 
     def pose(self, angles: Mapping[str, float]) -> HandPose:
@@ -78,7 +79,7 @@ class Reacher:
         return HandPose(hypot(x, y), atan2(y, x), float(z), asin(min(max(float(transform[2, 2]), -1.0), 1.0)))
 
     def point(self, pose: HandPose) -> FloatArray:
-        """A hand pose's place in the body frame, shape (3,)."""
+        """Position (3,) of a hand pose, body frame, metres."""
         return np.array(
             [
                 self._axis[0] + pose.radius_m * cos(pose.azimuth_rad),
@@ -88,12 +89,12 @@ class Reacher:
         )
 
     def seen_from_arm(self, point_m: tuple[float, float, float]) -> tuple[float, float, float]:
-        """(radius_m, azimuth_rad, height_m) of a point of the body frame about the arm base's axis."""
+        """(radius_m, azimuth_rad, height_m) about the arm base's axis of a point (x, y, z), body frame, metres."""
         x, y = point_m[0] - self._axis[0], point_m[1] - self._axis[1]
         return hypot(x, y), atan2(y, x), point_m[2]
 
     def step(self, angles: Mapping[str, float], pose: HandPose) -> FloatArray:
-        """Joint angles (in the order of ARM, shape (4,)) one step nearer to a hand pose.
+        """Joint angles (4,), rad, in the order of ARM, one step nearer to a hand pose.
 
         A joint that a step would carry over its limit is put on the limit and the others are solved again.
         """
@@ -105,7 +106,7 @@ class Reacher:
         jac = np.vstack([jac6[:3], 0.2 * pitch_row])
         error = np.empty(4)
         error[:3] = self.point(pose) - transform[:3, 3]
-        # 0.2 m: what a radian of pitch counts against a metre of place.
+        # A radian of pitch weighs as much as 0.2 m of position.
         error[3] = 0.2 * (pose.pitch_rad - asin(min(max(float(along[2]), -1.0), 1.0)))
         start = np.array([angles[name] for name in ARM])
         free = np.ones(4, dtype=bool)
@@ -123,7 +124,7 @@ class Reacher:
         return start + change
 
     def solve(self, angles: Mapping[str, float], pose: HandPose) -> dict[str, float] | None:
-        """Joint angles for a hand pose, found from nearby ones; None when it is out of reach (5 mm, 3 degrees)."""
+        """Joint angles, rad, for a hand pose, iterated from `angles`; None if it is out of reach (5 mm, 3 degrees)."""
         trial = dict(angles)
         for _ in range(60):
             trial.update(zip(ARM, self.step(trial, pose).tolist(), strict=True))

@@ -1,10 +1,10 @@
-"""Where the hand can reach: by the kinematics, and by a mesh over the places where it has been seen.
+"""Reachable targets: by the kinematics, and by a mesh over the positions where the hand was seen.
 
-A triangulation fills the convex hull of its points, and the space that a hand reaches is not convex: there is a hollow
-about the shoulder, one where the camera mount stands, and one behind the body. So a tetrahedron counts only when it is
-small: when the ball through its corners, empty of sightings by construction, is no larger than the gaps that sightings
-so dense would leave (an alpha shape). A place in a larger one is inside the hull, but nobody has seen the hand near it:
-that is answered as `unproven`, not as reachable.
+A Delaunay triangulation fills the convex hull of its points, but the space that a hand reaches is not convex: it has
+hollows about the shoulder, at the camera mount and behind the body. A tetrahedron therefore counts only if the ball
+through its corners, which contains no sighting, is no larger than the gaps between sightings of that density: an alpha
+shape (Edelsbrunner and Muecke 1994). Positions in larger tetrahedra are `UNPROVEN`: inside the hull, but the hand was
+never seen near.
 """
 
 from __future__ import annotations
@@ -23,37 +23,42 @@ from services.planning.config import ArmConfig
 from services.planning.reach import ARM, HandPose, Reacher
 
 GAP_FACTOR = 3.0
-"""A ball is small while its radius is at most so many times the distance within which sightings have neighbours."""
+"""Largest radius of a small ball, as a multiple of the distance of neighbouring sightings."""
 LEAST_RADIUS_M = 0.03
-"""Gaps smaller than this are closed however dense the sightings are elsewhere."""
+"""Gaps below this radius are closed, however dense the sightings are."""
 _LUMP = 64
-"""So many places wait until they are entered together: adding to the mesh costs as much for one as for many."""
+"""Positions that are entered together: an update of the mesh costs as much for one as for many."""
 _GRID_M = 0.004
-"""Of two places in one cell of this size the second adds nothing and is left out."""
+"""Cell size of the thinning: of several positions in one cell only the first is kept."""
 BEYOND_M = 0.15
-"""Further than this beyond all places where the hand was seen, what was learned of it says nothing."""
+"""Distance from all sightings beyond which the learned map says nothing."""
 RETREAT_STEP_M, RETREAT_STEPS = 0.005, 8
 RETREAT_ROOM_M = 0.01
-"""The arm must fold in further than to where it waits, lest it waits at its limits."""
+"""The arm must be able to fold in further than where it waits, so that it does not wait at its limits."""
 RETREAT_HEIGHTS_M = (0.045, 0.08)
 _UPRIGHT = {"arm_base": -0.087, "shoulder": 0.66, "elbow": -1.6, "wrist_pitch": 0.77}
-"""Elbow up, hand before the robot: where the search for joint angles starts, so that it stays in that family."""
+"""Elbow up, hand in front of the robot: start of the iteration for joint angles, which stays in that family."""
 
 
 class ReachVerdict(IntEnum):
+    """Whether the hand was seen around a position."""
+
     OUTSIDE = 0
-    """Beyond every place where the hand was seen."""
+    """Outside of the hull of all sightings."""
     UNPROVEN = 1
-    """Between places where the hand was seen, but in a gap: it may be a hollow."""
+    """Between sightings, in a gap that may be a hollow."""
     INSIDE = 2
-    """Amidst places where the hand was seen."""
+    """Among sightings."""
 
 
 class ReachMesh:
-    """The mesh over places (b, 3), body frame, metres. Fewer than five places in general position prove nothing."""
+    """The mesh over positions (b, 3), body frame, metres, grown incrementally.
+
+    With fewer than five positions in general position every verdict is OUTSIDE.
+    """
 
     def __init__(self, places_m: FloatArray | None = None, *, radius_m: float | None = None) -> None:
-        """`radius_m`: of the largest ball that counts as small; None derives it from the sightings' own spacing."""
+        """`radius_m`: radius of the largest ball that counts as small; None derives it from the sightings' spacing."""
         self._wanted_m = radius_m
         self._mesh: scipy.spatial.Delaunay | None = None
         self._waiting: list[FloatArray] = []
@@ -66,21 +71,21 @@ class ReachMesh:
 
     @property
     def places_m(self) -> FloatArray:
-        """The places that the mesh is made of, those that wait to be entered included; shape (b, 3)."""
+        """All positions (b, 3), body frame, metres, including those not yet entered."""
         return np.concatenate([self._held, *self._waiting])
 
     def add(self, places_m: FloatArray | Sequence[Sequence[float]]) -> None:
-        """More places where the hand was seen, shape (b, 3)."""
+        """Add positions (b, 3), body frame, metres, where the hand was seen."""
         self._waiting.append(np.asarray(places_m, dtype=np.float64).reshape(-1, 3))
         if self._mesh is None or sum(map(len, self._waiting)) >= _LUMP:
             self._enter()
 
     def verdict(self, place_m: Sequence[float] | FloatArray) -> ReachVerdict:
-        """For one place."""
+        """The verdict on one position (3,), body frame, metres."""
         return ReachVerdict(int(self.verdicts(np.asarray(place_m, dtype=np.float64)[None])[0]))
 
     def verdicts(self, places_m: FloatArray) -> IntArray:
-        """For places (b, 3): their `ReachVerdict`, shape (b,)."""
+        """The `ReachVerdict`s (b,) on positions (b, 3), body frame, metres."""
         self._enter()
         if self._mesh is None:
             return np.full(len(places_m), ReachVerdict.OUTSIDE)
@@ -89,12 +94,12 @@ class ReachMesh:
         return np.where(simplex < 0, ReachVerdict.OUTSIDE, inside)
 
     def nearest_m(self, place_m: Sequence[float] | FloatArray) -> float:
-        """From one place to the nearest at which the hand was seen; infinite where it was nowhere."""
+        """Distance, metres, from a position (3,) to the nearest sighting; infinite without sightings."""
         places = self.places_m
         return float(np.linalg.norm(places - np.asarray(place_m), axis=1).min()) if len(places) else float("inf")
 
     def volume_m3(self) -> float:
-        """Of all that is INSIDE."""
+        """Volume that is INSIDE."""
         self._enter()
         if self._mesh is None:
             return 0.0
@@ -124,7 +129,7 @@ class ReachMesh:
         self._measure()
 
     def _thinned(self, places_m: FloatArray) -> FloatArray:
-        """One a cell of a fine grid, the first that came: an incremental mesh suffers from doubles."""
+        """The first position (b, 3) in each cell of a fine grid: duplicates would harm the mesh."""
         kept = []
         for place, cell in zip(places_m, map(tuple, np.floor(places_m / _GRID_M).astype(int).tolist()), strict=True):
             if cell not in self._cells:
@@ -133,19 +138,19 @@ class ReachMesh:
         return np.array(kept).reshape(-1, 3)
 
     def _measure(self) -> None:
-        """Which tetrahedra are small."""
+        """Find the small tetrahedra."""
         assert self._mesh is not None
         if self._wanted_m is None:
             distances, _ = scipy.spatial.KDTree(self._held).query(self._held, k=min(4, len(self._held)))
             neighbours = np.asarray(distances)[:, -1]
             self.radius_m = max(LEAST_RADIUS_M, GAP_FACTOR * float(np.quantile(neighbours, 0.75)))
         self._small = _radii_m(self._mesh.points[self._mesh.simplices]) <= self.radius_m
-        self._mesh.find_simplex(self._held[:1])  # what it makes for the first question takes long: now, not then
+        self._mesh.find_simplex(self._held[:1])  # builds its search structure now: it takes long
 
 
 def _radii_m(corners: FloatArray) -> FloatArray:
-    """Circumradii of tetrahedra (s, 4, 3), shape (s,); infinite for flat ones. Derived: the centre is as far from each
-    corner, which gives three linear equations in its offset from the first."""
+    """Circumradii (s,), metres, of tetrahedra (s, 4, 3); infinite for flat ones. The centre is equidistant from the
+    corners, which gives three linear equations in its offset from the first corner (derived)."""
     edges = corners[:, 1:] - corners[:, :1]
     lengths2 = (edges**2).sum(axis=2)
     flat = np.abs(np.linalg.det(edges)) < 1e-12
@@ -155,7 +160,7 @@ def _radii_m(corners: FloatArray) -> FloatArray:
 
 
 class Grasp(NamedTuple):
-    """Where the hand has to go for a target: behind it, and around it."""
+    """Hand poses for a target: behind it, and around it."""
 
     behind: HandPose
     around: HandPose
@@ -170,20 +175,20 @@ class Reachability:
         self._retreat_m: float | None = None
 
     def use(self, learned: HandMap | None, mesh: ReachMesh | None) -> None:
-        """Judge by where the hand was seen, too, from now on; None: by the kinematics alone."""
+        """Also judge by the positions where the hand was seen; None: by the kinematics alone."""
         self._seen = (learned, mesh) if learned is not None and mesh is not None else None
         self._retreat_m = None  # the kinematics may have changed, too
 
     @property
     def retreat_m(self) -> float:
-        """Where the hand waits behind a target, from the arm base's axis: no nearer than the arm folds."""
+        """Radius about the arm base's axis at which the hand waits behind a target."""
         if self._retreat_m is None:
             self._retreat_m = self._retreat()
         return self._retreat_m
 
     def _retreat(self) -> float:
-        """The configured radius, or as much more as the kinematics that it reaches with want: a hand that is learned to
-        be further out than its drawing has it folds less far in."""
+        """The configured radius, increased as far as the kinematics in use need it: a hand that is learned to be longer
+        than the nominal one folds in less far."""
         config = self._config
         for more in range(RETREAT_STEPS):
             radius = config.retreat_radius_m + more * RETREAT_STEP_M
@@ -193,7 +198,7 @@ class Reachability:
         return config.retreat_radius_m
 
     def grasp(self, target_m: Vec3) -> Grasp:
-        """The hand poses for a target's centre (body frame), reachable or not."""
+        """The hand poses for a target's centre (x, y, z), body frame, metres, reachable or not."""
         config = self._config
         radius, azimuth, height = self._reacher.seen_from_arm(target_m)
         low, high = config.grasp_height_range_m
@@ -202,7 +207,7 @@ class Reachability:
         return Grasp(behind, behind._replace(radius_m=radius))
 
     def why_not(self, target_m: Vec3, *, touching: bool = False) -> str:
-        """Why a target cannot be grasped from here, or just touched; '' when it can."""
+        """Why a target cannot be grasped (or `touching`: touched) from here; '' when it can."""
         config = self._config
         radius_range_m = config.touch_radius_range_m if touching else config.grasp_radius_range_m
         radius, azimuth, height = self._reacher.seen_from_arm(target_m)
@@ -221,7 +226,7 @@ class Reachability:
             return "the joint limits do not let the hand there"
         if self._seen is not None:
             learned, mesh = self._seen
-            # In a gap between sightings, and a little beyond them, it may try: there the drawing still serves.
+            # In gaps between sightings and a little beyond them the nominal model still serves.
             place = learned.at(np.array([around[name] for name in ARM]))
             if mesh.verdict(place) is ReachVerdict.OUTSIDE and mesh.nearest_m(place) > BEYOND_M:
                 return "the hand was never seen anywhere near"

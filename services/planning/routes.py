@@ -1,4 +1,4 @@
-"""Ways over the free floor: cheapest paths for the round body, keeping off what stands there (Dijkstra's algorithm)."""
+"""Cheapest paths over the free floor for the round body, at a distance from obstacles (Dijkstra 1959)."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ _STEPS = ((1, 0), (0, 1), (1, 1), (1, -1))
 
 
 class Routes:
-    """All cheapest paths from one place, over a map as it is now."""
+    """All cheapest paths from one place over the present map."""
 
     def __init__(
         self, floor: FloorMap, field: ClearanceField, start_m: tuple[float, float], radius_m: float, comfort_m: float
     ) -> None:
-        """The body of `radius_m` never touches; nearer than `comfort_m` to something costs more. Where the robot
-        stands now, it may be nearer: it can always leave."""
+        """Cells nearer than `radius_m` to an obstacle are closed, nearer than `comfort_m` they cost more. Cells around
+        the start are always open, so that the robot can leave."""
         self._floor = floor
         cost = np.where(
             field.metres >= radius_m, 1.0 + 3.0 * np.clip((comfort_m - field.metres) / comfort_m, 0.0, 1.0), np.inf
@@ -41,12 +41,12 @@ class Routes:
         self._distance, self._predecessors = distance[0], predecessors[0]
 
     def cost(self, x_m: float, y_m: float) -> float:
-        """What the way there costs, metres of comfortable floor; infinite when there is none."""
+        """Cost of the path to a place, in metres of clear floor; infinite where there is no path."""
         cell = self._floor.cell(x_m, y_m)
         return float(self._distance[cell[0] * SIZE + cell[1]]) if cell is not None else float("inf")
 
     def path(self, x_m: float, y_m: float) -> list[tuple[float, float]]:
-        """Cell middles from the start to there, odometry frame; empty when there is no way."""
+        """Cell centres from the start to a place, odometry frame, metres; empty where there is no path."""
         cell = self._floor.cell(x_m, y_m)
         if cell is None or self._predecessors is None:
             return []
@@ -62,7 +62,7 @@ class Routes:
 
 
 def _graph(cost: FloatArray) -> Any:
-    """Neighbouring cells joined by the mean of their costs times the step's length."""
+    """Sparse graph over cells with costs (SIZE, SIZE): an edge costs the mean of its two cells times its length."""
     numbers = np.arange(SIZE * SIZE).reshape(SIZE, SIZE)
     rows, columns, weights = [], [], []
     for down, right in _STEPS:

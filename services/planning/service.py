@@ -14,22 +14,22 @@ from services.planning.core import PlanningCore
 
 
 def core(robot: Robot, config: PlanningConfig) -> PlanningCore:
-    """The planner's maths."""
+    """The planner's pure core."""
     return PlanningCore(robot, config)
 
 
 async def run(node: Node, config: PlanningConfig) -> None:
-    """Plan for ever: at a fixed rate, and at once when a new detection arrives."""
+    """Run the planner: at a fixed rate, and when a detection arrives."""
     await plan(node, config, core(node.robot, config))
 
 
 async def plan(node: Node, config: PlanningConfig, planner: PlanningCore) -> None:
-    """Drives a planner for ever, and serves it learned models."""
+    """Step a planner and serve requests to take over a learned model."""
     if config.model:
         node.log.info("reaching: %s", planner.learned.text)
 
     async def take(request: ModelRequest) -> ModelReply:
-        """Checked here, so that who sends it hears why not; the core takes what is published, for the record."""
+        """Check the model, and publish it: the core takes it from its topic, so that it is recorded."""
         try:
             decode(request.content, node.robot, "from the mesh")
         except ConfigError as error:

@@ -1,4 +1,4 @@
-"""What the planner knows of the robot itself, read as history and never older than its stated age."""
+"""The planner's state estimate: states read as history, never older than their topic's age, and the target memory."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ from services.planning.surroundings import Surroundings
 
 _WAIT_FOR_ODOMETRY_NS = NS // 5
 FLOOR_M, FLOOR_PER_M = 0.040, 0.012
-"""Lower than this, growing with the distance, counts as floor to an eye that is tilted: more than perception has it,
-for such an eye is likely to be rolled a little, too."""
+"""Height below which a point counts as floor for a tilted camera, and its growth per metre of distance: more than
+perception's limit, because a tilted camera is likely to be rolled a little, too."""
 
 
 class PerceptionWatch:
-    """Whether perception lives, by when it is heard: also when it sees nothing, and however slow it is."""
+    """Whether perception is alive, by the arrival of its messages, however slow it is and even if it sees nothing."""
 
     def __init__(self, least_s: float, periods: float) -> None:
-        """It may be silent for `least_s`, and for as many of its own periods where that is longer."""
+        """It may be silent for `least_s`, or for `periods` of its own periods where that is longer."""
         self._least_ns = round(least_s * NS)
         self._periods = periods
         self._heard_ns: int | None = None
@@ -43,14 +43,14 @@ class PerceptionWatch:
         self._blind_since_ns: int | None = None
 
     def heard(self, now_ns: int) -> None:
-        """Detections have come."""
+        """Note that detections have arrived."""
         if self._heard_ns is not None and now_ns > self._heard_ns:
             self._gaps_ns.append(now_ns - self._heard_ns)
         self._heard_ns = now_ns
         self._blind_since_ns = None
 
     def blind_s(self, now_ns: int) -> float | None:
-        """As `StateEstimator.blind_s`; from when this was first asked where nothing was ever heard."""
+        """As `StateEstimator.blind_s`; counted from the first call where nothing has arrived yet."""
         if self._heard_ns is not None and 0 <= now_ns - self._heard_ns <= self._patience_ns():
             return None
         if self._blind_since_ns is None or now_ns < self._blind_since_ns:
@@ -58,26 +58,26 @@ class PerceptionWatch:
         return (now_ns - self._blind_since_ns) / NS
 
     def age_s(self, now_ns: int) -> float:
-        """Since it was heard; of one that is slow, less by what it may be silent for longer than others."""
+        """Time since the last arrival, less the extra silence that a slow perception may have."""
         if self._heard_ns is None or now_ns < self._heard_ns:
             return float("inf")
         return max(now_ns - self._heard_ns - (self._patience_ns() - self._least_ns), 0) / NS
 
     def _patience_ns(self) -> int:
-        # The median: neither one pause nor two messages at once say how fast it is.
+        # The median is robust against one pause and against two messages together.
         period_ns = sorted(self._gaps_ns)[len(self._gaps_ns) // 2] if self._gaps_ns else 0
         return max(self._least_ns, round(self._periods * period_ns))
 
 
 class PostureSighting(NamedTuple):
-    """One detection that nothing makes doubtful, with the posture at its frame's stamp."""
+    """A detection without doubt, with the joint angles at its frame's stamp."""
 
     label: str
     stamp_ns: int
     position_m: Vec3
     area_px: int
     angles_rad: dict[str, float]
-    """Of every joint."""
+    """By joint, all of them."""
 
 
 class Turning:
@@ -119,7 +119,7 @@ class Turning:
 
 
 class StateEstimator:
-    """Takes every input of the planner; answers by time."""
+    """Takes every input of the planner and answers queries by time."""
 
     def __init__(self, config: PlanningConfig, robot: Robot) -> None:
         self._joints = tuple(robot.joints)
@@ -129,7 +129,7 @@ class StateEstimator:
         self.hand: ServoState | None = None
         self.intent: Intent | None = None
         self.unlocalised: dict[str, tuple[int, str]] = {}
-        """Per label the stamp and the note of its newest detection without a position."""
+        """By label, the stamp and note of its newest detection without a position."""
         self._odometry = History(3, angular=(2,))
         self._postures: dict[str, tuple[tuple[str, ...], History]] = {}
         self._gap_ns = round(config.odometry_gap_s * NS)
@@ -137,14 +137,14 @@ class StateEstimator:
         self._waiting: deque[Detections] = deque(maxlen=8)
         self._floors: deque[Obstacles] = deque(maxlen=4)
         self.sight_lag_s = 0.0
-        """How old a sighting is when the next one comes, smoothed: a fast perception makes it small."""
+        """Smoothed age of a sighting when the next one arrives; small for a fast perception."""
         self._looked_ns: int | None = None
         self._said_ns: dict[str, int] = {}
-        """Per topic, when its newest message was said."""
+        """By topic, when its newest message was published."""
         self._sight = PerceptionWatch(robot.base.command_timeout_s, config.blind_periods)
         self.turning = Turning()
         self.camera_tilt: CameraTilt | None = None
-        """Where it is known to be tilted: what it sees standing on the floor may be the floor."""
+        """The camera's learned tilt: points that a tilted camera sees above the floor may be floor."""
         self._watched = {config.marker}
         self._sightings: list[PostureSighting] = []
 
@@ -155,7 +155,7 @@ class StateEstimator:
             resets = self._odometry.resets
             self._odometry.add(message.stamp_ns, self.turning.pose(message), message.incarnation)
             if self._odometry.resets != resets:
-                # The base restarted: its odometry frame is a new one, places in the old one mean nothing now.
+                # The base restarted with a new odometry frame; positions in the old frame are void.
                 self.memory.clear()
                 self.around.clear()
                 self._floors.clear()
@@ -186,7 +186,7 @@ class StateEstimator:
         history.add(state.stamp_ns, state.position_rad, state.incarnation)
 
     def posture(self, stamp_ns: int) -> dict[str, float]:
-        """Every joint's angle at a time; where that time is not held, the newest."""
+        """Every joint's angle, rad, at a time; the newest where that time is not in the history."""
         angles = dict(self.angles())
         for joints, history in self._postures.values():
             then = history.at(stamp_ns, self._gap_ns)
@@ -195,7 +195,7 @@ class StateEstimator:
         return angles
 
     def localise(self, now_ns: int) -> None:
-        """Enter the detections whose odometry is known; the others wait, briefly."""
+        """Enter detections whose odometry is known into the memory; others wait for 0.2 s."""
         self._sightings.clear()
         for _ in range(len(self._waiting)):
             detections = self._waiting.popleft()
@@ -206,7 +206,7 @@ class StateEstimator:
                 self._waiting.append(detections)
 
     def look_around(self, now_ns: int, own: Callable[[Mapping[str, float]], tuple[FloatArray, FloatArray]]) -> None:
-        """Enter what was seen of the floor where its odometry is known; `own` gives the robot's hull in a posture."""
+        """Enter floor observations whose odometry is known. `own`: the robot's hull by joint angles."""
         while self._floors:
             seen = self._floors[0]
             pose = self._odometry.at(seen.stamp_ns, self._gap_ns)
@@ -218,7 +218,7 @@ class StateEstimator:
                 self.around.floor.enter(seen, Pose2(*pose.tolist()), own(self.posture(seen.stamp_ns)))
 
     def _standing(self, seen: Obstacles) -> Obstacles:
-        """Without what only a tilted eye lifts off the floor."""
+        """The obstacles without points that appear above the floor only because the camera is tilted."""
         if self.camera_tilt is None or self.camera_tilt.tilt_rad <= 0.0 or not seen.points_m:
             return seen
         points = np.array(seen.points_m)
@@ -246,15 +246,15 @@ class StateEstimator:
             )
 
     def watch(self, label: str) -> None:
-        """Keep the sightings of a label as they are, beside what memory makes of them."""
+        """Also keep the unfiltered sightings of a label."""
         self._watched.add(label)
 
     def sightings_of(self, label: str) -> list[PostureSighting]:
-        """The watched label's sightings of the step that runs, in order."""
+        """The watched label's sightings of the current step, in order."""
         return [sighting for sighting in self._sightings if sighting.label == label]
 
     def _posture_at(self, stamp_ns: int) -> dict[str, float] | None:
-        """Every joint's angle at a time; None where that time is not held."""
+        """Every joint's angle, rad, at a time; None where that time is not in the history."""
         angles: dict[str, float] = {}
         for joints, history in self._postures.values():
             then = history.at(stamp_ns, self._gap_ns)
@@ -269,7 +269,7 @@ class StateEstimator:
         return Pose2(*newest[1].tolist()) if newest else None
 
     def missing(self, now_ns: int) -> str:
-        """Which state is missing or too old to move on ('' when all are fresh)."""
+        """Which state is missing or too old to move; '' when all are fresh."""
         for topic, message in (
             (topics.BASE_STATE, self.base),
             (topics.ARM_STATE, self.arm),
@@ -284,29 +284,29 @@ class StateEstimator:
         return f"no angle of {lacking[0]}" if lacking else ""
 
     def latched(self) -> str:
-        """Which hardware stands still for the emergency stop ('' when none)."""
+        """Which hardware is stopped by the emergency stop; '' when none is."""
         for name, state in (("base", self.base), ("arm", self.arm), ("hand", self.hand)):
             if state is not None and state.latch != "released":
                 return f"{name}: emergency stop {state.latch}"
         return ""
 
     def blind_s(self, now_ns: int) -> float | None:
-        """For how long perception has been silent for longer than it may be; None while it is not."""
+        """Time, s, for which perception has exceeded its permitted silence; None while it has not."""
         return self._sight.blind_s(now_ns)
 
     def _age_s(self, topic: Topic[Any], now_ns: int) -> float:
-        """Since the newest of a topic was said: by its stamp, but where that is ahead of our clock by when it came."""
+        """Age, s, of a topic's newest message by its stamp, or by its arrival where the stamp is in the future."""
         said_ns = self._said_ns.get(topic.name)
-        # What was said later than now was said before the clock began anew.
+        # A publication time in the future belongs to the clock's last epoch.
         return (now_ns - said_ns) / NS if said_ns is not None and said_ns <= now_ns else float("inf")
 
     def intent_age_s(self, now_ns: int) -> float:
-        """Since the executive last said what it wants."""
+        """Age, s, of the executive's last intent."""
         return self._age_s(topics.INTENT, now_ns)
 
     def oldest(self, now_ns: int, *, sight: bool) -> tuple[str, float]:
-        """Who of those whom driving depends on was heard the longest ago, and how long ago, seconds; perception is
-        among them with `sight`."""
+        """The publisher that driving depends on with the oldest last message, and that age, s; perception counts with
+        `sight`."""
         ages = {"the executive": self.intent_age_s(now_ns)}
         for topic in (topics.BASE_STATE, topics.ARM_STATE, topics.HAND_STATE):
             ages[topic.service] = self._age_s(topic, now_ns)
@@ -321,7 +321,7 @@ class StateEstimator:
         return self.intent
 
     def angles(self) -> Mapping[str, float]:
-        """Every joint's newest measured angle."""
+        """Every joint's newest measured angle, rad."""
         angles: dict[str, float] = {}
         for state in (self.arm, self.hand):
             if state is not None:

@@ -1,4 +1,4 @@
-"""The floor map together with what is known of objects: what body and arm must keep clear of."""
+"""Obstacles for body and arm: the floor map together with the known objects."""
 
 from __future__ import annotations
 
@@ -16,16 +16,18 @@ from services.planning.routes import Routes
 
 _KEEP_NS = NS // 10
 _OBJECT_M = 0.033
-"""Radius at which a known object counts as standing in the way: the cans'."""
+"""Radius with which a known object counts as an obstacle: that of the cans."""
 _SMEAR_M = 0.09
-"""The map shows a known object up to so much wider than it is: cells, depth noise, odometry that drifts."""
+"""Margin by which the map may show an object wider than it is: cell size, depth noise, odometry drift."""
 
 
 class Fields(NamedTuple):
+    """Distances to obstacles, for the body and for the raised arm."""
+
     body: ClearanceField
-    """Of everything but the target."""
+    """All obstacles except the target."""
     arm: ClearanceField
-    """Of everything but the known objects, which are too low for the raised arm."""
+    """All obstacles except the known objects, which the raised arm passes over."""
 
 
 class Surroundings:
@@ -48,8 +50,10 @@ class Surroundings:
         now_ns: int,
         ignore: Sequence[tuple[float, float, float]] = (),
     ) -> Fields:
-        """Clearances for going to `label` ('' for nowhere), rebuilt when the map has changed, at most at 10 Hz.
-        `ignore`: discs (x, y, radius) in which nothing counts."""
+        """Clearances for going to `label` ('' for nowhere), rebuilt at most at 10 Hz and only when the map has changed.
+
+        `ignore`: discs (x, y, radius), odometry frame, metres, that count as free.
+        """
         what = (self.floor.changes, label)
         stale = self._built is None or self._built[1] != label or now_ns - self._built_ns >= _KEEP_NS
         if self._fields is None or (stale and what != self._built):
@@ -66,7 +70,7 @@ class Surroundings:
         return self._fields
 
     def unseen(self, places_m: FloatArray) -> FloatArray:
-        """Which of the places (n, 2) of the odometry frame nobody has looked at."""
+        """Which places (n, 2), odometry frame, were not seen yet; shape (n,)."""
         looked = self.floor.looked_at()
         hidden = []
         for x, y in places_m:
@@ -79,14 +83,14 @@ class Surroundings:
 
 
 def placed(points_m: FloatArray, pose: Pose2) -> FloatArray:
-    """Points (n, 2) of a pose's frame in its parent; shape (n, 2)."""
+    """Points (n, 2), metres, of the pose's frame in its parent frame; shape (n, 2)."""
     c, s = np.cos(pose.yaw_rad), np.sin(pose.yaw_rad)
     moved: FloatArray = points_m @ np.array([[c, s], [-s, c]]) + np.array([pose.x_m, pose.y_m])
     return moved
 
 
 def swept_by(hulls: Sequence[tuple[FloatArray, FloatArray]]) -> FloatArray:
-    """The floor places, 3 cm apart, under a motion of the arm: shape (n, 2), body frame."""
+    """Floor positions (n, 2), body frame, 3 cm apart, under a motion given as hulls: centres (m, 3) and radii (m,)."""
     points = np.concatenate([centres[:, :2] for centres, _ in hulls])
     cells: Mapping[tuple[int, int], None] = dict.fromkeys(
         (round(x / 0.03), round(y / 0.03)) for x, y in points.tolist()

@@ -1,9 +1,9 @@
-"""Learning at work: sightings of the hand go on teaching the map and the mesh of reachable places.
+"""Training at work: sightings of the hand train the learned map and the mesh of reachable positions further.
 
-`Adapter` notices when the body has changed (ours). While errors are of the usual size it nudges the map, which follows
-slow wear. When errors are much larger and stay so, the network keeps its weights but their variance is reset, and it
-learns the new body as fast as it first learned over the nominal model. Forgetting by a constant factor is slow instead:
-a direction that hundreds of sightings agreed on gives way only after as many more.
+`Adapter` detects a changed body (own method). While errors have their usual size it corrects the map slowly, which
+follows wear. When errors are much larger and stay so, the network keeps its weights but their variance is reset, and it
+learns the new body as fast as the first one. A constant forgetting factor would be slow: a direction that hundreds of
+sightings agree on would take as many new ones to change.
 """
 
 from __future__ import annotations
@@ -21,27 +21,27 @@ from services.planning.reachability import ReachMesh
 from services.planning.state_estimator import PostureSighting
 
 EVERY_NS = NS // 10
-"""Sightings nearer in time than this are nearly the same; babbling takes no more of them either."""
+"""Least time between two sightings that are used, as in babbling; nearer ones are nearly equal."""
 ROLL_RAD = 0.03
 LUMP = 64
-"""So many places are entered into the mesh together: it costs some tenths of a second, for one as for many."""
+"""Positions that are entered into the mesh together: an update takes tenths of a second, for one as for many."""
 NUDGE = 0.02
-"""Doubt of the weights while all is as usual, in units of a sighting's variance."""
+"""Prior variance of the weights while errors are usual, in units of a sighting's variance."""
 AFRESH = 100.0
-"""Doubt once the body has changed."""
+"""Prior variance once the body has changed."""
 MEMORY = 10
-"""The size of the errors is judged over about so many sightings."""
+"""Number of sightings over which errors are averaged."""
 SURPRISE = 4.0
-"""Mean square of the errors, in units of the usual, beyond which the body has changed."""
+"""Mean square error, in units of the usual one, above which the body has changed."""
 WILD_M = 0.15
-"""A sighting further off than this is something else than the hand."""
+"""A sighting further off than this is not the hand."""
 
 
 class Adapter:
-    """Teaches a map of its own, which begins as a copy of the given one."""
+    """Trains a copy of the given map."""
 
     def __init__(self, learned: HandMap, usual_m: float) -> None:
-        """`usual_m`: the map's usual error, root mean square (of the held-out sightings)."""
+        """`usual_m`: the map's usual error, the RMS over held-out sightings."""
         self.map = HandMap(
             learned.nominal,
             learned.network.copy(),
@@ -50,7 +50,7 @@ class Adapter:
         )
         self.samples = 0
         self.changes = 0
-        """Times that the body was found changed."""
+        """Number of detected changes of the body."""
         self._usual2 = max(usual_m, 1e-3) ** 2
         self._learner = LeastSquares(self.map.network, NUDGE)
         self._mean2 = self._usual2
@@ -58,11 +58,11 @@ class Adapter:
 
     @property
     def surprise(self) -> float:
-        """Mean square of the latest errors, in units of the usual: about 1 while nothing has changed."""
+        """Mean square of the latest errors in units of the usual one; about 1 for an unchanged body."""
         return self._mean2 / self._usual2
 
     def add(self, angles_rad: FloatArray, place_m: FloatArray) -> float:
-        """One sighting of the hand: angles (n,), place (3,). Returns the error before it was learned, metres."""
+        """Learn a sighting: angles (n,) rad, position (3,) metres. Returns the error before that, metres."""
         error_m = float(np.linalg.norm(self.map.at(angles_rad) - place_m))
         if error_m > WILD_M:
             return error_m
@@ -79,7 +79,7 @@ class Adapter:
 
 
 class Teacher:
-    """Teaches a copy of the map that it is given, and the mesh itself."""
+    """Trains a copy of the given map, and the given mesh itself."""
 
     def __init__(self, learned: HandMap, usual_m: float, mesh: ReachMesh) -> None:
         self._adapter = Adapter(learned, usual_m)
@@ -111,12 +111,12 @@ class Teacher:
         self._places.append(place_m)
 
     def rest(self) -> None:
-        """The robot does nothing: time to enter what was seen into the mesh."""
+        """Enter new positions into the mesh; called while the robot is idle."""
         if len(self._places) >= LUMP:
             self._mesh.add(np.array(self._places))
             self._places = []
 
 
 def arm_angles(angles_rad: Mapping[str, float]) -> FloatArray:
-    """In the order of ARM, shape (4,)."""
+    """Angles (4,), rad, in the order of ARM."""
     return np.array([angles_rad[name] for name in ARM])

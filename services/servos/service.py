@@ -15,7 +15,7 @@ from cocoro import topics
 from cocoro.component import Implementation
 from cocoro.errors import CocoroError, ConfigError
 from cocoro.faults import FaultReporter
-from cocoro.latch import LatchKeeper
+from cocoro.latch import ServiceLatch
 from cocoro.messages import LatchState, ServoCommand, ServoReply, ServoRequest, ServoState
 from cocoro.node import Node
 from cocoro.ports import port_path
@@ -68,7 +68,7 @@ class NetworkService:
         self._line = ServoLine(port, row.baud, settings, row.rate_hz, config.reply_s, self._on_cycle, keeps_goal)
         self._epoch = node.clock.epoch
         self._changed = asyncio.Event()
-        LatchKeeper(node, self._latched, self._line.halt)
+        ServiceLatch(node, self._latched, self._line.halt)
         node.on(command, self._commanded)
         node.serve(topics.SERVOS.of(node.name), self._asked)
 

@@ -1,1 +1,1 @@
-"""Captures in the forms that people look at: films, tables, Rerun and Foxglove."""
+"""Captures as films, tables, and files for Rerun and Foxglove."""

@@ -1,4 +1,4 @@
-"""A file that an export makes."""
+"""Files that an export makes, and `--attachments`: the files attached to a capture."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from cocoro.capture.reader import Capture
 
 
 def refuse_existing(out: Path) -> None:
-    """An export writes over nothing: it might be the capture. Raises CaptureError."""
+    """Raises CaptureError when the file exists. An export overwrites nothing: it might be the capture."""
     if out.exists():
-        raise CaptureError(f"{out} is there already; remove it, or choose another name")
+        raise CaptureError(f"{out} exists; remove it, or choose another name")
 
 
 @contextmanager
 def making(out: Path) -> Iterator[None]:
-    """While a file is made; one that failed does not stay. Raises CaptureError where none can be made."""
+    """Context for making a file; when it fails the file is removed. Raises CaptureError when none can be made there."""
     refuse_existing(out)
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
@@ -36,13 +36,16 @@ def making(out: Path) -> Iterator[None]:
 
 
 LONGEST_NAME = 200
-"""Characters: file systems take 255 bytes."""
+"""Characters. File systems allow 255 bytes."""
 
 
 def export_attachments(capture: Capture, folder: Path) -> int:
-    """Write each attachment into the folder under its own name, made one that a file can have there; a name that is
-    there twice has a number the second time. Returns how many were written; a damaged one is told in
-    `capture.problems`. Raises CaptureError when one cannot be written, or is there already."""
+    """Write each attachment into the folder, under its own name as far as that is a file name; a repeated name gets a
+    number.
+
+    Returns the number of files. Damaged attachments are added to `capture.problems`. Raises CaptureError when a
+    file cannot be written or exists.
+    """
     taken: set[str] = set()
     written = 0
     try:
@@ -63,7 +66,7 @@ def export_attachments(capture: Capture, folder: Path) -> int:
 
 
 def file_name(name: str) -> str:
-    """An attachment's name as that of a file in one folder: whoever wrote the capture chooses no other place."""
+    """An attachment's name as a plain file name, so that a capture cannot choose another folder."""
     plain = re.sub(r"[\x00-\x1f\x7f]", "_", name.replace("\\", "/").rstrip("/").rpartition("/")[2])[-LONGEST_NAME:]
     while len(plain.encode()) > LONGEST_NAME:
         plain = plain[1:]
@@ -71,7 +74,7 @@ def file_name(name: str) -> str:
 
 
 def _free(name: str, taken: set[str]) -> str:
-    """The name, or with a number where it is taken."""
+    """The name, with a number when it is taken."""
     number, free = 1, name
     while free in taken:
         number += 1

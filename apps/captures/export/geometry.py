@@ -1,4 +1,4 @@
-"""Where things are, for viewers: the robot's links, points of a depth image, turns as quaternions."""
+"""Geometry for viewers: poses of the robot's links, points of a depth image, quaternions."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ CAMERA = "camera"
 
 
 def quaternion(turn: FloatArray) -> Quaternion:
-    """x, y, z, w of a 3 x 3 rotation (Shepperd's method: the largest component is found first)."""
+    """The quaternion x, y, z, w of a rotation matrix, shape (3, 3). Shepperd's method: the largest component comes
+    first."""
     xx, yy, zz = turn[0, 0], turn[1, 1], turn[2, 2]
     squares = np.array([1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz, 1 + xx + yy + zz])
     largest = int(np.argmax(squares))
@@ -39,7 +40,7 @@ def about_z(yaw_rad: float) -> Quaternion:
 
 
 def rotated(by: Quaternion, place: Vec3) -> Vec3:
-    """A vector turned by a quaternion."""
+    """A vector rotated by a quaternion."""
     axis, w = np.array(by[:3]), by[3]
     vector = np.array(place)
     turned = vector + 2 * np.cross(axis, np.cross(axis, vector) + w * vector)
@@ -51,12 +52,12 @@ def conjugate(turn: Quaternion) -> Quaternion:
 
 
 class Posture:
-    """The robot as it was said to stand last."""
+    """The robot's last reported pose and joint angles."""
 
     def __init__(self, robot: Robot) -> None:
         self.robot = robot
         self.body = Pose2()
-        """In the odometry frame."""
+        """Pose in the odometry frame."""
         self.angles_rad: dict[str, float] = {}
         self._tree = Tree(robot.links, robot.links)
         self._parents = {name: link.parent for name, link in robot.links.items()}
@@ -68,13 +69,13 @@ class Posture:
         self.angles_rad.update(zip(servos.joints, servos.position_rad, strict=True))
 
     def links(self) -> dict[str, FloatArray]:
-        """4 x 4, each link's frame to the body's; empty until every joint has been heard of."""
+        """Each link's pose in the body frame, 4 x 4, m; empty until every joint has been reported."""
         if not self.robot.joints.keys() <= self.angles_rad.keys():
             return {}
         return {name: pose for name, pose in self._tree.poses(self.angles_rad).items() if name in self._parents}
 
     def bones(self, links: Mapping[str, FloatArray]) -> list[tuple[Vec3, Vec3]]:
-        """A line from each link's parent to it, in the body frame."""
+        """Line from each link's parent to the link, in the body frame, m."""
         found = []
         for name, pose in links.items():
             parent = links.get(self._parents[name])
@@ -84,8 +85,8 @@ class Posture:
 
 
 def points(frame: Frame, robot: Robot, step: int) -> tuple[Float32Array, ImageArray]:
-    """The depth image as points in the colour camera's frame, shape (n, 3), and their colours, RGB, shape (n, 3);
-    of every `step`th row and column."""
+    """Points of the depth image, shape (n, 3), m, in the colour camera's frame (x right, y down, z forward), and their
+    RGB colours, shape (n, 3). Every `step`th row and column is used."""
     camera = robot.camera.scaled(frame.width, frame.height)
     raw = np.frombuffer(frame.depth, dtype="<u2").reshape(frame.height, frame.width)[::step, ::step]
     depth = robot.depth_m(raw)

@@ -1,7 +1,7 @@
-"""Rerun: pictures, depth as points, the robot, what it believes and what is true, curves and phases.
+"""The Rerun viewer: pictures, depth points, the robot, believed and true objects, curves and phases.
 
-One picture of the world, told message by message: from a capture (`--rrd`, `cocoro view FILE`) or from the mesh as it
-goes (`cocoro view`). Needs the package rerun-sdk, which is an extra.
+`RerunScene` logs one message at a time, from a capture (`--rrd`, `cocoro view FILE`) or live (`cocoro view`). Needs
+the package rerun-sdk, an extra.
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ from cocoro.robot import Robot
 
 APPLICATION = "cocoro"
 TIMELINE = "robot"
-"""The stamps' time line."""
+"""Name of the time line of stamps."""
 DEPTH_STEP = 5
 JPEG_QUALITY = 85
 BONE, UNKNOWN, TRUE = (217, 217, 230), (255, 255, 255), (50, 230, 80)
 
 
 def library() -> Any:
-    """The package. Raises CaptureError with the line that installs it."""
+    """The rerun package. Raises CaptureError with the command that installs it."""
     try:
         import rerun
     except ModuleNotFoundError as error:
@@ -55,7 +55,8 @@ def library() -> Any:
 
 
 def export(capture: Capture, out: Path, progress: Callable[[float], None] = lambda _: None) -> int:
-    """Write a recording that Rerun opens; the number of messages in it. Raises CaptureError when that cannot be."""
+    """Write a recording that Rerun opens. Returns the number of messages in it. Raises CaptureError when it cannot be
+    written."""
     rr = library()
     with making(out):
         recording = rr.RecordingStream(APPLICATION)
@@ -66,8 +67,8 @@ def export(capture: Capture, out: Path, progress: Callable[[float], None] = lamb
 
 
 def opened(rr: Any) -> Any:
-    """A recording that a viewer shows, which is opened here. Raises CaptureError when it cannot be."""
-    beside_us = sysconfig.get_path("scripts")  # where the package has put it, whether or not that is in the PATH
+    """Open a viewer and return the recording that it shows. Raises CaptureError when the viewer does not start."""
+    beside_us = sysconfig.get_path("scripts")  # the viewer's folder, which need not be in PATH
     os.environ["PATH"] = os.pathsep.join(filter(None, (beside_us, os.environ.get("PATH"))))
     recording = rr.RecordingStream(APPLICATION)
     with no_viewer():
@@ -77,7 +78,7 @@ def opened(rr: Any) -> Any:
 
 @contextmanager
 def no_viewer() -> Iterator[None]:
-    """Around what fails when the viewer does, as it does without a screen."""
+    """Turns the error of a viewer that does not start, or has gone, into a CaptureError."""
     try:
         yield
     except RuntimeError as error:
@@ -88,7 +89,7 @@ def no_viewer() -> Iterator[None]:
 
 
 def log_capture(capture: Capture, recording: Any, progress: Callable[[float], None] = lambda _: None) -> int:
-    """A capture to a recording, whatever that is connected to."""
+    """Log every message of a capture to a recording. Returns their number."""
     scene = RerunScene(recording, robot_of(capture), catalogue_of(capture))
     count = 0
     for record in capture.messages():
@@ -104,7 +105,7 @@ def log_capture(capture: Capture, recording: Any, progress: Callable[[float], No
 
 
 class RerunScene:
-    """Tells a recording of each message, at the message's stamp."""
+    """Logs messages to a recording, at their stamps."""
 
     def __init__(self, recording: Any, robot: Robot, catalogue: Catalogue) -> None:
         self._rr = library()
@@ -117,7 +118,7 @@ class RerunScene:
         self._log("world", self._rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
 
     def log(self, topic: str, message: Message) -> None:
-        """`topic` is the key without the robot."""
+        """`topic` is the key without the robot's name."""
         self._to.set_time(TIMELINE, duration=message.stamp_ns / NS)
         if isinstance(message, Frame):
             self._frame(message)
@@ -152,7 +153,7 @@ class RerunScene:
         self._log("world/body/camera/colour", rr.Image(pixels).compress(jpeg_quality=JPEG_QUALITY))
         places, colours = points(frame, self._robot, DEPTH_STEP)
         links = self._posture.links()
-        if links:  # the points are hung on the body, since what hangs on a camera is a picture
+        if links:  # below the body, because entities below a camera are drawn into its picture
             pose = links[CAMERA]
             self._log(
                 "world/body/points", rr.Points3D(places @ pose[:3, :3].T + pose[:3, 3], colors=colours, radii=0.004)
@@ -227,7 +228,7 @@ class RerunScene:
         self._phase = phase
 
     def _truth(self, truth: Truth) -> None:
-        """In the body frame, where the belief is too."""
+        """In the body frame, as the believed objects."""
         there = [item for item in truth.objects if item.kind == "object"]
         back = conjugate(truth.body_orientation)
         places = []

@@ -1,4 +1,5 @@
-"""What a capture tells besides its pictures, small enough to be held in memory: looked up by frame and by time."""
+"""What a capture contains besides pictures, held in memory: tasks, plans and detections; belief compared with the
+truth."""
 
 from __future__ import annotations
 
@@ -35,7 +36,7 @@ class TopicTrack(Generic[M]):
         self._messages.append(message)
 
     def at(self, log_ns: int) -> M | None:
-        """The newest at a time; None before the first."""
+        """The newest message at a time; None before the first."""
         place = bisect_right(self._times_ns, log_ns)
         return self._messages[place - 1] if place else None
 
@@ -51,7 +52,7 @@ class Story:
             self._seen[seen.frame_incarnation, seen.frame_seq] = seen
 
     def seen_in(self, incarnation: int, seq: int) -> Detections | None:
-        """What perception made of a frame."""
+        """The detections of a frame."""
         return self._seen.get((incarnation, seq))
 
 
@@ -67,13 +68,17 @@ def read(capture: Capture, topic: Topic[M]) -> Iterator[tuple[Record, M]]:
 
 
 def robot_of(capture: Capture) -> Robot:
-    """The robot that the capture describes; the Calliope, where it describes none."""
-    told = capture.metadata.get("robot", {}).get("description")
-    return Robot.load() if told is None else Robot.from_data(msgspec.json.decode(told), f"{capture.path}, robot")
+    """The recorded robot description; the Calliope's when there is none."""
+    description = capture.metadata.get("robot", {}).get("description")
+    return (
+        Robot.load()
+        if description is None
+        else Robot.from_data(msgspec.json.decode(description), f"{capture.path}, robot")
+    )
 
 
 def catalogue_of(capture: Capture) -> Catalogue:
-    """The objects that perception knew then; today's, where the capture does not say."""
+    """Perception's recorded object catalogue; today's when there is none."""
     return recorded_file(capture, "perception", "objects", Catalogue.load)
 
 
@@ -85,22 +90,22 @@ def _track(capture: Capture, topic: Topic[M]) -> TopicTrack[M]:
 
 
 FARTHEST_NS = NS // 10
-"""Truth that is further from the belief's stamp is not of its time."""
+"""Largest distance between the stamps of a belief and of the truth that it is compared with."""
 
 
 class Truths:
-    """The truth by stamp; between two the places are interpolated, the body's turn is the nearer one's."""
+    """The simulator's truth by stamp. Positions are interpolated between two stamps, each in its own body frame."""
 
     def __init__(self, capture: Capture) -> None:
-        told = sorted(((truth.stamp_ns, n, truth) for n, (_, truth) in enumerate(read(capture, TRUTH))))
-        self._stamps_ns = [stamp_ns for stamp_ns, _, _ in told]
-        self._truths = [truth for _, _, truth in told]
+        truths = sorted(((truth.stamp_ns, n, truth) for n, (_, truth) in enumerate(read(capture, TRUTH))))
+        self._stamps_ns = [stamp_ns for stamp_ns, _, _ in truths]
+        self._truths = [truth for _, _, truth in truths]
 
     def __bool__(self) -> bool:
         return bool(self._truths)
 
     def in_body(self, label: str, stamp_ns: int) -> Vec3 | None:
-        """Where an object was, body frame; None when that is not known of the time."""
+        """An object's true position in the body frame, m; None when it is not known at that time."""
         after = bisect_left(self._stamps_ns, stamp_ns)
         around = [n for n in (after - 1, after) if 0 <= n < len(self._truths)]
         around = [n for n in around if abs(self._stamps_ns[n] - stamp_ns) <= FARTHEST_NS]
@@ -126,7 +131,7 @@ def _in_body(truth: Truth, label: str) -> Vec3 | None:
 
 
 def beliefs(capture: Capture) -> Iterator[dict[str, Any]]:
-    """A row for each object that the planner told of, in the body frame at the status' stamp."""
+    """One row per object and planner status, in the body frame at the status' stamp."""
     truths = Truths(capture)
     if not truths:
         return

@@ -1,4 +1,4 @@
-"""`--csv` and `--parquet`: each key as a table, and what the robot believed beside what was true."""
+"""`--csv` and `--parquet`: each key as a table, and a table of belief and truth."""
 
 from __future__ import annotations
 
@@ -14,21 +14,23 @@ from cocoro.capture.reader import Capture
 from cocoro.clock import NS
 
 LONGEST_LIST = 16
-"""A list of more plain values than this is given by its length."""
+"""A longer list of plain values is replaced by its length."""
 
 TableRow = dict[str, Any]
 
 
 class TableFolder(Protocol):
-    """Where a table goes."""
+    """Writes tables to a folder."""
 
     def write(self, name: str, rows: list[TableRow]) -> None: ...
 
 
-def export(capture: Capture, sink: TableFolder) -> list[str]:
-    """Write a table for each key that has any messages of maps (for each channel of it, where it has several), one for
-    each list of maps in it, and `belief` where the simulator's truth was recorded. Returns their names. Raises
-    CaptureError when it cannot be written."""
+def export(capture: Capture, folder: TableFolder) -> list[str]:
+    """Write a table for each key whose messages are maps (one per channel where it has several), one for each list of
+    maps in them, and `belief` when the simulator's truth is recorded.
+
+    Returns the tables' names. Raises CaptureError when one cannot be written.
+    """
     written = []
     for channel in (id for _, ids in sorted(capture.keys.items()) for id in ids):
         key = capture.channels[channel].topic
@@ -37,17 +39,17 @@ def export(capture: Capture, sink: TableFolder) -> list[str]:
         for part, rows in tables.items():
             head = key.removeprefix(f"{capture.robot}/").strip("/").replace("/", "_")
             name = ".".join(filter(None, (f"{head}{number}", part)))
-            sink.write(name, rows)
+            folder.write(name, rows)
             written.append(name)
     aligned = list(beliefs(capture))
     if aligned:
-        sink.write("belief", aligned)
+        folder.write("belief", aligned)
         written.append("belief")
     return written
 
 
 def _tables(capture: Capture, channel: int) -> dict[str, list[TableRow]]:
-    """By the name of the list that it is of; '' is the key's own."""
+    """Tables by the name of the list that they hold; '' for the key's own."""
     tables: dict[str, list[TableRow]] = {}
     for record in capture.messages(channels=[channel]):
         try:
@@ -77,7 +79,7 @@ def _tables(capture: Capture, channel: int) -> dict[str, list[TableRow]]:
 
 
 def _flat(value: Any, name: str = "") -> TableRow:
-    """Maps and short lists as columns: 'odometry_m.0'."""
+    """Maps and short lists as columns, such as 'odometry_m.0'."""
     if isinstance(value, Mapping):
         return _joined(((str(part), item) for part, item in value.items()), name)
     if isinstance(value, list):
@@ -97,15 +99,15 @@ def _joined(parts: Iterator[tuple[str, Any]], name: str) -> TableRow:
 
 
 def columns(rows: list[TableRow]) -> list[str]:
-    """All that any row has, in the order in which they come up. What is nothing or a map or list ('target' or
-    'target.label') has the columns of its parts alone."""
+    """All columns of the rows, in the order of appearance. A field that is a map or a list, or None ('target' beside
+    'target.label'), has only the columns of its parts."""
     names = dict.fromkeys(name for row in rows for name in row)
     wholes = {name[:at] for name in names for at, letter in enumerate(name) if letter == "."}
     return [name for name in names if name not in wholes or any(row.get(name) is not None for row in rows)]
 
 
 class CsvFolder:
-    """A file for each table."""
+    """One CSV file per table."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -123,7 +125,7 @@ class CsvFolder:
 
 
 class ParquetFolder:
-    """Likewise. Raises CaptureError when pyarrow is not installed."""
+    """One Parquet file per table. Raises CaptureError when pyarrow is not installed."""
 
     def __init__(self, folder: Path) -> None:
         try:
@@ -149,5 +151,5 @@ class ParquetFolder:
         values = [row.get(name) for row in rows]
         try:
             return self._arrow.array(values)
-        except (self._arrow.ArrowInvalid, self._arrow.ArrowTypeError):  # of several types: as texts
+        except (self._arrow.ArrowInvalid, self._arrow.ArrowTypeError):  # values of several types: as text
             return self._arrow.array([None if value is None else str(value) for value in values])

@@ -1,4 +1,4 @@
-"""`--video`: what the robot saw, with what it made of it drawn in, as the paper's films have it."""
+"""`--video`: the camera's pictures with detections and a caption drawn in."""
 
 from __future__ import annotations
 
@@ -23,12 +23,16 @@ from cocoro.topics import FRAME
 
 RATE_HZ = 30.0
 CODEC, SUFFIX = "mp4v", ".mp4"
-"""MPEG-4 part 2: what OpenCV can write wherever it is installed."""
+"""MPEG-4 part 2, which OpenCV can write on every platform."""
 
 
 def export(capture: Capture, out: Path, progress: Callable[[float], None] = lambda _: None) -> int:
-    """Write the film; the number of its pictures. In real time: a frame stays until the next, and what came faster
-    than the film is left out. Raises CaptureError when there is nothing to show, or it cannot be written."""
+    """Write the film in real time: each frame is shown until the next one, and frames beyond the film's rate are left
+    out.
+
+    Returns the number of pictures. Raises CaptureError when the capture has no pictures or the film cannot be
+    written.
+    """
     if out.suffix.lower() != SUFFIX:
         raise CaptureError(f"{out}: a film's name ends with {SUFFIX}")
     with making(out):
@@ -64,7 +68,7 @@ class _Film:
             self._writer = cv2.VideoWriter(name, cv2.VideoWriter.fourcc(*CODEC), RATE_HZ, self._size)
         if not self._writer.isOpened():
             raise CaptureError(f"{out}: OpenCV cannot write a film there; choose another place")
-        complaints.are_new()  # of opening it: it is open
+        complaints.are_new()  # messages of opening are not errors: it is open
 
     def show(self, at_s: float, picture: ImageArray) -> None:
         self._hold_until(at_s)
@@ -83,7 +87,7 @@ class _Film:
         return self._count
 
     def _is_whole(self) -> bool:
-        """A film whose end is missing cannot be opened."""
+        """Whether the film can be opened and has all its pictures."""
         film = cv2.VideoCapture(self._name)
         try:
             return film.isOpened() and round(film.get(cv2.CAP_PROP_FRAME_COUNT)) == self._count
@@ -110,7 +114,7 @@ class _Film:
 
 
 def _caption(story: Story, log_ns: int, at_s: float) -> str:
-    """Time, phase, what is left to go, and why it does what it does."""
+    """Time, phase, distance to go, and the reason of the current behaviour."""
     words = [f"{at_s:5.1f} s"]
     task, plan = story.tasks.at(log_ns), story.plans.at(log_ns)
     if task is not None and task.task_id:
@@ -124,13 +128,13 @@ def _caption(story: Story, log_ns: int, at_s: float) -> str:
 
 
 AHEAD_BYTES = 64 * 1024
-"""More than FFmpeg gathers before it writes, so that a write that failed would not have fitted."""
+"""More than FFmpeg buffers before it writes, so that a failed write would not fit."""
 
 
 @contextmanager
 def spelt_for_opencv(path: Path) -> Iterator[str]:
-    """A path as OpenCV takes it, which is in UTF-8 whatever the locale is; another one makes it crash. Such a path is
-    given by a link of a plain name while this lasts. Raises CaptureError where there cannot be one."""
+    """Yields the path as OpenCV accepts it. OpenCV requires UTF-8 whatever the locale is, and crashes otherwise, so
+    another name is replaced by a link that exists meanwhile. Raises CaptureError when no such link is possible."""
     try:
         name = os.fsencode(path).decode("utf-8")
     except UnicodeDecodeError:
@@ -148,8 +152,7 @@ def spelt_for_opencv(path: Path) -> Iterator[str]:
 
 
 class Complaints:
-    """What OpenCV prints on standard error, which is the only place where it says that a write failed. A context
-    manager: while it is entered, what is printed is kept from people, and counted."""
+    """Catches OpenCV's output on standard error while it is entered: only there does OpenCV report a failed write."""
 
     def __init__(self) -> None:
         self._paper = os.memfd_create("complaints")
@@ -159,7 +162,7 @@ class Complaints:
     def __enter__(self) -> Complaints:
         try:
             self._stderr = os.dup(2)
-        except OSError:  # there is none, and OpenCV says nothing
+        except OSError:  # no standard error: OpenCV prints nothing
             return self
         os.dup2(self._paper, 2)
         return self
@@ -173,7 +176,7 @@ class Complaints:
             self._stderr = None
 
     def are_new(self) -> bool:
-        """Whether anything has been printed since the last call."""
+        """Whether anything was printed since the last call."""
         before, self._read_bytes = self._read_bytes, os.fstat(self._paper).st_size
         return self._read_bytes > before
 
@@ -182,7 +185,7 @@ class Complaints:
 
 
 def why_not_more(path: Path) -> str:
-    """Why a file can grow no further, in the system's words; empty when it can."""
+    """Why a file cannot grow, in the system's words; '' when it can."""
     try:
         with tempfile.TemporaryFile(dir=path.parent, buffering=0) as probe:
             probe.seek(path.stat().st_size)
