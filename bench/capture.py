@@ -1,4 +1,4 @@
-"""What recording costs, what a killed recorder loses, and how fast a capture is executed again.
+"""Measures the cost of recording, the loss when a recorder is killed, and the speed of re-execution.
 
     python bench/capture.py traffic [--seconds 30] [--sensors ideal|real] [--compression zstd]
     python bench/capture.py kill [--times 20]
@@ -6,12 +6,11 @@
     python bench/capture.py again
     python bench/capture.py frames
 
-`traffic` starts the simulated robot as processes with its recorder, has it fetch the red can, and reads what the
-recorder's process cost (from the operating system, not from the recorder) and what it dropped or never got. `kill`
-sends the recorder SIGKILL at random moments while a stand-in for a robot publishes, and looks how much is missing.
-`reexecute` executes perception and planning again over what `traffic` recorded. `again` plays that into a mesh where
-another recorder listens, and compares the two captures. `frames` packs rendered frames of both
-kinds of sensors by each compression, in one thread.
+`traffic` starts the simulated robot as processes with its recorder, lets it fetch the red can, and reports the
+recorder's CPU time (from the operating system) and its dropped and lost messages. `kill` sends the recorder SIGKILL
+at random moments while a stand-in for a robot publishes, and measures how much is missing. `reexecute` re-executes
+perception and planning on what `traffic` recorded. `again` replays that to another recorder and compares the two
+captures. `frames` compresses rendered frames of both kinds of sensors by each method, in one thread.
 """
 
 from __future__ import annotations
@@ -48,7 +47,7 @@ from services.executive.tasks import FetchTask
 
 COCORO = [sys.executable, "-m", "apps.cli.main"]
 HEARD_S, LOOK_S = 10.0, 0.2
-"""How long the second recorder may take for the last of a replay, and how often that is looked for."""
+"""Longest wait for a replay's last messages at the second recorder, and the period of the check."""
 PROFILE = """
 robot = "calliope"
 clock = "sim"
@@ -67,7 +66,7 @@ record_steps = true
 
 
 def traffic(folder: Path, seconds: float, sensors: str, compression: str) -> None:
-    """A live fetch, recorded."""
+    """Record a live fetch."""
     profile = folder / "bench.toml"
     profile.write_text(PROFILE.format(folder=folder, sensors=sensors, compression=compression))
     subprocess.run([*COCORO, "up", str(profile), "--detach"], check=True, stdout=subprocess.DEVNULL)
@@ -76,7 +75,7 @@ def traffic(folder: Path, seconds: float, sensors: str, compression: str) -> Non
         before, started = recorder.cpu_times(), time.monotonic()
         written = recorder.io_counters().write_bytes
         done = subprocess.run([*COCORO, "fetch", "red_can"], capture_output=True, text=True, check=False)
-        time.sleep(max(seconds - (time.monotonic() - started), 0.0))  # so long it is measured
+        time.sleep(max(seconds - (time.monotonic() - started), 0.0))  # the rest of the measuring time
         after, lasted_s = recorder.cpu_times(), time.monotonic() - started
         written = recorder.io_counters().write_bytes - written
         cpu_s = after.user + after.system - before.user - before.system
@@ -101,7 +100,7 @@ def traffic(folder: Path, seconds: float, sensors: str, compression: str) -> Non
 
 
 async def kill(folder: Path, times: int) -> None:
-    """The time between the death of the recorder and the last that is in its file."""
+    """The time from the last recorded message to the recorder's death."""
     draw, robot = random.Random(times), Robot.load()
     async with (
         await ZenohBus.open(default("bench", "bench", folder / "run")) as bus,
@@ -116,7 +115,7 @@ async def kill(folder: Path, times: int) -> None:
 
 
 async def _kill_one(bus: ZenohBus, folder: Path, after_s: float) -> float:
-    """Seconds from the last state in the file to the kill; everything before it must be there."""
+    """Seconds from the last state in the file to the kill. All earlier states must be there."""
     heard = asyncio.Event()
     watch = bus.watch_alive(recorder_key("bench", "*"), lambda _, alive: heard.set() if alive else None)
     out = folder / f"kill-{time.time_ns()}"
@@ -164,7 +163,7 @@ def execute(folder: Path) -> None:
 
 
 def again(folder: Path) -> None:
-    """Record, replay, record again: are the payloads the same, in the same order of each key?"""
+    """Record, replay and record again; compare the payloads and their order per key."""
     (first,) = folder.glob("*.mcap")
     listener = folder / "listener.toml"
     listener.write_text(
@@ -176,7 +175,7 @@ def again(folder: Path) -> None:
         (second,) = (folder / "again").glob("*.mcap")
         played, give_up_s = _published(first), time.monotonic() + HEARD_S
         while _count(_published(second)) < _count(played) and time.monotonic() < give_up_s:
-            time.sleep(LOOK_S)  # the last of it is still on its way, or waits to be written
+            time.sleep(LOOK_S)  # the last messages may be on their way, or wait to be written
     finally:
         subprocess.run([*COCORO, "down"], check=True, stdout=subprocess.DEVNULL)
     payloads = [played, _published(second)]
@@ -192,7 +191,7 @@ def _count(published: dict[str, list[int]]) -> int:
 
 
 def _published(path: Path) -> dict[str, list[int]]:
-    """By key, what components published, but for what recorders say of themselves."""
+    """What components published, by key, without what recorders publish about themselves."""
     found: dict[str, list[int]] = defaultdict(list)
     with Capture.open(path) as capture:
         for each in capture.messages():
@@ -203,7 +202,7 @@ def _published(path: Path) -> dict[str, list[int]]:
 
 
 def frames(folder: Path) -> None:
-    """Time of the processor, since the machine may have other work."""
+    """CPU time, since the machine may have other work."""
     for sensors in ("ideal", "real"):
         path = folder / f"{sensors}.mcap"
         rehearse(RehearsalRequest(task=FetchTask(label="red_can"), sensors=sensors, record=str(path)))

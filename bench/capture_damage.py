@@ -1,9 +1,9 @@
-"""Damaged captures, and what every command that takes one makes of them.
+"""Tries every command that takes a capture on damaged captures.
 
     python bench/capture_damage.py [--times 1000]
 
-Spoils a second of a rehearsed fetch at random, again and again, and has each command read it. None may hang, fail but
-in words, or find what was not recorded.
+Damages a second of a rehearsed fetch at random, repeatedly, and has each command read it. None may hang, fail
+without an explanation, or find a message that was not recorded.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from services.executive.tasks import FetchTask
 
 
 def damage(folder: Path, times: int) -> None:
-    """What each command makes of damaged captures."""
+    """Run each command on damaged captures and print the results."""
     second, spoilt = folder / "second.mcap", folder / "spoilt.mcap"
     request = RehearsalRequest(
         task=FetchTask(label="red_can"), width=160, height=120, frame_rate_hz=10.0, record=str(folder / "whole.mcap")
@@ -76,7 +76,7 @@ def _fingerprint(record: Record) -> tuple[str, int, int, int, int]:
 
 
 def _spoilt(whole: bytes, draw: random.Random) -> bytes:
-    """Cut, flipped, blanked, with something taken away or put in; of a closed file, or of one without its end."""
+    """Cut, flipped, zeroed, shortened or extended; of a closed or an unclosed file."""
     data = bytearray(whole if draw.random() < 0.5 else whole[: round(len(whole) * draw.uniform(0.2, 0.95))])
     at, length = draw.randrange(len(data)), draw.choice((1, 8, 600, 5000))
     kind = draw.choice(("cut", "flip", "flip", "blank", "take", "put"))

@@ -1,13 +1,13 @@
-"""How fast captures are written and read: by the code here, and by the mcap package.
+"""Compares the speed of writing and reading captures with the mcap package's.
 
     python bench/capture_format.py files [--seconds 5] [--times 5]
     python bench/capture_format.py records [--times 5]
 
-`files`: both write by zstd, as each does it by itself, the messages of a rehearsed fetch (30 frames of 1.54 MB and some
-800 small messages a second), and read the same files. `records`: each kind of record that is made or read by hand, and
-a frame joined with its head before it is packed or packed piece by piece. The two take turns in one run. The
-figures are times of this process, reader threads included, the middle one of all turns; a ratio is the package's time
-over that of the code here. Files are on a disk in memory where there is one, so no disk is measured.
+`files`: both write the messages of a rehearsed fetch (30 frames of 1.54 MB and some 800 small messages a second)
+with zstd, each in its own way, and read the same files. `records`: each kind of record that is encoded or decoded
+here, and a frame that is joined with its head before compression or compressed piece by piece. The two take turns
+in one run. The figures are medians of this process's CPU time, reader threads included; a ratio is the package's
+time over that of the code here. Files are in memory (/dev/shm) where possible, so no disk is measured.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from cocoro.clock import NS
 from services.capture import file
 from services.capture.file import QUICK, Packer
 from services.capture.keys import QueuedMessage, info_of
-from services.capture.writer import CaptureWriter, Limits
+from services.capture.writer import CaptureWriter, FileLimits
 from services.executive.tasks import FetchTask
 
 SMALL_BYTES = 64 * 1024
@@ -63,11 +63,11 @@ def recorded(folder: Path, sensors: Literal["ideal", "real"], seconds: float) ->
 
 def write_here(made: list[QueuedMessage], out: Path) -> None:
     writer = CaptureWriter(
-        lambda _: out, Packer("zstd"), Limits(), lambda key, payload: info_of(key, "calliope", payload)
+        lambda _: out, Packer("zstd"), FileLimits(), lambda key, payload: info_of(key, "calliope", payload)
     )
     due_ns = made[0].log_ns
     for one in made:
-        if one.log_ns >= due_ns:  # as the recorder does it
+        if one.log_ns >= due_ns:  # as the recorder does
             writer.flush()
             due_ns += NS // 10
         writer.put(one)
@@ -99,7 +99,7 @@ def read_by_package(path: Path) -> int:
 
 
 def in_turn(times: int, **ways: Callable[[], object]) -> dict[str, float]:
-    """Seconds of processor of each way, the middle of so many turns."""
+    """Median CPU time of each way, s, over so many turns."""
     spent: dict[str, list[float]] = {name: [] for name in ways}
     for _ in range(times):
         for name, way in ways.items():
@@ -110,8 +110,10 @@ def in_turn(times: int, **ways: Callable[[], object]) -> dict[str, float]:
 
 
 def peak_of_a_frame(folder: Path, frame: QueuedMessage) -> float:
-    """MB that writing one frame takes at the peak, beside the frame itself."""
-    writer = CaptureWriter(lambda _: folder / "peak.mcap", Packer("zstd"), Limits(), lambda *_: info_of(*_of(frame)))
+    """Memory that writing one frame takes at the peak besides the frame, MB."""
+    writer = CaptureWriter(
+        lambda _: folder / "peak.mcap", Packer("zstd"), FileLimits(), lambda *_: info_of(*_of(frame))
+    )
     writer.put(frame)
     tracemalloc.start()
     writer.put(frame._replace(log_ns=frame.log_ns + 1))
@@ -202,7 +204,7 @@ def _frames(name: str, frames: list[bytes], times: int) -> None:
     contents = [file.packed(Chunk("zstd", data, 0, 0, crc, size))[9:] for data, size, crc in packed]
 
     def write() -> None:
-        for data, size, crc in packed:  # the head, and the packed records as they are
+        for data, size, crc in packed:  # the head, and the packed records unchanged
             file.chunk_head(mcap.ChunkHead(0, 0, size, crc, "zstd", len(data)))
 
     def write_by_package() -> None:

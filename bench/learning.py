@@ -35,29 +35,29 @@ def best_s(call: Callable[[], object], number: int = 1, repeat: int = 5) -> floa
 
 
 def main() -> None:
-    drawing = NominalModel(Robot.load())
+    nominal = NominalModel(Robot.load())
     rng = np.random.default_rng(0)
-    low, high = drawing.limits_rad.T
+    low, high = nominal.limits_rad.T
     angles = rng.uniform(low, high, (SAMPLES, 4))
-    places = drawing.predict(angles) + rng.normal(0.0, 0.003, (SAMPLES, 3))
+    places = nominal.predict(angles) + rng.normal(0.0, 0.003, (SAMPLES, 3))
     seen = Sightings(angles, places, np.arange(SAMPLES) // 4)
 
     def paper() -> None:
         network = HyperplaneRbf.paper()
-        learn_in_order(network, *drawing.priming(), PAPER_RATE / 10)
+        learn_in_order(network, *nominal.priming(), PAPER_RATE / 10)
         learn_in_order(network, angles, places, PAPER_RATE)
 
-    learned = fit(BEST, drawing, seen)
-    plain = fit(METHODS[0], drawing, seen)
+    learned = fit(BEST, nominal, seen)
+    plain = fit(METHODS[0], nominal, seen)
     learner = LeastSquares(HyperplaneRbf.paper())
     mesh = ReachMesh(places)
     asked = rng.uniform(-0.6, 0.9, (1000, 3))
     rows = (
         ("the paper's map: 10,000 priming points, then 1,000 samples in order", best_s(paper), "s", 2.0),
-        ("the default map: 1,000 samples", best_s(lambda: fit(BEST, drawing, seen)), "s", None),
+        ("the default map: 1,000 samples", best_s(lambda: fit(BEST, nominal, seen)), "s", None),
         ("one Jacobian, 81 bases", 1e6 * best_s(lambda: plain.jacobian(angles[0]), 20, 200), "us", 50.0),
         (
-            "one Jacobian, 81 bases over the drawing",
+            "one Jacobian, 81 bases over the nominal model",
             1e6 * best_s(lambda: learned.jacobian(angles[0]), 20, 200),
             "us",
             None,

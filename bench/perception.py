@@ -1,9 +1,9 @@
-"""Perception's cost a frame: the default detector against the paper's, in one run, on one core.
+"""Measures perception's time per frame: the default detector against the paper's, in one run, on one core.
 
     python -m bench.perception [--frames N] [--json]
 
-All six known objects stand in a rendered scene with the real sensors' faults. `step` is what the service does with a
-frame: decode to arrays, detect, localise. Compare within a run; the absolute figures are the machine's.
+All six known objects stand in a rendered scene with the real sensors' faults. `step` is the service's work for a
+frame: decode to arrays, detect, localise. Compare within a run; the absolute figures depend on the machine.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ PERIOD_NS = 33_333_333
 
 
 def frames(robot: Robot, catalogue: Catalogue, size: tuple[int, int], count: int) -> list[Frame]:
-    """So many frames of the scene, each with noise of its own."""
+    """Frames of the scene, each with different noise."""
     visuals, poses = [], np.tile(np.eye(4), (len(PLACES), 1, 1))
     for pose, (label, place) in zip(poses, PLACES.items(), strict=True):
         known = catalogue[label]
@@ -58,7 +58,7 @@ def frames(robot: Robot, catalogue: Catalogue, size: tuple[int, int], count: int
 
 
 def step_ms(core: PerceptionCore, frame: Frame) -> tuple[float, int]:
-    """Milliseconds of one step with a frame whose head angles are there, and how many objects it placed."""
+    """Time of one step with a frame whose head angles are known, ms, and the number of localised objects."""
     neck = [
         ServoState(
             stamp_ns=frame.stamp_ns + offset,
@@ -80,12 +80,14 @@ def step_ms(core: PerceptionCore, frame: Frame) -> tuple[float, int]:
 def measure(size: tuple[int, int], count: int) -> dict[str, object]:
     robot, catalogue = Robot.load(), Catalogue.load()
     shown = frames(robot, catalogue, size, count + 3)
-    configs = {name: PerceptionConfig(detector=name, floor_rate_hz=1e-3) for name in ("blob", "paper")}  # objects alone
+    configs = {
+        name: PerceptionConfig(detector=name, floor_rate_hz=1e-3) for name in ("blob", "paper")
+    }  # no floor scans
     cores = {name: PerceptionCore(robot, config, catalogue) for name, config in configs.items()}
     times: dict[str, list[float]] = {name: [] for name in cores}
     placed: dict[str, int] = dict.fromkeys(cores, 0)
     for number, frame in enumerate(shown):
-        for name, core in cores.items():  # in turn, so that the machine's moods hit both alike
+        for name, core in cores.items():  # in turn, so that the machine's other work affects both alike
             taken_ms, found = step_ms(core, frame)
             if number >= 3:
                 times[name].append(taken_ms)

@@ -1,4 +1,4 @@
-"""Captures for tests: made on the bus of one process, in virtual time, by the recorder itself."""
+"""Makes captures for tests: on a local bus in virtual time, by the recorder itself."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ from deploy.delayed import DelayedNode
 from deploy.processes import named
 from services.capture.file import Compression, Packer
 from services.capture.keys import KeyInfo, QueuedMessage, info_of
-from services.capture.writer import CaptureWriter, Limits
+from services.capture.writer import CaptureWriter, FileLimits
 
 ROBOT = Robot.load()
 STILL: dict[str, Any] = {"odometry_yaw_rad": 0.0, "speed_mps": 0.0, "turn_rate_radps": 0.0}
 
-FOR_EVER = Limits()
+FOR_EVER = FileLimits()
 
 Scenario = Callable[["Room"], Awaitable[None]]
 
 
 class Room:
-    """A mesh with a recorder on it."""
+    """A mesh with a recorder."""
 
     def __init__(self) -> None:
         self.mesh = LocalMesh()
@@ -42,7 +42,7 @@ class Room:
         return DelayedNode(name, self.mesh.join(), self.clock, ROBOT, **options)
 
     async def recorded(self, settings: dict[str, Any], scenario: Scenario) -> None:
-        """Play a scenario while a recorder of these settings is there."""
+        """Play a scenario while a recorder with these settings runs."""
         component = load(named("capture"))
         config = msgspec.convert(settings, component.config)
         node = self.node("capture", module=named("capture").module, config=config)
@@ -58,14 +58,14 @@ class Room:
 
 
 def record(path: Path, scenario: Scenario, **settings: Any) -> Path:
-    """A scenario's capture, in one file."""
+    """Record a scenario into one file."""
     room = Room()
     run_virtual(room.recorded({"file": str(path), **settings}, scenario))
     return path
 
 
 async def drive(room: Room, seconds: float = 2.0, frames: bool = True) -> None:
-    """A robot that drives in a circle and sees noise: 50 states a second and 10 small frames."""
+    """A robot that drives in a circle and sees noise: 50 states and 10 small frames a second."""
     async with room.node("base") as base, room.node("kinect") as kinect:
         base.ready()
         kinect.ready()
@@ -81,7 +81,9 @@ def frame(number: int, width: int = 16, height: int = 12) -> Frame:
     return Frame(width=width, height=height, colour=memoryview(shade), depth=memoryview(shade[: 2 * width * height]))
 
 
-def writer(folder: Path, limits: Limits = FOR_EVER, compression: Compression = "zstd", **options: Any) -> CaptureWriter:
+def writer(
+    folder: Path, limits: FileLimits = FOR_EVER, compression: Compression = "zstd", **options: Any
+) -> CaptureWriter:
     """Writes one-1.mcap, one-2.mcap and so on."""
 
     def info(key: str, payload: bytes) -> KeyInfo:
@@ -91,7 +93,7 @@ def writer(folder: Path, limits: Limits = FOR_EVER, compression: Compression = "
 
 
 def entry(key: str, number: int, payload: bytes = b"", log_ns: int | None = None) -> QueuedMessage:
-    """The nth message of a key, 10 ms apart."""
+    """The nth message of a key; they are 10 ms apart."""
     at_ns = NS + number * NS // 100 if log_ns is None else log_ns
     return QueuedMessage(f"calliope/{key}", number, at_ns, at_ns - 1000, payload or state(number))
 
@@ -101,6 +103,6 @@ def state(number: int) -> bytes:
 
 
 def all_of(path: Path, *keys: str) -> list[Record]:
-    """Every record, its payload a copy."""
+    """Every record, with a copy of its payload."""
     with Capture.open(path) as capture:
         return [record._replace(payload=memoryview(bytes(record.payload))) for record in capture.messages(*keys)]

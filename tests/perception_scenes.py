@@ -29,7 +29,7 @@ CAMERA_HEIGHT_M = 0.70
 
 
 class Canvas:
-    """A frame painted by hand: flat rectangles that face the camera, over a grey wall."""
+    """A painted frame: flat rectangles that face the camera, before a grey wall."""
 
     def __init__(self, width: int = 640, height: int = 480, wall_m: float | None = 3.0) -> None:
         self.camera = ROBOT.camera.scaled(width, height)
@@ -44,8 +44,8 @@ class Canvas:
         size_m: tuple[float, float] | None = None,
         seen_at_m: float | None = None,
     ) -> None:
-        """Paint an object's colour, as large as its outline is at that depth. Without depth (`depth_m` None)
-        `seen_at_m` says how large. The depth camera sees it shifted, as it stands beside the colour camera."""
+        """Paint an object's colour, as large as its outline at that depth; without depth, as at `seen_at_m`. In the
+        depth image it is shifted by the offset between the cameras."""
         known = CATALOGUE[label]
         apparent_m = depth_m if seen_at_m is None else seen_at_m
         assert apparent_m is not None
@@ -73,7 +73,7 @@ class Canvas:
 
 @dataclass
 class Thing:
-    """One visual of a rendered scene; known objects have their label's shape and colour."""
+    """One visual of a rendered scene. Known objects have their label's shape and colour."""
 
     name: str
     shape: str
@@ -83,7 +83,7 @@ class Thing:
 
 
 def known(label: str, x: float, y: float, z: float | None = None) -> Thing:
-    """A known object that stands on the floor there, or has its centre at z."""
+    """A known object that stands on the floor, or has its centre at z."""
     row = CATALOGUE[label]
     assert row.radius_m is not None
     size = (row.radius_m,) if row.height_m is None else (row.radius_m, row.height_m)
@@ -95,14 +95,14 @@ def block(x: float, y: float, z: float, size_m: tuple[float, float, float], rgb:
 
 
 def facing(thing: Thing) -> tuple[float, float]:
-    """Pan and tilt that bring a thing near the image's middle."""
+    """Pan and tilt that bring a thing near the image's centre, rad."""
     x, y, z = thing.position_m
     return atan2(y, x), -atan2(CAMERA_HEIGHT_M - z, hypot(x, y))
 
 
 @dataclass
 class Scene:
-    """A rendered scene, looked at from the robot's head."""
+    """A rendered scene, seen from the robot's head."""
 
     things: list[Thing]
     sensors: Sensors = "ideal"
@@ -137,7 +137,7 @@ def perception(**config: object) -> PerceptionCore:
 
 
 def head_at(stamp_ns: int, pan: float = 0.0, tilt: float = 0.0, incarnation: int = 0) -> Sample:
-    """The arm network's state, with the joints in another order than the neck's own."""
+    """The arm network's state, with the joints in another order than the neck's."""
     state = ServoState(
         stamp_ns=stamp_ns,
         incarnation=incarnation,
@@ -150,7 +150,7 @@ def head_at(stamp_ns: int, pan: float = 0.0, tilt: float = 0.0, incarnation: int
 
 
 def seen(frame: Frame, pan: float = 0.0, tilt: float = 0.0, **config: object) -> Detections:
-    """What perception says of one frame, with the head still."""
+    """Perception's detections in one frame, with the head still."""
     around = [head_at(frame.stamp_ns + offset * MS, pan, tilt) for offset in (-10, 10)]
     outputs = perception(**config).step([*around, Sample(FRAME, frame)], frame.stamp_ns + 20 * MS)
     message = outputs[0].message
@@ -159,14 +159,14 @@ def seen(frame: Frame, pan: float = 0.0, tilt: float = 0.0, **config: object) ->
 
 
 def the(label: str, detections: Detections) -> Detection:
-    """The one detection of that label."""
+    """The one detection of a label."""
     found = [detection for detection in detections.detections if detection.label == label]
     assert len(found) == 1, f"{label}: {[d.label for d in detections.detections]}"
     return found[0]
 
 
 def error_mm(detection: Detection, thing: Thing) -> tuple[float, float]:
-    """How far the position is from the truth, horizontally and vertically, in millimetres."""
+    """Horizontal and vertical error of the position, mm."""
     assert detection.position_m is not None, detection.note
     dx, dy, dz = (1e3 * (a - b) for a, b in zip(detection.position_m, thing.position_m, strict=True))
     return hypot(dx, dy), abs(dz)

@@ -1,4 +1,4 @@
-"""MCAP files that other tools made, trimmed or put together: what the commands say and make of them."""
+"""MCAP files of other tools, trimmed or composed: what the commands report and make of them."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def trimmed(whole: Path, out: Path, keep: int, library: str = "") -> Path:
-    """Every so many messages of a capture, by the package's writer; header and metadata are copied."""
+    """A copy of a capture with every `keep`th message, by the package's writer; header and metadata are copied."""
     with whole.open("rb") as source, out.open("wb") as target:
         reader, copy = make_reader(source), Writer(target)
         header = reader.get_header()
@@ -86,7 +86,7 @@ def test_the_tally_of_the_file_itself_is_believed(whole: Path) -> None:
 
 
 def test_as_many_messages_of_other_payloads_do_not_have_the_first_ones_sizes(tmp_path: Path) -> None:
-    """A tally that agrees with the statistics and not with the chunks."""
+    """The copied tally agrees with the statistics, but not with the chunks."""
     written = writer(tmp_path)
     for n in range(50):
         written.put(entry("base/state", n))
@@ -122,7 +122,7 @@ def test_statistics_that_are_not_so_are_told(tmp_path: Path) -> None:
 
 
 def loose(path: Path, count: int = 1000, **options: Any) -> Path:
-    """Messages of two channels in turn, late ones among them, with metadata and an attachment in between."""
+    """Messages of two channels in turn, some of them late, with metadata and an attachment in between."""
     with path.open("wb") as target:
         made = Writer(target, use_chunking=False, **options)
         made.start("ros2", "somebody")
@@ -186,7 +186,7 @@ def test_an_unfinished_file_without_chunks_is_read_up_to_its_last_whole_record(t
 
 @pytest.fixture
 def twofold(tmp_path: Path) -> Path:
-    """One topic, once as MessagePack and once as JSON, with as many messages of different sizes, and another schema."""
+    """One topic with two channels, MessagePack and JSON: as many messages of different sizes, and different schemas."""
     path = tmp_path / "twofold.mcap"
     with path.open("wb") as target:
         made = Writer(target, compression=CompressionType.LZ4)
@@ -223,7 +223,7 @@ def test_two_channels_of_one_topic_stay_two_when_told_and_repaired(
             assert capture.channels[2].metadata == {"a": "b"}
             schemas = [capture.schema(channel) for channel in (1, 2)]
             assert [schema and schema.encoding for schema in schemas] == ["jsonschema", "other"]
-    assert info_of(repaired, capsys)["checked"] is False  # by its tally, which has both
+    assert info_of(repaired, capsys)["checked"] is False  # by its tally, which has both channels
     assert all_of(repaired) == all_of(twofold)
 
 

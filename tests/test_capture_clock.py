@@ -1,4 +1,4 @@
-"""Log times while somebody sets the wall clock, and while the machine sleeps."""
+"""Log times when the wall clock is set, and when the machine sleeps."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from cocoro.capture.reader import Capture
 from cocoro.clock import NS, steady_ns
 from services.capture.log_clock import KEPT_STEPS, TOGETHER_NS, WALL_CLOCK, LogClock
 from services.capture.service import captures, file_name, make_room
-from services.capture.writer import Limits
+from services.capture.writer import FileLimits
 
 START_NS = 1_750_000_000 * NS
 HOUR_NS = 3600 * NS
 
 
 class Machine:
-    """Its two clocks. Each reading takes a moment, as on a machine."""
+    """A machine's two clocks. Each reading takes time, as on a real machine."""
 
     def __init__(self) -> None:
         self.steady_ns = 77 * NS
@@ -112,7 +112,7 @@ def test_this_machines_clocks_are_not_set_while_nobody_sets_them() -> None:
 
 def test_a_capture_tells_in_each_of_its_files_how_the_clock_was_set(machine: Machine, tmp_path: Path) -> None:
     clock = LogClock(machine.wall, machine.steady)
-    written = writer(tmp_path, Limits(file_s=60.0))
+    written = writer(tmp_path, FileLimits(file_s=60.0))
     for n in range(300):
         written.put(entry("base/state", n, log_ns=clock.now_ns()))
         machine.passes(0.5)

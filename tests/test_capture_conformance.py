@@ -1,4 +1,4 @@
-"""Anybody's MCAP files: what the mcap package reads of them is what is read here, and what is left after a repair."""
+"""MCAP files of other programs: the reader here finds what the mcap package finds, before and after a repair."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ FILES = dict(variants())
 
 
 class Known(NamedTuple):
-    """All that a file has."""
+    """The contents of a file."""
 
     messages: list[tuple[int, int, int, int, bytes]]
-    """Channel, sequence, times and payload, in order of the log times, then of the file."""
+    """Channel, sequence, times and payload, in the order of log times, then of the file."""
     channels: dict[int, Channel]
     schemas: dict[int, Schema]
     metadata: list[Metadata]
@@ -38,7 +38,7 @@ class Known(NamedTuple):
 
 
 def by_package(data: bytes) -> Known:
-    """From front to back, as the package's readers without an index do it."""
+    """Read front to back, as the package's readers without an index do."""
     known = Known([], {}, {}, [], [])
     for record in StreamReader(BytesIO(data), validate_crcs=True).records:
         if isinstance(record, Channel):
@@ -98,7 +98,7 @@ def test_every_file_of_the_conformance_set_is_read_as_the_package_reads_it_befor
 
 
 def _check_indexed(data: bytes, known: Known) -> None:
-    """A repaired file has indices, so the package's reader of indexed files finds everything by them."""
+    """A repaired file has indices, so the package's indexed reader finds everything."""
     reader = make_reader(BytesIO(data), validate_crcs=True)
     summary = reader.get_summary()
     assert summary is not None
@@ -125,7 +125,7 @@ def test_the_commands_call_none_of_them_damaged(name: str, tmp_path: Path, capsy
 
 
 def _records(data: bytes) -> Iterator[bytes]:
-    """Each record of a file with its prefix."""
+    """Each record of a file, with its prefix."""
     at = len(MAGIC)
     while at < len(data) - len(MAGIC):
         end = at + 9 + int.from_bytes(data[at + 1 : at + 9], "little")
@@ -223,15 +223,15 @@ OTHERS = st.tuples(st.sampled_from(["metadata", "attachment"]), st.text(max_size
 def test_whatever_the_package_writes_is_read_as_the_package_reads_it_before_and_after_repair(
     tmp_path_factory: pytest.TempPathFactory, options: dict[str, Any], acts: list[Any], profile: str
 ) -> None:
-    if not options["use_chunking"]:  # the package's checksum over all the data lacks channels that it has not flushed
+    if not options["use_chunking"]:  # the package's checksum over all data lacks channels that it has not flushed
         options["enable_data_crcs"] = False
     stream, folder = BytesIO(), tmp_path_factory.mktemp("any")
     written = Writer(stream, **options)
     written.start(profile)
     schemas = [0, written.register_schema("S", "jsonschema", b"{}"), written.register_schema("S", "other", b"")]
-    for n, schema in enumerate((*schemas, 1)):  # two topics, two channels of each
+    for n, schema in enumerate((*schemas, 1)):  # two topics with two channels each
         written.register_channel(f"/topic{n % 2}", "json", schema, {"n": str(n)})
-    written.add_message(1, 20, b"", 20)  # or the package loses the channels
+    written.add_message(1, 20, b"", 20)  # without a message the package loses the channels
     for n, (kind, which, number, data) in enumerate(acts):
         if kind == "message":
             written.add_message(which + 1, number, data, n, n)
@@ -250,7 +250,7 @@ def test_whatever_the_package_writes_is_read_as_the_package_reads_it_before_and_
             assert (found.problems, found.notes, found.messages) == ((), (), len(known.messages))
         rewrite(capture, repaired, Packer("lz4"))
     again = here(repaired)
-    if profile == "cocoro":  # whose conventions give each metadata record a checksum
+    if profile == "cocoro":  # its conventions require a checksum in each metadata record
         known = known._replace(metadata=[_sealed(found) for found in known.metadata])
     assert again == known
     assert by_package(repaired.read_bytes())._replace(metadata=known.metadata) == known

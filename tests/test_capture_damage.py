@@ -1,4 +1,5 @@
-"""Captures that are cut, flipped, emptied or never were one: a clear error, or a partial reading that says so."""
+"""Captures that are cut, flipped or emptied, and files that are no captures: a clear error, or a partial reading that
+reports what is missing."""
 
 from __future__ import annotations
 
@@ -30,13 +31,13 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def whole(folder: Path) -> bytes:
-    """A capture of two seconds, closed."""
+    """A closed capture of two seconds."""
     return record(folder / "whole.mcap", drive, rotate_mb=1.0).read_bytes()
 
 
 @pytest.fixture(scope="module")
 def killed(whole: bytes) -> bytes:
-    """The same as a killed recorder leaves it: without its end."""
+    """The capture as a killed recorder leaves it: without its end."""
     return whole[: int(len(whole) * 0.9)]
 
 
@@ -105,8 +106,8 @@ def test_a_damaged_capture_gives_nothing_but_what_was_recorded_and_says_what_is_
 
 
 def _read(path: Path) -> str | tuple[list[Told], dict[str, dict[str, str]], bool, list[str], int]:
-    """What a reader makes of it: the error's text; or its messages, its metadata, whether it was closed, what is wrong
-    with it, and how many messages the report counts."""
+    """The result of reading: the error's text; or the messages, the metadata, whether it was closed, the problems, and
+    the number of messages in the report."""
     try:
         with Capture.open(path) as capture:
             found = [_told(each) for each in capture.messages()]

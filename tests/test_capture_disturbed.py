@@ -1,4 +1,4 @@
-"""Files that somebody moves or removes while they are being recorded."""
+"""Files that are moved or removed while they are recorded."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from cocoro.capture.conventions import CaptureError
 from cocoro.capture.reader import Capture
 from cocoro.messages import Recording
 from cocoro.vloop import run_virtual
-from services.capture.writer import KEPT_DISTURBED, LOOK_S, CaptureWriter, Limits, describe_disturbance, locate
+from services.capture.writer import KEPT_DISTURBED, LOOK_S, CaptureWriter, FileLimits, describe_disturbance, locate
 
 
 class Watch:
-    """Time as a writer sees it."""
+    """The writer's clock."""
 
     def __init__(self) -> None:
         self.now_s = 100.0
@@ -29,13 +29,13 @@ class Watch:
 
 
 class Disturbed:
-    """A writer, and its file's fate."""
+    """A writer and its file."""
 
-    def __init__(self, folder: Path, limits: Limits | None = None) -> None:
+    def __init__(self, folder: Path, limits: FileLimits | None = None) -> None:
         self.watch = Watch()
         self.folder = folder
         self.number = 0
-        self.writer: CaptureWriter = writer(folder, limits or Limits(), monotonic_s=self.watch)
+        self.writer: CaptureWriter = writer(folder, limits or FileLimits(), monotonic_s=self.watch)
 
     def put(self, count: int) -> None:
         for _ in range(count):
@@ -43,7 +43,7 @@ class Disturbed:
             self.number += 1
 
     def flush(self) -> None:
-        """As it does ten times a second; long after the last look."""
+        """One of ten flushes a second, long after the last check."""
         self.watch.now_s += LOOK_S
         self.writer.flush()
 
@@ -52,7 +52,7 @@ class Disturbed:
 
 
 def only(folder: Path) -> Path:
-    """The one capture that is there."""
+    """The only capture in the folder."""
     (path,) = folder.glob("*.mcap")
     return path
 
@@ -127,7 +127,7 @@ def test_what_happened_since_the_last_look_is_seen_at_the_end(it: Disturbed, bec
 
 
 def test_a_file_that_is_removed_just_before_the_next_one_begins_is_told_of_too(tmp_path: Path) -> None:
-    it = Disturbed(tmp_path, Limits(file_bytes=3000))
+    it = Disturbed(tmp_path, FileLimits(file_bytes=3000))
     it.put(10)
     it.flush()
     (tmp_path / "one-1.mcap").unlink()

@@ -1,4 +1,4 @@
-"""Captures in the forms that people look at."""
+"""Exports of captures: film, tables, Foxglove, Rerun."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ GOLDEN = Path(__file__).parent / "golden" / "fetch.mcap"
 
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The golden capture, in all forms that need nothing more."""
+    """The golden capture in the forms that need no extra."""
     folder = tmp_path_factory.mktemp("exported")
     forms = {"--video": "film.mp4", "--csv": "csv"}
     assert (
@@ -65,7 +65,7 @@ def test_the_film_lasts_as_long_as_the_capture_and_shows_what_the_robot_saw(expo
     assert isinstance(last, Frame)
     seen = np.frombuffer(last.colour, np.uint8).reshape(120, 160, 3)[:90, :, ::-1]
     difference = np.abs(pictures[-1][:90].astype(int) - seen.astype(int))
-    assert np.median(difference) < 12  # but for what is drawn in and the film's loss, the same
+    assert np.median(difference) < 12  # except for what is drawn in, and the film's compression
 
 
 def test_a_capture_without_pictures_makes_no_film(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -147,7 +147,7 @@ def test_a_list_of_maps_is_a_table_of_its_own(exported: Path) -> None:
 
 def test_belief_stands_beside_truth_in_the_body_frame(tmp_path: Path) -> None:
     async def drive_past(room: Room) -> None:
-        """The body looks left, along y, and goes 0.1 m on between two truths; the can is 1 m to its right."""
+        """The body faces left, along y, and moves 0.1 m between two truths; the can is 1 m to its right."""
         async with room.node("sim") as sim, room.node("planning") as planning:
             can = TrueObject(label="red_can", kind="object", position_m=(2.0, 1.0, 0.06), orientation=(0, 0, 0, 1))
             for tick in range(11):
@@ -164,7 +164,7 @@ def test_belief_stands_beside_truth_in_the_body_frame(tmp_path: Path) -> None:
     with Capture.open(path) as capture:
         assert "belief" in tables.export(capture, tables.CsvFolder(tmp_path / "csv"))
     (row,) = _rows(tmp_path / "csv" / "belief.csv")
-    gone_m = 0.5 + 0.1 / 3  # of 30 ms between the truths 10 have passed
+    gone_m = 0.5 + 0.1 / 3  # 10 of the 30 ms between the truths have passed
     assert (float(row["true_x_m"]), float(row["true_y_m"])) == pytest.approx((1.0 - gone_m, -1.0), abs=1e-6)
     assert float(row["error_m"]) == pytest.approx(0.1 / 3, abs=1e-6)
 
@@ -193,7 +193,7 @@ def fox(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_file_for_foxglove_has_its_schemas_in_the_robots_time(fox: Path) -> None:
-    """tests/test_capture_foreign.py has the npm packages decode and check each message."""
+    """tests/test_capture_foreign.py decodes and validates each message with npm packages."""
     shown: dict[str, list[bytes]] = {}
     recorded: dict[str, list[Any]] = {}
     last = 0
@@ -230,7 +230,7 @@ def test_without_foxglove_one_line_says_how_to_install_it(
 
 
 def test_an_export_does_not_write_over_a_file(exported: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """It might be the capture."""
+    """The file might be the capture."""
     with Capture.open(GOLDEN) as capture, pytest.raises(CaptureError, match="exists; remove it"):
         video.export(capture, exported / "film.mp4")
     for form in ("--video", "--foxglove", "--rrd"):
@@ -240,14 +240,14 @@ def test_an_export_does_not_write_over_a_file(exported: Path, capsys: pytest.Cap
     assert main(["export", str(GOLDEN), "--csv", str(exported / "more"), "--rrd", str(GOLDEN)]) == 1
     assert "exists; remove it" in capsys.readouterr().err
     assert GOLDEN.read_bytes() == before
-    assert not (exported / "more").exists()  # all are looked at before the first is made
+    assert not (exported / "more").exists()  # all outputs are checked before the first is made
 
 
 # --- Rerun ----------------------------------------------------------------------------------------
 
 
 class Made:
-    """Whatever of Rerun's: it remembers what it was made with."""
+    """Stands in for any object of Rerun's, and keeps the arguments of its construction."""
 
     def __init__(self, *args: Any, **options: Any) -> None:
         self.args, self.options = args, options
@@ -262,7 +262,7 @@ class Made:
 
 
 class Stream:
-    """A recording that keeps what it is told, by path."""
+    """A recording that keeps what is logged, by path."""
 
     newest: Stream
 
@@ -330,7 +330,7 @@ def test_rerun_is_told_of_the_mesh_as_it_goes(monkeypatch: pytest.MonkeyPatch) -
     told = Stream.newest.told
     assert len(told["world/body"]) == 50
     assert len(told["world/body/camera/colour"]) == 10
-    (command,) = told["curves/wheels/commanded_left"]  # as old as it is
+    (command,) = told["curves/wheels/commanded_left"]  # however old it is
     assert command[1].args == (0.1,)
 
 

@@ -1,4 +1,4 @@
-"""The files that a recorder writes: what is in them, when a new one begins, and what is left when the disk refuses."""
+"""The files that a recorder writes: their contents, when a new one begins, and what remains when the disk refuses."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from cocoro.topics import TOPICS
 from services.capture.file import COMPRESSIONS, Compression, Packer
 from services.capture.keys import KeyFilter, lossy
 from services.capture.service import captures, make_room
-from services.capture.writer import Limits, Missing
+from services.capture.writer import FileLimits, Missing
 
 BIG = msgspec.msgpack.encode(frame(7, 320, 240))
 
@@ -136,8 +136,8 @@ def test_keys_never_heard_of_are_kept_as_what_they_seem_to_be(tmp_path: Path) ->
 # --- one file after another -----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("limits", [Limits(file_bytes=4000), Limits(file_s=0.5)], ids=["by size", "by time"])
-def test_rotation_loses_nothing_and_every_file_is_whole_in_itself(tmp_path: Path, limits: Limits) -> None:
+@pytest.mark.parametrize("limits", [FileLimits(file_bytes=4000), FileLimits(file_s=0.5)], ids=["by size", "by time"])
+def test_rotation_loses_nothing_and_every_file_is_whole_in_itself(tmp_path: Path, limits: FileLimits) -> None:
     written = writer(tmp_path, limits)
     written.remember("run", {"robot": "calliope"})
     for n in range(500):
@@ -184,7 +184,7 @@ def test_the_oldest_captures_make_room_and_nothing_else_does(tmp_path: Path) -> 
 
 
 class Disk:
-    """Stands in for a disk of so many bytes: the write that does not fit is done in part, as a real one does it."""
+    """A disk with room for so many bytes. A write that does not fit is done in part, as on a real disk."""
 
     def __init__(self, room: int) -> None:
         self.room = room
@@ -222,7 +222,7 @@ def test_a_full_disk_ends_the_recording_with_a_readable_file(tmp_path: Path, mon
 
 def test_recording_stops_before_the_disk_is_full(tmp_path: Path) -> None:
     total = shutil.disk_usage(tmp_path).total
-    written = writer(tmp_path, Limits(min_free_bytes=2 * total))
+    written = writer(tmp_path, FileLimits(min_free_bytes=2 * total))
     written.put(entry("base/state", 0))
     with pytest.raises(CaptureError, match="MB are free; make room"):
         written.flush()
@@ -282,7 +282,7 @@ def test_info_counts_rates_gaps_and_losses(tmp_path: Path) -> None:
 
 
 class Older(msgspec.Struct, kw_only=True):
-    """A BaseState of another time: it lacks fields, and has one that is no more."""
+    """A BaseState of an earlier version: it lacks some of today's fields and has one that is gone."""
 
     stamp_ns: int = 0
     seq: int = 0

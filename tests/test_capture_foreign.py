@@ -1,4 +1,4 @@
-"""Others read our captures: with libraries that know nothing of this project, by what docs/captures.md says."""
+"""Captures are read by libraries that know nothing of this project, as docs/captures.md describes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ UNREACHABLE = ("ENOTFOUND", "ECONNREFUSED", "ETIMEDOUT", "EAI_AGAIN", "ENETUNREA
 
 @pytest.fixture(scope="module")
 def expected() -> dict[str, tuple[str, int]]:
-    """By our own reader: each key's type and number of messages."""
+    """Each key's type and number of messages, by this project's reader."""
     with Capture.open(GOLDEN) as capture:
         counts = Counter(record.key for record in capture.messages())
         schemas = {key: capture.schema(channel) for key, (channel,) in capture.keys.items()}
@@ -58,7 +58,7 @@ def test_the_mcap_and_msgpack_libraries_read_everything_by_the_page(expected: di
 
 
 def _crc(entries: dict[str, str]) -> str:
-    """As the page has it."""
+    """As docs/captures.md defines it."""
     crc = 0
     for name in sorted(entries):
         if name != "crc32":
@@ -71,7 +71,7 @@ def _crc(entries: dict[str, str]) -> str:
 
 @pytest.fixture(scope="module")
 def reader(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """tests/foreign with its packages, which npm gets as the lock file says."""
+    """tests/foreign with its npm packages, at the versions of the lock file."""
     if shutil.which("node") is None or shutil.which("npm") is None:
         pytest.skip("node and npm are not installed: the npm packages cannot read the capture here")
     folder = tmp_path_factory.mktemp("foreign")

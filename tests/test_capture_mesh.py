@@ -1,4 +1,5 @@
-"""Recording and replaying over zenoh, with processes: what is left after a kill, and that nobody is impersonated."""
+"""Recording and replaying over zenoh with processes: what remains after a kill, and that no living service is
+impersonated."""
 
 from __future__ import annotations
 
@@ -38,13 +39,13 @@ pytestmark = pytest.mark.zenoh
 
 ROBOT = "calliope"
 KILLS = 5
-"""bench/capture.py does 20 and tells the figures."""
+"""bench/capture.py does 20 and prints the figures."""
 MISSING_S = 0.3
 PATIENCE_S = 60.0
 
 
 class Pulse:
-    """A robot's base that says its state all the time; and how late this machine let it."""
+    """A base that publishes its state continuously, and measures how late this machine lets it."""
 
     def __init__(self, node: Node) -> None:
         self.stall_s = 0.0
@@ -110,7 +111,7 @@ def test_a_killed_recorder_leaves_all_but_the_last_moment(short_path: Path) -> N
                     whole = rewrite(capture, out / "whole.mcap", Packer("zstd"))
                 sequences = [each.sequence for each in states]
                 assert sequences == list(range(sequences[0], sequences[-1] + 1))
-                # What this machine's other work took from it is not the recorder's.
+                # Delays by the machine's other work are not the recorder's.
                 assert (killed_ns - states[-1].log_ns) / 1e9 < MISSING_S + 2 * pulse.stall_s
                 assert [each.sequence for each in all_of(whole.path, "base/state")] == sequences
 
@@ -172,7 +173,7 @@ def test_a_recording_whose_file_is_taken_away_goes_on_in_the_next_one_and_says_w
 
 
 async def files_of(folder: Path, count: int) -> list[Path]:
-    """A folder's captures, as soon as there are so many."""
+    """Wait until a folder has so many captures."""
     return await asyncio.to_thread(_files_of, folder, count)
 
 
@@ -185,7 +186,7 @@ def _files_of(folder: Path, count: int) -> list[Path]:
 
 
 class Wall:
-    """A wall clock that a test sets."""
+    """A wall clock that the test sets."""
 
     def __init__(self) -> None:
         self.ahead_ns = 0
@@ -293,7 +294,7 @@ def test_replay_is_worked_by_the_keyboard(short_path: Path) -> None:
     screen.wait_for("pass 2")
     os.write(ours, b"-")
     screen.wait_for("x0.80")
-    os.write(ours, b"++x-\x1bOC\x1b[D")  # at once, as of keys that are held down
+    os.write(ours, b"++x-\x1bOC\x1b[D")  # in one write, as from keys that are held down
     screen.wait_for("paused 0.0 of 2.0 s, x1.00")
     os.write(ours, b" ")
     screen.wait_for("0.3 of 2.0 s")
@@ -303,14 +304,14 @@ def test_replay_is_worked_by_the_keyboard(short_path: Path) -> None:
 
 
 class Screen:
-    """What a program writes on its terminal."""
+    """The output of a program on its terminal."""
 
     def __init__(self, fd: int) -> None:
         self._fd = fd
         self._text = ""
 
     def wait_for(self, words: str) -> None:
-        """Until it has been written; what came before it is forgotten."""
+        """Wait for an output; earlier output is forgotten."""
         until_s = time.monotonic() + PATIENCE_S
         while words not in self._text:
             assert time.monotonic() < until_s, f"{words!r} does not come; there is {self._text[-300:]!r}"

@@ -1,4 +1,4 @@
-"""The recorder on the mesh: it hears everything, keeps what fits, counts the rest, and never stands in the way."""
+"""The recorder on the mesh: it receives everything, keeps what fits, counts the rest, and never delays the robot."""
 
 from __future__ import annotations
 
@@ -246,7 +246,7 @@ def _refuse(*_: object) -> int:
 
 
 class Stalled:
-    """A disk that does not answer until it is let go."""
+    """A disk that does not answer until it is released."""
 
     def __init__(self, folder: Path) -> None:
         self.go = threading.Event()
@@ -347,7 +347,7 @@ def test_steps_that_are_to_be_recorded_begin_when_a_recorder_hears_them() -> Non
 @pytest.mark.parametrize("name", ["robot", "sim", "sim-wire"])
 def test_the_recorder_is_part_of_every_profile_that_has_a_robot(name: str) -> None:
     profile = profiles.read(name)
-    assert profile.processes[0] == "capture"  # the first to come up, the last to be stopped
+    assert profile.processes[0] == "capture"  # started first, stopped last
     assert all(profile.launch(service).record_steps for service in ("perception", "planning"))
 
 

@@ -1,4 +1,4 @@
-"""Exact re-execution: equal where nothing has changed, and told where, what and by how much where something has."""
+"""Re-execution: equal outputs where nothing has changed; otherwise a report of where, what and by how much."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from cocoro.core import Core, Output, Sample, Schedule, Take
 from cocoro.messages import Detections, PlannerStatus
 from services.capture.file import Packer
 from services.capture.keys import QueuedMessage, lossy
-from services.capture.writer import CaptureWriter, Limits
+from services.capture.writer import CaptureWriter, FileLimits
 from services.perception import service as perception
 from services.planning import service as planning
 from services.planning.config import PlanningConfig
@@ -36,8 +36,7 @@ from services.planning.core import PlanningCore
 
 GOLDEN = Path(__file__).parent / "golden" / "fetch.mcap"
 TOLERANCE = 1e-3
-"""Across machines: a thousandth of a number, or of one metre, radian or pixel where the number is smaller. Another
-processor may add up in another order."""
+"""Tolerance across machines: a thousandth of a number, or of 1 below 1. Another processor may add in another order."""
 
 
 def again(path: Path, service: str, tolerance: float = 0.0) -> ReexecutionResult:
@@ -51,13 +50,13 @@ def without(path: Path, out: Path, keep: Callable[[Record], bool], start_ns: int
 
 
 def use_core(monkeypatch: pytest.MonkeyPatch, service: ModuleType, make: Callable[..., Core]) -> None:
-    """Have another core made for a service."""
+    """Replace a service's core."""
     monkeypatch.setattr(service, "implementation", replace(service.implementation, core=make))
 
 
 @pytest.mark.parametrize("service", ["perception", "planning"])
 def test_the_golden_capture_is_executed_again_with_equal_outputs(service: str) -> None:
-    """When this fails because outputs are meant to be others now, make the capture anew: tests/golden/make.py."""
+    """When outputs are meant to change, make the capture anew: tests/golden/make.py."""
     result = again(GOLDEN, service, TOLERANCE)
     assert result.first is None, result.first
     assert result.not_executable == 0
@@ -73,7 +72,7 @@ def test_the_golden_capture_is_small() -> None:
 
 
 class Changed:
-    """A core whose nth output of a type is another; detections of nothing do not count."""
+    """A core that changes its nth output of a type. Empty detections do not count."""
 
     def __init__(self, core: Core, change: Callable[[Any], None], kind: type, number: int) -> None:
         self.reads, self.schedule = core.reads, core.schedule
@@ -179,7 +178,7 @@ def test_lossy_frames_are_no_inputs(tmp_path: Path) -> None:
     path = tmp_path / "lossy.mcap"
     with Capture.open(GOLDEN) as capture:
         infos = {key: info_in(capture, capture.keys[key][0]) for key in capture.keys}
-        out = CaptureWriter(lambda _: path, Packer("lz4"), Limits(), lambda key, _: infos[key], prepare=lossy(80))
+        out = CaptureWriter(lambda _: path, Packer("lz4"), FileLimits(), lambda key, _: infos[key], prepare=lossy(80))
         for name, entries in capture.metadata.items():
             out.remember(name, entries)
         for each in capture.messages():
@@ -191,11 +190,11 @@ def test_lossy_frames_are_no_inputs(tmp_path: Path) -> None:
 
 
 def test_a_repeated_message_does_not_take_the_place_of_the_one_that_was_consumed(tmp_path: Path) -> None:
-    """Readers reject it by its number, whatever it says."""
+    """Readers reject it by its number, whatever its content."""
     path = tmp_path / "repeated.mcap"
     with Capture.open(GOLDEN) as capture:
         infos = {key: info_in(capture, capture.keys[key][0]) for key in capture.keys}
-        out = CaptureWriter(lambda _: path, Packer("lz4"), Limits(), lambda key, _: infos[key])
+        out = CaptureWriter(lambda _: path, Packer("lz4"), FileLimits(), lambda key, _: infos[key])
         for name, entries in capture.metadata.items():
             out.remember(name, entries)
         for each in capture.messages():
@@ -210,8 +209,7 @@ def test_a_repeated_message_does_not_take_the_place_of_the_one_that_was_consumed
 
 
 def of_an_older_version(out: Path, change: Callable[[dict[str, Any]], None] = lambda _: None) -> Path:
-    """The golden capture as it were if the planner's status had had no `model`, an object no `sigma_m`, and the status
-    something else, that is no more."""
+    """The golden capture as if the planner's status had no `model` and another field, and an object no `sigma_m`."""
 
     def older(name: str, payload: bytes) -> bytes:
         if name != "PlannerStatus":
@@ -234,7 +232,7 @@ def of_an_older_version(out: Path, change: Callable[[dict[str, Any]], None] = la
         infos["calliope/planning/status"] = infos["calliope/planning/status"]._replace(
             schema=schema._replace(data=json.dumps(then).encode())
         )
-        written = CaptureWriter(lambda _: out, Packer("lz4"), Limits(), lambda key, _: infos[key])
+        written = CaptureWriter(lambda _: out, Packer("lz4"), FileLimits(), lambda key, _: infos[key])
         for name, entries in capture.metadata.items():
             written.remember(name, entries)
         for each in capture.messages():
@@ -287,10 +285,10 @@ def test_a_capture_that_does_not_have_what_it_takes_is_told_of(service: str, wor
 
 
 def started_otherwise(out: Path, change: Callable[[dict[str, Any]], object]) -> Path:
-    """The golden capture as it were if the planner had had other settings."""
+    """The golden capture as if the planner had had other settings."""
     with Capture.open(GOLDEN) as capture:
         infos = {key: info_in(capture, capture.keys[key][0]) for key in capture.keys}
-        written = CaptureWriter(lambda _: out, Packer("lz4"), Limits(), lambda key, _: infos[key])
+        written = CaptureWriter(lambda _: out, Packer("lz4"), FileLimits(), lambda key, _: infos[key])
         for name, entries in capture.metadata.items():
             if name == "service/planning":
                 config = json.loads(entries["config"])
@@ -329,7 +327,7 @@ def test_the_planner_s_former_setting_coordination_chooses_the_core(
 
 
 class Adder:
-    """Counts the states that it got since it was started."""
+    """Counts the states since its start."""
 
     reads: Mapping[Any, Take] = {topics.BASE_STATE: "all"}
     schedule = Schedule(None, (topics.BASE_STATE,))

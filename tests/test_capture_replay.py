@@ -1,4 +1,4 @@
-"""Replay: the time line by itself, then on the mesh, and recorded once more."""
+"""Replay: the time line alone, on the mesh, and recorded again."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from cocoro.vloop import run_virtual
 
 @pytest.fixture
 def capture(tmp_path: Path) -> Iterator[Capture]:
-    """Ten states, 0.1 s apart, and a picture with every other."""
+    """Ten states, 0.1 s apart, and a picture with every second one."""
     written = writer(tmp_path)
     for n in range(10):
         at_ns = 10**9 + n * 10**8
@@ -163,7 +163,7 @@ def test_the_clock_says_how_fast_time_goes() -> None:
 
 
 async def think(room: Room) -> None:
-    """A robot that drives, and a service that answers each state: hardware keys and others."""
+    """A robot that drives, and a service that answers each state: hardware's keys and others."""
     async with room.node("planning") as planning:
 
         def answer(_: BaseState) -> None:
@@ -175,7 +175,7 @@ async def think(room: Room) -> None:
 
 
 def replayed(path: Path, out: Path, *, hardware: bool = False, **options: Any) -> Path:
-    """A capture of a capture's replay."""
+    """The capture of a capture's replay."""
 
     async def play(room: Room) -> None:
         with Capture.open(path) as capture:
@@ -199,7 +199,7 @@ def test_a_capture_of_a_replay_has_the_same_payloads_in_the_same_order(tmp_path:
 
 
 def _payloads(path: Path) -> dict[str, list[bytes]]:
-    """By key, but for what recorders say of themselves."""
+    """Payloads by key, without what recorders publish about themselves."""
     found: dict[str, list[bytes]] = defaultdict(list)
     for each in all_of(path):
         service, _, topic = each.key.removeprefix("calliope/").partition("/")
@@ -235,7 +235,7 @@ def test_hardware_alone_impersonates_the_robot_with_a_clock(tmp_path: Path) -> N
 
 
 class Counting:
-    """A core that counts the states that it is given."""
+    """A core that counts its input states."""
 
     reads: Mapping[Any, Take] = {topics.BASE_STATE: "all"}
     schedule = Schedule(None, (topics.BASE_STATE,))
@@ -249,7 +249,7 @@ class Counting:
 
 
 def test_what_thinks_is_up_before_the_capture_begins_and_misses_nothing_of_it(tmp_path: Path) -> None:
-    """`cocoro up replay` in one terminal, then `cocoro replay --hardware` in another: until then there is no clock."""
+    """`cocoro up replay` in one terminal, then `cocoro replay --hardware` in another; until then there is no clock."""
     path = record(tmp_path / "first.mcap", drive)
     core = Counting()
 

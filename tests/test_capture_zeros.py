@@ -1,5 +1,6 @@
-"""Zeros where something was: in a recorder's own file they are damage also where MCAP lets 0 mean 'not checked' or
-'none'; in anybody's file, where the statistics contradict them. What is whole is never called damaged."""
+"""Zeros in a file. In a recorder's own file they are damage, even where MCAP lets 0 mean "not checked" or "none"; in a
+file of another program they are damage where the statistics contradict them. An intact file is never called
+damaged."""
 
 from __future__ import annotations
 
@@ -21,12 +22,12 @@ from apps.captures.rewrite import rewrite
 from cocoro.capture.mcap import MAGIC, PREFIX
 from cocoro.capture.reader import Capture
 from services.capture.file import CaptureFile, Packer
-from services.capture.writer import Limits, sync_and_close
+from services.capture.writer import FileLimits, sync_and_close
 
 CHUNK_CRC = PREFIX.size + 24
-"""From a chunk record's beginning, of 4 bytes."""
+"""Offset of the checksum, 4 bytes, in a chunk record."""
 FOOTER = PREFIX.size + 20 + len(MAGIC)
-"""From a file's end to its footer."""
+"""Offset of the footer from the file's end."""
 
 
 class Part(NamedTuple):
@@ -52,7 +53,7 @@ def zeroed(data: bytes, start: int, length: int) -> bytes:
 
 
 def problems(path: Path, data: bytes, check: bool = False) -> list[str]:
-    """What is told once every message was read; with `check`, once every byte was."""
+    """The problems after every message was read; with `check`, after every byte was."""
     path.write_bytes(data)
     with Capture.open(path) as capture:
         list(capture.messages())
@@ -62,7 +63,7 @@ def problems(path: Path, data: bytes, check: bool = False) -> list[str]:
 
 
 def resealed(data: bytes, summary: bytes) -> bytes:
-    """The file with another summary, whose checksum is right."""
+    """The file with another summary and its right checksum."""
     start = parts(data, Opcode.DATA_END)[0].end
     footer = data[-FOOTER:][: PREFIX.size] + struct.pack("<QQ", start, 0)
     return data[:start] + summary + footer + struct.pack("<I", zlib.crc32(summary + footer)) + MAGIC
@@ -80,7 +81,7 @@ def packed(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> bytes:
-    """A recorder's file with two chunks that are not packed."""
+    """A recorder's file with two uncompressed chunks."""
     return made(tmp_path_factory.mktemp("zeros"))
 
 
@@ -104,7 +105,7 @@ def made(folder: Path) -> bytes:
 def test_zeros_anywhere_over_a_chunks_head_lose_nothing_unsaid(
     state: str, length: int, packed: bytes, tmp_path: Path
 ) -> None:
-    """From the head's middle on, zeros make a chunk that has no records and no checksum."""
+    """Zeros from the middle of the head on make a chunk without records and checksum."""
     path, (first, *_, last) = tmp_path / "zeros.mcap", parts(packed, Opcode.CHUNK)
     data = packed if state == "whole" else packed[: last.end]
     path.write_bytes(data)
@@ -258,7 +259,7 @@ def others(path: Path, **options: Any) -> bytes:
 
 
 def emptied(data: bytes) -> bytes:
-    """Zeros over the first chunk's head and all after it in the chunk: it is one without records then."""
+    """The first chunk zeroed from its head on, which makes it a chunk without records."""
     chunk = parts(data, Opcode.CHUNK)[0]
     return zeroed(data, chunk.start + PREFIX.size, chunk.end - chunk.start - PREFIX.size)
 
@@ -300,7 +301,7 @@ def test_no_file_of_a_recorder_is_called_damaged(packed: bytes, tmp_path: Path) 
     with Capture.open(path) as capture:
         assert rewrite(capture, again, Packer("lz4")).problems == ()
     assert problems(again, again.read_bytes(), check=True) == []
-    limits = Limits(file_s=0.05)
+    limits = FileLimits(file_s=0.05)
     written = writer(tmp_path, limits)
     for n in range(40):
         written.put(entry("base/state", n))

@@ -43,7 +43,7 @@ def arm_file(tmp_path: Path, robot: Robot) -> Path:
 
 
 def trial(number: int, turned_rad: float) -> WheelTrial:
-    """Of a body whose wheels stand as far apart as its drawing says."""
+    """Of a body whose wheels stand as far apart as the nominal model has it."""
     before = (1.5, 0.0)
     c, s = cos(turned_rad), sin(turned_rad)
     after = (1.5 * c, -1.5 * s)
@@ -60,7 +60,7 @@ def test_an_arms_samples_become_a_model_with_every_method_measured(
     report = json.loads(capsys.readouterr().out)
     assert report["chosen"] == BEST.name
     by_name = {score["name"]: score["held_out_m"] for score in report["scores"]}
-    assert by_name[BEST.name] < 0.6 * by_name["the drawing with its best constant offset"]
+    assert by_name[BEST.name] < 0.6 * by_name["the nominal model with its best constant offset"]
     arm = model.load(made, robot).arm
     assert arm is not None
     assert arm.training.scores["held_out_rms_m"] == by_name[BEST.name]

@@ -136,7 +136,7 @@ def test_a_lesson_tells_how_good_the_map_is_and_what_the_wheels_are(
 ) -> None:
     settings, result = learned
     assert settings.model_file(0).is_file()
-    assert {score["name"] for score in result["arm"]["scores"]} >= {"the drawing", result["arm"]["chosen"]}
+    assert {score["name"] for score in result["arm"]["scores"]} >= {"the nominal model", result["arm"]["chosen"]}
     assert result["wheels"]["separation_m"] == pytest.approx(0.255, abs=1e-3)
     assert set(result["curves"]["default"]) == set(result["curves"]["paper"])
     json.dumps(result, allow_nan=False)

@@ -69,7 +69,7 @@ def test_what_it_would_match_is_shown_and_nothing_is_saved_without_yes(
 ) -> None:
     assert main(["objects", "learn", "cup", "--from", photo, "--size", "0.06x0.1"]) == 0
     out = capsys.readouterr().out
-    assert "cup: cylinder, 6.0 x 6.0 x 10.0 cm (as you say)" in out
+    assert "cup: cylinder, 6.0 x 6.0 x 10.0 cm (as given)" in out
     assert "the robot   cup (no depth)" in out  # what perception itself makes of the picture
     assert "nothing is saved" in out
     assert not (here / "objects.toml").exists()
@@ -131,17 +131,17 @@ def test_what_is_known_is_only_replaced_or_added_to_when_that_is_said(
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
-        (["Cup", "--from", "photo.png"], "is no label"),
+        (["Cup", "--from", "photo.png"], "is not a valid label"),
         (["cup", "--from", "nowhere.png"], "there is no picture nowhere.png"),
-        (["cup", "--from", "words.png"], "is no picture that can be read"),
+        (["cup", "--from", "words.png"], "is not a readable picture"),
         (["cup", "--from", "photo.png"], "give --size"),
         (["cup", "--from", "photo.png", "--size", "6cm"], "write it in metres"),
         (["cup", "--from", "photo.png", "--size", "60"], "it is in metres"),
         (["cup", "--from", "photo.png", "--size", "0x1"], "write it in metres"),
         (["cup", "--from", "photo.png", "--at", "middle"], "write it as U,V"),
         (["cup", "--from", "photo.png", "--box", "1,2,3"], "LEFT,TOP,RIGHT,BOTTOM"),
-        (["cup", "--from", "photo.png", "--at", "1,2", "--box", "1,2,3,4"], "say one of them"),
-        (["cup", "--from", "photo.png", "--shape", "cone"], "cylinder, sphere or box"),
+        (["cup", "--from", "photo.png", "--at", "1,2", "--box", "1,2,3,4"], "give one of them"),
+        (["cup", "--from", "photo.png", "--shape", "cone"], "cylinder, sphere and box"),
         (["cup", "--from", "photo.png", "--picture", "cup.jpg"], "name must end with .png"),
         (["cup", "--from", "photo.png", "--size", "0.1", "--catalogue", "words.png"], "words.png"),
     ],

@@ -141,8 +141,8 @@ def test_samples_of_another_kind_robot_or_description_are_refused(tmp_path: Path
 @pytest.mark.parametrize(
     ("content", "text"),
     [
-        (b"", "nothing in it"),
-        (b"not json\n", "no file of samples"),
+        (b"", "it is empty"),
+        (b"not json\n", "not a file of samples"),
         (b'{"format":"cocoro.hand-samples","version":9,"robot":"calliope","drawing":""}\n', "version 9"),
     ],
 )

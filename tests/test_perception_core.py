@@ -1,4 +1,4 @@
-"""Perception over time: which head angles a frame is localised with, what waits, what is dropped."""
+"""Perception over time: the head angles that a frame is localised with, which frames wait, and which are dropped."""
 
 from collections.abc import Sequence
 from math import hypot
@@ -20,7 +20,7 @@ def frame(stamp_ns: int = STAMP_NS, **more: int) -> Frame:
 
 
 def messages(outputs: Sequence[Output]) -> list[Detections]:
-    """The detections among what a step gave."""
+    """The detections among a step's outputs."""
     return [output.message for output in outputs if isinstance(output.message, Detections)]
 
 
@@ -108,7 +108,9 @@ def test_an_old_frame_is_dropped_and_counted() -> None:
     states = [head_at(STAMP_NS - 10 * MS), head_at(STAMP_NS + 10 * MS)]
     assert not core.step([*states, Sample(FRAME, frame())], STAMP_NS + 501 * MS)
     assert core.stale_frames == 1
-    assert core.step([Sample(FRAME, frame())], STAMP_NS + 500 * MS - 1) == []  # time went back: nothing is known
+    assert (
+        core.step([Sample(FRAME, frame())], STAMP_NS + 500 * MS - 1) == []
+    )  # the clock restarted: no head angles are known
     assert core.stale_frames == 1
 
 

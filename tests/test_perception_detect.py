@@ -1,4 +1,4 @@
-"""What the two detectors see in painted frames: what they are to find, and what they are not to be taken in by."""
+"""The two detectors on painted frames: what they must find, and what they must not mistake for an object."""
 
 import msgspec
 import numpy as np
@@ -19,7 +19,7 @@ def middle(canvas: Canvas) -> tuple[float, float]:
 
 
 def beside(canvas: Canvas, right: float, down: float = 0.0) -> tuple[float, float]:
-    """A point off the middle, in shares of the image's width."""
+    """A point beside the middle, in shares of the image's width."""
     width = canvas.camera.width
     return canvas.camera.cx + right * width, canvas.camera.cy + down * width
 
@@ -60,7 +60,8 @@ def test_the_box_and_the_area_are_those_of_the_object(size: tuple[int, int]) -> 
 @SIZES
 @pytest.mark.parametrize("depth_m", [0.6, 0.75, 1.5, 3.0])
 def test_depth_is_registered_to_the_colour_image(depth_m: float, size: tuple[int, int]) -> None:
-    """Twice as wide as its depth is shifted: read at the colour's own pixel, half of it would be the wall's."""
+    """The object is twice as wide as the shift of its depth: read at the colour's own pixels, half of it would be the
+    wall's."""
     canvas = Canvas(*size)
     canvas.rectangle("yellow_ball", middle(canvas), depth_m)
     box = (0, 0, canvas.camera.width, canvas.camera.height)
@@ -69,7 +70,7 @@ def test_depth_is_registered_to_the_colour_image(depth_m: float, size: tuple[int
     yellow = canvas.colour[:, :, 2] < 60
     on_object = depth[yellow]
     assert np.isfinite(on_object).mean() > 0.9
-    step_m = 5e-5 * (1 + (depth_m / 0.1236) ** 2)  # one depth code
+    step_m = 5e-5 * (1 + (depth_m / 0.1236) ** 2)  # one step of the depth code
     assert np.abs(on_object[np.isfinite(on_object)] - depth_m).max() < step_m
 
 
@@ -101,7 +102,8 @@ def test_a_patch_of_the_cans_colour_does_not_pull_the_blob() -> None:
 
 
 def test_the_papers_detector_points_between_two_regions_of_one_colour() -> None:
-    """Its known weakness, which the default does not share: the median of all matching pixels lies on neither."""
+    """A known weakness of the paper's detector, which the default one does not share: the median of all matching
+    pixels is on neither region."""
     canvas = Canvas()
     canvas.rectangle("red_can", (200, 100), 1.0)
     canvas.rectangle("red_can", (440, 380), 1.0, size_m=(0.065, 0.12))
@@ -189,7 +191,8 @@ def test_colour_without_depth_is_refused_a_position() -> None:
 
 
 def test_what_the_depth_camera_sees_past_a_near_object_is_not_its_depth() -> None:
-    """It stands beside the colour camera: of the wall behind the can it sees a strip that the can hides."""
+    """The depth camera is beside the colour camera, so it sees a strip of the wall that the can hides from the colour
+    camera."""
     canvas = Canvas(wall_m=1.0)
     canvas.rectangle("red_can", (320, 240), None, seen_at_m=0.45)
     behind = RgbdImage.of(canvas.frame(), ROBOT).depth_m((278, 200, 362, 280))

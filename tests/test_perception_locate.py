@@ -1,4 +1,4 @@
-"""Where perception says that rendered objects are, against the truth."""
+"""Positions that perception computes from rendered scenes, against the truth."""
 
 from math import cos, radians, sin
 
@@ -19,13 +19,14 @@ pytestmark = pytest.mark.sim
 GREY = (0.5, 0.5, 0.5)
 CAN = "red_can"
 AIMS = ((0.0, 0.0), (0.2, 0.1), (-0.25, -0.12))
-"""Pan and tilt beside the object, rad."""
+"""Pan and tilt relative to the object, rad."""
 
 
 def errors_mm(
     distance_m: float, sensors: Sensors, size: tuple[int, int] = (640, 480), label: str = CAN
 ) -> NDArray[np.float64]:
-    """(horizontal, vertical) errors of one object at a distance, for three bearings and three aims of the head."""
+    """Horizontal and vertical errors of one object at a distance, mm, shape (n, 2), for three bearings and three aims
+    of the head."""
     errors: list[tuple[float, float]] = []
     for number, bearing in enumerate((-0.4, 0.1, 0.6)):
         thing = known(label, distance_m * cos(bearing), distance_m * sin(bearing))
@@ -108,7 +109,7 @@ def test_a_turning_heads_motion_blur_leaves_a_near_can_in_place(speed_radps: flo
 def test_what_seems_to_be_a_part_of_something_that_reaches_into_the_floor_is_no_such_thing(
     area_px: int, is_told: bool
 ) -> None:
-    """Of a can that the arm hides in part, what is left may be as round as a ball."""
+    """The visible part of a can behind the arm may be as round as a ball."""
     localiser = Localiser(ROBOT, CATALOGUE, PerceptionConfig().occluded_share)
     camera = ROBOT.camera
     head_rad = np.array([0.3, -0.6])
@@ -144,7 +145,7 @@ def test_a_body_before_the_can_does_not_move_its_axis(cover: Thing, size: tuple[
     with Scene([NEAR, cover], "real", 1, *size) as scene:
         hidden = the(CAN, seen(scene.frame(pan, tilt), pan, tilt))
     assert hidden.area_px < 0.9 * free.area_px
-    assert abs(hidden.u_px - free.u_px) + abs(hidden.v_px - free.v_px) > 1.0  # the visible centroid does jump
+    assert abs(hidden.u_px - free.u_px) + abs(hidden.v_px - free.v_px) > 1.0  # the visible centroid moves
     assert error_mm(hidden, NEAR)[0] < 4.0
 
 
@@ -199,7 +200,7 @@ BLUE = CATALOGUE["blue_can"].rgb
 
 
 def blue_ball(x: float, y: float, z: float = 0.04) -> Thing:
-    """As blue as the blue can."""
+    """A ball of the blue can's colour."""
     return Thing("blue_ball", "sphere", (0.04,), BLUE, (x, y, z))
 
 

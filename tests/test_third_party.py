@@ -35,6 +35,8 @@ from cocoro.robot import Robot
 from cocoro.topics import Topic
 from deploy import processes
 
+pytestmark = pytest.mark.process  # pip installs the distribution
+
 KEY = f"calliope/{NAME}/travelled"
 
 

@@ -14,10 +14,9 @@ import numpy as np
 from cocoro.arrays import BoolArray, Float32Array, FloatArray, ImageArray, IntArray, MaskArray
 from cocoro.colour import Lab, lab_of
 from cocoro.errors import ConfigError
+from services.perception.image import PixelBox
 
 ChromaArray = Float32Array
-PixelBox = tuple[int, int, int, int]
-"""Left, top, right, bottom in pixels; right and bottom exclusive."""
 
 MIN_AREA_PX = 150.0
 """Least pixels of an object in a 640 x 480 picture; a can at 3.5 m has 220. Fewer give neither colour nor size."""

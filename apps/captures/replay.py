@@ -28,7 +28,7 @@ from services.capture.keys import KeyFilter
 
 SIMULATOR = "sim"
 HARDWARE_TOPICS = (FRAME, BASE_STATE, ARM_STATE, HAND_STATE)
-"""What a robot's hardware publishes."""
+"""The topics that a robot's hardware publishes."""
 LINGER_S = 0.5
 """Pause after the last message: leaving the mesh discards what is not sent yet."""
 TICK_S = 1 / 120

@@ -1,4 +1,4 @@
-"""Where a look at a new object comes from, and how what was learnt of it looks."""
+"""Takes a view of a new object, from a picture file or a robot's camera, and draws what was learned of it."""
 
 from __future__ import annotations
 
@@ -29,36 +29,40 @@ from cocoro.topics import ARM_STATE, FRAME
 from deploy import processes
 
 PERCEPTION = "perception"
-"""The process whose core says what the robot would see: loaded by name, since the API knows no services."""
+"""The component whose core detects the objects in the preview."""
 FRAME_S = 5.0
+"""Longest wait for a frame and the head's angles."""
 STILL_RAD = 0.01
-"""Between two readings of the head; more, and the picture is blurred and the camera's pose doubtful."""
+"""Largest change between two readings of the head; with more, the picture is blurred and the pose uncertain."""
 NO_DEPTH = 2047
+"""Code of a pixel without depth."""
 MS = 1_000_000
 OWN, OTHER, OUTLINE = (0, 255, 120), (255, 0, 60), (255, 255, 255)
 
 
 @dataclass(frozen=True)
 class CameraView:
-    look: ObjectView
+    """One view of the camera, and what is known of the robot at that time."""
+
+    object_view: ObjectView
     frame: Frame
     head_rad: dict[str, float] | None
-    """The neck's joints as the frame was taken; None for a picture."""
+    """Angles of the head's joints when the frame was taken; None for a picture file."""
     catalogue: Path | None
-    """The file of known objects that the robot which is up was started with, if it was with one."""
+    """The file of known objects that the running robot was started with, if any."""
 
 
 def of_picture(path: Path, robot: Robot) -> CameraView:
-    """A picture file, taken to be the robot's camera's. Raises ConfigError when it is none."""
+    """A picture file, assumed to be taken by the robot's camera. Raises ConfigError for an unreadable picture."""
     if not path.is_file():
-        raise ConfigError(f"there is no picture {path}; --from names a file, or says live")
+        raise ConfigError(f"there is no picture {path}; --from takes a file, or `live`")
     image = load(path)
     if image is None:
-        raise ConfigError(f"{path} is no picture that can be read (PNG, JPEG)")
+        raise ConfigError(f"{path} is not a readable picture (PNG, JPEG)")
     colour = np.ascontiguousarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)
     height, width = colour.shape[:2]
     if max(height, width) > 4096:
-        raise ConfigError(f"{path} has {width} x {height} pixels; 4096 a side are the most")
+        raise ConfigError(f"{path} has {width} x {height} pixels; at most 4096 on each side are allowed")
     depth = np.full(height * width, NO_DEPTH, dtype="<u2")
     frame = Frame(
         width=width, height=height, colour=colour.reshape(-1).data, depth=depth.view(np.uint8).data, stamp_ns=MS
@@ -66,21 +70,21 @@ def of_picture(path: Path, robot: Robot) -> CameraView:
     return CameraView(ObjectView(colour, robot), frame, None, None)
 
 
-async def of_robot(where: RobotChoice) -> CameraView:
-    """What a robot sees now. Raises MeshError when it is not there, or sends no frames."""
-    async with joined(where, frames=True) as link:
+async def of_robot(choice: RobotChoice) -> CameraView:
+    """The robot's newest view. Raises MeshError when the robot is not there, or publishes no frames or head angles."""
+    async with joined(choice, frames=True) as link:
         resolved = link.run_dir.resolved()
         named = resolved.get("objects") or resolved.get("service", {}).get(PERCEPTION, {}).get("objects")
         robot = link.described()
         frame, head = await _frame(link, robot.chain("camera").joints)
     pose = robot.chain("camera").pose(head)
     raw_depth = np.frombuffer(frame.depth, dtype="<u2").reshape(frame.height, frame.width)
-    look = ObjectView(colour_of(frame), robot, raw_depth, pose)
-    return CameraView(look, frame, head, Path(named) if named else None)
+    object_view = ObjectView(colour_of(frame), robot, raw_depth, pose)
+    return CameraView(object_view, frame, head, Path(named) if named else None)
 
 
 async def _frame(link: Link, joints: tuple[str, ...]) -> tuple[Frame, dict[str, float]]:
-    """A frame and the head's angles as it was taken; when it can be had, one for which the head was still."""
+    """A frame and the head's angles, rad, at its time; preferably one for which the head stood still."""
     frames: deque[Frame] = deque(maxlen=30)
     states: deque[ServoState] = deque(maxlen=500)
     news = asyncio.Event()
@@ -103,15 +107,15 @@ async def _frame(link: Link, joints: tuple[str, ...]) -> tuple[Frame, dict[str, 
         for topic in (FRAME, ARM_STATE):
             link.drop(topic)
     if pair is None:
-        missing = "frame from the camera" if not frames else "word from the arm's servos about the head"
-        raise MeshError(f"no {missing} within {FRAME_S:g} s: `cocoro status` tells more")
+        missing = "frame from the camera" if not frames else "angles of the head from the arm's servos"
+        raise MeshError(f"no {missing} within {FRAME_S:g} s: see `cocoro status`")
     return pair
 
 
 def _with_head(
     frame: Frame, states: deque[ServoState], joints: tuple[str, ...], still: bool
 ) -> tuple[Frame, dict[str, float]] | None:
-    """The head between the states around the frame's stamp."""
+    """The frame with the head's angles interpolated at its stamp; None when a state around it is missing."""
     before = next((state for state in reversed(states) if state.stamp_ns <= frame.stamp_ns), None)
     after = next((state for state in states if state.stamp_ns > frame.stamp_ns), None)
     if before is None or after is None:
@@ -125,37 +129,40 @@ def _with_head(
     return frame, {joint: first[joint] + share * (second[joint] - first[joint]) for joint in joints}
 
 
-# --- what was learnt ------------------------------------------------------------------------------
+# --- the preview -----------------------------------------------------------------------------------
 
 
-def preview(sight: CameraView, learnt: LearnedObject, catalogue: Path) -> tuple[ImageArray, list[str]]:
-    """The picture with the region outlined, every pixel of its colour tinted (green: the object's, red: others), and
-    what perception itself would see in it with that catalogue; and that in words."""
-    image = sight.look.colour.copy()
-    own = learnt.region.mask > 0
-    for where, tint in ((learnt.matched & own, OWN), (learnt.matched & ~own, OTHER)):
-        image[where] = (0.5 * image[where] + 0.5 * np.array(tint)).astype(np.uint8)
-    cv2.drawContours(image, outline_of(learnt.region), -1, OUTLINE, 1)
-    seen = _perceived(sight, catalogue)
-    tinted = msgspec.structs.replace(sight.frame, colour=np.ascontiguousarray(image).reshape(-1).data)
+def preview(view: CameraView, learned: LearnedObject, catalogue: Path) -> tuple[ImageArray, list[str]]:
+    """A picture and descriptions of what perception would detect with this catalogue.
+
+    The picture, RGB, (height, width, 3), has the object's outline, the detections, and a tint on every pixel of its
+    colours: green on the object, red elsewhere.
+    """
+    image = view.object_view.colour.copy()
+    own = learned.region.mask > 0
+    for place, tint in ((learned.matched & own, OWN), (learned.matched & ~own, OTHER)):
+        image[place] = (0.5 * image[place] + 0.5 * np.array(tint)).astype(np.uint8)
+    cv2.drawContours(image, outline_of(learned.region), -1, OUTLINE, 1)
+    seen = _perceived(view, catalogue)
+    tinted = msgspec.structs.replace(view.frame, colour=np.ascontiguousarray(image).reshape(-1).data)
     drawn = draw(tinted, seen, Catalogue.load(catalogue))
-    _put_close_up(drawn, sight.look.colour, learnt)
+    _put_close_up(drawn, view.object_view.colour, learned)
     return drawn, [describe(one) for one in seen.detections]
 
 
-def _put_close_up(image: ImageArray, colour: ImageArray, learnt: LearnedObject) -> None:
-    """The object as it is, with its outline, large, in the corner of the picture that is furthest from it."""
-    left, top, right, bottom = learnt.region.box
+def _put_close_up(image: ImageArray, colour: ImageArray, learned: LearnedObject) -> None:
+    """Draws the object enlarged with its outline into the corner of the picture that is furthest from it."""
+    left, top, right, bottom = learned.region.box
     height, width = image.shape[:2]
     spare = max(right - left, bottom - top) // 3 + 3
     crop = slice(max(top - spare, 0), bottom + spare), slice(max(left - spare, 0), right + spare)
     rows, columns = colour[crop].shape[:2]
     factor = min(0.4 * height / rows, 0.4 * width / columns, 12.0)
-    if factor < 1.5:  # it is large as it stands
+    if factor < 1.5:  # the object is large enough
         return
     size = round(columns * factor), round(rows * factor)
     large = np.asarray(cv2.resize(colour[crop], size, interpolation=cv2.INTER_NEAREST), dtype=np.uint8)
-    mask = cv2.resize(learnt.region.mask[crop], size, interpolation=cv2.INTER_NEAREST)
+    mask = cv2.resize(learned.region.mask[crop], size, interpolation=cv2.INTER_NEAREST)
     outlines, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     cv2.drawContours(large, outlines, -1, OUTLINE, 1)
     x = 0 if (left + right) > width else width - size[0]
@@ -164,17 +171,17 @@ def _put_close_up(image: ImageArray, colour: ImageArray, learnt: LearnedObject) 
     cv2.rectangle(image, (x, y), (x + size[0] - 1, y + size[1] - 1), OUTLINE, 1)
 
 
-def _perceived(sight: CameraView, catalogue: Path) -> Detections:
-    """What the robot's own perception makes of the frame."""
+def _perceived(view: CameraView, catalogue: Path) -> Detections:
+    """Detections of the robot's perception in the frame, with this catalogue."""
     component = load_component(processes.named(PERCEPTION))
     assert component.core is not None
-    core = component.core(sight.look.robot, msgspec.convert({"objects": str(catalogue)}, component.config))
-    stamp_ns = sight.frame.stamp_ns
-    samples = [Sample(FRAME, sight.frame)]
-    if sight.head_rad is not None:
+    core = component.core(view.object_view.robot, msgspec.convert({"objects": str(catalogue)}, component.config))
+    stamp_ns = view.frame.stamp_ns
+    samples = [Sample(FRAME, view.frame)]
+    if view.head_rad is not None:
         for number, stamp in enumerate((stamp_ns - MS, stamp_ns + MS)):
-            samples.append(Sample(ARM_STATE, _head_state(sight.head_rad, stamp, number)))
-    for now_ns in (stamp_ns + MS, stamp_ns + 400 * MS):  # without the head's angles it waits for them for a while
+            samples.append(Sample(ARM_STATE, _head_state(view.head_rad, stamp, number)))
+    for now_ns in (stamp_ns + MS, stamp_ns + 400 * MS):  # without the head's angles perception waits for them first
         for output in core.step(samples, now_ns):
             if isinstance(output.message, Detections):
                 return output.message

@@ -1,4 +1,4 @@
-"""`cocoro objects learn LABEL`: a new object from a picture or from what the robot sees, shown before it is kept."""
+"""`cocoro objects learn LABEL`: learns a new object from a picture or the camera, and shows it before saving."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from cocoro.robot import Robot
 
 LIVE = "live"
 FILE = "objects.toml"
-"""Where the user's catalogue goes unless it is said, or the robot that is up names one."""
+"""The user's catalogue when neither an option nor the running robot names one."""
 
 
 @dataclass(frozen=True)
 class SaveOptions:
-    """What is to become of what was learnt."""
+    """Options on how the learned object is saved."""
 
     catalogue: Path | None
     picture: Path | None
@@ -40,40 +40,41 @@ class SaveOptions:
 
 
 async def learn_object(
-    where: RobotChoice, source: str, wanted: ObjectHints, keeping: SaveOptions, robot: Robot | None = None
+    choice: RobotChoice, source: str, hints: ObjectHints, saving: SaveOptions, robot: Robot | None = None
 ) -> int:
-    """Learn a look of an object and keep it. `robot`: whose camera took a picture file; None is the Calliope.
+    """Learns an object from one view, shows it and saves it; returns the exit code.
 
-    Raises ConfigError for what cannot be, MeshError when the view is to be live and there is no robot.
+    `robot` is the robot whose camera took a picture file, the Calliope by default. Raises ConfigError for impossible
+    options or a view without an object, MeshError when the view is live and no robot is up.
     """
-    sight = await of_robot(where) if source == LIVE else of_picture(Path(source), robot or Robot.load())
-    path = keeping.catalogue or sight.catalogue or Path(FILE)
+    view = await of_robot(choice) if source == LIVE else of_picture(Path(source), robot or Robot.load())
+    path = saving.catalogue or view.catalogue or Path(FILE)
     catalogue = Catalogue.from_text(text_of(path), str(path))
-    before = catalogue.get(wanted.label)
-    if before is not None and not (keeping.replace or keeping.add):
+    before = catalogue.get(hints.label)
+    if before is not None and not (saving.replace or saving.add):
         raise ConfigError(
-            f"{wanted.label} is known already in {path}: --replace forgets what it looked like, --add keeps that too"
+            f"{hints.label} is known already in {path}: --replace replaces its colours, --add adds to them"
         )
-    learnt = learn(sight.look, wanted, catalogue)
-    if keeping.add and before is not None:
-        learnt = replace(learnt, known=_both(before, learnt.known))
-    picture = keeping.picture or Path(f"{wanted.label}.png")
-    seen = _show(sight, learnt, path, picture)
-    if keeping.as_json:
-        print(json.dumps(_report(learnt, seen, picture, path, saved=keeping.yes)))
+    learned = learn(view.object_view, hints, catalogue)
+    if saving.add and before is not None:
+        learned = replace(learned, known=_both(before, learned.known))
+    picture = saving.picture or Path(f"{hints.label}.png")
+    seen = _preview(view, learned, path, picture)
+    if saving.as_json:
+        print(json.dumps(_report(learned, seen, picture, path, saved=saving.yes)))
     else:
-        print(_text(learnt, seen, picture))
-    if not keeping.yes and (keeping.as_json or not _confirmed(path)):
+        print(_text(learned, seen, picture))
+    if not saving.yes and (saving.as_json or not _confirmed(path)):
         return exits.DONE
-    saved = save(path, learnt.known)
-    if not keeping.as_json:
-        print(f"saved in {path}, which has {len(saved)} objects now; {_how_to_use(path, sight.catalogue)}")
+    saved = save(path, learned.known)
+    if not saving.as_json:
+        print(f"saved in {path}, which has {len(saved)} objects now; {_how_to_use(path, view.catalogue)}")
     return exits.DONE
 
 
 def _confirmed(path: Path) -> bool:
     if not sys.stdin.isatty():
-        print("nothing is saved: look at the picture, then say it again with --yes")
+        print("nothing is saved: look at the picture, then repeat the command with --yes")
         return False
     answer = input(f"save it in {path}? [y/N] ").strip().lower()
     return answer in ("y", "yes")
@@ -81,77 +82,77 @@ def _confirmed(path: Path) -> bool:
 
 def _how_to_use(path: Path, used: Path | None) -> str:
     if used is not None and used.resolve() == path.resolve():
-        return "the robot that is up knows it after `cocoro down` and `cocoro up` again"
-    return f"a robot knows it that is started with `cocoro up sim --objects {path}`"
+        return "the running robot knows it after `cocoro down` and `cocoro up`"
+    return f"start a robot that knows it with `cocoro up sim --objects {path}`"
 
 
 def _both(before: ObjectSpec, now: ObjectSpec) -> ObjectSpec:
-    """The old row with the new look's colours added to its own."""
+    """The known row with the new colours added."""
     lab = tuple(dict.fromkeys((*before.lab, *now.lab)))
     shared = tuple(dict.fromkeys((*before.lab_by_shape, *now.lab_by_shape)))
     return msgspec.structs.replace(before, lab=lab, lab_by_shape=shared)
 
 
-# --- what it looks like ---------------------------------------------------------------------------
+# --- preview and report ---------------------------------------------------------------------------
 
 
-def _show(sight: CameraView, learnt: LearnedObject, path: Path, picture: Path) -> list[str]:
-    """Write the picture; what the robot would say that it sees, with the new object in its catalogue."""
+def _preview(view: CameraView, learned: LearnedObject, path: Path, picture: Path) -> list[str]:
+    """Writes the picture; returns descriptions of what the robot would detect with the new object in its catalogue."""
     with tempfile.TemporaryDirectory() as folder:
         draft = Path(folder) / "objects.toml"
         with naming(draft):
-            draft.write_text(with_object(text_of(path), learnt.known), encoding="utf-8")
-        image, seen = preview(sight, learnt, draft)
+            draft.write_text(with_object(text_of(path), learned.known), encoding="utf-8")
+        image, seen = preview(view, learned, draft)
     save_png(image, picture)
     return seen
 
 
-def _text(learnt: LearnedObject, seen: list[str], picture: Path) -> str:
-    known, region = learnt.known, learnt.region
+def _text(learned: LearnedObject, seen: list[str], picture: Path) -> str:
+    known, region = learned.known, learned.region
     sizes = " x ".join(f"{100 * side:.1f}" for side in known.size_m)
-    measured = learnt.measured
-    how = "as you say" if measured is None else f"measured at {measured.distance_m:.2f} m"
+    measured = learned.measured
+    how = "as given" if measured is None else f"measured at {measured.distance_m:.2f} m"
     red, green, blue = (round(255 * channel) for channel in known.rgb)
     lines = [
         f"{known.label}: {known.shape}, {sizes} cm ({how}), {1000 * known.mass_kg:.0f} g, "
         f"{'graspable' if known.graspable else 'not graspable'}",
         f"  region      {region.area_px} pixels at {region.box[0]},{region.box[1]} to {region.box[2]},{region.box[3]}",
-        f"  colour      rgb {red} {green} {blue}, chromaticity {learnt.range.chromaticity:.0f}, "
+        f"  colour      rgb {red} {green} {blue}, chromaticity {learned.range.chromaticity:.0f}, "
         f"{len(known.lab)} boxes in CIELAB{_shared(known)}",
-        f"  matched     {learnt.matched_share:.0%} of the region's pixels, {learnt.elsewhere} other places",
-        f"  the robot   {', '.join(seen) if seen else 'would see nothing known here'}",
-        *(f"  beware      {warning}" for warning in learnt.warnings),
+        f"  matched     {learned.matched_share:.0%} of the region's pixels, {learned.elsewhere} other places",
+        f"  the robot   {', '.join(seen) if seen else 'would detect nothing here'}",
+        *(f"  beware      {warning}" for warning in learned.warnings),
         f"  picture     {picture}",
     ]
     return "\n".join(lines)
 
 
 def _shared(known: ObjectSpec) -> str:
-    return f", {len(known.lab_by_shape)} more that it shares" if known.lab_by_shape else ""
+    return f", {len(known.lab_by_shape)} more shared with other objects" if known.lab_by_shape else ""
 
 
-def _report(learnt: LearnedObject, seen: list[str], picture: Path, path: Path, *, saved: bool) -> dict[str, Any]:
+def _report(learned: LearnedObject, seen: list[str], picture: Path, path: Path, *, saved: bool) -> dict[str, Any]:
     return {
-        "object": msgspec.to_builtins(learnt.known),
-        "region": {"box_px": learnt.region.box, "area_px": learnt.region.area_px, "cut": learnt.region.cut},
-        "measured": None if learnt.measured is None else learnt.measured._asdict(),
-        "chromaticity": learnt.range.chromaticity,
-        "matched_share": learnt.matched_share,
-        "elsewhere": learnt.elsewhere,
-        "overlaps": [overlap._asdict() for overlap in learnt.overlaps],
+        "object": msgspec.to_builtins(learned.known),
+        "region": {"box_px": learned.region.box, "area_px": learned.region.area_px, "cut": learned.region.cut},
+        "measured": None if learned.measured is None else learned.measured._asdict(),
+        "chromaticity": learned.range.chromaticity,
+        "matched_share": learned.matched_share,
+        "elsewhere": learned.elsewhere,
+        "overlaps": [overlap._asdict() for overlap in learned.overlaps],
         "seen": seen,
-        "warnings": learnt.warnings,
+        "warnings": learned.warnings,
         "picture": str(picture),
         "catalogue": str(path),
         "saved": saved,
     }
 
 
-# --- options that have a form of their own --------------------------------------------------------
+# --- options with a form of their own -------------------------------------------------------------
 
 
 def pixel_of(text: str | None) -> tuple[int, int] | None:
-    """'320,240'."""
+    """Reads `--at`: '320,240'. Raises ConfigError."""
     if text is None:
         return None
     if not re.fullmatch(r"\d+,\d+", text):
@@ -161,7 +162,7 @@ def pixel_of(text: str | None) -> tuple[int, int] | None:
 
 
 def box_of(text: str | None) -> tuple[int, int, int, int] | None:
-    """'300,200,360,320'."""
+    """Reads `--box`: '300,200,360,320'. Raises ConfigError."""
     if text is None:
         return None
     if not re.fullmatch(r"\d+,\d+,\d+,\d+", text):
@@ -171,7 +172,7 @@ def box_of(text: str | None) -> tuple[int, int, int, int] | None:
 
 
 def size_of(text: str | None) -> tuple[float, ...] | None:
-    """'0.066x0.12', one to three numbers."""
+    """Reads `--size`, one to three lengths: '0.066x0.12'. Raises ConfigError."""
     if text is None:
         return None
     if not re.fullmatch(r"\d*\.?\d+(x\d*\.?\d+){0,2}", text) or not all(sizes := tuple(map(float, text.split("x")))):
@@ -180,16 +181,18 @@ def size_of(text: str | None) -> tuple[float, ...] | None:
             "(a box)"
         )
     if max(sizes) > 2.0:
-        raise ConfigError(f"--size {text}: it is in metres, and nothing that large is an object to a robot")
+        raise ConfigError(f"--size {text}: it is in metres, and objects are at most 2 m large")
     return sizes
 
 
 def hints_of(label: str, **options: Any) -> ObjectHints:
-    """Raises ConfigError for a label or a shape that cannot be."""
+    """The hints from the options. Raises ConfigError for an invalid label or shape, or --at together with --box."""
     if not re.fullmatch(r"[a-z][a-z0-9_-]{0,63}", label):
-        raise ConfigError(f"{label!r} is no label: small letters, digits, '_' and '-', a letter first: orange_box")
+        raise ConfigError(
+            f"{label!r} is not a valid label: small letters, digits, '_' and '-', a letter first: orange_box"
+        )
     if options["shape"] not in (None, "cylinder", "sphere", "box"):
-        raise ConfigError(f"--shape {options['shape']}: it is cylinder, sphere or box")
+        raise ConfigError(f"--shape {options['shape']}: known are cylinder, sphere and box")
     if options["at_px"] is not None and options["box_px"] is not None:
-        raise ConfigError("--at and --box: say one of them")
+        raise ConfigError("--at and --box: give one of them")
     return ObjectHints(label=label, **options)

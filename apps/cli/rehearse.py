@@ -1,4 +1,4 @@
-"""`cocoro rehearse`: hand the request to the simulator, and say in words or in JSON what came of it."""
+"""`cocoro rehearse`: runs a task in simulation and prints the result as text or JSON."""
 
 from __future__ import annotations
 
@@ -20,15 +20,18 @@ from cocoro.errors import CocoroError, ConfigError
 
 
 def rehearse(options: dict[str, Any], latency: list[str], frames: str | None, as_json: bool) -> int:
-    """`options` are fields of the request. Raises ConfigError for what cannot be."""
+    """Runs a rehearsal and returns the exit code. `options` are fields of the request.
+
+    Raises ConfigError for an impossible option.
+    """
     request = request_of(options, latency, frames)
-    from apps.rehearsal.rehearse import rehearse as run  # with the simulator, which takes its time to import
+    from apps.rehearsal.rehearse import rehearse as run  # imports the simulator, which is slow
 
     try:
         with _output_to_stderr() if as_json else nullcontext():
             result: dict[str, Any] = run(request)
     except CocoroError as error:
-        refusal = getattr(error, "code", None)  # of the executive, which would not start the task
+        refusal = getattr(error, "code", None)  # the executive refused the task
         if refusal is None:
             raise
         print(f"cocoro: refused: {error}", file=sys.stderr)
@@ -39,7 +42,7 @@ def rehearse(options: dict[str, Any], latency: list[str], frames: str | None, as
 
 @contextmanager
 def _output_to_stderr() -> Iterator[None]:
-    """Whatever is printed meanwhile, by libraries in C too, goes to stderr: JSON's place has nothing but JSON."""
+    """Redirects standard output, also of libraries in C, to standard error, so that JSON stands alone."""
     sys.stdout.flush()
     stdout_fd = os.dup(1)
     os.dup2(2, 1)
@@ -63,7 +66,7 @@ def request_of(options: dict[str, Any], latency: list[str], frames: str | None) 
 
 
 def summary(result: dict[str, Any]) -> str:
-    """The result in words, a fact a line."""
+    """The result as text, one fact on each line."""
     name = f"{result['task']} {result['label']}".strip()
     reason = f": {result['reason']}" if result.get("reason") else ""
     speed = result["sim_s"] / result["wall_s"] if result["wall_s"] else 0.0
@@ -74,11 +77,11 @@ def summary(result: dict[str, Any]) -> str:
         lines.append(f"  reached with: {result['model']}")
     truth = result["truth"]
     lines.append("in truth")
-    lines += [f"  {name.replace('_', ' '):<18} {_said(value)}" for name, value in truth.items()]
+    lines += [f"  {name.replace('_', ' '):<18} {_value(value)}" for name, value in truth.items()]
     return "\n".join(lines)
 
 
-def _said(value: object) -> str:
+def _value(value: object) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, float):

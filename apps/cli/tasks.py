@@ -1,4 +1,4 @@
-"""`fetch`, `park`, `put-down` and `cancel`: ask the executive, follow the task to its outcome, say it."""
+"""Runs a task on a robot: requests it from the executive, follows it to its outcome, and reports that."""
 
 from __future__ import annotations
 
@@ -26,19 +26,24 @@ from cocoro.topics import CANCEL, LATCH, RUN, TASK
 USAGE_REFUSALS = ("unknown_label", "not_graspable", "bad_request")
 """Refusals that are the operator's mistake, not the robot's state."""
 UNSETTLED = ("not_alive", "estop")
-"""Refusals that may be over in a moment: not everyone has been heard yet, or the emergency stop is not known yet."""
+"""Refusals of an executive that has just started and has not yet received every service's state."""
 SETTLE_S = 3.0
+"""Longest time for which an unsettled refusal is answered by another request."""
 ASK_AGAIN_S = 0.1
+"""Time between two of these requests."""
 CANCEL_S = 10.0
-"""How long a cancelled task may take to say its outcome."""
+"""Longest wait for the outcome of a cancelled task."""
 EXECUTIVE = "executive"
 LOOK_S = 0.2
-"""How often it is looked whether an executive that is not heard has died."""
+"""Time between two checks whether a silent executive has died."""
 
 
 async def run(where: RobotChoice, request: TaskRequest, as_json: bool, picture: Path | None) -> int:
-    """Run a task to its outcome and return the exit code. `picture`: file for the last picture of the task's snapshot
-    phase."""
+    """Runs a task to its outcome and returns the exit code. `picture`: file for the last picture of the task's snapshot
+    phase.
+
+    Raises MeshError when the robot or its executive is not there, ConfigError for a name that is not a PNG file's.
+    """
     if picture is not None:
         check(picture)
     async with joined(where, frames=picture is not None) as link:
@@ -52,6 +57,7 @@ async def run(where: RobotChoice, request: TaskRequest, as_json: bool, picture: 
 
 
 async def cancel(where: RobotChoice) -> int:
+    """Cancels the running task; the exit code is 3 when none runs."""
     async with joined(where) as link:
         reply = await link.call(CANCEL, CancelRequest())
     if not reply.accepted:
@@ -62,12 +68,12 @@ async def cancel(where: RobotChoice) -> int:
 
 
 class Follower:
-    """One task, from the request to the outcome. `interrupt` cancels it on the robot."""
+    """Requests one task and follows it to its outcome."""
 
     def __init__(
         self, link: Link, request: TaskRequest, view: TaskDisplay, picture: Path | None, contact: Contact | None = None
     ) -> None:
-        """`contact` knows what became of an executive that is not heard any more."""
+        """`contact` finds out what happened to an executive that is silent."""
         self._contact = contact or Contact(link.run_dir.claimant_pid)
         self._link = link
         self._request = request
@@ -77,22 +83,22 @@ class Follower:
         self._name = f"{self._task.name} {self._task.target}".strip()
         self._task_id = ""
         self._news: asyncio.Queue[TaskState | bool] = asyncio.Queue()
-        """What the executive says; and whether its token is there, as that changes."""
+        """States of the task, and whether the executive's liveliness token is present, at each change."""
         self._interrupted = asyncio.Event()
 
     def interrupt(self) -> None:
-        """The first one cancels the task on the robot, the second one leaves at once."""
+        """Handles Ctrl-C: the first cancels the task on the robot, the second ends the command."""
         if self._interrupted.is_set():
             raise KeyboardInterrupt
         self.cancel()
 
     def cancel(self) -> None:
-        """Have the task cancelled on the robot, and wait for its outcome."""
+        """Cancels the task on the robot; `run` then returns its outcome."""
         self._interrupted.set()
 
     async def run(self) -> tuple[int, dict[str, object]]:
-        """The exit code, and the result as data."""
-        news = self._link.inbox(TASK)  # before the call, so that nothing is missed
+        """Runs the task; returns the exit code and the result as data."""
+        news = self._link.inbox(TASK)  # before the request, so that no state is missed
         news.add(lambda _key, state: self._news.put_nowait(state))
         alive = self._link.watch_alive(self._on_alive, EXECUTIVE)
         reply = await self._ask()
@@ -117,7 +123,7 @@ class Follower:
         self._news.put_nowait(alive)
 
     async def _ask(self) -> TaskReply:
-        """Ask for the task; a robot that has only just come up gets a little time to find itself able."""
+        """Requests the task, repeatedly for a short time when the robot has only just started."""
         latch = self._link.latest(LATCH)
         for _ in range(round(SETTLE_S / ASK_AGAIN_S)):
             reply = await self._link.call(RUN, self._request)
@@ -128,7 +134,7 @@ class Follower:
         return reply
 
     async def _follow(self) -> TaskState:
-        """The task's last state, as the executive says it, or as it is when that is not heard any more."""
+        """The task's last state, from the executive, or composed here when the executive died or stays silent."""
         camera: SnapshotTaker | None = None
         while True:
             news = await self._news.get()
@@ -147,11 +153,11 @@ class Follower:
             self._view.show(state)
 
     async def _after_silence(self) -> TaskState:
-        """The executive's token has dropped: the next that it says of the task, or the task's end when it is dead or
-        is not heard for long."""
+        """The task's next state after the executive's token was lost; a failed state when the executive died or stays
+        silent."""
         lost = await self._contact.lost(EXECUTIVE)
         if not self._contact.dead(EXECUTIVE):
-            self._view.say(f"{lost}: waiting for the executive to be heard again")
+            self._view.say(f"{lost}: waiting for the executive")
         end_s = asyncio.get_running_loop().time() + RECOVERY_S
         while (left_s := end_s - asyncio.get_running_loop().time()) > 0:
             if self._contact.dead(EXECUTIVE):
@@ -162,12 +168,12 @@ class Follower:
                     continue
                 if news.task_id == self._task_id:
                     return news
-                # Before, it was the state of an earlier task; now it is all that an executive knows that began anew.
-                return self._failed("the executive knows nothing of the task any more")
-        return self._failed(f"{lost}; the task may still be running: see cocoro status")
+                # An executive that publishes another task now has restarted without this one.
+                return self._failed("the executive restarted and no longer knows the task")
+        return self._failed(f"{lost}; the task may still be running; see cocoro status")
 
     def _failed(self, reason: str) -> TaskState:
-        """What is said when the executive does not say it."""
+        """A failed state, composed when the executive cannot publish it."""
         return TaskState(
             task_id=self._task_id,
             task=self._task.name,
@@ -184,16 +190,16 @@ class Follower:
 
     async def _cancel_when_interrupted(self) -> None:
         await self._interrupted.wait()
-        self._view.say(f"cancelling {self._name} (once more leaves without waiting)")
+        self._view.say(f"cancelling {self._name} (Ctrl-C again ends without waiting)")
         try:
             reply = await self._link.call(CANCEL, CancelRequest(task_id=self._task_id))
             if reply.accepted:
                 await asyncio.sleep(CANCEL_S)
-                self._view.say("the task does not end: `cocoro estop` stops the robot")
+                self._view.say("the task does not end; `cocoro estop` stops the robot")
             else:
                 self._view.say(f"not cancelled: {reply.text}")
         except CallTimeoutError:
-            self._view.say("the executive does not answer: `cocoro estop` stops the robot")
+            self._view.say("the executive does not answer; `cocoro estop` stops the robot")
         except CocoroError as error:
             self._view.say(f"not cancelled: {error}")
 

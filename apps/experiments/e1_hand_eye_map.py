@@ -46,7 +46,7 @@ def section(settings: ExperimentSettings, results: Mapping[str, RunResult]) -> S
     made = Section(KEY, TITLE, _about(good))
     by_name = {seed: {s["name"]: s for s in result["arm"]["scores"]} for seed, result in good.items()}
     chosen = [by_name[seed][result["arm"]["chosen"]]["held_out_m"] for seed, result in good.items()]
-    baseline = [scores["the drawing with its best constant offset"]["held_out_m"] for scores in by_name.values()]
+    baseline = [scores["the nominal model with its best constant offset"]["held_out_m"] for scores in by_name.values()]
     cm = [100 * value for value in chosen]
     ratio = [ours / theirs for ours, theirs in zip(chosen, baseline, strict=True)]
     measure = "held-out error, RMS"
@@ -67,10 +67,10 @@ def section(settings: ExperimentSettings, results: Mapping[str, RunResult]) -> S
         row("share of that baseline's error", "ours", ratio, "", digits=2, wanted="at most 0.6 in each seed",
             held=bool(ratio) and max(ratio) <= 0.6)
     )  # fmt: skip
-    for name in ("the drawing", *(method.name for method in METHODS)):
+    for name in ("the nominal model", *(method.name for method in METHODS)):
         values = [100 * scores[name]["held_out_m"] for scores in by_name.values() if name in scores]
-        who = "ours, the default: " if name == BEST.name else "baseline: " if name == "the drawing" else ""
-        paper = "seen almost 10 cm nearer than the model" if name == "the drawing" else ""
+        who = "ours, the default: " if name == BEST.name else "baseline: " if name == "the nominal model" else ""
+        paper = "seen almost 10 cm nearer than the model" if name == "the nominal model" else ""
         made.rows.append(row(measure, who + name, values, "cm", digits=2, paper=paper))
     for key, who in (("default", "ours, the default"), ("paper", "the paper's 81-base rule")):
         for size in SIZES:

@@ -1,4 +1,4 @@
-"""Takes what babbling reports into its file, and knows how far that has got; for the command and the rehearsal."""
+"""Collects the samples of babbling into a file and reports the progress, for the command and the rehearsal."""
 
 from __future__ import annotations
 
@@ -21,8 +21,10 @@ CELL_M = 0.05
 
 
 class Coverage:
-    """What share of the places that the hand comes to has been seen already (Good and Turing): one less the share of
-    sightings that lie alone in their cell. It needs no knowledge of the arm, and no more sightings than there are."""
+    """Estimated share of the hand's positions that was seen, by cells of 5 cm (Good-Turing estimator, Good 1953).
+
+    It is one minus the share of sightings that are alone in their cell, and needs no knowledge of the arm.
+    """
 
     def __init__(self) -> None:
         self._cells: Counter[tuple[int, int, int]] = Counter()
@@ -41,7 +43,7 @@ class Coverage:
 
 
 class SampleCollector(ABC, Generic[SampleRow]):
-    """Rows of one task's babbling. Use it with `with`; raises as `SampleFile` does."""
+    """Collects the rows of one task's babbling. Use it with `with`; raises like `SampleFile`."""
 
     def __init__(self, writer: SampleFile[SampleRow]) -> None:
         self._writer = writer
@@ -60,20 +62,20 @@ class SampleCollector(ABC, Generic[SampleRow]):
     @property
     @abstractmethod
     def next(self) -> int:
-        """The number to go on with."""
+        """The number of the draw or trial to continue with."""
 
     @property
     @abstractmethod
     def said(self) -> str:
-        """How far it has got, in words."""
+        """The progress in words."""
 
     @abstractmethod
     def take(self, message: Message) -> None:
-        """Keep what is reported; a message of another task is passed over."""
+        """Keep a reported sample; a message of another task is ignored."""
 
 
 class HandCollector(SampleCollector[HandRow]):
-    """Of the arm's babbling."""
+    """Samples of the arm's babbling."""
 
     def __init__(self, path: Path, robot: Robot) -> None:
         self._joints = arm_joints(robot)
@@ -84,7 +86,7 @@ class HandCollector(SampleCollector[HandRow]):
 
     @property
     def next(self) -> int:
-        """The draw to go on with; number 0 is a corner of the range, which says little."""
+        """The draw to continue with; number 0 is a corner of the range, which says little."""
         return max((row.draw + 1 for row in self._writer.rows), default=1)
 
     @property
@@ -107,16 +109,16 @@ class HandCollector(SampleCollector[HandRow]):
 
 
 class WheelCollector(SampleCollector[WheelRow]):
-    """Of the wheels' babbling."""
+    """Trials of the wheels' babbling."""
 
     def __init__(self, path: Path, robot: Robot, target_height_m: float | None = None) -> None:
-        """`target_height_m`: of the target's centre above the floor, where that is known."""
+        """`target_height_m`: height of the target's centre above the floor, if it is known."""
         self._separation_m = robot.base.wheel_separation_m
         super().__init__(SampleFile(path, WheelRow, robot, wheel_header(robot, target_height_m)))
 
     @property
     def next(self) -> int:
-        """The trial to go on with: the first of a pair. Pair 0 stands in the range's corner: both wheels back."""
+        """The trial to continue with: the first of a pair. Pair 0 is a corner of the range: both wheels back."""
         return max((row.trial // 2 * 2 + 2 for row in self._writer.rows), default=2)
 
     @property
@@ -126,7 +128,7 @@ class WheelCollector(SampleCollector[WheelRow]):
 
     def take(self, message: Message) -> None:
         if isinstance(message, WheelTrial):
-            # The base's odometry makes its turn of the two wheels' roads with the distance that it was told.
+            # The base's odometry computes its turn from the wheels' travel with the nominal distance.
             half_m = message.turned_rad * self._separation_m / 2
             row = WheelRow(
                 stamp_ns=message.stamp_ns,

@@ -1,8 +1,8 @@
-"""What babbling saw, on disk: JSON lines that any tool reads, appended sample by sample, whole after any kind of end.
+"""Samples of babbling on disk: JSON lines that any tool reads, appended one by one, valid after any kind of end.
 
-The first line is the header: format, version, robot, the fingerprint of the drawing that the positions were computed
-with, joints, units. Each further line is one row. A row is written at once and whole lines only count, so a process
-that is killed loses nothing but a line that it had not finished; that is cut off when the file is next appended to.
+The first line is the header: format, version, robot, fingerprint of the robot description that the positions were
+computed with, joints, units. Each further line is one row. Rows are written unbuffered and only whole lines count, so a
+process that is killed loses at most an unfinished line, which is cut off when the file is next appended to.
 """
 
 from __future__ import annotations
@@ -30,37 +30,37 @@ class HandRow(msgspec.Struct, frozen=True, kw_only=True):
     """One sighting of the hand's marker."""
 
     stamp_ns: int
-    """Of the frame."""
+    """The frame's."""
     draw: int
-    """The number of the Sobol draw that the arm was on its way to: rows of one draw lie near one another."""
+    """Number of the Sobol draw that the arm moved to; rows of one draw are near one another."""
     angles_rad: tuple[float, ...]
-    """Of the header's joints, at the frame's stamp."""
+    """Angles of the header's joints at the frame's stamp."""
     head_rad: FiniteVec2
     """Pan and tilt at the frame's stamp."""
     seen_m: FiniteVec3
-    """The marker's centre, body frame, as the drawing of the neck places what the camera saw."""
+    """The marker's centre, body frame: what the camera saw, transformed by the nominal model of the neck."""
     area_px: int
 
 
 class WheelRow(msgspec.Struct, frozen=True, kw_only=True):
-    """One trial of wheel babbling: the target seen, both wheels turned for a while, the target seen again."""
+    """One trial of wheel babbling: the target is seen, both wheels turn for a time, the target is seen again."""
 
     stamp_ns: int
-    """When the trial ended."""
+    """The trial's end."""
     trial: int
     left_mps: float
     right_mps: float
     """The commanded speeds."""
     left_m: float
     right_m: float
-    """How far each wheel rolled, by the base's odometry."""
+    """Travel of each wheel by the base's odometry."""
     before_m: FiniteVec2
     after_m: FiniteVec2
-    """The target over the floor, body frame, each the mean of several frames while the robot stood."""
+    """The target's (x, y), body frame; each is the mean of several frames while the robot stood."""
     turned_rad: float
-    """What the base's own odometry said of the turn."""
+    """The turn by the base's own odometry."""
     height_m: float | None = None
-    """How high above the floor the target's centre was seen, at the end."""
+    """Seen height of the target's centre above the floor, at the end."""
 
 
 class Header(msgspec.Struct, frozen=True, kw_only=True):
@@ -68,12 +68,12 @@ class Header(msgspec.Struct, frozen=True, kw_only=True):
     version: int
     robot: str
     drawing: str
-    """Fingerprint of the robot description."""
+    """Fingerprint of the robot description (`fingerprint_of`)."""
     joints: tuple[str, ...] = ()
     roll_rad: float = 0.0
-    """The wrist roll throughout (hand samples)."""
+    """The wrist roll during babbling (hand samples)."""
     target_height_m: float | None = None
-    """How high above the floor the target's centre is known to be (wheel trials)."""
+    """True height of the target's centre above the floor, if known (wheel trials)."""
     units: str = "rad, m, m/s, ns; body frame: x forward, y left, z up, origin on the floor between the wheels"
 
 
@@ -81,7 +81,7 @@ SampleRow = TypeVar("SampleRow", bound=HandRow | WheelRow)
 
 
 class Recorded(Generic[SampleRow]):
-    """A file that was read."""
+    """The content of a file."""
 
     def __init__(self, path: Path, header: Header, rows: list[SampleRow]) -> None:
         self.path = path
@@ -90,7 +90,7 @@ class Recorded(Generic[SampleRow]):
 
     @property
     def fingerprint(self) -> str:
-        """Of the rows, whatever their order of keys on disk."""
+        """Fingerprint of the rows, independent of the order of keys on disk."""
         digest = hashlib.sha256()
         for row in self.rows:
             digest.update(msgspec.json.encode(row))
@@ -110,12 +110,12 @@ def read(path: Path, kind: type[SampleRow], robot: Robot | None = None) -> Recor
 def _parse(path: Path, data: bytes, kind: type[SampleRow], robot: Robot | None) -> Recorded[SampleRow]:
     lines = data[: data.rfind(b"\n") + 1].splitlines()  # a line without an end was being written
     if not lines:
-        raise ConfigError(f"samples {path}: there is nothing in it; babble into a new file")
+        raise ConfigError(f"samples {path}: it is empty; babble into a new file")
     header = _header(path, lines[0], kind)
     if robot is not None and header.robot != robot.name:
         raise ConfigError(f"samples {path}: they are of robot {header.robot!r}, this one is {robot.name!r}")
     if robot is not None and header.drawing != fingerprint_of(robot):
-        raise ConfigError(f"samples {path}: they were seen with another description of {robot.name}: babble anew")
+        raise ConfigError(f"samples {path}: they were taken with another description of {robot.name}: babble again")
     decoder = msgspec.json.Decoder(kind)
     rows: list[SampleRow] = []
     for number, line in enumerate(lines[1:], start=2):
@@ -134,7 +134,7 @@ def _header(path: Path, line: bytes, kind: type[SampleRow]) -> Header:
     try:
         header = msgspec.json.decode(line, type=Header)
     except msgspec.MsgspecError as error:
-        raise ConfigError(f"samples {path}: it is no file of samples ({error})") from error
+        raise ConfigError(f"samples {path}: it is not a file of samples ({error})") from error
     if header.format != wanted:
         raise ConfigError(f"samples {path}: it holds {header.format}, not {wanted}")
     if header.version != VERSION:

@@ -1,4 +1,4 @@
-"""From samples to a model: every way of learning measured on samples that it has not seen, the best one kept."""
+"""From samples to a model: every method is measured on held-out samples, and the best one is kept."""
 
 from __future__ import annotations
 
@@ -30,16 +30,16 @@ CURVE = (100, 300, 1000, 2000)
 
 @dataclass(frozen=True)
 class ArmReport:
-    """What came of the arm's samples."""
+    """Results of learning from the arm's samples."""
 
     samples: int
     outliers: int
     draws: int
     scores: list[Score]
-    """Of the baselines first."""
+    """The baselines first."""
     chosen: Method
     curve: dict[int, float]
-    """Held-out error of the chosen method, metres, after so many samples."""
+    """Held-out error of the chosen method, metres, by number of samples."""
 
     def data(self) -> dict[str, Any]:
         return {
@@ -66,28 +66,31 @@ def learn_arm(
     method: str | None = None,
     tell: Callable[[str], None] = lambda text: None,
 ) -> tuple[BodyModel, ArmReport]:
-    """Fit every method, choose, write the model. `tell` hears what is being done. Raises ConfigError."""
+    """Fit every method (or `method` alone), choose one, and write the model into `into`.
+
+    `tell` gets the progress. Raises ConfigError for bad or too few samples and for an unknown method.
+    """
     recorded = dataset.read(samples, HandRow, robot)
     rows = recorded.rows
     if len(rows) < LEAST_SAMPLES:
-        raise ConfigError(f"samples {samples}: {len(rows)} are too few to learn from; {LEAST_SAMPLES} are the least")
-    drawing = NominalModel(robot, recorded.header.roll_rad)
+        raise ConfigError(f"samples {samples}: {len(rows)} are too few; at least {LEAST_SAMPLES} are needed")
+    nominal = NominalModel(robot, recorded.header.roll_rad)
     seen = sightings(rows)
-    kept = study.clean(seen, drawing)
+    kept = study.clean(seen, nominal)
     learn, held = study.split(kept)
     if not len(held):
-        raise ConfigError(f"samples {samples}: {study.HELD_OUT} draws at least are needed to hold one out")
+        raise ConfigError(f"samples {samples}: at least {study.HELD_OUT} draws are needed to hold one out")
     methods = _methods(search, method)
     scores = []
     for number, one in enumerate(methods, 1):
         tell(f"{number} of {len(methods)}: {one.name}")
-        scores.append(study.score(one, drawing, learn, held))
+        scores.append(study.score(one, nominal, learn, held))
     chosen = study.best(scores, methods)
     sizes = [*[size for size in CURVE if size < len(learn)], len(learn)]
-    curve_m = study.curve(chosen, drawing, learn, held, sizes)
+    curve_m = study.curve(chosen, nominal, learn, held, sizes)
     report = ArmReport(
         samples=len(kept), outliers=len(seen) - len(kept), draws=len(np.unique(kept.draws)),
-        scores=[*study.baselines(drawing, learn, held), *scores], chosen=chosen,
+        scores=[*study.baselines(nominal, learn, held), *scores], chosen=chosen,
         curve=dict(zip(sizes, curve_m, strict=True)),
     )  # fmt: skip
     own = next(score for score in scores if score.name == chosen.name)
@@ -98,7 +101,7 @@ def learn_arm(
             "drawing_offset_rms_m": report.scores[1].held_out_m,
         },
     )  # fmt: skip
-    learned = study.fit(chosen, drawing, kept)  # what is used learns from the held-out draws too
+    learned = study.fit(chosen, nominal, kept)  # the model also learns from the held-out draws
     arm = model.arm_model(learned, recorded.header.roll_rad, kept.places_m, training)
     made = msgspec.structs.replace(_before(into, robot), arm=arm)
     model.save(made, into)
@@ -106,11 +109,11 @@ def learn_arm(
 
 
 def learn_wheels(samples: Path, into: Path, robot: Robot) -> tuple[BodyModel, WheelFit]:
-    """Fit the distance of the wheels, write the model. Raises ConfigError."""
+    """Fit the wheel distance and the camera's tilt, and write the model into `into`. Raises ConfigError."""
     recorded = dataset.read(samples, WheelRow, robot)
     fit = fit_wheels(recorded.rows)
     if fit is None:
-        raise ConfigError(f"samples {samples}: no trial in it turned far enough to tell the wheels' distance")
+        raise ConfigError(f"samples {samples}: no trial in it turned far enough to measure the wheel distance")
     scores = {"sigma_m": fit.sigma_m, "median_m": fit.median_m}
     training = Training(
         data=recorded.fingerprint, samples=len(recorded.rows), method="all trials at once",
@@ -124,7 +127,7 @@ def learn_wheels(samples: Path, into: Path, robot: Robot) -> tuple[BodyModel, Wh
 
 
 def _before(into: Path, robot: Robot) -> BodyModel:
-    """What the file holds already, so that arm and wheels can be learned one after the other."""
+    """The model in the file, so that arm and wheels can be learned one after the other."""
     return model.load(into, robot) if into.is_file() else model.empty(robot)
 
 
@@ -140,8 +143,10 @@ def _methods(search: bool, method: str | None) -> Sequence[Method]:
 
 
 def eye_tilt(trials: Sequence[WheelRow], height_m: float | None, robot: Robot) -> float | None:
-    """The median over wheel trials before a target whose centre is known to be so high; None where that is not known,
-    or too few trials tell how high it was seen."""
+    """The camera's tilt, rad: the median over wheel trials whose target's centre is `height_m` high.
+
+    None where the height is unknown, or too few trials have a seen height.
+    """
     if height_m is None:
         return None
     eye = CameraTilt(robot)

@@ -14,12 +14,12 @@ from cocoro.learning.network import HyperplaneRbf
 _BLOCK = 128
 """Samples computed at a time."""
 NEIGHBOUR_M = 0.025
-"""The paper's: a sighting whose nearest neighbour is further away is an outlier."""
+"""The paper's limit: a sighting whose nearest neighbour is further away is an outlier."""
 SPARSE_FACTOR = 4.0
 
 
 def learn_in_order(network: HyperplaneRbf, inputs: FloatArray, targets: FloatArray, rate: float) -> None:
-    """The paper's rule: each sample once, in order. Changes the network. inputs (b, n), targets (b, k).
+    """The paper's rule: learns each sample once, in order. Changes the network. Inputs (b, n), targets (b, k).
 
     Block by block, exactly as sample by sample: with G the Gram matrix of a block's features, the errors E that the
     rule meets one after the other are the solution of the triangular system (I + rate tril(G, -1)) E = T - Phi W, and
@@ -35,8 +35,8 @@ def learn_in_order(network: HyperplaneRbf, inputs: FloatArray, targets: FloatArr
 
 
 def folds(groups: IntArray, count: int) -> Iterable[tuple[BoolArray, BoolArray]]:
-    """`count` pairs of boolean masks (learn, check), whole groups in each: what is checked was never near to what was
-    learned. `groups` (b,) tells which samples belong together."""
+    """`count` pairs of masks (learn (b,), check (b,)) with whole groups in each, so that no checked sample is near a
+    learned one. `groups` (b,): the group of each sample."""
     names = np.unique(groups)
     for number in range(count):
         check = np.isin(groups, names[number::count])
@@ -44,10 +44,10 @@ def folds(groups: IntArray, count: int) -> Iterable[tuple[BoolArray, BoolArray]]
 
 
 def inliers(places_m: FloatArray, limit_m: float = NEIGHBOUR_M) -> BoolArray:
-    """Which of the places (b, 3) have a neighbour within the limit; shape (b,).
+    """Which positions (b, 3), metres, have a neighbour within the limit; shape (b,).
 
-    The paper's 2.5 cm supposes sightings that lie densely. Where they do not, most of them would be outliers; so the
-    limit is never less than four times the median distance of neighbours (ours).
+    The paper's 2.5 cm assume dense sightings. The limit is at least four times the median distance of neighbours (own
+    addition), since otherwise most of few sightings would be outliers.
     """
     if len(places_m) < 2:
         return np.ones(len(places_m), dtype=np.bool_)
@@ -56,7 +56,9 @@ def inliers(places_m: FloatArray, limit_m: float = NEIGHBOUR_M) -> BoolArray:
 
 
 def plausible(errors_m: FloatArray, limit: float = 6.0) -> BoolArray:
-    """Which of the errors (b, 3) of a map are of the usual size; shape (b,). Usual is up to `limit` times their median
-    length: a wrong sighting in the midst of good ones has near neighbours and is found only so."""
+    """Which errors (b, 3) of a map, metres, are at most `limit` times their median length; shape (b,).
+
+    It finds a wrong sighting among good ones, which has near neighbours.
+    """
     size = np.linalg.norm(errors_m, axis=1)
     return np.asarray(size <= limit * float(np.median(size)))

@@ -19,7 +19,7 @@ from cocoro.frames import wrap_rad
 from cocoro.units import Vec2
 
 LEAST_TURN_RAD = 0.10
-"""A trial that turned less says little: errors of the bearings count as much as the turn."""
+"""A trial that turned less is not used: errors of the bearings would count as much as the turn."""
 _ITERATIONS = 20
 
 
@@ -36,7 +36,7 @@ def turn_between(before_m: Vec2, after_m: Vec2, way_m: float) -> float:
 
 
 def separation_of(trial: WheelRow) -> float | None:
-    """What one trial says of the distance, metres; None where it turned too little to say anything."""
+    """The distance by one trial, metres; None where it turned too little."""
     turn = turn_between(trial.before_m, trial.after_m, (trial.left_m + trial.right_m) / 2)
     if abs(turn) < LEAST_TURN_RAD:
         return None
@@ -45,29 +45,29 @@ def separation_of(trial: WheelRow) -> float | None:
 
 @dataclass(frozen=True)
 class WheelFit:
-    """What all trials together say."""
+    """The fit to all trials."""
 
     separation_m: float
-    """The robot's learned wheel distance."""
+    """The learned wheel distance: the one that turns the robot."""
     sigma_m: float
-    """Standard deviation of that, by the scatter of the trials."""
+    """Its standard deviation, by the scatter of the trials."""
     median_m: float
     """The paper's estimate: the median over the trials."""
     estimates_m: tuple[float, ...]
-    """Trial by trial, those that say anything."""
+    """The distance by each trial that turned enough."""
     left_scale: float = 1.0
     right_scale: float = 1.0
-    """How far each wheel rolls for a metre that it was told to."""
+    """True travel of each wheel over the commanded one."""
 
 
 def fit_wheels(trials: Sequence[WheelRow]) -> WheelFit | None:
-    """The paper's median, and a fit to all trials at once: None without a trial that turned enough.
+    """The paper's median, and a fit to all trials; None without a trial that turned enough.
 
-    The fit has the two wheels' scales beside the distance: a wheel that rolls 1% further than its nominal radius says
-    bends a straight way, and a median over forward and reverse trials cannot tell that from the distance. Each trial
-    gives two equations, from the target's place over the floor, bearing and distance (Gauss-Newton with weights that
-    bound outliers, derived). What turns the robot by an angle is the distance over the mean scale; that is what
-    odometry and navigation want, so `separation_m` is it.
+    The fit estimates the two wheels' scales beside the distance: a wheel that rolls 1% further than its nominal radius
+    bends a straight path, which a median over forward and reverse trials cannot distinguish from another distance. Each
+    trial gives two equations: bearing and distance of the target over the floor (Gauss-Newton with Huber weights;
+    equations derived). `separation_m` is the distance over the mean scale, which turns the robot and which odometry and
+    navigation need.
     """
     estimates = [(separation_of(trial), trial) for trial in trials]
     useful = [value for value, _ in estimates if value is not None]
@@ -77,7 +77,7 @@ def fit_wheels(trials: Sequence[WheelRow]) -> WheelFit | None:
     if len(useful) < 4:
         return WheelFit(median, float("nan"), median, tuple(useful))
     state, sigma = _solve(trials, np.array([1.0 / median, 0.0, 0.0]))
-    # The turn of a pair of opposite roads s: 2 s (1 + mean) / L.
+    # The turn of opposite travels s: 2 s (1 + mean) / L.
     inverse, left, right = state.tolist()
     return WheelFit(1.0 / inverse, sigma / inverse**2, median, tuple(useful), 1.0 + left, 1.0 + right)
 
@@ -85,11 +85,11 @@ def fit_wheels(trials: Sequence[WheelRow]) -> WheelFit | None:
 _PRIOR = np.diag([0.0, 1.0 / 0.02, 1.0 / 0.02])
 """The scales are within a few hundredths of one."""
 _BEARING_RAD, _RANGE_M = 0.006, 0.008
-"""Of a sighting while the robot stands: what backlash and depth leave uncertain."""
+"""Standard deviations of a sighting while the robot stands, from backlash and depth noise."""
 
 
 def _solve(trials: Sequence[WheelRow], state: FloatArray) -> tuple[FloatArray, float]:
-    """(1 / L with the mean scale in it, left, right scale beyond one) and the standard deviation of the first."""
+    """The fitted state (3,): mean scale / L in 1/m, left and right scale less one; and the deviation of the first."""
     for _ in range(_ITERATIONS):
         residual = _residuals(trials, state)
         slope = np.stack([(_residuals(trials, state + step) - residual) / 1e-5 for step in 1e-5 * np.eye(3)], axis=1)
@@ -105,7 +105,7 @@ def _solve(trials: Sequence[WheelRow], state: FloatArray) -> tuple[FloatArray, f
 
 
 def _residuals(trials: Sequence[WheelRow], state: FloatArray) -> FloatArray:
-    """How far each target's second place is from where the arc would have brought it, in bearing and in distance."""
+    """Normalised residuals (2 b,) of the target's second position, in bearing and distance, for a state (3,)."""
     inverse, left, right = state.tolist()
     found = []
     for trial in trials:

@@ -1,4 +1,4 @@
-"""What a capture has beyond plain MCAP: profile, checksums of metadata, the tally at the file's end; and errors."""
+"""Conventions of captures beyond MCAP: profile, checksums of metadata, the tally at the file's end, and errors."""
 
 from __future__ import annotations
 

@@ -36,7 +36,7 @@ _ACTION_FIELDS: Mapping[str, Mapping[str, Any]] = {
     "babble-arm": {"first": 0, "count": 0},
     "babble-wheels": {"label": "", "first": 0, "count": 0},
 }
-"""What a former intent had for each action, with the defaults of then."""
+"""The fields of a former intent for each action, with their defaults."""
 _TASK_FIELDS: Mapping[str, Mapping[str, Any]] = {
     "fetch": {"label": "", "bring": False},
     "follow": {"label": "", "for_s": None},
@@ -45,7 +45,7 @@ _TASK_FIELDS: Mapping[str, Mapping[str, Any]] = {
     "babble-arm": {"first": 0, "count": 1000},
     "babble-wheels": {"label": "", "first": 0, "count": 1000},
 }
-"""What a former request had for each task, with the defaults of then."""
+"""The fields of a former request for each task, with their defaults."""
 
 
 def todays_name(schema: str) -> str:

@@ -20,7 +20,7 @@ from services.capture.keys import KeyFilter, info_of, lossy
 from services.capture.log_clock import LogClock
 from services.capture.recorder import Ledger, Recorder
 from services.capture.sink import DirectSink, ThreadedSink
-from services.capture.writer import MB, CaptureWriter, Limits, sync_and_close
+from services.capture.writer import MB, CaptureWriter, FileLimits, sync_and_close
 
 
 async def run(node: Node, config: CaptureConfig, log_clock: LogClock | None = None) -> None:
@@ -61,7 +61,7 @@ implementation = Implementation(CaptureConfig, run)
 def _writer(
     robot: str, config: CaptureConfig, ledger: Ledger, started: datetime, release: Callable[[int], None] | None
 ) -> CaptureWriter:
-    limits = Limits(min_free_bytes=round(config.min_free_mb * MB))
+    limits = FileLimits(min_free_bytes=round(config.min_free_mb * MB))
     if config.file is None:
         limits = replace(limits, file_bytes=config.rotate_mb * MB, file_s=config.rotate_s)
     return CaptureWriter(

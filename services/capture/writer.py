@@ -29,7 +29,7 @@ ChannelName = str | tuple[str, int]
 
 
 @dataclass(frozen=True)
-class Limits:
+class FileLimits:
     """When the next file is begun, and when recording stops."""
 
     file_bytes: float = float("inf")
@@ -60,7 +60,7 @@ class CaptureWriter:
         self,
         place: Callable[[int], Path],
         packer: Packer,
-        limits: Limits,
+        limits: FileLimits,
         info: Callable[[str, bytes], KeyInfo],
         missing: Callable[[], Missing] = lambda: Missing({}, {}),
         release: Callable[[int], None] = sync_and_close,

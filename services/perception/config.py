@@ -32,7 +32,7 @@ class PerceptionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
     """Least share of the pixels that the object would have at its distance. A smaller blob is another, smaller thing,
     unless the object is partly hidden."""
     min_hidden_share: PositiveShare = 0.08
-    """The same for an object that the image's edge or something nearer hides in part."""
+    """As `min_share`, for an object that the image's edge or something nearer hides in part."""
     max_share: Annotated[float, Meta(ge=1)] = 1.7
     """Largest such share. A larger blob is another, larger thing."""
     occluded_share: PositiveShare = 0.6

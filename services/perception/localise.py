@@ -119,7 +119,7 @@ class _ShapeFit(NamedTuple):
     misfit: float
     """Mean misfit per piece of evidence: half the squared residual over its standard deviation, by Huber's loss."""
     size_misfit: float
-    """The same for the pixel count."""
+    """As `misfit`, for the pixel count."""
     pieces: int
 
 

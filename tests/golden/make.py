@@ -1,7 +1,7 @@
-"""Makes the golden capture anew: `python tests/golden/make.py`.
+"""Makes the golden capture: `python tests/golden/make.py`.
 
-To be done when perception or planning is meant to give other outputs than before, and only then: the test that
-executes it again is there to say when they do so without being meant to.
+Only for a change that is meant to alter the outputs of perception or planning. The test that re-executes the
+capture finds changes that are not.
 """
 
 from __future__ import annotations

@@ -40,7 +40,7 @@ from cocoro.objects import ObjectSpec
 from cocoro.units import Vec3
 from services.capture.file import Packer
 from services.capture.keys import KeyInfo, QueuedMessage
-from services.capture.writer import CaptureWriter, Limits
+from services.capture.writer import CaptureWriter, FileLimits
 
 try:
     from foxglove import messages as fg
@@ -85,7 +85,7 @@ def export(capture: Capture, out: Path, progress: Callable[[float], None] = lamb
 
 def _export(capture: Capture, out: Path, progress: Callable[[float], None]) -> int:
     translator = Translator(capture)
-    writer = CaptureWriter(lambda _: out, Packer("zstd"), Limits(), lambda *_: KeyInfo(JSON, None, {}))
+    writer = CaptureWriter(lambda _: out, Packer("zstd"), FileLimits(), lambda *_: KeyInfo(JSON, None, {}))
     newest_ns = 0
     for stamp_ns, made in _by_stamp(capture, translator, progress):
         newest_ns = max(newest_ns, stamp_ns)

@@ -1,4 +1,4 @@
-"""What a capture contains besides pictures, held in memory: tasks, plans and detections; belief compared with the
+"""A capture's content besides pictures, held in memory: tasks, plans and detections; belief compared with the
 truth."""
 
 from __future__ import annotations
