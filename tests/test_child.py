@@ -11,6 +11,8 @@ import pytest
 
 from cocoro.child import ChildProcess, wait_or_kill
 
+pytestmark = pytest.mark.process
+
 ECHO = """
 import socket, sys
 channel = socket.socket(fileno=int(sys.argv[-1]))
