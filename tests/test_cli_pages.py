@@ -54,7 +54,7 @@ def test_the_commands_of_a_page_can_be_given_as_they_are_written(page: Path) -> 
     wrong = []
     for line, whole in dict.fromkeys(shown(page)):
         words = arguments(line)
-        if not words or {"-h", "--help"} & {*words} or words[0] in ("stop", "estop"):
+        if not words or ("..." in line and not whole) or {"-h", "--help"} & {*words} or words[0] in ("stop", "estop"):
             continue
         if words[0] in THIRD_PARTY or " ".join(words[:2]) in THIRD_PARTY:
             continue
@@ -62,6 +62,6 @@ def test_the_commands_of_a_page_can_be_given_as_they_are_written(page: Path) -> 
             parse(get_group(app), "cocoro", words)
         except BaseException as error:
             kind = type(error).__name__
-            if whole or kind != "MissingParameter":  # a sentence may name a command without its arguments
+            if whole or kind not in ("MissingParameter", "BadOptionUsage"):  # a sentence may leave arguments out
                 wrong.append(f"{line.strip()}: {kind}: {error}")
     assert not wrong, "\n".join(wrong)

@@ -163,8 +163,8 @@ def test_a_bug_is_one_line_and_its_traceback_can_be_had(table: Table) -> None:
     ending = table.play("topics", Surroundings(bug))
     assert ending.code == exits.FAILED
     assert ending.err == (
-        "cocoro: internal error, please report it: ZeroDivisionError: a bug\\nof two lines (in apps.cli.app, line "
-        f"{line_of('listing.table()')}); COCORO_LOG=debug shows the traceback\n"
+        "cocoro: internal error, please report it: ZeroDivisionError: a bug\\nof two lines (in apps.cli.topics, line "
+        f"{line_of('else table()')}); COCORO_LOG=debug shows the traceback\n"
     )
     told = table.play("topics", Surroundings(bug | {"env": {"COCORO_LOG": "debug"}}))
     assert told.code == exits.FAILED
@@ -189,7 +189,7 @@ def test_the_error_of_one_task_of_several_is_told_as_its_own(capsys: pytest.Capt
 
 
 def line_of(text: str) -> int:
-    lines = (Path(__file__).parent.parent / "apps" / "cli" / "app.py").read_text(encoding="utf-8").splitlines()
+    lines = (Path(__file__).parent.parent / "apps" / "cli" / "topics.py").read_text(encoding="utf-8").splitlines()
     return next(number for number, line in enumerate(lines, 1) if text in line)
 
 

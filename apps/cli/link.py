@@ -7,17 +7,19 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from apps.cli.options import RobotChoice
 from cocoro.bus.base import Bus
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.errors import ConfigError, MeshError
 from cocoro.participant import Answer, Participant
-from cocoro.robot import Robot
 from cocoro.topics import Request
 from deploy import robot_time
 from deploy.rundir import RunDir, robots
+
+if TYPE_CHECKING:
+    from cocoro.robot import Robot
 
 __all__ = ["Answer", "MeshLink", "find", "joined", "within"]
 
@@ -41,6 +43,8 @@ class MeshLink(Participant):
     def described(self) -> Robot:
         """The robot by the files that it was started with, if they are on this machine; else the Calliope. Raises
         ConfigError."""
+        from cocoro.robot import Robot  # slow to import; few commands need it
+
         resolved = self.run_dir.resolved()
         return Robot.load(*(Path(file) if (file := resolved.get(name)) else None for name in ROBOT_FILES))
 
