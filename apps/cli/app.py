@@ -57,7 +57,7 @@ COMMANDS = (
     ),
     CommandRow("hz", TOOLS, "Rate, jitter and amount of data on a key, as it arrives here, over the last seconds."),
     CommandRow("logs", TOOLS, "Logs of the robot's processes on this machine since their start, merged by time."),
-    CommandRow("new", TOOLS, "Write a component from a template: `cocoro new service NAME`."),
+    CommandRow("new", TOOLS, "Write a component (`new service NAME`) or a task (`new task NAME`) from a template."),
     CommandRow(
         "base", HARDWARE, "Show the base: mode, battery, bumpers, odometry; `recover` puts it back into its mode."
     ),
