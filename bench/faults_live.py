@@ -53,7 +53,7 @@ class LiveTrial:
     stand_s: float
     """Simulated time from the last physics step before the signal until the body stood for good."""
     real_s: float
-    """The same in real time, from the sending of the signal."""
+    """Real time from the sending of the signal until then."""
 
 
 class LiveRobot:

@@ -106,19 +106,19 @@ class Inbox:
 
 
 class Listener:
-    """Collects lots, and lets a test wait for so many samples."""
+    """Collects batches, and lets a test wait for so many samples."""
 
     def __init__(self) -> None:
-        self.lots: list[list[Received]] = []
+        self.batches: list[list[Received]] = []
         self._came = asyncio.Event()
 
-    def __call__(self, lot: list[Received]) -> None:
-        self.lots.append(lot)
+    def __call__(self, batch: list[Received]) -> None:
+        self.batches.append(batch)
         self._came.set()
 
     @property
     def heard(self) -> list[Received]:
-        return [each for lot in self.lots for each in lot]
+        return [each for batch in self.batches for each in batch]
 
     async def has(self, count: int) -> None:
         while len(self.heard) < count:

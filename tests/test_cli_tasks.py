@@ -45,7 +45,7 @@ ID = "fetch-1"
 
 @dataclass
 class Executive:
-    """Accepts one task and tells what the test lets it tell."""
+    """Accepts one task and publishes the states that the test gives."""
 
     node: Node
     replies: list[TaskReply] = field(default_factory=lambda: [TaskReply(accepted=True, task_id=ID)])

@@ -336,7 +336,7 @@ def test_another_user_without_any_variable_can_stop_the_robot(robot: str) -> Non
 @pytest.mark.process
 @needs_root
 def test_an_address_that_names_another_user_is_that_of_who_made_it(robot: str) -> None:
-    """So what he answers, or does not, is told of a robot of his."""
+    """Its answers, or their absence, are attributed to that user's robot."""
     with a_liar(robot), moving(robot, "arm"):
         asking = stop(robot)
     assert {point.service: point.uid for point in asking.points.values()} == {"base": 65534, "arm": 0}

@@ -34,8 +34,8 @@ def blocks_of(page: Path) -> list[Block]:
 
 @contextmanager
 def reader(folder: Path) -> Iterator[dict[str, str]]:
-    """The environment of somebody who follows a page: a virtual environment on top of ours, in `folder`, so that what
-    the page installs is gone afterwards, and a run directory."""
+    """The environment of a reader who follows a page: a run directory and a virtual environment in `folder` on top of
+    ours, so that installations of the page do not remain."""
     home = folder / "venv"
     venv.create(home, with_pip=False, symlinks=True)
     (site,) = home.glob("lib/python*/site-packages")
@@ -61,7 +61,7 @@ def reader(folder: Path) -> Iterator[dict[str, str]]:
 
 
 def run(script: str, folder: Path, environment: dict[str, str]) -> str:
-    """What a script prints. It must succeed."""
+    """Run a script, which must succeed; returns its output."""
     command = ["bash", "-euo", "pipefail", "-c", script]
     done = subprocess.run(
         command, cwd=folder, env=environment, capture_output=True, text=True, timeout=PATIENCE_S, check=False

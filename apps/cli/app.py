@@ -1,7 +1,8 @@
 """The commands of `cocoro`, in the order in which its help lists them.
 
-`cocoro --help` needs this file alone. A command's own file has its options and what it does; it is imported when the
-command is called, so it may import whatever it needs.
+`cocoro --help` needs this file and `task_commands`. A command's own file has its options and what it does; it is
+imported when the command is called, so it may import whatever it needs. The commands of tasks (`cocoro fetch`) are made
+from the types of tasks by `task_commands`; `tasks` sends the request and follows the task to its outcome.
 """
 
 from __future__ import annotations
@@ -145,8 +146,7 @@ def load(name: str) -> TyperCommand | TyperGroup:
 
 
 class CommandGroup(TyperGroup):
-    """The group of all commands: help comes from COMMANDS, and a command is loaded when it is called. Further commands
-    are made from the types of tasks."""
+    """The group of all commands: it lists COMMANDS and the tasks, and loads a command when it is called."""
 
     def __init__(self, **attributes: Any) -> None:
         super().__init__(**attributes)
