@@ -1,8 +1,8 @@
-"""What the mesh costs: latencies, the processor's share of a camera's stream, and the time that joining takes.
+"""Measures the mesh: latencies, the CPU share of a camera's stream, and the time to join.
 
     python bench/bus.py [--pings N] [--seconds S]
 
-Figures are those of this machine at this moment; compare within the table. Each row's ratio is to its first row.
+The figures depend on this machine and its load; compare within the table. Each ratio is to the first row.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ RATE_HZ = 30.0
 
 @dataclass(frozen=True)
 class Way:
-    """A configuration of the mesh: how a process that is called `name` joins."""
+    """A configuration of the mesh: how a process named `name` joins."""
 
     title: str
     directory: str | None = None
@@ -41,7 +41,7 @@ class Way:
     router: bool = False
     shared_memory: bool = True
     receiver_too: bool = True
-    """Whether who receives the frames shares memory, too."""
+    """Whether the receiver of the frames uses shared memory, too."""
 
     def config(self, name: str) -> ZenohConfig:
         if self.directory is not None:
@@ -68,7 +68,7 @@ def free_port() -> int:
 
 
 async def serve(way: Way, name: str) -> None:
-    """Echo pings, answer calls, send frames when asked to; or just route. Until standard input ends."""
+    """Echo pings, answer calls and send frames on request, or only route, until standard input ends."""
     ended = asyncio.Event()
 
     def end() -> None:
@@ -130,7 +130,7 @@ async def alive(bus: ZenohBus, key: str) -> None:
 
 
 async def pings_us(bus: ZenohBus, count: int) -> list[float]:
-    """Half of the way there and back, of 1 KiB, from loop to loop."""
+    """Half the round-trip time of 1 KiB, from event loop to event loop."""
     came = asyncio.Event()
     subscription = bus.subscribe("bench/pong", Qos.COMMAND, lambda *_: came.set(), depth=1)
     ping = bus.publisher("bench/ping", Qos.COMMAND)
@@ -143,7 +143,7 @@ async def pings_us(bus: ZenohBus, count: int) -> list[float]:
         try:
             await asyncio.wait_for(came.wait(), 1.0)
         except TimeoutError:
-            continue  # not known to the other yet
+            continue  # the other process does not know it yet
         halves.append((time.perf_counter() - begin_s) * 1e6 / 2)
     subscription.close()
     ping.close()
@@ -160,8 +160,8 @@ async def calls_us(bus: ZenohBus, count: int) -> list[float]:
 
 
 async def frames_ms(bus: ZenohBus, seconds: float) -> tuple[list[float], float, float, float, int]:
-    """One-way times until the bytes are there, the processor's shares of sender and receiver, a put's median time,
-    and how many arrived."""
+    """One-way times until the bytes have arrived, CPU shares of sender and receiver, the median time of a put, and
+    the number of arrivals."""
     took: list[float] = []
 
     def arrive(_: str, payload: Payload) -> None:
@@ -211,7 +211,7 @@ async def measure(way: Way, pings: int, seconds: float, quick: bool = False) -> 
 
 
 async def patiently(config: ZenohConfig) -> ZenohBus:
-    """Open, also before the router is there."""
+    """Open a session; waits for the router."""
     while True:
         try:
             return await ZenohBus.open(config)
@@ -225,7 +225,7 @@ async def nothing() -> AsyncIterator[None]:
 
 
 async def program_ms(directory: str, members: int, count: int = 10) -> list[float]:
-    """From the start of a Python program to the end of its first call, in a mesh of some members."""
+    """Time from the start of a Python program to the end of its first call, by the number of members."""
     script = (
         "import asyncio, sys; from pathlib import Path\n"
         "from cocoro.bus.endpoints import ZenohConfig; from cocoro.bus.zenoh import ZenohBus\n"

@@ -191,7 +191,7 @@ def _count(published: dict[str, list[int]]) -> int:
 
 
 def _published(path: Path) -> dict[str, list[int]]:
-    """What components published, by key, without what recorders publish about themselves."""
+    """The messages that components published, by key, without those of recorders."""
     found: dict[str, list[int]] = defaultdict(list)
     with Capture.open(path) as capture:
         for each in capture.messages():

@@ -1,4 +1,4 @@
-"""A participant's bus that can fail, service by service: as a process that dies, hangs, falls silent or is late."""
+"""A bus that can make services fail: die, hang, fall silent or be late."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from cocoro.bus.local import LocalBus
 from deploy.processes import hardware
 
 Way = Literal["dies", "silent", "hangs", "late"]
-"""dies: says and hears nothing, and its token is gone. silent: says nothing. hangs: says and hears nothing, and its
-token stays. late: what it says comes `LATE_S` after it was said, in order."""
+"""dies: sends and receives nothing, and its token is gone. silent: sends nothing. hangs: sends and receives nothing,
+but its token stays. late: its messages arrive `LATE_S` late, in order."""
 LATE_S = 1.0
 
 
@@ -37,7 +37,7 @@ class _Publisher:
 
 
 class FaultyBus:
-    """The bus of the service `name`; that of the simulator is the bus of each hardware service, too."""
+    """The bus of the service `name`. The simulator's bus is also that of each hardware service."""
 
     where = "in this process"
 
@@ -48,17 +48,17 @@ class FaultyBus:
         self._tokens: dict[str, Handle] = {}
 
     def fail(self, service: str, way: Way) -> None:
-        """From now on a service fails that way."""
+        """Make a service fail in that way from now on."""
         self._ways[service] = way
         if way == "dies" and service in self._tokens:
             self._tokens[service].close()
 
     def way(self, service: str) -> Way | None:
-        """How a service fails; None while it does not."""
+        """How a service fails; None when it does not fail."""
         return self._ways.get(service)
 
     def owner(self, key: str) -> str:
-        """Who speaks, hears or answers at a key."""
+        """The service that publishes, reads or serves a key."""
         service = key.split("/")[1]
         return service if self._name == "sim" and service in hardware() else self._name
 

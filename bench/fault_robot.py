@@ -1,4 +1,4 @@
-"""A whole robot in one process, in virtual time, that drives at full speed and to which something happens then."""
+"""A whole robot in one process and in virtual time that drives at full speed when a fault occurs."""
 
 from __future__ import annotations
 
@@ -29,24 +29,24 @@ from sim.motion import MotionRow, read_motion
 SERVICES = ("sim", "perception", "planning", "executive")
 STANDING_MPS = 0.01
 PATIENCE_S = 25.0
-"""How long a robot may take until it drives at full speed."""
+"""Time limit to reach full speed."""
 WATCH_S = 1.0
-"""How long it is watched after a fault."""
+"""Time that it is watched after a fault."""
 FRAMES = {"width": 320, "height": 240, "frame_rate_hz": 30.0, "sensors": "real"}
 
 
 def full_speed_mps(drive: str) -> float:
-    """The highest speed that the planner drives at, of itself, on an errand."""
+    """The highest speed that the planner chooses for a task."""
     planning = PlanningConfig()
     return planning.follow.max_speed_mps if drive == "follow" else planning.navigation.max_speed_mps
 
 
 class NotFastError(CocoroError):
-    """The robot never came to its full speed."""
+    """The robot did not reach its full speed."""
 
 
 class Happening(NamedTuple):
-    """Something that goes wrong: a service that fails some way, or what `what` says, or both at once."""
+    """A fault: a service that fails in some way, an event (`what`), or both together."""
 
     service: str = ""
     way: Way | None = None
@@ -59,14 +59,14 @@ class Happening(NamedTuple):
 
     @property
     def watch_s(self) -> float:
-        """Who is late is watched until after he is heard again. But perception that is late, of itself or for want of
-        frames, is one that is slow by then, and the robot drives on."""
+        """Time to watch after the fault, s. A late service is watched until its messages arrive again. Late
+        perception is the exception: by then it counts as slow, and the robot drives on."""
         late_s = LATE_S if self.service in ("perception", "kinect") else LATE_S + 0.5
         return late_s if self.way == "late" else WATCH_S
 
 
 class FaultRobot:
-    """Use it as an asynchronous context manager, in virtual time. `folder` is for the record of its motion."""
+    """An asynchronous context manager in virtual time. `folder` receives the record of its motion."""
 
     def __init__(self, errand: Errand, folder: Path, seed: int) -> None:
         self._errand = errand
@@ -112,7 +112,8 @@ class FaultRobot:
     # --- before -----------------------------------------------------------------------------------
 
     async def drive(self, rng: random.Random) -> MotionRow:
-        """Give the task, and be at full speed at a random moment; how the body moves then. Raises NotFastError."""
+        """Give the task and drive until a random moment at full speed; returns the body's motion then. Raises
+        NotFastError."""
         await self._begin()
         full_mps = 0.97 * full_speed_mps(self._errand.task.name)
         end_s = PATIENCE_S + self._now_s()
@@ -130,7 +131,7 @@ class FaultRobot:
         for _ in range(100):
             await asyncio.sleep(0.05)
             reply = TaskReply(accepted=False)
-            with suppress(CocoroError):  # nobody serves it yet
+            with suppress(CocoroError):  # no service answers it yet
                 reply = await self.operator.call(topics.RUN, question)
             if reply.accepted:
                 return
@@ -146,7 +147,7 @@ class FaultRobot:
     # --- what happens -----------------------------------------------------------------------------
 
     async def stand_s(self, happening: Happening, rng: random.Random) -> float:
-        """Have it happen, and watch; from that moment until the body stood for good, seconds."""
+        """Cause the fault and watch; returns the time from the fault until the body stood for good, s."""
         began_ns = self.operator.now_ns()
         work = [self.operator.spawn(self._do(happening.what, rng))] if happening.what else []
         if happening.way is not None:
@@ -179,8 +180,7 @@ class FaultRobot:
             await self._flood(rng)
 
     async def _flood(self, rng: random.Random) -> None:
-        """Publish what is no message, what was said already, and what was cut short, on a random key a thousand times a
-        second."""
+        """Publish invalid, repeated and truncated messages on random keys, a thousand times a second."""
         keys = sorted(key for key, said in self._said.items() if said)
         while True:
             key = rng.choice(keys)

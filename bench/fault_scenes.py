@@ -1,4 +1,4 @@
-"""Scenes in which a robot drives at full speed, drawn at random: to a thing far off, or behind one that moves."""
+"""Random scenes in which a robot drives at full speed: to a distant object, or behind a moving one."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ BALL = "blue_ball"
 
 
 class Errand(NamedTuple):
-    """A task, and the file of the scene that it is for."""
+    """A task, and the file of its scene."""
 
     task: Task
     scene: Path
 
 
 def draw_errand(drive: Drive, rng: random.Random, folder: Path) -> Errand:
-    """Make a scene for a drive and write it into a folder."""
+    """Draw a scene for a drive and write it into a folder."""
     scene = folder / "scene.toml"
     if drive == "follow":
         scene.write_text(_walk(rng))
@@ -49,7 +49,7 @@ def _can(label: str, distance_m: float, bearing_rad: float) -> str:
 
 
 def _walk(rng: random.Random) -> str:
-    """A ball that is carried away at about the speed that the robot can follow at, along a winding line."""
+    """A ball that moves away along a winding line, about as fast as the robot can follow."""
     heading = rng.uniform(-0.5, 0.5)
     x, y = 1.2 * cos(heading), 1.2 * sin(heading)
     start = f"[{x:.3f}, {y:.3f}, 0.7]"

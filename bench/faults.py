@@ -1,17 +1,16 @@
-"""How fast the robot stands after a fault at full speed: `python -m bench.faults [--count 200] [--seed N] [--json]`.
+"""Measures the time to stand after a fault at full speed: `python -m bench.faults [--count 200] [--seed N] [--json]`.
 
-Each trial is a whole robot in virtual time, on an errand in a scene drawn at random: a fetch or a go-to at full speed,
-or a pursuit that makes up for a gap. At a random moment at full speed something happens to it, the kinds of
-docs/faults.md in turn. Then the simulator's truth at every step of the physics (240 Hz) says when the body stood for
-good: slower than 1 cm/s, at its centre as well as, by turning, where its wheels are. Exit code 1 when one took longer
-than 0.3 s.
+Each trial is a whole robot in virtual time with a task in a random scene: a fetch or a go-to at full speed, or a
+pursuit that closes a gap. At a random moment at full speed a fault occurs, the kinds of docs/faults.md in turn. Then
+the simulator's true state at every physics step (240 Hz) shows when the body stood for good: slower than 1 cm/s both at
+its centre and at its wheels. Exit code 1 when a trial took longer than 0.3 s.
 
-`python -m bench.faults live --count N`: the same with the processes of a robot that is up in real time, killed and
-stopped. `python -m bench.faults alarms --count N [--others 2]`: how often patience ends while everyone lives. See
+`python -m bench.faults live --count N` does the same with real processes in real time, which are killed and stopped.
+`python -m bench.faults alarms --count N [--others 2]` counts how often patience ends although all services live. See
 `bench.faults_live`.
 
-The same seed gives the same trials. Nothing here depends on how busy the machine is but the wall time; that of `live`
-does, and says what it is worth.
+Equal seeds give equal trials. The results do not depend on the load of the machine, except those of `live`, which
+reports the load.
 """
 
 from __future__ import annotations
@@ -46,30 +45,30 @@ HAPPENINGS: tuple[Happening, ...] = (
     *(Happening(service, "silent", "flood") for service in ("planning", "executive", "perception", "base")),
 )
 TRIES = 4
-"""Scenes that are drawn for a trial until there is one in which the robot comes to its full speed."""
+"""Number of scenes to draw for a trial before one must let the robot reach full speed."""
 
 
 @dataclass(frozen=True)
 class Trial:
-    """One fault, and what came of it."""
+    """One fault and its result."""
 
     number: int
     what: str
     drive: Drive
     speed_mps: float
-    """At the moment of the fault, of the faster of centre and wheels' rims, by the truth."""
+    """True speed at the fault: the greater of centre and wheel rims."""
     stand_s: float
-    """From the fault until it stood for good."""
+    """Time from the fault until the body stood for good."""
 
 
 def happening_of(number: int) -> tuple[Happening, Drive]:
-    """The kind and the errand of a trial; all kinds come once before any comes again."""
+    """Kind and task of a trial. Every kind occurs once before any occurs again."""
     turn, kind = divmod(number, len(HAPPENINGS))
     return HAPPENINGS[kind], DRIVES[(turn + kind) % len(DRIVES)]
 
 
 def run_trial(seed: int, number: int) -> Trial:
-    """Raises NotFastError when no scene that was drawn lets the robot drive at full speed."""
+    """Raises NotFastError when the robot reaches full speed in no scene that was drawn."""
     happening, drive = happening_of(number)
     rng = random.Random(f"{seed}/{number}")
     for left in reversed(range(TRIES)):
@@ -97,14 +96,14 @@ async def _try(number: int, happening: Happening, drive: Drive, rng: random.Rand
 
 @dataclass(frozen=True)
 class Spread:
-    """How long it took until the robot stood, in several trials; seconds."""
+    """Times to stand of several trials, s."""
 
     count: int
     median_s: float
     p95_s: float
     worst_s: float
     margin_s: float
-    """Left of the bound in the worst."""
+    """Margin to the bound in the worst trial."""
 
 
 def spread(trials: Iterable[Trial]) -> Spread:
@@ -140,7 +139,7 @@ def _print(trials: Sequence[Trial]) -> None:
 
 
 def _quiet() -> None:
-    """An emergency stop that is pressed on purpose is no news."""
+    """Hides the log line of the emergency stop, which is pressed on purpose here."""
     logging.getLogger("cocoro").setLevel(logging.ERROR)
 
 

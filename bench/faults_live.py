@@ -1,8 +1,8 @@
-"""Faults and false alarms of a robot that is up: processes on zenoh in real time, judged at every step of the physics.
+"""Faults and false alarms of a live robot: processes on zenoh in real time, judged at every physics step.
 
-`live`: in each trial a robot is started (profile `sim`, real sensors), drives at full speed, and one of its processes
-is killed or stopped. `alarms`: nothing is killed; counted is how often a robot that fetches and follows was slowed or
-stopped by somebody's patience though everyone lived. Times are the simulator's; real ones are told beside them.
+`live`: each trial starts a robot (profile `sim`, real sensors), lets it drive at full speed, and kills or stops one of
+its processes. `alarms`: nothing is killed. It counts how often a robot that fetches and follows is slowed or stopped by
+a service's patience although all services live. Times are simulated; real times are printed beside them.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ from services.executive.tasks import FetchTask, FollowTask
 from sim.motion import MotionRow, read_motion
 
 VICTIMS = {"sim": ("planning", "executive", "perception"), "sim-wire": ("base", "arm")}
-"""By profile, services whose processes are killed and stopped; 'arm' is that of all servos. With the simulator itself
-time stands, so nothing moves on."""
+"""By profile, the services whose processes are killed and stopped; the process of 'arm' drives all servos. The
+simulator is not among them, because time stands still without it."""
 SIGNALS = (signal.SIGKILL, signal.SIGSTOP)
 PATIENCE_S = 40.0
 WATCH_S = 1.2
@@ -45,26 +45,26 @@ WATCH_S = 1.2
 
 @dataclass(frozen=True)
 class LiveTrial:
-    """One process killed or stopped, and what came of it."""
+    """One killed or stopped process and the result."""
 
     what: str
     drive: str
     speed_mps: float
     stand_s: float
-    """Simulated, from the last step of the physics before the signal until it stood for good."""
+    """Simulated time from the last physics step before the signal until the body stood for good."""
     real_s: float
-    """By the machine's clock, from when the signal was sent."""
+    """Real time from the sending of the signal until then."""
 
 
 class LiveRobot:
-    """A robot that is up, on an errand. Make it with `robot_up`."""
+    """A running robot with a task. Made by `robot_up`."""
 
     def __init__(self, cocoro: Operator, node: Node, motion: Path) -> None:
         self.cocoro = cocoro
         self.node = node
         self.states: list[TaskState] = []
         self.whys: list[str] = []
-        """The planner's word on its doings, status by status."""
+        """The planner's stated activity, status by status."""
         self._motion = motion
         self.rows: list[MotionRow] = []
         node.on(topics.TASK, self.states.append)
@@ -74,12 +74,12 @@ class LiveRobot:
         self.whys.append(status.why)
 
     def read(self) -> MotionRow:
-        """The newest step of the physics."""
+        """Time of the newest physics step."""
         self.rows += read_motion(self._motion, len(self.rows))
         return self.rows[-1]
 
     async def begin(self, question: TaskRequest) -> str:
-        """Have a task accepted as soon as the robot is able; its id. Raises TimeoutError."""
+        """Request a task until it is accepted; returns its id. Raises TimeoutError."""
         async with asyncio.timeout(PATIENCE_S):
             while True:
                 try:
@@ -100,7 +100,7 @@ class LiveRobot:
                 await asyncio.sleep(0.05)
 
     async def at_speed(self, errand: Errand, rng: random.Random) -> MotionRow:
-        """Give the task, and be at full speed at a random moment. Raises TimeoutError."""
+        """Give the task and drive until a random moment at full speed. Raises TimeoutError."""
         await self.begin(TaskRequest(task=errand.task))
         full_mps = 0.97 * full_speed_mps(errand.task.name)
         async with asyncio.timeout(PATIENCE_S):
@@ -117,8 +117,8 @@ class LiveRobot:
 async def robot_up(
     cocoro: Operator, profile: str, scene: str, folder: Path, *settings: str
 ) -> AsyncIterator[LiveRobot]:
-    """A robot of a profile in a scene; `folder` is for the record of its motion. Raises CocoroError when it does not
-    come up."""
+    """Start a robot of a profile in a scene. `folder` receives the record of its motion. Raises CocoroError when it
+    does not start."""
     motion = folder / "motion"
     options = ["--scene", scene, "--sensors", "real"]
     for setting in (f"service.sim.motion={motion}", *settings):
@@ -162,7 +162,7 @@ async def _trial(number: int, profile: str, rng: random.Random) -> LiveTrial:
 
 
 def live(count: int, seed: int, profile: str, bound_s: float) -> bool:
-    """Print each trial and what came of all; whether the robot stood in time in every one."""
+    """Print each trial and a summary; returns whether the robot stood in time in every trial."""
     trials: list[LiveTrial] = []
     for number in range(count):
         try:
@@ -190,22 +190,22 @@ def live(count: int, seed: int, profile: str, bound_s: float) -> bool:
 
 @dataclass
 class Alarms:
-    """How often somebody's patience ended while everyone lived."""
+    """How often a service's patience ended although all services lived."""
 
     task: str
     seconds: float
     driven: float
-    """Seconds in which the wheels turned."""
+    """Time in which the wheels turned."""
     base: int
-    """Times that the base's deadman held wheels that turned."""
+    """Number of times that the base's deadman stopped turning wheels."""
     deepest: float
-    """The share of its speed that the robot lost in the worst of them."""
+    """Greatest share of its speed that the robot lost by that."""
     stood: int
-    """Times that it came to stand by that."""
+    """Number of times that it stood because of that."""
     slower: int
-    """Times that the planner drove slower because somebody was late."""
+    """Number of times that the planner slowed down because of a late service."""
     halted: Counter[str]
-    """Times that it commanded zero because somebody was silent, by its words."""
+    """Number of times that it commanded zero because of a silent service, by its stated reason."""
     outcome: str = ""
 
     def line(self) -> str:
@@ -218,7 +218,7 @@ class Alarms:
 
 
 def _deadman(rows: Sequence[MotionRow]) -> tuple[int, float, int]:
-    """Events, the deepest loss of speed as a share, and how many ended in standing."""
+    """Number of events, the greatest share of speed lost, and the number that ended in standing."""
     events, deepest, stood = 0, 0.0, 0
     began_mps: float | None = None
     for row in rows:
@@ -261,7 +261,7 @@ async def _alarms(scene: str, question: TaskRequest, *settings: str) -> Alarms:
 
 @contextmanager
 def busy(processes: int) -> Iterator[None]:
-    """Others that want all of the machine meanwhile."""
+    """Processes that load the machine meanwhile."""
     with ExitStack() as stack:
         for _ in range(processes):
             process = stack.enter_context(subprocess.Popen([sys.executable, "-c", "while True: pass"]))
@@ -270,7 +270,7 @@ def busy(processes: int) -> Iterator[None]:
 
 
 def alarms(count: int, others: int, settings: Sequence[str]) -> bool:
-    """Print what a fetch and a pursuit met, `count` times; whether all came to their ends."""
+    """Run a fetch and a pursuit `count` times and print the alarms; returns whether all tasks ended as they should."""
     well = True
     with busy(others):
         for _ in range(count):

@@ -1,7 +1,7 @@
-"""Both hardware parsers on mutated bytes for minutes: `python -m bench.fuzz --seconds 300 --seed 0`.
+"""Feeds mutated bytes to both hardware parsers: `python -m bench.fuzz --seconds 300 --seed 0`.
 
-Good frames are flipped, cut, spliced, doubled and mixed with noise, and fed in random pieces. What comes out must be
-whole in every respect, checked here by other means than the parsers'; anything raised ends the run.
+Valid frames are flipped, cut, spliced, doubled and mixed with noise, and fed in random pieces. Every parsed frame must
+be valid by an independent check; an exception ends the run.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from services.servos import table
 from services.servos.bus import find_status
 
 NOISE = (0x13, 0xFF, 0x00, 0x23, 0x29)
-"""Bytes that frames begin with, or have their lengths in."""
+"""Bytes that occur as headers and lengths of frames."""
 
 
 class Fuzzer:
@@ -47,7 +47,7 @@ class Fuzzer:
         return bytes(data)
 
     def create(self) -> None:
-        """The stream parser by itself, and behind it the guard's whole machine."""
+        """The stream parser alone, and the guard's state machine behind it."""
         draws = self._draws
 
         def good() -> bytes:

@@ -1,7 +1,7 @@
-"""The base and servo services with somebody who keeps the robot moving, as one process.
+"""The base and servo services in one process, with commands that keep the robot moving.
 
-`python -m bench.hardware_driver CREATE ARM HAND`, started by `bench.hardware_faults`. It tells ten times a second, a
-JSON line each, what `cocoro status` would show, and takes {"do": "recover"} and {"do": "clear"}.
+`python -m bench.hardware_driver CREATE ARM HAND`, started by `bench.hardware_faults`. It prints the contents of `cocoro
+status` ten times a second, each as a JSON line, and accepts {"do": "recover"} and {"do": "clear"}.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from services.servos.service import ServosConfig
 from services.servos.service import run as run_servos
 
 WHEELS = ((0.2, 0.2), (0.12, 0.06), (-0.06, 0.06))
-"""m/s; each for a while, in turn."""
+"""Wheel speeds, m/s, commanded in turn."""
 REACH_RAD = {"elbow": 0.4, "shoulder": 0.3, "claw_left": 0.2}
-"""These joints go to and fro so far."""
+"""Joints that move to and fro, with their amplitudes, rad."""
 SPEED_RADPS = 0.6
 STEP_S = 0.7
 REPLY_S = 0.05
@@ -77,7 +77,7 @@ class Driver:
                 for network in ("arm", "hand"):
                     await self._node.call(topics.SERVOS.of(network), ServoRequest(action="clear"))
         except CocoroError:
-            pass  # it is asked again as long as it is needed
+            pass  # it is requested again while it is needed
 
 
 async def main(create: str, arm: str, hand: str) -> None:
@@ -94,7 +94,7 @@ async def main(create: str, arm: str, hand: str) -> None:
             for line in sys.stdin:
                 question = json.loads(line)["do"]
                 asyncio.run_coroutine_threadsafe(driver.obey(question), loop)
-            os._exit(0)  # whoever started this is gone
+            os._exit(0)  # the parent process has ended
 
         threading.Thread(target=listen, daemon=True).start()
         async with asyncio.TaskGroup() as group:

@@ -2,16 +2,16 @@
 
     python -m bench.hardware_faults --count 1000
 
-The services run in a process of their own (`bench.hardware_driver`), which keeps wheels and joints moving; here is the
-emulated hardware. Each fault is asked for, looked at from the hardware's side, taken away again, and the robot must
-move again without a restart (unless its process was killed). Counted and told for each kind:
+The services run in a separate process (`bench.hardware_driver`), which keeps wheels and joints moving; this process
+emulates the hardware. Each fault is caused, observed from the hardware's side and ended. Then the robot must move again
+without a restart (unless its process was killed). Counted for each kind:
 
-- crashes: the services' process ended though nobody killed it;
-- wrong: wheels or goals that nobody asked for. Where bytes to the Create are damaged it cannot know: its commands have
-  no checksum. What it made of them is counted apart, with how long it lasted;
-- stops: how long the wheels went on where link or service were lost (limit 0.3 s);
-- unseen: not told in the health of the services, which is what `cocoro status` shows;
-- stuck: not moving again in time.
+- crashes: the services' process ended by itself;
+- wrong: wheel speeds or goals that were not commanded. The Create cannot detect damaged bytes, because its commands
+  have no checksum; their effects are counted separately, with their duration;
+- stops: time that the wheels went on after link or service were lost (limit 0.3 s);
+- unseen: not reported in the health of the services, which `cocoro status` shows;
+- stuck: did not move again in time.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ AGAIN_S = 40.0
 FAR_NS = 10**19
 SPEEDS = {(round(1000 * left), round(1000 * right)) for left, right in WHEELS}
 TURNS = {((left - right) // 2, -((left - right) // 2)) for left, right in SPEEDS}
-"""What the reflexes make of them."""
+"""Wheel speeds that the reflexes may make of the commanded ones, mm/s."""
 GOOD_WHEELS = SPEEDS | TURNS | {(0, 0)}
 
 
@@ -64,18 +64,18 @@ class Tally:
 
 @dataclass
 class Trial:
-    """One fault: how it comes, how long it stays, how it goes, what is expected of it."""
+    """One fault: its start, its duration, its end, and the expected reaction."""
 
     name: str
     begin: Callable[[], None]
     end: Callable[[], None]
     for_s: float
     shown: tuple[str, ...]
-    """One of these must be told; none is asked for when it is empty."""
+    """One of these texts must be reported; empty when no report is required."""
     stops: bool = False
-    """The wheels must stop within the limit."""
+    """Whether the wheels must stop within the limit."""
     garbles: bool = False
-    """Bytes to the Create are damaged."""
+    """Whether bytes to the Create are damaged."""
     kills: bool = False
 
 
@@ -136,7 +136,7 @@ class Campaign:
             self._until_moving()
 
     def _await_stop(self, began_ns: int, tally: Tally) -> None:
-        """When they stopped is taken from the hardware's own log: who waits for it here may be late."""
+        """The time of the stop comes from the emulator's log, since this process may notice it late."""
         create = self._hardware.create
         try:
             self._hardware.emulator.until(lambda: create.wheels_mmps == (0, 0), 5.0)
@@ -150,7 +150,7 @@ class Campaign:
         tally.late_stops += took_ms > STOP_NS / MS
 
     def _judge(self, trial: Trial, tally: Tally) -> None:
-        """What wheels and joints were told meanwhile, against what anybody wanted."""
+        """Compare the commands that reached wheels and joints with those that were given."""
         wrong = self._hardware.wrong_goals()
         tally.notes += wrong[:3]
         tally.wrong += len(wrong)
@@ -167,7 +167,7 @@ class Campaign:
                 tally.notes.append(f"wheels {wheels}")
 
     def _until_moving(self) -> bool:
-        """Wheels and every moved joint go again; a person's part is done: recovering, clearing."""
+        """Wait until wheels and joints move again; does the operator's part (recover, clear)."""
         create, servos = self._hardware.create, self._hardware.servos
         moved = [ROBOT.joints[joint].id for joint in REACH_RAD]
         end_s = time.monotonic() + AGAIN_S
@@ -192,7 +192,7 @@ class Campaign:
         return False
 
     def _state(self) -> str:
-        """What there is to know of hardware that does not move."""
+        """The state of hardware that does not move, for the report."""
         create, servos = self._hardware.create, self._hardware.servos
         told: list[Any] = []
         while not self._services.told.empty():
@@ -217,13 +217,13 @@ class Campaign:
         if cut:
             shown = ("does not answer",) if way == "to_driver" or name != "create" else ("disturbed",)
         elif kind in ("late", "repeated"):
-            shown = ()  # late or twice is no damage as long as it is whole
+            shown = ()  # bytes that are late or doubled are not damaged
         elif name != "create" and way == "to_device":
             shown = ("disturbed", "does not answer")
 
         def end() -> None:
             self._call(line.undisturb)
-            if name == "create":  # a flipped bit may be the command that changes the baud rate
+            if name == "create":  # a flipped bit may form the command that changes the baud rate
                 self._call(lambda: setattr(self._hardware.create, "baud", 57600))
 
         return Trial(
@@ -345,7 +345,7 @@ def _pause(seconds: float) -> None:
 
 
 def run(count: int, seed: int, tell: Callable[[str], None]) -> dict[str, Tally]:
-    """What each kind of fault came to."""
+    """Print the results of each kind of fault."""
     with tempfile.TemporaryDirectory(prefix="cocoro") as name:
         folder = Path(name)
         hardware = Hardware(folder, seed)

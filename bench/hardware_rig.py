@@ -1,4 +1,4 @@
-"""The two sides that `bench.hardware_faults` has face each other: the emulated robot, and the services' process."""
+"""The two sides of `bench.hardware_faults`: the emulated robot and the services' process."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SLACK_COUNTS = 25
 
 
 class Hardware:
-    """The emulated robot, and what is asked of it."""
+    """The emulated robot and the commands that reached it."""
 
     def __init__(self, folder: Path, seed: int) -> None:
         self.create = EmulatedCreate()
@@ -46,7 +46,7 @@ class Hardware:
             self.limits[joint.id] = ends[0] - SLACK_COUNTS, ends[1] + SLACK_COUNTS
 
     def wheel_log(self) -> list[tuple[int, tuple[int, int]]]:
-        """Since the last call."""
+        """Wheel commands since the last call."""
 
         def take() -> list[tuple[int, tuple[int, int]]]:
             log = list(self.create.acted)
@@ -56,8 +56,8 @@ class Hardware:
         return self.emulator.call(take)
 
     def wrong_goals(self) -> list[str]:
-        """Since the last call: goals out of where anybody sent that joint, speeds beyond what was commanded."""
-        limit = round(max(SPEED_RADPS, 1.0) / 0.011623892) + 1  # a held joint goes at 1 rad/s
+        """Since the last call: goals outside the commanded range of a joint, and speeds above the commanded ones."""
+        limit = round(max(SPEED_RADPS, 1.0) / 0.011623892) + 1  # a held joint moves at 1 rad/s
 
         def take() -> list[str]:
             wrong = []
@@ -100,13 +100,13 @@ class Services:
         return self.process.poll() is None
 
     def last_words(self) -> str:
-        """Of a process that ended."""
+        """The exit code and last output of a process that ended."""
         lines = self._said.read_text(errors="replace").strip().splitlines()
         return f"ended with {self.process.poll()}: {' / '.join(lines[-3:])}"
 
     def say(self, what: str) -> None:
         assert self.process.stdin is not None
-        with suppress(BrokenPipeError):  # that it has ended is noticed elsewhere
+        with suppress(BrokenPipeError):  # its end is noticed elsewhere
             self.process.stdin.write(json.dumps({"do": what}) + "\n")
             self.process.stdin.flush()
 
@@ -117,7 +117,7 @@ class Services:
         return None
 
     def shows(self, texts: tuple[str, ...]) -> bool:
-        """Whether one of these is told within its time; forgets what was told before."""
+        """Whether one of these texts is reported within the time limit, not counting earlier reports."""
         while not self.told.empty():
             self.told.get()
         end_s = time.monotonic() + SEEN_S

@@ -1,4 +1,4 @@
-"""What learning the hand-eye map costs on one core: priming, training, one Jacobian, one online sample, the mesh.
+"""Measures the cost of the hand-eye map on one core: priming, training, one Jacobian, one online sample, the mesh.
 
 python bench/learning.py
 """
@@ -30,7 +30,7 @@ SAMPLES = 1000
 
 
 def best_s(call: Callable[[], object], number: int = 1, repeat: int = 5) -> float:
-    """The least time of one call: what else the machine does only ever adds to it."""
+    """The least time of one call, since load can only add to it."""
     return min(timeit.repeat(call, number=number, repeat=repeat)) / number
 
 

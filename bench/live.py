@@ -1,11 +1,11 @@
-"""The robot as its operator has it, processes on zenoh in real time: `python -m bench.live fetches|periods`.
+"""The live robot, with processes on zenoh in real time: `python -m bench.live fetches|periods`.
 
-`fetches`: start it, fetch the red can, shut it down, again and again; nothing may fail, nothing may be left over, and
-the truth must say that the can is held and nothing else was touched. With `--profile sim-wire` the real services of
-base and servos drive it over emulated wires.
+`fetches`: start the robot, fetch the red can and shut down, repeatedly. Nothing may fail or be left over, and the true
+state must have the can in the hand and nothing else touched. With `--profile sim-wire` the real services of base and
+servos drive it over emulated wires.
 `periods`: how evenly wheels and servos are commanded during a fetch, with perception slowed to 2 Hz.
 
-Times are this machine's at this moment: see how busy it is. Exit code 1 when something failed.
+Times depend on the machine's load. Exit code 1 when something failed.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ NAME = "calliope"
 
 
 class Operator:
-    """`cocoro` with a run directory of its own."""
+    """`cocoro` with a separate run directory."""
 
     def __init__(self, root: Path) -> None:
         self.run_dir = RunDir(NAME, root)
@@ -86,7 +86,7 @@ class Fetched(NamedTuple):
 
 
 async def _fetch(cocoro: Operator) -> Fetched:
-    """One fetch, judged a while after it says that it is done: what it holds then, it holds."""
+    """One fetch, judged a while after its end, so that a slipping can counts as lost."""
     judge = Judge(find_scene("paper", 0, "red_can"), "red_can")
     async with (
         await ZenohBus.open(cocoro.run_dir.join_as("bench")) as bus,
@@ -129,7 +129,7 @@ def fetches(count: int, profile: str, sensors: str) -> bool:
 
 
 async def _commands(cocoro: Operator) -> dict[str, list[int]]:
-    """The stamps of what is commanded, and of what is detected, while a fetch goes on."""
+    """The stamps of commands and detections during a fetch."""
     stamps: dict[str, list[int]] = {}
     async with (
         await ZenohBus.open(cocoro.run_dir.join_as("bench")) as bus,
@@ -161,7 +161,7 @@ def periods(latency_s: float) -> bool:
 
 
 def _loops(status: Any, service: str) -> Any:
-    """Wherever it stands in the status."""
+    """The loops of a service, wherever they are in the status."""
     if isinstance(status, dict):
         if status.get("service") == service and status.get("loops"):
             return status["loops"]

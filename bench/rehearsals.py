@@ -1,7 +1,7 @@
-"""How often tasks succeed, by the truth: `python -m bench.rehearsals paper --sensors real --seeds 0:10`.
+"""Measures how often tasks succeed by the true state: `python -m bench.rehearsals paper --sensors real --seeds 0:10`.
 
-Rehearsals in parallel processes; one line each, then the share that reached what the set asks for. Exit code 1 when one
-did not. Nothing here depends on how busy the machine is but the wall time.
+Runs rehearsals in parallel processes and prints a line for each, then the share that met the set's conditions. Exit
+code 1 when one did not. Only the wall time depends on the machine's load.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""What a frame of the simulated Kinect costs, part by part: `python bench/render.py [--frames 640x480] [--rounds 60]`.
+"""Measures a frame of the simulated Kinect by parts: `python bench/render.py [--frames 640x480] [--rounds 60]`.
 
-The parts take turns in every round, so a machine that is busy for a while is so for all of them; read the ratios.
+The parts take turns in every round, so that a temporary load affects all of them; compare the ratios.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from sim.world import World
 
 FRAME_NS = 33_333_333
 TURN_RADPS = 0.5
-"""How fast the head turns in the row of the moving camera: 10 pixels of blur at 640 x 480."""
+"""Speed of the head for the moving camera: 10 pixels of blur at 640 x 480."""
 
 
 def parts_of(robot: Robot, world: World, width: int, height: int) -> dict[str, Callable[[], object]]:
-    """Every part by its name, ready to be called again and again; the first is what the others are compared with."""
+    """Every part by its name, to be called repeatedly. The others are compared with the first."""
     camera = robot.camera.scaled(width, height)
     poses, pose, light = world.visual_poses(), world.camera_pose(), world.light
     depth_pose = moved(pose, np.array(robot.kinect.depth_offset_m))
@@ -85,7 +85,7 @@ def turning_frames(capture: Callable[..., object], pose: np.ndarray, light: obje
 
 
 def measure(parts: dict[str, Callable[[], object]], rounds: int) -> dict[str, np.ndarray]:
-    """Milliseconds of each part, (rounds,)."""
+    """Times of each part, ms, (rounds,)."""
     taken: dict[str, list[float]] = {name: [] for name in parts}
     for round_ in range(rounds + 5):
         for name, part in parts.items():

@@ -1,7 +1,7 @@
-"""What the hardware services cost, at the ends of emulated wires: `python -m bench.servos`.
+"""Measures the CPU time of the hardware services on emulated wires: `python -m bench.servos`.
 
-The emulated hardware is a process of its own; measured are the services' processes, everything in them included:
-messages in and out (on a bus of one process), the lines' threads, the guard of the base's port.
+The emulated hardware is a separate process. The figures contain everything in the services' processes: messages (on a
+local bus), the threads of the lines, and the guard of the base's port.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ REPLY_S = 0.1
 
 
 class Meter:
-    """Share of one core that this process and those that it started have taken, and how often something came."""
+    """Share of one core used by this process and its children, and the rates of the messages."""
 
     def __init__(self, children: Sequence[psutil.Process] = ()) -> None:
         self._processes = [psutil.Process(), *children]
@@ -56,7 +56,7 @@ class Meter:
 
 
 async def measure_arm(folder: Path, seconds: float) -> str:
-    """Six servos on one line, each commanded and told 50 times a second."""
+    """Six servos on one line, each commanded and reported at 50 Hz."""
     robot, mesh, clock = Robot.load(), LocalMesh(), RealClock()
     joints = robot.network_joints("arm")
     async with Node("arm", mesh.join(), clock, robot) as node, Node("other", mesh.join(), clock, robot) as other:
@@ -84,7 +84,7 @@ async def measure_arm(folder: Path, seconds: float) -> str:
 
 
 async def measure_base(folder: Path, seconds: float) -> str:
-    """Driving, told at its own rate; the guard's process included."""
+    """A driving base with the guard's process, reported at the Create's rate."""
     robot, mesh, clock = Robot.load(), LocalMesh(), RealClock()
     async with Node("base", mesh.join(), clock, robot) as node, Node("other", mesh.join(), clock, robot) as other:
         node.spawn(run_base(node, BaseConfig(port=str(folder / "create"))))

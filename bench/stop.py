@@ -1,12 +1,12 @@
-"""The emergency stop of a robot that drives at full speed, among hostile neighbours: `python -m bench.stop [SITUATION]`
+"""Measures the emergency stop of a robot at full speed under hostile conditions: `python -m bench.stop [SITUATION]`
 
-Each stop is measured from the start of the program `cocoro stop` until the base commands zero, as the base's process
-says with its acknowledgement (both on CLOCK_MONOTONIC), and is judged by the base's state: latched, and standing.
+The time of a stop is from the start of the program `cocoro stop` until the base commands zero, by the base's
+acknowledgement (both on CLOCK_MONOTONIC). The base's state must then be latched and standing.
 `python -m bench.stop restarts` stops the robot, kills supervisor, executive and hardware in random order, starts it
-again and asks whether it is still latched.
+again and checks that it is still latched.
 
-Runs as root in mount and network namespaces of its own, so that it fills no disk of this machine's and stops no other
-robot. Exit code 1 when a stop had no effect, was not told truly or came later than the bound.
+Runs as root in separate mount and network namespaces, so that it fills no disk of this machine and stops no other
+robot. Exit code 1 when a stop had no effect, was reported wrongly or came later than the bound.
 """
 
 from __future__ import annotations
@@ -43,17 +43,17 @@ from services.executive.tasks import FetchTask
 
 STANDING_MPS = 0.01
 BOUNDS_S = {"quiet": 0.3, "loaded": 1.0}
-"""Of the worst; in all other situations it is a second, too."""
+"""Bound for the slowest stop, s, by situation; 1.0 for those that are not named."""
 COUNTS = {"quiet": 50, "loaded": 50, "restarts": 50}
 
 
 class Stopped(NamedTuple):
-    """How one stop went."""
+    """The result of one stop."""
 
     zero_s: float
-    """From the start of the program until zero was commanded."""
+    """Time from the start of the program until zero was commanded."""
     stood_s: float
-    """Until the base said that it stands."""
+    """Time until the base reported that it stands."""
     ended_s: float
     code: int
     said: str
@@ -124,7 +124,7 @@ publisher = session.declare_publisher(sys.argv[2], congestion_control=zenoh.Cong
 begun, sent = time.monotonic(), 0
 while True:
     for _ in range(1000):
-        publisher.put(b"rubbish that is no message of anybody's")
+        publisher.put(b"garbage that is not a message")
     sent += 1000
     ahead = sent / float(sys.argv[3]) - (time.monotonic() - begun)
     if ahead > 0:
@@ -136,7 +136,7 @@ while True:
 
 @contextmanager
 def flood(here: Place, rate_hz: float) -> Iterator[None]:
-    """Rubbish on the base's command key, by two neighbours of the same user."""
+    """Two processes of the same user that publish garbage on the base's command key."""
     sockets = [f"unixsock-stream/{path}" for path in sorted(here.run_dir.path.glob("*.sock"))]
     options = json.dumps(
         {
@@ -159,7 +159,7 @@ def flood(here: Place, rate_hz: float) -> Iterator[None]:
 
 @contextmanager
 def bad_member(here: Place) -> Iterator[None]:
-    """A register entry of this user's that is locked and says nothing that could be understood."""
+    """A locked register entry with unreadable contents."""
     entry = here.run_dir.path / "ffffffffffffffff.member"
     with entry.open("w") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
@@ -239,7 +239,7 @@ def run(situation: str, count: int, any_time: bool) -> dict[str, Any]:
 
 
 async def _still_latched(here: Place) -> str:
-    """What is wrong with the latch of a robot that is up again, or ''."""
+    """The fault of the latch of a restarted robot; '' when it is latched."""
     async with (
         await ZenohBus.open(here.run_dir.join_as("bench")) as bus,
         Node("tester", bus, FollowedClock(), Robot.load()) as node,
@@ -251,7 +251,7 @@ async def _still_latched(here: Place) -> str:
         reporting: tuple[Topic[Any], ...] = (topics.BASE_STATE, topics.ARM_STATE, topics.HAND_STATE)
         for topic in reporting:
             await asyncio.wait_for(node.latest(topic).next(), PATIENCE_S)
-        await asyncio.sleep(1.5)  # longer than a cold start takes to be believed
+        await asyncio.sleep(1.5)  # longer than the executive takes to believe a cold start
         reply = await node.call(topics.RUN, TaskRequest(task=FetchTask(label="red_can")), 10.0)
         if reply.accepted or set(states.values()) != {"latched"}:
             return f"{states}, a fetch was {reply.refusal or 'accepted'}"
@@ -267,7 +267,7 @@ def _kill(here: Place, who: str) -> None:
 
 
 def restarts(count: int, seed: int) -> list[str]:
-    """Whom was killed in which order, for each time that the latch was forgotten."""
+    """For each time that the latch was lost, the processes that were killed, in order."""
     draws = random.Random(seed)
     forgotten = []
     for number in range(count):
@@ -279,7 +279,7 @@ def restarts(count: int, seed: int) -> list[str]:
             draws.shuffle(order)
             order = order[: draws.randint(1, len(order))]
             for who in order:
-                time.sleep(draws.choice((0.0, 0.0, 0.05, 0.3, 1.0)))  # a moment of the restart, drawn
+                time.sleep(draws.choice((0.0, 0.0, 0.05, 0.3, 1.0)))  # a random moment of the restart
                 _kill(here, who)
             if "supervisor" in order:
                 here.up("sim-wire" if wire else "sim", "--frames", "160x120@10")
@@ -295,7 +295,7 @@ def restarts(count: int, seed: int) -> list[str]:
 
 
 def in_namespaces() -> None:
-    """Go on in mount and network namespaces of our own."""
+    """Enter new mount and network namespaces."""
     if os.environ.get("BENCH_STOP_INSIDE"):
         subprocess.run(["mount", "--make-rprivate", "/"], check=True)
         return
@@ -308,7 +308,7 @@ def main() -> int:
     parser.add_argument("situations", nargs="*", metavar="SITUATION", help=f"{', '.join(SITUATIONS)}, restarts; or all")
     parser.add_argument("--count", type=int, help="stops in each; 50 where it is quiet or loaded, else 20")
     parser.add_argument("--seed", type=int, default=0, help="of the restarts")
-    parser.add_argument("--any-time", action="store_true", help="judge the effect and what is told, not the time")
+    parser.add_argument("--any-time", action="store_true", help="judge the effect and the report, not the time")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     wanted = options.situations or list(SITUATIONS)

@@ -1,4 +1,4 @@
-"""The robot of `bench.stop`: where it lives, and what drives it."""
+"""The robot of `bench.stop`: its directories and its driver."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from deploy.rundir import RunDir
 
 NAME = "calliope"
 CIRCLE = (0.41, 0.29)
-"""Wheel speeds of a circle of 0.75 m, on which the body drives at 0.35 m/s."""
+"""Wheel speeds for a circle of 0.75 m at 0.35 m/s."""
 FULL_MPS = 0.345
 PATIENCE_S = 60.0
 PROFILE = """
@@ -43,17 +43,17 @@ radius_m = 0.033
 height_m = 0.12
 position_m = [4.0, 4.0]
 """
-"""Nothing is in the way."""
+"""A scene without obstacles."""
 
 
 class Driver:
-    """Stands in for the planner: drives on a circle for as long as it is told to."""
+    """Replaces the planner: drives on a circle while it is requested."""
 
     def __init__(self, node: Node) -> None:
         self.node = node
         self.state: BaseState | None = None
         self.latched_s = 0.0
-        """When this process heard of it."""
+        """When this process received it."""
         self._news = asyncio.Event()
         node.on(topics.BASE_STATE, self._hear)
         node.spawn(self._drive())
@@ -86,7 +86,7 @@ class Driver:
 
 
 class Place:
-    """Where a robot of the bench lives, and how its commands are called."""
+    """The directories of a robot and its commands."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
@@ -119,7 +119,7 @@ class Place:
 
 @contextmanager
 def place() -> Iterator[Place]:
-    """A robot's place on disks of its own: 64 MB each, in memory, so that they can be filled."""
+    """Directories of a robot on separate disks of 64 MB in memory, so that they can be filled."""
     root = Path(tempfile.mkdtemp(prefix="cs"))
     with ExitStack() as stack:
         stack.callback(lambda: subprocess.run(["rm", "-rf", str(root)], check=False))

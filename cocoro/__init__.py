@@ -9,6 +9,7 @@ Everything that a component's author needs can be imported from here; each name 
 - Messages: `Topic` and `Request` declare what travels; `Message` is the base of every published message, `Qos` the
   quality of service of a key, `Bus` the interface to the mesh. `Latest` and `Stream` read a topic's `Inbox`, and a
   `Publisher` publishes on one topic.
+- A task: `Task` and `Skills`, `Action` for the planner, `TaskFailedError` to end it as failed.
 - Time: `Clock` and its kinds, `is_fresh` for ages, `every` for loops, `NS` nanoseconds per second; `run_virtual` runs a
   coroutine in virtual time.
 - The robot: `Robot` is the description of its body, `Catalogue` of `ObjectSpec`s the objects that it knows, `History` a
@@ -39,17 +40,20 @@ if TYPE_CHECKING:
     from cocoro.inbox import Inbox, Latest, Stream
     from cocoro.latch import ServiceLatch
     from cocoro.messages import Message
+    from cocoro.messages.actions import Action
     from cocoro.node import Node
     from cocoro.objects import Catalogue, ObjectSpec
     from cocoro.participant import Answer, Participant
     from cocoro.publisher import Publisher
     from cocoro.robot import Robot
     from cocoro.stepper import every
+    from cocoro.tasks import Skills, Task, TaskFailedError
     from cocoro.topics import Request, Topic
     from cocoro.vloop import run_virtual
 
 __all__ = [
     "NS",
+    "Action",
     "Answer",
     "Bus",
     "CallTimeoutError",
@@ -82,8 +86,11 @@ __all__ = [
     "Sample",
     "Schedule",
     "ServiceLatch",
+    "Skills",
     "Stream",
     "Take",
+    "Task",
+    "TaskFailedError",
     "Topic",
     "VirtualClock",
     "every",
@@ -103,6 +110,8 @@ _MODULES = {
     "inbox": ("Inbox", "Latest", "Stream"),
     "latch": ("ServiceLatch",),
     "messages": ("Message",),
+    "messages.actions": ("Action",),
+    "tasks": ("Skills", "Task", "TaskFailedError"),
     "node": ("Node",),
     "objects": ("Catalogue", "ObjectSpec"),
     "participant": ("Answer", "Participant"),

@@ -1,4 +1,4 @@
-"""What a service is and how it was started: enough to record it and to make its core again."""
+"""Description of a service and of its start: enough to record it and to make its core again."""
 
 from __future__ import annotations
 

@@ -83,7 +83,7 @@ async def sleep(clock: Clock, seconds: float) -> bool:
 
 
 class _OwnTime:
-    """What clocks have in common whose time comes from no other process."""
+    """Base of clocks whose time comes from this process."""
 
     epoch = 0
     stands = False

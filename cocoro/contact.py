@@ -1,4 +1,4 @@
-"""What is known about a service whose liveliness token dropped, and whether this process itself was asleep.
+"""Finds out what became of a service whose liveliness token dropped, and whether this process itself was asleep.
 
 A token drops when its process ends, and also when the mesh has not heard from that process for the lease: because it
 was stopped, it hangs, the connection is broken, or this process was asleep. A dead process of this machine no longer

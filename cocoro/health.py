@@ -1,4 +1,4 @@
-"""What a node measures of itself for its health message: counts and rates, loop periods, CPU and memory."""
+"""Measurements for a node's health message: counts and rates, loop periods, CPU and memory."""
 
 from __future__ import annotations
 
@@ -7,12 +7,13 @@ import resource
 import sys
 import time
 from collections import deque
-
-import numpy as np
-import psutil
+from typing import TYPE_CHECKING
 
 from cocoro.clock import NS
 from cocoro.messages import LoopHealth
+
+if TYPE_CHECKING:
+    import psutil
 
 log = logging.getLogger(__name__)
 
@@ -73,6 +74,8 @@ class LoopMeter:
         self._last_ns = now_ns
 
     def health(self) -> LoopHealth:
+        import numpy as np  # slow to import; operators' commands import this module for `Rate`
+
         periods, steps = np.array(self.periods_ms), np.array(self.steps_ms)
         self.periods_ms.clear()
         self.steps_ms.clear()
@@ -91,6 +94,8 @@ class ProcessMeter:
     """CPU share and resident memory of this process."""
 
     def __init__(self) -> None:
+        import psutil
+
         self._cpu_s, self._at_s = time.process_time(), time.monotonic()
         self._process: psutil.Process | None = None
         try:

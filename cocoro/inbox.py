@@ -1,4 +1,4 @@
-"""What a participant receives on one topic: checked, counted, and handed to its readers."""
+"""Receives one topic: checks and counts its messages, and hands them to the topic's readers."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class Inbox(Generic[M]):
             self._readers.remove(reader)
 
     def deliver(self, key: str, payload: Payload) -> None:
-        """The bus's callback. Never raises: a payload that cannot be accepted is counted and dropped."""
+        """The bus's callback. A payload that cannot be accepted is counted and dropped."""
         if len(payload) > self.topic.max_bytes:
             self._reject(key, f"{len(payload)} bytes, at most {self.topic.max_bytes} are taken")
             return

@@ -12,6 +12,7 @@ from functools import cache
 from typing import Any, NamedTuple
 
 from cocoro.component import Component
+from cocoro.entry_points import added_to
 from cocoro.errors import ConfigError
 from cocoro.topics import REQUESTS, TOPICS, Request, Topic, find_topic
 
@@ -36,28 +37,23 @@ class ThirdParties(NamedTuple):
 @cache
 def third_parties() -> ThirdParties:
     """All installed components of third parties; found once in a process."""
-    from importlib.metadata import entry_points  # slow to import, and rarely needed
-
     components: dict[str, Component] = {}
     topics: dict[str, Topic[Any]] = {}
     requests: dict[str, Request[Any, Any]] = {}
-    problems: list[str] = []
-    for point in entry_points(group=GROUP):
-        where = f"entry point {point.name!r} of {point.dist.name if point.dist else 'an unknown distribution'}"
+    found = added_to(GROUP)
+    problems = list(found.faults)
+    for name, component, origin in found.added:
         try:
-            component = point.load()
-            if not isinstance(component, Component) or component.name != point.name:
-                raise ConfigError(f"{point.value} is not a Component named {point.name!r}")
-            if component.name in components:
+            if not isinstance(component, Component) or component.name != name:
+                raise ConfigError(f"its value is not a Component named {name!r}")
+            if name in components:
                 raise ConfigError("there is a component of that name already")
             new_topics = _new((*component.publishes, *component.reads), TOPICS, topics)
             new_requests = _new((*component.serves, *component.calls), REQUESTS, requests)
         except ConfigError as error:
-            problems.append(f"{where}: {error}")
-        except Exception as error:  # third-party code runs here
-            problems.append(f"{where} cannot be loaded: {type(error).__name__}: {error}")
+            problems.append(f"{origin}: {error}")
         else:
-            components[component.name] = component
+            components[name] = component
             topics |= new_topics
             requests |= new_requests
     return ThirdParties(components, tuple(topics.values()), tuple(requests.values()), tuple(problems))

@@ -270,7 +270,7 @@ class Node(Participant):
     # --- health -----------------------------------------------------------------------------------
 
     def about(self) -> AboutReply:
-        """What this service is and how it was started."""
+        """Describes this service and its start."""
         return about(
             self.name, self.robot_name, self.robot, module=self.module, config=self.config,
             record_steps=self.record_steps, virtual=self.clock.virtual,

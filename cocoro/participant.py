@@ -1,4 +1,4 @@
-"""What every participant of a robot's mesh can do: read topics, call requests, watch which services are alive.
+"""A participant of a robot's mesh: reads topics, calls requests, watches which services are alive.
 
 A service is a `cocoro.node.Node`, which also publishes and serves. The command line is a participant alone.
 """
@@ -40,7 +40,7 @@ class Participant:
     frame_depth: ClassVar[int] = 2
     """Frames that may wait for the event loop, per key."""
     depth: ClassVar[int] = 256
-    """The same of all other messages."""
+    """Other messages that may wait for the event loop, per key."""
 
     def __init__(self, bus: Bus, clock: Clock, robot_name: str) -> None:
         self.bus = bus

@@ -42,7 +42,7 @@ class Base(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_wheel_speed_mps: Positive
     wheel_acceleration_mps2: Positive
     command_timeout_s: Positive
-    """Upper bound for how long a wheel command counts, at any speed."""
+    """A wheel command is valid for at most this time, at any speed."""
     state_rate_hz: Positive
     stand_within_s: Positive = 0.3
     """The wheels stand within this time after the last command, from any speed."""
@@ -97,7 +97,7 @@ class Network(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     baud: int
     rate_hz: Positive
     command_timeout_s: Positive
-    """How long a command to these joints counts."""
+    """A command to these joints is valid for this time."""
 
 
 class Claw(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

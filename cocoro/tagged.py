@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from functools import cache
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Generic, TypeVar
 
 import msgspec
 
@@ -26,29 +25,6 @@ class Tagged(msgspec.Struct, frozen=True):
     def target(self) -> str:
         """The label of the object that it concerns; '' for none."""
         return str(getattr(self, "label", ""))
-
-
-class Added(NamedTuple):
-    """What the entry points of a group point to."""
-
-    values: tuple[Any, ...]
-    faults: tuple[str, ...]
-    """Why others could not be loaded."""
-
-
-@cache
-def added_by(group: str) -> Added:
-    """Load the entry points of a group, once in a process. One that cannot be loaded costs itself only."""
-    from importlib.metadata import entry_points  # takes 40 ms to import, which most processes never need
-
-    values, faults = [], []
-    for point in entry_points(group=group):
-        try:
-            values.append(point.load())
-        except Exception as error:  # whatever a third party's module raises
-            owner = point.dist.name if point.dist else "an unknown distribution"
-            faults.append(f"entry point {point.name!r} of {owner} cannot be loaded: {type(error).__name__}: {error}")
-    return Added(tuple(values), tuple(faults))
 
 
 class Registry(Generic[T]):

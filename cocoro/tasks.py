@@ -21,9 +21,10 @@ from typing import Annotated, Any, ClassVar, Literal, Protocol
 import msgspec
 from msgspec import Meta
 
+from cocoro.entry_points import added_to
 from cocoro.messages import PlannerStatus
 from cocoro.messages.actions import TASK_GROUP, Action
-from cocoro.tagged import Registry, Tagged, added_by
+from cocoro.tagged import Registry, Tagged
 from cocoro.topics import Topic
 from cocoro.units import Positive, Vec2, Vec3
 
@@ -106,7 +107,7 @@ class Task(Tagged, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_fi
     needs_label: ClassVar[Literal["", "known", "graspable"]] = ""
     """Whether the object that `label` names must be known, or known and graspable."""
     hand: ClassVar[Literal["empty", "holding", "any"]] = "empty"
-    """What the hand must be when the task starts."""
+    """State of the hand in which the task may start."""
     needs_battery: ClassVar[bool] = True
     """False: the task may start with a low battery."""
     snapshot_phase: ClassVar[str] = ""
@@ -134,6 +135,6 @@ def registry(own: Iterable[type[Task]]) -> Registry[Task]:
 
 
 def _third_parties() -> Iterator[type[Task]]:
-    for value in added_by(TASK_GROUP).values:
+    for _, value, _ in added_to(TASK_GROUP).added:
         if isinstance(value, type) and issubclass(value, Task):
             yield value

@@ -171,7 +171,7 @@ MODEL = Topic(
 )  # fmt: skip
 INTENT = Topic(
     "executive/intent", m.Intent, Qos.COMMAND, 50.0, 0.3,
-    "The wanted behaviour. The wheels stop when it is 0.15 s old; beyond its age the planner becomes idle.",
+    "The wanted behaviour. The wheels stop after `command_timeout_s`; beyond its age the planner becomes idle.",
 )  # fmt: skip
 TASK = Topic(
     "executive/task", m.TaskState, Qos.EVENT, 5.0, 2.0,

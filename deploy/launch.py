@@ -154,14 +154,14 @@ def _stop_signal() -> asyncio.Event:
     loop, stop = asyncio.get_running_loop(), asyncio.Event()
     before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
 
-    def told() -> None:
+    def on_signal() -> None:
         stop.set()
         for number, handler in before.items():
             loop.remove_signal_handler(number)
             signal.signal(number, handler)
 
     for number in before:
-        loop.add_signal_handler(number, told)
+        loop.add_signal_handler(number, on_signal)
     return stop
 
 

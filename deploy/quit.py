@@ -1,8 +1,8 @@
-"""Ending a process without taking its interpreter apart.
+"""Ends a process without finalizing its interpreter.
 
-Python ends a thread that asks for an interpreter which is being taken apart by unwinding its stack. Zenoh's threads
-do not bear that: they abort the process ("FATAL: exception not rethrown", exit code -6) when one of them comes back
-with a last sample in just that moment, though all work was done and the mesh was left.
+While Python finalizes, a thread that asks for the interpreter is ended by unwinding its stack. Zenoh's threads cannot
+be unwound: if one of them calls back at that moment, the process aborts ("FATAL: exception not rethrown", exit code
+-6), although all work was done and the mesh had been left.
 """
 
 from __future__ import annotations
@@ -14,19 +14,19 @@ import threading
 from contextlib import suppress
 from typing import NoReturn
 
-UNSAID = 120
-"""Python's own exit code for it."""
+UNFLUSHED = 120
+"""Python's exit code for output that could not be flushed."""
 
 
 def quit_process(code: int) -> NoReturn:
-    """End with this exit code: other threads that are no daemons end first, then what was registered with `atexit`
-    is called and what was printed is written."""
-    threading._shutdown()  # type: ignore[attr-defined] # with executors' threads, which no public call ends
+    """Ends the process with this exit code, after other non-daemon threads have ended, `atexit` functions have run and
+    the output is flushed."""
+    threading._shutdown()  # type: ignore[attr-defined] # executors' threads are ended by no public call
     atexit._run_exitfuncs()
     for stream in (sys.stdout, sys.stderr):
         try:
-            with suppress(ValueError, AttributeError):  # it is closed, or there is none
+            with suppress(ValueError, AttributeError):  # closed or missing
                 stream.flush()
-        except OSError:  # nobody reads it any more, or the disk is full: what was printed has not arrived
-            code = code or UNSAID
+        except OSError:  # no reader any more, or a full disk
+            code = code or UNFLUSHED
     os._exit(code)

@@ -116,6 +116,8 @@ class Simulator:
         self._states: tuple[tuple[Publisher[Any], Callable[[], Message]], ...] = ()
         self.rate = 1.0
         self._motion: MotionWriter | None = None
+        self.makes_time = node.clock.needs_ticks
+        """Whether the robot's clock follows this simulator; otherwise the simulator keeps up with the clock."""
         node.drive_clock()
 
     def connect_camera(self, kinect: Node) -> None:
@@ -234,13 +236,13 @@ async def keep_going(node: Node, config: SimConfig, simulator: Simulator) -> Non
     with ExitStack() as stack:
         if config.motion:
             stack.enter_context(simulator.write_motion(Path(config.motion)))
-        if node.clock.virtual:
-            await _in_virtual_time(simulator, node.clock)
-        else:
+        if simulator.makes_time:
             await _in_real_time(simulator, config.pace)
+        else:
+            await _at_the_clocks_pace(simulator, node.clock)
 
 
-async def _in_virtual_time(simulator: Simulator, clock: Clock) -> None:
+async def _at_the_clocks_pace(simulator: Simulator, clock: Clock) -> None:
     ticks = 0
     while True:
         ticks += 1

@@ -1,4 +1,4 @@
-"""Both buses, for tests of what either promises: the local one in virtual time, the zenoh one over Unix sockets."""
+"""Both buses for one test suite: the local bus in virtual time, and the zenoh bus over Unix sockets."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Mesh(Protocol):
     async def join(self) -> Bus: ...
 
     async def drop(self, bus: Bus) -> None:
-        """End a participant without its taking back anything itself."""
+        """End a participant without closing its declarations."""
 
 
 class Local:
@@ -62,7 +62,7 @@ Scenario = Callable[..., Coroutine[Any, Any, None]]
 
 
 def scenario(test: Scenario) -> Callable[..., None]:
-    """A test that is a coroutine: run on the mesh's own kind of loop, with a limit that only a failure reaches."""
+    """Run a coroutine as a test, on the event loop of the mesh's kind and with a time limit for failures."""
 
     @functools.wraps(test)
     def run(mesh: Mesh, **fixtures: Any) -> None:
@@ -82,7 +82,7 @@ async def joined(mesh: Mesh, count: int) -> AsyncIterator[list[Bus]]:
 
 
 class Inbox:
-    """Collects what a subscription gives, and lets a test wait for what it must contain."""
+    """Collects the samples of a subscription; a test can wait for its contents."""
 
     def __init__(self) -> None:
         self.samples: list[tuple[str, bytes]] = []
@@ -106,19 +106,19 @@ class Inbox:
 
 
 class Listener:
-    """Collects lots, and lets a test wait for so many samples."""
+    """Collects batches, and lets a test wait for so many samples."""
 
     def __init__(self) -> None:
-        self.lots: list[list[Received]] = []
+        self.batches: list[list[Received]] = []
         self._came = asyncio.Event()
 
-    def __call__(self, lot: list[Received]) -> None:
-        self.lots.append(lot)
+    def __call__(self, batch: list[Received]) -> None:
+        self.batches.append(batch)
         self._came.set()
 
     @property
     def heard(self) -> list[Received]:
-        return [each for lot in self.lots for each in lot]
+        return [each for batch in self.batches for each in batch]
 
     async def has(self, count: int) -> None:
         while len(self.heard) < count:
@@ -130,7 +130,7 @@ numbers = itertools.count()
 
 
 async def known(who: Bus, *by: Bus) -> None:
-    """Wait until others know all that a bus has declared so far: declarations arrive in their order."""
+    """Wait until other buses know all earlier declarations of a bus; declarations arrive in order."""
     key = f"known/{next(numbers)}"
     token = who.declare_alive(key)
     for bus in by:

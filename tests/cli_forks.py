@@ -1,8 +1,7 @@
-"""Runs the command in many situations, cheaply: one process that has imported it, and forks for each of them.
+"""Runs the `cocoro` command in many situations at little cost: a process that has imported it, and a fork for each.
 
-`Forks` is used by tests. What it starts is this very file, as a program that takes one situation a line, as JSON, and
-answers with how the command ended in it. A forked child opens no zenoh session: the commands that it is given end
-before.
+Tests use `Forks`. It starts this file as a program that reads one situation per line, as JSON, and answers with the
+end of the command. A forked child cannot open a zenoh session, so only commands that end before may be given.
 """
 
 from __future__ import annotations
@@ -32,27 +31,27 @@ from typing import Any
 from cocoro.errors import CocoroError
 
 PATIENCE_S = 60.0
-"""Far more than any of the commands takes, on however busy a machine: it hangs."""
+"""Time limit of a command, s; one that takes longer hangs."""
 NEW_MOUNTS, PRIVATE, RECURSIVE, READ_ONLY = 0x20000, 1 << 18, 1 << 14, 1
-"""Of unshare(2) and mount(2)."""
+"""Flags of unshare(2) and mount(2)."""
 LATER = 7
 TALKED = 3
 FULL = "size=4k"
-"""Of an empty file system: it is filled."""
+"""Options of a small file system, which is then filled."""
 NO_MOUNTS = 77
-"""Exit code of a child that may not have mounts of its own."""
+"""Exit code of a child that may not make mounts."""
 
 
 OFTEN = (
     "services.base.doctor", "services.capture.service", "services.kinect.doctor", "services.kinect.tools",
     "services.servos.doctor", "services.servos.tools", "apps.captures.export.foxglove", "apps.captures.export.video",
 )  # fmt: skip
-"""What commands import when they are called."""
+"""Modules that commands import when they are called."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """A command's situation."""
+    """A command and its situation."""
 
     arguments: list[str]
     folder: str
@@ -64,30 +63,30 @@ class Case:
     unbuffered: bool = False
     encoding: str = "utf-8"
     env: dict[str, str | None] = field(default_factory=dict)
-    """None takes a variable away."""
+    """Environment variables; None removes one."""
     no_folder: bool = False
     """The current directory is removed."""
     mounts: list[tuple[str, str]] = field(default_factory=list)
-    """Where an empty file system is, and its options (`ro` is read-only); the command alone sees it."""
+    """Places and options of empty file systems (`ro`: read-only) that only the command sees."""
     at_call: int | None = None
-    """In which call of a Python function a signal comes; -1 counts them."""
+    """Number of the Python function call that raises a signal; -1 counts the calls."""
     number: int = signal.SIGINT
     again: bool = False
-    """And once more, a few calls later."""
+    """Whether the signal is raised again a few calls later."""
     deaf: bool = False
-    """Ctrl-C is ignored."""
+    """Whether SIGINT is ignored."""
     fresh: bool = False
-    """With what the command imports of this project not yet imported."""
+    """Whether the project's modules must be imported again."""
     instead: tuple[str, str] | None = None
-    """A function as `module:name`, and which of this file's is called in its place: `bug`, `talk` or `log`."""
+    """A function as `module:name`, and its replacement from this file: `bug`, `talk` or `log`."""
 
 
 @dataclass(frozen=True)
 class Ending:
-    """How a command ended."""
+    """The end of a command."""
 
     code: int
-    """Negative for a signal."""
+    """Exit code; negative for a signal."""
     out: str
     err: str
     hung: bool = False
@@ -95,7 +94,7 @@ class Ending:
 
 
 class Forks:
-    """A context manager, and called with a Case, which it plays."""
+    """A context manager; call it with a Case to run that."""
 
     def __init__(self, **env: str) -> None:
         threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
@@ -129,17 +128,17 @@ class Forks:
 
 
 def serve() -> None:
-    """Import everything, then play what comes."""
+    """Import everything, then run the cases from standard input."""
     with contextlib.redirect_stdout(sys.stderr):
         preload()
-    gc.disable()  # a collection touches, and so copies, what the children share
+    gc.disable()  # garbage collection would touch, and so copy, the memory that the children share
     for line in sys.stdin:
         ending = play(Case(**named_here(json.loads(line))))
         print(json.dumps(asdict(ending)), flush=True)
 
 
 def named_here(value: Any) -> Any:
-    """With file names as this process's locale spells them: in that of C, `ü` is two bytes of no character."""
+    """Decode file names by this process's locale; in the C locale `ü` is two undecodable bytes."""
     if isinstance(value, str):
         return os.fsdecode(value.encode("utf-8", "surrogateescape"))
     if isinstance(value, list):
@@ -150,7 +149,7 @@ def named_here(value: Any) -> Any:
 def preload() -> None:
     import typer.main
 
-    typer.main.get_command = functools.cache(typer.main.get_command)  # to make them is most of what a command costs
+    typer.main.get_command = functools.cache(typer.main.get_command)  # making them takes most of a command's time
     typer.main.get_group = functools.cache(typer.main.get_group)
     from apps import cli
     from apps.cli.main import main
@@ -194,7 +193,7 @@ def play(case: Case) -> Ending:
 
 
 def ended(child: int, master: int, out: int) -> bool:
-    """Whether it ends; takes what it writes on its terminal meanwhile."""
+    """Wait for the end of the child and read its terminal meanwhile; returns whether it ended."""
     pid_fd = os.pidfd_open(child)
     try:
         while True:
@@ -202,7 +201,7 @@ def ended(child: int, master: int, out: int) -> bool:
             if master in ready:
                 try:
                     os.write(out, os.read(master, 65536))
-                except OSError:  # nobody has the terminal any more
+                except OSError:  # no process has the terminal any more
                     return bool(select.select([pid_fd], [], [], PATIENCE_S)[0])
             else:
                 return pid_fd in ready
@@ -214,13 +213,13 @@ def ended(child: int, master: int, out: int) -> bool:
 
 
 def live(case: Case, kept: dict[str, int], narrow: int, counted: int) -> None:
-    """Be the process `cocoro`, as the interpreter has it when its first line runs."""
+    """Become the process `cocoro`, in the state in which the interpreter runs its first line."""
     for name, value in case.env.items():
         if value is None:
             os.environ.pop(name, None)
         else:
             os.environ[name] = value
-    tempfile.tempdir = None  # it has been asked for here
+    tempfile.tempdir = None  # its cached value is of this process
     mount(case.mounts)
     os.chdir(case.folder)
     if case.no_folder:
@@ -253,7 +252,7 @@ def live(case: Case, kept: dict[str, int], narrow: int, counted: int) -> None:
 
 
 def opened(place: str, kept: int, narrow: int) -> int | None:
-    """A descriptor of what a standard stream is to be; None for none."""
+    """Open the file descriptor of a standard stream; None for a closed one."""
     if place == "gone":
         reader, writer = os.pipe()
         os.close(reader)
@@ -295,7 +294,7 @@ def bug(*_: object, **__: object) -> None:
 
 
 def talk(*_: object) -> int:
-    """A command that has much to say, each time at once, and gets to its end."""
+    """A command that prints much, unbuffered, and ends."""
     for line in range(3):
         for stream in (sys.stdout, sys.stderr):
             print(line, file=stream, flush=True)
@@ -303,7 +302,7 @@ def talk(*_: object) -> int:
 
 
 def log(*_: object) -> str:
-    """A fault that a library, the event loop say, logs and goes on after."""
+    """Log a fault as a library does that continues, such as the event loop."""
     logging.getLogger("asyncio").error("a callback failed\nwith details", exc_info=ValueError("of two\nlines"))
     return ""
 

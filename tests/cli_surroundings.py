@@ -1,4 +1,4 @@
-"""Every command of `cocoro`, the surroundings in which each is tried, and what must hold of it there."""
+"""Every command of `cocoro`, the surroundings in which each is run, and the conditions that it must meet there."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ ARGUMENTS: dict[str, str] = {
     "experiment": "E9",
     "up": "{name}.toml",
     "run": "{name}",
-    "estop": "--robot {name}",  # else it would stop every robot on this machine
+    "estop": "--robot {name}",  # otherwise it would stop every robot on this machine
     "stop": "--robot {name}",
     "objects learn": "mug --from {name}.png",
     "capture info": "{capture}",
@@ -43,6 +43,7 @@ ARGUMENTS: dict[str, str] = {
     "capture reexecute": "{capture} --service {name}",
     "capture rerun": "{capture} --service {name}",
     "new service": "nearest --into {name}",
+    "new task": "greet --into {name}",
     "servos set-id": "1 2 --port {name}",
     "servos calibrate": "elbow",
     "servos limits": "elbow",
@@ -50,12 +51,12 @@ ARGUMENTS: dict[str, str] = {
     "learn arm": "{name}.jsonl",
     "learn wheels": "{name}.jsonl",
 }
-"""For each command arguments with which it ends soon and, where it can without a robot, well. No zenoh session may be
-opened: the commands run in forked children."""
+"""For each command arguments with which it ends soon and, if it can without a robot, successfully. It must not open a
+zenoh session, since it runs in a forked child."""
 
 
 def commands(command: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[str, Any]]:
-    """Each that can be called, by its name."""
+    """All commands by name, without groups."""
     if not hasattr(command, "commands"):
         yield " ".join(path), command
         return
@@ -75,20 +76,20 @@ COMMANDS = dict(found for name, command in LOADED.items() for found in commands(
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What is wrong around a command."""
+    """Faults of a command's environment."""
 
     what: dict[str, Any] = field(default_factory=dict)
-    """Fields of a Case; in `env` and `mounts` {root} is a folder of the test's own."""
+    """Fields of a Case; {root} in `env` and `mounts` is the test's folder."""
     odd: str = ""
-    """Is in the names of all folders and files."""
+    """Part of the names of all folders and files."""
     lost: bool = False
-    """Standard output does not arrive."""
+    """Whether standard output is lost."""
     same: bool = True
-    """It ends with the exit code that it has when all is well."""
+    """Whether the exit code is that of good surroundings."""
     lines: int = 1
-    """At most so many things are said of it."""
+    """Greatest number of error messages."""
     helps: bool = False
-    """`--help` is tried, too."""
+    """Whether `--help` is run, too."""
 
 
 NOT_UTF8 = "caf\udce9"
@@ -135,7 +136,7 @@ SURROUNDINGS: dict[str, Surroundings] = {
     "a run directory too long for a file": Surroundings({"env": {"COCORO_RUN_DIR": "{root}/" + "x" * 300}}, same=False),
     "no /proc": Surroundings({"mounts": [("/proc", "size=64k")]}, lines=2),
 }
-"""What is independent of each other is tried at once."""
+"""Each row combines faults that do not depend on one another."""
 
 NEVER_SAID = (
     "Traceback", "Exception ignored", "internal error", "excepthook", "WARN", "Fatal", "Error in", "Aborted",
@@ -143,7 +144,7 @@ NEVER_SAID = (
 
 
 class Table:
-    """Plays commands in surroundings."""
+    """Runs commands in surroundings."""
 
     def __init__(self, forks: Callable[[Case], Ending], root: Path) -> None:
         self._forks = forks
@@ -182,20 +183,20 @@ class Table:
             shutil.rmtree(run)
 
     def calls(self, command: str, fresh: bool) -> int:
-        """How many functions of Python's it calls."""
+        """Number of Python function calls of a command."""
         if (command, fresh) not in self._calls:
             self._calls[command, fresh] = self.play(command, Surroundings({"at_call": -1, "fresh": fresh})).calls
         return self._calls[command, fresh]
 
     def usual(self, command: str, help_: bool = False) -> Ending:
-        """How it ends when all is well."""
+        """The end of a command in good surroundings."""
         if (command, help_) not in self._usual:
             self._usual[command, help_] = self.play(command, Surroundings(), help_)
         return self._usual[command, help_]
 
 
 def wrong(ending: Ending, usual: Ending, surroundings: Surroundings) -> list[str]:
-    """What is not as it must be."""
+    """The requirements that the ending of a command misses."""
     found = []
     said = ending.out + ending.err
     lines = [line for line in ending.err.splitlines() if line.startswith("cocoro: ")]
@@ -210,7 +211,7 @@ def wrong(ending: Ending, usual: Ending, surroundings: Surroundings) -> list[str
         found.append(f"says {words[0]}")
     if lost and kept and not any("standard output" in line for line in lines):
         found.append("does not say that its output is lost")
-    if len(set(lines)) > surroundings.lines + lost:  # Ctrl-C while a line is written may write it twice
+    if len(set(lines)) > surroundings.lines + lost:  # SIGINT during a write may print a line twice
         found.append("says several things")
     if kept and ending.code and not ending.err.strip() and not ending.out.strip():
         found.append("fails in silence")

@@ -1,6 +1,6 @@
-"""The clocks' tests: the system's clocks as the virtual loop's time, so that a test decides what passes.
+"""For tests of clocks: the system's clocks follow the time of the virtual loop.
 
-`pytest_plugins` of conftest.py makes the fixture known.
+`pytest_plugins` in conftest.py registers the fixture.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from cocoro.clock import NS
 
 @pytest.fixture
 def real_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The system's clocks as the virtual loop's time, from 100 s on, so that a test decides what passes."""
+    """Have the system's clocks follow the virtual loop's time, from 100 s on."""
 
     class Time:
         CLOCK_BOOTTIME = "boottime"
@@ -44,7 +44,7 @@ def loop_s() -> float:
 
 
 async def started(waiting: Coroutine[Any, Any, bool]) -> asyncio.Task[bool]:
-    """A task that has come to its first wait."""
+    """Start a task and run it until its first wait."""
     task = asyncio.create_task(waiting)
     for _ in range(5):
         await asyncio.sleep(0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import signal
 from collections.abc import Iterator
@@ -64,10 +65,19 @@ def mesh(request: pytest.FixtureRequest, short_path: Path) -> Mesh:
     return Local() if request.param == "local" else Zenoh(short_path)
 
 
+@pytest.fixture(scope="session")
+def states(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Folders for latch records, not made yet: cheaper than `mktemp`, which looks through all earlier ones."""
+    folder = tmp_path_factory.mktemp("states")
+    return (folder / str(number) for number in itertools.count())
+
+
 @pytest.fixture(autouse=True)
-def latches_of_this_test(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
+def latches_of_this_test(states: Iterator[Path], monkeypatch: pytest.MonkeyPatch) -> None:
     """Give each test its own folder for latch records, so that it begins with none latched."""
-    monkeypatch.setenv("COCORO_STATE_DIR", str(tmp_path_factory.mktemp("state")))
+    state = next(states)
+    state.mkdir(mode=0o700)
+    monkeypatch.setenv("COCORO_STATE_DIR", str(state))
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -1,5 +1,7 @@
-"""To a base on the mesh of a robot that is up: planner and executive, which release it and drive it straight on at
-0.2 m/s: `python drive_on_mesh.py ROBOT`."""
+"""Replaces planner and executive of a running robot: releases its base and drives it straight at 0.2 m/s.
+
+`python drive_on_mesh.py ROBOT`
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The executive for tests, with a planner and hardware that do as a test's script says."""
+"""The executive with a scripted planner and scripted hardware."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ from deploy.processes import hardware, needs, stoppable
 
 
 class Robot:
-    """An executive under test, and all that it needs around it."""
+    """An executive under test and the services that it needs."""
 
     def __init__(self, service: ServiceUnderTest) -> None:
         self.service = service
         self.script: dict[str, list[str]] = {}
-        """By behaviour, how its next steps end: 'done', a reason to fail, or 'never'; done when nothing is said."""
+        """By behaviour, the results of its next steps: 'done', a reason to fail, or 'never'. The default is 'done'."""
         self.takes_s = 0.1
         self.holding = False
         self.speed_mps = 0.0
@@ -43,7 +43,7 @@ class Robot:
         self.says: dict[str, LatchState] = dict.fromkeys(stoppable(), "released")
         self.task_id = ""
         self.asked: list[str] = []
-        """The behaviours that were wanted, each once."""
+        """The behaviours that were requested, without repetitions."""
         self._intent = idle()
         self._since_ns = 0
         self._end = "done"
@@ -101,15 +101,15 @@ class Robot:
         return reply.task_id
 
     async def estop(self, latched: bool) -> EstopReply:
-        """Ask the executive alone."""
+        """Send a stop request to the executive alone."""
         return await self.service.ask(topics.ESTOP.of("executive"), EstopRequest(latched=latched, by="test"))
 
     def state(self) -> TaskState:
-        """What was said last of a task; nothing of any when nothing was said."""
+        """The last published state of a task; empty before the first."""
         return (self.service.outputs(topics.TASK) or [TaskState()])[-1]
 
     async def outcome(self) -> TaskState:
-        """Of the task that was begun last."""
+        """Wait for the end of the last task that was begun."""
 
         def over() -> bool:
             state = self.state()
@@ -129,7 +129,7 @@ class Robot:
 async def robot(
     clock: Clock | None = None, ready: bool = True, contact: Contact | None = None, **config: Any
 ) -> AsyncIterator[Robot]:
-    """A robot whose services all live and whose hardware is released, or (`ready=False`) nothing yet."""
+    """A robot with all services alive and the hardware released; with `ready=False` without them."""
     under_test = ServiceUnderTest("services.executive.service", {"needed": needs("executive")} | config, clock=clock)
     if contact is not None:
         under_test.node.contact = contact

@@ -1,7 +1,7 @@
 """Debian's playback library for Kinect recordings: the installed one, or one that is unpacked for the tests.
 
-Unpacked means: `apt-get download`, then `dpkg-deb -x` into a folder of the tests' own. Nothing of the system changes,
-and nobody need be root (but for fetching the lists of packages, where there are none yet).
+Unpacking is `apt-get download` and `dpkg-deb -x` into a temporary folder. This changes nothing in the system and needs
+no root, except to fetch missing package lists.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Contenders for claims: processes that all try at the same moment, round after round.
+"""A process that contends for claims, in rounds.
 
-Run as `python faults_claims.py ROOT NAME SERVICES ROUNDS`: for each line on its standard input it tries to be those
-services and says whether it is; at the next line it gives them back.
+Run as `python faults_claims.py ROOT NAME SERVICES ROUNDS`. For each line on standard input it tries to claim the
+services and prints whether it has them; at the next line it releases them.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""A simulated robot as it runs on a machine, process by process, and what an onlooker on its mesh hears; for tests
-that kill and stop its processes. What happened when is told by the simulator's stamps alone."""
+"""A live simulated robot and an observer on its mesh, for tests that kill and stop its processes. All times are the
+simulator's stamps."""
 
 from __future__ import annotations
 
@@ -40,15 +40,15 @@ WATCHED: tuple[Topic[Any], ...] = (
     topics.EXCHANGES.of("base"), *(topics.HEALTH.of(service) for service in SERVICES),
 )  # fmt: skip
 KEEP = 1_000_000
-"""Of everything that is watched all is kept, however late this process gets to it."""
+"""Depth of the observer's queues: it loses nothing, even when it is late."""
 SLOW = {"width": 320, "height": 240, "frame_rate_hz": 30.0, "pace": 0.5}
-"""A small picture, and half as fast as it could be: a busy machine must not make the robot late."""
+"""Small images and a reduced frame rate, so that load does not make the robot late."""
 PROCESSES = ("sim", "perception", "planning", "executive")
 STANDING_MPS = 0.01
 
 
 class LiveRobot:
-    """A robot that is up. Make it with `live`."""
+    """A running robot, made by `live`."""
 
     def __init__(self, name: str, root: Path, folder: Path) -> None:
         self.name = name
@@ -85,11 +85,11 @@ class LiveRobot:
         return os.environ | {"COCORO_RUN_DIR": str(self._root)}
 
     async def told(self, text: str) -> str:
-        """Wait for a line of the supervisor's."""
+        """Wait for a line of the supervisor's output."""
         return await asyncio.to_thread(self.up.until, text)
 
     async def command(self, *arguments: str) -> tuple[int, str]:
-        """Run a `cocoro` command; its exit code and what it printed."""
+        """Run a `cocoro` command; returns its exit code and output."""
         process = await asyncio.create_subprocess_exec(
             sys.executable, "-m", "apps.cli.main", *arguments, "--robot", self.name,
             env=self.env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
@@ -102,7 +102,7 @@ class LiveRobot:
         return self.run_dir.claims()[service].pid
 
     def signal(self, service: str, number: signal.Signals) -> None:
-        """To the process that is a service now."""
+        """Send a signal to the current process of a service."""
         target = Target(self.run_dir.path / "claims" / service)
         target.signal(number)
         target.close()
@@ -113,7 +113,7 @@ class LiveRobot:
         decoder = msgspec.msgpack.Decoder(topic.type)
 
         def keep(_key: str, payload: Payload) -> None:
-            with suppress(msgspec.MsgspecError):  # of a test that publishes what is bad
+            with suppress(msgspec.MsgspecError):  # the publisher of invalid messages in a test
                 self._heard[topic.name].append(decoder.decode(payload))
                 self._news.set()
 
@@ -127,14 +127,14 @@ class LiveRobot:
         return all(self._alive.get(service, False) for service in services)
 
     def heard(self, topic: Topic[M]) -> list[M]:
-        """All of a topic, in order of arrival."""
+        """All messages of a topic, in order of arrival."""
         return self._heard[topic.name]  # type: ignore[return-value]
 
     def forget(self) -> None:
         self._heard.clear()
 
     async def until(self, content: Callable[[], object], timeout_s: float = PATIENCE_S) -> None:
-        """Wait until something holds; looks whenever anything is heard."""
+        """Wait until a condition holds; checks it at every received message."""
         async with asyncio.timeout(timeout_s):
             while not content():
                 self._news.clear()
@@ -142,7 +142,7 @@ class LiveRobot:
 
     @property
     def now_s(self) -> float:
-        """Simulated time, as far as it was heard of."""
+        """The newest received simulated time."""
         truths = self.heard(topics.TRUTH)
         return truths[-1].stamp_ns / NS if truths else 0.0
 
@@ -152,7 +152,7 @@ class LiveRobot:
         await self.until(lambda: self.now_s >= end_s)
 
     async def surely_now_s(self) -> float:
-        """A time of the simulator's that is not earlier than the moment of asking."""
+        """Wait for a simulated time that is not earlier than the call."""
         exchanges = topics.EXCHANGES.of("base")
         before = len(self.heard(exchanges))
         key = topics.ABOUT.of("base").key(self.name)
@@ -162,7 +162,7 @@ class LiveRobot:
         return newest.stamp_ns / NS
 
     def publish(self, key: str, payload: bytes) -> None:
-        """Put something on the mesh under this robot's name."""
+        """Publish a payload under this robot's name."""
         publisher = self._bus.publisher(f"{self.name}/{key}", Qos.STATE)
         publisher.put(payload)
         publisher.close()
@@ -178,7 +178,7 @@ class LiveRobot:
         return msgspec.msgpack.decode(replies[0].payload, type=TaskReply)
 
     async def begin(self, request: TaskRequest) -> str:
-        """Have a task accepted, as soon as the robot is able; its id."""
+        """Request a task until it is accepted; returns its id."""
         async with asyncio.timeout(PATIENCE_S):
             while not (reply := await self.ask(request)).accepted:
                 assert reply.refusal in ("not_alive", "estop"), reply.text
@@ -199,13 +199,13 @@ class LiveRobot:
         return state
 
     async def driving(self, label: str = "red_can", speed_mps: float = 0.12) -> str:
-        """Fetch something, and be on the way to it; the task's id."""
+        """Start a fetch and wait until the robot drives; returns the task's id."""
         task_id = await self.begin(asked("fetch", label=label))
         await self.drives(speed_mps, task_id)
         return task_id
 
     async def drives(self, speed_mps: float = 0.12, task_id: str = "") -> None:
-        """Wait until the body truly moves."""
+        """Wait until the body moves, by the true state."""
         since_s = self.now_s
 
         def fast() -> bool:
@@ -219,7 +219,7 @@ class LiveRobot:
     # --- the truth ------------------------------------------------------------------------------------
 
     def speeds(self, since_s: float) -> list[float]:
-        """True speeds of the body over each step of the truth that lies after then."""
+        """True speeds of the body, one for each later step of the true state."""
         after = [truth for truth in self.heard(topics.TRUTH) if truth.stamp_ns >= since_s * NS]
         return [_speed_mps(a, b) for a, b in pairwise(after)]
 
@@ -227,7 +227,7 @@ class LiveRobot:
         return max(self.speeds(when_s)) < STANDING_MPS
 
     def obeyed_since(self, when_s: float) -> list[tuple[float, float]]:
-        """Wheel commands other than zero that were given after then."""
+        """Later wheel commands other than zero."""
         return [
             (command.left_mps, command.right_mps)
             for command in self.heard(topics.BASE_COMMAND)
@@ -235,7 +235,7 @@ class LiveRobot:
         ]
 
     def held(self, label: str) -> bool:
-        """Truly between both claws, touching nothing else."""
+        """Whether an object touches both claws and nothing else, by the true state."""
         objects = self.heard(topics.TRUTH)[-1].objects
         return set(next(item for item in objects if item.label == label).touching) == {"claw_left", "claw_right"}
 
@@ -248,7 +248,7 @@ def _speed_mps(a: Truth, b: Truth) -> float:
 async def live(
     folder: Path, *, name: str = "calliope", scene: Path | str = "paper", mesh: str = "", **sim: Any
 ) -> AsyncIterator[LiveRobot]:
-    """A robot that is up, and goes down at the end. `sim`: settings of the simulator beside `SLOW`."""
+    """Start a robot and shut it down at the end. `sim`: settings of the simulator besides `SLOW`."""
     root = short_folder()
     robot = LiveRobot(name, root, folder)
     robot.profile.write_text(profile_text(name, {**SLOW, "scene": str(scene), **sim}, mesh))

@@ -14,11 +14,11 @@ from cocoro.topics import Topic
 
 KEY = "calliope/key"
 FAR = 2**62
-"""A number that no message and no stamp comes to."""
+"""A number beyond those of all messages and stamps."""
 
 
 class StillClock(VirtualClock):
-    """A clock that stands at the time that a test sets."""
+    """A clock that stands at a time set by the test."""
 
     stands = True
 
@@ -42,6 +42,7 @@ def inbox_of(topic: Topic[Any], clock: StillClock | None = None) -> tuple[Inbox[
 def payload(topic: Topic[Any], seq: int = 0, incarnation: int = 1, stamp_ns: int = 100 * NS, **fields: Any) -> bytes:
     goods: dict[str, dict[str, Any]] = {
         topics.BASE_COMMAND.name: {"left_mps": 0.1, "right_mps": 0.1},
+        topics.INTENT.name: {"action": {"action": "park"}},
         topics.BASE_STATE.name: {"odometry_m": (0, 0), "odometry_yaw_rad": 0, "speed_mps": 0, "turn_rate_radps": 0},
     }
     packed: bytes = msgpack.packb(

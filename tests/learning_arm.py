@@ -1,4 +1,4 @@
-"""An arm to learn about: a worn body's own kinematics, seen with a little noise, draw by draw."""
+"""Samples of a worn arm for the learning tests: its true kinematics with a little noise, draw by draw."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ NOISE_M = 0.002
 
 
 def sightings(robot: Robot, *, seed: int = 0, draws: int = 150, each: int = 4, noise_m: float = NOISE_M) -> Sightings:
-    """So many moves through the arm's range, so many frames of each."""
+    """Sample random moves through the arm's range, with several frames of each."""
     rng = np.random.default_rng(seed)
     true = NominalModel(body_of(robot, "worn", seed).robot)
     low, high = true.limits_rad.T
-    # A part of the range, as much as a camera sees of it.
+    # the part of the range that the camera sees
     low, high = low + 0.3 * (high - low), high - 0.3 * (high - low)
     corners = rng.uniform(low, high, (draws + 1, 4))
     share = np.arange(1, each + 1) / each

@@ -1,4 +1,4 @@
-"""A mount namespace of its own, with small file systems where the machine has large ones, for tests of what is full."""
+"""A mount namespace with small file systems, for tests of full disks."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from types import TracebackType
 import pytest
 
 FULL_BYTES = 1 << 30
-"""More than any file system of these tests holds."""
+"""More than the capacity of any file system of these tests."""
 
 
 class Namespace:
-    """`prefix` in front of a command has it run there. A context manager; skips the test where it cannot be had."""
+    """A context manager. A command with `prefix` runs in the namespace. Skips the test where it cannot be made."""
 
     def __init__(self, mounts: dict[Path, str]) -> None:
         """`mounts`: the places that get a tmpfs, each with its options, such as 'size=1m'."""
@@ -47,11 +47,11 @@ class Namespace:
         return ["nsenter", "--target", str(self._process.pid), "--mount", f"--wd={Path.cwd()}", "--"]
 
     def at(self, path: Path) -> Path:
-        """A path of the namespace, as it is reached from outside."""
+        """The path by which a path of the namespace is reached from outside."""
         return Path(f"/proc/{self._process.pid}/root") / path.relative_to("/")
 
     def fill(self, place: Path) -> Path:
-        """Have a file take all the room that is left; the file, as it is reached from outside."""
+        """Fill the remaining space with a file; returns its path from outside."""
         filler = self.at(place) / "filler"
         with filler.open("wb", buffering=0) as file:
             for block in (1 << 20, 4096, 1):

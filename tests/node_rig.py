@@ -1,4 +1,4 @@
-"""Nodes for tests, on the bus of one process and in virtual time."""
+"""Nodes on a local bus in virtual time."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ HERE: dict[str, Any] = {"odometry_m": (0.0, 0.0), "odometry_yaw_rad": 0.0, "spee
 
 
 class Mesh:
-    """A mesh that nodes of a test join."""
+    """A mesh for the nodes of a test."""
 
     def __init__(self, clock: Clock | None = None) -> None:
         self.mesh = LocalMesh()
@@ -34,5 +34,5 @@ def state(**fields: Any) -> BaseState:
 
 
 async def answered(question: CancelRequest) -> TaskReply:
-    """What serves a request."""
+    """A handler of a request."""
     return TaskReply(accepted=True, task_id=question.task_id)

@@ -1,4 +1,4 @@
-"""What the tests of the command share: `cocoro` as a process of its own, and small components to start with it."""
+"""Runs `cocoro` as a separate process, with small components to start."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from places import short_folder
 from deploy.rundir import RunDir, Target
 
 PATIENCE_S = 300.0
-"""Far more than anything here takes, on however busy a machine: a test that waits so long has failed."""
+"""Time limit for every wait, s; a test that reaches it has failed."""
 
 PARTS = """
 import asyncio, os, signal
@@ -94,14 +94,14 @@ def install_parts(folder: Path) -> None:
 
 
 class Shell:
-    """A run directory of its own, and commands that use it. A context manager: what is up goes down at its end."""
+    """A context manager with a new run directory for its commands. At the end it shuts a running robot down."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.root = short_folder()
         self.run_dir = RunDir("robbie", self.root)
         self.prefix: list[str] = []
-        """In front of every command, as that which has it run in a namespace."""
+        """Put in front of every command, for example to run it in a namespace."""
         self._started: list[Running] = []
         install_parts(folder)
 
@@ -140,12 +140,12 @@ class Shell:
         return self.run_dir.claims()[service].pid
 
     def target(self, service: str) -> Target:
-        """The process that is a service now."""
+        """Process id of the current process of a service."""
         return Target(self.run_dir.path / "claims" / service)
 
 
 class Running:
-    """A command that goes on, read line by line."""
+    """A running command, read line by line."""
 
     def __init__(self, command: list[str], env: dict[str, str]) -> None:
         self.process = subprocess.Popen(command, env=env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
@@ -161,7 +161,7 @@ class Running:
         self._queue.put(None)
 
     def until(self, text: str) -> str:
-        """Read on until a line has `text` in it; that line."""
+        """Read until a line contains `text`; returns the line."""
         while (line := self._queue.get(timeout=PATIENCE_S)) is not None:
             self.lines.append(line)
             if text in line:
@@ -169,7 +169,7 @@ class Running:
         raise AssertionError(f"no {text!r} in:\n" + "\n".join(self.lines))
 
     def end(self, signal_number: int | None = None) -> int:
-        """Signal it, if need be, read the rest and return the exit code."""
+        """Send a signal (if given), read the rest of the output and return the exit code."""
         if signal_number is not None:
             self.process.send_signal(signal_number)
         while (line := self._queue.get(timeout=PATIENCE_S)) is not None:

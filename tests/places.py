@@ -16,7 +16,7 @@ def short_folder() -> Path:
 
 @contextmanager
 def in_short_folder() -> Iterator[Path]:
-    """The same, removed at the end."""
+    """A short folder that is removed at the end."""
     place = min(tempfile.gettempdir(), "/tmp", key=len)
     with tempfile.TemporaryDirectory(prefix="cocoro", dir=place, ignore_cleanup_errors=True) as folder:
         yield Path(folder)

@@ -1,4 +1,4 @@
-"""The planner's core for tests, by hand: every step with everything fresh that a test does not hold back."""
+"""Steps the planner's core by hand, with fresh inputs except those that a test withholds."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ CAN_M = (1.5, 0.0, 0.06)
 
 
 class Planner:
-    """A planning core on a robot that is perfectly obedient but for its wheels, and sees a can and free floor."""
+    """A planning core on a robot that follows all commands except to the wheels, and sees a can and free floor."""
 
     def __init__(self, config: PlanningConfig | None = None, make: type[PlanningCore] = PlanningCore) -> None:
         self.under_test = CoreUnderTest(make(ROBOT, config or PlanningConfig()))
@@ -46,7 +46,7 @@ class Planner:
         self._count = 0
 
     def tick(self) -> PlannerStatus:
-        """One step, 20 ms later, with everything fresh that is not silent."""
+        """One step, 20 ms later, with fresh messages of all topics that are not silent."""
         test = self.under_test
         test.now_ns += round(TICK_S * 1e9)
         here = {"odometry_m": (0.0, 0.0), "odometry_yaw_rad": 0.0, "speed_mps": 0.0, "turn_rate_radps": 0.0}
@@ -89,7 +89,7 @@ class Planner:
 
     @property
     def commanded(self) -> set[str]:
-        """The topics that the last step commanded on."""
+        """The topics of the last step's commands."""
         return {output.topic.name for output in self.under_test.steps[-1]} - {topics.PLAN.name}
 
     def _feed(self, topic: Topic[Any], message: Message) -> None:
@@ -114,12 +114,12 @@ class Planner:
 
 
 def started(config: PlanningConfig | None = None, make: type[PlanningCore] = PlanningCore) -> Planner:
-    """A planner that has seen what there is."""
+    """A planner that has received all inputs."""
     planner = Planner(config, make)
     planner.run(0.2)
     return planner
 
 
 def standing(planner: Planner) -> bool:
-    """Whether the wheels are told to stand, or told nothing, which stops them."""
+    """Whether zero is commanded to the wheels, or nothing, which also stops them."""
     return planner.wheels == BaseCommand(left_mps=0.0, right_mps=0.0) if "base/command" in planner.commanded else True

@@ -1,5 +1,5 @@
-"""The whole robot in one process, in virtual time, for tests that break it: services are killed and started again,
-the emergency stop is pressed, and the simulator's truth says what became of it."""
+"""The whole robot in one process and in virtual time, for tests that kill and restart services or press the emergency
+stop, and judge the result by the true state."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class _Running(NamedTuple):
 
 
 class RobotRig:
-    """Use it as an asynchronous context manager, in virtual time."""
+    """An asynchronous context manager, in virtual time."""
 
     def __init__(
         self,
@@ -58,8 +58,8 @@ class RobotRig:
         mesh: LocalMesh | None = None,
         clock_of: Callable[[str], Clock] | None = None,
     ) -> None:
-        """`settings` by service; frames are small unless those of 'sim' say otherwise. `name` and `mesh`: for more
-        than one robot on a mesh. `clock_of` gives each service its clock, instead of virtual time."""
+        """`settings`: by service; frames are small unless the settings of 'sim' are given. `name` and `mesh`: for
+        several robots on one mesh. `clock_of`: returns the clock of each service, in place of virtual time."""
         self._settings = {"sim": SMALL_FRAMES} | dict(settings or {})
         self._latency_s = latency_s or {}
         self._record_steps = record_steps
@@ -110,7 +110,7 @@ class RobotRig:
         return self._services[name].bus
 
     async def kill(self, name: str) -> None:
-        """As SIGKILL does: at once, nothing said."""
+        """End a service as SIGKILL does."""
         bus, node, work = self._services.pop(name)
         bus.kill()
         work.cancel()
@@ -124,12 +124,12 @@ class RobotRig:
         return self.operator.now_ns() / NS
 
     async def advance(self, seconds: float) -> None:
-        """Let time pass. Raises what a service raised meanwhile."""
+        """Let time pass. Raises the exception of a service that failed meanwhile."""
         await asyncio.sleep(seconds)
         self._check()
 
     async def until(self, content: Callable[[], object], timeout_s: float = 60.0) -> None:
-        """Let time pass until something holds."""
+        """Let time pass until a condition holds."""
         end_s = self.now_s + timeout_s
         while not content():
             assert self.now_s < end_s, f"still not so after {timeout_s:g} s"
@@ -147,7 +147,7 @@ class RobotRig:
         return await self.operator.call(topics.RUN, asked(task, label, timeout_s))
 
     async def begin(self, task: str, label: str = "", timeout_s: float | None = None) -> str:
-        """Have a task accepted, as soon as the robot is ready for one; its id."""
+        """Request a task until it is accepted; returns its id."""
         reply = await self.ask(task, label, timeout_s)
         while reply.refusal in ("not_alive", "estop") and self.now_s < 3.0:
             await self.advance(0.05)
@@ -156,7 +156,7 @@ class RobotRig:
         return reply.task_id
 
     def state(self, task_id: str) -> TaskState:
-        """What the executive said last of a task."""
+        """The last published state of a task."""
         return self._tasks[task_id]
 
     async def outcome(self, task_id: str, timeout_s: float = 120.0) -> TaskState:
@@ -168,38 +168,38 @@ class RobotRig:
         return await self.outcome(await self.begin(task, label, timeout_s))
 
     async def phase(self, task_id: str, phase: str) -> None:
-        """Wait for a task to come to a phase."""
+        """Wait until a task reaches a phase."""
         await self.until(lambda: task_id in self._tasks and self._tasks[task_id].phase == phase)
 
     async def cancel(self) -> TaskReply:
         return await self.operator.call(topics.CANCEL, CancelRequest())
 
     async def estop(self, latched: bool) -> set[str]:
-        """Press or reset the emergency stop; who acknowledged that it is so."""
+        """Press or reset the emergency stop; returns the services that acknowledged it."""
         question = EstopRequest(latched=latched, by="test")
         answers = await self.operator.call_all(topics.ESTOP.of("*"), question)
         wanted = "latched" if latched else "released"
         return {answer.service for answer in answers if answer.reply is not None and answer.reply.latch == wanted}
 
     async def driving(self, speed_mps: float = 0.25) -> str:
-        """Fetch the red can, and be on the way to it at some speed; the task's id."""
+        """Start a fetch of the red can and wait until the robot drives at a speed, m/s; returns the task's id."""
         task_id = await self.begin("fetch", "red_can")
         await self.until(lambda: self.speed_mps > speed_mps)
         return task_id
 
     async def holding(self) -> None:
-        """Have the red can in the hand, lifted."""
+        """Fetch the red can and wait until it is lifted."""
         assert (await self.run("fetch", "red_can")).outcome == "done"
 
     # --- the truth ------------------------------------------------------------------------------------
 
     @property
     def speed_mps(self) -> float:
-        """Of the body, truly, over the last step of the truth."""
+        """True speed of the body over the last step of the true state."""
         return self.speeds_since(-1.0)[-1] if len(self.truths) > 1 else 0.0
 
     def speeds_since(self, when_s: float) -> list[float]:
-        """True speeds of the body over each step of the truth that lies after then."""
+        """True speeds of the body, one for each later step of the true state."""
         after = [truth for truth in self.truths[-300:] if truth.stamp_ns >= when_s * NS]
         return [
             hypot(b.body_m[0] - a.body_m[0], b.body_m[1] - a.body_m[1]) / ((b.stamp_ns - a.stamp_ns) / NS)
@@ -207,13 +207,13 @@ class RobotRig:
         ]
 
     def turned_since(self, when_s: float) -> float:
-        """How far the body's heading truly changed, radians."""
+        """True change of the body's heading since then, rad."""
         after = [truth for truth in self.truths if truth.stamp_ns >= when_s * NS]
         first, last = (_yaw_rad(truth) for truth in (after[0], after[-1]))
         return abs(wrap_rad(last - first))
 
     def commanded_since(self, when_s: float) -> list[tuple[float, float]]:
-        """The wheel commands published after then."""
+        """The wheel commands that were published later."""
         return [
             (command.left_mps, command.right_mps)
             for command in self.tap.messages(topics.BASE_COMMAND)
@@ -221,15 +221,15 @@ class RobotRig:
         ]
 
     def base_obeys_since(self, when_s: float) -> bool:
-        """Whether the base, by its own word, obeyed anyone's wheel commands after then."""
+        """Whether the base reports that it followed a wheel command later."""
         return any(state.stopped_by == "" for state in self._base if state.stamp_ns > when_s * NS)
 
     def thing(self, label: str) -> TrueObject:
-        """An object as it truly is now."""
+        """The true state of an object."""
         return next(item for item in self.truths[-1].objects if item.label == label)
 
     def held(self, label: str) -> bool:
-        """Truly between both claws, touching nothing else, and off the floor."""
+        """Whether an object touches both claws and nothing else and is off the floor, by the true state."""
         return set(self.thing(label).touching) == CLAWS
 
 

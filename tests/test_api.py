@@ -1,4 +1,4 @@
-"""What `cocoro` offers by `__all__`."""
+"""The public names of `cocoro`, by `__all__`."""
 
 from __future__ import annotations
 

@@ -12,10 +12,10 @@ from copy import copy
 from pathlib import Path
 
 import pytest
+from stop_rig import PATIENCE_S, new_robot, stopped_ns
 from test_base_service import Driven
 from wire_base import PATIENCE_NS, Bench, FakeService, guarded
 
-from apps.cli.stop_asking import Asking
 from cocoro import topics
 from cocoro.clock import RealClock
 from cocoro.messages import EstopRequest
@@ -25,12 +25,10 @@ from cocoro.testing import ServiceUnderTest
 
 pytestmark = [pytest.mark.zenoh, pytest.mark.process]
 
-PATIENCE_S = 60.0
-
 
 @pytest.fixture
 def name() -> str:
-    return f"robot-{os.urandom(4).hex()}"
+    return new_robot()
 
 
 @pytest.fixture
@@ -48,21 +46,13 @@ def service(bench: Bench, name: str) -> Iterator[FakeService]:
         yield service
 
 
-def stop(name: str) -> dict[str, int | None]:
-    """Send a stop; returns when each service stopped, None for those that did not answer."""
-    with Asking(name) as asking:
-        asking.go_on(time.monotonic() + PATIENCE_S)
-        asking.hear_of_the_disk(time.monotonic() + PATIENCE_S)
-    return {point.service: point.latched_ns for point in asking.points.values()}
-
-
 def test_the_guard_stops_the_wheels_by_itself_and_asking_on_does_not_help(
     bench: Bench, service: FakeService, name: str
 ) -> None:
     service.keep_asking(200, 200)
     bench.until_wheels(200, 200)
     asked_ns = time.monotonic_ns()
-    answers = stop(name)
+    answers = stopped_ns(name)
     assert answers["wheels"] is not None
     assert bench.until_wheels(0, 0) - asked_ns < PATIENCE_NS
     bench.forget()
@@ -74,9 +64,9 @@ def test_the_guard_stops_the_wheels_by_itself_and_asking_on_does_not_help(
 def test_only_a_reset_that_knows_of_the_stop_lets_the_wheels_turn_again(
     bench: Bench, service: FakeService, name: str
 ) -> None:
-    stop(name)
+    stopped_ns(name)
     service.report(stops=1)
-    stop(name)
+    stopped_ns(name)
     service.reset = 1  # this one does not know of the second
     service.keep_asking(200, 200)
     service.report(stops=2, why="estop")
@@ -91,15 +81,24 @@ def test_a_reset_of_more_stops_than_there_were_resets_none_to_come(
     service.reset = reset
     service.ask(0, 0)
     service.report(why="")
-    stop(name)
+    stopped_ns(name)
     service.reset = 0
     service.keep_asking(200, 200)
     service.report(stops=1, why="estop")
     assert bench.create.wheels_mmps == (0, 0)
 
 
+@pytest.fixture
+def latches(tmp_path: Path) -> Path:
+    """The folder of the base's latch record, which is released."""
+    folder = tmp_path / "latch"
+    prepare(folder, ["base"], by_hand=True)
+    return folder
+
+
 @asynccontextmanager
-async def driven(bench: Bench, name: str, latches: Path) -> AsyncIterator[Driven]:
+async def rolling(bench: Bench, name: str, latches: Path) -> AsyncIterator[Driven]:
+    """The base service and its guard, driving straight."""
     robot = copy(Robot.load())
     robot.name = name
     config = {"port": bench.port}
@@ -108,26 +107,23 @@ async def driven(bench: Bench, name: str, latches: Path) -> AsyncIterator[Driven
     ) as service:
         base = Driven(bench, service)
         await base.state(lambda state: state.mode == "safe")
+        await base.roll()
         yield base
         base.silence()
 
 
-def test_service_and_guard_are_both_told_and_a_reset_releases_both(bench: Bench, name: str, tmp_path: Path) -> None:
-    latches = tmp_path / "latch"
-    prepare(latches, ["base"], by_hand=True)
-
+def test_service_and_guard_are_both_told_and_a_reset_releases_both(bench: Bench, name: str, latches: Path) -> None:
     async def scenario() -> None:
-        async with driven(bench, name, latches) as base:
-            await base.roll()
+        async with rolling(bench, name, latches) as base:
             asked_ns = time.monotonic_ns()
-            answers = await asyncio.to_thread(stop, name)
+            answers = await asyncio.to_thread(stopped_ns, name)
             assert set(answers) == {"base", "wheels"}
             assert None not in answers.values()
             assert await base.wheels(0, 0) - asked_ns < PATIENCE_NS
             state = await base.state(lambda state: state.stopped_by == "estop")
             assert state.latch == "latched"
             assert read(latches / "base").latched
-            await asyncio.to_thread(stop, name)
+            await asyncio.to_thread(stopped_ns, name)
             base.release()  # the executive's word releases nothing
             await base.state(lambda state: state.latch == "latched")
             reply = await base.service.ask(topics.ESTOP.of("base"), EstopRequest(latched=False, by="test"))
@@ -138,15 +134,11 @@ def test_service_and_guard_are_both_told_and_a_reset_releases_both(bench: Bench,
     asyncio.run(asyncio.wait_for(scenario(), PATIENCE_S))
 
 
-def test_a_loop_that_hangs_keeps_the_wheels_from_nothing(bench: Bench, name: str, tmp_path: Path) -> None:
-    latches = tmp_path / "latch"
-    prepare(latches, ["base"], by_hand=True)
-
+def test_a_loop_that_hangs_keeps_the_wheels_from_nothing(bench: Bench, name: str, latches: Path) -> None:
     async def scenario() -> None:
-        async with driven(bench, name, latches) as base:
-            await base.roll()
+        async with rolling(bench, name, latches) as base:
             asked_ns = time.monotonic_ns()
-            answers = stop(name)  # in the loop, which hangs meanwhile
+            answers = stopped_ns(name)  # in the loop, which hangs meanwhile
             assert None not in answers.values()
             assert bench.until_wheels(0, 0) - asked_ns < PATIENCE_NS
             await base.state(lambda state: state.latch == "latched")
@@ -154,14 +146,10 @@ def test_a_loop_that_hangs_keeps_the_wheels_from_nothing(bench: Bench, name: str
     asyncio.run(asyncio.wait_for(scenario(), PATIENCE_S))
 
 
-def test_a_guard_that_comes_after_a_stop_knows_of_it_from_the_service(bench: Bench, name: str, tmp_path: Path) -> None:
-    latches = tmp_path / "latch"
-    prepare(latches, ["base"], by_hand=True)
-
+def test_a_guard_that_comes_after_a_stop_knows_of_it_from_the_service(bench: Bench, name: str, latches: Path) -> None:
     async def scenario() -> None:
-        async with driven(bench, name, latches) as base:
-            await base.roll()
-            await asyncio.to_thread(stop, name)
+        async with rolling(bench, name, latches) as base:
+            await asyncio.to_thread(stopped_ns, name)
             await base.state(lambda state: state.latch == "latched")
             before = guards(name)
             for pid in before:
@@ -175,12 +163,12 @@ def test_a_guard_that_comes_after_a_stop_knows_of_it_from_the_service(bench: Ben
 
 
 def guards(name: str) -> set[int]:
-    """The processes that are guards of a robot's wheels."""
+    """Process ids of the guards of a robot's wheels."""
     found = set()
     for folder in Path("/proc").glob("[0-9]*"):
         try:
             arguments = (folder / "cmdline").read_bytes().split(b"\0")
-        except OSError:  # it ended just now
+        except OSError:  # it has just ended
             continue
         if b"services.base.guard" in arguments and name.encode() in arguments:
             found.add(int(folder.name))

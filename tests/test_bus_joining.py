@@ -1,4 +1,4 @@
-"""Joining a mesh over zenoh: the register of who is in it, the ways to configure it, and meeting whoever is there."""
+"""Joining a mesh over zenoh: the register of members, the configuration, and the connection to those present."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def test_a_directory_that_others_may_replace_is_refused(directory: Path) -> None
 
 def test_a_directory_that_cannot_be_made_is_refused(directory: Path) -> None:
     directory.write_text("a file")
-    with pytest.raises(ConfigError, match="Not a directory; put that right, or choose another by COCORO_RUN_DIR"):
+    with pytest.raises(ConfigError, match=r"robot: Not a directory.*COCORO_RUN_DIR"):
         Membership.register(directory, "x")
 
 
@@ -135,7 +135,8 @@ asyncio.run(main())
 async def test_where_nobody_is_the_error_says_what_to_start(directory: Path) -> None:
     with pytest.raises(MeshError) as raised:
         await ZenohBus.open(local(directory), expect_mesh=True)
-    assert str(raised.value) == f"no mesh at {directory}: start one with `cocoro up`"
+    assert str(directory) in str(raised.value)
+    assert "`cocoro up`" in str(raised.value)
     assert members(directory) == []
 
 

@@ -210,7 +210,7 @@ def test_an_entry_that_has_no_room_for_its_name_is_one(directory: Path, monkeypa
 
 @contextmanager
 def crowd(directory: Path, count: int) -> Iterator[None]:
-    """So many connections to each member's socket, of which none says anything."""
+    """Open `count` connections to each member's socket that send nothing."""
     with ExitStack() as stack:
         for path in sorted(directory.glob("*.sock")):
             for _ in range(count):

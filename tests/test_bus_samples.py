@@ -201,7 +201,7 @@ async def test_a_reader_that_fails_gets_the_next_sample_all_the_same(mesh: Mesh)
 
 
 @scenario
-async def test_who_listens_hears_all_in_order_in_few_lots_and_what_has_come_when_it_ends(mesh: Mesh) -> None:
+async def test_who_listens_hears_all_in_order_in_few_batches_and_what_has_come_when_it_ends(mesh: Mesh) -> None:
     async with joined(mesh, 2) as (a, b):
         listener, last, every_s = Listener(), Inbox(), 0.2
         listening = b.listen("robot/**", listener, every_s)
@@ -214,7 +214,7 @@ async def test_who_listens_hears_all_in_order_in_few_lots_and_what_has_come_when
             publishers[number % 2].put(b"%d" % number)
         await listener.has(200)
         most = 200 if isinstance(mesh, Local) else (loop.time() - began_s) / every_s + 2
-        assert len(listener.lots) <= most
+        assert len(listener.batches) <= most
 
         for number in range(200, 300):
             publishers[number % 2].put(b"%d" % number)
@@ -237,8 +237,8 @@ async def test_who_fails_at_a_lot_gets_the_next_one(mesh: Mesh, caplog: pytest.L
     async with joined(mesh, 1) as (a,):
         listener = Listener()
 
-        def fail_once(lot: list[Received]) -> None:
-            listener(lot)
+        def fail_once(batch: list[Received]) -> None:
+            listener(batch)
             if len(listener.heard) == 1:
                 raise RuntimeError("once")
 

@@ -1,4 +1,4 @@
-"""What stands between zenoh's threads and the loop: the ring, the outbox and the pool of shared memory."""
+"""The parts between zenoh's threads and the event loop: ring, outbox and pool of shared memory."""
 
 from __future__ import annotations
 

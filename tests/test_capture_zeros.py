@@ -133,7 +133,8 @@ def test_a_chunks_times_that_are_zeros_are_told_by_check(whole: bytes, tmp_path:
     chunk = parts(whole, Opcode.CHUNK)[1]
     data = zeroed(whole, chunk.start + PREFIX.size, 16)
     (problem,) = problems(tmp_path / "zeros.mcap", data, check=True)
-    assert problem == f"the times of the chunk at byte {chunk.start} differ from those of its messages"
+    assert "times" in problem
+    assert f"byte {chunk.start} " in problem
     assert len(all_of(tmp_path / "zeros.mcap")) == 20
 
 
@@ -147,7 +148,8 @@ def test_an_index_of_messages_that_is_zeros_or_missing_is_told_by_check(whole: b
             assert len(all_of(path)) == 20
     killed = whole[: parts(whole, Opcode.DATA_END)[0].start]
     (problem,) = problems(path, killed[: index.start] + killed[index.end :])
-    assert problem == f"before byte {index.start} an index of messages is missing"
+    assert "index" in problem
+    assert f"byte {index.start} " in problem
 
 
 # --- the end --------------------------------------------------------------------------------------
@@ -243,7 +245,7 @@ def test_an_attachment_without_its_checksum_is_damaged_in_a_repaired_file_of_a_r
         assert any("attachment 'notes.txt'" in each for each in problems(path, zeroed(data, start, end - start), True))
 
 
-# --- anybody's ------------------------------------------------------------------------------------
+# --- of other recorders ------------------------------------------------------------------------------------
 
 
 def others(path: Path, **options: Any) -> bytes:

@@ -43,7 +43,7 @@ def arm_file(tmp_path: Path, robot: Robot) -> Path:
 
 
 def trial(number: int, turned_rad: float) -> WheelTrial:
-    """Of a body whose wheels stand as far apart as the nominal model has it."""
+    """A trial of a body whose wheel distance is the nominal one."""
     before = (1.5, 0.0)
     c, s = cos(turned_rad), sin(turned_rad)
     after = (1.5 * c, -1.5 * s)
@@ -142,7 +142,7 @@ def test_wheel_trials_go_on_with_a_new_pair(tmp_path: Path, robot: Robot) -> Non
         kept.take(trial(4, 0.5))
         assert first == 2
         assert kept.next == 6
-        assert kept.said == "1 trials, 0.1 turns in all"
+        assert kept.summary == "1 trials, 0.1 turns in all"
 
 
 def test_progress_has_a_bar_the_coverage_and_the_time_that_is_left(tmp_path: Path, robot: Robot) -> None:
@@ -155,6 +155,6 @@ def test_progress_has_a_bar_the_coverage_and_the_time_that_is_left(tmp_path: Pat
         text = view.text(30.0)
         assert text.startswith("[#####...............] 50 of 200: 50 samples, coverage 100%")
         assert text.endswith("1 min 30 s left")
-        state = TaskState(phase="babble-arm", elapsed_s=30.0, text="50 of 200 samples, draw 9")
+        state = TaskState(task="babble-arm", phase="babble-arm", elapsed_s=30.0, text="50 of 200 samples, draw 9")
         view.show(state)
         assert state.text == text

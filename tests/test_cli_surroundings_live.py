@@ -79,7 +79,7 @@ def test_a_robot_minds_no_reader_that_has_gone(shell: Shell) -> None:
     assert b"good ready" in running.stdout.readline()
     running.stdout.close()
     with closing(shell.target("good")) as good:
-        good.signal(signal.SIGKILL)  # which is told of, to nobody
+        good.signal(signal.SIGKILL)  # the supervisor reports it; no process reads that
         assert good.wait(PATIENCE_S)
     while "good" not in shell.run_dir.claims():
         time.sleep(0.02)

@@ -16,7 +16,7 @@ from msgspec import to_builtins
 
 from apps.cli import exits
 from apps.cli.babble import SampleWriter
-from apps.cli.link import Link
+from apps.cli.link import MeshLink
 from apps.cli.progress import LineDisplay, LiveDisplay, TaskDisplay
 from apps.cli.tasks import Follower
 from cocoro.bus.local import LocalMesh
@@ -45,7 +45,7 @@ ID = "fetch-1"
 
 @dataclass
 class Executive:
-    """Accepts one task and tells what the test lets it tell."""
+    """Accepts one task and publishes the states that the test gives."""
 
     node: Node
     replies: list[TaskReply] = field(default_factory=lambda: [TaskReply(accepted=True, task_id=ID)])
@@ -86,7 +86,7 @@ class Scene:
         self.mesh = LocalMesh()
         self.bus = self.mesh.join()
         self.node = Node("executive", self.bus, VirtualClock(), Robot.load())
-        self.link = Link(RunDir("calliope", Path("unused")), self.mesh.join())
+        self.link = MeshLink(RunDir("calliope", Path("unused")), self.mesh.join())
         self.out = io.StringIO()
 
     def follower(self, view: TaskDisplay | None = None) -> Follower:
@@ -177,7 +177,7 @@ class Claimed(Scene):
         super().__init__()
         run_dir = RunDir("calliope", folder)
         (self.claim,) = run_dir.claim("executive", ["executive"])
-        self.link = Link(run_dir, self.mesh.join())
+        self.link = MeshLink(run_dir, self.mesh.join())
 
     def returns(self) -> Executive:
         """The executive, on the mesh again as it was before."""

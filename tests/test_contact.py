@@ -1,4 +1,4 @@
-"""What is said of services that are not heard any more, and by whom: who was itself asleep accuses nobody."""
+"""The reasons given for silent services. A process that was itself asleep blames no other."""
 
 from __future__ import annotations
 

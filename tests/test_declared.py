@@ -7,7 +7,6 @@ from collections.abc import AsyncIterator, Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -127,15 +126,14 @@ async def test_the_kinect_speaks_as_it_declares(monkeypatch: pytest.MonkeyPatch)
 @pytest.mark.process
 @pytest.mark.zenoh
 @pytest.mark.sim
-def test_the_simulator_behind_wires_speaks_as_it_declares(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.usefixtures("root")
+def test_the_simulator_behind_wires_speaks_as_it_declares() -> None:
     async def scenario() -> list[str]:
         async with ServiceUnderTest(WIRE, SMALL_FRAMES, clock=FollowedClock()) as service:
             await _until(lambda: service.outputs(FRAME))
             return misdeclared(WIRE, service.bus)
 
-    with TemporaryDirectory(prefix="cocoro") as folder:  # short: sockets live there
-        monkeypatch.setenv("COCORO_RUN_DIR", folder)
-        assert asyncio.run(scenario()) == []
+    assert asyncio.run(scenario()) == []
 
 
 @in_virtual_time

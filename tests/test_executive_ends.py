@@ -1,4 +1,4 @@
-"""What ends an executive's task from outside: an operator, a death, silence, a mistake, a clock that begins anew."""
+"""Ends of a task from outside: an operator, a death, silence, a mistake, a clock that restarts."""
 
 from __future__ import annotations
 

@@ -171,7 +171,7 @@ FETCHED = {"held": True, "knocked_over": []}
 
 
 def made_up(run: ExperimentRun, lesson: RunResult) -> dict[str, Any]:
-    """What a run might have come to."""
+    """A plausible result of a run."""
     if run.kind == "learn":
         return lesson
     if run.kind == "bend":

@@ -1,4 +1,4 @@
-"""All processes of a robot are stopped at once, as by a laptop's lid, and go on: nobody is called dead who lives."""
+"""All processes of a robot are stopped together, as by a laptop's lid, and continue: no living one is called dead."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def everyone(robot: LiveRobot, *others: Running) -> set[int]:
 
 
 def said_by_all(robot: LiveRobot, *others: Running) -> str:
-    """What people have been told, on terminals and in logs; the supervisor's log has all that it says."""
+    """All output on terminals and in logs; the supervisor's log contains its whole output."""
     logs = [robot.run_dir.log(process).read_text() for process in (*PROCESSES, "supervisor")]
     return "\n".join([*logs, *(line for each in others for line in each.lines)])
 

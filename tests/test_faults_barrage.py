@@ -27,10 +27,10 @@ pytestmark = pytest.mark.sim
 
 SERVICES = ("kinect", "base", "arm", "hand", "perception", "planning", "executive")
 PERIOD_S = 0.00043
-"""From one bad message to the next. Never twice at once, and hardly ever together with a good one: of what comes at
-once the bus itself keeps the newest."""
+"""Period of the invalid messages. It keeps them apart from each other and nearly always from valid ones, since the bus
+keeps only the newest of simultaneous messages."""
 TOPICS_NOW: tuple[Topic[Any], ...] = tuple(topic for topic in TOPICS if "{" not in topic.name)
-"""The rows that are no service's own."""
+"""The topics that do not exist per service."""
 
 
 # --- what is bad ------------------------------------------------------------------------------------
@@ -45,7 +45,7 @@ def is_good(topic: Topic[Any], payload: bytes) -> bool:
 
 
 def spoilt(topic: Topic[Any], good: bytes, draw: random.Random) -> Iterator[bytes]:
-    """What a good message turns into on its way when something is wrong; every one of them is bad."""
+    """Invalid payloads made from a valid one."""
     data = msgpack.unpackb(good)
     yield b""
     yield bytes(draw.randrange(256) for _ in range(draw.randrange(1, 40)))
@@ -100,7 +100,7 @@ async def fetched(barrage_seed: int | None) -> TaskState:
         assert state.outcome == "done", state.reason
         assert rig.held("red_can")
         if barrage_seed is not None:
-            await rig.advance(1.1)  # everyone tells of its health
+            await rig.advance(1.1)  # every service publishes its health
             was_counted(rig, barrage)
         return state
 
@@ -120,7 +120,7 @@ def was_counted(rig: RobotRig, barrage: Barrage) -> None:
         ("executive", "planning/status"), ("executive", "base/state"),
     }  # fmt: skip
     for service, name in heard:
-        # The last ones were sent after the health was told.
+        # The last ones were sent after the health was published.
         assert 0.8 * barrage.sent[name] <= rejected[service][name] <= barrage.sent[name], (service, name)
         assert barrage.sent[name] > 100
 

@@ -19,9 +19,9 @@ from deploy.processes import hardware
 pytestmark = [pytest.mark.zenoh, pytest.mark.sim, pytest.mark.process]
 
 ZERO_S = 0.22
-"""From the moment of the fault until nothing but zero is commanded."""
+"""Bound from the fault until only zero is commanded."""
 STAND_S = 0.3
-"""The same until the body truly stands."""
+"""Bound from the fault until the body stands, by the true state."""
 FAR = """
 [[object]]
 label = "red_can"
@@ -117,7 +117,7 @@ def test_bad_messages_on_every_key_of_a_robot_that_drives_are_counted_and_stop_n
             await robot.drives(task_id=task_id)
 
             def counted() -> bool:
-                """By everyone, in a health that was told later."""
+                """Whether every service reports them in a later health message."""
                 return all(
                     any(
                         health.stamp_ns > began_s * 1e9 and sum(port.rejected for port in health.topics) >= len(rubbish)
@@ -158,7 +158,7 @@ def test_a_simulator_that_is_stopped_stops_time_and_when_it_goes_on_so_does_the_
         async with live(tmp_path) as robot:
             task_id = await robot.driving()
             robot.signal("base", signal.SIGSTOP)
-            # Nothing tells that time stands; longer than anything of a running robot is silent is long enough.
+            # No event marks that time stands; wait longer than any silence of a running robot.
             await asyncio.sleep(1.0)
             robot.signal("base", signal.SIGCONT)
             await robot.drives(task_id=task_id)

@@ -71,7 +71,7 @@ class Drive(NamedTuple):
     speeds_mps: list[float]
     outcome: TaskState
     told: tuple[str, ...]
-    """Of the reader's health."""
+    """The faults in the reader's health."""
 
 
 def drive(topic: Topic[Any] | None = None, spoil: Spoil | None = None, clock_of: ClockOf | None = None) -> Drive:
@@ -165,7 +165,7 @@ def test_the_latch_still_latches_after_a_bad_word_on_it(spoil: Spoil) -> None:
 
 @pytest.mark.parametrize("topic", [topics.BASE_COMMAND, topics.BASE_STATE], ids=lambda topic: topic.name)
 def test_a_task_whose_key_stays_unreadable_fails_and_says_which_and_why(topic: Topic[Any]) -> None:
-    """Its publisher's counter jumps about: nothing that it says can be told from rubbish."""
+    """The publisher's sequence numbers jump, so that no message can be trusted."""
 
     @in_virtual_time
     async def scenario() -> None:
@@ -181,7 +181,7 @@ def test_a_task_whose_key_stays_unreadable_fails_and_says_which_and_why(topic: T
             assert state.reason.startswith("unreadable: ")
             assert f" cannot read {topic.name} of {PUBLISHER[topic.name]}: " in state.reason
             assert "rejected: sequence number " in state.reason
-            # Without the base's word the executive cannot know that it rests, and waits for as long as it may.
+            # Without the base's state the executive cannot see that it rests, and waits until its limit.
             assert rig.now_s - since_s < (1.5 if topic is topics.BASE_COMMAND else 4.5)
             assert max(rig.speeds_since(since_s + 0.5)) < HALTED_MPS
             refused = await rig.ask("fetch", "red_can")

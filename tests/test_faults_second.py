@@ -27,7 +27,7 @@ def run_dir(tmp_path: Path) -> RunDir:
 
 
 class Contender:
-    """A process that tries to be some services whenever it is told."""
+    """A process that claims some services on request."""
 
     def __init__(self, process: subprocess.Popen[str]) -> None:
         self._process = process
@@ -58,7 +58,7 @@ def contenders(run_dir: RunDir, *services: str) -> Iterator[list[Contender]]:
 
 @contextmanager
 def looked_at(run_dir: RunDir) -> Iterator[None]:
-    """Somebody looks all the time who is what, as `cocoro status` and the supervisor do."""
+    """Read the claims continuously, as `cocoro status` and the supervisor do."""
     enough = threading.Event()
 
     def look() -> None:

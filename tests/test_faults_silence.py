@@ -19,15 +19,15 @@ from cocoro.testing import in_virtual_time
 pytestmark = pytest.mark.sim
 
 ZERO_S = 0.2
-"""From the moment of the fault until nothing but zero is commanded."""
+"""Bound from the fault until only zero is commanded."""
 STAND_S = 0.3
-"""The same until the body truly stands."""
+"""Bound from the fault until the body stands, by the true state."""
 REAL = {"sim": SMALL_FRAMES | {"frame_rate_hz": 30.0, "sensors": "real"}}
 PERIOD_S = 1 / 30
 
 
 class Mute:
-    """In a publisher's place."""
+    """Replaces a publisher and sends nothing."""
 
     trouble = ""
 

@@ -1,4 +1,4 @@
-"""What keeps a robot from starting is said in one line, and is no crash."""
+"""A fault that prevents the start of a robot is reported in one line, without a crash."""
 
 from __future__ import annotations
 

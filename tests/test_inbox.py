@@ -1,4 +1,4 @@
-"""What a node receives: checked at the border, counted, handed on."""
+"""Received messages are checked, counted and handed on."""
 
 from __future__ import annotations
 

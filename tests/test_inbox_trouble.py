@@ -1,4 +1,4 @@
-"""Rejected messages as a reader's health tells of them."""
+"""Rejected messages in the health of their reader."""
 
 from __future__ import annotations
 

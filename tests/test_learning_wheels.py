@@ -115,5 +115,5 @@ def test_wheels_that_roll_unequally_far_are_told_from_the_distance() -> None:
     fit = fit_wheels(trials(scales=(1.015, 0.99), noise=(0.001, 0.001)))
     assert fit is not None
     assert fit.right_scale - fit.left_scale == pytest.approx(-0.025, abs=0.008)
-    # What turns the robot is the distance over the mean scale.
+    # The robot turns by the distance over the mean scale.
     assert fit.separation_m == pytest.approx(TRUE_M / 1.0025, abs=0.0015)

@@ -31,7 +31,7 @@ from deploy.rundir import RunDir
 pytestmark = [pytest.mark.zenoh, pytest.mark.sim, pytest.mark.process]
 
 UNDER_WAY_S = 0.1
-"""What messages may take on a busy machine, and one period of the truth."""
+"""Allowance for messages under way on a busy machine, plus one period of the true state, s."""
 
 
 @pytest.fixture
@@ -112,7 +112,7 @@ def test_a_simulator_that_dies_fails_the_task_comes_back_and_the_robot_is_used_a
 def test_who_is_frozen_while_driving_leaves_a_robot_that_stands(
     shell: Shell, service: str, said: Topic[Any], reason: str | None
 ) -> None:
-    """All times are the simulator's own: how busy the machine is plays no part but for messages under way."""
+    """All times are the simulator's, so load affects only messages under way."""
     patient = ("--set", "mesh.lease_s=60")  # on a busy machine two simulated seconds may be longer than the usual lease
     assert shell("up", "sim", "--detach", "--frames", "320x240@15", *patient).returncode == exits.DONE
     fetch = shell.start("fetch", "red_can")

@@ -1,4 +1,4 @@
-"""What a component is written against: publishing, reading, life and health of a node."""
+"""The node: publishing, reading, liveliness and health."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Odometry from what a Create is told and the little that it reports."""
+"""Odometry from the commands to a Create and its coarse reports."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ HZ = 240
 def drive_by_reports(
     left_mps: float, right_mps: float, seconds: float, *, share: float = 1.0, report_hz: int = 5
 ) -> tuple[Odometry, Odometry]:
-    """Fused and exact odometry of wheels that turn at `share` of what they are told."""
+    """Fused and exact odometry of wheels that turn at `share` of the commanded speed."""
     fused, exact = Odometry(ROBOT.base), Odometry(ROBOT.base)
     counters = CreateCounters(ROBOT.base.wheel_separation_m)
     ramp = WheelRamp(ROBOT.base)

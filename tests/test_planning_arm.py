@@ -53,7 +53,7 @@ def within_limits(angles: FloatArray) -> bool:
 
 
 class Arm:
-    """An arm that does exactly what it is told."""
+    """An arm that follows commands exactly."""
 
     def __init__(self, angles: dict[str, float], robot: Robot = ROBOT) -> None:
         self.controller = ArmController(robot, CONFIG.arm, REACHER)

@@ -115,11 +115,11 @@ def test_from_wherever_babbling_ended_the_arm_gets_ready_and_is_folded_again(
             assert step.arrived
 
 
-# --- the behaviours, with hardware that does what it is told -------------------------------------------
+# --- the behaviours, with hardware that follows commands -------------------------------------------
 
 
 class Body:
-    """Joints that follow at once, wheels that roll as commanded, a camera that sees marker and target."""
+    """Joints that follow immediately, wheels that roll as commanded, a camera that sees marker and target."""
 
     def __init__(self, robot: Robot, separation_m: float) -> None:
         self.robot = robot

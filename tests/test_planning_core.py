@@ -1,4 +1,4 @@
-"""The planner's core: what it does with what it is told, and with what it is not told."""
+"""The planner's core: its reactions to its inputs, and to missing ones."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ TICK_S = 0.02
 
 
 class Base:
-    """A base that does what it is told."""
+    """A base that follows commands exactly."""
 
     def __init__(self) -> None:
         self.pose = Pose2()

@@ -97,7 +97,7 @@ WRITES: dict[str, tuple[Callable[[RunDir], None], tuple[str, ...]]] = {
     "register": (register, ("lock",)),
     "wire": (plug, ("wire",)),
 }
-"""What writes below the run directory, and the files that it would write there."""
+"""Functions that write below the run directory, with the files that they write."""
 LOOKS: tuple[Callable[[RunDir], object], ...] = (
     RunDir.supervisor,
     RunDir.claims,
@@ -105,7 +105,7 @@ LOOKS: tuple[Callable[[RunDir], object], ...] = (
     lambda run_dir: members(run_dir.path),
     lambda run_dir: robots(run_dir.root),
 )
-"""What only looks: it would signal the processes and join the mesh that it reads of there."""
+"""Functions that only read; their callers signal the processes and join the mesh that they find."""
 
 writes = pytest.mark.parametrize(("write", "files"), WRITES.values(), ids=WRITES)
 

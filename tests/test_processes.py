@@ -14,6 +14,7 @@ from apps.cli import stop_asking
 from cocoro import topics
 from cocoro.component import Component
 from cocoro.component import load as load_component
+from cocoro.entry_points import added_to
 from cocoro.errors import ConfigError
 from cocoro.installed import third_parties
 from cocoro.messages import Message
@@ -29,6 +30,7 @@ def forget() -> None:
     """Have third parties looked for anew."""
     processes.table.cache_clear()
     third_parties.cache_clear()
+    added_to.cache_clear()
 
 
 @pytest.fixture
@@ -140,7 +142,7 @@ def test_third_parties_add_rows_by_entry_point(parts: Path) -> None:
     ("entry", "message"),
     [
         ("planning = parts:planning", r"parts.good of a third party: there is a component named 'planning' already"),
-        ("fine = parts:good", r"'fine' of parts: parts:good is not a Component named 'fine'"),
+        ("fine = parts:good", r"'fine' of parts: its value is not a Component named 'fine'"),
         ("fine = parts:nothing", r"'fine' of parts cannot be loaded: AttributeError"),
     ],
 )

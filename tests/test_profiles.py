@@ -1,4 +1,4 @@
-"""Profiles: what comes with the project, what may be overridden, and what a mistake in one says."""
+"""Profiles: those of the project, overrides, and the errors of a faulty one."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from deploy.quit import UNSAID
+from deploy.quit import UNFLUSHED
 
 PATIENCE_S = 60.0
 
@@ -53,7 +53,7 @@ def test_what_it_could_not_print_is_an_error() -> None:
     buffered = os.environ | {"PYTHONUNBUFFERED": ""}
     with Path("/dev/full").open("w") as full:
         run = subprocess.run([sys.executable, "-c", script], stdout=full, env=buffered, timeout=PATIENCE_S)
-    assert run.returncode == UNSAID
+    assert run.returncode == UNFLUSHED
 
 
 CAUGHT_IN_A_CALLBACK = """

@@ -1,4 +1,4 @@
-"""What happened of late is counted for a while and then forgotten."""
+"""Recent events are counted for a while and then forgotten."""
 
 from __future__ import annotations
 

@@ -18,9 +18,9 @@ from deploy.processes import hardware
 pytestmark = pytest.mark.sim
 
 HALT_S = 0.3
-"""From whatever goes wrong until the robot stands, by the truth."""
+"""Bound from a fault until the robot stands, by the true state."""
 ZERO_S = 0.2
-"""The same until nothing but zero is commanded."""
+"""Bound from a fault until only zero is commanded."""
 
 
 def stands_since(rig: RobotRig, when_s: float) -> bool:

@@ -1,4 +1,4 @@
-"""The robot's one offset to wall time: fixed once, read by whoever joins, and not believed after another boot."""
+"""The robot's offset to wall time: fixed once, read by every process that joins, and invalid after a reboot."""
 
 from __future__ import annotations
 

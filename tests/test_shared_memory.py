@@ -29,21 +29,21 @@ from deploy.rundir import RunDir
 
 
 class Room(NamedTuple):
-    """What statvfs says, as far as it is asked."""
+    """The fields of statvfs that are used."""
 
     f_bavail: int
     f_frsize: int = 1
 
 
 def has_free(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
-    """So many bytes are free, and may be locked in memory."""
+    """Have `count` bytes free in shared memory, without a limit for locked memory."""
     monkeypatch.setattr(os, "statvfs", lambda _: Room(count))
     monkeypatch.setattr(shared, "lockable_bytes", lambda: None)
 
 
 @pytest.fixture
 def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """In /dev/shm's place."""
+    """A folder that replaces /dev/shm."""
     monkeypatch.setattr(shared, "PLACE", tmp_path)
     return tmp_path
 

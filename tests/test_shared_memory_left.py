@@ -1,4 +1,4 @@
-"""Nothing of the machine's shared memory is left behind, and nothing that anybody holds is taken away."""
+"""No shared memory is left behind, and none that a process holds is removed."""
 
 from __future__ import annotations
 

@@ -62,7 +62,7 @@ def up(shell: Shell, *options: str, profile: str = "sim") -> str:
 
 
 def latch(shell: Shell) -> str:
-    """As the robot tells it, once the executive knows."""
+    """The latch in the status, once the executive knows it."""
     for _ in range(100):
         done = shell("status", "--json", "--robot", shell.run_dir.robot)
         told = json.loads(done.stdout)
@@ -76,7 +76,7 @@ def robot(shell: Shell, *arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 def kill(shell: Shell, *services: str) -> None:
-    """All at once, as far as that is possible."""
+    """Kill services as simultaneously as possible."""
     targets = [shell.target(service) for service in services]
     for target in targets:
         target.signal(signal.SIGKILL)
@@ -105,7 +105,7 @@ def test_the_latch_outlives_the_death_of_everything_and_only_a_reset_releases_it
     assert latch(shell) == "latched"
     assert robot(shell, "fetch", "red_can").returncode == exits.REFUSED
 
-    kill(shell, "executive", "base")  # at once, and started again by the supervisor
+    kill(shell, "executive", "base")  # simultaneously; the supervisor restarts them
     assert latch(shell) == "latched"
     for _ in range(20):
         if (reset := robot(shell, "reset")).returncode == exits.DONE:

@@ -1,4 +1,4 @@
-"""The emergency stop's own path: who hears it, who is believed, and what cannot deny it."""
+"""The emergency stop's path: who receives it, whose answers count, and what cannot prevent it."""
 
 from __future__ import annotations
 
@@ -10,24 +10,23 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import pytest
+from stop_rig import PATIENCE_S, full_queue, new_robot, stop
 
 from apps.cli import stop_asking as asking_module
 from apps.cli.stop_asking import Asking, addresses
 from cocoro.stop.path import PREFIX, StopPoint, listen
 
-PATIENCE_S = 60.0
 ROOT = Path(__file__).parents[1]
 needs_root = pytest.mark.skipif(os.getuid() != 0, reason="only root can be another user")
 
 
 @pytest.fixture
 def robot() -> str:
-    """A robot of that name is nowhere else on this machine, though other tests may run beside this one."""
-    return f"robot-{os.urandom(4).hex()}"
+    return new_robot()
 
 
 def kept(_by: str) -> Future[str]:
@@ -38,7 +37,7 @@ def kept(_by: str) -> Future[str]:
 
 @contextmanager
 def moving(robot: str, *services: str, keep: Callable[[str], Future[str]] = kept) -> Iterator[dict[str, list[str]]]:
-    """Services that can be stopped; for each, by whom it was stopped so far."""
+    """Services that can be stopped; yields, for each, by whom it has been stopped."""
     halted: dict[str, list[str]] = {service: [] for service in services}
     with ExitStack() as stack:
         for service in services:
@@ -48,26 +47,36 @@ def moving(robot: str, *services: str, keep: Callable[[str], Future[str]] = kept
         yield halted
 
 
-def stop(robot: str | None, within_s: float = PATIENCE_S) -> Asking:
-    with Asking(robot) as asking:
-        asking.go_on(time.monotonic() + within_s)
-        asking.hear_of_the_disk(time.monotonic() + within_s)
-    return asking
-
-
 def reached(asking: Asking) -> list[bool]:
     """For each stop point of the robot, whether the request has been delivered to it."""
     return [point.sent_s is not None for point in asking.points.values()]
 
 
 def another_user(robot: str, code: str) -> subprocess.Popen[str]:
-    """Some Python run by nobody (user 65534), without one variable of the environment; `robot` is its argument."""
+    """Run Python code as nobody (user 65534) with an empty environment and `robot` as its argument."""
     imports = (
         f"import os, socket, sys, time; sys.path.insert(0, {str(ROOT)!r}); from apps.cli.stop_asking import Asking;"
     )
     become = "os.setgroups([]); os.setgid(65534); os.setuid(65534);"
     command = [sys.executable, "-I", "-S", "-c", imports + become + code, robot]
     return subprocess.Popen(command, env={}, cwd="/", stdout=subprocess.PIPE, text=True)
+
+
+@contextmanager
+def a_liar(robot: str) -> Iterator[None]:
+    """A process of another user that answers as the base, at an address that names this user."""
+    code = (
+        "s = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM);"
+        f"s.bind(b'\\0{PREFIX}0/' + sys.argv[1].encode() + b'/base/liar');"
+        "print('there', flush=True); _, who = s.recvfrom(100); s.sendto(b'latched base 1', who); s.recvfrom(100)"
+    )
+    with another_user(robot, code) as liar:
+        try:
+            assert liar.stdout is not None
+            assert liar.stdout.readline() == "there\n"
+            yield
+        finally:
+            liar.kill()
 
 
 def test_everything_that_moves_is_halted_before_it_answers_and_says_that_the_latch_is_kept(robot: str) -> None:
@@ -159,7 +168,7 @@ def test_who_does_not_read_is_named_and_holds_up_nobody(robot: str) -> None:
             asking = stop(robot, within_s=0.1)
             assert [point.service for point in asking.waiting] == ["arm"]
             assert halted["base"]
-            # What was sent waits for it: it is stopped as soon as it goes on.
+            # The request waits in its queue, so it stops as soon as it continues.
             taken = deaf.take(wait=False)
             assert taken is not None
             assert taken.by.startswith("operator")
@@ -170,18 +179,14 @@ def test_who_does_not_read_is_named_and_holds_up_nobody(robot: str) -> None:
 def test_full_queues_are_tried_again(robot: str) -> None:
     slow = StopPoint(robot, "base")
     (address,) = addresses(robot)
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as sender:
-        with suppress(BlockingIOError):
-            while True:
-                sender.sendto(b"", b"\0" + address[1:].encode())
-        with Asking(robot) as asking:
-            assert reached(asking) == [False]
-            halted: list[str] = []
-            listen(slow, halted.append, kept)
-            asking.go_on(time.monotonic() + PATIENCE_S)
-            assert reached(asking) == [True]
-            assert all(point.latched_ns for point in asking.points.values())
-            assert halted[-1].startswith("operator")
+    with full_queue(address), Asking(robot) as asking:
+        assert reached(asking) == [False]
+        halted: list[str] = []
+        listen(slow, halted.append, kept)
+        asking.go_on(time.monotonic() + PATIENCE_S)
+        assert reached(asking) == [True]
+        assert all(point.latched_ns for point in asking.points.values())
+        assert halted[-1].startswith("operator")
     slow.close()
 
 
@@ -191,17 +196,13 @@ def test_who_finds_no_room_in_a_flood_is_there_as_soon_as_there_is_some(
     monkeypatch.setattr(asking_module, "LOOK_AGAIN_S", PATIENCE_S)  # it is not tried by and by
     full = StopPoint(robot, "base")
     (address,) = addresses(robot)
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as sender:
-        with suppress(BlockingIOError):
-            while True:
-                sender.sendto(b"", b"\0" + address[1:].encode())
-        with Asking(robot) as asking:
-            asking.go_on(time.monotonic() + 0.05)
-            assert reached(asking) == [False]
-            while full.take(wait=False) is not None:
-                pass
-            asking.go_on(time.monotonic() + 0.05)
-            assert reached(asking) == [True]
+    with full_queue(address), Asking(robot) as asking:
+        asking.go_on(time.monotonic() + 0.05)
+        assert reached(asking) == [False]
+        while full.take(wait=False) is not None:
+            pass
+        asking.go_on(time.monotonic() + 0.05)
+        assert reached(asking) == [True]
     full.close()
 
 
@@ -335,21 +336,10 @@ def test_another_user_without_any_variable_can_stop_the_robot(robot: str) -> Non
 @pytest.mark.process
 @needs_root
 def test_an_address_that_names_another_user_is_that_of_who_made_it(robot: str) -> None:
-    """So what he answers, or does not, is told of a robot of his."""
-    code = (
-        "s = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM);"
-        f"s.bind(b'\\0{PREFIX}0/' + sys.argv[1].encode() + b'/base/liar');"
-        "print('there', flush=True); _, who = s.recvfrom(100); s.sendto(b'latched base 1', who); s.recvfrom(100)"
-    )
-    with another_user(robot, code) as liar:
-        try:
-            assert liar.stdout is not None
-            assert liar.stdout.readline() == "there\n"
-            with moving(robot, "arm"):
-                asking = stop(robot)
-            assert {point.service: point.uid for point in asking.points.values()} == {"base": 65534, "arm": 0}
-        finally:
-            liar.kill()
+    """Its answers, or their absence, are attributed to that user's robot."""
+    with a_liar(robot), moving(robot, "arm"):
+        asking = stop(robot)
+    assert {point.service: point.uid for point in asking.points.values()} == {"base": 65534, "arm": 0}
 
 
 @pytest.mark.process
@@ -358,17 +348,6 @@ def test_where_the_kernel_does_not_tell_whose_an_address_is_only_the_answers_of_
     robot: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(asking_module, "owners", lambda _: {})
-    code = (
-        "s = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM);"
-        f"s.bind(b'\\0{PREFIX}0/' + sys.argv[1].encode() + b'/base/liar');"
-        "print('there', flush=True); _, who = s.recvfrom(100); s.sendto(b'latched base 1', who); s.recvfrom(100)"
-    )
-    with another_user(robot, code) as liar:
-        try:
-            assert liar.stdout is not None
-            assert liar.stdout.readline() == "there\n"
-            with moving(robot, "arm"):
-                asking = stop(robot, within_s=0.3)
-            assert [point.service for point in asking.waiting] == ["base"]
-        finally:
-            liar.kill()
+    with a_liar(robot), moving(robot, "arm"):
+        asking = stop(robot, within_s=0.3)
+    assert [point.service for point in asking.waiting] == ["base"]

@@ -74,7 +74,8 @@ def test_rubbish_is_latched_says_why_and_is_put_right_by_the_next_word(folder: P
     (folder / "base").write_bytes(content)
     kept = LatchRecord(folder / "base")
     assert kept.entry.latched
-    assert kept.entry.by == f"the record {folder}/base, which cannot be read: it is damaged"
+    assert f"{folder}/base" in kept.entry.by
+    assert "damaged" in kept.entry.by
     assert kept.keep(False, "operator").result(PATIENCE_S) == ""
     assert not read(folder / "base").latched
 

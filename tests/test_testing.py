@@ -1,4 +1,4 @@
-"""The harness for components, tried on a small component of its own."""
+"""The harness for components, with a small component."""
 
 from __future__ import annotations
 

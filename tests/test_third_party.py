@@ -16,7 +16,7 @@ from typing import Any
 import msgspec
 import pytest
 from capture_rig import STILL, Room, all_of, record
-from third_party import NAME, install, on_path
+from third_party import NAME, forget_third_parties, install, on_path
 
 from apps.captures.player import Player
 from apps.captures.reexecute import reexecute
@@ -29,7 +29,7 @@ from cocoro.bus.base import Qos
 from cocoro.capture.reader import Capture
 from cocoro.component import Component, load
 from cocoro.errors import ConfigError
-from cocoro.installed import third_parties, topic_named
+from cocoro.installed import topic_named
 from cocoro.messages import BaseState, Message
 from cocoro.robot import Robot
 from cocoro.topics import Topic
@@ -119,6 +119,13 @@ def test_a_topic_that_is_declared_so_is_not_recorded(rejected: dict[str, Any]) -
         assert KEY in capture.keys
 
 
+def test_record_reports_what_is_not_recorded(
+    odometer: Component, root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["record", "--out", str(tmp_path)]) == 4  # there is no robot in this run directory
+    assert f"not recorded, as declared: {NAME}/scratch\n" in capsys.readouterr().err
+
+
 def test_it_is_exported(rejected: dict[str, Any], tmp_path: Path) -> None:
     assert main(["export", str(rejected["path"]), "--csv", str(tmp_path)]) == 0
     with (tmp_path / f"{NAME}_travelled.csv").open() as table:
@@ -175,8 +182,7 @@ def test_a_topic_of_a_taken_name_is_an_error_and_does_not_disturb(
 ) -> None:
     clash = Topic(name, Other, Qos.STATE, 1.0, 3.0, "Clashes.")
     monkeypatch.setattr(import_module(NAME), "component", replace(odometer, publishes=(clash,)))
-    third_parties.cache_clear()
-    processes.table.cache_clear()
+    forget_third_parties()
     try:
         with pytest.raises(ConfigError, match=rf"'{NAME}' of cocoro-{NAME}: its topic {name} differs from the one"):
             processes.named(NAME)
@@ -186,5 +192,4 @@ def test_a_topic_of_a_taken_name_is_an_error_and_does_not_disturb(
         assert NAME not in {component.name for component in processes.components()}
         assert main(["topics"]) == 0
     finally:
-        third_parties.cache_clear()
-        processes.table.cache_clear()
+        forget_third_parties()

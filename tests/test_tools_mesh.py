@@ -34,7 +34,7 @@ ANY = RobotChoice()
 
 @asynccontextmanager
 async def robot() -> AsyncIterator[None]:
-    """A planner that commands, a base that listens, and somebody whose keys no table knows."""
+    """A planner that commands, a base that listens, and a participant whose keys are in no table."""
     async with (
         await ZenohBus.open(default("calliope", "robot")) as bus,
         Node("planning", bus, RealClock(), Robot.load(), health_hz=20.0) as planning,
@@ -122,7 +122,7 @@ def test_top_tells_who_lives_what_it_costs_and_what_each_reader_misses(
     run_dir.profile_file.write_text(json.dumps(profile))
 
     async def after_a_while() -> int:
-        async with asyncio.timeout(30.0):  # until something was rejected, and told in a health message
+        async with asyncio.timeout(30.0):  # until a rejection appears in a health message
             while True:
                 code = await top.show_top(ANY, True, True, 1.0)
                 out = capsys.readouterr().out

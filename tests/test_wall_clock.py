@@ -100,7 +100,7 @@ def wall(tmp_path: Path) -> Iterator[WallClock]:
 
 
 class Driven:
-    """A robot that is a base at an emulated line, up under its supervisor, and a planner in a process of its own."""
+    """A robot that is a base on an emulated line, under its supervisor, and a planner in a separate process."""
 
     def __init__(self, bench: Bench, wall: WallClock, root: Path, folder: Path) -> None:
         self.bench = bench
@@ -153,7 +153,7 @@ class Driven:
         return bool(self.bench.emulator.call(lambda: list(self.bench.create.acted)))
 
     def python(self, code: str) -> Any:
-        """What a Python process of this robot prints, as JSON."""
+        """Run Python code in the robot's environment; returns its JSON output."""
         out = subprocess.run([sys.executable, "-c", code], env=self._env, capture_output=True, timeout=PATIENCE_S)
         return json.loads(out.stdout)
 
@@ -163,7 +163,7 @@ class Driven:
         return done.returncode, done.stdout
 
     def rejected(self) -> list[tuple[str, str]]:
-        """What anyone rejected, with the reason, as `cocoro top` tells it."""
+        """Rejected topics with the reasons, by `cocoro top`."""
         code, out = self.command("top", "--once", "--json")
         assert code == 0, out
         readers = [(topic["topic"], reader) for topic in json.loads(out)["topics"] for reader in topic["readers"]]
@@ -223,7 +223,7 @@ def test_steps_of_the_wall_clock_disturb_no_drive_and_lengthen_no_deadman(wall: 
             robot.kill_planner()
             wall.step_to(step_s)
             assert robot.bench.until_wheels(0, 0) - killed_ns < DEADMAN_S * NS + 100 * MS, step_s
-            robot.drive()  # a planner that starts after the step is understood at once
+            robot.drive()  # messages of a planner that starts after the step are accepted immediately
         assert robot.rejected() == []
 
 

@@ -13,6 +13,7 @@ import pytest
 
 from apps.cli.main import main
 from cocoro.capture import types
+from cocoro.entry_points import added_to
 from cocoro.installed import third_parties
 from deploy import processes
 
@@ -35,6 +36,7 @@ def forget_third_parties() -> None:
     """Have installed components looked for anew."""
     processes.table.cache_clear()
     third_parties.cache_clear()
+    added_to.cache_clear()
     types.reader_of.cache_clear()
 
 

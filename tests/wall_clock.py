@@ -1,8 +1,8 @@
-"""A wall clock that a test steps in every process that it starts, without touching the machine's.
+"""A wall clock that a test steps in the processes that it starts, without changing the machine's.
 
-A few lines of C are compiled and preloaded (LD_PRELOAD), so that everything in a process that asks the C library for
-the wall time gets it stepped: Python, and libraries such as zenoh. The steady clocks stay as they are. What the kernel
-itself knows as wall time (a timer on CLOCK_REALTIME, the times of files) is not stepped.
+A few lines of C are compiled and preloaded (LD_PRELOAD), so that the C library returns a stepped wall time to Python
+and to libraries such as zenoh. Steady clocks are unchanged. Wall time inside the kernel (timers on CLOCK_REALTIME, file
+times) is not stepped.
 """
 
 from __future__ import annotations
@@ -69,11 +69,11 @@ time_t time(time_t *now) {
 
 
 class NoPreloadError(Exception):
-    """The wall clock cannot be stepped here; the text says why."""
+    """The wall clock cannot be stepped here; the text gives the reason."""
 
 
 class WallClock:
-    """Steps the wall time of all processes that are started with `env`. Use it as a context manager."""
+    """Steps the wall time of all processes that are started with `env`. A context manager."""
 
     def __init__(self, folder: Path) -> None:
         """Raises NoPreloadError."""
@@ -104,5 +104,5 @@ class WallClock:
         os.close(self._fd)
 
     def step_to(self, seconds: float) -> None:
-        """From now on, wall time is the machine's and so much more."""
+        """Set the wall time to the machine's plus an offset, s."""
         self._memory[:8] = struct.pack("=q", round(seconds * 1e9))

@@ -1,4 +1,4 @@
-"""Processes that meet over zenoh, for tests: children that tell what they hear, and what asks after them."""
+"""Child processes on a zenoh mesh that print what they receive, and ways to observe them."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ asyncio.run(main())
 
 
 class Child:
-    """A process in the mesh, which tells by lines what it does."""
+    """A process on the mesh that prints its activity, line by line."""
 
     def __init__(self, process: asyncio.subprocess.Process) -> None:
         self.process = process
@@ -127,7 +127,7 @@ def local(directory: Path, name: str = "test", **options: Any) -> ZenohConfig:
 
 @asynccontextmanager
 async def changes(bus: ZenohBus, key: str) -> AsyncIterator[asyncio.Queue[bool]]:
-    """Whether a token lives, as it changes."""
+    """A queue of the changes of a liveliness token: whether it exists."""
     news: asyncio.Queue[bool] = asyncio.Queue()
     watch = bus.watch_alive(key, lambda _, alive: news.put_nowait(alive))
     yield news
@@ -152,5 +152,5 @@ async def echo(key: str, payload: Payload) -> bytes:
 
 
 def held() -> list[Path]:
-    """The segments that this process holds; others of this user's may come and go."""
+    """The shared memory segments that this process holds; other processes' segments are not counted."""
     return [Path(f"/proc/self/fd/{fd}").readlink() for fd in shared._held()]

@@ -47,7 +47,7 @@ class ObjectView:
 
 @dataclass(frozen=True)
 class ObjectHints:
-    """What the person states about the object; None where it is to be found in the picture."""
+    """Facts that the person states about the object; None for what is to be found in the picture."""
 
     label: str
     at_px: tuple[int, int] | None = None

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import msgspec
 
-from apps.rehearsal.lockstep import LOCKSTEP_PLANNER
+from apps.rehearsal.lockstep import LOCKSTEP_PLANNER, PLANNING_MODULE
 from cocoro.capture.conventions import CaptureError
 from cocoro.capture.reader import Capture, Record
 from cocoro.capture.types import LossyFrame, MessageHead, NotReadableError
@@ -182,9 +182,8 @@ def recorded_file(capture: Capture, service: str, field: str, load: Callable[[Pa
 def _origin(service: str, entries: Mapping[str, str], folder: Path) -> Origin:
     module = entries["module"]
     settings = json.loads(entries["config"])
-    # Until 2026 the planner had the setting `coordination`; lock-step is a component of its own now.
-    if settings.pop("coordination", "concurrent") == "lockstep":
-        module = LOCKSTEP_PLANNER.module
+    if module == PLANNING_MODULE and settings.pop("coordination", "concurrent") == "lockstep":
+        module = LOCKSTEP_PLANNER.module  # a former setting of the planner; now a component of its own
     component = LOCKSTEP_PLANNER if module == LOCKSTEP_PLANNER.module else processes.by_module(module)
     if component is None:
         raise ConfigError(f"no component that is installed here has the module {module!r}")

@@ -1,7 +1,8 @@
 """The commands of `cocoro`, in the order in which its help lists them.
 
-`cocoro --help` needs this file alone. A command's own file has its options and what it does; it is imported when the
-command is called, so it may import whatever it needs.
+`cocoro --help` needs this file and `task_commands`. A command's own file has its options and what it does; it is
+imported when the command is called, so it may import whatever it needs. The commands of tasks (`cocoro fetch`) are made
+from the types of tasks by `task_commands`; `tasks` sends the request and follows the task to its outcome.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ class CommandRow(NamedTuple):
 COMMANDS = (
     CommandRow("cancel", TASKS, "End the running task; the robot stands still."),
     CommandRow("rehearse", TASKS, "Try a task in simulation: the whole robot in one process, in virtual time."),
-    CommandRow("status", WATCH, "What runs, its health, what the robot does and why."),
+    CommandRow("status", WATCH, "The running services, their health, the task and the planner's reason."),
     CommandRow("objects", WATCH, "The objects that the robot knows, and where it saw each last; `learn` adds one."),
     CommandRow("snapshot", WATCH, "Write a picture of what the robot sees now, with its detections drawn in."),
     CommandRow(
@@ -48,7 +49,7 @@ COMMANDS = (
     CommandRow(
         "top",
         TOOLS,
-        "What runs and what travels, live: cpu, memory, rates against nominal, ages, what was skipped, lost, rejected.",
+        "Services and topics, live: cpu, memory, rates against nominal, ages, and what was skipped, lost or rejected.",
     ),
     CommandRow(
         "echo",
@@ -56,8 +57,8 @@ COMMANDS = (
         "The messages of a key, decoded, of any type; a message that a reader would reject is marked with the reason.",
     ),
     CommandRow("hz", TOOLS, "Rate, jitter and amount of data on a key, as it arrives here, over the last seconds."),
-    CommandRow("logs", TOOLS, "What the robot's processes on this machine wrote since their start, merged by time."),
-    CommandRow("new", TOOLS, "Write a component from a template: `cocoro new service NAME`."),
+    CommandRow("logs", TOOLS, "Logs of the robot's processes on this machine since their start, merged by time."),
+    CommandRow("new", TOOLS, "Write a component (`new service NAME`) or a task (`new task NAME`) from a template."),
     CommandRow(
         "base", HARDWARE, "Show the base: mode, battery, bumpers, odometry; `recover` puts it back into its mode."
     ),
@@ -83,7 +84,7 @@ COMMANDS = (
     CommandRow("down", RUNNING, "Stop a robot's processes."),
     CommandRow("run", RUNNING, "Run one process in this terminal, on the mesh of the profile."),
     CommandRow("estop", SAFETY, "Emergency stop, now: everything that moves stands still until `reset`."),
-    CommandRow("stop", SAFETY, "The same as estop.", hidden=True),
+    CommandRow("stop", SAFETY, "Short for estop.", hidden=True),
     CommandRow("reset", SAFETY, "Release the emergency stop."),
 )
 
@@ -145,8 +146,7 @@ def load(name: str) -> TyperCommand | TyperGroup:
 
 
 class CommandGroup(TyperGroup):
-    """The group of all commands: help comes from COMMANDS, and a command is loaded when it is called. Further commands
-    are made from the types of tasks."""
+    """The group of all commands: it lists COMMANDS and the tasks, and loads a command when it is called."""
 
     def __init__(self, **attributes: Any) -> None:
         super().__init__(**attributes)

@@ -13,7 +13,7 @@ import typer
 from msgspec.structs import replace
 
 from apps.cli.interrupt import on_interrupt
-from apps.cli.link import Link, joined
+from apps.cli.link import MeshLink, joined
 from apps.cli.options import JsonOption, MeshOption, RobotChoice, RobotOption, SamplesOutOption
 from apps.cli.output import going_on
 from apps.cli.progress import TaskDisplay, task_display
@@ -78,7 +78,7 @@ class BabbleDisplay:
         self._had = len(kept)
 
     def show(self, state: TaskState) -> None:
-        if state.phase.startswith("babble"):
+        if state.phase == state.task:
             state.text = self.text(state.elapsed_s)
         self._view.show(state)
 
@@ -86,7 +86,7 @@ class BabbleDisplay:
         self._view.say(text)
 
     def result(self, text: str) -> None:
-        self._view.result(f"{text}; {self._kept.said}")
+        self._view.result(f"{text}; {self._kept.summary}")
 
     def close(self) -> None:
         self._view.close()
@@ -96,7 +96,7 @@ class BabbleDisplay:
         full = round(BAR * min(count / self._wanted, 1.0))
         new = count - self._had
         left = f", {_time((self._wanted - count) * elapsed_s / new)} left" if new else ""
-        return f"[{'#' * full}{'.' * (BAR - full)}] {count} of {self._wanted}: {self._kept.said}{left}"
+        return f"[{'#' * full}{'.' * (BAR - full)}] {count} of {self._wanted}: {self._kept.summary}{left}"
 
 
 class SampleWriter:
@@ -132,7 +132,7 @@ async def collect(
                 shown.result(f"{file} holds {len(kept)} already, which is enough")
                 return 0
             if len(kept):
-                shown.say(f"continuing {file}: {kept.said}")
+                shown.say(f"continuing {file}: {kept.summary}")
             samples: Any = link.inbox(task.samples)  # before the request, so that no sample is missed
             task = replace(task, first=kept.next, count=wanted - len(kept))
             follower = Follower(link, TaskRequest(task=task), shown, None)
@@ -151,13 +151,13 @@ async def collect(
     return code
 
 
-async def _standing_height(link: Link, label: str) -> float | None:
+async def _standing_height(link: MeshLink, label: str) -> float | None:
     """Height of the centre of a known object that stands on the floor, m; None for an unknown one."""
     reply = await link.call(OBJECTS, ObjectsRequest())
     return next((known.size_m[2] / 2 for known in reply.objects if known.label == label), None)
 
 
-async def description(link: Link) -> Robot:
+async def description(link: MeshLink) -> Robot:
     """The description that the planner of a running robot computes with."""
     reply = await link.call(ABOUT.of("planning"), AboutRequest())
     if reply.description is None:

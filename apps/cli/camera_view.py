@@ -14,7 +14,7 @@ import numpy as np
 
 from apps.appearance.learn import LearnedObject, ObjectView
 from apps.appearance.size import outline_of
-from apps.cli.link import Link, joined, within
+from apps.cli.link import MeshLink, joined, within
 from apps.cli.options import RobotChoice
 from apps.pictures import colour_of, describe, draw
 from cocoro.arrays import ImageArray
@@ -83,7 +83,7 @@ async def of_robot(choice: RobotChoice) -> CameraView:
     return CameraView(object_view, frame, head, Path(named) if named else None)
 
 
-async def _frame(link: Link, joints: tuple[str, ...]) -> tuple[Frame, dict[str, float]]:
+async def _frame(link: MeshLink, joints: tuple[str, ...]) -> tuple[Frame, dict[str, float]]:
     """A frame and the head's angles, rad, at its time; preferably one for which the head stood still."""
     frames: deque[Frame] = deque(maxlen=30)
     states: deque[ServoState] = deque(maxlen=500)

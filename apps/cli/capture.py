@@ -45,7 +45,7 @@ def info(
     ] = False,
     json: JsonOption = False,
 ) -> None:
-    """What a capture has: keys, counts, rates, gaps, losses and where it is from. Exit code 1 when it is damaged."""
+    """Contents of a capture: keys, counts, rates, gaps, losses and its origin. Exit code 1 when it is damaged."""
     sys.exit(show_info(file, check, json))
 
 

@@ -1,4 +1,4 @@
-"""What a command's exit code says. Scripts rely on these."""
+"""Exit codes of the commands. Scripts rely on them."""
 
 DONE = 0
 FAILED = 1

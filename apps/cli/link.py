@@ -7,25 +7,27 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from apps.cli.options import RobotChoice
 from cocoro.bus.base import Bus
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.errors import ConfigError, MeshError
 from cocoro.participant import Answer, Participant
-from cocoro.robot import Robot
 from cocoro.topics import Request
 from deploy import robot_time
 from deploy.rundir import RunDir, robots
 
-__all__ = ["Answer", "Link", "find", "joined", "within"]
+if TYPE_CHECKING:
+    from cocoro.robot import Robot
+
+__all__ = ["Answer", "MeshLink", "find", "joined", "within"]
 
 ROBOT_FILES = ("description", "measured")
 START = "start one with `cocoro up sim`"
 
 
-class Link(Participant):
+class MeshLink(Participant):
     """An operator's participant of the mesh. Make it with `joined`."""
 
     onlooker = True
@@ -41,11 +43,13 @@ class Link(Participant):
     def described(self) -> Robot:
         """The robot by the files that it was started with, if they are on this machine; else the Calliope. Raises
         ConfigError."""
+        from cocoro.robot import Robot  # slow to import; few commands need it
+
         resolved = self.run_dir.resolved()
         return Robot.load(*(Path(file) if (file := resolved.get(name)) else None for name in ROBOT_FILES))
 
     def unserved(self, request: Request[Any, Any]) -> str:
-        return f"{self.robot} has no {request.server} running: {START}, `cocoro status` tells more"
+        return f"{self.robot} has no {request.server} running: {START}, or see `cocoro status`"
 
     def refused(self, answer: Answer[Any]) -> str:
         return f"{answer.service}: {answer.error}"
@@ -56,10 +60,10 @@ class Link(Participant):
         return "not alive" if self._private and self.run_dir.claimant(service) is None else "no contact"
 
 
-def find(where: RobotChoice) -> RunDir:
+def find(choice: RobotChoice) -> RunDir:
     """The robot that a command is for. Raises MeshError when none is up, ConfigError when several are."""
-    if where.robot is not None:
-        return RunDir(where.robot)
+    if choice.robot is not None:
+        return RunDir(choice.robot)
     up = robots()
     if not up:
         raise MeshError(f"no robot is up on this machine: {START}")
@@ -69,17 +73,19 @@ def find(where: RobotChoice) -> RunDir:
 
 
 @asynccontextmanager
-async def joined(where: RobotChoice, patience_s: float | None = None, *, frames: bool = False) -> AsyncIterator[Link]:
+async def joined(
+    choice: RobotChoice, patience_s: float | None = None, *, frames: bool = False
+) -> AsyncIterator[MeshLink]:
     """Joins the mesh of a robot. Raises MeshError when there is none. `frames`: the command reads frames, or all
     keys."""
-    if where.profile is not None:
+    if choice.profile is not None:
         from deploy import profiles
 
-        profile = profiles.read(where.profile)
-        run_dir = RunDir(where.robot or profile.robot)
+        profile = profiles.read(choice.profile)
+        run_dir = RunDir(choice.robot or profile.robot)
         config = run_dir.join_as("operator", profile.mesh)
     else:
-        run_dir = find(where)
+        run_dir = find(choice)
         config = run_dir.join_as("operator")
         if config.directory is not None and not run_dir.populated:
             raise MeshError(f"{run_dir.robot} is not up on this machine: {START}")
@@ -87,7 +93,7 @@ async def joined(where: RobotChoice, patience_s: float | None = None, *, frames:
     if patience_s is not None:
         config = replace(config, patience_s=patience_s)
     async with await ZenohBus.open(config, expect_mesh=True) as bus:
-        yield Link(run_dir, bus, private=config.directory is not None)
+        yield MeshLink(run_dir, bus, private=config.directory is not None)
 
 
 async def within(timeout_s: float, condition: Callable[[], bool], changed: asyncio.Event) -> bool:

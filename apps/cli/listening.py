@@ -8,7 +8,7 @@ from collections import deque
 from contextlib import suppress
 from typing import NamedTuple
 
-from apps.cli.link import Link
+from apps.cli.link import MeshLink
 from cocoro.bus.base import Payload, Qos
 from cocoro.errors import ConfigError
 from cocoro.installed import topic_named
@@ -46,7 +46,7 @@ def takes_frames(text: str) -> bool:
 class KeyListener:
     """Collects what arrives on a key expression; payloads that are not taken in time are dropped and counted."""
 
-    def __init__(self, link: Link, keyexpr: str) -> None:
+    def __init__(self, link: MeshLink, keyexpr: str) -> None:
         self.keyexpr = keyexpr
         self._waiting: deque[ReceivedPayload] = deque()
         self._arrived = asyncio.Event()

@@ -146,7 +146,7 @@ def logs(
     ] = None,
     robot: RobotOption = None,
 ) -> None:
-    """What the robot's processes on this machine wrote since their start, merged by time. Works when it is down."""
+    """Logs of the robot's processes on this machine since their start, merged by time. Works when it is down."""
     sys.exit(asyncio.run(print_logs(robot, service, follow, lines, level)))
 
 

@@ -15,7 +15,7 @@ from typing import Annotated, Any, cast
 import typer
 
 from apps.cli import exits
-from apps.cli.link import Link, joined
+from apps.cli.link import MeshLink, joined
 from apps.cli.options import (
     DescriptionOption,
     JsonOption,
@@ -110,7 +110,7 @@ async def request(choice: RobotChoice, action: str, joints: list[str]) -> int:
     return code
 
 
-async def _request_one(link: Link, network: str, action: str, joints: list[str]) -> int:
+async def _request_one(link: MeshLink, network: str, action: str, joints: list[str]) -> int:
     question = ServoRequest(action=action, joints=tuple(joints))  # type: ignore[arg-type] # one of three, by the command
     try:
         reply = await link.call(SERVOS.of(network), question)

@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from apps.cli import exits
-from apps.cli.link import Link, joined, within
+from apps.cli.link import MeshLink, joined, within
 from apps.cli.options import MeshOption, RobotChoice, RobotOption
 from cocoro.errors import ConfigError, MeshError
 from cocoro.messages import Detections, Frame
@@ -57,7 +57,7 @@ def check(out: Path) -> None:
 class SnapshotTaker:
     """Keeps the newest frame whose detections are known, from `open` on, until `write` saves it."""
 
-    def __init__(self, link: Link) -> None:
+    def __init__(self, link: MeshLink) -> None:
         self._link = link
         self._frames: OrderedDict[tuple[int, int], Frame] = OrderedDict()
         self._pair: tuple[Frame, Detections] | None = None

@@ -12,7 +12,7 @@ import msgspec
 import typer
 
 from apps.cli import exits
-from apps.cli.link import Link, joined, within
+from apps.cli.link import MeshLink, joined, within
 from apps.cli.options import JsonOption, MeshOption, RobotChoice, RobotOption
 from apps.cli.terminal import print_table
 from cocoro.errors import ConfigError
@@ -30,7 +30,7 @@ app = typer.Typer()
 
 @app.command()
 def status(robot: RobotOption = None, profile: MeshOption = None, json: JsonOption = False) -> None:
-    """What runs, its health, what the robot does and why. Exit code 1 when something that should run does not."""
+    """The running services, their health, the task and the planner's reason. Exit code 1 when a service is missing."""
     sys.exit(asyncio.run(show_status(RobotChoice(robot, profile), json)))
 
 
@@ -48,7 +48,7 @@ async def show_status(choice: RobotChoice, as_json: bool) -> int:
 class Survey:
     """Collects the health of every live service and the newest state of task, plan, latch and base."""
 
-    def __init__(self, link: Link) -> None:
+    def __init__(self, link: MeshLink) -> None:
         self._link = link
         self._health: dict[str, Health] = {}
         self._newest: dict[str, Message] = {}

@@ -73,7 +73,7 @@ def operate(
 def rehearse(
     task: Task,
     scene: Annotated[str, typer.Option(help="A scene's name, or its file.")] = "paper",
-    seed: Annotated[int, typer.Option(min=0, help="Seed of everything that is drawn at random.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")] = 0,
     sensors: Annotated[
         str, typer.Option(metavar="ideal|real", help="Perfect camera and body, or real ones.")
     ] = "ideal",

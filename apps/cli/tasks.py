@@ -12,7 +12,7 @@ import msgspec
 
 from apps.cli import exits
 from apps.cli.interrupt import on_interrupt
-from apps.cli.link import Link, joined
+from apps.cli.link import MeshLink, joined
 from apps.cli.options import RobotChoice
 from apps.cli.output import going_on
 from apps.cli.progress import TaskDisplay, task_display
@@ -38,7 +38,7 @@ LOOK_S = 0.2
 """Time between two checks whether a silent executive has died."""
 
 
-async def run(where: RobotChoice, request: TaskRequest, as_json: bool, picture: Path | None) -> int:
+async def run(choice: RobotChoice, request: TaskRequest, as_json: bool, picture: Path | None) -> int:
     """Runs a task to its outcome and returns the exit code. `picture`: file for the last picture of the task's snapshot
     phase.
 
@@ -46,7 +46,7 @@ async def run(where: RobotChoice, request: TaskRequest, as_json: bool, picture: 
     """
     if picture is not None:
         check(picture)
-    async with joined(where, frames=picture is not None) as link:
+    async with joined(choice, frames=picture is not None) as link:
         contact = Contact(link.run_dir.claimant_pid, SleepDetector())
         follower = Follower(link, request, task_display(as_json), picture, contact)
         with on_interrupt(follower.interrupt), going_on():
@@ -56,9 +56,9 @@ async def run(where: RobotChoice, request: TaskRequest, as_json: bool, picture: 
     return code
 
 
-async def cancel(where: RobotChoice) -> int:
+async def cancel(choice: RobotChoice) -> int:
     """Cancels the running task; the exit code is 3 when none runs."""
-    async with joined(where) as link:
+    async with joined(choice) as link:
         reply = await link.call(CANCEL, CancelRequest())
     if not reply.accepted:
         print(f"cocoro: refused: {reply.text}", file=sys.stderr)
@@ -71,7 +71,12 @@ class Follower:
     """Requests one task and follows it to its outcome."""
 
     def __init__(
-        self, link: Link, request: TaskRequest, view: TaskDisplay, picture: Path | None, contact: Contact | None = None
+        self,
+        link: MeshLink,
+        request: TaskRequest,
+        view: TaskDisplay,
+        picture: Path | None,
+        contact: Contact | None = None,
     ) -> None:
         """`contact` finds out what happened to an executive that is silent."""
         self._contact = contact or Contact(link.run_dir.claimant_pid)

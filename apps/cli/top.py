@@ -16,7 +16,7 @@ import typer
 
 from apps.cli import exits
 from apps.cli.interrupt import elapsed, interrupt_event
-from apps.cli.link import Link, joined, within
+from apps.cli.link import MeshLink, joined, within
 from apps.cli.options import JsonOption, MeshOption, RobotChoice, RobotOption
 from apps.cli.status import expected
 from apps.cli.top_view import Screen, print_report
@@ -45,7 +45,7 @@ def top(
     profile: MeshOption = None,
     json: JsonOption = False,
 ) -> None:
-    """What runs and what travels, live: cpu, memory, rates against nominal, ages, what was skipped, lost, rejected.
+    """Services and topics, live: cpu, memory, rates against nominal, ages, and what was skipped, lost or rejected.
 
     Ctrl-C ends it. Counts are since the start; a value that is wrong now, or grows and should not, is red.
     """
@@ -84,7 +84,7 @@ def _print(report: dict[str, Any], as_json: bool) -> None:
 class MeshWatch:
     """Collects the health of all services; `report` returns the newest as data."""
 
-    def __init__(self, link: Link) -> None:
+    def __init__(self, link: MeshLink) -> None:
         self._link = link
         self._alive: set[str] = set()
         self._health: dict[str, Health] = {}

@@ -22,7 +22,7 @@ from deploy.processes import COMPONENTS, publishers, readers
 QOS = {
     Qos.FRAME: "newest wins; shared memory, lowest priority",
     Qos.STATE: "newest wins",
-    Qos.COMMAND: "newest wins; sent at once at real-time priority; expires",
+    Qos.COMMAND: "newest wins; sent immediately, at real-time priority; expires",
     Qos.EVENT: "reliable, in order",
 }
 
@@ -92,22 +92,22 @@ def markdown() -> str:
         "# Topics\n",
         "Made by `cocoro topics --markdown` from `cocoro/topics.py`, `cocoro/messages/` and the declarations of the\n"
         "components (`services/*/component.py`, `sim/`); change those. A recorder reads everything that is recorded.\n",
-        "A key is `<robot>/<topic>`. A payload is one MessagePack map, its fields named as below; a reader ignores\n"
-        "fields that it does not know. SI units, in the names. What arrives malformed, wrongly typed, oversized or\n"
-        "out of order is counted in the reader's health and dropped.\n",
-        "## What is published\n",
+        "A key is `<robot>/<topic>`. A payload is one MessagePack map with the fields below, in the SI units that\n"
+        "their names give. A reader ignores fields that it does not know. It drops messages that are malformed,\n"
+        "wrongly typed, too large or out of order, and counts them in its health.\n",
+        "## Topics of messages\n",
         _markdown_table((*HEADS, "readers"), (_row_with_readers(topic) for topic in TOPICS)),
         *(f"- `{topic.name}`: {topic.doc}" for topic in TOPICS),
         "\nQuality of service: "
         + "; ".join(f"**{qos.value}**: {text.replace(';', ',')}" for qos, text in QOS.items())
         + ".\n",
-        "## What can be asked\n",
+        "## Requests\n",
         _markdown_table(("request", "question", "answer", "server", "time-out"), map(_request_row, REQUESTS)),
         *(f"- `{request.name}`: {request.doc}" for request in REQUESTS),
         "\n## Types\n",
         *(_type_section(types[name]) for name in _with_parts(dict.fromkeys(mentioned), types)),
         "## Actions\n",
-        "What the `action` of an `Intent` can be: a map with the action's name in `action`, and these fields.\n",
+        "The field `action` of an `Intent` is a map: the name of an action in `action`, and its fields.\n",
         *(_type_section(types[kind.__name__]._replace(name=name)) for name, kind in ACTIONS.own.items()),
     ]
     return "\n".join(parts).rstrip() + "\n"

@@ -104,8 +104,8 @@ def bend(seeds: Sequence[Mapping[str, Any]]) -> Figure:
     return figure
 
 
-def reaches(traces: Mapping[tuple[str, str], Mapping[str, list[Any]]], said: Sequence[str]) -> Figure:
-    """The hand's path: a column for each method, rows from above and from the side. `said` are the columns' titles."""
+def reaches(traces: Mapping[tuple[str, str], Mapping[str, list[Any]]], titles: Sequence[str]) -> Figure:
+    """The hand's path: a column for each method, rows from above and from the side."""
     figure, axes = sheet(2, 2, width=4.2, height=3.6)
     ways = list(dict.fromkeys(way for way, _ in traces))
     for column, way in enumerate(ways):
@@ -123,7 +123,7 @@ def reaches(traces: Mapping[tuple[str, str], Mapping[str, list[Any]]], said: Seq
                 axis.plot(hand[:, 0], hand[:, other], color=colour, linestyle=line, linewidth=0.8, label=label)
                 axis.scatter(targets[:, 0], targets[:, other], s=60, facecolors="none", edgecolors=TRUE, zorder=3)
                 axis.set(xlabel="ahead, m", ylabel="left, m" if other == 1 else "up, m", aspect="equal")
-        axes[column].set_title(said[column], fontsize=9)
+        axes[column].set_title(titles[column], fontsize=9)
     figure.legend(*axes[0].get_legend_handles_labels(), frameon=False, fontsize=8, ncols=2, loc="outside lower center")
     return figure
 

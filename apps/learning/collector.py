@@ -66,7 +66,7 @@ class SampleCollector(ABC, Generic[SampleRow]):
 
     @property
     @abstractmethod
-    def said(self) -> str:
+    def summary(self) -> str:
         """The progress in words."""
 
     @abstractmethod
@@ -90,7 +90,7 @@ class HandCollector(SampleCollector[HandRow]):
         return max((row.draw + 1 for row in self._writer.rows), default=1)
 
     @property
-    def said(self) -> str:
+    def summary(self) -> str:
         return f"{len(self)} samples, coverage {self._coverage.share:.0%}"
 
     def take(self, message: Message) -> None:
@@ -122,7 +122,7 @@ class WheelCollector(SampleCollector[WheelRow]):
         return max((row.trial // 2 * 2 + 2 for row in self._writer.rows), default=2)
 
     @property
-    def said(self) -> str:
+    def summary(self) -> str:
         turned = sum(abs(row.turned_rad) for row in self._writer.rows)
         return f"{len(self)} trials, {turned / (2 * pi):.1f} turns in all"
 

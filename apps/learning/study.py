@@ -48,6 +48,7 @@ class Sightings:
         return len(self.draws)
 
     def pick(self, mask: BoolArray | slice) -> Sightings:
+        """The sightings of a mask (b,) or slice."""
         return Sightings(self.angles_rad[mask], self.places_m[mask], self.draws[mask])
 
 
@@ -158,6 +159,7 @@ def errors_m(learned: HandMap | NominalModel, sightings: Sightings) -> FloatArra
 
 
 def rms(errors: FloatArray) -> float:
+    """Root mean square of errors (b,), in their unit; NaN without errors."""
     return float(np.sqrt(np.mean(errors**2))) if len(errors) else float("nan")
 
 

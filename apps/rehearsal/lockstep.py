@@ -53,6 +53,7 @@ async def run(node: Node, config: PlanningConfig) -> None:
 
 
 implementation = Implementation(PlanningConfig, run, LockstepPlanner)
+PLANNING_MODULE = named("planning").module
 LOCKSTEP_PLANNER: Component = replace(named("planning"), module=__name__)
 """The planner of a rehearsal in lock-step."""
 

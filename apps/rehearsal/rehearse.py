@@ -42,12 +42,12 @@ from sim.trace import Trace
 RECORDER = "capture"
 PROCESSES = ("sim", "perception", "planning", "executive")
 START_S = 5.0
-"""So long the robot may take until it accepts a task."""
+"""Longest time until the robot accepts a task, simulated seconds."""
 
 
 def rehearse(request: RehearsalRequest) -> dict[str, Any]:
-    """Run one task and return the result, as the JSON has it. Raises CocoroError when the robot refuses the task,
-    ConfigError for a wrong scene or service name."""
+    """Run one task and return its result, as `--json` prints it. Raises TaskRefusedError when the robot refuses the
+    task, ConfigError for a wrong scene or service name."""
     started = time.perf_counter()
     unknown = sorted(set(request.latency) - set(PROCESSES))
     if unknown:
@@ -84,7 +84,7 @@ class _Rehearsal:
         self._body = body_of(self._robot, request.body, request.seed).robot
         self._trace = Trace(self._body, present)
         self._steps: list[dict[str, Any]] = []
-        """One by one, the tasks that came to an end."""
+        """Results of the tasks that have ended, in order."""
         self._frame: Frame | None = None
         self._seen: Detections | None = None
         self._recording: Recording | None = None
@@ -159,7 +159,7 @@ class _Rehearsal:
         return dict(held)
 
     async def _operate(self, operator: Node) -> TaskState:
-        """What the operator does: give the task, watch it to its end, and again with each other label."""
+        """Request the task and follow it to its end, then again with each further label."""
         request = self._request
         states = operator.stream(topics.TASK)
         if request.picture is not None:
@@ -201,7 +201,7 @@ class _Rehearsal:
         raise AssertionError("a stream has no end")
 
     def _keep_step(self, state: TaskState) -> None:
-        """What came of one task, by the truth at its end."""
+        """Keep the result of one task, by the truth at its end."""
         labels = {item.label: item for item in self._scene.objects}
         known = labels.get(state.label)
         edge_m = self._trace.edge_m(known.half_width_m) if known is not None else None
@@ -225,7 +225,7 @@ class _Rehearsal:
             return TaskReply(accepted=False, refusal="not_alive", text=str(error))
 
     def _standing_height_m(self) -> float | None:
-        """Of the target's centre, as the robot knows the object."""
+        """Height of the target's centre above the floor, m, by the catalogue; None for an unknown object."""
         catalogue = Catalogue.load(Path(self._request.objects) if self._request.objects else None)
         known = catalogue.get(self._task.target)
         return known.size_m[2] / 2 if known is not None else None
@@ -250,7 +250,7 @@ class _Rehearsal:
         return {
             "kind": request.body,
             "wheel_separation_m": separation_m,
-            # Wheels that roll further than they are told to turn it as if they stood nearer together.
+            # Wheels that roll further than commanded turn the robot as if they were closer together.
             "turning_separation_m": separation_m / float(scales.mean()),
         }
 
@@ -264,7 +264,7 @@ class _Rehearsal:
             "sensors": request.sensors,
             "lockstep": request.lockstep,
             "model": self._trace.model,
-            **({} if self._collector is None else {"samples": len(self._collector), "said": self._collector.said}),
+            **({} if self._collector is None else {"samples": len(self._collector), "said": self._collector.summary}),
             "outcome": state.outcome,
             "reason": state.reason,
             "sim_s": round(state.elapsed_s, 3),

@@ -1,4 +1,4 @@
-"""What a zenoh bus declares: publishers, subscriptions, servers, tokens; and the shared memory of one publisher."""
+"""Declarations of a zenoh bus (publishers, subscriptions, servers, tokens), and the shared memory of one publisher."""
 
 from __future__ import annotations
 

@@ -1,12 +1,12 @@
-"""The machine's shared memory as zenoh uses it: what it takes, whether that can be had, and that none of it is left.
+"""The machine's shared memory as zenoh uses it: how much it needs, whether that is available, and its removal.
 
-Zenoh's segments are the files NUMBER.zenoh in /dev/shm. Every process that maps one holds a lock (flock) on it for as
-long as it does, and locks its pages in memory (mlock), so that a segment takes all of its room when it is made, and a
-publisher that has its segments does not mind when the place fills later. A process that ends without having closed its
-segments leaves the files; one that nobody holds any more belongs to nobody, and may be removed.
+Zenoh's segments are the files NUMBER.zenoh in /dev/shm. Each process that maps a segment holds a lock (flock) on it and
+locks its pages in memory (mlock). So a segment takes all of its room when it is made, and a publisher keeps working
+when /dev/shm fills later. A process that ends without closing its segments leaves the files; a file that no process
+holds may be removed.
 
-Nobody depends on it: what cannot be shared is copied through the mesh's sockets. What a process cannot have at its
-start it goes without until it is started again.
+Shared memory is optional: without it, frames are copied through the mesh's sockets. That is decided once, when the
+process starts.
 """
 
 from __future__ import annotations
@@ -23,29 +23,29 @@ from pathlib import Path
 
 PLACE = Path("/dev/shm")
 POOL_BYTES = 24 * 1024 * 1024
-"""Each publisher's frames. Fifteen colour and depth frames of 640 x 480. Receivers hold one or two each; one that has
-stopped holds all."""
+"""One publisher's pool: fifteen colour and depth frames of 640 x 480. A receiver holds one or two; a stopped one
+all."""
 PROCESS_BYTES = 1_310_720
-"""Zenoh's register of what is shared, in each process that publishes frames."""
+"""Zenoh's register of shared buffers, per process that publishes frames."""
 SESSION_BYTES = 12_288
-"""What each process that publishes or reads frames proves with that it is on this machine."""
+"""Zenoh's segment by which a process that publishes or reads frames proves that it runs on this machine."""
 LOCKED_BYTES = POOL_BYTES + PROCESS_BYTES + 64 * SESSION_BYTES
-"""What one process locks in memory: a publisher's segments, which readers lock, too, and those of whom it meets."""
+"""Memory that one process locks: a publisher's segments (readers lock them, too), and those of 64 other processes."""
 COSTS = "frames are copied through sockets instead, which costs more"
 NEWBORN_S = 10.0
-"""A segment without a size is about to get one, unless it is as old as this."""
+"""An empty segment that is younger than this is just being made."""
 _SEGMENT = re.compile(r"\d+\.zenoh")
 _IPC_LOCK = 1 << 14
-"""CAP_IPC_LOCK: locks in memory whatever the limit."""
+"""CAP_IPC_LOCK: the process may lock any amount of memory."""
 
 
 def need_bytes(publishers: int, readers: int) -> int:
-    """The room in /dev/shm that so many processes take that publish frames and that read them."""
+    """The room in /dev/shm for processes that publish frames and processes that read them, bytes."""
     return publishers * (POOL_BYTES + PROCESS_BYTES) + (publishers + readers) * SESSION_BYTES
 
 
 def obstacle(wanted_bytes: int) -> str:
-    """Why this process cannot have so much more of it, by how much, and what to do; empty when it can."""
+    """Why this process cannot have `wanted_bytes` of shared memory, and what to do; empty when it can."""
     if wanted_bytes == 0:
         return ""
     try:
@@ -70,7 +70,8 @@ def obstacle(wanted_bytes: int) -> str:
 
 
 def lockable_bytes() -> int | None:
-    """What this process may lock in memory; None for any amount. Raises its own limit as far as it may."""
+    """Memory that this process may lock, bytes; None for any amount. Raises the process's soft limit to its hard
+    limit."""
     with suppress(OSError, ValueError):
         capabilities = re.search(r"^CapEff:\s*([0-9a-f]+)", Path("/proc/self/status").read_text(), re.MULTILINE)
         if capabilities is not None and int(capabilities[1], 16) & _IPC_LOCK:
@@ -84,8 +85,7 @@ def lockable_bytes() -> int | None:
 
 
 def sweep() -> int:
-    """Remove what dead processes of this user's have left; how many segments that were. Those that anybody holds are
-    not touched, whoever's they are."""
+    """Removes this user's segments that no process holds. Returns their number."""
     removed = 0
     with suppress(OSError):
         for entry in list(os.scandir(PLACE)):
@@ -96,8 +96,8 @@ def sweep() -> int:
 
 
 def drop_failed() -> int:
-    """Remove what zenoh began to make in this process and could not: it stays mapped, and takes its room until the end
-    of the process. How many segments that were."""
+    """Removes segments that zenoh could not finish in this process, which stay mapped and take room until its end.
+    Returns their number."""
     removed = 0
     with suppress(OSError):
         mapped = {line.split(maxsplit=5)[-1] for line in Path("/proc/self/maps").read_text().splitlines()}
@@ -112,8 +112,8 @@ def drop_failed() -> int:
 
 
 def release() -> int:
-    """Remove the segments that this process holds and nobody else does: for the end of the process, when its sessions
-    have been closed. How many they were."""
+    """Removes the segments that only this process holds; for its end, after its sessions are closed. Returns their
+    number."""
     removed = 0
     for fd in _held():
         with suppress(OSError):
@@ -123,7 +123,7 @@ def release() -> int:
 
 
 def segments() -> dict[str, int]:
-    """The size in bytes of each of this user's segments, by name, whoever of them holds it or not."""
+    """The sizes of this user's segments, bytes, by name."""
     found = {}
     with suppress(OSError):
         for entry in os.scandir(PLACE):
@@ -148,18 +148,18 @@ def _remove_if_dead(path: str) -> bool:
 
 
 def _unlink(path: str, status: os.stat_result) -> bool:
-    """Whether it was there, and that very file."""
-    if not os.path.samestat(os.stat(path, follow_symlinks=False), status):  # noqa: PTH116 # a string is at hand
+    """Removes a file unless another one has its name now; returns whether it did."""
+    if not os.path.samestat(os.stat(path, follow_symlinks=False), status):  # noqa: PTH116 # the path is a string
         return False
     os.unlink(path)  # noqa: PTH108
     return True
 
 
 def _held() -> Iterable[int]:
-    """The descriptors by which this process holds segments."""
+    """The descriptors of the segments that this process holds."""
     try:
         entries = list(os.scandir("/proc/self/fd"))
-    except OSError:  # no /proc: then nobody can tell
+    except OSError:  # no /proc
         return
     for entry in entries:
         with suppress(OSError):

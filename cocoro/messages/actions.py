@@ -5,15 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
+from cocoro.entry_points import added_to
 from cocoro.messages.common import Count, FiniteNonNegative, FiniteVec2
-from cocoro.tagged import Registry, Tagged, added_by
+from cocoro.tagged import Registry, Tagged
 
 TASK_GROUP = "cocoro.tasks"
 """The entry point group of third parties' tasks, which may bring actions of their own."""
 
 
 class Action(Tagged, frozen=True, tag_field="action"):
-    """What the planner is to do until it is done. A behaviour of `services.planning.behaviours` carries it out."""
+    """One thing for the planner to do. A behaviour of `services.planning.behaviours` carries it out."""
 
     def behaviour(self) -> Any:
         """A new behaviour that carries out this action. Third parties' actions implement it; those of the project are
@@ -117,7 +118,7 @@ class BabbleWheels(Action, frozen=True, tag="babble-wheels"):
 
 
 def _brought() -> Iterator[type[Action]]:
-    for task in added_by(TASK_GROUP).values:
+    for _, task, _ in added_to(TASK_GROUP).added:
         yield from getattr(task, "brings", ())
 
 

@@ -1,4 +1,4 @@
-"""Tasks: how they are asked for, refused, followed and ended; and the known objects."""
+"""Requests and progress of tasks, and the known objects."""
 
 from __future__ import annotations
 
@@ -20,26 +20,27 @@ class Phase(msgspec.Struct, kw_only=True):
 
 
 class TaskState(Message):
-    """The task that runs, or the one that ran last."""
+    """State of the running task, or of the last one when none runs."""
 
     task_id: str = ""
     task: str = ""
     label: str = ""
     phase: str = "idle"
     text: str = ""
-    """What it does now, in words, with the planner's reason."""
+    """The planner's reason for what the robot does now, for people."""
     distance_m: Finite | None = None
     started_ns: int = 0
     phases: tuple[Phase, ...] = ()
     outcome: Outcome | None = None
     reason: str = ""
-    """For failed and cancelled: not_found, lost, slipped, unreachable, timed_out, ... and words after a colon."""
+    """For failed and cancelled tasks: a word (not_found, lost, slipped, unreachable, timed_out, ...), a colon, and a
+    sentence."""
     elapsed_s: Finite = 0.0
 
 
 class TaskRequest(msgspec.Struct, kw_only=True):
     task: Any
-    """A `cocoro.tasks.Task`; where it was received, the map that it travels as: the task's name in `task`, and its
+    """A `cocoro.tasks.Task`. On the wire, and where it was received: a map with the task's name in `task`, and its
     fields."""
     timeout_s: Annotated[float, Meta(gt=0, le=3600)] | None = None
     """None: the task's own limit."""
@@ -52,7 +53,7 @@ RefusalCode = Literal[
 
 
 class TaskReply(msgspec.Struct, kw_only=True):
-    """Accepted with a task's id, or refused with a code and a sentence that says what to do."""
+    """The accepted task's id, or a refusal with a code and a sentence that says what to do."""
 
     accepted: bool
     task_id: str = ""
@@ -62,7 +63,7 @@ class TaskReply(msgspec.Struct, kw_only=True):
 
 class CancelRequest(msgspec.Struct, kw_only=True):
     task_id: str = ""
-    """Empty cancels whatever runs."""
+    """Empty: cancel the running task, whichever it is."""
 
 
 class ObjectsRequest(msgspec.Struct, kw_only=True):

@@ -60,8 +60,8 @@ class BaseState(Message):
 
 
 class BaseCommand(Message):
-    """Wheel speeds. They are valid for 0.15 s, at higher speeds for less (`Base.patience_s`); then the base commands
-    zero."""
+    """Wheel speeds. They are valid for the base's `command_timeout_s`, at higher speeds for less (`Base.patience_s`);
+    then the base commands zero."""
 
     left_mps: Finite
     right_mps: Finite
@@ -95,9 +95,9 @@ class ServoState(Message):
 
 
 class ServoCommand(Message):
-    """Goals for the named joints of one network; the other joints keep their goals. A command is valid for 0.15 s. Then
-    an arm or neck joint that still moves holds its position; the hand keeps its goal, so that it does not drop an
-    object."""
+    """Goals for the named joints of one network; the other joints keep their goals. A command is valid for the
+    network's `command_timeout_s`. Then an arm or neck joint that still moves holds its position; the hand keeps its
+    goal, so that it does not drop an object."""
 
     joints: tuple[str, ...]
     goal_rad: tuple[Finite, ...]

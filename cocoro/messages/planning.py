@@ -1,4 +1,4 @@
-"""What the planner is told, what it does, and what it has learned."""
+"""Messages from and to the planner: intents, status, learned models, samples for learning."""
 
 from __future__ import annotations
 
@@ -11,38 +11,37 @@ from cocoro.messages.common import Count, Finite, FiniteVec2, FiniteVec3, Messag
 
 
 class Intent(Message):
-    """What the executive wants of the planner. Repeated at the topic's rate: a planner that no longer hears it stands
-    still."""
+    """The action that the executive asks for, repeated at the topic's rate. Without it the planner stands still."""
 
     action: Any
     """One of `cocoro.messages.actions`, or a third party's: a map with the action's name in `action`, and its fields.
     A message whose action is unknown or has a bad field is rejected."""
     task_id: str = ""
     step: Count = 0
-    """Counts the intents of one run of the executive, so that a status can say which one it answers."""
+    """Counts the intents of one run of the executive. The planner's status repeats the number that it answers."""
 
     def __post_init__(self) -> None:
         self.action = ACTIONS.read(self.action)
 
 
 class TargetEstimate(msgspec.Struct, kw_only=True):
-    """What the planner believes of one object now: fused over time and carried by odometry."""
+    """Estimate of one object now, fused over time and carried along by odometry."""
 
     label: str
     position_m: FiniteVec3
-    """Centre, body frame, now."""
+    """Centre, body frame."""
     velocity_mps: FiniteVec3 = (0.0, 0.0, 0.0)
-    """In the odometry frame."""
+    """Odometry frame."""
     sigma_m: Finite = 0.0
     """Standard deviation of the horizontal position."""
     age_s: Finite = 0.0
-    """Since the newest frame in which it was localised."""
+    """Time since the newest frame in which it was localised."""
     odometry_position_m: FiniteVec3 = (0.0, 0.0, 0.0)
-    """The same centre in the odometry frame."""
+    """Centre, odometry frame."""
 
 
 class PlannerStatus(Message):
-    """What the planner does and why; the executive decides on it, people read it."""
+    """State of the current action, for the executive's decisions and for people."""
 
     task_id: str = ""
     step: Count = 0
@@ -50,69 +49,69 @@ class PlannerStatus(Message):
     """The name of the action that it carries out."""
     state: Literal["running", "done", "failed"] = "running"
     reason: str = ""
-    """For 'failed', a word that the executive acts on: lost, unreachable, blocked, slipped, no_grip, stale."""
+    """For 'failed': the word that the executive decides on (lost, unreachable, blocked, slipped, no_grip, stale)."""
     why: str = ""
-    """One sentence for people: why it does what it does now."""
+    """Reason for what the robot does now, one sentence for people."""
     target: TargetEstimate | None = None
     distance_m: Finite | None = None
-    """What is left to go: to the stopping place when driving, hand to target when reaching."""
+    """Remaining distance: to the stopping place when driving, from hand to target when reaching."""
     hand_m: FiniteVec3 | None = None
-    """Centre between the pads, body frame, felt (from the joint angles)."""
+    """Centre between the pads, body frame, by the joint angles."""
     holding: bool = False
-    """The claws are stopped by something between them."""
+    """Something between the claws stops them."""
     body_m: FiniteVec2 | None = None
     body_yaw_rad: Finite = 0.0
-    """Where the body stands in the odometry frame."""
+    """Pose of the body in the odometry frame."""
     known: tuple[TargetEstimate, ...] = ()
-    """Every object in memory."""
+    """All objects in memory."""
     model: str = ""
-    """With what it reaches: the rigid body and why, or what was learned and how good that is."""
+    """The body model that it reaches with: the rigid body and why, or the learned model and its error."""
 
 
 class LearnedModel(Message):
-    """What the robot has learned of its body, as `cocoro.learning.model` writes it: the planner's own, from now on."""
+    """Learned model that the planner uses from now on, as `cocoro.learning.model` writes it."""
 
     content: bytes
 
 
 class ModelRequest(msgspec.Struct, kw_only=True):
-    """Take a model over, in place of the one that is used."""
+    """Use this model in place of the current one."""
 
     content: bytes
-    """As `cocoro.learning.model` writes it."""
+    """Written by `cocoro.learning.model`."""
 
 
 class ModelReply(msgspec.Struct, kw_only=True):
     accepted: bool
     text: str = ""
-    """What is used from now on; or why not, and what goes on being used."""
+    """The model that is used from now on; for a refusal the reason, and the model that stays in use."""
 
 
 class HandSample(Message):
-    """What the arm's babbling saw: joint angles and the hand's marker, both at the frame's stamp, which is this
-    message's."""
+    """Sample of the arm's babbling: joint angles and place of the hand's marker at the frame's stamp, which is this
+    message's stamp, too."""
 
     draw: Count
-    """The number of the draw that the arm was on its way to."""
+    """Number of the draw that the arm moved to."""
     angles_rad: dict[str, Finite]
-    """Of every joint, neck and hand included."""
+    """Angles of all joints, neck and hand included."""
     seen_m: FiniteVec3
-    """The marker's centre, body frame."""
+    """Centre of the marker, body frame."""
     area_px: Count
 
 
 class WheelTrial(Message):
-    """What one trial of the wheels' babbling saw: a standing target before and after the wheels turned."""
+    """Sample of the wheels' babbling: places of a standing target before and after the wheels turned."""
 
     trial: Count
     left_mps: Finite
     right_mps: Finite
-    """As commanded."""
+    """Commanded speeds."""
     way_m: Finite
     turned_rad: Finite
-    """What the base's odometry says of the way of the body's origin along its arc, and of the turn."""
+    """Way of the body's origin along its arc, and turn, by the base's odometry."""
     before_m: FiniteVec2
     after_m: FiniteVec2
-    """The target over the floor, body frame, each the mean of several frames while the robot stood."""
+    """Places of the target on the floor, body frame; each the median of several frames while the robot stood."""
     height_m: Finite | None = None
-    """How high above the floor its centre was seen, at the end."""
+    """Height of the target's centre above the floor, seen at the end."""

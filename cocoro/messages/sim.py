@@ -1,4 +1,4 @@
-"""The simulator's own: its clock, and the truth, which is for tests, the judge and viewers alone."""
+"""The simulator's messages: its clock, and the truth, which only tests, the judge and viewers may read."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from cocoro.messages.common import Finite, FiniteQuaternion, FiniteVec3, Message
 
 
 class ClockTick(Message):
-    """Simulated time is `stamp_ns`; a new incarnation is a new epoch."""
+    """Simulated time, in `stamp_ns`. A new incarnation is a new epoch."""
 
     rate: Annotated[float, Meta(gt=0, le=1e3)] = 1.0
-    """Simulated seconds a real second, as the simulator last measured it."""
+    """Simulated seconds per real second, as last measured."""
     paused: bool = False
 
 
@@ -25,15 +25,15 @@ class TrueObject(msgspec.Struct, kw_only=True):
     """Centre, world frame."""
     orientation: FiniteQuaternion
     touching: tuple[str, ...] = ()
-    """Names of what it touches: robot links ('claw_left'), 'floor', other labels."""
+    """Names of the things that it touches: robot links ('claw_left'), 'floor', other labels."""
 
 
 class Truth(Message):
     body_m: FiniteVec3
-    """The body frame's origin in the world."""
+    """Origin of the body frame, world frame."""
     body_orientation: FiniteQuaternion
     joints_rad: dict[str, Finite]
     """True joint angles."""
     objects: tuple[TrueObject, ...]
     collisions: tuple[str, ...] = ()
-    """Contacts of the robot now, other than wheels on floor and claws on object: 'elbow~green_can'."""
+    """Current contacts of the robot except wheels on the floor and claws on an object: 'elbow~green_can'."""

@@ -1,4 +1,4 @@
-"""What can be tuned in the executive; a profile's `[service.executive]` table sets these."""
+"""Configuration of the executive: a profile's `[service.executive]` table."""
 
 from __future__ import annotations
 

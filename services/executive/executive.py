@@ -8,6 +8,7 @@ from typing import Any
 
 from cocoro import topics
 from cocoro.clock import NS
+from cocoro.entry_points import added_to
 from cocoro.messages import (
     BaseState,
     CancelRequest,
@@ -25,7 +26,6 @@ from cocoro.messages import (
 from cocoro.messages.actions import TASK_GROUP, Idle
 from cocoro.node import Node
 from cocoro.objects import Catalogue
-from cocoro.tagged import added_by
 from cocoro.tasks import Task, TaskFailedError
 from services.executive.config import ExecutiveConfig
 from services.executive.estop import Estop
@@ -45,7 +45,7 @@ class Executive:
         self._catalogue = catalogue
         self._alive: set[str] = set()
         self._unreadable: dict[str, str] = {}
-        """What a service cannot read and why, by service."""
+        """By service: the input that it cannot read, and the reason."""
         self._running: asyncio.Task[Any] | None = None
         self._ended: asyncio.Future[Ending] | None = None
         """Gets the running task's outcome when something outside of it ends it."""
@@ -284,4 +284,4 @@ class Executive:
 
 def _with_faults(text: str) -> str:
     """Name the third parties' tasks that could not be loaded: one of them may be what was asked for."""
-    return "; ".join((text, *added_by(TASK_GROUP).faults))
+    return "; ".join((text, *added_to(TASK_GROUP).faults))

@@ -27,7 +27,7 @@ _SIDE_RAD = 0.6
 _NEAR_RAD = 0.06
 _FRONT_RAD = -0.087
 _ASTRAY_RAD = 0.6
-"""Pitch error beyond which only babbling leaves the hand."""
+"""A pitch error above this occurs only after babbling."""
 
 
 class ArmStep(NamedTuple):

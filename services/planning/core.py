@@ -24,11 +24,11 @@ from services.planning.reach import ARM
 from services.planning.state_estimator import StateEstimator
 
 _STALE_NS = NS
-"""A running behaviour fails when the robot's state has been missing for so long."""
+"""Time without the robot's state after which a running behaviour fails."""
 
 
 class PlanningCore:
-    """See `cocoro.core.Core`. Stands still, and says why, whenever it is not sure."""
+    """The planner as a `cocoro.core.Core`. Without a fresh state of the robot it stands still and reports why."""
 
     LONGEST_STEP_S: ClassVar[float] = 0.05
     """Motion advances by at most this much time in one step."""
@@ -84,7 +84,7 @@ class PlanningCore:
         self._follow_intent(now_ns)
         missing, hand, body = self._estimator.missing(now_ns), self._estimator.hand, self._estimator.body()
         if missing or hand is None or body is None:
-            # Zero, and not silence, which the base would take for a word that is yet to come.
+            # An explicit zero: silence would let the base hold its last command until that expires.
             return [
                 Output(topics.BASE_COMMAND, BaseCommand(left_mps=0.0, right_mps=0.0)),
                 *self._halt(missing or "no odometry yet", now_ns),
@@ -103,10 +103,10 @@ class PlanningCore:
         return [*self._commands(plan, snapshot), *plan.reports, Output(topics.PLAN, status)]
 
     def _own_hull(self, angles: Mapping[str, float]) -> tuple[FloatArray, FloatArray]:
-        """Where the robot itself, and what it holds, is in its own view in a posture."""
+        """Hull of the robot and of what it holds: sphere centres, (n, 3), body frame, m, and radii, (n,), m."""
         centres, radii = self.actuators.arm.clearance.hull(angles)
         off = self.learned.offset_m(angles)
-        if off is not None:  # the arm is seen there, and nearer to its shoulder in between
+        if off is not None:  # the camera sees the arm with this offset, and with a smaller one near the shoulder
             centres, radii = np.vstack([centres, centres + off / 2, centres + off]), np.tile(radii, 3)
         held = self.actuators.reacher.position(angles)
         chassis = np.array([0.0, 0.0, 0.0])
@@ -117,7 +117,7 @@ class PlanningCore:
         last_ns, self._last_ns = self._last_ns, now_ns
         if last_ns is None or now_ns <= last_ns:
             return 1.0 / self._config.rate_hz
-        # After a pause, motion goes on from where it stood, it does not jump.
+        # After a pause, motion continues without a jump.
         return min((now_ns - last_ns) / NS, self.LONGEST_STEP_S)
 
     def _follow_intent(self, now_ns: int) -> None:
@@ -134,7 +134,7 @@ class PlanningCore:
             self._behaviour = behaviour_for(intent.action)
 
     def _plan(self, snapshot: Snapshot) -> Plan:
-        """Step the behaviour; once it has ended, hold still with its result."""
+        """Step the behaviour. After its end, hold still and repeat its result."""
         if self._ended is not None:
             return Plan(
                 snapshot.stand(),
@@ -152,22 +152,22 @@ class PlanningCore:
         return plan
 
     def slow_down(self, plan: Plan, snapshot: Snapshot) -> None:
-        """Drive no faster than from where the wheels stand in time if whoever was heard the longest ago is gone: one
-        that is late makes the robot slower, one that is silent makes it stand."""
+        """Limit the speed so that the robot can still stop in time if the service with the oldest message has died. A
+        late service slows the robot down, a silent one stops it."""
         driver, base = self.actuators.driver, self.actuators.robot.base
         who, age_s = self._estimator.oldest(snapshot.now_ns, sight=self._behaviour.needs_sight)
         if self._estimator.intent_age_s(snapshot.now_ns) > base.command_timeout_s:
             plan.base, plan.why = driver.pause(snapshot.dt_s), "standing still: the executive is silent"
             return
-        # What is commanded now is for the time until the next step.
+        # The command holds until the next step.
         limit_mps = base.speed_at_age_mps(age_s + 1.0 / self._config.rate_hz)
         slower = driver.within(plan.base, limit_mps)
         if slower is not plan.base:
             plan.base, plan.why = slower, f"slower, for {who} is late; {plan.why}"
 
     def _blind(self, snapshot: Snapshot) -> Plan | None:
-        """What is done while perception is silent by what needs to see: nothing, and that for so long only. What it
-        had begun goes on when perception speaks again."""
+        """Pause a behaviour that needs sight while perception is silent, and fail it after `blind_for_good_s`. None
+        while there is no reason to pause."""
         if not self._behaviour.needs_sight:
             return None
         blind_s = self._estimator.blind_s(snapshot.now_ns)
@@ -181,7 +181,7 @@ class PlanningCore:
         return plan
 
     def _halt(self, why: str, now_ns: int) -> Sequence[Output]:
-        """Command nothing, so that everything stops by itself, and start afresh from what is measured later."""
+        """Command nothing, so that the hardware stops by itself, and restart later from the measured state."""
         self.actuators.arm.resync()
         self.actuators.driver.reset()
         self.actuators.grip.keep()

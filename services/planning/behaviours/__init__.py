@@ -1,5 +1,5 @@
-"""Behaviours: small state machines, one for each action, that are stepped at the planner's rate. Each step gives what
-base, head, arm and hand are to do, and why, until the behaviour is done or has failed."""
+"""Behaviours: small state machines, one for each action, that are stepped at the planner's rate. Each step gives a plan
+for base, head and arm, with the reason, until the behaviour is done or has failed."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ BEHAVIOURS: Mapping[type[Action], Callable[[Any], Behaviour]] = {
     actions.BabbleArm: ArmBabbling,
     actions.BabbleWheels: WheelBabbling,
 }
-"""What carries out each of the project's actions. A third party's action makes its own behaviour."""
+"""The behaviour of each of the project's actions. A third party's action makes its own."""
 
 
 def behaviour_for(action: Action) -> Behaviour:

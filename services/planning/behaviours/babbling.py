@@ -1,4 +1,4 @@
-"""Babbling: moving to learn. The arm from draw to draw, the eyes on the hand; the wheels in pairs of trials."""
+"""Babbling: movements to learn from. The arm moves from draw to draw, the wheels in pairs of trials."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ from services.planning.reach import ARM, HandPose
 
 
 class ArmBabbling:
-    """Moves the arm from draw to draw and reports the hand wherever its marker is really seen.
+    """Moves the arm from draw to draw and reports a sample wherever the hand's marker is seen.
 
-    From each posture the next draw is one that the drawing calls safe and seeable, and that a straight, safe way leads
-    to. Where none of many is, it goes back the way it came. At last it goes home, from where the arm can be folded.
+    The next draw is one that is safe and visible by the nominal model, and that a straight, safe way leads to. When
+    none of many draws is, the arm goes back the way it came. At the end it goes home, from where it can be folded.
     """
 
     needs_sight = True
     SPEED_RADPS = 0.7
     EVERY_NS = NS // 10
-    """Sightings nearer in time than this are nearly the same."""
+    """Shortest time between two samples; earlier sightings are nearly the same."""
     LOOKS_A_STEP = 2
-    """Draws that are looked at in one step: each takes up to some milliseconds."""
+    """Draws that are examined in one step; each takes up to a few milliseconds."""
     GIVE_UP = 60
-    """After so many draws that no way leads to, it goes back."""
+    """Number of draws without a clear way after which the arm goes back."""
 
     def __init__(self, action: BabbleArm) -> None:
         self._first = first = action.first
@@ -47,7 +47,7 @@ class ArmBabbling:
         self._postures: Postures | None = None
         self._goal: FloatArray | None = None
         self._trail: list[FloatArray] = []
-        """Postures from home to here, each with a clear way to the next."""
+        """Postures from home to the current one, each with a clear way to the next."""
         self._returning = False
         self._last_ns: int | None = None
         self._hitches = 0
@@ -79,7 +79,7 @@ class ArmBabbling:
         return plan
 
     def _unfold(self, snapshot: Snapshot) -> Plan:
-        """To the posture that everything starts from; from a posture of an earlier babbling straight there."""
+        """Move to the home posture, also from a posture of an earlier babbling."""
         actuators, travel = snapshot.actuators, snapshot.actuators.config.arm
         home = HandPose(travel.travel_radius_m, 0.0, travel.travel_height_m, travel.pitch_rad)
         step = actuators.arm.reach(home, travel.hand_speed_mps, snapshot.angles, snapshot.dt_s)
@@ -91,7 +91,7 @@ class ArmBabbling:
         return plan
 
     def _choose(self, snapshot: Snapshot) -> None:
-        """Where to next; nowhere yet when none of the draws of this step would do."""
+        """Choose the next goal; leave it open when no draw of this step is suitable."""
         assert self._draws is not None
         assert self._postures is not None
         here = self._trail[-1]
@@ -110,7 +110,7 @@ class ArmBabbling:
             self._goal, self._looked = self._trail.pop(), 0
 
     def _go_home(self, here: FloatArray) -> None:
-        """Straight where there is a clear way, else back along the trail."""
+        """Go straight home where there is a clear way, otherwise back along the trail."""
         assert self._postures is not None
         home = self._trail[0]
         if len(self._trail) <= 2 or self._postures.clear_way(here, home):
@@ -128,7 +128,7 @@ class ArmBabbling:
         self._goal = None
 
     def _hitch(self, plan: Plan, snapshot: Snapshot) -> None:
-        """The way is not as clear as the drawing has it: back to where it came from."""
+        """Go back to the last posture: the way is less clear than the nominal model has it."""
         self._hitches += 1
         snapshot.actuators.arm.resync()
         self._goal = self._trail[-1]
@@ -136,7 +136,7 @@ class ArmBabbling:
             plan.state, plan.reason, plan.why = "failed", "blocked", "the arm is held up again and again"
 
     def _report(self, snapshot: Snapshot) -> list[Output]:
-        """The hand's sightings since the last step, as far as they tell something new."""
+        """Samples from the hand's sightings since the last step, without those that are nearly the same."""
         found: list[Output] = []
         for sight in snapshot.estimator.sightings_of(snapshot.actuators.config.marker):
             new = self._last_ns is None or sight.stamp_ns - self._last_ns >= self.EVERY_NS
@@ -156,25 +156,25 @@ class ArmBabbling:
 
 
 class WheelBabbling:
-    """Pairs of trials (the paper's): both wheels turn for a while at drawn speeds, then as long at the opposite ones;
-    before and after each the standing robot looks at a standing target.
+    """Carries out pairs of trials (the paper's): both wheels turn for a time at drawn speeds, then for the same time at
+    the opposite speeds. Before and after each trial the standing robot looks at a standing target.
 
-    The head comes to every look from the same side, so that its backlash is the same each time and falls out.
+    The head comes to every look from the same side, so that its backlash cancels out.
     """
 
     needs_sight = True
     SPEED_MPS = 0.15
     TURN_S = 1.0
     LOOKS = 8
-    """Frames of one look."""
+    """Number of frames of one look."""
     AWAY_RAD = (0.12, 0.08)
-    """From where the head comes to a look, in pan and tilt."""
+    """Offset in pan and tilt from which the head comes to each look."""
     AWAY_S, SETTLE_S = 0.35, 0.45
     LOST_S = 4.0
     LEAST_TURN_RAD = 0.2
-    """A draw that turns it less is passed over."""
+    """A draw that turns the robot less is skipped."""
     MOVED_M = 0.5
-    """Further than this from where it began it does not go."""
+    """Largest distance from where it began."""
 
     def __init__(self, action: BabbleWheels) -> None:
         self._label, first = action.label, action.first
@@ -226,7 +226,7 @@ class WheelBabbling:
         return None if target is None else snapshot.look_at(target.position_m)
 
     def _look(self, snapshot: Snapshot, spent_s: float, why: str, places: list[tuple[float, float, float]]) -> Plan:
-        """Away, back to the target, wait, take the frames."""
+        """Turn the head away and back to the target, wait, and collect the frames."""
         plan = Plan(snapshot.stand(), snapshot.still(), why)
         if spent_s < self.AWAY_S or self._gaze is None:
             gaze = self._look_there(snapshot)
@@ -248,14 +248,14 @@ class WheelBabbling:
         return plan
 
     def _looked(self, snapshot: Snapshot, plan: Plan) -> None:
-        """A look is complete: it ends one trial and begins the next."""
+        """Complete a look: it ends one trial and begins the next."""
         x, y, height_m = np.median(np.array(self._seen), axis=0).tolist()
         after = (x, y)
         if self._before is not None:
             before, start = self._before
             moved = start.inverse().compose(snapshot.body)
             half = moved.yaw_rad / 2
-            # The way along the arc, from its chord; backwards where the chord points backwards.
+            # Way along the arc, from its chord; negative when the chord points backwards.
             arc_per_chord = half / sin(half) if abs(half) > 1e-6 else 1.0
             way_m = hypot(moved.x_m, moved.y_m) * arc_per_chord * (1.0 if moved.x_m >= 0 else -1.0)
             trial = WheelTrial(
@@ -282,7 +282,7 @@ class WheelBabbling:
         self._gaze, self._phase_ns, self._driving = None, snapshot.now_ns, True
 
     def _draw(self, snapshot: Snapshot) -> tuple[float, float]:
-        """The next pair's speeds: of the draws the next that turns the robot far enough to say something."""
+        """Wheel speeds of the next pair, m/s: those of the next draw that turns the robot far enough."""
         for number, speeds in self._draws:
             left, right = speeds.tolist()
             if abs(right - left) * self.TURN_S > self.LEAST_TURN_RAD * snapshot.actuators.robot.base.wheel_separation_m:

@@ -1,4 +1,4 @@
-"""What every behaviour works with: the snapshot of one step, the actuators to command, the plan to give."""
+"""Input and output of every behaviour: the snapshot of one step, the actuators, and the plan."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ State = Literal["running", "done", "failed"]
 
 @dataclass
 class Actuators:
-    """What a behaviour commands with; one set for the planner's life, so that motion goes on smoothly from one
+    """Controllers of base, arm, hand and head. The planner keeps one set, so that motion stays smooth from one
     behaviour to the next."""
 
     robot: Robot
@@ -41,13 +41,12 @@ class Actuators:
     gaze: Gaze = field(init=False)
     reachability: Reachability = field(init=False)
     unfolding: FloatArray = field(init=False)
-    """The floor places (n, 2), body frame, over which the arm swings when it unfolds."""
+    """Places on the floor, (n, 2), body frame, m, over which the arm swings when it unfolds."""
     camera_tilt: CameraTilt = field(init=False)
     ready_on_the_way: bool = True
-    """Whether the hand gets ready for a target while the base still drives; else it stays parked until the base
-    stands."""
+    """The hand gets ready for a target while the base drives. Otherwise it stays parked until the base stands."""
     grasp_height_m: float = 0.065
-    """At which height what is in the hand was grasped: there it is put down."""
+    """Height at which the held object was grasped, and at which it is put down."""
 
     def __post_init__(self) -> None:
         config, robot = self.config, self.robot
@@ -78,7 +77,7 @@ class Actuators:
 
 @dataclass(frozen=True)
 class Snapshot:
-    """One step's view: everything fresh, everything now."""
+    """State of the robot and its surroundings in one step."""
 
     now_ns: int
     dt_s: float
@@ -91,7 +90,8 @@ class Snapshot:
         return self.estimator.memory.estimate(label, self.body, self.now_ns)
 
     def fields(self, label: str, ignore: tuple[tuple[float, float, float], ...] = ()) -> Fields:
-        """What body and arm must keep clear of on the way to a label."""
+        """Distance fields of the obstacles for body and arm on the way to a label; `ignore` has circles (x, y, radius),
+        odometry frame, m, in which the map is ignored."""
         known = [item for item in self.estimator.memory.all(self.body, self.now_ns, sure=True) if item.label != label]
         target = self.target(label)
         if target is not None:
@@ -99,8 +99,8 @@ class Snapshot:
         return self.estimator.around.fields(label, known, self.now_ns, ignore)
 
     def unseen_under_swing(self) -> tuple[float, float] | None:
-        """The middle of the floor under the arm's swing that nobody has looked at, odometry frame; None when all was
-        seen. What is under the robot itself cannot be seen, nor need it be."""
+        """Middle of the unseen floor under the arm's swing, odometry frame, m; None when all of it was seen. The floor
+        under the robot does not count."""
         places = placed(self.actuators.unfolding, self.body)
         away = places[np.hypot(places[:, 0] - self.body.x_m, places[:, 1] - self.body.y_m) > 0.33]
         hidden = away[self.estimator.around.unseen(away)]
@@ -131,18 +131,18 @@ class Snapshot:
 
 @dataclass
 class Plan:
-    """What a behaviour wants now."""
+    """Commands of one step, their reason, and the state of the behaviour."""
 
     base: BaseCommand
     arm: ArmStep
     why: str
     head: tuple[float, float, float] | None = None
-    """Pan, tilt, speed; None holds the head where it is."""
+    """Pan and tilt, rad, and speed, rad/s; None holds the head where it is."""
     state: State = "running"
     reason: str = ""
     distance_m: float | None = None
     reports: list[Output] = field(default_factory=list)
-    """What it has to say beside the planner's status: what babbling saw."""
+    """Messages to publish beside the planner's status: samples of babbling."""
 
 
 class Behaviour(Protocol):
@@ -157,11 +157,11 @@ class Behaviour(Protocol):
 
 
 def planar_m(target: TargetEstimate) -> float:
-    """Distance over the floor from the body's centre."""
+    """Distance over the floor from the body's centre, m."""
     return hypot(target.position_m[0], target.position_m[1])
 
 
 def hand_place(snapshot: Snapshot) -> tuple[float, float, float]:
-    """Where the pads' centre is, body frame."""
+    """Centre between the pads, body frame, m."""
     x, y, z = snapshot.actuators.reacher.position(snapshot.angles).tolist()
     return x, y, z

@@ -18,13 +18,13 @@ from services.planning.surroundings import Fields
 
 
 def grasp_aim(actuators: Actuators) -> tuple[float, float]:
-    """Where in the body frame a target stands best for the arm."""
+    """Best place of a target for the arm, body frame, m."""
     x, y, _ = actuators.reacher.point(HandPose(actuators.config.arm.grasp_radius_m, 0.0, 0.0, 0.0)).tolist()
     return x, y
 
 
 class BackOff:
-    """After a bump: remember what stands there and back away from it."""
+    """Reaction to a bump: enters the obstacle in the map and backs away from it."""
 
     BACK_M = 0.12
     MAX_BUMPS = 3
@@ -34,7 +34,7 @@ class BackOff:
         self._bumps = 0
 
     def step(self, snapshot: Snapshot, head: tuple[float, float, float]) -> Plan | None:
-        """What to do about a bump; None when there is nothing to back off from."""
+        """The plan that backs off; None when there is no bump."""
         base = snapshot.estimator.base
         if base is not None and (base.bump_left or base.bump_right) and self._from is None:
             self._from = snapshot.body
@@ -120,7 +120,7 @@ class Approaching:
     MAX_STALLS = 2
 
     def _touched(self, snapshot: Snapshot) -> None:
-        """The arm meets something that was not seen: remember it where the hand is, and fold the arm."""
+        """Enter an unseen obstacle, which holds up the arm, in the map at the hand's place."""
         self._stalls += 1
         x, y, _ = snapshot.body.apply(hand_place(snapshot))
         snapshot.estimator.around.floor.bump([(x, y)])
@@ -131,12 +131,12 @@ class Approaching:
         return self._course.roomy(snapshot.body, fields)
 
     def _room_ahead(self, snapshot: Snapshot, fields: Fields) -> bool:
-        """Whether the arm can go on unfolding while the robot drives."""
+        """Whether there is room for the arm to unfold while the robot drives on."""
         assert self._course is not None
         return all(self._course.roomy(snapshot.body.compose(Pose2(ahead)), fields) for ahead in (0.25, 0.5))
 
     def _unseen_swing(self, snapshot: Snapshot) -> tuple[float, float] | None:
-        """A place to look at before the arm unfolds; looked for once, for as long as a glance takes."""
+        """A place to look at before the arm unfolds, odometry frame, m; for the time of one glance."""
         if self._glance_since_ns is None:
             self._glance_since_ns = snapshot.now_ns
         glance_s = snapshot.actuators.config.navigation.glance_s + snapshot.estimator.sight_lag_s
@@ -158,7 +158,7 @@ class Approaching:
                 have.height_m < config.travel_height_m - 0.05
                 and have.radius_m > actuators.reachability.retreat_m + 0.02
             ):
-                # Low and stretched out, perhaps around something: back out before anything else.
+                # The hand is low and stretched out, perhaps around something: back it out first.
                 actuators.grip.open()
                 back = have._replace(radius_m=actuators.reachability.retreat_m, pitch_rad=config.pitch_rad)
                 step = arm.reach(back, config.insert_speed_mps, angles, dt_s)
@@ -174,7 +174,7 @@ class Approaching:
             return step, move._replace(why=f"no room yet to unfold the arm; {move.why}")
         elif arm.parked(reference) and (place := self._unseen_swing(snapshot)) is not None:
             why = "looking where to unfold the arm"
-            # It goes on driving meanwhile, but not up to the target.
+            # The robot drives on meanwhile, but not up to the target.
             held = _waiting(move, why) if move.left_m < 0.35 else move._replace(why=f"{why}; {move.why}")
             return arm.park(angles, dt_s)._replace(arrived=False), held._replace(look_at=place)
         if arm.folded(reference) and not self._room_ahead(snapshot, fields):
@@ -186,7 +186,7 @@ class Approaching:
             goal = goal._replace(azimuth_rad=min(max(goal.azimuth_rad, low), high))
             have = actuators.reacher.pose({**angles, **reference})
             if abs(have.azimuth_rad - goal.azimuth_rad) > 0.12 and have.height_m > config.travel_height_m - 0.03:
-                # What stands beside the target is passed over first: the hand comes down where it is to be.
+                # The hand moves high over obstacles beside the target, then comes down at its place.
                 goal = goal._replace(radius_m=config.travel_radius_m, height_m=config.travel_height_m)
             step = arm.reach(goal, config.hand_speed_mps, angles, dt_s)
             late = move.left_m < 0.10 and not step.arrived and step.left > 0.03
@@ -267,7 +267,7 @@ class Following:
         x, y, _ = target.position_m
         distance, bearing = hypot(x, y), atan2(y, x)
         vx, vy, _ = snapshot.body.inverse().rotate(target.velocity_mps)
-        # Along and across the line of sight.
+        # Velocity along and across the line of sight.
         along = (vx * x + vy * y) / max(distance, 0.2)
         across = (x * vy - y * vx) / max(distance, 0.2)
         gap = distance - config.distance_m
@@ -295,7 +295,7 @@ class Following:
         return Plan(snapshot.stand(), arm, "lost it: searching", head, distance_m=planar_m(target))
 
     def _ignored(self, now_ns: int) -> tuple[tuple[float, float, float], ...]:
-        """Where the target has just been nothing stands, whatever the map still shows."""
+        """Circles (x, y, radius), odometry frame, m, around recent places of the target: the map may still show it."""
         while self._trail and now_ns - self._trail[0][0] > 8 * NS:
             self._trail.popleft()
         return tuple((x, y, 0.15) for _, (x, y) in list(self._trail)[::10]) + tuple(

@@ -1,4 +1,4 @@
-"""Going somewhere for its own sake: to a set distance from a target, the arm folded."""
+"""Driving to a set distance from a target, the arm folded."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Going:
     needs_sight = True
     CREEP_MPS = 0.04
     NEAR_ENOUGH_M = 0.003
-    """At last it creeps, for the driver's own tolerance is made for the arm, which makes up for it."""
+    """Tolerance of the creep at the end. The driver's own tolerance is larger, because the arm can make up for it."""
 
     def __init__(self, action: GoTo) -> None:
         self._label = action.label
@@ -39,7 +39,7 @@ class Going:
         if backing is not None:
             return backing
         arm = actuators.arm.park(snapshot.angles, snapshot.dt_s)
-        # The arm works where things are seen; the wheels have to go to where they are.
+        # The arm works in the camera's frame, tilt error included; the wheels need the true place.
         x, y, _ = straight = actuators.camera_tilt.straight(target.position_m)
         place = snapshot.body.apply(straight)[:2]
         move = self._course.step(
@@ -50,7 +50,7 @@ class Going:
             actuators.driver,
             snapshot.now_ns,
         )
-        # The camera is blind near by, so on the last stretch the target may be remembered for a while.
+        # The camera is blind nearby, so on the last stretch a remembered target serves for a while.
         patience_s = config.stale_target_s if move.direct else config.stale_on_way_s
         if target.age_s > patience_s + snapshot.estimator.sight_lag_s:
             why = f"{self._label} has not been seen for {target.age_s:.1f} s"

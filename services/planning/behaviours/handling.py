@@ -1,4 +1,4 @@
-"""Handling behaviours: the base stands, arm and hand work."""
+"""Handling behaviours: the base stands, arm and hand move."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ class Reaching:
 
     needs_sight = False
     FREEZE_M = 0.08
-    """From here on the hand covers the target: its place is held."""
+    """Distance from which the hand hides the target, so that its last place is kept."""
     CLOSE_IN_M = 0.015
 
     def __init__(self, action: Reach, *, touching: bool = False) -> None:
@@ -25,7 +25,7 @@ class Reaching:
 
     @property
     def goal(self) -> HandPose | None:
-        """Where the hand comes to at last, once that is settled."""
+        """Final pose of the hand, once it is settled."""
         return self._frozen.around if self._frozen is not None else None
 
     def step(self, snapshot: Snapshot) -> Plan:

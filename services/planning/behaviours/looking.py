@@ -1,4 +1,4 @@
-"""Standing behaviours: idle, park, and looking for something."""
+"""Idling, parking, and looking for a target."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Searching:
     needs_sight = True
     CONFIRMED = 2
     IN_VIEW_S = 0.2
-    """A target is in view when its newest sighting is not older than this and perception's own lag."""
+    """Age of the newest sighting, beyond perception's own lag, up to which a target counts as in view."""
 
     BACK_M = 0.4
 
@@ -61,7 +61,7 @@ class Searching:
         self._sweep: Sweep | None = None
         self._looked_at_ns: int | None = None
         self._looked_from = 0
-        """Sightings there were when looking at the remembered place began."""
+        """Number of sightings when looking at the remembered place began."""
 
     def step(self, snapshot: Snapshot) -> Plan:
         config = snapshot.actuators.config.head
@@ -85,7 +85,7 @@ class Searching:
         if self._sweep is None:
             self._sweep = Sweep(config, pan)
         goal = self._sweep.next(pan, tilt)
-        # Slow perception must still see every direction twice as the view passes over it.
+        # Even slow perception must see every direction twice while the view passes over it.
         speed = min(config.sweep_speed_radps, 0.4 / max(snapshot.estimator.sight_lag_s, 1e-3))
         head = (*goal, speed)
         if self._sweep.done:
@@ -94,7 +94,7 @@ class Searching:
         return Plan(base, arm, f"sweeping for {self._label}: {self._sweep.share:.0%} done", head)
 
     def _back_away(self, snapshot: Snapshot) -> Plan | None:
-        """From a target that is seen, but too near for the depth camera: until it has depth."""
+        """Back away from a target that is too near for the depth camera; None when there is none."""
         stamp_ns, note = snapshot.estimator.unlocalised.get(self._label, (0, ""))
         fresh = snapshot.now_ns - stamp_ns < (0.5 + snapshot.estimator.sight_lag_s) * NS
         if not fresh or note != "no depth" or snapshot.target(self._label) is not None:
@@ -150,12 +150,12 @@ class Exploring:
         head = snapshot.look_at(snapshot.body.inverse().apply((*place, 0.0)))
         plan = Plan(base, arm, f"going to look from elsewhere: {move.why}", head, distance_m=move.left_m)
         if move.blocked or (move.arrived and snapshot.standing):
-            # Wherever it has got to, it can look from there.
+            # Also a place on the way serves as a viewpoint.
             plan.state = "done"
         return plan
 
     def _viewpoint(self, snapshot: Snapshot) -> tuple[float, float] | None:
-        """The place within reach that is nearest to the most unseen floor."""
+        """The reachable place with the most unseen floor nearby, odometry frame, m; None when there is none."""
         around, actuators = snapshot.estimator.around, snapshot.actuators
         navigation = actuators.config.navigation
         fields = snapshot.fields("")

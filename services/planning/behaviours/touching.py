@@ -1,4 +1,4 @@
-"""Touching: the open hand brought around what is within the arm's reach, one thing after the other."""
+"""Touching: brings the open hand around a target within the arm's reach."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from services.planning.behaviours.handling import Reaching
 from services.planning.reach import HandPose
 
 REACHED = Spherical(0.02, 0.034, 0.034)
-"""The paper's: how far hand and target may be apart, egocentric: metres, azimuth and elevation in radians."""
+"""The paper's limits of the distance between hand and target in egocentric coordinates: m, rad, rad."""
 
 
 class Touching:
@@ -45,7 +45,7 @@ class Touching:
         return plan
 
     def _back_out(self, snapshot: Snapshot, goal: HandPose) -> Plan:
-        """Out of what it was around before, along the hand's own axis."""
+        """Back the hand out along its own axis, from around the previous target."""
         actuators, config = snapshot.actuators, snapshot.actuators.config.arm
         actuators.grip.open()
         step = actuators.arm.reach(goal, config.hand_speed_mps, snapshot.angles, snapshot.dt_s)
@@ -59,7 +59,7 @@ class Touching:
         return plan
 
     def _look(self, snapshot: Snapshot) -> Plan | None:
-        """Wait, for so long, for a target that the hand has hidden; None once it is in view."""
+        """Wait for a limited time for a target that the hand has hidden; None once it is in view."""
         target, lag_s = snapshot.target(self._label), snapshot.estimator.sight_lag_s
         if target is None or self._seen or target.age_s < self.IN_VIEW_S + lag_s:
             self._seen = True
@@ -73,7 +73,7 @@ class Touching:
         )
 
     def _judge(self, snapshot: Snapshot, plan: Plan) -> None:
-        """The goal's posture is commanded; done is it when the hand has come there."""
+        """Report `done` only when the hand has come to the commanded pose."""
         goal = self._reach.goal
         assert goal is not None
         x, y, z = snapshot.actuators.reacher.point(goal).tolist()

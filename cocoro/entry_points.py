@@ -1,0 +1,39 @@
+"""Entry points: values that installed distributions of third parties add to a group."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any, NamedTuple
+
+
+class Added(NamedTuple):
+    """One value that a third party added."""
+
+    name: str
+    """Of the entry point."""
+    value: Any
+    origin: str
+    """The entry point and its distribution, for messages."""
+
+
+class EntryPoints(NamedTuple):
+    """The entry points of one group."""
+
+    added: tuple[Added, ...]
+    faults: tuple[str, ...]
+    """Why others could not be loaded, one text each."""
+
+
+@cache
+def added_to(group: str) -> EntryPoints:
+    """Load the entry points of a group, once in a process. One that cannot be loaded does not disturb the others."""
+    from importlib.metadata import entry_points  # takes 40 ms to import, which most processes never need
+
+    added, faults = [], []
+    for point in entry_points(group=group):
+        origin = f"entry point {point.name!r} of {point.dist.name if point.dist else 'an unknown distribution'}"
+        try:
+            added.append(Added(point.name, point.load(), origin))
+        except Exception as error:  # third-party code runs here
+            faults.append(f"{origin} cannot be loaded: {type(error).__name__}: {error}")
+    return EntryPoints(tuple(added), tuple(faults))
