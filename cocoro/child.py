@@ -60,11 +60,15 @@ class ChildProcess:
         self.channel, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self.channel.setblocking(False)
         with theirs:
-            self.process = start(
-                module, *arguments, "--fd", str(theirs.fileno()), site_packages=site_packages,
-                env={**os.environ, **(environment or {}), "PYTHONPATH": search_path},
-                pass_fds=(theirs.fileno(), *pass_fds), **options,
-            )  # fmt: skip
+            try:
+                self.process = start(
+                    module, *arguments, "--fd", str(theirs.fileno()), site_packages=site_packages,
+                    env={**os.environ, **(environment or {}), "PYTHONPATH": search_path},
+                    pass_fds=(theirs.fileno(), *pass_fds), **options,
+                )  # fmt: skip
+            except OSError:
+                self.channel.close()
+                raise
         self._open = True
         self._loop: asyncio.AbstractEventLoop | None = None
         self._on_message: Callable[[bytes], None] = lambda _: None

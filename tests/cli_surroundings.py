@@ -43,6 +43,7 @@ ARGUMENTS: dict[str, str] = {
     "capture reexecute": "{capture} --service {name}",
     "capture rerun": "{capture} --service {name}",
     "new service": "nearest --into {name}",
+    "new task": "greet --into {name}",
     "servos set-id": "1 2 --port {name}",
     "servos calibrate": "elbow",
     "servos limits": "elbow",

@@ -155,6 +155,6 @@ def test_progress_has_a_bar_the_coverage_and_the_time_that_is_left(tmp_path: Pat
         text = view.text(30.0)
         assert text.startswith("[#####...............] 50 of 200: 50 samples, coverage 100%")
         assert text.endswith("1 min 30 s left")
-        state = TaskState(phase="babble-arm", elapsed_s=30.0, text="50 of 200 samples, draw 9")
+        state = TaskState(task="babble-arm", phase="babble-arm", elapsed_s=30.0, text="50 of 200 samples, draw 9")
         view.show(state)
         assert state.text == text

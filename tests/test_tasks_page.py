@@ -30,6 +30,7 @@ def test_the_page_works_word_for_word(tmp_path: Path) -> None:
                 target.parent.mkdir(exist_ok=True)
                 target.write_text(block.text, encoding="utf-8")
         refused = run("cocoro nod --times 11 2>&1 || echo exit code $?", tmp_path, environment)
+        made = run("cocoro new task greet && pip install -e greet && pytest greet", tmp_path, environment)
         listed = run("cocoro --help; cocoro rehearse --help", tmp_path, environment)
     tried, operated = printed
     assert "2 passed" in tried
@@ -37,5 +38,6 @@ def test_the_page_works_word_for_word(tmp_path: Path) -> None:
     assert re.search(r"^done: nod in", tried, re.MULTILINE)
     assert re.search(r"^done: nod in", operated, re.MULTILINE)
     assert "exit code 2" in refused
+    assert "2 passed" in made, "so does the template"
     assert len(re.findall(r"nod +Nod the head\.", listed)) == 2
     assert sys.prefix not in operated

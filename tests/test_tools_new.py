@@ -95,4 +95,24 @@ def test_the_templates_are_part_of_the_package() -> None:
     packed = {path for pattern in patterns for path in (ROOT / "apps").glob(pattern)}
     files = {path for path in TEMPLATES.rglob("*") if path.is_file()}
     assert files <= packed
-    assert len(files) == len(list(new.files({"name": "a", "package": "a", "class": "A"})))
+    words = {"name": "a", "package": "a", "class": "A"}
+    assert len(files) == sum(len(list(new.files(template, words))) for template in (new.SERVICE, new.TASK))
+
+
+@pytest.mark.process
+def test_a_new_task_is_a_type_a_test_and_a_registration(tmp_path: Path) -> None:
+    assert main(["new", "task", "wave-hand", "--into", str(tmp_path)]) == 0
+    folder = tmp_path / "wave-hand"
+    assert {path.name for path in folder.iterdir()} == {"pyproject.toml", "wave_hand.py", "test_wave_hand.py"}
+    assert not any(re.search(r"\{\{|\}\}", path.read_text()) for path in folder.iterdir())
+    done = subprocess.run(
+        [sys.executable, "-P", "-m", "ruff", "check", "--no-cache", "--select", "E,F,N,UP,B,SIM", "."],
+        cwd=folder, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout
+
+
+@pytest.mark.parametrize("name", ["fetch", "go-to", "Wave", "numpy"])
+def test_a_task_of_a_name_that_cannot_be_or_is_taken_is_refused(tmp_path: Path, name: str) -> None:
+    assert main(["new", "task", name, "--into", str(tmp_path)]) == 2
+    assert list(tmp_path.iterdir()) == []

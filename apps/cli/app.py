@@ -1,7 +1,8 @@
 """The commands of `cocoro`, in the order in which its help lists them.
 
-`cocoro --help` needs this file alone. A command's own file has its options and what it does; it is imported when the
-command is called, so it may import whatever it needs.
+`cocoro --help` needs this file and `task_commands`. A command's own file has its options and what it does; it is
+imported when the command is called, so it may import whatever it needs. The commands of tasks (`cocoro fetch`) are made
+from the types of tasks by `task_commands`; `tasks` sends the request and follows the task to its outcome.
 """
 
 from __future__ import annotations
@@ -57,7 +58,7 @@ COMMANDS = (
     ),
     CommandRow("hz", TOOLS, "Rate, jitter and amount of data on a key, as it arrives here, over the last seconds."),
     CommandRow("logs", TOOLS, "Logs of the robot's processes on this machine since their start, merged by time."),
-    CommandRow("new", TOOLS, "Write a component from a template: `cocoro new service NAME`."),
+    CommandRow("new", TOOLS, "Write a component (`new service NAME`) or a task (`new task NAME`) from a template."),
     CommandRow(
         "base", HARDWARE, "Show the base: mode, battery, bumpers, odometry; `recover` puts it back into its mode."
     ),
@@ -145,8 +146,7 @@ def load(name: str) -> TyperCommand | TyperGroup:
 
 
 class CommandGroup(TyperGroup):
-    """The group of all commands: help comes from COMMANDS, and a command is loaded when it is called. Further commands
-    are made from the types of tasks."""
+    """The group of all commands: it lists COMMANDS and the tasks, and loads a command when it is called."""
 
     def __init__(self, **attributes: Any) -> None:
         super().__init__(**attributes)

@@ -78,7 +78,7 @@ class BabbleDisplay:
         self._had = len(kept)
 
     def show(self, state: TaskState) -> None:
-        if state.phase.startswith("babble"):
+        if state.phase == state.task:
             state.text = self.text(state.elapsed_s)
         self._view.show(state)
 

@@ -160,23 +160,23 @@ async def show_rates(choice: RobotChoice, text: str, window_s: float, once: bool
     """Measures until interrupted, or with `once` over one window; the exit code is 1 when nothing arrived in it."""
     meters: dict[str, RateMeter] = {}
     async with joined(choice, frames=takes_frames(text)) as link:
-        ear = KeyListener(link, keyexpr_of(text, link.robot))
+        listener = KeyListener(link, keyexpr_of(text, link.robot))
         with interrupt_event() as end, _view(as_json, once) as view:
             show_s = time.monotonic() + (window_s if once else SHOW_S)
             while not end.is_set():
-                await ear.wait(end, max(show_s - time.monotonic(), 0.0))
-                for heard in ear.take():
-                    if heard.key not in meters:
-                        meters[heard.key] = RateMeter(heard.key, _nominal_hz(heard.key, link.robot), window_s)
-                    meters[heard.key].hear(heard.payload, heard.at_s)
+                await listener.wait(end, max(show_s - time.monotonic(), 0.0))
+                for received in listener.take():
+                    if received.key not in meters:
+                        meters[received.key] = RateMeter(received.key, _nominal_hz(received.key, link.robot), window_s)
+                    meters[received.key].hear(received.payload, received.at_s)
                 if time.monotonic() >= show_s:
                     show_s = time.monotonic() + SHOW_S
-                    view.show(_reports(meters.values()), ear.keyexpr)
+                    view.show(_reports(meters.values()), listener.keyexpr)
                     if once:
                         break
-        if ear.dropped:
+        if listener.dropped:
             print(
-                f"cocoro: {ear.dropped} messages came faster than this command could count, and are not in the figures",
+                f"cocoro: {listener.dropped} messages arrived too fast and are not in the figures",
                 file=sys.stderr,
             )
         if end.is_set() and not once:

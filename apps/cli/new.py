@@ -1,4 +1,4 @@
-"""`cocoro new service NAME`: writes a distribution with a working component and its tests."""
+"""`cocoro new service NAME` and `cocoro new task NAME`: write a distribution with a working component or task."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import importlib.util
 import keyword
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path, PurePosixPath
@@ -17,21 +17,20 @@ import typer
 from apps.cli import exits
 from cocoro.errors import ConfigError
 from deploy import processes
+from services.executive.tasks import TASKS
 
-TEMPLATE = "templates/service"
+SERVICE, TASK = "templates/service", "templates/task"
 SUFFIX = ".template"
 NAME = r"[a-z][a-z0-9_-]{0,31}"
 """Valid names: a chunk of a key, and with '_' for '-' a Python package."""
 
 
 app = typer.Typer()
-new = typer.Typer(no_args_is_help=True, help="Write a component from a template: `cocoro new service NAME`.")
+new = typer.Typer(
+    no_args_is_help=True,
+    help="Write a component (`new service NAME`) or a task (`new task NAME`) from a template.",
+)
 app.add_typer(new, name="new")
-
-
-@new.callback()
-def _new() -> None:
-    """Makes `new` a group of commands, although it has one."""
 
 
 @new.command()
@@ -43,21 +42,22 @@ def service(
     sys.exit(write_service(name, into))
 
 
+@new.command()
+def task(
+    name: Annotated[str, typer.Argument(help="Name of the task, and of its command: greet.")],
+    into: Annotated[Path, typer.Option(metavar="DIR", help="The folder that its folder goes into.")] = Path(),
+) -> None:
+    """A working task with its test, as a package of your own: see docs/tasks.md."""
+    sys.exit(write_task(name, into))
+
+
 def write_service(name: str, into: Path) -> int:
     """Writes the component into the folder `into`/`name`. Raises ConfigError for an invalid or taken name."""
     folder = into / name
     if folder.exists():
         raise ConfigError(f"{folder} exists already; choose another name, or another place with --into")
     package = package_of(name)
-    words = {"name": name, "package": package, "class": "".join(part.capitalize() for part in re.split("[-_]+", name))}
-    for path, text in files(words):
-        target = folder / path
-        try:
-            target.parent.mkdir(parents=True, exist_ok=True)
-            target.write_text(text, encoding="utf-8")
-        except OSError as error:
-            raise ConfigError(f"{target} cannot be written: {error.strerror}") from error
-        print(target)
+    write(SERVICE, name, folder)
     hints = (
         (f"pytest {folder}", "runs its tests"),
         (f"pip install -e {folder}", "installs it"),
@@ -65,13 +65,56 @@ def write_service(name: str, into: Path) -> int:
         (f"cocoro echo {name}/travelled", "prints its messages"),
     )
     print(f"\nIts computation is in {folder / package / 'core.py'}. Next:")
-    for command, what in hints:
-        print(f"  {command:<{max(len(command) for command, _ in hints)}}  # {what}")
+    print_hints(hints)
     return exits.DONE
 
 
+def write_task(name: str, into: Path) -> int:
+    """Writes the task into the folder `into`/`name`. Raises ConfigError for an invalid or taken name."""
+    folder = into / name
+    if folder.exists():
+        raise ConfigError(f"{folder} exists already; choose another name, or another place with --into")
+    package = package_of(name)
+    if name in TASKS.all():
+        raise ConfigError(f"there is a task {name} already; choose another name")
+    write(TASK, name, folder)
+    print(f"\nIts type is in {folder / package}.py. Next:")
+    print_hints(
+        (
+            (f"pip install -e {folder}", "installs it"),
+            (f"pytest {folder}", "runs its test"),
+            (f"cocoro rehearse {name}", "tries it in simulation"),
+            (f"cocoro {name}", "runs it on a robot that is up"),
+        )
+    )
+    return exits.DONE
+
+
+def write(template: str, name: str, folder: Path) -> None:
+    """Writes the files of a template and prints their paths. Raises ConfigError when one cannot be written."""
+    words = {
+        "name": name,
+        "package": name.replace("-", "_"),
+        "class": "".join(part.capitalize() for part in re.split("[-_]+", name)),
+    }
+    for path, text in files(template, words):
+        target = folder / path
+        try:
+            target.parent.mkdir(parents=True, exist_ok=True)
+            target.write_text(text, encoding="utf-8")
+        except OSError as error:
+            raise ConfigError(f"{target} cannot be written: {error.strerror}") from error
+        print(target)
+
+
+def print_hints(hints: Iterable[tuple[str, str]]) -> None:
+    width = max(len(command) for command, _ in hints)
+    for command, what in hints:
+        print(f"  {command:<{width}}  # {what}")
+
+
 def package_of(name: str) -> str:
-    """The Python package of a component. Raises ConfigError for a name that is not valid or is taken."""
+    """The Python package of a component or task. Raises ConfigError for a name that is not valid or is taken."""
     if not re.fullmatch(NAME, name):
         raise ConfigError(f"{name!r} is not a valid name: small letters, digits, '_' and '-', a letter first")
     package = name.replace("-", "_")
@@ -85,9 +128,9 @@ def package_of(name: str) -> str:
     return package
 
 
-def files(words: dict[str, str]) -> Iterator[tuple[PurePosixPath, str]]:
-    """The files of the template with `words` filled in: path below the component's folder, and text."""
-    for path, source in _walk(resources.files("apps").joinpath(TEMPLATE), PurePosixPath()):
+def files(template: str, words: dict[str, str]) -> Iterator[tuple[PurePosixPath, str]]:
+    """The files of a template with `words` filled in: path below the new folder, and text."""
+    for path, source in _walk(resources.files("apps").joinpath(template), PurePosixPath()):
         text = source.read_text(encoding="utf-8")
         for word, value in words.items():
             text = text.replace(f"{{{{{word}}}}}", value)

@@ -9,9 +9,9 @@ import msgspec
 
 from apps.experiments.lessons import load_robot
 from apps.experiments.runs import ExperimentRun
-from apps.rehearsal.request import BodyKind, Sensors
 from cocoro.robot import Robot
 from services.executive.tasks import BabbleArmTask, BabbleWheelsTask
+from sim.realism import BodyKind, Sensors
 
 
 class ExperimentSettings(msgspec.Struct, frozen=True, kw_only=True):

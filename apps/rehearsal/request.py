@@ -8,9 +8,7 @@ import msgspec
 from msgspec import Meta
 
 from services.executive.tasks import TASKS
-
-Sensors = Literal["ideal", "real"]
-BodyKind = Literal["nominal", "worn"]
+from sim.realism import BodyKind, Sensors
 
 
 class RehearsalRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

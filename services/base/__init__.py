@@ -1,1 +1,1 @@
-"""The Create: its bytes (`oi`), the guard that owns its port, the driver that makes sense of it, the service."""
+"""The base: the Create's bytes (`oi`), the guard that owns its port, the driver (the pure core), and the service."""

@@ -1,1 +1,1 @@
-"""The Kinect: colour and raw depth, stamped by the robot's clock."""
+"""The Kinect: frames of colour and raw depth, stamped by the robot's clock."""

@@ -1,1 +1,1 @@
-"""Dynamixel servos: their registers (`table`), packets, port and bus; motion and networks; the service."""
+"""The Dynamixel servos: registers (`table`), bus, the thread of a line, motion and network (pure), and the service."""

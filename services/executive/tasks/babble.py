@@ -9,7 +9,7 @@ from msgspec import Meta
 from cocoro.messages.actions import BabbleArm, BabbleWheels, Park, Search
 from cocoro.tasks import UNLIMITED_S, Limits, Skills, Task
 from cocoro.topics import HAND_SAMPLES, WHEEL_TRIALS
-from services.executive.tasks.steps import Label
+from services.executive.tasks.steps import TargetLabel
 
 First = Annotated[
     int, Meta(ge=0, description="Number to go on with where an earlier run ended.", extra={"option": False})
@@ -38,7 +38,7 @@ class BabbleWheelsTask(Task, frozen=True, kw_only=True, tag="babble-wheels"):
     needs_label = "known"
     samples = WHEEL_TRIALS
 
-    label: Label
+    label: TargetLabel
     first: First = 0
     count: Annotated[int, Meta(ge=1, le=1_000_000, description="How many trials.")] = 1000
 

@@ -9,7 +9,7 @@ from msgspec import Meta
 
 from cocoro.messages.actions import Approach, Carry, Close, Lift, PutDown, Reach
 from cocoro.tasks import Skills, Task, TaskFailedError
-from services.executive.tasks.steps import Label, find
+from services.executive.tasks.steps import TargetLabel, find
 
 _LOOK_AGAIN = ("lost", "unreachable")
 _TRY_AGAIN = ("slipped", "no_grip")
@@ -21,7 +21,7 @@ class FetchTask(Task, frozen=True, kw_only=True, tag="fetch"):
     needs_label = "graspable"
     snapshot_phase = "grasp"
 
-    label: Label
+    label: TargetLabel
     bring: Annotated[bool, Meta(description="Bring it to where the task began and put it down.")] = False
 
     async def run(self, skills: Skills) -> None:

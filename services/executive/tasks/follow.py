@@ -8,7 +8,7 @@ from msgspec import Meta
 
 from cocoro.messages.actions import Follow
 from cocoro.tasks import UNLIMITED_S, Limits, Skills, Task, TaskFailedError
-from services.executive.tasks.steps import Label, find
+from services.executive.tasks.steps import TargetLabel, find
 
 
 class FollowTask(Task, frozen=True, kw_only=True, tag="follow"):
@@ -17,7 +17,7 @@ class FollowTask(Task, frozen=True, kw_only=True, tag="follow"):
     needs_label = "known"
     pursuit_phase = "follow"
 
-    label: Label
+    label: TargetLabel
     for_s: Annotated[float, Meta(gt=0, le=3600, description="Follow for so long, then stop.")] | None = None
 
     def limit_s(self, limits: Limits) -> float:

@@ -8,7 +8,7 @@ from msgspec import Meta
 
 from cocoro.messages.actions import GoTo
 from cocoro.tasks import Skills, Task
-from services.executive.tasks.steps import Label, find
+from services.executive.tasks.steps import TargetLabel, find
 
 
 class GoToTask(Task, frozen=True, kw_only=True, tag="go-to"):
@@ -16,7 +16,7 @@ class GoToTask(Task, frozen=True, kw_only=True, tag="go-to"):
 
     needs_label = "known"
 
-    label: Label
+    label: TargetLabel
     distance_m: Annotated[
         float, Meta(ge=0, le=5, description="From the robot's centre to the object's nearest edge, over the floor.")
     ] = 0.2

@@ -9,7 +9,7 @@ from msgspec import Meta
 from cocoro.messages.actions import Explore, Search
 from cocoro.tasks import Skills, TaskFailedError
 
-Label = Annotated[str, Meta(description="A known object; `cocoro objects` lists them.")]
+TargetLabel = Annotated[str, Meta(description="A known object; `cocoro objects` lists them.")]
 
 
 async def find(skills: Skills, label: str) -> None:

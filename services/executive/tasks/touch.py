@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from cocoro.messages.actions import Search, Touch
 from cocoro.tasks import Skills, Task
-from services.executive.tasks.steps import Label
+from services.executive.tasks.steps import TargetLabel
 
 
 class TouchTask(Task, frozen=True, kw_only=True, tag="touch"):
@@ -12,7 +12,7 @@ class TouchTask(Task, frozen=True, kw_only=True, tag="touch"):
 
     needs_label = "graspable"
 
-    label: Label
+    label: TargetLabel
 
     async def run(self, skills: Skills) -> None:
         status, limits = skills.status, skills.limits
