@@ -17,10 +17,11 @@ check mypy
 check lint-imports --no-logo
 [ ${#unclean[@]} = 0 ] || echo "NOT CLEAN: ${unclean[*]}"
 
-# Tests of real processes run alone; the others go by virtual time and run in parallel.
+# Tests that measure real time run alone, since load would falsify their times. The others run on two workers; each file
+# stays on one of them, so that what a file's tests share is made once.
 if [ $# = 0 ]; then
-    echo "== pytest, what goes by virtual time, on two processors"
-    pytest -rs -n 2 -m "not zenoh"
+    echo "== pytest on two workers, without the tests that measure real time"
+    pytest -rs -n 2 --dist loadfile -m "not zenoh"
     tests=$?
     set -- -m zenoh
 fi

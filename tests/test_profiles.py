@@ -114,7 +114,9 @@ def test_a_profiles_own_files_are_found_from_anywhere(tmp_path: Path, monkeypatc
 def test_it_meets_in_the_run_directory_unless_it_says_where(short_path: Path) -> None:
     here = RunDir("r", short_path).join_as("planning", profiles.read("sim").mesh)
     assert (here.directory, here.name) == (short_path / "r", "planning")
-    routed = written(short_path, 'robot = "r"\nprocesses = ["sim"]\n[mesh]\nmode = "client"\nconnect = ["tls/base:7447"]')
+    routed = written(
+        short_path, 'robot = "r"\nprocesses = ["sim"]\n[mesh]\nmode = "client"\nconnect = ["tls/base:7447"]'
+    )
     away = RunDir("r", short_path).join_as("planning", profiles.read(routed).mesh)
     assert (away.directory, away.mode, away.connect) == (None, "client", ("tls/base:7447",))
 
