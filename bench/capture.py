@@ -29,13 +29,13 @@ from pathlib import Path
 import psutil
 
 from apps.captures.info import report
+from apps.captures.reader import Capture
 from apps.captures.reexecute import describe_result, reexecute
 from apps.rehearsal.rehearse import rehearse
 from apps.rehearsal.request import RehearsalRequest
 from cocoro import topics
 from cocoro.bus.endpoints import default
 from cocoro.bus.zenoh import ZenohBus
-from cocoro.capture.reader import Capture
 from cocoro.clock import RealClock
 from cocoro.keys import recorder_key
 from cocoro.messages import BaseState, Frame

@@ -17,12 +17,12 @@ from collections import defaultdict
 from contextlib import redirect_stderr, redirect_stdout, suppress
 from pathlib import Path
 
+from apps.captures.reader import Capture, Record
 from apps.captures.rewrite import rewrite
 from apps.cli.main import main as cocoro
 from apps.rehearsal.rehearse import rehearse
 from apps.rehearsal.request import RehearsalRequest
 from cocoro.capture.conventions import CaptureError
-from cocoro.capture.reader import Capture, Record
 from cocoro.clock import NS
 from services.capture.file import Packer
 from services.executive.tasks import FetchTask

@@ -31,11 +31,11 @@ from mcap.stream_reader import breakup_chunk
 from mcap.writer import CompressionType
 from mcap.writer import Writer as PackageWriter
 
+from apps.captures.contents import unpacked
+from apps.captures.reader import Capture
 from apps.rehearsal.rehearse import rehearse
 from apps.rehearsal.request import RehearsalRequest
 from cocoro.capture import mcap
-from cocoro.capture.contents import unpacked
-from cocoro.capture.reader import Capture
 from cocoro.clock import NS
 from services.capture import file
 from services.capture.file import QUICK, Packer

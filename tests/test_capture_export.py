@@ -21,12 +21,12 @@ from mcap.reader import make_reader
 from apps.captures.export import rerun_scene, tables, video
 from apps.captures.export.geometry import Posture, about_z, conjugate, points, quaternion, rotated
 from apps.captures.export.story import catalogue_of, robot_of
+from apps.captures.reader import Capture
 from apps.cli.export import watch
 from apps.cli.main import main
 from cocoro import topics
 from cocoro.bus.base import Qos
 from cocoro.capture.conventions import CaptureError
-from cocoro.capture.reader import Capture
 from cocoro.kinematics import turn_z
 from cocoro.messages import BaseCommand, Frame, PlannerStatus, ServoState, TargetEstimate, TrueObject, Truth
 from cocoro.objects import Catalogue

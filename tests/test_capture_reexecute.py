@@ -15,6 +15,7 @@ import pytest
 from capture_rig import Room, drive, record
 
 from apps.captures.compare import difference
+from apps.captures.reader import Capture, Record
 from apps.captures.recorded import origins
 from apps.captures.reexecute import ReexecutionResult, reexecute
 from apps.captures.rewrite import info_in, rewrite
@@ -22,7 +23,6 @@ from apps.cli.main import main
 from apps.rehearsal.lockstep import LockstepPlanner
 from cocoro import topics
 from cocoro.capture.conventions import CaptureError
-from cocoro.capture.reader import Capture, Record
 from cocoro.clock import NS
 from cocoro.core import Core, Output, Sample, Schedule, Take
 from cocoro.messages import Detections, PlannerStatus

@@ -13,9 +13,9 @@ import pytest
 from capture_rig import ROBOT, Room, all_of, drive, entry, record, writer
 
 from apps.captures.player import AT_ONCE, FASTEST, Player
+from apps.captures.reader import Capture
 from apps.captures.replay import Replay, played_keys, refuse_if_alive, restarted, services_of, with_rate
 from cocoro import topics
-from cocoro.capture.reader import Capture
 from cocoro.clock import FollowedClock
 from cocoro.core import Output, Sample, Schedule, Take
 from cocoro.errors import ConfigError, RefusedError

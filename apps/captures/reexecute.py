@@ -17,8 +17,8 @@ import numpy as np
 
 from apps.captures.compare import difference, known_to
 from apps.captures.info import changed_since
+from apps.captures.reader import Capture
 from apps.captures.recorded import FoundMessage, MessageId, Origin, RecordedStep, origins, steps_of, with_messages
-from cocoro.capture.reader import Capture
 from cocoro.capture.types import NotReadableError
 from cocoro.clock import NS
 from cocoro.core import Core, Output, Sample

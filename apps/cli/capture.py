@@ -15,12 +15,12 @@ import msgspec
 import typer
 
 from apps.captures.info import AttachmentReport, CaptureReport, report
+from apps.captures.reader import Capture
 from apps.captures.rewrite import REPAIRED, rewrite
 from apps.cli import exits
 from apps.cli.options import CaptureArgument, FromOption, JsonOption, OnlyOption, ToOption, WithoutOption
 from apps.cli.terminal import table
 from cocoro.capture.conventions import CaptureError
-from cocoro.capture.reader import Capture
 from cocoro.clock import NS
 from cocoro.errors import ConfigError
 from services.capture.file import COMPRESSIONS, Compression, Packer

@@ -14,12 +14,12 @@ import msgspec
 import typer
 
 from apps.captures.export.files import refuse_existing
+from apps.captures.reader import Capture
 from apps.cli import exits
 from apps.cli.interrupt import interrupt_event
 from apps.cli.link import joined
 from apps.cli.options import CaptureArgument, MeshOption, RobotChoice, RobotOption
 from cocoro.bus.base import Bus, Payload
-from cocoro.capture.reader import Capture
 from cocoro.clock import NS
 from cocoro.errors import ConfigError
 from cocoro.messages import Message

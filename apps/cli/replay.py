@@ -16,6 +16,7 @@ from typing import Annotated, Any
 import typer
 
 from apps.captures.player import Player
+from apps.captures.reader import Capture
 from apps.captures.replay import SIMULATOR, Replay, played_keys, refuse_if_alive, services_of
 from apps.cli import exits
 from apps.cli.capture import check_span
@@ -23,7 +24,6 @@ from apps.cli.options import CaptureArgument, FromOption, OnlyOption, ToOption
 from apps.cli.terminal import StatusLine
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.capture.conventions import CaptureError
-from cocoro.capture.reader import Capture
 from cocoro.errors import ConfigError, RefusedError
 from cocoro.keys import alive_key, service_of
 from deploy import processes

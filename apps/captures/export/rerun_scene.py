@@ -18,9 +18,9 @@ import numpy as np
 from apps.captures.export.files import making
 from apps.captures.export.geometry import CAMERA, Posture, about_z, conjugate, points, quaternion, rotated
 from apps.captures.export.story import catalogue_of, robot_of
+from apps.captures.reader import Capture
 from apps.pictures import describe
 from cocoro.capture.conventions import CaptureError
-from cocoro.capture.reader import Capture
 from cocoro.capture.types import NotReadableError
 from cocoro.clock import NS
 from cocoro.messages import (

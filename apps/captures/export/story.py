@@ -11,8 +11,8 @@ from typing import Any, Generic, TypeVar
 import msgspec
 
 from apps.captures.export.geometry import conjugate, rotated
+from apps.captures.reader import Capture, Record
 from apps.captures.recorded import recorded_file
-from cocoro.capture.reader import Capture, Record
 from cocoro.capture.types import NotReadableError
 from cocoro.clock import NS
 from cocoro.messages import Detections, Message, PlannerStatus, TaskState, TrueObject, Truth

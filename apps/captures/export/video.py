@@ -13,10 +13,10 @@ import cv2
 
 from apps.captures.export.files import making
 from apps.captures.export.story import Story, catalogue_of, read
+from apps.captures.reader import Capture
 from apps.pictures import draw
 from cocoro.arrays import ImageArray
 from cocoro.capture.conventions import CaptureError
-from cocoro.capture.reader import Capture
 from cocoro.clock import NS
 from cocoro.messages import Frame
 from cocoro.topics import FRAME

@@ -21,8 +21,8 @@ from mcap.records import (
     SummaryOffset,
 )
 
+from apps.captures.contents import LARGEST_RECORD, Contents, Disk, MessageBlock, unpacked
 from cocoro.capture import mcap
-from cocoro.capture.contents import LARGEST_RECORD, Contents, Disk, MessageBlock, unpacked
 from cocoro.capture.mcap import KNOWN, MAGIC, PREFIX, CutOffError, DamageError
 
 RUN_BYTES = 1 << 20
