@@ -11,8 +11,8 @@ from cocoro.arrays import ImageArray
 from cocoro.errors import CocoroError
 from cocoro.messages import Detection, Detections, Frame
 from cocoro.objects import Catalogue
-from cocoro.picture import save
 from cocoro.units import Rgb
+from services.kinect.picture import save
 
 LOCALISED: Rgb = (255, 255, 255)
 UNLOCALISED: Rgb = (255, 160, 0)

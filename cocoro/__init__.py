@@ -19,8 +19,8 @@ Everything that a component's author needs can be imported from here; each name 
 - Errors: `CocoroError` and its kinds; a command prints their text without a traceback.
 
 Parts with a module of their own: `cocoro.topics` (the project's topics and requests), `cocoro.messages` (their types),
-`cocoro.testing` (components under test), `cocoro.capture` (reading captures), `cocoro.kinematics`, `cocoro.learning`,
-`cocoro.arrays` and `cocoro.units` (types).
+`cocoro.testing` (components under test), `cocoro.capture` (the format of captures; `apps.captures.reader` reads them),
+`cocoro.kinematics`, `cocoro.learning`, `cocoro.arrays` and `cocoro.units` (types).
 """
 
 from __future__ import annotations
@@ -52,51 +52,12 @@ if TYPE_CHECKING:
     from cocoro.vloop import run_virtual
 
 __all__ = [
-    "NS",
-    "Action",
-    "Answer",
-    "Bus",
-    "CallTimeoutError",
-    "Catalogue",
-    "Clock",
-    "CocoroError",
-    "Component",
-    "ConfigError",
-    "Contact",
-    "Core",
-    "FollowedClock",
-    "History",
-    "Implementation",
-    "Inbox",
-    "Latest",
-    "MeshError",
-    "Message",
-    "Node",
-    "ObjectSpec",
-    "Output",
-    "Participant",
-    "Pose2",
-    "Publisher",
-    "Qos",
-    "RealClock",
-    "RefusedError",
-    "RemoteError",
-    "Request",
-    "Robot",
-    "Sample",
-    "Schedule",
-    "ServiceLatch",
-    "Skills",
-    "Stream",
-    "Take",
-    "Task",
-    "TaskFailedError",
-    "Topic",
-    "VirtualClock",
-    "every",
-    "is_fresh",
-    "run_virtual",
-]
+    "NS", "Action", "Answer", "Bus", "CallTimeoutError", "Catalogue", "Clock", "CocoroError", "Component",
+    "ConfigError", "Contact", "Core", "FollowedClock", "History", "Implementation", "Inbox", "Latest", "MeshError",
+    "Message", "Node", "ObjectSpec", "Output", "Participant", "Pose2", "Publisher", "Qos", "RealClock",
+    "RefusedError", "RemoteError", "Request", "Robot", "Sample", "Schedule", "ServiceLatch", "Skills", "Stream",
+    "Take", "Task", "TaskFailedError", "Topic", "VirtualClock", "every", "is_fresh", "run_virtual",
+]  # fmt: skip
 
 _MODULES = {
     "bus.base": ("Bus", "Qos"),

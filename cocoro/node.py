@@ -160,9 +160,9 @@ class Node(Participant):
         return inbox
 
     def watch_alive(self, handler: Callable[[str, bool], None], service: str = "*") -> Handle:
-        if self.contact.sleep_detector is not None and not self._detects_sleep:
+        if self.contact.keeps and not self._detects_sleep:
             self._detects_sleep = True
-            self.spawn(self.contact.sleep_detector.keep())
+            self.spawn(self.contact.keep())
 
         def changed(name: str, alive: bool) -> None:
             if alive:

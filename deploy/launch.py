@@ -96,10 +96,10 @@ async def _main(process: str, run_dir: RunDir, data: dict[str, Any], profile_nam
     from cocoro.bus.zenoh import ZenohBus
     from cocoro.clock import FollowedClock
     from cocoro.component import load as load_component
-    from cocoro.contact import Contact, SleepDetector
     from cocoro.robot import Robot
     from cocoro.stop.record import latch_dir
     from deploy import processes, profiles, robot_time
+    from deploy.contact import ProcessContact, SleepDetector
     from deploy.delayed import DelayedNode
 
     profile = profiles.from_data(data, profile_name)
@@ -131,7 +131,7 @@ async def _main(process: str, run_dir: RunDir, data: dict[str, Any], profile_nam
                 config=config,
                 profile=data,
                 latches=latch_dir(profile.robot),
-                contact=Contact(run_dir.claimant_pid, SleepDetector(log.warning)),
+                contact=ProcessContact(run_dir.claimant_pid, SleepDetector(log.warning)),
             ) as node,
         ):
             log.info("joined the mesh at %s", bus.where)

@@ -112,7 +112,7 @@ class RunDir:
         return holder(self.path / "claims" / service)
 
     def claimant_pid(self, service: str) -> int | None:
-        """The number of that process, for `cocoro.contact.Contact`; 0 when it cannot be read."""
+        """The number of that process, for `deploy.contact.ProcessContact`; 0 when it cannot be read."""
         by = self.claimant(service)
         return None if by is None else by.pid
 

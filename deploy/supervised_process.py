@@ -13,8 +13,8 @@ from typing import IO
 
 from cocoro import child
 from cocoro.component import Component
-from cocoro.contact import RECOVERY_S, SleepDetector
 from cocoro.errors import ConfigError
+from deploy.contact import RECOVERY_S, SleepDetector
 from deploy.launch import CRASHED, MISCONFIGURED, REFUSED
 from deploy.processes import BACKOFF_LIMIT_S, SETTLED_S
 from deploy.rundir import RunDir

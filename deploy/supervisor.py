@@ -23,11 +23,11 @@ import msgspec
 
 from cocoro.bus import shared
 from cocoro.bus.zenoh import ZenohBus
-from cocoro.contact import SleepDetector
 from cocoro.errors import CocoroError, ConfigError, RefusedError
 from cocoro.keys import alive_key, service_of
 from cocoro.stop.record import latch_dir, prepare
 from deploy import robot_time, service_manager
+from deploy.contact import SleepDetector
 from deploy.launch import CRASHED
 from deploy.processes import shared_bytes, stoppable
 from deploy.profiles import Profile, from_data

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from cocoro.clock import NS
-from cocoro.contact import BEAT_S, LATE_S, RECOVERY_S, Contact, SleepDetector
 from cocoro.testing import in_virtual_time
+from deploy.contact import BEAT_S, LATE_S, RECOVERY_S, ProcessContact, SleepDetector
 from deploy.processes import named
 from deploy.rundir import RunDir
 from deploy.supervised_process import SupervisedProcess
@@ -65,7 +65,7 @@ async def test_a_busy_machine_is_not_asleep() -> None:
 
 @in_virtual_time
 async def test_without_a_run_directory_nobody_is_known_to_be_dead() -> None:
-    contact = Contact()
+    contact = ProcessContact()
     contact.met("base")
     assert not contact.dead("base")
     assert await contact.lost("base") == "lost contact with base"
@@ -78,7 +78,7 @@ def test_one_of_another_machine_is_never_known_to_be_dead(tmp_path: Path) -> Non
 
     @in_virtual_time
     async def scenario() -> None:
-        contact = Contact(run_dir.claimant_pid)
+        contact = ProcessContact(run_dir.claimant_pid)
         contact.met("base")
         assert not contact.dead("base")
         assert await contact.lost("base") == "lost contact with base"
@@ -88,7 +88,7 @@ def test_one_of_another_machine_is_never_known_to_be_dead(tmp_path: Path) -> Non
 
 def test_one_that_is_met_again_lives_again(tmp_path: Path) -> None:
     run_dir = RunDir("calliope", tmp_path)
-    contact = Contact(run_dir.claimant_pid)
+    contact = ProcessContact(run_dir.claimant_pid)
     (first,) = run_dir.claim("base", ["base"])
     contact.met("base")
     first.release()
@@ -101,7 +101,7 @@ def test_one_that_is_met_again_lives_again(tmp_path: Path) -> None:
 
 def test_a_run_directory_that_cannot_be_read_says_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run_dir = RunDir("calliope", tmp_path)
-    contact = Contact(run_dir.claimant_pid)
+    contact = ProcessContact(run_dir.claimant_pid)
     (claim,) = run_dir.claim("base", ["base"])
     contact.met("base")
 

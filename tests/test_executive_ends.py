@@ -10,10 +10,10 @@ from executive_rig import idle_again, robot
 
 from cocoro import topics
 from cocoro.clock import NS
-from cocoro.contact import Contact, SleepDetector
 from cocoro.held_file import hold
 from cocoro.messages import CancelRequest
 from cocoro.testing import JumpingClock, in_virtual_time
+from deploy.contact import ProcessContact, SleepDetector
 from deploy.processes import hardware
 from deploy.rundir import RunDir
 from services.executive.tasks import ParkTask
@@ -139,7 +139,7 @@ def test_only_of_one_that_is_known_to_be_dead_it_is_said_that_it_died(
     async def scenario() -> None:
         clock = Sleepy()
         said: list[str] = []
-        async with robot(contact=Contact(run_dir.claimant_pid, SleepDetector(said.append, clock))) as it:
+        async with robot(contact=ProcessContact(run_dir.claimant_pid, SleepDetector(said.append, clock))) as it:
             it.script = {"search": ["never"]}
             await it.begin()
             await it.phase("search")

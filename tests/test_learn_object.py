@@ -14,10 +14,10 @@ from apps.appearance.colours import overlaps, range_of
 from apps.appearance.learn import LearnedObject, ObjectHints, ObjectView, learn
 from apps.appearance.region import ColourField, at_pixel, in_box, most_salient
 from apps.pictures import colour_of
-from cocoro.colour import in_boxes, lab_of
 from cocoro.errors import ConfigError
 from cocoro.messages import Frame
 from cocoro.objects import Catalogue
+from services.perception.cielab import in_boxes, lab_of
 
 ORANGE, TEAL = (0.95, 0.45, 0.05), (0.05, 0.60, 0.55)
 

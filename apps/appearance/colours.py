@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 
 from cocoro.arrays import Float32Array, ImageArray
-from cocoro.colour import Lab, in_boxes, lab_of
 from cocoro.errors import ConfigError
 from cocoro.objects import LabBox, ObjectSpec
+from services.perception.cielab import Lab, in_boxes, lab_of
 
 EDGES_L = (8.0, 12.0, 20.0, 30.0, 40.0, 50.0, 60.0, 75.0, 99.0)
 """Limits of lightness, with one box between each two: chroma falls with lightness, so a single box would contain many

@@ -12,10 +12,10 @@ from apps.appearance.colours import NEARLY_GREY, ColourOverlap, ColourRange, ove
 from apps.appearance.region import ColourField, ObjectRegion, at_pixel, in_box, most_salient
 from apps.appearance.size import MeasuredSize, ObjectShape, guessed_shape, size_of, surface_depth_m
 from cocoro.arrays import BoolArray, CodeArray, FloatArray, ImageArray
-from cocoro.colour import in_boxes, lab_of, matches
 from cocoro.errors import ConfigError
 from cocoro.objects import Catalogue, ObjectSpec
 from cocoro.robot import Robot
+from services.perception.cielab import in_boxes, lab_of, matches
 from services.perception.image import PixelBox
 
 GRASPABLE_WIDTH_M = (0.02, 0.075)

@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 
 from cocoro.arrays import BoolArray, Float32Array, FloatArray, ImageArray, IntArray, MaskArray
-from cocoro.colour import Lab, lab_of
 from cocoro.errors import ConfigError
+from services.perception.cielab import Lab, lab_of
 from services.perception.image import PixelBox
 
 ChromaArray = Float32Array

@@ -23,10 +23,10 @@ from cocoro.core import Sample
 from cocoro.errors import ConfigError, MeshError
 from cocoro.messages import Detections, Frame, Message, ServoState
 from cocoro.objects import Catalogue
-from cocoro.picture import load
 from cocoro.robot import Robot
 from cocoro.topics import ARM_STATE, FRAME
 from deploy import processes
+from services.kinect.picture import load
 
 PERCEPTION = "perception"
 """The component whose core detects the objects in the preview."""

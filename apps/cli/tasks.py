@@ -17,11 +17,11 @@ from apps.cli.options import RobotChoice
 from apps.cli.output import going_on
 from apps.cli.progress import TaskDisplay, task_display
 from apps.cli.snapshot import SnapshotTaker, check
-from cocoro.contact import RECOVERY_S, Contact, SleepDetector
 from cocoro.errors import CallTimeoutError, CocoroError
 from cocoro.messages import CancelRequest, TaskReply, TaskRequest, TaskState
 from cocoro.tasks import Task
 from cocoro.topics import CANCEL, LATCH, RUN, TASK
+from deploy.contact import RECOVERY_S, ProcessContact, SleepDetector
 
 USAGE_REFUSALS = ("unknown_label", "not_graspable", "bad_request")
 """Refusals that are the operator's mistake, not the robot's state."""
@@ -47,7 +47,7 @@ async def run(choice: RobotChoice, request: TaskRequest, as_json: bool, picture:
     if picture is not None:
         check(picture)
     async with joined(choice, frames=picture is not None) as link:
-        contact = Contact(link.run_dir.claimant_pid, SleepDetector())
+        contact = ProcessContact(link.run_dir.claimant_pid, SleepDetector())
         follower = Follower(link, request, task_display(as_json), picture, contact)
         with on_interrupt(follower.interrupt), going_on():
             code, result = await follower.run()
@@ -76,10 +76,10 @@ class Follower:
         request: TaskRequest,
         view: TaskDisplay,
         picture: Path | None,
-        contact: Contact | None = None,
+        contact: ProcessContact | None = None,
     ) -> None:
         """`contact` finds out what happened to an executive that is silent."""
-        self._contact = contact or Contact(link.run_dir.claimant_pid)
+        self._contact = contact or ProcessContact(link.run_dir.claimant_pid)
         self._link = link
         self._request = request
         self._task: Task = request.task
@@ -111,8 +111,8 @@ class Follower:
             return self._refused(reply)
         self._task_id = reply.task_id
         beside = [asyncio.create_task(self._cancel_when_interrupted())]
-        if self._contact.sleep_detector is not None:
-            beside.append(asyncio.create_task(self._contact.sleep_detector.keep()))
+        if self._contact.keeps:
+            beside.append(asyncio.create_task(self._contact.keep()))
         try:
             state = await self._follow()
         finally:

@@ -1,5 +1,5 @@
-"""Captures are MCAP files with every message of a robot's mesh. Here is their format, and reading them.
+"""The format of captures: MCAP files with every message of a robot's mesh.
 
-`reader.Capture` opens one and gives its messages; `types` reads them as today's message types. The recorder writes
-them (`services.capture`). docs/captures.md describes the format for readers without this project.
+`services.capture` writes them, `apps.captures.reader` reads them, and `types` decodes their messages as today's types.
+docs/captures.md describes the format for readers without this project.
 """

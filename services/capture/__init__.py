@@ -1,1 +1,1 @@
-"""The recorder: writes everything that travels on the mesh into MCAP files (format and reading: `cocoro.capture`)."""
+"""The recorder: writes everything that travels on the mesh into MCAP files (their format: `cocoro.capture`)."""

@@ -17,12 +17,12 @@ import numpy as np
 from cocoro.arrays import CodeArray, FloatArray, ImageArray
 from cocoro.clock import RealClock
 from cocoro.errors import CocoroError, ConfigError
-from cocoro.picture import load as load_picture
-from cocoro.picture import save as save_picture
 from services.kinect.calibration import Board, BoardView, find_corners
 from services.kinect.camera import open_device
 from services.kinect.device import DepthCamera, KinectConfig, RawFrame
 from services.kinect.lens import NO_DATA
+from services.kinect.picture import load as load_picture
+from services.kinect.picture import save as save_picture
 
 STILL_PX = 0.7
 """The board is held still when its corners move less than this between frames (mean of all corners)."""

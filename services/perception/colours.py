@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cocoro.arrays import ImageArray
-from cocoro.colour import lab_of, matches
 from cocoro.objects import Catalogue
+from services.perception.cielab import lab_of, matches
 
 __all__ = ["Classes", "ColourTable", "lab_of", "matches"]
 
