@@ -59,7 +59,7 @@ class Registry(Generic[T]):
         """A member from the map that it travels as; a member stays as it is. Raises ValueError, which lists the known
         names for an unknown one, and names the field that is wrong."""
         if isinstance(data, Tagged):
-            return data  # type: ignore[return-value] # whoever made it chose the family
+            return data  # type: ignore[return-value] # its maker chose the family
         if not isinstance(data, Mapping):
             raise ValueError(f"{self._word}: a map is expected, not {type(data).__name__}")
         kind = self.kind(data.get(self._word))

@@ -1,4 +1,4 @@
-"""The actions that the executive asks of the planner: one type each, told apart by its tag on the wire."""
+"""The actions that the executive asks of the planner: one type each, with a tag on the wire."""
 
 from __future__ import annotations
 
