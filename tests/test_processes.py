@@ -126,6 +126,7 @@ def test_a_component_starts_with_nothing_configured(process: Component) -> None:
     assert msgspec.convert({}, component.config) == config
     with pytest.raises(msgspec.ValidationError, match="unknown field"):
         msgspec.convert({"no_such_field": 1}, component.config)
+    assert not {*component.config.__struct_fields__} & {*profiles.Launch.__struct_fields__}, "every component has these"
 
 
 def test_an_unknown_name_lists_the_known_ones() -> None:
