@@ -10,7 +10,7 @@ class Added(NamedTuple):
     """One value that a third party added."""
 
     name: str
-    """Of the entry point."""
+    """The entry point's name."""
     value: Any
     origin: str
     """The entry point and its distribution, for messages."""
@@ -21,7 +21,7 @@ class EntryPoints(NamedTuple):
 
     added: tuple[Added, ...]
     faults: tuple[str, ...]
-    """Why others could not be loaded, one text each."""
+    """For each one that could not be loaded, the reason."""
 
 
 @cache
