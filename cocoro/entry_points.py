@@ -34,6 +34,6 @@ def added_to(group: str) -> EntryPoints:
         origin = f"entry point {point.name!r} of {point.dist.name if point.dist else 'an unknown distribution'}"
         try:
             added.append(Added(point.name, point.load(), origin))
-        except Exception as error:  # third-party code runs here
+        except (Exception, SystemExit) as error:  # third-party code runs here, whatever it does
             faults.append(f"{origin} cannot be loaded: {type(error).__name__}: {error}")
     return EntryPoints(tuple(added), tuple(faults))
