@@ -12,8 +12,8 @@ from typing import Any
 from cli_forks import Case, Ending
 
 from apps.cli import exits
-from apps.cli.app import COMMANDS as LISTED
 from apps.cli.app import load
+from apps.cli.listed import COMMANDS as LISTED
 from apps.cli.task_commands import task_command, task_names
 
 GOLDEN = Path(__file__).parent / "golden" / "fetch.mcap"

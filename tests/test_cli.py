@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from places import in_short_folder
 
-from apps.cli import app, stop_asking, task_commands
+from apps.cli import app, listed, stop_asking, task_commands
 from apps.cli.main import PACKAGES, main
 from apps.cli.options import frames_of, latencies_of
 from apps.cli.running import overrides
@@ -166,8 +166,8 @@ def test_a_task_of_the_project_is_found_without_a_search_for_third_parties(monke
     assert task_commands.RehearsalGroup().get_command(None, "babble-arm") is not None
 
 
-@pytest.mark.parametrize("row", app.COMMANDS, ids=lambda row: row.name)
-def test_a_commands_own_help_begins_with_its_line_of_the_list(row: app.CommandRow) -> None:
+@pytest.mark.parametrize("row", listed.COMMANDS, ids=lambda row: row.name)
+def test_a_commands_own_help_begins_with_its_line_of_the_list(row: listed.CommandRow) -> None:
     command = app.load(row.name)
     assert " ".join((command.help or "").split()).startswith(row.summary)
     assert command.hidden == row.hidden

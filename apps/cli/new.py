@@ -15,7 +15,7 @@ from typing import Annotated
 import typer
 
 from apps.cli import exits
-from apps.cli.app import COMMANDS
+from apps.cli.listed import COMMANDS
 from cocoro.errors import ConfigError
 from deploy import processes
 from services.executive.tasks import TASKS
