@@ -49,7 +49,7 @@ class LogClock:
         self._count = 0
 
     def at(self, steady_ns: int) -> int:
-        """The log time of a message that arrived at this time of `boottime_ns`, both in ns."""
+        """The log time of a message that arrived at this time of `cocoro.clock.steady_ns`, both in ns."""
         return steady_ns + self._start.offset_ns
 
     def now_ns(self) -> int:
