@@ -21,7 +21,6 @@ import zlib
 from collections.abc import Callable
 from io import BytesIO
 from pathlib import Path
-from typing import Literal
 
 import zstandard
 from mcap.data_stream import ReadDataStream
@@ -42,12 +41,13 @@ from services.capture.file import QUICK, Packer
 from services.capture.keys import QueuedMessage, info_of
 from services.capture.writer import CaptureWriter, FileLimits
 from services.executive.tasks import FetchTask
+from sim.realism import Sensors
 
 SMALL_BYTES = 64 * 1024
 MEMORY = Path("/dev/shm")
 
 
-def recorded(folder: Path, sensors: Literal["ideal", "real"], seconds: float) -> list[QueuedMessage]:
+def recorded(folder: Path, sensors: Sensors, seconds: float) -> list[QueuedMessage]:
     """The first messages of a rehearsed fetch, in order."""
     path = folder / f"{sensors}.mcap"
     rehearse(RehearsalRequest(task=FetchTask(label="red_can"), sensors=sensors, record=str(path)))

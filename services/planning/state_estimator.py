@@ -83,8 +83,8 @@ class PostureSighting(NamedTuple):
 class Turning:
     """The base's odometry with a learned wheel distance in place of the nominal one.
 
-    The base computes its heading and turn rate from the wheels' travel and the nominal distance; here both are scaled,
-    and with the heading the direction of each stretch of its path. Path length and speed do not depend on the distance.
+    The base computes its heading from the wheels' travel and the nominal distance; here it is scaled, and with it the
+    direction of each stretch of its path. Path length and speed do not depend on the distance.
     """
 
     def __init__(self) -> None:
@@ -112,10 +112,6 @@ class Turning:
         bent = Pose2(c * step.x_m - s * step.y_m, s * step.x_m + c * step.y_m, step.yaw_rad + extra_rad)
         self._pose = self._pose.compose(bent)
         return self._pose
-
-    def rate_radps(self, state: BaseState) -> float:
-        """The body's turn rate."""
-        return self.ratio * state.turn_rate_radps
 
 
 class StateEstimator:
