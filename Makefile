@@ -12,7 +12,7 @@ test: install
 	@deploy/test.sh
 
 unit: install
-	@.venv/bin/pytest -n 2 --dist loadfile -m "not process and not sim and not zenoh"
+	@.venv/bin/pytest -n 2 --dist loadfile -m "not process and not sim and not sweep and not zenoh"
 
 clean:
 	rm -rf .venv out run build *.egg-info

@@ -18,6 +18,8 @@ from apps.cli.main import main
 from cocoro.capture.conventions import CaptureError
 from services.capture.file import Packer
 
+pytestmark = pytest.mark.sweep
+
 DAMAGES = 1000
 
 Told = tuple[str, int, int, int, bytes]

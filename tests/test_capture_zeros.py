@@ -24,6 +24,8 @@ from cocoro.capture.mcap import MAGIC, PREFIX
 from services.capture.file import CaptureFile, Packer
 from services.capture.writer import FileLimits, sync_and_close
 
+pytestmark = pytest.mark.sweep
+
 CHUNK_CRC = PREFIX.size + 24
 """Offset of the checksum, 4 bytes, in a chunk record."""
 FOOTER = PREFIX.size + 20 + len(MAGIC)

@@ -39,7 +39,7 @@ def test_commands_of_the_command_line_exist() -> None:
     assert {name: main([name, "--help"]) for name in named} == dict.fromkeys(named, 0)
 
 
-@pytest.mark.parametrize("marker", ["process", "sim", "zenoh"])
+@pytest.mark.parametrize("marker", ["process", "sim", "sweep", "zenoh"])
 def test_markers_are_those_of_pytest_and_of_make_unit(marker: str) -> None:
     markers = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["pytest"]["ini_options"]["markers"]
     assert marker in CODE

