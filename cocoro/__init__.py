@@ -1,7 +1,8 @@
 """CoCoRo mesh: the API that components, applications and tests are written against.
 
-Everything that a component's author needs can be imported from here; each name is loaded at its first use, so that
-`import cocoro` costs nothing. What is not named here is internal to the project.
+Everything that a component's author needs can be imported from here. `import cocoro` itself loads nothing; the first
+use of a name loads the whole API, so the declaration of a component, which every command imports, takes its names from
+their modules, such as `cocoro.component`. Names that are not listed here are internal to the project.
 
 - A component: `Component` declares it, `Implementation` is what its module gives, `Node` is what its `run` gets. A
   `Participant` reads and calls without being a service; `call_all` returns an `Answer` per service.
@@ -15,7 +16,7 @@ Everything that a component's author needs can be imported from here; each name 
 - The robot: `Robot` is the description of its body, `Catalogue` of `ObjectSpec`s the objects that it knows, `History` a
   state over time, `Pose2` a pose on the floor.
 - Safety: `ServiceLatch` keeps the emergency stop's latch of a service that moves something; `Contact` finds out what
-  became of a service that is no longer heard.
+  became of a service whose liveliness token dropped.
 - Errors: `CocoroError` and its kinds; a command prints their text without a traceback.
 
 Parts with a module of their own: `cocoro.topics` (the project's topics and requests), `cocoro.messages` (their types),
@@ -25,31 +26,10 @@ Parts with a module of their own: `cocoro.topics` (the project's topics and requ
 
 from __future__ import annotations
 
-from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from cocoro.bus.base import Bus, Qos
-    from cocoro.clock import NS, Clock, FollowedClock, RealClock, VirtualClock, is_fresh
-    from cocoro.component import Component, Implementation
-    from cocoro.contact import Contact
-    from cocoro.core import Core, Output, Sample, Schedule, Take
-    from cocoro.errors import CallTimeoutError, CocoroError, ConfigError, MeshError, RefusedError, RemoteError
-    from cocoro.frames import Pose2
-    from cocoro.history import History
-    from cocoro.inbox import Inbox, Latest, Stream
-    from cocoro.latch import ServiceLatch
-    from cocoro.messages import Message
-    from cocoro.messages.actions import Action
-    from cocoro.node import Node
-    from cocoro.objects import Catalogue, ObjectSpec
-    from cocoro.participant import Answer, Participant
-    from cocoro.publisher import Publisher
-    from cocoro.robot import Robot
-    from cocoro.stepper import every
-    from cocoro.tasks import Skills, Task, TaskFailedError
-    from cocoro.topics import Request, Topic
-    from cocoro.vloop import run_virtual
+    from cocoro.api import *
 
 __all__ = [
     "NS", "Action", "Answer", "Bus", "CallTimeoutError", "Catalogue", "Clock", "CocoroError", "Component",
@@ -59,39 +39,16 @@ __all__ = [
     "Take", "Task", "TaskFailedError", "Topic", "VirtualClock", "every", "is_fresh", "run_virtual",
 ]  # fmt: skip
 
-_MODULES = {
-    "bus.base": ("Bus", "Qos"),
-    "clock": ("Clock", "FollowedClock", "NS", "RealClock", "VirtualClock", "is_fresh"),
-    "component": ("Component", "Implementation"),
-    "contact": ("Contact",),
-    "core": ("Core", "Output", "Sample", "Schedule", "Take"),
-    "errors": ("CallTimeoutError", "CocoroError", "ConfigError", "MeshError", "RefusedError", "RemoteError"),
-    "frames": ("Pose2",),
-    "history": ("History",),
-    "inbox": ("Inbox", "Latest", "Stream"),
-    "latch": ("ServiceLatch",),
-    "messages": ("Message",),
-    "messages.actions": ("Action",),
-    "tasks": ("Skills", "Task", "TaskFailedError"),
-    "node": ("Node",),
-    "objects": ("Catalogue", "ObjectSpec"),
-    "participant": ("Answer", "Participant"),
-    "publisher": ("Publisher",),
-    "robot": ("Robot",),
-    "stepper": ("every",),
-    "topics": ("Request", "Topic"),
-    "vloop": ("run_virtual",),
-}
-_HOME = {name: module for module, names in _MODULES.items() for name in names}
 
-
-if not TYPE_CHECKING:  # type checkers see the imports above, and report unknown names
+if not TYPE_CHECKING:  # type checkers see the import above, and report unknown names
 
     def __getattr__(name: str) -> object:
-        if name not in _HOME:
+        if name not in __all__:  # the name of a module, or an unknown one
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        value = globals()[name] = getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
-        return value
+        from cocoro import api
+
+        globals().update({public: getattr(api, public) for public in __all__})
+        return globals()[name]
 
 
 def __dir__() -> list[str]:

@@ -47,8 +47,8 @@ class Component:
     """One process: its topics and requests, its dependencies, how it is run, its budget.
 
     A topic or request with `{service}` in its name stands for each of this component's services where the component
-    publishes or serves it, and for any service where the component reads or calls it. What every node does (health,
-    records of steps and requests, `about`, following the clock) is not declared.
+    publishes or serves it, and for any service where the component reads or calls it. What every node publishes, serves
+    and reads (health, records of steps and requests, `about`, the clock) is not declared.
     """
 
     name: str
@@ -64,9 +64,9 @@ class Component:
     serves: tuple[Request[Any, Any], ...] = ()
     calls: tuple[Request[Any, Any], ...] = ()
     records: bool = False
-    """It hears every key of the robot, besides those of `reads`."""
+    """It receives every key of the robot, besides those of `reads`."""
     needs: tuple[str, ...] = ()
-    """Services that it cannot work without; without those that these need in turn."""
+    """Services that it cannot work without. Those that these need in turn are not listed."""
     moves: tuple[str, ...] = ()
     """Those of its services that move something. Each must serve the emergency stop."""
     hardware: bool = False

@@ -1,4 +1,4 @@
-"""What a node knows of services whose liveliness token dropped."""
+"""A node's knowledge of services whose liveliness token dropped."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ class Added(NamedTuple):
     """One value that a third party added."""
 
     name: str
-    """Of the entry point."""
+    """The entry point's name."""
     value: Any
     origin: str
     """The entry point and its distribution, for messages."""
@@ -21,7 +21,7 @@ class EntryPoints(NamedTuple):
 
     added: tuple[Added, ...]
     faults: tuple[str, ...]
-    """Why others could not be loaded, one text each."""
+    """For each one that could not be loaded, the reason."""
 
 
 @cache
@@ -34,6 +34,6 @@ def added_to(group: str) -> EntryPoints:
         origin = f"entry point {point.name!r} of {point.dist.name if point.dist else 'an unknown distribution'}"
         try:
             added.append(Added(point.name, point.load(), origin))
-        except Exception as error:  # third-party code runs here
+        except (Exception, SystemExit) as error:  # third-party code runs here, whatever it does
             faults.append(f"{origin} cannot be loaded: {type(error).__name__}: {error}")
     return EntryPoints(tuple(added), tuple(faults))

@@ -116,9 +116,8 @@ class ServiceLatch:
             self._reset_ns = self._node.now_ns()
             self._set("released", request.by)
         not_kept = await self._not_kept(STOP_KEPT_S if request.latched else RESET_KEPT_S)
-        return EstopReply(
-            service=self._node.name, latch=self.state, text=not_kept
-        )  # another request may have changed it meanwhile
+        # Another request may have changed the state meanwhile.
+        return EstopReply(service=self._node.name, latch=self.state, text=not_kept)
 
     async def _not_kept(self, within_s: float) -> str:
         """Why the last state is not on the disk; '' when it is."""

@@ -11,7 +11,7 @@ T = TypeVar("T", bound="Tagged")
 
 
 class Tagged(msgspec.Struct, frozen=True):
-    """A member of such a family: a frozen struct whose map on the wire holds its tag."""
+    """Base of the types of a family: frozen structs whose maps on the wire hold their tags."""
 
     @classmethod
     def tag(cls) -> str:
@@ -23,7 +23,7 @@ class Tagged(msgspec.Struct, frozen=True):
 
     @property
     def target(self) -> str:
-        """The label of the object that it concerns; '' for none."""
+        """The label of the object that the task or action concerns; '' for none."""
         return str(getattr(self, "label", ""))
 
 

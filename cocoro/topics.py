@@ -23,7 +23,7 @@ Q = TypeVar("Q", bound=msgspec.Struct)
 R = TypeVar("R", bound=msgspec.Struct)
 
 ANY = "*"
-"""In place of a service's name: of every service."""
+"""Stands for every service where a service's name is expected."""
 _PER_SERVICE = "{service}"
 
 
@@ -36,7 +36,7 @@ class Topic(Generic[M]):
     type: type[M]
     qos: Qos
     rate_hz: float | None
-    """Nominal; None when it is published on change."""
+    """Nominal rate; None when it is published on change."""
     max_age_s: float
     """A reader must not act on an older sample; `doc` says what it does instead."""
     doc: str

@@ -88,9 +88,11 @@ class Profile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     def config(self, process: str, kind: type[C]) -> C:
         """The settings of a component, of the class `kind`. If its table has no `objects` or `needed`, these are
         filled in: the profile's objects, and the services that the component needs. Raises ConfigError that names
-        profile, table and field."""
+        profile, table and field, or the setting of `kind` that has the name of one in `Launch`."""
         table = {k: v for k, v in self._table(process).items() if k not in Launch.__struct_fields__}
         fields = getattr(kind, "__struct_fields__", ())
+        if taken := sorted({*fields} & {*Launch.__struct_fields__}):
+            raise ConfigError(f"component {process}: every component has a setting {taken[0]}: rename this one's")
         if self.objects is not None and "objects" in fields:
             table = {"objects": self.objects} | table
         if "needed" in fields:

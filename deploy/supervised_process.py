@@ -50,7 +50,7 @@ class SupervisedProcess:
         report: Callable[[str], None],
         sleep_detector: SleepDetector,
     ) -> None:
-        """`sleep_detector` tells whether the supervisor itself was asleep."""
+        """`sleep_detector` detects that the supervisor itself was asleep."""
         self.row = row
         self.restarts = 0
         self._run_dir = run_dir

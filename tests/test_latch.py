@@ -19,7 +19,7 @@ ROBOT = Robot.load()
 
 
 class Base:
-    """A base service's keeper, an executive that says its word, and an operator."""
+    """A base service with its latch, an executive and an operator."""
 
     def __init__(self, clock: VirtualClock | None = None) -> None:
         self.mesh, self.clock = LocalMesh(), clock or VirtualClock()
@@ -43,13 +43,13 @@ class Base:
             await self.node.__aexit__()
         self.node = Node("base", self.mesh.join(), self.clock, ROBOT)
         await self.node.__aenter__()
-        self.keeper = ServiceLatch(self.node, lambda state, by: self.changes.append((state, by)))
+        self.latch = ServiceLatch(self.node, lambda state, by: self.changes.append((state, by)))
 
-    async def word(self, state: LatchState, stamp_ns: int | None = None) -> LatchState:
-        """The executive says it; what the keeper makes of it."""
+    async def publish(self, state: LatchState, stamp_ns: int | None = None) -> LatchState:
+        """Publishes the latch as the executive does; returns the state of the base's latch."""
         self.executive.publish(topics.LATCH, Latch(state=state, by="executive"), stamp_ns)
         await settle()
-        return self.keeper.state
+        return self.latch.state
 
     async def ask(self, latched: bool) -> EstopReply:
         return await self.operator.call(topics.ESTOP.of("base"), EstopRequest(latched=latched, by="operator"))
@@ -59,17 +59,17 @@ class Base:
 async def test_it_comes_up_unknown_and_stays_so_until_someone_knows() -> None:
     async with Base() as base:
         await asyncio.sleep(60.0)
-        assert base.keeper.state == "unknown"
-        assert await base.word("unknown") == "unknown"
+        assert base.latch.state == "unknown"
+        assert await base.publish("unknown") == "unknown"
         assert base.changes == []
-        assert await base.word("released") == "released"
+        assert await base.publish("released") == "released"
         assert base.changes == [("released", "executive")]
 
 
 @in_virtual_time
 async def test_an_operators_stop_is_in_force_before_it_is_acknowledged() -> None:
     async with Base() as base:
-        await base.word("released")
+        await base.publish("released")
         reply = await base.ask(latched=True)
         assert reply == EstopReply(service="base", latch="latched")
         assert base.changes[-1] == ("latched", "operator")
@@ -80,10 +80,10 @@ async def test_what_is_latched_is_released_by_an_operator_and_by_nobody_else() -
     async with Base() as base:
         await base.ask(latched=True)
         await asyncio.sleep(10.0)
-        assert await base.word("released") == "latched"
-        assert await base.word("unknown") == "latched"
+        assert await base.publish("released") == "latched"
+        assert await base.publish("unknown") == "latched"
         assert (await base.ask(latched=False)).latch == "released"
-        assert base.keeper.state == "released"
+        assert base.latch.state == "released"
 
 
 @in_virtual_time
@@ -95,8 +95,8 @@ async def test_an_operator_can_release_what_knows_of_no_latch() -> None:
 @in_virtual_time
 async def test_the_executives_word_latches() -> None:
     async with Base() as base:
-        await base.word("released")
-        assert await base.word("latched") == "latched"
+        await base.publish("released")
+        assert await base.publish("latched") == "latched"
 
 
 @pytest.mark.parametrize(("after_s", "state"), [(0.0, "released"), (0.49, "released"), (0.51, "latched")])
@@ -107,7 +107,7 @@ def test_a_word_from_before_a_reset_does_not_undo_it(after_s: float, state: Latc
             await base.ask(latched=True)
             await base.ask(latched=False)
             await asyncio.sleep(after_s)
-            assert await base.word("latched") == state
+            assert await base.publish("latched") == state
 
     scenario()
 
@@ -124,26 +124,26 @@ async def test_a_restarted_service_is_stopped_and_stays_so_while_the_stop_is_lat
     async with Base() as base:
         await base.ask(latched=True)
         await base.restart()
-        assert base.keeper.state == "unknown"
-        assert await base.word("latched") == "latched"
-        assert await base.word("released") == "latched"
+        assert base.latch.state == "unknown"
+        assert await base.publish("latched") == "latched"
+        assert await base.publish("released") == "latched"
 
 
 @in_virtual_time
 async def test_a_restarted_service_goes_on_when_nothing_is_latched() -> None:
     async with Base() as base:
-        await base.word("released")
+        await base.publish("released")
         await base.restart()
-        assert base.keeper.state == "unknown"
-        assert await base.word("released") == "released"
+        assert base.latch.state == "unknown"
+        assert await base.publish("released") == "released"
 
 
 @in_virtual_time
 async def test_an_old_word_is_none() -> None:
     async with Base() as base:
         await asyncio.sleep(10.0)
-        assert await base.word("released", stamp_ns=round(7.9 * NS)) == "unknown"
-        assert await base.word("released", stamp_ns=round(8.1 * NS)) == "released"
+        assert await base.publish("released", stamp_ns=round(7.9 * NS)) == "unknown"
+        assert await base.publish("released", stamp_ns=round(8.1 * NS)) == "released"
 
 
 @in_virtual_time
@@ -153,4 +153,4 @@ async def test_a_word_counts_again_when_the_clock_has_begun_anew_after_a_reset()
     async with Base(clock) as base:
         await base.ask(latched=False)
         clock.jump_to(1.0)
-        assert await base.word("latched") == "latched"
+        assert await base.publish("latched") == "latched"

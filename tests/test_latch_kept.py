@@ -28,7 +28,7 @@ PATIENCE_S = 60.0
 
 
 class Base:
-    """A base service's keeper, and an operator. Make it with `base`."""
+    """A base service with its latch, and an operator. Make it with `base`."""
 
     def __init__(self, folder: Path, node: Node, operator: Node) -> None:
         self.folder = folder
@@ -37,7 +37,7 @@ class Base:
         self.changes: list[tuple[LatchState, str]] = []
         self.halts = 0
         self._news = asyncio.Event()
-        self.keeper = ServiceLatch(node, self.changed, self.halt)
+        self.latch = ServiceLatch(node, self.changed, self.halt)
 
     def changed(self, state: LatchState, by: str) -> None:
         self.changes.append((state, by))
@@ -59,14 +59,14 @@ class Base:
     async def latched(self) -> None:
         """Wait until it is."""
         async with asyncio.timeout(PATIENCE_S):
-            while self.keeper.state != "latched":
+            while self.latch.state != "latched":
                 self._news.clear()
                 await self._news.wait()
 
     async def kept(self) -> None:
         """Wait until the disk has what was set last."""
-        assert self.keeper._record is not None
-        assert await asyncio.wrap_future(self.keeper._record.last) == ""
+        assert self.latch._record is not None
+        assert await asyncio.wrap_future(self.latch._record.last) == ""
 
 
 @pytest.fixture
@@ -108,7 +108,7 @@ def test_a_loop_that_hangs_keeps_nothing_from_being_halted_and_kept(folder: Path
             assert point.latched_ns
             assert point.kept
             assert it.halts == 1
-            assert it.keeper.state == "released"
+            assert it.latch.state == "released"
             await it.latched()
 
     asyncio.run(scenario())
@@ -120,13 +120,13 @@ def test_what_died_latched_comes_up_latched_and_is_released_by_the_owner_only(fo
             await it.ask(latched=False)
             it.stop()
         async with base(folder) as it:
-            assert it.keeper.state == "latched"
+            assert it.latch.state == "latched"
             assert it.changes[0][1].startswith(f"operator (user {os.getuid()}, pid {os.getpid()}), 20")
-            it.keeper.follow("released", "executive")
-            assert it.keeper.state == "latched"
+            it.latch.follow("released", "executive")
+            assert it.latch.state == "latched"
             assert await it.ask(latched=False) == EstopReply(service="base", latch="released")
         async with base(folder) as it:
-            assert it.keeper.state == "unknown", "it still waits for the executive's word"
+            assert it.latch.state == "unknown", "it still waits for the executive's report"
 
     asyncio.run(scenario())
 
@@ -153,7 +153,7 @@ def test_a_record_that_cannot_be_read_is_a_latch_that_says_why(folder: Path) -> 
 
     async def scenario() -> None:
         async with base(folder) as it:
-            assert it.keeper.state == "latched"
+            assert it.latch.state == "latched"
             assert it.changes == [("latched", f"the record {folder}/base, which cannot be read: it is damaged")]
 
     asyncio.run(scenario())
@@ -215,7 +215,7 @@ def test_what_halts_may_fail_and_the_loop_latches_all_the_same(folder: Path) -> 
             def fail() -> None:
                 raise RuntimeError("out of order")
 
-            it.keeper._halt = fail
+            it.latch._halt = fail
             asking = await asyncio.to_thread(it.stop, 0.1)
             assert [point.service for point in asking.waiting] == ["base"]
             await it.latched()

@@ -126,6 +126,7 @@ def test_a_component_starts_with_nothing_configured(process: Component) -> None:
     assert msgspec.convert({}, component.config) == config
     with pytest.raises(msgspec.ValidationError, match="unknown field"):
         msgspec.convert({"no_such_field": 1}, component.config)
+    assert not {*component.config.__struct_fields__} & {*profiles.Launch.__struct_fields__}, "every component has these"
 
 
 def test_an_unknown_name_lists_the_known_ones() -> None:
@@ -144,9 +145,11 @@ def test_third_parties_add_rows_by_entry_point(parts: Path) -> None:
         ("planning = parts:planning", r"parts.good of a third party: there is a component named 'planning' already"),
         ("fine = parts:good", r"'fine' of parts: its value is not a Component named 'fine'"),
         ("fine = parts:nothing", r"'fine' of parts cannot be loaded: AttributeError"),
+        ("fine = this_exits:good", r"'fine' of parts cannot be loaded: SystemExit: 3"),
     ],
 )
 def test_a_bad_entry_point_is_named(parts: Path, entry: str, message: str) -> None:
+    (parts / "this_exits.py").write_text("raise SystemExit(3)")
     (parts / "parts-1.0.dist-info" / "entry_points.txt").write_text(f"[cocoro.components]\n{entry}\n")
     with pytest.raises(ConfigError, match=message):
         processes.table()

@@ -61,6 +61,14 @@ def test_a_services_table_becomes_its_config(tmp_path: Path) -> None:
     assert profile.launch("planning") == profiles.Launch(latency_s=0.1, record_steps=True)
 
 
+def test_a_setting_that_every_component_has_is_none_of_a_components_own() -> None:
+    class Slow(msgspec.Struct):
+        latency_s: float = 0.0
+
+    with pytest.raises(ConfigError, match=r"component planning: .* latency_s: rename"):
+        profiles.read("sim").config("planning", Slow)
+
+
 @pytest.mark.parametrize(
     ("table", "message"),
     [

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from cocoro.errors import ConfigError
+from cocoro.private import RUN_DIR
 
 LONGEST_SOCKET_PATH = 100
 """Bytes; the kernel takes 107 on Linux and 103 on macOS."""
@@ -59,7 +60,7 @@ class ZenohConfig:
             if any(c in path for c in FORBIDDEN):
                 raise ConfigError(f"mesh directory {path}: the path may not contain any of {FORBIDDEN}")
             if any("\udc80" <= c <= "\udcff" for c in path):
-                raise ConfigError(f"mesh directory {path}: the path must be UTF-8, choose another by COCORO_RUN_DIR")
+                raise ConfigError(f"mesh directory {path}: the path must be UTF-8, choose another by {RUN_DIR}")
         elif not self.listen and not self.connect:
             raise ConfigError(f"mesh of {self.name}: give a directory, or endpoints to listen on or connect to")
 
@@ -82,7 +83,7 @@ def default(robot: str, name: str, run_dir: Path | None = None) -> ZenohConfig:
 def default_run_dir() -> Path:
     """$COCORO_RUN_DIR, else `cocoro` in $XDG_RUNTIME_DIR, else a directory of this user in the place for temporary
     files. Its content must be this user's alone (see `cocoro.private`)."""
-    if explicit := os.environ.get("COCORO_RUN_DIR"):
+    if explicit := os.environ.get(RUN_DIR):
         return Path(explicit).absolute()
     if runtime := os.environ.get("XDG_RUNTIME_DIR"):
         return Path(runtime) / "cocoro"

@@ -54,7 +54,7 @@ class LocalMesh:
         if (before > 0) != (self.tokens[key] > 0):
             for watch in list(self.watchers):
                 if matches(watch.keyexpr, key):
-                    watch.tell(key, self.tokens[key] > 0)
+                    watch.report(key, self.tokens[key] > 0)
 
 
 class LocalSubscription:
@@ -111,10 +111,10 @@ class LocalListening(LocalSubscription):
     def __init__(self, mesh: LocalMesh, keyexpr: str, handler: OnBatch) -> None:
         loop = asyncio.get_running_loop()
 
-        def hear(key: str, payload: Payload) -> None:
+        def receive(key: str, payload: Payload) -> None:
             handler([Received(key, payload, round(loop.time() * NS))])
 
-        super().__init__(mesh, keyexpr, Qos.EVENT, hear, depth=1)
+        super().__init__(mesh, keyexpr, Qos.EVENT, receive, depth=1)
 
     def close(self) -> None:
         for place in list(self._waiting):
@@ -168,9 +168,9 @@ class _Watch:
         mesh.watchers.append(self)
         for key, count in mesh.tokens.items():
             if count > 0 and matches(keyexpr, key):
-                self.tell(key, True)
+                self.report(key, True)
 
-    def tell(self, key: str, alive: bool) -> None:
+    def report(self, key: str, alive: bool) -> None:
         asyncio.get_running_loop().call_soon(self._call, key, alive)
 
     def _call(self, key: str, alive: bool) -> None:

@@ -7,9 +7,7 @@ from collections import Counter
 from collections.abc import Mapping
 
 import msgspec
-from mcap.records import (
-    Channel,
-)
+from mcap.records import Channel
 
 from cocoro.errors import CocoroError, ConfigError
 

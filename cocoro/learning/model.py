@@ -27,7 +27,6 @@ VERSION = 1
 LARGEST_WEIGHT = 1e6
 
 Weight = Annotated[float, Meta(ge=-LARGEST_WEIGHT, le=LARGEST_WEIGHT)]
-BoundedNonNegative = Annotated[float, Meta(ge=0, le=LARGEST_WEIGHT)]
 
 
 class Training(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

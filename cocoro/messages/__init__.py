@@ -1,4 +1,4 @@
-"""The typed messages of the mesh, one file a service. Units are SI and stand in the field name (`_m`, `_rad`, `_mps`).
+"""The typed messages of the mesh, one file per service. Units are SI; the field's name has them (`_m`, `_rad`, `_mps`).
 
 A message is a MessagePack map on the wire and is validated when it is decoded. Positions are in the body frame unless
 the field says otherwise: x forward, y left, z up, origin on the floor between the drive wheels. A reader ignores

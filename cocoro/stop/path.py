@@ -117,7 +117,7 @@ def listen(point: StopPoint, halt: Callable[[str], None], keep: Callable[[str], 
     """
     room = threading.BoundedSemaphore(WAITING_FOR_THE_DISK)
 
-    def hear() -> None:
+    def receive() -> None:
         while not point.closed:
             try:
                 if (asked := point.take(wait=True)) is not None:
@@ -130,7 +130,7 @@ def listen(point: StopPoint, halt: Callable[[str], None], keep: Callable[[str], 
                 _log_failure(point.service)
                 time.sleep(FAILURE_S)
 
-    threading.Thread(target=hear, name=f"stop {point.service}", daemon=True).start()
+    threading.Thread(target=receive, name=f"stop {point.service}", daemon=True).start()
 
 
 def _answer_when_kept(point: StopPoint, asked: Asked, kept: Future[str], room: threading.BoundedSemaphore) -> None:

@@ -102,7 +102,7 @@ class FreenectCamera:
         colour = self._view("colour", pair["colour"]).reshape(HEIGHT, WIDTH, 3).copy()
         depth = self._view("depth", pair["depth"]).view("<u2").reshape(HEIGHT, WIDTH).astype(np.uint16)
         self._send(free=(pair["colour"], pair["depth"]))
-        age_ns = time.monotonic_ns() - pair["t"] + round(self._config.latency_s * NS)
+        age_ns = time.monotonic_ns() - pair["t"] + round(self._config.least_age_s * NS)
         return RawFrame(self._clock.now_ns() - age_ns, colour, depth)
 
     def _view(self, kind: ImageKind, buffer: int) -> ImageArray:

@@ -27,8 +27,8 @@ class KinectConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Folder of a fakenect recording that is played in a loop instead of a device."""
     tilt_deg: Annotated[float, Meta(ge=-30, le=30)] = 0.0
     """Angle of the device's own tilt motor. The robot's description assumes 0."""
-    latency_s: Annotated[float, Meta(ge=0, le=0.2)] = 0.033
-    """Least time from the middle of an exposure to the arrival of its image: half an exposure, read-out and transfer.
+    least_age_s: Annotated[float, Meta(ge=0, le=0.2)] = 0.033
+    """Least age of an image at its arrival, from the middle of its exposure: half an exposure, read-out and transfer.
     An estimate that has not been measured on a device."""
 
 
