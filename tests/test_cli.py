@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from places import in_short_folder
 
-from apps.cli import app, stop_asking
+from apps.cli import app, stop_asking, task_commands
 from apps.cli.main import PACKAGES, main
 from apps.cli.options import frames_of, latencies_of
 from apps.cli.running import overrides
@@ -23,7 +23,7 @@ from apps.rehearsal.request import RehearsalRequest
 from cocoro.errors import CocoroError, ConfigError
 from cocoro.topics import TOPICS
 from deploy.processes import stoppable
-from services.executive.tasks import FetchTask
+from services.executive.tasks import TASKS, FetchTask
 
 COMMANDS = (
     "up", "down", "status", "fetch", "follow", "park", "put-down", "estop", "reset", "cancel", "objects", "snapshot",
@@ -157,6 +157,13 @@ def test_a_command_that_is_no_task_imports_no_task() -> None:
     code = "import sys; from apps.cli.main import main; main(['down', '--help']); print(*sys.modules, file=sys.stderr)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
     assert "services.executive.tasks" not in done.stderr.split()
+
+
+def test_a_task_of_the_project_is_found_without_a_search_for_third_parties(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(TASKS, "_others", lambda: pytest.fail("the search takes 40 ms"))
+    assert task_commands.task_command("fetch") is not None
+    assert task_commands.task_command("babble-arm") is None
+    assert task_commands.RehearsalGroup().get_command(None, "babble-arm") is not None
 
 
 @pytest.mark.parametrize("row", app.COMMANDS, ids=lambda row: row.name)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import errno
 import io
-import re
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,7 +16,7 @@ from msgspec import to_builtins
 from apps.cli import exits
 from apps.cli.babble import SampleWriter
 from apps.cli.link import MeshLink
-from apps.cli.progress import LineDisplay, LiveDisplay, TaskDisplay
+from apps.cli.progress import LineDisplay, TaskDisplay
 from apps.cli.tasks import Follower
 from cocoro.bus.local import LocalMesh
 from cocoro.clock import VirtualClock
@@ -117,8 +116,8 @@ async def following(follower: Follower) -> asyncio.Task[tuple[int, dict[str, obj
 async def test_a_task_that_is_done_is_followed_phase_by_phase_and_exits_with_0(scene: Scene) -> None:
     executive = Executive(scene.node)
     running = await following(scene.follower())
-    told = ((0.2, "search", None), (0.4, "search", None), (3.0, "approach", 0.9), (3.2, "approach", 0.8))
-    for elapsed_s, phase, distance_m in told:
+    states = ((0.2, "search", None), (0.4, "search", None), (3.0, "approach", 0.9), (3.2, "approach", 0.8))
+    for elapsed_s, phase, distance_m in states:
         executive.tell(phase, elapsed_s, distance_m=distance_m, text="because")
     executive.tell("end", 9.5, outcome="done")
     code, result = await running
@@ -223,7 +222,7 @@ async def test_an_executive_that_is_lost_and_heard_again_says_the_outcome_itself
     executive.tell("end", 40.0, outcome="done")
     code, _ = await running
     assert code == exits.DONE
-    assert scene.out.getvalue().splitlines()[0] == ("lost contact with executive: waiting for the executive")
+    assert scene.out.getvalue().splitlines()[0] == "lost contact with executive: waiting for the executive"
 
 
 @with_claim
@@ -284,14 +283,14 @@ async def test_babbling_that_cannot_be_kept_is_cancelled_on_the_robot(scene: Sce
     executive = Executive(scene.node)
     executive.on_cancel = lambda: executive.tell("end", 2.0, outcome="cancelled")
     follower, full = scene.follower(), Full()
-    keeper = SampleWriter(full, follower.cancel)  # type: ignore[arg-type]
+    writer = SampleWriter(full, follower.cancel)  # type: ignore[arg-type]
     running = await following(follower)
-    keeper.take(Message())
-    keeper.take(Message())
+    writer.take(Message())
+    writer.take(Message())
     assert (await running)[0] == exits.REFUSED
     assert executive.cancelled == [ID]
     assert full.taken == 1
-    assert keeper.failure is not None
+    assert writer.failure is not None
 
 
 @in_virtual_time
@@ -380,55 +379,3 @@ def test_a_latched_emergency_stop_is_not_asked_about_again_and_again(latch: Latc
 async def test_without_an_executive_it_says_what_to_start(scene: Scene) -> None:
     with pytest.raises(MeshError, match=r"no executive running: start one with `cocoro up sim`"):
         await scene.follower().run()
-
-
-class Terminal(io.StringIO):
-    """A terminal that knows what rich uses of it: line ends, erasing a line, and going up."""
-
-    def isatty(self) -> bool:
-        return True
-
-    @property
-    def screen(self) -> list[str]:
-        lines, row = [""], 0
-        for token in re.findall(r"\x1b\[\??\d*[A-Za-z]|\r|\n|[^\x1b\r\n]+", self.getvalue()):
-            if token == "\n":
-                row += 1
-                lines += [""] * (row == len(lines))
-            elif token == "\x1b[2K":
-                lines[row] = ""
-            elif token == "\x1b[1A":
-                row -= 1
-            elif not token.startswith(("\x1b", "\r")):
-                lines[row] += token
-        return "\n".join(lines).rstrip("\n").split("\n")
-
-
-def test_on_a_terminal_one_line_is_written_over_and_each_phases_last_stays(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("COLUMNS", "40")
-    monkeypatch.setenv("TERM", "xterm")
-    out = Terminal()
-    live = LiveDisplay(out)
-    for elapsed_s, phase in ((0.1, "search"), (0.5, "search"), (0.7, "approach")):
-        live.show(TaskState(phase=phase, elapsed_s=elapsed_s, text="a text that is much too long for this"))
-    assert out.screen == [
-        "   0.5 s  search               a text that is much too long for this",
-        "   0.7 s  approach             a text t…",
-    ]
-    live.result("done: fetch red_can in 0.9 s")
-    assert out.screen == [
-        "   0.5 s  search               a text that is much too long for this",
-        "   0.7 s  approach             a text that is much too long for this",
-        "done: fetch red_can in 0.9 s",
-    ]
-
-
-def test_text_beside_the_progress_stands_above_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("TERM", "xterm")
-    out = Terminal()
-    live = LiveDisplay(out)
-    live.show(TaskState(phase="search", elapsed_s=0.1))
-    live.say("cancelling fetch red_can")
-    assert out.screen == ["cancelling fetch red_can", "   0.1 s  search"]
-    live.close()
-    assert out.screen == ["cancelling fetch red_can"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import sys
 from math import cos, isnan, sin
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 from learning_arm import sightings
 
+from apps.cli import experiment as experimenting
 from apps.cli.experiment import RunProgress
 from apps.cli.main import main
 from apps.experiments import lessons, plan, report
@@ -25,6 +27,8 @@ from apps.learning.study import BEST
 from apps.rehearsal.request import RehearsalRequest
 from cocoro.learning.handmap import NominalModel
 from cocoro.robot import Robot
+
+HIDE_CURSOR, SHOW_CURSOR = "\x1b[?25l", "\x1b[?25h"
 
 # --- statistics ---------------------------------------------------------------------------------------
 
@@ -241,7 +245,7 @@ def test_progress_without_a_terminal_is_a_line_for_each_finished_run() -> None:
     progress.begin(4, 1)
     progress.started("learn-0")
     progress.ended("babble-arm-0", {"error": "it broke"})
-    progress.end()
+    progress.close()
     assert out.getvalue().splitlines() == ["4 runs; 1 of them have a result already", "2 of 4 babble-arm-0: it broke"]
     assert progress.text() == "1 failed; learn-0"
 
@@ -253,11 +257,27 @@ def test_progress_on_a_terminal_is_a_bar_and_the_runs_in_work(monkeypatch: pytes
     progress.begin(4, 1)
     progress.started("learn-0")
     progress.ended("babble-arm-0", {"outcome": "done"})
-    progress.end()
+    progress.close()
     shown = out.getvalue()
     assert "2/4" in shown
     assert "learn-0" in shown
     assert "babble-arm-0" not in shown  # a run that succeeded is counted, not listed
+
+
+def test_the_terminal_is_as_before_when_the_experiments_end_with_an_error(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def fail(_keys: Any, _settings: Any, progress: RunProgress, *, plots: bool) -> None:
+        progress.begin(4, 1)
+        raise OSError("the disk is full")
+
+    out = Terminal()
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setattr(sys, "stderr", out)
+    monkeypatch.setattr(experimenting, "run", fail)
+    assert main(["experiment", "E3", "--out", str(tmp_path)]) == 1
+    shown = out.getvalue()
+    assert shown.index(HIDE_CURSOR) < shown.index(SHOW_CURSOR) < shown.index("the disk is full")
 
 
 class Terminal(io.StringIO):

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from math import degrees
 from pathlib import Path
 
 import pytest
 from wire_servos import REPLY_S, ServoBench
 
+from apps.cli.doctor import _own_checks
 from apps.cli.main import main
 from apps.cli.servos import ServoWorkbench
 from cocoro.errors import RefusedError
 from cocoro.robot import SERVO_COUNT_RAD, Robot
+from deploy import profiles
+from deploy.processes import named
 from services.base.doctor import check as check_base
 from services.base.service import BaseConfig
 from services.servos import tools
@@ -230,6 +234,14 @@ def test_the_doctor_talks_to_the_create(tmp_path: Path) -> None:
         checks = {check.name: check for check in check_base(config, ROBOT, "robbie")}
         assert "switch it on" in checks["Create"].text
     assert "plug the adapter in" in check_base(config, ROBOT, "robbie")[0].text
+
+
+@pytest.mark.parametrize("module", ["nowhere.service", "services.base.nothing"])
+def test_the_doctor_names_a_component_that_is_not_installed(module: str) -> None:
+    missing = replace(named("base"), module=module)
+    (check,) = _own_checks(missing, profiles.read("robot"), ROBOT)
+    assert (check.name, check.state) == ("base", "bad")
+    assert f"there is no module {module}" in check.text
 
 
 def test_the_whole_doctor_prints_a_line_a_check(

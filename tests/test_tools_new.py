@@ -1,4 +1,4 @@
-"""`cocoro new service`: what it writes works, and what it refuses."""
+"""`cocoro new service` and `cocoro new task`: what they write works, and what they refuse."""
 
 from __future__ import annotations
 
@@ -112,7 +112,19 @@ def test_a_new_task_is_a_type_a_test_and_a_registration(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stdout
 
 
-@pytest.mark.parametrize("name", ["fetch", "go-to", "Wave", "numpy"])
-def test_a_task_of_a_name_that_cannot_be_or_is_taken_is_refused(tmp_path: Path, name: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "complaint"),
+    [
+        ("fetch", "there is a task fetch already"),
+        ("go-to", "there is a task go-to already"),
+        ("status", "there is a command `cocoro status` already"),
+        ("Wave", "is not a valid name"),
+        ("numpy", "there is a Python module numpy already"),
+    ],
+)
+def test_a_task_of_a_name_that_cannot_be_or_is_taken_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str, complaint: str
+) -> None:
     assert main(["new", "task", name, "--into", str(tmp_path)]) == 2
+    assert complaint in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []

@@ -7,12 +7,12 @@ import hashlib
 import json
 import tempfile
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import msgspec
 
@@ -126,9 +126,6 @@ def _lossy(capture: Capture, record: Record) -> bool:
     return schema is not None and schema.name == LossyFrame.__name__
 
 
-T = TypeVar("T")
-
-
 @dataclass(frozen=True)
 class Origin:
     """One start of a service."""
@@ -165,18 +162,6 @@ def origins(captures: Sequence[Capture], service: str) -> Iterator[list[Origin]]
         except (KeyError, TypeError, ValueError, ConfigError) as error:
             raise CaptureError(f"{path}: the start of {service} cannot be repeated: {error}") from error
         yield made
-
-
-def recorded_file(capture: Capture, service: str, field: str, load: Callable[[Path | None], T]) -> T:
-    """Load a file of a service's configuration from its recorded content; `load(None)` when none was recorded."""
-    recorded = json.loads(capture.metadata.get(f"service/{service}", {}).get("files", "[]"))
-    content = next((base64.b64decode(file["content"]) for file in recorded if file["field"] == field), b"")
-    if not content:
-        return load(None)
-    with tempfile.NamedTemporaryFile(suffix=".toml") as copy:
-        copy.write(content)
-        copy.flush()
-        return load(Path(copy.name))
 
 
 def _origin(service: str, entries: Mapping[str, str], folder: Path) -> Origin:

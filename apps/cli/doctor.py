@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json as json_module
 import os
 import shutil
@@ -119,11 +120,21 @@ def _libraries(profile: Profile) -> Iterator[Check]:
 
 
 def _own_checks(component: Component, profile: Profile, robot: Robot) -> Iterable[Check]:
-    """The checks that a component declares."""
+    """Whether the component's implementation is installed, and the checks that it declares."""
+    if not _exists(component.module):
+        return (bad(component.name, f"there is no module {component.module}: install the package that has it"),)
     if not component.checks:
         return ()
     config = profile.config(component.name, load(component).config)
     return machine_checks(component, config, robot, profile.robot)
+
+
+def _exists(module: str) -> bool:
+    """Whether a module is installed; only the packages that it lies in are imported."""
+    try:
+        return importlib.util.find_spec(module) is not None
+    except ModuleNotFoundError:
+        return False
 
 
 def _rules() -> Check:

@@ -62,9 +62,8 @@ def main(command: str, arguments: list[str]) -> int:
     except Exception as error:  # whatever it is, the stops so far must be reported
         troubles.append(f"the mesh could not be asked: {type(error).__name__}: {error}")
         code = exits.FAILED
-    for stop in sorted(
-        stops, key=lambda stop: stop.owner is None
-    ):  # the operator's own robots last, where they are seen
+    # The operator's own robots come last, where they are seen.
+    for stop in sorted(stops, key=lambda stop: stop.owner is None):
         printed = _report(stop, as_json)
         code = code or stop.code or (exits.DONE if printed else exits.FAILED)
     for trouble in troubles:

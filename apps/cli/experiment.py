@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from contextlib import closing
 from pathlib import Path
 from typing import Annotated, TextIO
 
@@ -58,7 +59,8 @@ class RunProgress:
             self._print(f"{self._done} of {self._total} {name}: {error or result.get('outcome', 'done')}")
         self._bar.update(self._task, completed=self._done, description=self.text())
 
-    def end(self) -> None:
+    def close(self) -> None:
+        """Leaves the terminal as it was."""
         self._bar.stop()
 
     def text(self) -> str:
@@ -137,12 +139,11 @@ def run_experiments(
         settings = msgspec.structs.replace(settings, **frames_of(frames))
     progress = RunProgress(sys.stderr)
     try:
-        sections, path = run(keys, settings, progress, plots=plots)
+        with closing(progress):
+            sections, path = run(keys, settings, progress, plots=plots)
     except KeyboardInterrupt:
-        progress.end()
         print("interrupted; finished runs are kept, and the same command continues", file=sys.stderr)
         return exits.REFUSED
-    progress.end()
     for section in sections:
         print(f"{section.key}: {section.title}")
         heads = ("measure", "who", "mean +- 95% CI", "worst", "unit", "wanted", "")

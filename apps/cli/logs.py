@@ -53,7 +53,7 @@ def robot_of(robot: str | None) -> RunDir:
         return (up or found)[0]
     if not found:
         raise ConfigError(f"there are no logs in {default_run_dir()}: no robot has been up here (`cocoro up sim`)")
-    raise ConfigError(f"logs of several robots, say which: {', '.join(f'--robot {r.robot}' for r in up or found)}")
+    raise ConfigError(f"logs of several robots; choose one: {', '.join(f'--robot {r.robot}' for r in up or found)}")
 
 
 def files_of(run_dir: RunDir, name: str | None) -> list[Path]:

@@ -1,6 +1,6 @@
 """`cocoro`: the operator's command, from its arguments to its exit code.
 
-`cocoro stop` takes a path that imports next to nothing; all other commands are in `app`. An error becomes one line on
+`cocoro stop` takes a path that imports next to nothing; all other commands are in `app`. An error becomes one line
 on standard error that says what failed, where, and what to do.
 """
 

@@ -15,6 +15,7 @@ from typing import Annotated
 import typer
 
 from apps.cli import exits
+from apps.cli.app import COMMANDS
 from cocoro.errors import ConfigError
 from deploy import processes
 from services.executive.tasks import TASKS
@@ -77,6 +78,8 @@ def write_task(name: str, into: Path) -> int:
     package = package_of(name)
     if name in TASKS.all():
         raise ConfigError(f"there is a task {name} already; choose another name")
+    if name in {row.name for row in COMMANDS}:
+        raise ConfigError(f"there is a command `cocoro {name}` already; choose another name")
     write(TASK, name, folder)
     print(f"\nIts type is in {folder / package}.py. Next:")
     print_hints(

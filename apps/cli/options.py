@@ -104,6 +104,7 @@ TimeoutOption = Annotated[
     float | None,
     typer.Option("--timeout", min=0.1, max=3600.0, metavar="SECONDS", help="Fail the task after this time."),
 ]
+
 # --- captures and topics --------------------------------------------------------------------------
 
 CaptureArgument = Annotated[Path, typer.Argument(metavar="FILE", help="A capture (MCAP file).")]

@@ -78,7 +78,7 @@ async def record_mesh(choice: RobotChoice, settings: dict[str, Any], seconds: fl
         async with Node(
             name, link.bus, clock, robot, robot_name=link.robot, module=CAPTURE.module, config=config, profile=resolved
         ) as node:
-            with StatusLine() as line, interrupt_event() as end, going_on():
+            with interrupt_event() as end, going_on(), StatusLine() as line:
                 display = _RecordingDisplay(line)
                 node.on(RECORDING.of(name), display.show)
                 await _run_until(component.run(node, config), end, display.failed, seconds)

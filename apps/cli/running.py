@@ -121,9 +121,8 @@ def overrides(
         sim["body"] = body
     if frames is not None:
         sim.update(frames_of(frames))
-    found = [
-        f"service.sim.{name}={json.dumps(value)}" for name, value in sim.items()
-    ]  # these JSON values are TOML values, too
+    # These JSON values are TOML values, too.
+    found = [f"service.sim.{name}={json.dumps(value)}" for name, value in sim.items()]
     found += [f"service.{name}.latency_s={seconds}" for name, seconds in latencies_of(latency).items()]
     return found + settings
 

@@ -19,7 +19,7 @@ from typing import NamedTuple
 from apps.cli import exits
 
 STOPPABLE = ("base", "arm", "hand")
-"""Copy of the list in `cocoro.topics`, which is slow to import."""
+"""What moves, by the project's components: `deploy.processes.stoppable`, which is slow to import."""
 SOCKETS = "/proc/net/unix"
 PREFIX = "@cocoro-stop/"
 """The addresses of `cocoro.stop.path`, as the kernel lists them."""

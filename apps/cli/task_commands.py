@@ -122,12 +122,21 @@ def _text(path: Path | None) -> str | None:
 def task_names() -> list[str]:
     """The tasks that are commands of their own. `cocoro babble` runs those of the project's tasks that report samples,
     because it keeps the samples."""
-    return [name for name, kind in TASKS.all().items() if kind.samples is None or name not in TASKS.own]
+    return [name for name in TASKS.all() if not _is_babbling(name)]
 
 
 def task_command(name: str) -> TyperCommand | None:
     """The command of a task; None for a name that is none."""
-    return _command(name, operate) if name in task_names() else None
+    return _command(name, operate) if _is_known(name) and not _is_babbling(name) else None
+
+
+def _is_babbling(name: str) -> bool:
+    return name in TASKS.own and TASKS.own[name].samples is not None
+
+
+def _is_known(name: str) -> bool:
+    """Whether there is a task of that name. One of the project's is found without a search for third parties'."""
+    return name in TASKS.own or name in TASKS.all()
 
 
 class RehearsalGroup(TyperGroup):
@@ -137,7 +146,7 @@ class RehearsalGroup(TyperGroup):
         return list(TASKS.all())
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        return _command(cmd_name, rehearse) if cmd_name in TASKS.all() else None
+        return _command(cmd_name, rehearse) if _is_known(cmd_name) else None
 
 
 app = typer.Typer()

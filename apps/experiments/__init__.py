@@ -1,4 +1,5 @@
 """The paper's experiments in virtual time: rehearsals over many seeds, judged by the simulator's truth.
 
-`experiments` runs them. The module of an experiment (`e1_...`) says which runs it needs, and what its report has.
+`experiments` runs them. The module of an experiment (`e1_...`) lists the runs that it needs, and makes its section of
+the report.
 """

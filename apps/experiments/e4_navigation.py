@@ -19,7 +19,7 @@ ASKED_M = 0.20
 MEAN_M, SPREAD_M = 0.01, 0.01
 WAYS: dict[str, tuple[str, dict[str, Any]]] = {
     "learned": ("ours: the learned wheel distance", {}),
-    "drawing": ("baseline: the nominal wheel distance", {"model": None}),
+    "nominal": ("baseline: the nominal wheel distance", {"model": None}),
     "lockstep": ("baseline: lock-step", {"lockstep": True}),
 }
 _SCENE = """name = "ball"

@@ -75,7 +75,7 @@ class ResultRow(NamedTuple):
     def data(self) -> dict[str, Any]:
         summary = {key: None if value != value else value for key, value in self.values._asdict().items()}
         return {
-            "measure": self.measure, "who": self.who, "unit": self.unit, "text": self.text, **summary,
+            "measure": self.measure, "who": self.who, "unit": self.unit, "said": self.text, **summary,
             "wanted": self.wanted, "held": self.held, "paper": self.paper,
         }  # fmt: skip
 

@@ -57,9 +57,8 @@ def carry_out(kind: str, fields: dict[str, Any]) -> RunResult:
         if kind == "rehearse":
             request = msgspec.convert(fields, RehearsalRequest)
             if request.samples is not None and request.bend_s is not None:
-                Path(request.samples).unlink(
-                    missing_ok=True
-                )  # samples of an interrupted run do not contain the bend at that time
+                # Samples of an interrupted run do not contain the bend at that time.
+                Path(request.samples).unlink(missing_ok=True)
             return dict(rehearse(request))
         return dict(LESSONS[kind](**fields))
     except (CocoroError, msgspec.ValidationError) as error:

@@ -119,7 +119,7 @@ def learn_wheels(samples: Path, into: Path, robot: Robot) -> tuple[BodyModel, Wh
         data=recorded.fingerprint, samples=len(recorded.rows), method="all trials at once",
         scores={name: value for name, value in scores.items() if not isnan(value)},
     )  # fmt: skip
-    tilt_rad = eye_tilt(recorded.rows, recorded.header.target_height_m, robot)
+    tilt_rad = camera_tilt(recorded.rows, recorded.header.target_height_m, robot)
     wheels = WheelModel(separation_m=fit.separation_m, eye_tilt_rad=tilt_rad or 0.0, training=training)
     made = msgspec.structs.replace(_before(into, robot), wheels=wheels)
     model.save(made, into)
@@ -142,13 +142,13 @@ def _methods(search: bool, method: str | None) -> Sequence[Method]:
     return found
 
 
-def eye_tilt(trials: Sequence[WheelRow], height_m: float | None, robot: Robot) -> float | None:
+def camera_tilt(trials: Sequence[WheelRow], height_m: float | None, robot: Robot) -> float | None:
     """The camera's tilt, rad: the median over wheel trials whose target's centre is `height_m` high.
 
     None where the height is unknown, or too few trials have a seen height.
     """
     if height_m is None:
         return None
-    eye = CameraTilt(robot)
-    found = [eye.tilt_of((*row.after_m, row.height_m), height_m) for row in trials if row.height_m is not None]
+    nominal = CameraTilt(robot)
+    found = [nominal.tilt_of((*row.after_m, row.height_m), height_m) for row in trials if row.height_m is not None]
     return float(np.median(found)) if len(found) >= LEAST_TRIALS else None

@@ -70,7 +70,7 @@ class Method:
     """For "least squares": prior variance of the weights in units of a sighting's variance."""
 
 
-BEST = Method("81 bases over the nominal, least squares")
+BEST = Method("81 bases over the nominal model, least squares")
 METHODS: tuple[Method, ...] = (
     Method("the paper's rule, 81 bases", "in order", over_nominal=False),
     Method("the paper's rule, spherical", "in order", over_nominal=False, coordinates="spherical"),
@@ -78,7 +78,7 @@ METHODS: tuple[Method, ...] = (
     Method("81 bases, least squares", over_nominal=False),
     Method("256 bases, least squares", over_nominal=False, bases=4, width_rad=1.05),
     BEST,
-    Method("81 bases over the nominal, spherical", coordinates="spherical"),
+    Method("81 bases over the nominal model, spherical", coordinates="spherical"),
     Method("16 bases over the nominal model", bases=2, width_rad=2.5),
     Method("256 bases over the nominal model", bases=4, width_rad=1.05),
 )
@@ -204,7 +204,7 @@ def grid(rule: Literal["in order", "least squares"]) -> Sequence[Method]:
                     found.append(Method(name, rule, over_nominal=False, bases=bases, width_rad=width, rate=rate))
             else:
                 for doubt in (10.0, 100.0, 1000.0):
-                    name = f"{bases**4} bases over the nominal, sigma {width:g}, doubt {doubt:g}"
+                    name = f"{bases**4} bases over the nominal model, sigma {width:g}, doubt {doubt:g}"
                     found.append(Method(name, bases=bases, width_rad=width, doubt=doubt))
     return found
 

@@ -19,7 +19,7 @@ class RehearsalRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
     then: tuple[str, ...] = ()
     """Labels with which the same task is done again, one after the other. The first task that fails is the last."""
     samples: str | None = None
-    """File that the samples of a task that reports some are appended to. The task goes on where the file ends."""
+    """File that the reported samples are appended to. The task continues after the last sample in it."""
     scene: str = "paper"
     """A scene's name, or the path of a scene file."""
     seed: Annotated[int, Meta(ge=0)] = 0

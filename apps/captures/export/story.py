@@ -3,6 +3,8 @@ truth."""
 
 from __future__ import annotations
 
+import base64
+import json
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterator
 from math import dist
@@ -12,7 +14,6 @@ import msgspec
 
 from apps.captures.export.geometry import conjugate, rotated
 from apps.captures.reader import Capture, Record
-from apps.captures.recorded import recorded_file
 from cocoro.capture.types import NotReadableError
 from cocoro.clock import NS
 from cocoro.messages import Detections, Message, PlannerStatus, TaskState, TrueObject, Truth
@@ -79,7 +80,13 @@ def robot_of(capture: Capture) -> Robot:
 
 def catalogue_of(capture: Capture) -> Catalogue:
     """Perception's recorded object catalogue; today's when there is none."""
-    return recorded_file(capture, "perception", "objects", Catalogue.load)
+    files = json.loads(capture.metadata.get("service/perception", {}).get("files", "[]"))
+    content = next((base64.b64decode(file["content"]) for file in files if file["field"] == "objects"), b"")
+    return (
+        Catalogue.from_text(content.decode(errors="replace"), f"{capture.path}, objects")
+        if content
+        else Catalogue.load()
+    )
 
 
 def _track(capture: Capture, topic: Topic[M]) -> TopicTrack[M]:
