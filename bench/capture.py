@@ -116,14 +116,14 @@ async def kill(folder: Path, times: int) -> None:
 
 async def _kill_one(bus: ZenohBus, folder: Path, after_s: float) -> float:
     """Seconds from the last state in the file to the kill. All earlier states must be there."""
-    heard = asyncio.Event()
-    watch = bus.watch_alive(recorder_key("bench", "*"), lambda _, alive: heard.set() if alive else None)
+    appeared = asyncio.Event()
+    watch = bus.watch_alive(recorder_key("bench", "*"), lambda _, alive: appeared.set() if alive else None)
     out = folder / f"kill-{time.time_ns()}"
     recorder = await asyncio.create_subprocess_exec(
         *COCORO, "record", "--out", str(out), "--robot", "bench",
         env=os.environ | {"COCORO_RUN_DIR": str(folder / "run")}, stdout=subprocess.DEVNULL,
     )  # fmt: skip
-    await heard.wait()
+    await appeared.wait()
     watch.close()
     await asyncio.sleep(after_s)
     recorder.kill()

@@ -21,7 +21,6 @@ import zlib
 from collections.abc import Callable
 from io import BytesIO
 from pathlib import Path
-from typing import Literal
 
 import zstandard
 from mcap.data_stream import ReadDataStream
@@ -42,12 +41,13 @@ from services.capture.file import QUICK, Packer
 from services.capture.keys import QueuedMessage, info_of
 from services.capture.writer import CaptureWriter, FileLimits
 from services.executive.tasks import FetchTask
+from sim.realism import Sensors
 
 SMALL_BYTES = 64 * 1024
 MEMORY = Path("/dev/shm")
 
 
-def recorded(folder: Path, sensors: Literal["ideal", "real"], seconds: float) -> list[QueuedMessage]:
+def recorded(folder: Path, sensors: Sensors, seconds: float) -> list[QueuedMessage]:
     """The first messages of a rehearsed fetch, in order."""
     path = folder / f"{sensors}.mcap"
     rehearse(RehearsalRequest(task=FetchTask(label="red_can"), sensors=sensors, record=str(path)))
@@ -141,14 +141,14 @@ def compare(folder: Path, seconds: float, times: int) -> None:
 def _compare(folder: Path, name: str, made: list[QueuedMessage], times: int) -> None:
     out, paths = folder / "out.mcap", [folder / "here.mcap", folder / "package.mcap"]
 
-    def anew(write: Callable[[list[QueuedMessage], Path], None]) -> Callable[[], None]:
+    def into_a_new_file(write: Callable[[list[QueuedMessage], Path], None]) -> Callable[[], None]:
         def way() -> None:
             write(made, out)
             out.unlink()
 
         return way
 
-    spent = in_turn(times, here=anew(write_here), package=anew(write_by_package))
+    spent = in_turn(times, here=into_a_new_file(write_here), package=into_a_new_file(write_by_package))
     print(f"{name}: {len(made)} messages, {sum(len(one.payload) for one in made) / 1e6:.0f} MB")
     print(f"  written here {spent['here']:.3f} s, by the package {spent['package']:.3f} s: {_ratio(spent):.1f} times")
     write_here(made, paths[0])

@@ -64,7 +64,7 @@ class Driver:
 
     async def tell(self) -> None:
         async for _ in self._node.every(10.0):
-            faults = [f"{service}: {fault}" for service, told in self._faults.items() for fault in told]
+            faults = [f"{service}: {fault}" for service, found in self._faults.items() for fault in found]
             print(
                 json.dumps({"faults": faults, "stopped_by": self._base.stopped_by if self._base else "?"}), flush=True
             )

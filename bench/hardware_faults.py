@@ -194,12 +194,12 @@ class Campaign:
     def _state(self) -> str:
         """The state of hardware that does not move, for the report."""
         create, servos = self._hardware.create, self._hardware.servos
-        told: list[Any] = []
-        while not self._services.told.empty():
-            told.append(self._services.told.get())
+        reports: list[Any] = []
+        while not self._services.reports.empty():
+            reports.append(self._services.reports.get())
         limp = [number for number, servo in servos.items() if not servo.motor.on]
-        heard = f"pending {create.pending.hex()}{', deaf' if create.deaf else ''}"
-        return f"mode {create.mode}, baud {create.baud}, {heard}, limp {limp}, {told[-1:]}"
+        received = f"pending {create.pending.hex()}{', deaf' if create.deaf else ''}"
+        return f"mode {create.mode}, baud {create.baud}, {received}, limp {limp}, {reports[-1:]}"
 
     # --- the faults -----------------------------------------------------------------------------------
 

@@ -86,14 +86,14 @@ class Services:
             self.process = subprocess.Popen(
                 self._command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=said, text=True
             )
-        self.told: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
-        threading.Thread(target=self._read, args=(self.process, self.told), daemon=True).start()
+        self.reports: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
+        threading.Thread(target=self._read, args=(self.process, self.reports), daemon=True).start()
         self.starts += 1
 
-    def _read(self, process: subprocess.Popen[str], told: queue.SimpleQueue[dict[str, Any]]) -> None:
+    def _read(self, process: subprocess.Popen[str], reports: queue.SimpleQueue[dict[str, Any]]) -> None:
         assert process.stdout is not None
         for line in process.stdout:
-            told.put(json.loads(line))
+            reports.put(json.loads(line))
 
     @property
     def alive(self) -> bool:
@@ -118,12 +118,12 @@ class Services:
 
     def shows(self, texts: tuple[str, ...]) -> bool:
         """Whether one of these texts is reported within the time limit, not counting earlier reports."""
-        while not self.told.empty():
-            self.told.get()
+        while not self.reports.empty():
+            self.reports.get()
         end_s = time.monotonic() + SEEN_S
         while (left_s := end_s - time.monotonic()) > 0:
             try:
-                report = self.told.get(timeout=left_s)
+                report = self.reports.get(timeout=left_s)
             except queue.Empty:
                 return False
             if any(

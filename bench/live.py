@@ -136,8 +136,8 @@ async def _commands(cocoro: Operator) -> dict[str, list[int]]:
         Node("bench", bus, FollowedClock(), Robot.load()) as node,
     ):
         for topic in (topics.BASE_COMMAND, topics.ARM_COMMAND, topics.DETECTIONS):
-            heard = stamps.setdefault(topic.name, [])
-            node.on(topic, lambda message, heard=heard: heard.append(message.stamp_ns))  # type: ignore[misc]
+            arrived = stamps.setdefault(topic.name, [])
+            node.on(topic, lambda message, arrived=arrived: arrived.append(message.stamp_ns))  # type: ignore[misc]
         process = cocoro.start("fetch", "red_can")
         said, _ = await asyncio.to_thread(process.communicate)
         print(said.strip().splitlines()[-1])
@@ -152,9 +152,9 @@ def periods(latency_s: float) -> bool:
             return False
         stamps = asyncio.run(_commands(cocoro))
         _, status, _ = cocoro("status", "--json")
-    for name, heard in stamps.items():
-        apart_ms = [(b - a) / 1e6 for a, b in pairwise(heard)]
-        rate_hz = (len(heard) - 1) / ((heard[-1] - heard[0]) / NS)
+    for name, arrived in stamps.items():
+        apart_ms = [(b - a) / 1e6 for a, b in pairwise(arrived)]
+        rate_hz = (len(arrived) - 1) / ((arrived[-1] - arrived[0]) / NS)
         print(f"{name:22s} {rate_hz:5.1f} Hz; period by stamp {_spread(apart_ms, 'ms')}")
     print("the planner's own loop:", json.dumps(_loops(json.loads(status), "planning")))
     return True

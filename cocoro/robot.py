@@ -23,6 +23,7 @@ from cocoro.kinematics import Chain, Link, Tree
 from cocoro.units import Positive, Vec3
 
 OWN_FILE = "calliope.toml"
+_MISSING = f"; cocoro/{OWN_FILE} has every field, and a row with a new name needs all fields of its kind"
 
 LensValues = tuple[float, float, float, float, float, float, float, float, float]
 """fx, fy, cx, cy in pixels, then OpenCV's distortion coefficients k1, k2, p1, p2, k3."""
@@ -287,9 +288,11 @@ class Robot:
             if override is not None:
                 where = str(override)
                 _merge(data, tomllib.loads(override.read_text(encoding="utf-8")))
+                where = f"{path} with {override}" if path else where  # either may have the wrong field
             return cls(msgspec.convert(data, _DescriptionFile))
         except (ValueError, OSError) as error:  # not UTF-8, not TOML, not a description, not there
-            raise ConfigError(f"robot description {where}: {error}") from error
+            advice = _MISSING if "missing required field" in str(error) else ""
+            raise ConfigError(f"robot description {where}: {error}{advice}") from error
 
     @classmethod
     def from_data(cls, data: Any, where: str = "robot description") -> Robot:
@@ -372,14 +375,16 @@ def _completed(data: Any) -> Any:
     """Recorded data with the fields that descriptions did not have yet when it was recorded."""
     if not isinstance(data, dict):
         return data
-    own = tomllib.loads(_own_text())
     claw, base, networks = (data.get(name) for name in ("claw", "base", "network"))
-    data = {"hull": own["hull"], **data}
-    if isinstance(claw, dict):
-        data["claw"] = {"level_roll_deg": own["claw"]["level_roll_deg"], **claw}
+    if "hull" not in data or (isinstance(claw, dict) and "level_roll_deg" not in claw):
+        own = tomllib.loads(_own_text())
+        data = {"hull": own["hull"], **data}
+        if isinstance(claw, dict):
+            data["claw"] = {"level_roll_deg": own["claw"]["level_roll_deg"], **claw}
     if isinstance(networks, dict) and isinstance(base, dict) and "command_timeout_s" in base:
         timeout = {"command_timeout_s": base["command_timeout_s"]}
-        data["network"] = {name: timeout | row if isinstance(row, dict) else row for name, row in networks.items()}
+        networks = {name: timeout | row if isinstance(row, dict) else row for name, row in networks.items()}
+        data = {**data, "network": networks}
     return data
 
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from contextlib import AsyncExitStack, ExitStack
 from heapq import heappop, heappush
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import msgspec
 from msgspec import Meta
@@ -25,8 +25,9 @@ from sim.camera import SimKinect
 from sim.component import SIM
 from sim.motion import MotionWriter
 from sim.random_scene import find_scene
-from sim.realism import BodyKind, BodyRealism, body_of
+from sim.realism import BodyKind, BodyRealism, Sensors, body_of
 from sim.render import make_renderer
+from sim.render.choice import RendererChoice
 from sim.world import Motors, World, message_motors
 
 TICK_HZ = 120
@@ -43,7 +44,7 @@ class SimConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     target: str = ""
     """An object that a random scene must contain."""
     seed: Annotated[int, Meta(ge=0)] = 0
-    sensors: Literal["ideal", "real"] = "ideal"
+    sensors: Sensors = "ideal"
     width: Annotated[int, Meta(ge=16, le=4096)] = 640
     height: Annotated[int, Meta(ge=16, le=4096)] = 480
     frame_rate_hz: Annotated[float, Meta(gt=0, le=120)] = 30.0
@@ -55,7 +56,7 @@ class SimConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Charge that the base reports; it does not change."""
     command_timeout_s: Annotated[float, Meta(gt=0)] | None = None
     """Replaces the robot's deadman time; only the lock-step baseline does."""
-    renderer: Literal["auto", "moderngl", "tiny"] = "auto"
+    renderer: RendererChoice = "auto"
     body: BodyKind = "nominal"
     """worn: the body differs from the nominal description by errors drawn from the seed, unknown to all services."""
     bend_at_s: Annotated[float, Meta(ge=0)] | None = None

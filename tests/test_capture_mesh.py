@@ -4,6 +4,7 @@ impersonated."""
 from __future__ import annotations
 
 import asyncio
+import json
 import os
 import random
 import select
@@ -30,6 +31,7 @@ from cocoro.keys import recorder_key
 from cocoro.messages import BaseState
 from cocoro.node import Node
 from cocoro.robot import Robot
+from deploy.rundir import RunDir
 from services.capture.config import CaptureConfig
 from services.capture.file import Packer
 from services.capture.log_clock import WALL_CLOCK, LogClock
@@ -232,6 +234,24 @@ def test_a_recorder_whose_wall_clock_is_set_goes_on_as_if_it_had_not_been_and_no
     assert f"clock     set {'forward' if by_s > 0 else 'back'} by {abs(step['by_s']):.3f} s" in capture_command.text(
         found
     )
+
+
+@pytest.mark.process
+def test_a_capture_that_is_made_by_hand_has_the_profile_of_the_start(short_path: Path) -> None:
+    profile = {"name": "sim", "robot": ROBOT, "clock": "real", "processes": ["base"]}
+
+    async def scenario() -> None:
+        async with robot(short_path) as (bus, _):
+            RunDir(ROBOT, short_path).remember(json.dumps(profile).encode())
+            recorder = await cocoro(short_path, "record", "--out", str(short_path / "out"))
+            await heard_by_a_recorder(bus)
+            recorder.terminate()
+            await asyncio.wait_for(recorder.communicate(), PATIENCE_S)
+            (path,) = (short_path / "out").glob("*.mcap")
+            with Capture.open(path) as capture:
+                assert json.loads(capture.metadata["profile"]["profile"]) == profile
+
+    asyncio.run(scenario())
 
 
 @pytest.mark.process

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import islice
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -83,6 +84,16 @@ def test_the_park_pose_beside_the_mount_is_not_babbled_into(postures: Postures, 
 def test_a_hand_folded_onto_its_own_arm_is_not_safe(postures: Postures) -> None:
     assert postures.safe(np.array([-0.1, 1.2, -0.8, 0.3]))
     assert not postures.safe(np.array([-0.1, 1.2, -2.55, -2.1]))
+
+
+def test_a_tube_that_a_measured_file_adds_does_not_count_as_hand(postures: Postures, tmp_path: Path) -> None:
+    file = tmp_path / "measured.toml"
+    file.write_text(
+        '[[hull.tube]]\nname = "bracket"\nstart = "elbow"\nend = "wrist_pitch"\nradius_m = 0.02\nballs = 4\n'
+    )
+    bracketed = Postures(Robot.load(override=file))  # the bracket is inside of the forearm
+    draws = [posture for _, posture in islice(sobol(1, postures.ranges), 100)]
+    assert [bracketed.safe(posture) for posture in draws] == [postures.safe(posture) for posture in draws]
 
 
 def test_between_two_safe_postures_the_straight_way_may_not_be_clear(postures: Postures) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from importlib import resources
 from math import radians, tan
 from pathlib import Path
@@ -158,7 +159,9 @@ def test_a_description_from_before_it_had_a_hull_gets_the_calliopes_and_its_own_
     del data["hull"], data["claw"]["level_roll_deg"]
     for row in data["network"].values():
         del row["command_timeout_s"]
+    recorded = deepcopy(data)
     robot = Robot.from_data(data)
+    assert data == recorded
     assert robot.hull == ROBOT.hull
     assert robot.claw == ROBOT.claw
     assert {row.command_timeout_s for row in robot.networks.values()} == {9.0}
@@ -200,7 +203,7 @@ def test_another_deadman_leaves_the_robot_itself_alone() -> None:
         ("[base]\nwheel_separation_m = -0.1\n", r"\$\.base\.wheel_separation_m"),
         ("[base]\nwheels = 3\n", r"wheels"),
         ("[base\n", r"own\.toml"),
-        ('[[joint]]\nname = "tail"\n', r"\$\.joint\[9\]"),
+        ('[[joint]]\nname = "tail"\n', r"own\.toml.*\$\.joint\[9\].*new name needs all fields"),
         ('[[link]]\nname = "shoulder"\nparent = "nowhere"\n', r"shoulder.*nowhere"),
         ('[[link]]\nname = "arm_base"\nparent = "gripper"\n', r"arm_base.*circle"),
         ('[[link]]\nname = "elbow"\njoint = "knee"\n', r"elbow.*knee"),
@@ -222,6 +225,15 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:
     unreadable.write_bytes(b"\xff\xfe\x00")
     with pytest.raises(ConfigError, match=r"binary\.toml"):
         Robot.load(unreadable)
+
+
+def test_a_description_without_a_field_is_refused_with_the_place_that_has_it(tmp_path: Path) -> None:
+    whole = tmp_path / "whole.toml"
+    whole.write_text(TEXT.replace("level_roll_deg = 90.0", "", 1))
+    with pytest.raises(ConfigError, match=r"whole\.toml: .*level_roll_deg.*calliope\.toml has every field"):
+        Robot.load(whole)
+    with pytest.raises(ConfigError, match=r"whole\.toml with .*own\.toml: .*level_roll_deg"):
+        Robot.load(whole, written(tmp_path, "[base]\nmass_kg = 10.0\n"))
 
 
 def test_a_whole_description_of_ones_own_is_read(tmp_path: Path) -> None:

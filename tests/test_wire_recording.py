@@ -64,5 +64,6 @@ def test_a_folder_that_holds_a_recording_is_left_alone(tmp_path: Path) -> None:
     done = subprocess.run(command, cwd=Path(__file__).parents[1], capture_output=True, text=True, check=False)
     assert done.returncode == 2
     assert done.stderr.startswith(f"{tmp_path} ")
+    assert "recording already" in done.stderr
     assert len(done.stderr.splitlines()) == 1
     assert (tmp_path / "INDEX.txt").read_text() == "precious\n"

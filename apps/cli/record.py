@@ -76,7 +76,7 @@ async def record_mesh(choice: RobotChoice, settings: dict[str, Any], seconds: fl
         robot = link.described()
         name = f"record-{os.getpid()}"
         async with Node(
-            name, link.bus, clock, robot, robot_name=link.robot, module=CAPTURE.module, config=config
+            name, link.bus, clock, robot, robot_name=link.robot, module=CAPTURE.module, config=config, profile=resolved
         ) as node:
             with interrupt_event() as end, going_on(), StatusLine() as line:
                 display = _RecordingDisplay(line)

@@ -94,7 +94,7 @@ class GuardLogic:
         self._overran_ns = 0
         self._ended_ns: int | None = None
         self._halted_ns: int | None = None
-        self._told_stop = False
+        self._stop_sent = False
         self._counted_ns = 0
         self._counting_ns: int | None = None
         self._counts_lost = False
@@ -223,8 +223,8 @@ class GuardLogic:
         """Stop the wheels: first by a drive command; by a halt when no frame confirms that. The drive command may be
         lost or garbled, be taken for the data of another command, or be ignored in the Create's mode."""
         assert self._ended_ns is not None
-        if not self._told_stop:
-            self._told_stop = True
+        if not self._stop_sent:
+            self._stop_sent = True
             if self.readings.get(oi.MODE, SAFE) >= SAFE:
                 return oi.drive_direct(0, 0)
         elif self.stands or now_ns < (self._ended_ns if self._halted_ns is None else self._halted_ns) + HEEDED_NS:

@@ -11,10 +11,8 @@ from typing import Literal, NamedTuple
 
 BAUD = 57_600
 MAX_SPEED_MMPS = 500
-STREAM_S = 0.015
-"""Period of the Create's stream frames."""
 MAX_FRAME = 86
-"""Largest stream frame, bytes, that fits into that period at 57600 baud."""
+"""Largest stream frame, bytes: it fits into 15 ms, the period of the frames, at 57600 baud."""
 
 START, SAFE, FULL, DEMO, DRIVE, DRIVE_DIRECT, STREAM, QUERY = 128, 131, 132, 136, 137, 145, 148, 149
 OPCODES = range(128, 159)

@@ -190,7 +190,7 @@ class Recorder:
             Recording(**progress._asdict(), dropped=dict(missing.dropped), lost=dict(missing.lost), ended=ended),
         )
 
-    # --- what is arrived ----------------------------------------------------------------------------
+    # --- messages ----------------------------------------------------------------------------------
 
     def _on_batch(self, batch: list[Received]) -> None:
         for key, payload, arrival_ns in batch:

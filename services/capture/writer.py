@@ -265,7 +265,7 @@ def _error(error: OSError, path: Path) -> CaptureError:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Makes the new file's directory message survive a loss of power."""
+    """Makes the new file's directory entry survive a loss of power."""
     fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(fd)

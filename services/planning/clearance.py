@@ -11,11 +11,13 @@ from math import cos, radians, sin
 
 import numpy as np
 
-from cocoro.arrays import FloatArray
+from cocoro.arrays import BoolArray, FloatArray
 from cocoro.robot import Robot
 
 ON_CHASSIS_M = 0.03
 """Height of what is mounted on top of the chassis."""
+HAND = "wrist_roll"
+"""The link at which the hand begins."""
 _ALONG_FINGER = np.array([[0.0], [0.5], [1.0]])
 """Places of a finger's balls, as shares of its length."""
 
@@ -37,6 +39,9 @@ class Clearance:
         self._mount_max = np.array(robot.kinect.mount_max_m)
         self._chassis_radius_m = robot.base.chassis_diameter_m / 2
         self._chassis_top_m = robot.base.chassis_height_m + ON_CHASSIS_M
+        hand = [tube.start == HAND for tube in hull.tube for _ in range(tube.balls)]
+        self.on_hand: BoolArray = np.array(hand + [True] * (len(self._radii) - len(hand)))
+        """Which of the hull's balls belong to the hand, shape (n,)."""
         self._beyond_chassis = hull.tube[0].balls
         """Index of the first ball that is checked against the chassis: the first tube turns on it."""
 

@@ -76,14 +76,10 @@ class SeenHand:
         self._roll_rad = (marker.nominal if isinstance(marker, HandMap) else marker).roll_rad
         self._config = config
         self._correction = np.zeros(3)
+        """Added to the computed hand position, (3,), metres."""
         self._wanted = np.zeros(3)
         self._now_ns: int | None = None
         self._seen_ns: int | None = None
-
-    @property
-    def correction_m(self) -> FloatArray:
-        """Correction of the computed hand position, (3,), metres."""
-        return self._correction
 
     def pose(self, angles: Mapping[str, float]) -> FloatArray:
         pose = self._felt.pose(angles)

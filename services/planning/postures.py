@@ -30,8 +30,6 @@ class Postures:
         self.ranges = np.clip(limits, -RANGE_RAD, RANGE_RAD)
         self._clearance = Clearance(robot)
         hull = robot.hull
-        self._hand_from = sum(tube.balls for tube in hull.tube if tube.start != "wrist_roll")
-        """Index of the hull's first ball that belongs to the hand."""
         self._from_upper_arm_m = hull.tube[0].radius_m + OWN_ARM_M
         self._kinect_min, self._kinect_max = np.array(hull.kinect_min_m), np.array(hull.kinect_max_m)
         self._roll_rad = robot.claw.level_roll_rad
@@ -57,9 +55,10 @@ class Postures:
             return False
         shoulder, elbow = (chain.position(angles) for chain in self._upper)
         along = elbow - shoulder
-        hand = centres[self._hand_from :] - shoulder
+        on_hand = self._clearance.on_hand
+        hand = centres[on_hand] - shoulder
         share = np.clip(hand @ along / (along @ along), -0.3, 1.0)  # the shoulder's bracket is behind the axis
-        away = np.linalg.norm(hand - share[:, None] * along, axis=1) - radii[self._hand_from :]
+        away = np.linalg.norm(hand - share[:, None] * along, axis=1) - radii[on_hand]
         return float(away.min()) > self._from_upper_arm_m
 
     def seeable(self, posture: FloatArray) -> bool:

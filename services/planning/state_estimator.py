@@ -38,20 +38,20 @@ class PerceptionWatch:
         """It may be silent for `least_s`, or for `periods` of its own periods where that is longer."""
         self._least_ns = round(least_s * NS)
         self._periods = periods
-        self._heard_ns: int | None = None
+        self._arrived_ns: int | None = None
         self._gaps_ns: deque[int] = deque(maxlen=5)
         self._blind_since_ns: int | None = None
 
-    def heard(self, now_ns: int) -> None:
+    def arrived(self, now_ns: int) -> None:
         """Note that detections have arrived."""
-        if self._heard_ns is not None and now_ns > self._heard_ns:
-            self._gaps_ns.append(now_ns - self._heard_ns)
-        self._heard_ns = now_ns
+        if self._arrived_ns is not None and now_ns > self._arrived_ns:
+            self._gaps_ns.append(now_ns - self._arrived_ns)
+        self._arrived_ns = now_ns
         self._blind_since_ns = None
 
     def blind_s(self, now_ns: int) -> float | None:
         """As `StateEstimator.blind_s`; counted from the first call where nothing has arrived yet."""
-        if self._heard_ns is not None and 0 <= now_ns - self._heard_ns <= self._patience_ns():
+        if self._arrived_ns is not None and 0 <= now_ns - self._arrived_ns <= self._patience_ns():
             return None
         if self._blind_since_ns is None or now_ns < self._blind_since_ns:
             self._blind_since_ns = now_ns
@@ -59,9 +59,9 @@ class PerceptionWatch:
 
     def age_s(self, now_ns: int) -> float:
         """Time since the last arrival, less the extra silence that a slow perception may have."""
-        if self._heard_ns is None or now_ns < self._heard_ns:
+        if self._arrived_ns is None or now_ns < self._arrived_ns:
             return float("inf")
-        return max(now_ns - self._heard_ns - (self._patience_ns() - self._least_ns), 0) / NS
+        return max(now_ns - self._arrived_ns - (self._patience_ns() - self._least_ns), 0) / NS
 
     def _patience_ns(self) -> int:
         # The median is robust against one pause and against two messages together.
@@ -83,8 +83,8 @@ class PostureSighting(NamedTuple):
 class Turning:
     """The base's odometry with a learned wheel distance in place of the nominal one.
 
-    The base computes its heading and turn rate from the wheels' travel and the nominal distance; here both are scaled,
-    and with the heading the direction of each stretch of its path. Path length and speed do not depend on the distance.
+    The base computes its heading from the wheels' travel and the nominal distance; here it is scaled, and with it the
+    direction of each stretch of its path. Path length and speed do not depend on the distance.
     """
 
     def __init__(self) -> None:
@@ -113,10 +113,6 @@ class Turning:
         self._pose = self._pose.compose(bent)
         return self._pose
 
-    def rate_radps(self, state: BaseState) -> float:
-        """The body's turn rate."""
-        return self.ratio * state.turn_rate_radps
-
 
 class StateEstimator:
     """Takes every input of the planner and answers queries by time."""
@@ -139,7 +135,7 @@ class StateEstimator:
         self.sight_lag_s = 0.0
         """Smoothed age of a sighting when the next one arrives; small for a fast perception."""
         self._looked_ns: int | None = None
-        self._said_ns: dict[str, int] = {}
+        self._published_ns: dict[str, int] = {}
         """By topic, when its newest message was published."""
         self._sight = PerceptionWatch(robot.base.command_timeout_s, config.blind_periods)
         self.turning = Turning()
@@ -149,7 +145,7 @@ class StateEstimator:
         self._sightings: list[PostureSighting] = []
 
     def take(self, topic: Topic[Message], message: Message, now_ns: int) -> None:
-        self._said_ns[topic.name] = min(message.stamp_ns, now_ns)
+        self._published_ns[topic.name] = min(message.stamp_ns, now_ns)
         if isinstance(message, BaseState):
             self.base = message
             resets = self._odometry.resets
@@ -168,7 +164,7 @@ class StateEstimator:
                 self.hand = message
         elif isinstance(message, Detections):
             self._waiting.append(message)
-            self._sight.heard(now_ns)
+            self._sight.arrived(now_ns)
             if self._looked_ns is not None and message.stamp_ns > self._looked_ns:
                 lag_s = min(max((now_ns - self._looked_ns) / NS, 0.0), 5.0)
                 self.sight_lag_s += 0.3 * (lag_s - self.sight_lag_s)
@@ -296,9 +292,9 @@ class StateEstimator:
 
     def _age_s(self, topic: Topic[Any], now_ns: int) -> float:
         """Age, s, of a topic's newest message by its stamp, or by its arrival where the stamp is in the future."""
-        said_ns = self._said_ns.get(topic.name)
+        published_ns = self._published_ns.get(topic.name)
         # A publication time in the future belongs to the clock's last epoch.
-        return (now_ns - said_ns) / NS if said_ns is not None and said_ns <= now_ns else float("inf")
+        return (now_ns - published_ns) / NS if published_ns is not None and published_ns <= now_ns else float("inf")
 
     def intent_age_s(self, now_ns: int) -> float:
         """Age, s, of the executive's last intent."""

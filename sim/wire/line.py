@@ -35,10 +35,8 @@ class PseudoSerialPort:
         ours, theirs = pty.openpty()
         tty.setraw(theirs)
         os.set_blocking(ours, False)
-        self._ends = (
-            ours,
-            theirs,
-        )  # theirs stays open: otherwise a driver that closes the port would look like an unplugged adapter
+        # Theirs stays open: otherwise a driver that closes the port would look like an unplugged adapter.
+        self._ends = ours, theirs
         fresh = f".{self.path.name}.{os.getpid()}"
         with private.directory(self.path.parent, make=True) as folder:
             with suppress(FileNotFoundError):
