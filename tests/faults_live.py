@@ -68,7 +68,7 @@ class LiveRobot:
         await self.told("is up")
         self._bus = await ZenohBus.open(self.run_dir.join_as("onlooker"))
         for topic in WATCHED:
-            self._bus.subscribe(topic.key(self.name), Qos.STATE, self._keeper(topic), depth=KEEP)
+            self._bus.subscribe(topic.key(self.name), Qos.STATE, self._stored(topic), depth=KEEP)
         self._bus.watch_alive(f"{self.name}/*/alive", self._on_alive)
         await self.until(lambda: self.heard(topics.TRUTH))
 
@@ -107,9 +107,9 @@ class LiveRobot:
         target.signal(number)
         target.close()
 
-    # --- what is heard --------------------------------------------------------------------------------
+    # --- messages -------------------------------------------------------------------------------------
 
-    def _keeper(self, topic: Topic[Any]) -> Callable[[str, Payload], None]:
+    def _stored(self, topic: Topic[Any]) -> Callable[[str, Payload], None]:
         decoder = msgspec.msgpack.Decoder(topic.type)
 
         def keep(_key: str, payload: Payload) -> None:

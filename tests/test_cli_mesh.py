@@ -56,11 +56,11 @@ class FakeRobot:
 
     def __init__(self, nodes: dict[str, Node], latched_by: dict[str, ServiceLatch]) -> None:
         self.nodes = nodes
-        self.keepers = latched_by
+        self.latched_by = latched_by
 
     @property
     def latches(self) -> set[str]:
-        return {keeper.state for keeper in self.keepers.values()}
+        return {latch.state for latch in self.latched_by.values()}
 
 
 @asynccontextmanager
@@ -72,10 +72,10 @@ async def robot(*services: str, without_latch: tuple[str, ...] = ()) -> AsyncIte
         for node in nodes.values():
             await stack.enter_async_context(node)
         keeping = [name for name in stoppable() if name in nodes and name not in without_latch]
-        keepers = {name: ServiceLatch(nodes[name], lambda *_: None) for name in keeping}
+        latches = {name: ServiceLatch(nodes[name], lambda *_: None) for name in keeping}
         for node in nodes.values():
             node.ready("all is well")
-        yield FakeRobot(nodes, keepers)
+        yield FakeRobot(nodes, latches)
 
 
 def answering(node: Node, latch: str, text: str = "") -> None:
