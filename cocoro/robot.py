@@ -194,7 +194,8 @@ class _DescriptionFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     pose: dict[str, dict[str, float]]
 
     def __post_init__(self) -> None:
-        """Refuses references to links and joints that the description does not have, and circles of links."""
+        """Refuses references to links and joints that the description does not have, circles of links, and boxes whose
+        corners are swapped."""
         parents = {row.name: row.parent for row in self.link}
         joints = {joint.name for joint in self.joint}
         for row in self.link:
@@ -213,6 +214,12 @@ class _DescriptionFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         for where, name in [("marker", self.marker.link), *hull]:
             if name not in parents:
                 raise ValueError(f"{where}: there is no link {name!r}")
+        for where, low_m, high_m in (
+            ("kinect.mount_min_m", self.kinect.mount_min_m, self.kinect.mount_max_m),
+            ("hull.kinect_min_m", self.hull.kinect_min_m, self.hull.kinect_max_m),
+        ):
+            if not all(low < high for low, high in zip(low_m, high_m, strict=True)):
+                raise ValueError(f"{where}: {low_m} must be below {high_m} along each axis")
         poses = [(f"pose {name}", set(angles)) for name, angles in self.pose.items()]
         claws = [("claw", set(self.claw.open_sign)), ("hull.finger_turn_deg", set(self.hull.finger_turn_deg))]
         for where, named in [*poses, *claws]:

@@ -178,9 +178,11 @@ def test_a_measured_tube_of_the_hull_changes_that_one_alone(tmp_path: Path) -> N
     [
         ('[[hull.tube]]\nname = "forearm"\nend = "nowhere"\n', "hull.tube forearm: there is no link 'nowhere'"),
         ("[hull]\nfinger_turn_deg = { claw_middle = 1.0 }\n", "hull.finger_turn_deg: there is no link 'claw_middle'"),
+        ("[hull]\nkinect_max_m = [0.13, -0.2, 0.79]\n", r"own\.toml: hull\.kinect_min_m: .* must be below"),
+        ("[kinect]\nmount_min_m = [0.0, 0.0, 9.0]\n", r"own\.toml: kinect\.mount_min_m: .* must be below"),
     ],
 )
-def test_a_hull_on_links_that_are_not_there_is_refused(tmp_path: Path, text: str, named: str) -> None:
+def test_a_hull_or_mount_that_cannot_be_is_refused(tmp_path: Path, text: str, named: str) -> None:
     with pytest.raises(ConfigError, match=named):
         Robot.load(override=written(tmp_path, text))
 
