@@ -1,4 +1,4 @@
-"""Rigid-body kinematics against the drawing and against itself."""
+"""Rigid-body kinematics against the maker's drawing and against itself."""
 
 from __future__ import annotations
 

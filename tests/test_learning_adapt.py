@@ -22,9 +22,9 @@ def parts(robot: Robot) -> tuple[Sightings, Sightings, Sightings]:
 
 
 def bent(robot: Robot, seen: Sightings) -> Sightings:
-    drawing = NominalModel(robot)
+    nominal = NominalModel(robot)
     beyond = seen.angles_rad + np.array([0.0, 0.0, BEND_RAD, 0.0])
-    shift = drawing.predict(beyond) - drawing.predict(seen.angles_rad)
+    shift = nominal.predict(beyond) - nominal.predict(seen.angles_rad)
     return Sightings(seen.angles_rad, seen.places_m + shift, seen.draws)
 
 
