@@ -26,10 +26,14 @@ class Hop(Action, frozen=True, tag="hop"):
         return f"hopping {self.height_m} m"
 
 
+class Stumble(Action, frozen=True, tag="stumble"):
+    """An action without a behaviour."""
+
+
 class HopTask(Task, frozen=True, kw_only=True, tag="hop"):
     """Hop."""
 
-    brings: ClassVar[tuple[type[Action], ...]] = (Hop,)
+    brings: ClassVar[tuple[type[Action], ...]] = (Hop, Stumble)
 
     async def run(self, skills: Skills) -> None:
         await skills.do(Hop(0.1), timeout_s=1.0)
@@ -42,6 +46,13 @@ def third_party(monkeypatch: pytest.MonkeyPatch) -> None:
     found = {TASK_GROUP: EntryPoints(added, ("entry point 'jump' of jumper cannot be loaded: ImportError: gone",))}
     for module in ("cocoro.tasks", "cocoro.messages.actions", "services.executive.executive"):
         monkeypatch.setattr(f"{module}.added_to", found.__getitem__)
+
+
+def test_an_action_without_a_behaviour_never_reaches_the_planner(third_party: None) -> None:
+    assert "hop" in ACTIONS.all()
+    sent = msgspec.msgpack.encode({"action": {"action": "stumble"}})
+    with pytest.raises(msgspec.ValidationError, match="unknown action 'stumble'"):
+        msgspec.msgpack.decode(sent, type=Intent)
 
 
 # --- what travels ---------------------------------------------------------------------------------

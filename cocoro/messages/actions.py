@@ -118,8 +118,9 @@ class BabbleWheels(Action, frozen=True, tag="babble-wheels"):
 
 
 def _brought() -> Iterator[type[Action]]:
+    """Third parties' actions that have a behaviour: one without would end the planner."""
     for _, task, _ in added_to(TASK_GROUP).added:
-        yield from getattr(task, "brings", ())
+        yield from (kind for kind in getattr(task, "brings", ()) if kind.behaviour is not Action.behaviour)
 
 
 ACTIONS: Registry[Action] = Registry(
