@@ -7,10 +7,7 @@ unknown fields, so a field with a default may be added at any time.
 
 from __future__ import annotations
 
-from cocoro.messages.capture import (
-    DisturbedFile,
-    Recording,
-)
+from cocoro.messages.capture import DisturbedFile, Recording
 from cocoro.messages.common import (
     LARGEST,
     Count,
@@ -55,11 +52,7 @@ from cocoro.messages.node import (
     StepRecord,
     TopicHealth,
 )
-from cocoro.messages.perception import (
-    Detection,
-    Detections,
-    Obstacles,
-)
+from cocoro.messages.perception import Detection, Detections, Obstacles
 from cocoro.messages.planning import (
     HandSample,
     Intent,
@@ -70,16 +63,8 @@ from cocoro.messages.planning import (
     TargetEstimate,
     WheelTrial,
 )
-from cocoro.messages.sim import (
-    ClockTick,
-    TrueObject,
-    Truth,
-)
-from cocoro.messages.stop import (
-    EstopReply,
-    EstopRequest,
-    Latch,
-)
+from cocoro.messages.sim import ClockTick, TrueObject, Truth
+from cocoro.messages.stop import EstopReply, EstopRequest, Latch
 
 __all__ = [
     "LARGEST", "AboutFile", "AboutReply", "AboutRequest", "BaseCommand", "BaseState", "CancelRequest", "ClockTick",
