@@ -19,7 +19,8 @@ from typing import NamedTuple
 from apps.cli import exits
 
 STOPPABLE = ("base", "arm", "hand")
-"""What moves, by the project's components: `deploy.processes.stoppable`, which is slow to import."""
+"""The services that move something: a copy of `deploy.processes.stoppable()`, which is slow to import. A test compares
+them."""
 SOCKETS = "/proc/net/unix"
 PREFIX = "@cocoro-stop/"
 """The addresses of `cocoro.stop.path`, as the kernel lists them."""

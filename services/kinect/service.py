@@ -28,7 +28,7 @@ async def run(node: Node, config: KinectConfig) -> None:
 
     with closing(open_device(config, node.clock, on_fault)) as camera:
         async for frame in camera.frames():
-            # In a thread: it takes a few milliseconds, for which the event loop must not wait.
+            # Straightening takes a few milliseconds, so a thread does it and the event loop does not wait.
             straight = frame if straighten.idle else await asyncio.to_thread(straighten, frame)
             node.publish(topics.FRAME, to_message(straight))
 
