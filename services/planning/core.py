@@ -23,6 +23,7 @@ from services.planning.learned import Learned
 from services.planning.reach import ARM
 from services.planning.state_estimator import StateEstimator
 
+
 class PlanningCore:
     """The planner as a `cocoro.core.Core`. Without a fresh state of the robot it stands still and reports why."""
 
@@ -186,7 +187,10 @@ class PlanningCore:
         self._head_goal = None
         if self._missing_since_ns is None or now_ns < self._missing_since_ns:
             self._missing_since_ns = now_ns
-        failed = not isinstance(self._intent.action, Idle) and now_ns - self._missing_since_ns > self._config.stale_for_good_s * NS
+        failed = (
+            not isinstance(self._intent.action, Idle)
+            and now_ns - self._missing_since_ns > self._config.stale_for_good_s * NS
+        )
         body = self._estimator.body()
         status = PlannerStatus(
             task_id=self._intent.task_id,
