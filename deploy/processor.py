@@ -81,11 +81,7 @@ class ProcessorWatch:
             for name in [key[0]]
         }
         names = {pid: name for name, pid in robot.items()}
-        used = {
-            (pid, start): (cpu_s - before.used_s.get((pid, start), cpu_s if start < before.boot_ticks else 0.0))
-            / seconds
-            for (pid, start), cpu_s in now.used_s.items()
-        }
+        used = {who: (cpu_s - before.used_s.get(who, 0.0)) / seconds for who, cpu_s in now.used_s.items()}
         most = sorted(used, key=used.__getitem__, reverse=True)[:TAKERS]
         takers = tuple(
             Taker(pid, names.get(pid) or _command(self._proc, pid), used[pid, start])
@@ -97,8 +93,6 @@ class ProcessorWatch:
 
 class _Look(NamedTuple):
     at_s: float
-    boot_ticks: float
-    """Time since the machine's start, in the unit of start times."""
     used_s: dict[tuple[int, int], float]
     """By number and start time: processor time of every process."""
     waited_s: dict[tuple[str, int], float]
@@ -121,8 +115,7 @@ def _look(proc: Path, robot: Mapping[str, int]) -> _Look | None:
             waited_s[name, pid] = int((proc / str(pid) / "schedstat").read_text().split()[1]) / 1e9
         except (OSError, ValueError, IndexError):
             continue
-    boot_ticks = time.clock_gettime(time.CLOCK_BOOTTIME) * TICK_HZ
-    return _Look(time.monotonic(), boot_ticks, used_s, waited_s) if used_s else None
+    return _Look(time.monotonic(), used_s, waited_s) if used_s else None
 
 
 def start_of(pid: int, proc: Path = PROC) -> int | None:

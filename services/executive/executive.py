@@ -255,7 +255,7 @@ class Executive:
         end_s = loop.time() + self._config.contact_s
         why = self._unheard[service] = await contact.lost(service)
         self._node.log.warning("%s", why)
-        while service not in self._alive and contact.lives(service) and loop.time() < end_s:
+        while service not in self._alive and contact.lives(service) and loop.time() < end_s:  # noqa: ASYNC110 # a lock
             await asyncio.sleep(LOOK_S)
         del self._unheard[service]
         if not self._unheard:

@@ -20,8 +20,8 @@ LOOSE_S = 0.5
 a moment, and then need a quarter of a second until they trust their grip again."""
 
 LISTEN_S = 0.25
-"""Time after which this process notes that it heard nothing of the planner. However long the time was in fact, it counts
-as this much: a process that did not run heard nothing, whoever spoke."""
+"""Time after which this process notes that it heard nothing of the planner. However long it really was, it counts as
+this much: a process that did not run heard nothing, whoever spoke."""
 
 
 class PlannerSkills:
