@@ -60,11 +60,7 @@ class ObjectSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
         wanted = {"cylinder": {"radius_m", "height_m"}, "sphere": {"radius_m"}, "box": {"size_m"}}[self.shape]
         given = {
             name
-            for name, value in (
-                ("radius_m", self.radius_m),
-                ("height_m", self.height_m),
-                ("size_m", self.box_m),
-            )
+            for name, value in (("radius_m", self.radius_m), ("height_m", self.height_m), ("size_m", self.box_m))
             if value is not None
         }
         if missing := sorted(wanted - given):

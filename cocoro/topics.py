@@ -221,6 +221,10 @@ CANCEL = Request(
     "executive/cancel", m.CancelRequest, m.TaskReply,
     "End the running task; the robot stops.",
 )  # fmt: skip
+REPORT = Request(
+    "executive/report", m.ReportRequest, m.ReportReply,
+    "The state of a task, running or ended.",
+)  # fmt: skip
 OBJECTS = Request(
     "executive/objects", m.ObjectsRequest, m.ObjectsReply,
     "The known objects, and where each was seen last.",
@@ -250,4 +254,4 @@ ABOUT = Request(
     "The component, settings and versions of a service; answered by every service.",
 )  # fmt: skip
 
-REQUESTS: tuple[Request[Any, Any], ...] = (RUN, CANCEL, OBJECTS, ESTOP, LEARNED, RECOVER, SERVOS, ABOUT)
+REQUESTS: tuple[Request[Any, Any], ...] = (RUN, CANCEL, REPORT, OBJECTS, ESTOP, LEARNED, RECOVER, SERVOS, ABOUT)

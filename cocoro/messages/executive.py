@@ -44,11 +44,14 @@ class TaskRequest(msgspec.Struct, kw_only=True):
     fields."""
     timeout_s: Annotated[float, Meta(gt=0, le=3600)] | None = None
     """None: the task's own limit."""
+    asker: str = ""
+    """Name in the asker's liveliness token `<robot>/<asker>/asker`; when that is gone, the task is cancelled. Empty:
+    nobody is watched."""
 
 
 RefusalCode = Literal[
     "unknown_label", "not_graspable", "busy", "estop", "not_alive", "battery", "holding", "not_holding", "bad_request",
-    "no_task",
+    "no_task", "asker_gone",
 ]  # fmt: skip
 
 
@@ -64,6 +67,16 @@ class TaskReply(msgspec.Struct, kw_only=True):
 class CancelRequest(msgspec.Struct, kw_only=True):
     task_id: str = ""
     """Empty: cancel the running task, whichever it is."""
+
+
+class ReportRequest(msgspec.Struct, kw_only=True):
+    task_id: str = ""
+    """Empty: the running task, or the last one."""
+
+
+class ReportReply(msgspec.Struct, kw_only=True):
+    state: TaskState | None = None
+    """None: the executive does not know the task. It knows the last that ended, but none from before its own start."""
 
 
 class ObjectsRequest(msgspec.Struct, kw_only=True):
