@@ -67,7 +67,10 @@ def learn(
     picture: Annotated[
         Path | None, typer.Option(metavar="OUT.png", help="Picture of what would match; LABEL.png by default.")
     ] = None,
-    yes: Annotated[bool, typer.Option("--yes", "-y", help="Save it without asking.")] = False,
+    yes: Annotated[
+        bool | None,
+        typer.Option("--yes/--no", "-y/-n", help="Save it without asking, or only look; without a terminal say which."),
+    ] = None,
     replace: Annotated[bool, typer.Option("--replace", help="Replace the colours of a known object.")] = False,
     add: Annotated[bool, typer.Option("--add", help="Add the colours of another light to a known object.")] = False,
     description: DescriptionOption = None,
