@@ -79,7 +79,9 @@ class OutsideStage:
                 for body in self.bodies
             ]
         except KeyError as error:
-            raise ConfigError(f"the truth has no {error}: it is of another robot or scene than the one stated") from error
+            raise ConfigError(
+                f"the truth has no {error}: it is of another robot or scene than the one stated"
+            ) from error
 
     def poses(self, truth: Truth) -> FloatArray:
         """World poses of `visuals` in their order, (n, 4, 4)."""

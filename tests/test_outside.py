@@ -22,7 +22,9 @@ def test_everything_stands_where_the_world_has_it() -> None:
     wear = body_of(ROBOT, "worn", 4)
     with World(ROBOT, scene, seed=4, wear=wear) as world:
         world.set_latch("released")
-        world.command_servos("arm", ServoCommand(joints=("shoulder", "elbow"), goal_rad=(0.4, 0.5), speed_radps=(1.0, 1.0)))
+        world.command_servos(
+            "arm", ServoCommand(joints=("shoulder", "elbow"), goal_rad=(0.4, 0.5), speed_radps=(1.0, 1.0))
+        )
         for _ in range(60):
             world.step()
         stage = OutsideStage(wear.robot, scene)

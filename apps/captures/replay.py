@@ -126,9 +126,7 @@ class Replay:
         for key in self._player.keys:
             self._publisher(key)
         if self._hardware:
-            self._handles += [
-                self._bus.declare_alive(alive_key(self._robot, name)) for name in processes.hardware()
-            ]
+            self._handles += [self._bus.declare_alive(alive_key(self._robot, name)) for name in processes.hardware()]
         ticking = None
         if self._hardware and self._clock_key not in self._player.keys:
             ticking = asyncio.create_task(self._tick_for_ever())
