@@ -23,7 +23,6 @@ from cocoro.bus.base import Bus, Payload
 from cocoro.clock import NS
 from cocoro.errors import ConfigError
 from cocoro.messages import Message
-from cocoro.objects import Catalogue
 from cocoro.topics import TOPICS, Topic
 
 if TYPE_CHECKING:
@@ -176,7 +175,7 @@ async def view_mesh(choice: RobotChoice) -> int:
     rerun = library()
     async with joined(choice, frames=True) as link:
         recording = opened(rerun)
-        watch(link.bus, link.robot, RerunScene(recording, link.described(), Catalogue.load()))
+        watch(link.bus, link.robot, RerunScene(recording, link.described(), link.catalogue()))
         print("Ctrl-C ends it")
         with interrupt_event() as end:
             await end.wait()
