@@ -197,7 +197,6 @@ STEPS = Topic(
     "{service}/steps", m.StepRecord, Qos.EVENT, None, 1.0,
     "The inputs and outputs of each step of a pure core, when recording of steps is on.",
 )  # fmt: skip
-
 EXCHANGES = Topic(
     "{service}/requests", m.Exchange, Qos.EVENT, None, 1.0,
     "Every request to a service, with its answer, for recorders.", max_bytes=4 * 1024 * 1024,
@@ -222,8 +221,8 @@ CANCEL = Request(
     "End the running task; the robot stops.",
 )  # fmt: skip
 REPORT = Request(
-    "executive/report", m.ReportRequest, m.ReportReply,
-    "The state of a task, running or ended.",
+    "executive/report", m.ReportRequest, m.TaskState,
+    "The state of a task, running or ended; one without an id for a task that is not known.",
 )  # fmt: skip
 OBJECTS = Request(
     "executive/objects", m.ObjectsRequest, m.ObjectsReply,

@@ -58,15 +58,15 @@ async def wait(choice: RobotChoice, task_id: str, as_json: bool) -> int:
     async with joined(choice) as link:
         follower = Follower(link, None, task_display(as_json), None, _contact(link))
         follower.listen()  # before the question, so that no state is missed
-        reply = await link.call(REPORT, ReportRequest(task_id=task_id))
-        if reply.state is None:
+        state = await link.call(REPORT, ReportRequest(task_id=task_id))
+        if not state.task_id:
             raise CocoroError(
                 f"{link.robot}: the executive knows no task {task_id}: it has restarted since, or the name is wrong"
                 if task_id
                 else f"{link.robot}: no task has run since the executive started"
             )
         with on_signals(SIGNALS, lambda _number: follower.leave()), going_on():
-            code, result = await follower.attend(reply.state)
+            code, result = await follower.attend(state)
     if as_json:
         print(json.dumps(result))
     return code

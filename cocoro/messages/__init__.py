@@ -27,7 +27,6 @@ from cocoro.messages.executive import (
     Outcome,
     Phase,
     RefusalCode,
-    ReportReply,
     ReportRequest,
     TaskReply,
     TaskRequest,
@@ -74,7 +73,7 @@ __all__ = [
     "FiniteNonNegative", "FiniteQuaternion", "FiniteVec2", "FiniteVec3", "Frame", "HandSample", "Health", "Intent",
     "KnownObject", "Latch", "LatchState", "LearnedModel", "LoopHealth", "Message", "ModelReply", "ModelRequest",
     "ObjectsReply", "ObjectsRequest", "Obstacles", "Outcome", "Phase", "PlannerStatus", "Recording", "RecoverReply",
-    "RecoverRequest", "RefusalCode", "ReportReply", "ReportRequest", "ServoCommand", "ServoReply", "ServoRequest",
-    "ServoState", "StepRecord", "TargetEstimate", "TaskReply", "TaskRequest", "TaskState", "TopicHealth",
-    "TrueObject", "Truth", "WheelTrial",
+    "RecoverRequest", "RefusalCode", "ReportRequest", "ServoCommand", "ServoReply", "ServoRequest", "ServoState",
+    "StepRecord", "TargetEstimate", "TaskReply", "TaskRequest", "TaskState", "TopicHealth", "TrueObject", "Truth",
+    "WheelTrial",
 ]  # fmt: skip

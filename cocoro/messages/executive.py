@@ -45,8 +45,7 @@ class TaskRequest(msgspec.Struct, kw_only=True):
     timeout_s: Annotated[float, Meta(gt=0, le=3600)] | None = None
     """None: the task's own limit."""
     asker: str = ""
-    """Name in the asker's liveliness token `<robot>/<asker>/asker`; when that is gone, the task is cancelled. Empty:
-    nobody is watched."""
+    """When the liveliness token `<robot>/<asker>/asker` is gone, the task is cancelled. Empty: nobody is watched."""
 
 
 RefusalCode = Literal[
@@ -69,14 +68,8 @@ class CancelRequest(msgspec.Struct, kw_only=True):
     """Empty: cancel the running task, whichever it is."""
 
 
-class ReportRequest(msgspec.Struct, kw_only=True):
-    task_id: str = ""
+class ReportRequest(CancelRequest, kw_only=True):
     """Empty: the running task, or the last one."""
-
-
-class ReportReply(msgspec.Struct, kw_only=True):
-    state: TaskState | None = None
-    """None: the executive does not know the task. It knows the last that ended, but none from before its own start."""
 
 
 class ObjectsRequest(msgspec.Struct, kw_only=True):

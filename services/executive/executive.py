@@ -21,7 +21,6 @@ from cocoro.messages import (
     Outcome,
     Phase,
     RefusalCode,
-    ReportReply,
     ReportRequest,
     TaskReply,
     TaskRequest,
@@ -158,9 +157,9 @@ class Executive:
         self._end("cancelled", "by the operator")
         return TaskReply(accepted=True, task_id=self.state.task_id)
 
-    async def _report(self, request: ReportRequest) -> ReportReply:
-        known = (self.state, *reversed(self._over)) if self.state.task_id else ()
-        return ReportReply(state=next((one for one in known if request.task_id in ("", one.task_id)), None))
+    async def _report(self, request: ReportRequest) -> TaskState:
+        known = (self.state, *self._over)
+        return next((state for state in known if request.task_id in ("", state.task_id)), TaskState())
 
     async def _objects(self, request: ObjectsRequest) -> ObjectsReply:
         status = self._skills.status
