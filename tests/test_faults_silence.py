@@ -144,31 +144,15 @@ async def test_when_perception_stays_silent_the_task_fails_and_says_so() -> None
 
 @in_virtual_time
 async def test_when_the_planner_stays_silent_the_task_fails_and_says_so() -> None:
-    async with RobotRig(settings={"executive": {"planner_silence_s": 3.0}}) as rig:
+    async with RobotRig(settings={"executive": {"planner_silence_s": 1.0}}) as rig:
         task_id = await rig.driving()
         with silent(rig, "planning"):
             state = await rig.outcome(task_id, timeout_s=5.0)
-            assert (state.outcome, state.reason) == ("failed", "not_alive: nothing from the planner for 3 s")
+            assert (state.outcome, state.reason) == ("failed", "not_alive: nothing from the planner for 1 s")
             refused = await rig.ask("fetch", "red_can")
             assert (refused.refusal, refused.text) == ("not_alive", "the planner says nothing; see cocoro status")
         await rig.advance(0.2)
         assert (await rig.run("fetch", "red_can")).outcome == "done"
-
-
-@pytest.mark.parametrize("service", ["planning", "base", "arm", "hand"])
-def test_when_one_that_was_late_speaks_again_the_task_goes_on(service: str) -> None:
-    @in_virtual_time
-    async def scenario() -> None:
-        async with RobotRig() as rig:
-            task_id = await rig.driving()
-            late_s = rig.now_s
-            with silent(rig, service):
-                await rig.advance(4.0)
-                assert max(rig.speeds_since(late_s + STAND_S)) < HALTED_MPS
-            assert (await rig.outcome(task_id)).outcome == "done"
-            assert rig.held("red_can")
-
-    scenario()
 
 
 @in_virtual_time

@@ -103,7 +103,12 @@ def test_beyond_its_states_age_it_only_stands_and_in_time_it_gives_up(planner: P
     status = planner.run(0.04)
     assert only_stands(planner)
     assert (status.state, topic.name in status.why) == ("running", True)
-    assert planner.run(4.9).state == "running"
+    planner.run(3.0)
+    planner.silent.clear()
+    assert planner.run(0.3).state == "running"
+    assert not standing(planner), "it goes on"
+    planner.silent.add(topic.name)
+    assert planner.run(topic.max_age_s + 4.9).state == "running"
     status = planner.run(0.2)
     assert (status.state, status.reason) == ("failed", "stale")
     planner.silent.clear()
