@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import sys
 from contextlib import suppress
 from pathlib import Path
@@ -14,7 +13,7 @@ from apps.cli import exits
 from apps.cli.interrupt import on_interrupt
 from apps.cli.link import MeshLink, joined
 from apps.cli.options import RobotChoice
-from apps.cli.output import going_on
+from apps.cli.output import going_on, print_json
 from apps.cli.progress import TaskDisplay, task_display
 from apps.cli.snapshot import SnapshotTaker, check
 from cocoro.errors import CallTimeoutError, CocoroError
@@ -52,7 +51,7 @@ async def run(choice: RobotChoice, request: TaskRequest, as_json: bool, picture:
         with on_interrupt(follower.interrupt), going_on():
             code, result = await follower.run()
     if as_json:
-        print(json.dumps(result))
+        print_json(result)
     return code
 
 

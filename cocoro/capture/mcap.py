@@ -220,8 +220,7 @@ class ChunkHead:
 
 
 def unpack(name: str, packed: bytes | memoryview, raw_bytes: int) -> bytes | memoryview:
-    """Returns the uncompressed bytes of a chunk. Raises DamageError when they cannot be unpacked, or are not
-    `raw_bytes` many."""
+    """The uncompressed bytes of a chunk. Raises DamageError when they cannot be unpacked, or are not `raw_bytes`."""
     if raw_bytes > LARGEST_CHUNK:
         raise DamageError(f"a chunk claims to have {raw_bytes} bytes")
     try:
