@@ -15,7 +15,7 @@ from typing import Annotated, Any, NamedTuple, TextIO
 
 import typer
 
-from apps.cli import exits
+from apps.cli import completions, exits
 from apps.cli.interrupt import elapsed, interrupt_event
 from apps.cli.options import JsonOption, RobotOption
 from apps.cli.output import print_json
@@ -164,11 +164,18 @@ app = typer.Typer()
 
 @app.command()
 def logs(
-    service: Annotated[str | None, typer.Argument(help="A process or a service; all by default.")] = None,
+    service: Annotated[
+        str | None, typer.Argument(help="A process or a service; all by default.", autocompletion=completions.services)
+    ] = None,
     follow: Annotated[bool, typer.Option("--follow", "-f", help="Print new entries, too, until Ctrl-C.")] = False,
     lines: Annotated[int, typer.Option("--lines", "-n", min=0, help="Number of newest entries to begin with.")] = 100,
     level: Annotated[
-        str | None, typer.Option(metavar="LEVEL", help="Only this level and above: debug, info, warning, error.")
+        str | None,
+        typer.Option(
+            metavar="LEVEL",
+            autocompletion=completions.of(*LEVELS),
+            help="Only this level and above: debug, info, warning, error.",
+        ),
     ] = None,
     robot: RobotOption = None,
     json: JsonOption = False,

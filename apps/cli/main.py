@@ -61,14 +61,14 @@ def _run(arguments: list[str]) -> int:
 
 
 def _command(arguments: list[str]) -> int:
-    from typer.main import get_group
+    from typer.main import get_command
 
     from apps.cli.app import app
 
     if output.taken_over():
         output.log_to_stderr()
     try:
-        get_group(app)(args=arguments, prog_name="cocoro")  # calling `app` would replace sys.excepthook
+        get_command(app)(args=arguments, prog_name="cocoro")  # calling `app` would replace sys.excepthook
     except SystemExit as end:
         if _interrupted(end):  # typer has another exit code for it
             return _cancelled()
