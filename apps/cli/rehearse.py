@@ -12,7 +12,7 @@ import msgspec
 
 from apps.cli import exits
 from apps.cli.options import frames_of, latencies_of
-from apps.cli.output import print_json
+from apps.cli.output import complain, print_json
 from apps.cli.running import scene_of
 from apps.cli.tasks import USAGE_REFUSALS
 from apps.rehearsal.request import RehearsalRequest
@@ -34,7 +34,7 @@ def rehearse(options: dict[str, Any], latency: list[str], frames: str | None, as
         refusal = getattr(error, "code", None)  # the executive refused the task
         if refusal is None:
             raise
-        print(f"cocoro: refused: {error}", file=sys.stderr)
+        complain(f"refused: {error}")
         return exits.USAGE if refusal in USAGE_REFUSALS else exits.REFUSED
     if as_json:
         print_json(result)
