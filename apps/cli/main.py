@@ -90,6 +90,12 @@ def failed(error: BaseException) -> int:
     if hiding:
         output.complain(hiding)
         return exits.USAGE
+    if isinstance(error, ModuleNotFoundError):
+        from deploy.extras import advice_of
+
+        if sentence := advice_of(error):
+            output.complain(sentence)
+            return exits.USAGE
     _report_bug(error)
     return exits.FAILED
 
