@@ -35,8 +35,10 @@ def load(name: str) -> TyperCommand | TyperGroup:
             from apps.cli.record import app
         case "replay":
             from apps.cli.replay import app
-        case "export" | "view":
+        case "export":
             from apps.cli.export import app
+        case "view":
+            from apps.cli.view import app
         case "top":
             from apps.cli.top import app
         case "echo":
