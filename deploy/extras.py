@@ -8,10 +8,13 @@ from collections.abc import Iterable, Iterator
 from importlib import metadata
 
 from cocoro.component import Component
+from cocoro.errors import ConfigError
 
 PROJECT = "cocoro-mesh"
 EXTRAS = ("operator", "robot", "sim", "view", "tables", "foxglove", "experiments", "dev")
 """The extras, from the smallest on; of several that have a library the first is advised."""
+NEEDED = {"rehearse": "sim", "experiment": "sim"}
+"""The extra that a command needs as a whole, so that the first missing library does not lead to the next one."""
 MODULES = {
     "dynamixel-sdk": "dynamixel_sdk",
     "eclipse-zenoh": "zenoh",
@@ -30,32 +33,47 @@ def missing(components: Iterable[Component]) -> Iterator[str]:
             yield library
 
 
-def advice(library: str) -> str:
-    """How to install a distribution: `pip install 'cocoro-mesh[sim]'`, or by its own name when no extra has it."""
-    found = [extra for extra in EXTRAS if library in _libraries_of(extra)]
-    return f"pip install '{PROJECT}[{found[0]}]'" if found else f"pip install {library}"
+def require(what: str, components: Iterable[Component]) -> None:
+    """Raises ConfigError when `what`, a command, needs libraries that are not installed."""
+    if lacking := list(missing(components)):
+        are = "is" if len(lacking) == 1 else "are"
+        raise ConfigError(f"`{what}` needs {' and '.join(lacking)}, which {are} not installed: {advice(*lacking)}")
 
 
-def advice_of(error: BaseException) -> str | None:
-    """The sentence about a failed import; None for another error, or a module of no library of this project."""
+def advice(*libraries: str) -> str:
+    """How to install distributions: `pip install 'cocoro-mesh[sim]'`, or by their own names when no extra has all."""
+    found = [extra for extra in EXTRAS if set(libraries) <= _libraries_of(extra)]
+    return f"pip install '{PROJECT}[{found[0]}]'" if found else f"pip install {' '.join(libraries)}"
+
+
+def advice_of(error: BaseException, command: str = "") -> str | None:
+    """The sentence about a failed import, for one who gave a command; None for another error, or a module of no library
+    of this project."""
     if not isinstance(error, ModuleNotFoundError) or not error.name:
         return None
     name = error.name.partition(".")[0]
     library = next((library for library, own in MODULES.items() if own == name), name)
     known = {library for extra in (None, *EXTRAS) for library in _libraries_of(extra)}
-    return f"this needs {library}, which is not installed: {advice(library)}" if library in known else None
+    if library not in known:
+        return None
+    extra = NEEDED.get(command)
+    how = f"pip install '{PROJECT}[{extra}]'" if extra and library in _libraries_of(extra) else advice(library)
+    return f"this needs {library}, which is not installed: {how}"
 
 
 def _libraries_of(extra: str | None) -> set[str]:
-    """The distributions that an extra names, or with None the project itself."""
+    """The distributions that an extra brings, or with None the project itself."""
     try:
         lines = metadata.requires(PROJECT) or []
     except metadata.PackageNotFoundError:
         return set()
-    found = set()
+    found: set[str] = set()
     for line in lines:
         name, _, marker = line.partition(";")
         of = re.search(r"extra == ['\"]([\w-]+)['\"]", marker)
-        if (of[1] if of else None) == extra:
-            found.add(re.split(r"[\s<>=!~\[(]", name.strip(), maxsplit=1)[0])
-    return found - {PROJECT}
+        if (of[1] if of else None) != extra:
+            continue
+        library = re.split(r"[\s<>=!~\[(]", name.strip(), maxsplit=1)[0]
+        inner = re.search(r"\[([\w-]+)\]", name)
+        found |= {library} if library != PROJECT else _libraries_of(inner[1]) if inner else set()
+    return found

@@ -15,7 +15,8 @@ import shutil
 import sys
 import time
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from importlib import metadata
 from pathlib import Path
 
@@ -79,11 +80,10 @@ class Progress:
             sys.stdout.flush()
 
 
-def follow() -> None:
-    """Reads pip's output from standard input until its end."""
-    progress = Progress()
+def follow(output: Iterable[str], progress: Progress) -> None:
+    """Shows the progress that pip's lines tell, and their errors."""
     fetched = 0
-    for line in lines(progress):
+    for line in output:
         if found := FETCHED.match(line):
             fetched += 1
             progress.show(f"package {fetched}: {found[1]} {found[2] or ''}".rstrip())
@@ -114,11 +114,10 @@ def sizes() -> dict[str, int]:
     """Bytes on disk of each installed distribution, largest first."""
     found: dict[str, int] = defaultdict(int)
     for distribution in metadata.distributions():
+        name = distribution.metadata["Name"].lower()
         for file in distribution.files or ():
-            try:
-                found[distribution.metadata["Name"].lower()] += Path(str(distribution.locate_file(file))).stat().st_size
-            except OSError:
-                continue
+            with suppress(OSError):
+                found[name] += Path(str(distribution.locate_file(file))).stat().st_size
     return dict(sorted(found.items(), key=lambda each: -each[1]))
 
 
@@ -131,4 +130,8 @@ def print_sizes() -> None:
 
 
 if __name__ == "__main__":
-    print_sizes() if sys.argv[1:] == ["sizes"] else follow()
+    if sys.argv[1:] == ["sizes"]:
+        print_sizes()
+    else:
+        shown = Progress()
+        follow(lines(shown), shown)

@@ -89,7 +89,7 @@ def examine(profile: Profile) -> Iterator[Check]:
         running = [service for service in row.services if service in claims]
         if running:
             yield note(row.name, f"runs (pid {claims[running[0]].pid}): `cocoro status` shows its state")
-        else:
+        elif not any(extras.missing([row])):  # its checks need them
             yield from _own_checks(row, profile, robot)
     yield _clock(profile)
     yield _shared_memory(profile, claims)

@@ -76,8 +76,7 @@ def up(
         settings.insert(0, objects_of(objects))
     settings[:0] = model_of(model, reach, adapt)
     read = profiles.read(profile, settings)
-    for library in extras.missing(read.rows()):
-        raise ConfigError(f"`cocoro up {profile}` needs {library}, which is not installed: {extras.advice(library)}")
+    extras.require(f"cocoro up {profile}", read.rows())
     sys.exit(supervise_detached(read, unattended) if detach else supervise(read, unattended))
 
 
