@@ -44,7 +44,7 @@ def main(arguments: list[str] | None = None) -> int:
         code = _run(arguments)
     except BaseException as error:
         output.told = False  # the error is printed after the results of before
-        code = failed(error)
+        code = failed(error, arguments[0] if arguments else "")
     if code != exits.DONE and not output.told and output.asks_json(arguments):
         said = "; ".join(text.removeprefix("cocoro: ") for text in output.recent_complaints)
         output.print_json_error(code, said or ("cancelled" if code == exits.REFUSED else "no result"))
@@ -79,8 +79,9 @@ def _command(arguments: list[str]) -> int:
     return exits.DONE
 
 
-def failed(error: BaseException) -> int:
-    """Reports the error that ended a command in at most one line, and returns the exit code for it."""
+def failed(error: BaseException, command: str = "") -> int:
+    """Reports the error that ended a command in at most one line, and returns the exit code for it. `command` is the
+    command's name."""
     from cocoro.errors import CocoroError
 
     while isinstance(error, BaseExceptionGroup) and len(error.exceptions) == 1:  # a TaskGroup wraps errors
@@ -103,6 +104,12 @@ def failed(error: BaseException) -> int:
     if hiding:
         output.complain(hiding)
         return exits.USAGE
+    if isinstance(error, ModuleNotFoundError):
+        from deploy.extras import advice_of
+
+        if sentence := advice_of(error, command):
+            output.complain(sentence)
+            return exits.USAGE
     _report_bug(error)
     return exits.FAILED
 
