@@ -105,9 +105,11 @@ class CommandGroup(TyperGroup):
 
     def _list_tasks(self, args: list[str]) -> None:
         """Makes typer suggest tasks, too, for a mistyped command; it looks into `commands` alone."""
+        if not args or args[0] in self.commands:
+            return
         from apps.cli.task_commands import task_command, task_names
 
-        if args and args[0] not in self.commands and task_command(args[0]) is None:
+        if task_command(args[0]) is None:
             for name in task_names():
                 self.add_command(TyperCommand(name))
 
