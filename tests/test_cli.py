@@ -222,7 +222,7 @@ def simulator(monkeypatch: pytest.MonkeyPatch) -> list[RehearsalRequest]:
     """Stands in for the simulator; the requests that it got. It prints, as libraries do."""
     asked: list[RehearsalRequest] = []
 
-    def run(request: RehearsalRequest) -> dict[str, Any]:
+    def run(request: RehearsalRequest, _tell: object) -> dict[str, Any]:
         asked.append(request)
         print("pybullet build time: today", flush=True)
         return RESULT | {"outcome": "failed" if request.task.label == "blue_can" else "done"}
