@@ -32,7 +32,7 @@ from mcap.records import Attachment, AttachmentIndex, Channel, Schema, Statistic
 from apps.captures.contents import Contents, Disk, MessageBlock, miscounted, read_block
 from apps.captures.scan import contents, front_to_back
 from cocoro.capture import mcap
-from cocoro.capture.conventions import CHECKSUM, TALLY, CaptureError, NotAFileError, checksum
+from cocoro.capture.conventions import CHECKSUM, LEFT_OUT, TALLY, CaptureError, NotAFileError, checksum
 from cocoro.capture.mcap import DamageError
 from cocoro.capture.types import JSON, MSGPACK, NotReadableError, reader_of
 from cocoro.keys import matches
@@ -143,6 +143,17 @@ class Capture:
             return []
         names = ", ".join(f"{op:#04x}" for op in sorted(kinds))
         return [f"{kinds.total()} records of kinds that are not MCAP's own ({names}) are skipped"]
+
+    @cached_property
+    def left_out(self) -> tuple[tuple[int, int], ...]:
+        """Log times between which large messages were left out by intention, since nothing happened; the end is
+        exclusive."""
+        try:
+            stated = msgspec.json.decode(self.metadata[LEFT_OUT]["stretches"], type=list[tuple[int, int | None]])
+        except (KeyError, msgspec.MsgspecError):
+            return ()
+        here = [(start, self.end_ns if end is None else end) for start, end in stated]
+        return tuple((start, end) for start, end in here if end > self.start_ns and start < self.end_ns)
 
     @property
     def places(self) -> tuple[MessageBlock, ...]:
