@@ -33,7 +33,7 @@ class Verdict(msgspec.Struct, frozen=True, kw_only=True):
     and nothing else."""
     knocked_over: tuple[str, ...]
     """Objects that tilted by more than 30 degrees (balls excepted) or moved by more than 5 cm; the target counts only
-    until both claws first touched it, and objects that move by themselves never count."""
+    until both claws first touched it, and objects that move by themselves or are held at the start never count."""
     collisions: tuple[str, ...]
     """Unwanted contacts of the robot ('elbow~green_can'), each once, in order of appearance."""
     target_moved_m: float
@@ -60,6 +60,7 @@ class Judge:
         self._now_ns = 0
         self._held_since_ns: int | None = None
         self._grasped = False
+        self._carried: set[str] = set()
         self._moved_m = 0.0
         self._knocked: dict[str, None] = {}
         self._collisions: dict[str, None] = {}
@@ -109,7 +110,9 @@ class Judge:
             self._feed_target(item, known, fresh=first is item.position_m)
             if not self._grasped:
                 self._moved_m = max(self._moved_m, moved_m)
-        if known.kinematic or (is_target and self._grasped):
+        if first is item.position_m and set(item.touching) >= CLAWS:
+            self._carried.add(item.label)
+        if known.kinematic or item.label in self._carried or (is_target and self._grasped):
             return
         if moved_m > MOVED_M or (known.shape != "sphere" and _tilt_deg(item) > TILTED_DEG):
             self._knocked[item.label] = None

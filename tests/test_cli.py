@@ -23,7 +23,7 @@ from apps.rehearsal.request import RehearsalRequest
 from cocoro.errors import CocoroError, ConfigError
 from cocoro.topics import TOPICS
 from deploy.processes import stoppable
-from services.executive.tasks import TASKS, FetchTask
+from services.executive.tasks import TASKS, FetchTask, FollowTask, PutDownTask
 
 COMMANDS = (
     "up", "down", "status", "fetch", "follow", "park", "put-down", "estop", "reset", "cancel", "objects", "snapshot",
@@ -244,6 +244,20 @@ def test_every_option_of_rehearse_reaches_the_request(simulator: list[RehearsalR
             width=320, height=240, frame_rate_hz=15.0, timeout_s=60.0,
         )
     ]  # fmt: skip
+
+
+def test_the_world_may_run_before_and_tasks_may_follow_each_other(
+    simulator: list[RehearsalRequest], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert (
+        main(["rehearse", "fetch", "red_can", "--wait", "4", "--then", "put-down", "--then", "follow b --for 20"]) == 0
+    )
+    assert simulator[0].wait_s == 4.0
+    assert simulator[0].then == (PutDownTask(), FollowTask(label="b", for_s=20.0))
+    for wrong in ("dance", "follow", "follow b --for long", "--help", "", "put-down '"):
+        assert main(["rehearse", "fetch", "red_can", "--then", wrong]) == 2
+        assert f"--then {wrong!r}: " in capsys.readouterr().err
+    assert len(simulator) == 1
 
 
 def test_json_is_all_that_stands_on_the_output(

@@ -200,3 +200,10 @@ def test_where_the_target_ends_is_told_from_where_the_robot_began() -> None:
 def test_a_target_that_the_scene_has_not_is_refused() -> None:
     with pytest.raises(KeyError, match="red_can"):
         Judge(SCENE, "purple_can")
+
+
+def test_what_the_hand_holds_at_the_start_is_not_knocked_over_when_it_is_put_down() -> None:
+    judge = Judge(SCENE)
+    judge.feed(truth(0.0, {"red_can": (0.4, -0.1, 0.2)}, touching=BOTH))
+    judge.feed(truth(1.0, {"red_can": (0.5, -0.1, 0.06)}))
+    assert judge.result().knocked_over == ()

@@ -96,9 +96,11 @@ def test_what_cannot_be_asked_is_refused() -> None:
         rehearse(small(latency={"planing": 0.1}))
 
 
-def test_parking_needs_nothing_to_be_seen() -> None:
-    result = rehearse(small(task="park", label=""))
+def test_parking_needs_nothing_to_be_seen_and_tasks_come_one_after_the_other() -> None:
+    result = rehearse(small(task="park", label="", scene="follow", wait_s=3.0, then=({"task": "park"},), trace=True))
     assert (result["outcome"], result["truth"]["collisions"]) == ("done", ())
+    assert [(step["task"], step["outcome"]) for step in result["tasks"]] == [("park", "done")] * 2
+    assert result["trace"]["time_s"][-1] > 2.9, "the world ran for 3 s before"
 
 
 def test_a_rehearsal_is_of_the_robot_that_is_described(tmp_path: Path) -> None:

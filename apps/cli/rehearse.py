@@ -75,10 +75,19 @@ def summary(result: dict[str, Any]) -> str:
     lines.append(f"  took {result['wall_s']:.1f} s, {speed:.1f} times real time")
     if result.get("model"):
         lines.append(f"  reached with: {result['model']}")
-    truth = result["truth"]
     lines.append("in truth")
-    lines += [f"  {name.replace('_', ' '):<18} {_value(value)}" for name, value in truth.items()]
-    return "\n".join(lines)
+    lines += [f"  {name.replace('_', ' '):<18} {_value(value)}" for name, value in result["truth"].items()]
+    earlier = result.get("tasks", [])[:-1]
+    return "\n".join([*map(_in_short, earlier), *lines])
+
+
+def _in_short(step: dict[str, Any]) -> str:
+    """One line on a task before the last one."""
+    name = f"{step['task']} {step['label']}".strip()
+    touched = [*step["truth"].get("collisions", ()), *step["truth"].get("knocked_over", ())]
+    return f"{step['outcome']}: {name} in {step['sim_s']:.1f} s" + (
+        f"; touched {', '.join(touched)}" if touched else ""
+    )
 
 
 def _value(value: object) -> str:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import inspect
+import shlex
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -35,7 +36,7 @@ from apps.cli.options import (
     RobotOption,
     TimeoutOption,
 )
-from cocoro.errors import ConfigError
+from cocoro.errors import CocoroError, ConfigError
 from cocoro.tasks import Task
 from services.executive.tasks import TASKS
 
@@ -55,6 +56,10 @@ Shared = Callable[..., None]
 def operate(
     task: Task,
     timeout: TimeoutOption = None,
+    detach: Annotated[
+        bool,
+        typer.Option("--detach", "-d", help="Print the task's id and end; the task goes on. See `wait`, `cancel`."),
+    ] = False,
     snapshot: Annotated[
         Path | None, typer.Option(metavar="OUT.png", help="Write what the robot sees when it grasps.")
     ] = None,
@@ -62,12 +67,16 @@ def operate(
     profile: MeshOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Ctrl-C cancels it on the robot."""
-    from apps.cli import tasks
+    """Ctrl-C cancels it on the robot, and so does every other end of the command: a closed terminal, a kill."""
+    from apps.cli import task_running
     from cocoro.messages import TaskRequest
 
-    request = TaskRequest(task=task, timeout_s=timeout)
-    sys.exit(asyncio.run(tasks.run(RobotChoice(robot, profile), request, json, snapshot)))
+    choice, request = RobotChoice(robot, profile), TaskRequest(task=task, timeout_s=timeout)
+    if not detach:
+        sys.exit(asyncio.run(task_running.run(choice, request, json, snapshot)))
+    if snapshot is not None:
+        raise ConfigError("--snapshot takes its picture when the robot grasps: leave --detach out")
+    sys.exit(asyncio.run(task_running.detach(choice, request, json)))
 
 
 def rehearse(
@@ -94,6 +103,15 @@ def rehearse(
     frames: FramesOption = None,
     objects: ObjectsOption = None,
     timeout: TimeoutOption = None,
+    wait: Annotated[
+        float, typer.Option(min=0.0, max=3600.0, metavar="SECONDS", help="Let the world run before the task is asked.")
+    ] = 0.0,
+    then: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="'TASK ...'", help="Then another task, as its command is written: 'put-down'. Repeatable."
+        ),
+    ] = None,
     picture: Annotated[
         Path | None, typer.Option(metavar="OUT.png", help="Write what the robot saw when it grasped.")
     ] = None,
@@ -107,6 +125,7 @@ def rehearse(
         "task": task, "scene": scene, "seed": seed, "sensors": sensors, "body": body, "model": _text(model),
         "reach": reach or "learned", "adapt": adapt, "bend_s": bend, "samples": _text(samples), "lockstep": lockstep,
         "description": _text(description), "measured": _text(measured),
+        "wait_s": wait, "then": [task_of(words, "--then") for words in then or []],
         "objects": _text(objects), "timeout_s": timeout, "picture": _text(picture), "record": _text(record),
     }  # fmt: skip
     sys.exit(rehearsing.rehearse(options, latency or [], frames, json))
@@ -139,6 +158,30 @@ def _is_known(name: str) -> bool:
     return name in TASKS.own or name in TASKS.all()
 
 
+def task_of(words: str, option: str) -> Task:
+    """The task that a command line's words ask for: 'follow blue_ball --for 20'. Raises ConfigError, which names the
+    option that the words are of."""
+    read: list[Task] = []
+
+    def keep(task: Task) -> None:
+        """Keep it."""
+        read.append(task)
+
+    try:
+        name, *rest = shlex.split(words) or [""]
+        if not _is_known(name):
+            raise ConfigError(f"no such task: {name!r}; known are {', '.join(TASKS.all())}")
+        _command(name, keep).main(rest, prog_name=name, standalone_mode=False)
+    except Exception as error:
+        usage = getattr(error, "format_message", None)  # an error of typer's, whose types are its own affair
+        if usage is None and not isinstance(error, ValueError | CocoroError):
+            raise
+        raise ConfigError(f"{option} {words!r}: {usage() if usage is not None else error}") from error
+    if not read:
+        raise ConfigError(f"{option} {words!r}: give a task with its arguments")
+    return read[0]
+
+
 class RehearsalGroup(TyperGroup):
     """A command for each task."""
 
@@ -160,12 +203,27 @@ app.add_typer(
 )
 
 
-@app.command()
-def cancel(robot: RobotOption = None, profile: MeshOption = None) -> None:
-    """End the running task; the robot stands still."""
-    from apps.cli import tasks
+TaskIdArgument = Annotated[
+    str, typer.Argument(metavar="[ID]", help="The task's id, as `--detach` prints it; by default the running task.")
+]
 
-    sys.exit(asyncio.run(tasks.cancel(RobotChoice(robot, profile))))
+
+@app.command()
+def cancel(task: TaskIdArgument = "", robot: RobotOption = None, profile: MeshOption = None) -> None:
+    """End the running task; the robot stands still."""
+    from apps.cli import task_running
+
+    sys.exit(asyncio.run(task_running.cancel(RobotChoice(robot, profile), task)))
+
+
+@app.command()
+def wait(
+    task: TaskIdArgument = "", robot: RobotOption = None, profile: MeshOption = None, json: JsonOption = False
+) -> None:
+    """Follow a task to its end, and exit as its own command would have. Ctrl-C ends the waiting, not the task."""
+    from apps.cli import task_running
+
+    sys.exit(asyncio.run(task_running.wait(RobotChoice(robot, profile), task, json)))
 
 
 def _command(name: str, shared: Shared) -> TyperCommand:

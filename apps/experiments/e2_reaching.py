@@ -35,8 +35,9 @@ def runs(settings: ExperimentSettings) -> list[ExperimentRun]:
                 order = TARGETS * ROUNDS
                 found.append(
                     plan.with_model(
-                        settings, seed, _name(scene, way, seed), task=TouchTask(label=order[0]), then=list(order[1:]),
-                        scene=scene, trace=seed == settings.seeds[0], **fields,
+                        settings, seed, _name(scene, way, seed), task=TouchTask(label=order[0]),
+                        then=[TouchTask(label=label) for label in order[1:]], scene=scene,
+                        trace=seed == settings.seeds[0], **fields,
                     )
                 )  # fmt: skip
     return found

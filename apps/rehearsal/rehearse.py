@@ -26,7 +26,7 @@ from cocoro.clock import NS, VirtualClock
 from cocoro.component import load
 from cocoro.errors import CocoroError, ConfigError
 from cocoro.inbox import Stream
-from cocoro.messages import Detections, Frame, Recording, TaskReply, TaskRequest, TaskState
+from cocoro.messages import Detections, Frame, Recording, TaskReply, TaskRequest, TaskState, Truth
 from cocoro.node import Node
 from cocoro.objects import Catalogue
 from cocoro.robot import Robot
@@ -46,14 +46,12 @@ START_S = 5.0
 
 
 def rehearse(request: RehearsalRequest) -> dict[str, Any]:
-    """Run one task and return its result, as `--json` prints it. Raises TaskRefusedError when the robot refuses the
-    task, ConfigError for a wrong scene or service name."""
+    """Run the tasks and return the result of the last one, as `--json` prints it, with that of each in `tasks`. Raises
+    TaskRefusedError when the robot refuses one, ConfigError for a wrong scene or service name."""
     started = time.perf_counter()
     unknown = sorted(set(request.latency) - set(PROCESSES))
     if unknown:
         raise ConfigError(f"--latency {unknown[0]}: no such service; known are {', '.join(PROCESSES)}")
-    if request.then and not hasattr(request.task, "label"):
-        raise ConfigError(f"then: {request.task.name} has no label that could change")
     if request.record is not None and Path(request.record).exists():
         raise ConfigError(f"--record {request.record}: there is such a file already")
     result = run_virtual(_Rehearsal(request).run())
@@ -74,15 +72,11 @@ class _Rehearsal:
         self._request = request
         self._robot = Robot.load(*(Path(file) if file else None for file in (request.description, request.measured)))
         self._task: Task = request.task
-        label = self._task.target
-        scene = find_scene(request.scene, request.seed, label)
-        present = label if label in [item.label for item in scene.objects] else ""
-        self._judge: Judge | PursuitJudge = (
-            PursuitJudge(self._robot, scene, present) if self._task.pursuit_phase and present else Judge(scene, present)
-        )
-        self._scene = scene
+        """The task that runs now."""
+        self._scene = find_scene(request.scene, request.seed, self._task.target, request.objects or "")
+        self._judge = self._judge_of(self._task)
         self._body = body_of(self._robot, request.body, request.seed).robot
-        self._trace = Trace(self._body, present)
+        self._trace = Trace(self._body, self._present(self._task))
         self._steps: list[dict[str, Any]] = []
         """Results of the tasks that have ended, in order."""
         self._frame: Frame | None = None
@@ -114,12 +108,12 @@ class _Rehearsal:
                 await stack.enter_async_context(node)
                 services.append(asyncio.ensure_future(component.run(node, config)))
             operator = await stack.enter_async_context(Node("operator", mesh.join(), clock, robot))
-            operator.on(topics.TRUTH, self._judge.feed)
+            operator.on(topics.TRUTH, self._feed_judge)
             operator.on(topics.TRUTH, self._trace.feed)
             operator.on(topics.PLAN, self._trace.status)
             operator.on(topics.TASK, self._trace.state)
             operator.on(topics.RECORDING.of(RECORDER), self._keep_recording)
-            samples = self._task.samples
+            samples = request.task.samples
             if request.samples is not None and samples is not None:
                 self._collector = collector(samples, Path(request.samples), robot, self._standing_height_m())
                 stack.enter_context(self._collector)
@@ -139,6 +133,19 @@ class _Rehearsal:
             raise CocoroError(self._recording.fault)
         return self._result(state)
 
+    def _present(self, task: Task) -> str:
+        """The task's target, or '' where the scene has no such object."""
+        return task.target if task.target in [item.label for item in self._scene.objects] else ""
+
+    def _judge_of(self, task: Task) -> Judge | PursuitJudge:
+        present = self._present(task)
+        if task.pursuit_phase and present:
+            return PursuitJudge(self._robot, self._scene, present)
+        return Judge(self._scene, present)
+
+    def _feed_judge(self, truth: Truth) -> None:
+        self._judge.feed(truth)
+
     def _settings(self, name: str) -> dict[str, Any]:
         request = self._request
         if name == RECORDER:
@@ -149,7 +156,7 @@ class _Rehearsal:
                 field: getattr(request, field)
                 for field in ("scene", "seed", "sensors", "body", "width", "height", "frame_rate_hz")
             }
-            world |= {"target": self._task.target, "bend_at_s": request.bend_s}
+            world |= {"target": request.task.target, "bend_at_s": request.bend_s}
             return world | held
         if name == "planning":
             return {
@@ -159,23 +166,26 @@ class _Rehearsal:
         return dict(held)
 
     async def _operate(self, operator: Node) -> TaskState:
-        """Request the task and follow it to its end, then again with each further label."""
+        """Let the world run, then request each task and follow it to its end."""
         request = self._request
         states = operator.stream(topics.TASK)
         if request.picture is not None:
             operator.on(topics.FRAME, self._keep_frame)
             operator.on(topics.DETECTIONS, self._keep_seen)
-        if self._collector is not None and self._task.samples is not None:
-            operator.on(self._task.samples, self._collector.take)
-        for label in (self._task.target, *request.then):
-            changes: dict[str, Any] = {"label": label} if label != self._task.target else {}
-            if self._collector is not None:
-                left = request.task.count - len(self._collector)
-                changes |= {"first": self._collector.next, "count": max(left, 1)}
-            question = TaskRequest(task=replace(self._task, **changes), timeout_s=request.timeout_s)
-            self._trace.begin(label)
+        if self._collector is not None and request.task.samples is not None:
+            operator.on(request.task.samples, self._collector.take)
+        if request.wait_s:
+            await operator.sleep(request.wait_s)
+        for task in (request.task, *request.then):
+            self._task, self._judge = task, self._judge_of(task)
+            if self._collector is not None and task is request.task:
+                left = task.count - len(self._collector)
+                task = replace(task, first=self._collector.next, count=max(left, 1))
+            question = TaskRequest(task=task, timeout_s=request.timeout_s)
+            self._trace.begin(self._present(task))
+            asked_ns = operator.now_ns()
             reply = await self._ask(operator, question)
-            while reply.refusal in ("not_alive", "estop") and operator.now_ns() < START_S * NS:
+            while reply.refusal in ("not_alive", "estop") and operator.now_ns() - asked_ns < START_S * NS:
                 await operator.sleep(0.1)
                 reply = await self._ask(operator, question)
             if not reply.accepted:
@@ -207,6 +217,7 @@ class _Rehearsal:
         edge_m = self._trace.edge_m(known.half_width_m) if known is not None else None
         self._steps.append(
             {
+                "task": state.task,
                 "label": state.label,
                 "outcome": state.outcome,
                 "reason": state.reason,
@@ -214,6 +225,7 @@ class _Rehearsal:
                 "hand_to_target": self._trace.hand_gap(),
                 "target_edge_m": edge_m,
                 "longest_stall_s": round(self._trace.longest_stall_s(), 3),
+                "truth": msgspec.to_builtins(self._judge.result()),
             }
         )
 

@@ -16,8 +16,10 @@ class RehearsalRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
 
     task: Any
     """A `cocoro.tasks.Task`, or the map that it travels as."""
-    then: tuple[str, ...] = ()
-    """Labels with which the same task is done again, one after the other. The first task that fails is the last."""
+    wait_s: Annotated[float, Meta(ge=0, le=3600)] = 0.0
+    """Time that the world runs before the first task is asked for, simulated seconds."""
+    then: tuple[Any, ...] = ()
+    """Further tasks, as `task`, one after the other. The first task that fails is the last."""
     samples: str | None = None
     """File that the reported samples are appended to. The task continues after the last sample in it."""
     scene: str = "paper"
@@ -60,3 +62,4 @@ class RehearsalRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
 
     def __post_init__(self) -> None:
         msgspec.structs.force_setattr(self, "task", TASKS.read(self.task))
+        msgspec.structs.force_setattr(self, "then", tuple(TASKS.read(task) for task in self.then))
