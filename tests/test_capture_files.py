@@ -20,10 +20,10 @@ from message_samples import data_of
 
 from apps.captures.compare import changes, known_to
 from apps.captures.info import report
+from apps.captures.mcap_reading import unpack
 from apps.captures.reader import Capture
 from apps.captures.rewrite import rewrite
 from cocoro.capture.conventions import CaptureError
-from cocoro.capture.mcap import unpack
 from cocoro.capture.types import Alive, LossyFrame, NotReadableError, schema_of
 from cocoro.errors import ConfigError
 from cocoro.messages import BaseState, Detections, Frame, Message, PlannerStatus
