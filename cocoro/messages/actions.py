@@ -31,15 +31,17 @@ class Park(Action, frozen=True, tag="park"):
 
 
 class Search(Action, frozen=True, tag="search"):
-    """Look all around for an object; the base stands."""
+    """Look from here for an object, at the floor that was not seen yet; the base stands."""
 
     label: str
 
 
 class Explore(Action, frozen=True, tag="explore"):
-    """Drive to a place from which hidden floor can be seen."""
+    """Drive to where floor can be seen that was not seen yet. Fails with `not_found` when there is no such place."""
 
     label: str
+    time_is_up: bool = False
+    """Fail now, and say what was not seen."""
 
 
 class Approach(Action, frozen=True, tag="approach"):

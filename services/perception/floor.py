@@ -11,6 +11,7 @@ import numpy as np
 
 from cocoro.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from cocoro.messages import Obstacles
+from cocoro.messages.perception import SHOWN_STEP_M
 from cocoro.robot import Robot
 from services.perception.config import PerceptionConfig
 from services.perception.image import RgbdImage
@@ -23,6 +24,12 @@ _MIN_POINTS = 2
 """Fewer points above the floor in a cell are noise."""
 _MOST_CELLS = 600
 _RAYS = round(360 / _RAY_DEG)
+_ROW_RAD, _CAMERA_M = 0.0125, 0.73
+"""Angle between two rows of the grid, and the camera's height."""
+_NEAR_M = 1.0
+"""Nearer, neighbouring pixels may be more than a degree apart."""
+_GAP = 2.2
+"""Floor is shown without a gap where two pixels are less than so many rows apart."""
 
 
 class FloorScanner:
@@ -65,6 +72,7 @@ class FloorScanner:
                 for (x, y), z in zip(cells.tolist(), heights.tolist(), strict=True)
             ),
             free=_free(ray, distance, floor, standing),
+            shown=_shown(bearing, distance, floor),
             origin_m=(float(origin[0]), float(origin[1])),
         )
 
@@ -109,3 +117,32 @@ def _free(
     rays = np.flatnonzero(farthest > nearest)
     found = zip(bearings[rays].tolist(), nearest[rays].tolist(), farthest[rays].tolist(), strict=True)
     return tuple((round(bearing, 4), round(near, 3), round(far, 3)) for bearing, near, far in found)
+
+
+def _shown(bearing_rad: FloatArray, distance_m: FloatArray, floor: BoolArray) -> bytes:
+    """`Obstacles.shown` by the points' bearings and distances (n,) from the camera."""
+    runs = []
+    for part, width_deg in ((distance_m < _NEAR_M, 2), (distance_m >= _NEAR_M, 1)):
+        degree = np.floor(np.degrees(bearing_rad[part]) / width_deg).astype(np.int64) * width_deg % 360
+        order = np.lexsort((distance_m[part], degree))
+        degree, away, flat = degree[order], distance_m[part][order], floor[part][order]
+        if not flat.any():
+            continue
+        begins = np.ones(len(degree), dtype=bool)
+        rows_m = _GAP * _ROW_RAD * (away[1:] ** 2 / _CAMERA_M + _CAMERA_M)
+        begins[1:] = (degree[1:] != degree[:-1]) | ~flat[:-1] | (np.diff(away) > rows_m)
+        begins &= flat
+        ends = np.append(begins[1:] | ~flat[1:], True) & flat
+        first, last = np.flatnonzero(begins), np.flatnonzero(ends)
+        long = last > first
+        first, last = first[long], last[long]
+        runs.extend(np.stack([degree[first] + more, away[first], away[last]], axis=1) for more in range(width_deg))
+    if not runs:
+        return b""
+    found = np.concatenate(runs)
+    packed = np.zeros(len(found), dtype=[("degree", "<u2"), ("near", "u1"), ("far", "u1")])
+    packed["degree"] = found[:, 0] % 360
+    packed["near"] = np.minimum(np.ceil(found[:, 1] / SHOWN_STEP_M), 255)
+    packed["far"] = np.minimum(found[:, 2] / SHOWN_STEP_M, 255)
+    data: bytes = packed.tobytes()
+    return data

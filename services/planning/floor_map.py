@@ -93,7 +93,7 @@ class FloorMap:
             return
         shift = at - SIZE // 2
         evidence, looked = np.zeros_like(self._evidence), np.zeros_like(self._looked)
-        to, source = _overlap(-shift)
+        to, source = overlap(-shift)
         evidence[to] = self._evidence[source]
         looked[to] = self._looked[source]
         self._evidence, self._looked = evidence, looked
@@ -104,6 +104,11 @@ class FloorMap:
     def _index(self, points_m: FloatArray) -> IntArray:
         index: IntArray = np.floor(np.asarray(points_m)[:, :2] / CELL_M).astype(np.int64) - self._corner
         return index
+
+    @property
+    def corner(self) -> IntArray:
+        """Index of the map's first cell, (2,), counted in cells from the odometry frame's origin."""
+        return self._corner
 
     def centre(self, row: int, column: int) -> tuple[float, float]:
         """A cell's centre (x, y), odometry frame, metres."""
@@ -169,7 +174,7 @@ def _inside(points: FloatArray, centres: FloatArray, radii: FloatArray) -> BoolA
     return inside
 
 
-def _overlap(shift: IntArray) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
+def overlap(shift: IntArray) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
     """Destination and source slices for an array that moves by `shift` (2,) cells."""
     to, source = [], []
     for step in shift:

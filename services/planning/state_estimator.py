@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Mapping
 from itertools import compress
-from math import cos, sin
+from math import cos, hypot, inf, sin
 from typing import Any, NamedTuple
 
 import msgspec
@@ -21,11 +21,13 @@ from cocoro.robot import Robot
 from cocoro.topics import Topic
 from cocoro.units import Vec3
 from services.planning.config import PlanningConfig
-from services.planning.head import CameraTilt
+from services.planning.head import PAN, TILT, CameraTilt
 from services.planning.memory import TargetMemory
 from services.planning.surroundings import Surroundings
 
 _WAIT_FOR_ODOMETRY_NS = NS // 5
+_GLIMPSE_NS = NS // 20
+"""Time over which the camera's turn is measured."""
 FLOOR_M, FLOOR_PER_M = 0.040, 0.012
 """Height below which a point counts as floor for a tilted camera, and its growth per metre of distance: more than
 perception's limit, because a tilted camera is likely to be rolled a little, too."""
@@ -129,7 +131,7 @@ class StateEstimator:
         self._odometry = History(3, angular=(2,))
         self._postures: dict[str, tuple[tuple[str, ...], History]] = {}
         self._gap_ns = round(config.odometry_gap_s * NS)
-        self.around = Surroundings(config.marker)
+        self.around = Surroundings(config.marker, config.search, robot)
         self._waiting: deque[Detections] = deque(maxlen=8)
         self._floors: deque[Obstacles] = deque(maxlen=4)
         self.sight_lag_s = 0.0
@@ -212,6 +214,17 @@ class StateEstimator:
             if pose is not None and now_ns - seen.stamp_ns <= topics.OBSTACLES.max_age_s * NS:
                 seen = self._standing(seen)
                 self.around.floor.enter(seen, Pose2(*pose.tolist()), own(self.posture(seen.stamp_ns)))
+                self.around.seen.enter(seen, Pose2(*pose.tolist()), self._turning_radps(seen.stamp_ns))
+
+    def _turning_radps(self, stamp_ns: int) -> float:
+        """The rate at which the camera turned before a time; infinite where that is not known."""
+        before_ns = stamp_ns - _GLIMPSE_NS
+        angles, before = self._posture_at(stamp_ns), self._posture_at(before_ns)
+        pose, pose_before = (self._odometry.at(at_ns, self._gap_ns) for at_ns in (stamp_ns, before_ns))
+        if angles is None or before is None or pose is None or pose_before is None:
+            return inf
+        pan = angles[PAN] - before[PAN] + float(pose[2] - pose_before[2])
+        return hypot(pan, angles[TILT] - before[TILT]) * NS / _GLIMPSE_NS
 
     def _standing(self, seen: Obstacles) -> Obstacles:
         """The obstacles without points that appear above the floor only because the camera is tilted."""

@@ -11,8 +11,11 @@ from cocoro.arrays import FloatArray
 from cocoro.clock import NS
 from cocoro.frames import Pose2
 from cocoro.messages import TargetEstimate
+from cocoro.robot import Robot
+from services.planning.config import SearchConfig
 from services.planning.floor_map import ClearanceField, FloorMap
 from services.planning.routes import Routes
+from services.planning.seen_floor import SeenFloor
 
 _KEEP_NS = NS // 10
 _OBJECT_M = 0.033
@@ -31,16 +34,18 @@ class Fields(NamedTuple):
 
 
 class Surroundings:
-    def __init__(self, marker: str) -> None:
+    def __init__(self, marker: str, search: SearchConfig, robot: Robot) -> None:
         """`marker`: the label of the ball on the robot's own hand."""
         self._marker = marker
         self.floor = FloorMap()
+        self.seen = SeenFloor(search, robot)
         self._fields: Fields | None = None
         self._built: tuple[int, str] | None = None
         self._built_ns = 0
 
     def clear(self) -> None:
         self.floor.clear()
+        self.seen.clear()
         self._fields = None
 
     def fields(
@@ -68,6 +73,10 @@ class Surroundings:
             self._fields = Fields(ClearanceField(self.floor, body), ClearanceField(self.floor, arm))
             self._built, self._built_ns = what, now_ns
         return self._fields
+
+    def discs(self, known: Sequence[TargetEstimate]) -> tuple[tuple[float, float, float], ...]:
+        """The floor (x, y, radius), odometry frame, metres, that known objects stand on."""
+        return tuple((*item.odometry_position_m[:2], _OBJECT_M) for item in known if item.label != self._marker)
 
     def unseen(self, places_m: FloatArray) -> FloatArray:
         """Which places (n, 2), odometry frame, were not seen yet; shape (n,)."""
