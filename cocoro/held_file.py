@@ -10,6 +10,7 @@ import fcntl
 import os
 import random
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
 
@@ -49,6 +50,8 @@ class HeldFile:
     def release(self) -> None:
         fd, self._fd = self._fd, None
         if fd is not None:
+            with suppress(OSError):  # the next holder must not be taken for this one before it writes its name
+                os.pwrite(fd, b" " * os.fstat(fd).st_size, 0)
             os.close(fd)
 
 
@@ -99,11 +102,19 @@ def holder_of(fd: int, patience_s: float = 0.0) -> Holder | None:
             found = _DECODER.decode(os.pread(fd, _HOLDER_BYTES, 0))
         except (msgspec.MsgspecError, ValueError, RecursionError):
             found = UNKNOWN
-        if found.known or time.monotonic() >= deadline_s:
+        if (found.known and _lives(found.pid)) or time.monotonic() >= deadline_s:
             return found if found.known else UNKNOWN
-        time.sleep(0.001)  # it was taken this moment: its holder is about to write its name
+        time.sleep(0.001)  # taken this moment: the holder is about to write its name, perhaps over the last one's
     fcntl.flock(fd, fcntl.LOCK_UN)
     return None
+
+
+def _lives(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except OSError as error:
+        return not isinstance(error, ProcessLookupError)
+    return True
 
 
 def _lock(fd: int, kind: int) -> bool:

@@ -58,15 +58,8 @@ class ObjectSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 
     def __post_init__(self) -> None:
         wanted = {"cylinder": {"radius_m", "height_m"}, "sphere": {"radius_m"}, "box": {"size_m"}}[self.shape]
-        given = {
-            name
-            for name, value in (
-                ("radius_m", self.radius_m),
-                ("height_m", self.height_m),
-                ("size_m", self.box_m),
-            )
-            if value is not None
-        }
+        sizes = {"radius_m": self.radius_m, "height_m": self.height_m, "size_m": self.box_m}
+        given = {name for name, value in sizes.items() if value is not None}
         if missing := sorted(wanted - given):
             raise ValueError(f"a {self.shape} needs {' and '.join(missing)}")
         if surplus := sorted(given - wanted):

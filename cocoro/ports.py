@@ -11,7 +11,6 @@ from cocoro.bus.endpoints import default_run_dir
 from cocoro.checks import Check, bad, note, ok
 
 WIRE = "wire:"
-RULES = "deploy/udev/99-cocoro.rules"
 LATENCY_MS = 1
 """Wanted latency timer of an FTDI adapter, ms. Its default is 16 ms, and each servo's answer waits for it."""
 
@@ -39,7 +38,7 @@ def check_port(what: str, name: str, robot: str, *, quick: bool) -> list[Check]:
     if not port.exists() and name.startswith(WIRE):
         return [note(f"{what} port", f"{name} is emulated; it exists while the robot is up")]
     if not port.exists():
-        return [bad(f"{what} port", f"there is no {path}: plug the adapter in; its name comes from {RULES}")]
+        return [bad(f"{what} port", f"there is no {path}: plug the adapter in; its name comes from the udev rules")]
     if not os.access(port, os.R_OK | os.W_OK):
         return [bad(f"{what} port", f"{path} may not be used: `sudo usermod -aG dialout $USER`, then log in again")]
     checks = [ok(f"{what} port", path)]
@@ -47,7 +46,7 @@ def check_port(what: str, name: str, robot: str, *, quick: bool) -> list[Check]:
     if quick and latency_ms is not None:
         text = f"{latency_ms} ms"
         if latency_ms > LATENCY_MS:
-            text += f", should be {LATENCY_MS}: install {RULES}, then plug the adapter in again"
+            text += f", should be {LATENCY_MS}: install the udev rules, then plug the adapter in again"
         checks.append((ok if latency_ms <= LATENCY_MS else bad)(f"{what} adapter's latency", text))
     return checks
 

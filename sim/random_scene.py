@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from math import cos, hypot, pi, radians, sin
+from pathlib import Path
 
 import numpy as np
 
@@ -24,15 +25,16 @@ _BY_ROBOT_M = 0.30
 _TRIES = 2000
 
 
-def random_scene(seed: int, target: str = "") -> Scene:
+def random_scene(seed: int, target: str = "", catalogue: Catalogue | None = None) -> Scene:
     """Draw a scene: 1 to 4 known objects, 0.8 to 2.0 m away, within 120 degrees to either side and at least 0.25 m
     apart; for half of the seeds also 1 or 2 obstacles beside the lines of sight.
 
     At least one object fits into the hand. `target` is always among them: it takes the place of the first object, so
-    that the places do not depend on the target. Raises ConfigError for a target that is no known object.
+    that the places do not depend on the target. `catalogue` holds the known objects; None is the project's own. Raises
+    ConfigError for a target that is no known object.
     """
     rng = stream(seed, "random scene")
-    catalogue = Catalogue.load()
+    catalogue = Catalogue.load() if catalogue is None else catalogue
     graspable = [known for known in catalogue.targets if known.graspable]
     first = graspable[int(rng.integers(len(graspable)))]
     others = [known for known in catalogue.targets if known.label != first.label]
@@ -54,9 +56,13 @@ def random_scene(seed: int, target: str = "") -> Scene:
     return Scene(name=NAME, objects=objects, obstacles=tuple(obstacles), light=light)
 
 
-def find_scene(name_or_path: str, seed: int, target: str = "") -> Scene:
-    """The random scene for the name `random`, otherwise the scene that `load_scene` finds. Raises ConfigError."""
-    return random_scene(seed, target) if name_or_path == NAME else load_scene(name_or_path, seed)
+def find_scene(name_or_path: str, seed: int, target: str = "", objects: str = "") -> Scene:
+    """The random scene for the name `random`, otherwise the scene that `load_scene` finds. `objects` is the robot's
+    file of known objects, '' the project's own. Raises ConfigError."""
+    catalogue = Catalogue.load(Path(objects) if objects else None)
+    if name_or_path == NAME:
+        return random_scene(seed, target, catalogue)
+    return load_scene(name_or_path, seed, catalogue)
 
 
 def _places(rng: np.random.Generator, count: int) -> list[tuple[float, float]]:

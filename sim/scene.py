@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import tomllib
-from functools import cache
 from importlib import resources
 from math import cos, hypot, isfinite, pi, sin
 from pathlib import Path
@@ -32,11 +31,6 @@ _SIZES: dict[Shape, tuple[str, ...]] = {
     "cylinder": ("radius_m", "height_m"),
     "sphere": ("radius_m",),
 }
-
-
-@cache
-def _known() -> Catalogue:
-    return Catalogue.load()
 
 
 class _Table(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -123,12 +117,9 @@ class SceneObject(_Solid, frozen=True, kw_only=True):
 
     @property
     def colour(self) -> Vec3:
-        """`rgb`, else the colour of the known object with this label, else the colour in the label ('red_box'), else
-        grey."""
-        if self.rgb is not None:
-            return self.rgb
-        known = _known().get(self.label)
-        return known.rgb if known is not None else _COLOURS.get(self.label.split("_")[0], _GREY)
+        """`rgb`, which `load_scene` takes from the known object with this label when the file has none; else the colour
+        in the label ('red_box'), else grey."""
+        return self.rgb if self.rgb is not None else _COLOURS.get(self.label.split("_")[0], _GREY)
 
     @property
     def kinematic(self) -> bool:
@@ -213,11 +204,13 @@ class Scene(msgspec.Struct, frozen=True, kw_only=True):
         return self.robot.position_m[0] + c * x - s * y, self.robot.position_m[1] + s * x + c * y, z
 
 
-def load_scene(name_or_path: str | Path, seed: int = 0) -> Scene:
+def load_scene(name_or_path: str | Path, seed: int = 0, catalogue: Catalogue | None = None) -> Scene:
     """Read a scene: one that comes with the project by its name (`paper`), or a TOML file by its path.
 
-    Raises ConfigError that names the file, the table and the field.
+    `catalogue` holds the known objects that give their colours; None is the project's own. Raises ConfigError that
+    names the file, the table and the field.
     """
+    known_objects = Catalogue.load() if catalogue is None else catalogue
     text, where = _read(name_or_path)
     try:
         data = tomllib.loads(text)
@@ -233,7 +226,7 @@ def load_scene(name_or_path: str | Path, seed: int = 0) -> Scene:
     _check_labels(objects, where)
     scene = Scene(
         name=name,
-        objects=tuple(objects),
+        objects=tuple(_coloured(item, known_objects) for item in objects),
         obstacles=tuple(_rows(data, "obstacle", Obstacle, where)),
         light=_table(data.get("light", {}), Light, f"{where}, [light]"),
         robot=_table(data.get("robot", {}), Start, f"{where}, [robot]"),
@@ -288,6 +281,11 @@ def _table(data: Any, kind: type[_T], where: str) -> _T:
     if problem := table.problem():
         raise ConfigError(f"{where}: {problem}")
     return table
+
+
+def _coloured(item: SceneObject, catalogue: Catalogue) -> SceneObject:
+    known = catalogue.get(item.label)
+    return msgspec.structs.replace(item, rgb=known.rgb) if item.rgb is None and known is not None else item
 
 
 def _check_labels(objects: list[SceneObject], where: str) -> None:

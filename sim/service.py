@@ -43,6 +43,9 @@ class SimConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     scene: str = "paper"
     target: str = ""
     """An object that a random scene must contain."""
+    objects: str = ""
+    """The file of known objects that the robot was given: a scene's objects have their colours; '' is the project's
+    own."""
     seed: Annotated[int, Meta(ge=0)] = 0
     sensors: Sensors = "ideal"
     width: Annotated[int, Meta(ge=16, le=4096)] = 640
@@ -215,7 +218,7 @@ def make_world(
     """Make the world: the scene with the robot in it."""
     return World(
         _with_timeout(robot, config.command_timeout_s),
-        find_scene(config.scene, config.seed, config.target),
+        find_scene(config.scene, config.seed, config.target, config.objects),
         seed=config.seed,
         sensors=config.sensors,
         physics_hz=config.physics_hz,

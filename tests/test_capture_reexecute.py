@@ -209,9 +209,14 @@ def test_a_repeated_message_does_not_take_the_place_of_the_one_that_was_consumed
 
 
 def of_an_older_version(out: Path, change: Callable[[dict[str, Any]], None] = lambda _: None) -> Path:
-    """The golden capture as if the planner's status had no `model` and another field, and an object no `sigma_m`."""
+    """The golden capture as if the planner's status had no `model` and another field, an object no `sigma_m`, and an
+    intent its action's name and fields beside each other."""
 
     def older(name: str, payload: bytes) -> bytes:
+        if name == "Intent":
+            intent = msgspec.msgpack.decode(payload)
+            asked = intent.pop("action")
+            return msgspec.msgpack.encode({**intent, "behaviour": asked.pop("action"), **asked})
         if name != "PlannerStatus":
             return payload
         status = msgspec.msgpack.decode(payload)
@@ -229,6 +234,13 @@ def of_an_older_version(out: Path, change: Callable[[dict[str, Any]], None] = la
         del then["properties"]["model"]
         del then["$defs"]["TargetEstimate"]["properties"]["sigma_m"]
         then["properties"]["mood"] = {"type": "string"}
+        intent = infos["calliope/executive/intent"].schema
+        assert intent is not None
+        shape = json.loads(intent.data)
+        shape["properties"]["behaviour"] = shape["properties"].pop("action")
+        infos["calliope/executive/intent"] = infos["calliope/executive/intent"]._replace(
+            schema=intent._replace(data=json.dumps(shape).encode())
+        )
         infos["calliope/planning/status"] = infos["calliope/planning/status"]._replace(
             schema=schema._replace(data=json.dumps(then).encode())
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import shutil
 import stat
@@ -10,15 +11,19 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import msgspec
 import pytest
 
-from cocoro import private
+from cocoro import held_file, private
 from cocoro.bus.register import Membership, members
 from cocoro.errors import CocoroError, ConfigError
+from cocoro.held_file import Holder, holder_of
 from deploy.rundir import RunDir, robots
 from sim.wire.line import PseudoSerialPort
 
 NOBODY = 65534
+NO_PROCESS = 2**31 - 1
+"""Above every process number that Linux gives."""
 BEFORE = b"what the victim wrote"
 
 root_alone = pytest.mark.skipif(os.geteuid() != 0, reason="only root can be another user for a moment")
@@ -276,3 +281,21 @@ def test_a_held_file_that_says_nothing_is_held_by_somebody(tmp_path: Path, monke
         with pytest.raises(CocoroError, match="robbie has an executive already"):
             run_dir.claim("other", ["executive"])
     held[0].release()
+
+
+@pytest.mark.parametrize("end", ["its death", "letting go"])
+def test_a_new_holder_is_not_taken_for_the_last_one_before_it_has_written_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, end: str
+) -> None:
+    """A process that looks in that moment waits for the name."""
+    path, own = tmp_path / "executive", Holder("executive", os.getpid())
+    if end == "its death":
+        path.write_bytes(msgspec.json.encode(Holder("executive", NO_PROCESS)))
+    else:
+        held = held_file.hold(path, "executive")
+        assert held is not None
+        held.release()
+    with path.open("rb") as new, path.open("rb") as reader:
+        fcntl.flock(new, fcntl.LOCK_EX)
+        monkeypatch.setattr("time.sleep", lambda _: path.write_bytes(msgspec.json.encode(own)))
+        assert holder_of(reader.fileno(), patience_s=60.0) == own

@@ -19,7 +19,7 @@ from apps.cli.listed import COMMANDS
 def load(name: str) -> TyperCommand | TyperGroup:
     """Imports the file of a command and returns the command."""
     match name:
-        case "cancel" | "rehearse":
+        case "cancel" | "wait" | "rehearse":
             from apps.cli.task_commands import app
         case "status":
             from apps.cli.status import app
@@ -35,8 +35,10 @@ def load(name: str) -> TyperCommand | TyperGroup:
             from apps.cli.record import app
         case "replay":
             from apps.cli.replay import app
-        case "export" | "view":
+        case "export":
             from apps.cli.export import app
+        case "view":
+            from apps.cli.view import app
         case "top":
             from apps.cli.top import app
         case "echo":

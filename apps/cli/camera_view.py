@@ -14,7 +14,7 @@ import numpy as np
 
 from apps.appearance.learn import LearnedObject, ObjectView
 from apps.appearance.size import outline_of
-from apps.cli.link import MeshLink, joined, within
+from apps.cli.link import PERCEPTION, MeshLink, joined, within
 from apps.cli.options import RobotChoice
 from apps.pictures import colour_of, describe, draw
 from cocoro.arrays import ImageArray
@@ -28,8 +28,6 @@ from cocoro.topics import ARM_STATE, FRAME
 from deploy import processes
 from services.kinect.picture import load
 
-PERCEPTION = "perception"
-"""The component whose core detects the objects in the preview."""
 FRAME_S = 5.0
 """Longest wait for a frame and the head's angles."""
 STILL_RAD = 0.01
@@ -73,14 +71,12 @@ def of_picture(path: Path, robot: Robot) -> CameraView:
 async def of_robot(choice: RobotChoice) -> CameraView:
     """The robot's newest view. Raises MeshError when the robot is not there, or publishes no frames or head angles."""
     async with joined(choice, frames=True) as link:
-        resolved = link.run_dir.resolved()
-        named = resolved.get("objects") or resolved.get("service", {}).get(PERCEPTION, {}).get("objects")
-        robot = link.described()
+        robot, catalogue = link.described(), link.catalogue_file()
         frame, head = await _frame(link, robot.chain("camera").joints)
     pose = robot.chain("camera").pose(head)
     raw_depth = np.frombuffer(frame.depth, dtype="<u2").reshape(frame.height, frame.width)
     object_view = ObjectView(colour_of(frame), robot, raw_depth, pose)
-    return CameraView(object_view, frame, head, Path(named) if named else None)
+    return CameraView(object_view, frame, head, catalogue)
 
 
 async def _frame(link: MeshLink, joints: tuple[str, ...]) -> tuple[Frame, dict[str, float]]:

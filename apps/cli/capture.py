@@ -19,7 +19,7 @@ from apps.captures.reader import Capture
 from apps.captures.rewrite import REPAIRED, rewrite
 from apps.cli import exits
 from apps.cli.options import CaptureArgument, FromOption, JsonOption, OnlyOption, ToOption, WithoutOption
-from apps.cli.terminal import table
+from apps.cli.terminal import Column, fields, table
 from cocoro.capture.conventions import CaptureError
 from cocoro.clock import NS
 from cocoro.errors import ConfigError
@@ -28,7 +28,11 @@ from services.capture.keys import KeyFilter
 from services.capture.log_clock import WALL_CLOCK, WallClockStep, describe_step
 
 MB = 1e6
-
+COLUMNS = (
+    "key", Column("type", 4), Column("messages", right=True), Column("rate", 3, right=True),
+    Column("size", right=True), Column("longest gap", 2), Column("lost", 1, right=True),
+    Column("dropped", 1, right=True),
+)  # fmt: skip
 
 app = typer.Typer()
 capture = typer.Typer(no_args_is_help=True, help="Look at capture files, repair them, re-execute services on them.")
@@ -60,6 +64,7 @@ def show_info(file: Path, check: bool, as_json: bool) -> int:
 def text(found: CaptureReport) -> str:
     several = Counter(key.key for key in found.keys)
     names = {key.channel: key.key if several[key.key] == 1 else f"{key.key}#{key.channel}" for key in found.keys}
+    names = {channel: name.removeprefix(f"{found.robot}/") for channel, name in names.items()}
     rows = [
         (
             names[key.channel], key.type, str(key.messages), f"{key.rate_hz:.1f} Hz", f"{key.size_bytes / MB:.2f} MB",
@@ -68,12 +73,11 @@ def text(found: CaptureReport) -> str:
         )
         for key in found.keys
     ]  # fmt: skip
-    heads = ("key", "type", "messages", "rate", "size", "longest gap", "lost", "dropped")
     return "\n".join(
         [
             *_head(found),
             "",
-            table(heads, rows).rstrip(),
+            table(COLUMNS, rows).rstrip(),
             *(f"{names[key.channel]}: {change}" for key in found.keys for change in key.changed),
             *(f"attachment: {_attachment(each)}" for each in found.attachments),
             *(f"note: {note}" for note in found.notes),
@@ -111,7 +115,7 @@ def _head(found: CaptureReport) -> list[str]:
         ("versions", ", ".join(f"{name} {version}" for name, version in versions.items())),
         ("metadata", ", ".join(found.metadata)),
     ]
-    return [f"{name:<9} {value}" for name, value in lines if value]
+    return fields(lines).splitlines()
 
 
 def _clock_steps(found: CaptureReport) -> list[str]:

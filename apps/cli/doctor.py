@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import closing
+from importlib import resources
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -137,10 +138,15 @@ def _exists(module: str) -> bool:
         return False
 
 
+def _shipped(*path: str) -> str:
+    """The path of a file that comes with the project, wherever it is installed."""
+    return str(resources.files("deploy").joinpath(*path))
+
+
 def _rules() -> Check:
     if RULES.exists():
         return ok("udev rules", str(RULES))
-    return bad("udev rules", f"not installed: sudo cp deploy/udev/{RULES.name} {RULES.parent}, then replug")
+    return bad("udev rules", f"not installed: sudo cp {_shipped('udev', RULES.name)} {RULES.parent}, then replug")
 
 
 def _priority() -> Iterator[Check]:
@@ -151,7 +157,8 @@ def _priority() -> Iterator[Check]:
     if allowed:
         yield ok("real-time priority", "allowed")
     else:
-        yield note("real-time priority", "not allowed: LimitRTPRIO and LimitNICE in the unit file allow it")
+        unit = _shipped("systemd", "cocoro@.service")
+        yield note("real-time priority", f"not allowed: LimitRTPRIO and LimitNICE in the unit file allow it ({unit})")
 
 
 def _clock(profile: Profile) -> Check:

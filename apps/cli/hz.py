@@ -23,11 +23,17 @@ from apps.cli.interrupt import interrupt_event
 from apps.cli.link import joined
 from apps.cli.listening import KeyListener, keyexpr_of, takes_frames
 from apps.cli.options import JsonOption, KeyArgument, MeshOption, RobotChoice, RobotOption
-from apps.cli.terminal import table
+from apps.cli.terminal import Column, FittedTable, table
 from cocoro.bus.base import Payload
 from cocoro.installed import topic_named
 from cocoro.stream_checks import ANY_HZ, SequenceTracker
 
+COLUMNS = (
+    "key", Column("rate", right=True), Column("nominal", right=True), Column("by stamp", 4, right=True),
+    Column("period", 6, right=True), Column("jitter", 1, right=True), Column("min", 5, right=True),
+    Column("max", 3, right=True), Column("data", right=True), Column("message", 2, right=True),
+    Column("lost", right=True), Column("", text=True),
+)  # fmt: skip
 SHOW_S = 1.0
 SILENT_PERIODS = 3.0
 """A key that is silent for this many of its periods counts as stopped."""
@@ -215,11 +221,12 @@ class _RateDisplay:
         if self._as_json:
             print(json.dumps([asdict(report) for report in reports]), flush=True)
             return
-        text = rows(reports) if reports else f"nothing on {keyexpr} yet\n"
+        nothing = f"nothing on {keyexpr} yet"
         if self._live is not None:
-            self._live.update(Text(text.rstrip("\n"), no_wrap=True), refresh=True)
+            shown = FittedTable(COLUMNS, map(_row, reports)) if reports else Text(nothing)
+            self._live.update(shown, refresh=True)
         else:
-            print(text, end="", flush=True)
+            print(rows(reports) if reports else f"{nothing}\n", end="", flush=True)
 
 
 def _view(as_json: bool, once: bool) -> _RateDisplay:
@@ -228,8 +235,7 @@ def _view(as_json: bool, once: bool) -> _RateDisplay:
 
 
 def rows(reports: list[RateReport]) -> str:
-    heads = ("key", "rate", "nominal", "by stamp", "period", "jitter", "min", "max", "data", "message", "lost", "")
-    return table(heads, [_row(report) for report in reports])
+    return table(COLUMNS, [_row(report) for report in reports])
 
 
 def _row(report: RateReport) -> tuple[str, ...]:
@@ -241,7 +247,7 @@ def _row(report: RateReport) -> tuple[str, ...]:
 
     stopped = report.period_ms is not None and 1e3 * report.silent_s > SILENT_PERIODS * report.period_ms + 100
     return (
-        report.key, per_s(report.rate_hz), per_s(report.nominal_hz), per_s(report.stamped_hz),
+        report.key.partition("/")[2], per_s(report.rate_hz), per_s(report.nominal_hz), per_s(report.stamped_hz),
         ms(report.period_ms), ms(report.jitter_ms), ms(report.min_ms), ms(report.max_ms),
         f"{size_text(report.bytes_per_s)}/s", size_text(report.size_bytes), str(report.lost),
         f"silent for {report.silent_s:.1f} s" if stopped else "",

@@ -16,6 +16,7 @@ from apps.appearance.learn import LearnedObject, ObjectHints, learn
 from apps.cli import exits
 from apps.cli.camera_view import CameraView, of_picture, of_robot, preview
 from apps.cli.options import RobotChoice
+from apps.cli.output import complain
 from apps.cli.toml_files import save, text_of, with_object
 from apps.pictures import save_png
 from cocoro.errors import ConfigError, naming
@@ -33,7 +34,8 @@ class SaveOptions:
 
     catalogue: Path | None
     picture: Path | None
-    yes: bool
+    yes: bool | None
+    """Whether to save it; None: as the person at the terminal answers."""
     replace: bool
     add: bool
     as_json: bool
@@ -42,7 +44,8 @@ class SaveOptions:
 async def learn_object(
     choice: RobotChoice, source: str, hints: ObjectHints, saving: SaveOptions, robot: Robot | None = None
 ) -> int:
-    """Learns an object from one view, shows it and saves it; returns the exit code.
+    """Learns an object from one view, shows it and saves it; returns the exit code, which is `REFUSED` when nobody said
+    whether to save it, or the answer was no.
 
     `robot` is the robot whose camera took a picture file, the Calliope by default. Raises ConfigError for impossible
     options or a view without an object, MeshError when the view is live and no robot is up.
@@ -61,23 +64,29 @@ async def learn_object(
     picture = saving.picture or Path(f"{hints.label}.png")
     seen = _preview(view, learned, path, picture)
     if saving.as_json:
-        print(json.dumps(_report(learned, seen, picture, path, saved=saving.yes)))
+        print(json.dumps(_report(learned, seen, picture, path, saved=saving.yes is True)))
     else:
         print(_text(learned, seen, picture))
-    if not saving.yes and (saving.as_json or not _confirmed(path)):
+    if saving.yes is False:
         return exits.DONE
+    if saving.yes is None and not _confirmed(path, saving):
+        return exits.REFUSED
     saved = save(path, learned.known)
     if not saving.as_json:
         print(f"saved in {path}, which has {len(saved)} objects now; {_how_to_use(path, view.catalogue)}")
     return exits.DONE
 
 
-def _confirmed(path: Path) -> bool:
-    if not sys.stdin.isatty():
-        print("nothing is saved: look at the picture, then repeat the command with --yes")
-        return False
-    answer = input(f"save it in {path}? [y/N] ").strip().lower()
-    return answer in ("y", "yes")
+def _confirmed(path: Path, saving: SaveOptions) -> bool:
+    why = "--json asks no question" if saving.as_json else "there is no terminal to ask at"
+    if not saving.as_json and sys.stdin.isatty():
+        if input(f"save it in {path}? [y/N] ").strip().lower() in ("y", "yes"):
+            return True
+        why = "as you answered"
+    complain(
+        f"nothing is saved ({why}): look at the picture, then repeat the command with --yes, or with --no to look only"
+    )
+    return False
 
 
 def _how_to_use(path: Path, used: Path | None) -> str:

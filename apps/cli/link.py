@@ -19,10 +19,13 @@ from deploy import robot_time
 from deploy.rundir import RunDir, robots
 
 if TYPE_CHECKING:
+    from cocoro.objects import Catalogue
     from cocoro.robot import Robot
 
 __all__ = ["Answer", "MeshLink", "find", "joined", "within"]
 
+PERCEPTION = "perception"
+"""The component that detects the known objects."""
 ROBOT_FILES = ("description", "measured")
 START = "start one with `cocoro up sim`"
 
@@ -47,6 +50,20 @@ class MeshLink(Participant):
 
         resolved = self.run_dir.resolved()
         return Robot.load(*(Path(file) if (file := resolved.get(name)) else None for name in ROBOT_FILES))
+
+    def catalogue(self) -> Catalogue:
+        """The objects that the running robot knows, if their file is on this machine; else the project's own. Raises
+        ConfigError."""
+        from cocoro.objects import Catalogue
+
+        file = self.catalogue_file()
+        return Catalogue.load(file if file is not None and file.exists() else None)
+
+    def catalogue_file(self) -> Path | None:
+        """The file of known objects that the running robot was started with, if any."""
+        resolved = self.run_dir.resolved()
+        named = resolved.get("objects") or resolved.get("service", {}).get(PERCEPTION, {}).get("objects")
+        return Path(named) if named else None
 
     def unserved(self, request: Request[Any, Any]) -> str:
         return f"{self.robot} has no {request.server} running: {START}, or see `cocoro status`"

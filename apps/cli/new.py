@@ -39,7 +39,7 @@ def service(
     name: Annotated[str, typer.Argument(help="Name of the service, the first part of its keys: nearest.")],
     into: Annotated[Path, typer.Option(metavar="DIR", help="The folder that its folder goes into.")] = Path(),
 ) -> None:
-    """A working component with its test, as a package of your own: see docs/components.md."""
+    """A working component with its test, as a package of your own."""
     sys.exit(write_service(name, into))
 
 
@@ -48,7 +48,7 @@ def task(
     name: Annotated[str, typer.Argument(help="Name of the task, and of its command: greet.")],
     into: Annotated[Path, typer.Option(metavar="DIR", help="The folder that its folder goes into.")] = Path(),
 ) -> None:
-    """A working task with its test, as a package of your own: see docs/tasks.md."""
+    """A working task with its test, as a package of your own."""
     sys.exit(write_task(name, into))
 
 

@@ -15,7 +15,7 @@ from apps.cli import exits
 from apps.cli.link import joined
 from apps.cli.options import DescriptionOption, JsonOption, MeasuredOption, MeshOption, RobotChoice, RobotOption
 from apps.cli.snapshot import check
-from apps.cli.terminal import print_table
+from apps.cli.terminal import Column, print_table
 from cocoro.messages import KnownObject, ObjectsRequest
 from cocoro.topics import OBJECTS
 
@@ -67,7 +67,10 @@ def learn(
     picture: Annotated[
         Path | None, typer.Option(metavar="OUT.png", help="Picture of what would match; LABEL.png by default.")
     ] = None,
-    yes: Annotated[bool, typer.Option("--yes", "-y", help="Save it without asking.")] = False,
+    yes: Annotated[
+        bool | None,
+        typer.Option("--yes/--no", "-y/-n", help="Save it without asking, or only look; without a terminal say which."),
+    ] = None,
     replace: Annotated[bool, typer.Option("--replace", help="Replace the colours of a known object.")] = False,
     add: Annotated[bool, typer.Option("--add", help="Add the colours of another light to a known object.")] = False,
     description: DescriptionOption = None,
@@ -101,7 +104,8 @@ async def list_objects(choice: RobotChoice, as_json: bool) -> int:
     if as_json:
         print(json_module.dumps(msgspec.to_builtins(reply.objects)))
     else:
-        print_table(("object", "shape", "size (cm)", "graspable", "seen"), [_row(known) for known in reply.objects])
+        columns = ("object", Column("shape", 1), "size (cm)", "graspable", Column("seen", text=True))
+        print_table(columns, [_row(known) for known in reply.objects])
     return exits.DONE
 
 

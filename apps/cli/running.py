@@ -149,7 +149,7 @@ def scene_of(scene: str) -> str:
     if not scene.endswith(".toml") and os.sep not in scene:
         return scene
     if not Path(scene).is_file():
-        raise ConfigError(f"--scene {scene}: no such file; docs/scenes.md lists the scenes that have a name")
+        raise ConfigError(f"--scene {scene}: no such file; give a .toml file, or the name of a scene")
     return str(Path(scene).resolve())
 
 

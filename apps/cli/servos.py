@@ -41,6 +41,7 @@ from services.servos.bus import ServoBus
 
 NETWORKS = ("arm", "hand")
 DONE_WORDS = {"clear": "cleared", "relax": "limp", "hold": "holding"}
+NOBODY = "this command waits for a person at a terminal, but standard input has ended"
 REPLY_S = 0.05
 """Longest wait for one servo's reply on the serial line."""
 
@@ -322,12 +323,13 @@ def _wait_for_enter(text: str) -> None:
     try:
         input(f"{text}, then press Enter ")
     except EOFError:
-        raise CocoroError("this command waits for a person at a terminal, but standard input has ended") from None
+        raise CocoroError(NOBODY) from None
 
 
 def _was_entered() -> bool:
     """Whether a line was entered since the last call; does not wait."""
     if not select.select([sys.stdin], [], [], 0)[0]:
         return False
-    sys.stdin.readline()
+    if not sys.stdin.readline():
+        raise CocoroError(NOBODY)
     return True

@@ -6,7 +6,7 @@ import asyncio
 import sys
 from collections import OrderedDict
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -16,6 +16,9 @@ from apps.cli.options import MeshOption, RobotChoice, RobotOption
 from cocoro.errors import ConfigError, MeshError
 from cocoro.messages import Detections, Frame
 from cocoro.topics import DETECTIONS, FRAME
+
+if TYPE_CHECKING:
+    from cocoro.objects import Catalogue
 
 KEPT_FRAMES = 45
 """Frames that are kept until their detections arrive; perception may be this many frames late."""
@@ -78,7 +81,7 @@ class SnapshotTaker:
             for topic in (FRAME, DETECTIONS):
                 self._link.drop(topic)
         frame, detections = self._pair or (next(reversed(self._frames.values())), None)
-        _write(out, frame, detections)
+        _write(out, frame, detections, self._link.catalogue())
         if detections is None:
             return f"{out}: {frame.width} x {frame.height}, without detections (perception is silent)"
         labels = ", ".join(sorted(detection.label for detection in detections.detections)) or "nothing known"
@@ -101,8 +104,7 @@ class SnapshotTaker:
         self._changed.set()
 
 
-def _write(out: Path, frame: Frame, detections: Detections | None) -> None:
+def _write(out: Path, frame: Frame, detections: Detections | None, catalogue: Catalogue) -> None:
     from apps import pictures  # imports the image library
-    from cocoro.objects import Catalogue
 
-    pictures.save_png(pictures.draw(frame, detections, Catalogue.load()), out)
+    pictures.save_png(pictures.draw(frame, detections, catalogue), out)

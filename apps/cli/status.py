@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import sys
+from collections.abc import Iterator
 from functools import partial
 from typing import Any
 
@@ -14,7 +15,7 @@ import typer
 from apps.cli import exits
 from apps.cli.link import MeshLink, joined, within
 from apps.cli.options import JsonOption, MeshOption, RobotChoice, RobotOption
-from apps.cli.terminal import print_table
+from apps.cli.terminal import Column, fields, print_table
 from cocoro.errors import ConfigError
 from cocoro.messages import Health, Message, TaskState
 from cocoro.topics import BASE_STATE, HEALTH, LATCH, PLAN, TASK, Topic
@@ -24,6 +25,10 @@ NEWS: tuple[Topic[Any], ...] = (PLAN, TASK, LATCH, BASE_STATE)
 HEALTH_S = 2.5
 """Longest wait for the health of every live service; each publishes it once a second of the robot's time."""
 
+COLUMNS = (
+    "service", "state", Column("pid", 2, right=True), Column("cpu", right=True), Column("memory", right=True),
+    Column("loop", 1, right=True), Column("", text=True),
+)  # fmt: skip
 
 app = typer.Typer()
 
@@ -126,23 +131,21 @@ def _print(report: dict[str, Any]) -> None:
             )
         )
     print(f"{report['robot']}{f' (profile {name})' if (name := report['profile']) else ''}\n")
-    print_table(("service", "state", "pid", "cpu", "memory", "loop", ""), rows)
+    print_table(COLUMNS, rows)
     print()
+    print(fields(_facts(report)), end="")
+
+
+def _facts(report: dict[str, Any]) -> Iterator[tuple[str, str]]:
     if (latch := report["latch"]) is not None:
-        by = f" by {latch['by']}" if latch["by"] else ""
-        print(f"emergency stop  {latch['state']}{by}")
+        yield "emergency stop", f"{latch['state']}{f' by {name}' if (name := latch['by']) else ''}"
     if (base := report["base"]) is not None:
-        print(f"battery         {100 * base['battery_fraction']:.0f}%{', charging' if base['charging'] else ''}")
+        yield "battery", f"{100 * base['battery_fraction']:.0f}%{', charging' if base['charging'] else ''}"
     if report["task"] is not None:
-        print(f"task            {_task(msgspec.convert(report['task'], TaskState))}")
+        yield "task", _task(msgspec.convert(report["task"], TaskState))
     if (plan := report["plan"]) is not None:
-        print(
-            f"planner         {plan['behaviour']}: {plan['why']}"
-            if plan["why"]
-            else f"planner         {plan['behaviour']}"
-        )
-        if plan["model"]:
-            print(f"reaches with    {plan['model']}")
+        yield "planner", ": ".join(filter(None, (plan["behaviour"], plan["why"])))
+        yield "reaches with", plan["model"]
 
 
 def _task(task: TaskState) -> str:

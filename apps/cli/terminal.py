@@ -1,50 +1,172 @@
-"""Tables and a status line on the operator's terminal, drawn by rich; plain text where the output is no terminal."""
+"""Tables and a status line on the operator's terminal; plain text of full width where the output is no terminal.
+
+A table fits itself to the terminal: optional columns are left out, the last ones first, then what still does not fit
+goes into a second line of its row.
+"""
 
 from __future__ import annotations
 
+import shutil
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from io import StringIO
 from types import TracebackType
-from typing import TYPE_CHECKING, TextIO
+from typing import TYPE_CHECKING, NamedTuple, TextIO
 
 if TYPE_CHECKING:
+    from rich.console import Console, ConsoleOptions
     from rich.live import Live
-    from rich.table import Table
+    from rich.text import Text
 
 PLAIN_WIDTH = 10_000
 """Columns of a table that is written into a file or a pipe: enough that nothing is folded or cut."""
+GAP, SHIFT = 2, 4
+"""Spaces between two columns, and before the second line of a row."""
+TEXT_WIDTH = 24
+"""A column of sentences that would be narrower than this goes into the second line."""
 
 
-def print_table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
-    """Prints a table on standard output; a terminal that is too narrow folds its cells."""
-    if not sys.stdout.isatty():
-        print(table(heads, rows), end="")
-        return
+class Column(NamedTuple):
+    """How a table shows a column."""
+
+    head: str
+    rank: int = 0
+    """0: the column is always shown. Of the others empty ones are left out first, then those with the highest rank."""
+    right: bool = False
+    text: bool = False
+    """Sentences: folded to the width that the other columns leave. At most one column of a table, the last."""
+
+
+def print_table(columns: Sequence[str | Column], rows: Iterable[Sequence[str]]) -> None:
+    """Prints a table on standard output, as wide as the terminal at most."""
+    print(table(columns, rows), end="")
+
+
+def table(columns: Sequence[str | Column], rows: Iterable[Sequence[str]], width: int | None = None) -> str:
+    """Returns a table as text: aligned columns, capital headers, no frame, no spaces at the ends of lines.
+
+    `width` is that of standard output's terminal by default, unlimited where it is none.
+    """
     from rich.console import Console
 
-    Console(highlight=False).print(_table(heads, rows))
-
-
-def table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Returns a table as text: aligned columns, capital headers, no frame, no spaces at the ends of lines."""
-    from rich.console import Console
-
+    if width is None:
+        width = output_width()
     out = StringIO()
-    Console(file=out, width=PLAIN_WIDTH, force_terminal=False, color_system=None).print(_table(heads, rows))
+    Console(file=out, width=width, force_terminal=False, color_system=None).print(FittedTable(columns, rows))
     return "".join(f"{line.rstrip()}\n" for line in out.getvalue().splitlines())
 
 
-def _table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
-    from rich.table import Table
-    from rich.text import Text
+def fields(pairs: Iterable[tuple[str, str]]) -> str:
+    """Returns lines `name  value` as text, the values below one another and folded to the terminal's width."""
+    from textwrap import wrap
 
-    made = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="dim")
-    for head in heads:
-        made.add_column(Text(head.upper()), overflow="fold")
-    for row in rows:
-        made.add_row(*map(Text, row))
-    return made
+    found = [(name, value) for name, value in pairs if value]
+    indent = max((len(name) for name, _ in found), default=0) + GAP
+    room = max(output_width() - indent, 10)
+    lines = []
+    for name, value in found:
+        first, *rest = wrap(value, room, break_on_hyphens=False) if len(value) > room else [value]
+        lines += [f"{name:<{indent}}{first}", *(f"{'':<{indent}}{line}" for line in rest)]
+    return "".join(f"{line}\n" for line in lines)
+
+
+def output_width() -> int:
+    """Columns of the terminal that is standard output; PLAIN_WIDTH when it is none."""
+    return shutil.get_terminal_size().columns if sys.stdout.isatty() else PLAIN_WIDTH
+
+
+class FittedTable:
+    """A table for rich's consoles that fits itself to the width that it is drawn with."""
+
+    def __init__(self, columns: Sequence[str | Column], rows: Iterable[Sequence[str | Text]]) -> None:
+        from rich.text import Text
+
+        self._columns = [Column(column) if isinstance(column, str) else column for column in columns]
+        self._rows = [[cell if isinstance(cell, Text) else Text(cell) for cell in row] for row in rows]
+        self._natural = [
+            max(len(column.head), *(row[number].cell_len for row in self._rows)) if self._rows else len(column.head)
+            for number, column in enumerate(self._columns)
+        ]
+
+    def __rich_console__(self, _console: Console, options: ConsoleOptions) -> Iterator[Text]:
+        from rich.text import Text
+
+        shown, below = self._fitted(options.max_width)
+        widths = self._widths(shown, options.max_width)
+        yield self._line([Text(self._columns[number].head.upper(), "dim") for number in shown], shown, widths)
+        for row in self._rows:
+            cells = [list(self._folded(row[number], widths[number])) for number in shown]
+            for at in range(max(map(len, cells), default=0)):
+                yield self._line([cell[at] if at < len(cell) else Text() for cell in cells], shown, widths)
+            for line in self._second(row, below, options.max_width - SHIFT):
+                yield Text(" " * SHIFT).append_text(line)
+        away = {*range(len(self._columns))} - {*shown, *below}
+        if left_out := [self._columns[number].head for number in sorted(away) if self._is_filled(number)]:
+            yield Text(
+                f"(a wider terminal shows, too: {', '.join(left_out)})", "dim", no_wrap=True, overflow="ellipsis"
+            )
+
+    def _fitted(self, width: int) -> tuple[list[int], list[int]]:
+        """The columns of a row's first line and of its second, by their numbers."""
+        shown, below = list(range(len(self._columns))), list[int]()
+        while self._needed(shown) > width and (optional := [n for n in shown if self._columns[n].rank]):
+            shown.remove(max(optional, key=lambda n: (not self._is_filled(n), self._columns[n].rank, n)))
+        while self._needed(shown) > width and len(shown) > 1:
+            below.insert(0, shown.pop())
+        return shown, below
+
+    def _is_filled(self, number: int) -> bool:
+        return any(row[number].plain.strip() for row in self._rows)
+
+    def _needed(self, shown: list[int]) -> int:
+        least = [min(self._natural[n], TEXT_WIDTH) if self._columns[n].text else self._natural[n] for n in shown]
+        return sum(least) + GAP * (len(shown) - 1)
+
+    def _widths(self, shown: list[int], width: int) -> dict[int, int]:
+        widths = {number: min(self._natural[number], width) for number in shown}
+        for number in shown:
+            if self._columns[number].text:
+                others = sum(widths[other] + GAP for other in shown if other != number)
+                widths[number] = max(1, min(widths[number], width - others))
+        return widths
+
+    def _line(self, cells: list[Text], shown: list[int], widths: dict[int, int]) -> Text:
+        from rich.text import Text
+
+        line = Text(no_wrap=True, overflow="ellipsis")
+        for place, (cell, number) in enumerate(zip(cells, shown, strict=True)):
+            space = " " * (widths[number] - cell.cell_len)
+            line.append(" " * GAP if place else "")
+            line.append(space if self._columns[number].right else "").append_text(cell)
+            line.append("" if self._columns[number].right or place == len(shown) - 1 else space)
+        return line
+
+    def _folded(self, cell: Text, width: int) -> Iterator[Text]:
+        if cell.cell_len <= width:
+            yield cell
+            return
+        from rich.console import Console
+
+        yield from (_stripped(line) for line in cell.wrap(Console(width=width, file=StringIO()), width))
+
+    def _second(self, row: list[Text], below: list[int], width: int) -> Iterator[Text]:
+        """The lines of what does not fit beside the other columns, each value after its column's name."""
+        from rich.text import Text
+
+        line = Text()
+        for number in below:
+            if not row[number].plain.strip():
+                continue
+            column = self._columns[number]
+            line.append(", " if line.plain else "").append("" if column.text else f"{column.head} ", "dim")
+            line.append_text(row[number])
+        if line.plain:
+            yield from self._folded(line, width)
+
+
+def _stripped(line: Text) -> Text:
+    line.rstrip()
+    return line
 
 
 class StatusLine:

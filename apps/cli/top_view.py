@@ -6,15 +6,27 @@ from typing import Any
 
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
-from rich.table import Table
 from rich.text import Text
+
+from apps.cli.terminal import PLAIN_WIDTH, Column, FittedTable
 
 SLOW, STALLED = 0.85, 0.4
 """Shares of the nominal rate: a rate below SLOW is yellow, one below STALLED red."""
+OTHER_LINES = 7
+"""Lines of the screen beside services and topics: the headline's two, two blank ones, the topics' head, and two that
+tell what is left out."""
 BAD, DOUBTFUL, GOOD, FAINT = "bold red", "yellow", "green", "dim"
 COUNTED = ("skipped", "lost", "rejected")
-PLAIN_WIDTH = 200
-"""Columns where the output is no terminal; nothing is cut."""
+SERVICES = (
+    "service", "state", Column("pid", 4, right=True), Column("cpu", right=True), Column("memory", right=True),
+    Column("loop", right=True), Column("p99", 2, right=True), Column("step", 3, right=True),
+    Column("missed", right=True), Column("up", 5, right=True), Column("", text=True),
+)  # fmt: skip
+TOPICS = (
+    "topic", Column("from", 3), Column("rate", right=True), Column("nominal", right=True), Column("age", right=True),
+    Column("skipped", right=True), Column("lost", right=True), Column("rejected", right=True),
+    Column("read by", 2, text=True),
+)  # fmt: skip
 
 
 class Screen:
@@ -31,7 +43,7 @@ class Screen:
         self._live.stop()
 
     def show(self, report: dict[str, Any]) -> None:
-        self._live.update(render(report), refresh=True)
+        self._live.update(render(report, self._live.console), refresh=True)
 
 
 def print_report(report: dict[str, Any]) -> None:
@@ -41,8 +53,26 @@ def print_report(report: dict[str, Any]) -> None:
     console.print(render(report))
 
 
-def render(report: dict[str, Any]) -> RenderableType:
-    return Group(_headline(report), Text(), _services(report["services"]), Text(), _topics(report["topics"]))
+def render(report: dict[str, Any], screen: Console | None = None) -> RenderableType:
+    """The whole report; for a `screen` only topics that have a rate or a problem, as many as have room on it."""
+    services, topics, hidden = _services(report["services"]), report["topics"], list[Text]()
+    if screen is None:
+        room = len(topics)
+    else:
+        room = max(screen.height - len(screen.render_lines(services, pad=False)) - OTHER_LINES, 1)
+    if room < len(topics):
+        topics = sorted(filter(_is_busy, topics), key=lambda topic: not _is_troubled(topic))[:room]
+        more = len(report["topics"]) - len(topics)
+        hidden = [Text(f"(a higher terminal shows {more} more; so does --once)", FAINT)]
+    return Group(_headline(report), Text(), services, Text(), _topics(topics), *hidden)
+
+
+def _is_busy(topic: dict[str, Any]) -> bool:
+    return topic["nominal_hz"] is not None or _is_troubled(topic)
+
+
+def _is_troubled(topic: dict[str, Any]) -> bool:
+    return any(reader["growing"] and (reader["lost"] or reader["rejected"]) for reader in topic["readers"])
 
 
 # --- headline -------------------------------------------------------------------------------------
@@ -53,6 +83,8 @@ def _headline(report: dict[str, Any]) -> Text:
     text.append(report["robot"], "bold")
     if report["profile"]:
         text.append(f" ({report['profile']})")
+    if (latch := report["latch"]) is not None and latch["state"] != "released":
+        text.append(f"  EMERGENCY STOP {latch['state']}", BAD)  # first, so that no width cuts it
     machine = report["machine"]
     used = machine["cpu_share"]
     text.append(f"  cpu {'unknown (no /proc)' if used is None else f'{100 * used:.0f}%'} of {machine['cores']} cores")
@@ -62,8 +94,6 @@ def _headline(report: dict[str, Any]) -> Text:
         text.append(f"  clock {clock['stamp_ns'] / 1e9:.1f} s {rate}", DOUBTFUL if slow else "")
     if (base := report["base"]) is not None:
         text.append(f"  battery {100 * base['battery_fraction']:.0f}%")
-    if (latch := report["latch"]) is not None and latch["state"] != "released":
-        text.append(f"  EMERGENCY STOP {latch['state']}", BAD)
     text.append("\n")
     task, plan = report["task"], report["plan"]
     if task is not None and task["task_id"]:
@@ -82,20 +112,12 @@ def _headline(report: dict[str, Any]) -> Text:
 BAD_STATES = ("not alive", "no contact", "silent")
 
 
-def _services(services: list[dict[str, Any]]) -> Table:
-    table = Table(box=None, pad_edge=False, header_style=FAINT)
-    for head, right in (
-        ("SERVICE", False), ("STATE", False), ("PID", True), ("CPU", True), ("MEMORY", True), ("LOOP", True),
-        ("P99", True), ("STEP", True), ("MISSED", True), ("UP", True), ("", False),
-    ):  # fmt: skip
-        table.add_column(head, justify="right" if right else "left", no_wrap=True)
+def _services(services: list[dict[str, Any]]) -> FittedTable:
     shown: dict[int, str] = {}
-    for service in services:
-        table.add_row(*_service(service, shown))
-    return table
+    return FittedTable(SERVICES, [_service(service, shown) for service in services])
 
 
-def _service(service: dict[str, Any], shown: dict[int, str]) -> list[RenderableType]:
+def _service(service: dict[str, Any], shown: dict[int, str]) -> list[str | Text]:
     health = service["health"]
     style = BAD if service["state"] in BAD_STATES else GOOD if service["state"] == "ready" else DOUBTFUL
     state = Text(service["state"] or "?", style)
@@ -106,7 +128,7 @@ def _service(service: dict[str, Any], shown: dict[int, str]) -> list[RenderableT
     if service["state"] == "silent" and service["silent_s"] is not None:
         text = f"silent for {service['silent_s']:.0f} s"
     pid = health["pid"]
-    costs: list[RenderableType]
+    costs: list[str | Text]
     if pid in shown:  # several services in one process: its cost is shown once
         costs = [Text(str(pid), FAINT), Text(f"as {shown[pid]}", FAINT), ""]
     else:
@@ -143,22 +165,14 @@ def _duration(seconds: float) -> str:
 # --- topics ---------------------------------------------------------------------------------------
 
 
-def _topics(topics: list[dict[str, Any]]) -> Table:
-    table = Table(box=None, pad_edge=False, header_style=FAINT)
-    for head, right in (
-        ("TOPIC", False), ("FROM", False), ("RATE", True), ("NOMINAL", True), ("AGE", True), ("SKIPPED", True),
-        ("LOST", True), ("REJECTED", True), ("READ BY", False),
-    ):  # fmt: skip
-        table.add_column(head, justify="right" if right else "left", no_wrap=True)
-    for topic in topics:
-        table.add_row(*_topic(topic))
-    return table
+def _topics(topics: list[dict[str, Any]]) -> FittedTable:
+    return FittedTable(TOPICS, map(_topic, topics))
 
 
-def _topic(topic: dict[str, Any]) -> list[RenderableType]:
+def _topic(topic: dict[str, Any]) -> list[str | Text]:
     readers = topic["readers"]
     idle = topic["count"] == 0
-    rate: RenderableType = Text("-", FAINT) if idle else _rate(topic["rate_hz"], topic["nominal_hz"])
+    rate = Text("-", FAINT) if idle else _rate(topic["rate_hz"], topic["nominal_hz"])
     nominal = "" if topic["nominal_hz"] is None else f"{topic['nominal_hz']:g}"
     counts = [_count(readers, what) for what in COUNTED]
     publisher = topic["publisher"] if topic["published"] else f"({topic['publisher'] or 'nobody'})"

@@ -11,7 +11,8 @@ from typing import Annotated, Any, NamedTuple
 import typer
 
 from apps.cli.options import JsonOption
-from apps.cli.terminal import table as plain_table
+from apps.cli.terminal import Column
+from apps.cli.terminal import table as fitted_table
 from cocoro.bus.base import Qos
 from cocoro.component import Component
 from cocoro.installed import all_requests, all_topics
@@ -28,7 +29,8 @@ QOS = {
 
 
 HEADS = ("topic", "type", "rate", "max age", "qos", "publisher", "recorded")
-
+COLUMNS = tuple(Column(head, rank) for head, rank in zip(HEADS, (0, 1, 0, 2, 3, 0, 4), strict=True))
+REQUEST_COLUMNS = ("request", "question", "answer", Column("server", 2), Column("time-out", 1))
 
 app = typer.Typer()
 
@@ -44,9 +46,8 @@ def topics(
 
 def table() -> str:
     """The topics and requests of all installed components, as text."""
-    topics = plain_table(HEADS, [_row(topic) for topic in all_topics()])
-    request_heads = ("request", "question", "answer", "server", "time-out")
-    return f"{topics}\n{plain_table(request_heads, [_request_row(request) for request in all_requests()])}"
+    topics = fitted_table(COLUMNS, [_row(topic) for topic in all_topics()])
+    return f"{topics}\n{fitted_table(REQUEST_COLUMNS, [_request_row(request) for request in all_requests()])}"
 
 
 def as_json() -> str:

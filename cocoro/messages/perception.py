@@ -50,6 +50,11 @@ class Obstacles(Message):
 
     points_m: Annotated[tuple[FiniteVec3, ...], Meta(max_length=4096)] = ()
     """One point for each occupied floor cell of 4 cm: x, y of its middle, z of the highest point in it."""
+    lowest_m: Annotated[tuple[Finite, ...], Meta(max_length=4096)] = ()
+    """Height of the lowest point in each cell of `points_m`; empty in captures of before it was measured."""
+    nearest: bytes = b""
+    """Nearest depth (m) in each block of the depth image, row by row from its top left: 30 rows of 40 blocks, one byte
+    each, in steps of 14 mm rounded down; 0 where no pixel of the block has data."""
     free: Annotated[tuple[FiniteVec3, ...], Meta(max_length=1024)] = ()
     """Rays over free floor from `origin_m`: bearing (rad, body frame), nearest and farthest distance (m) at which the
     floor is visible. A ray ends before the first obstacle on it."""

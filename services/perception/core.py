@@ -39,6 +39,8 @@ class _Pending:
     sightings: tuple[ImageSighting, ...]
     floor_depth_m: Float32Array | None
     """Depth on a coarse grid, m, shape (rows, columns); None when no floor scan is due."""
+    nearest: bytes
+    """As in `Obstacles`, of the same image."""
     deadline_ns: int
 
 
@@ -98,6 +100,7 @@ class PerceptionCore:
             self.stale_frames += 1
             return
         image = RgbdImage.of(frame, self._robot)
+        floor_due = self._floor_due(frame.stamp_ns)
         self._pending.append(
             _Pending(
                 stamp_ns=frame.stamp_ns,
@@ -105,7 +108,8 @@ class PerceptionCore:
                 frame_incarnation=frame.incarnation,
                 camera=image.camera,
                 sightings=tuple(self._detector.detect(image)),
-                floor_depth_m=self._floor.sample(image) if self._floor_due(frame.stamp_ns) else None,
+                floor_depth_m=self._floor.sample(image) if floor_due else None,
+                nearest=self._floor.nearest(image) if floor_due else b"",
                 deadline_ns=now_ns + round(self._config.bracket_wait_s * NS),
             )
         )
@@ -133,7 +137,7 @@ class PerceptionCore:
         assert pending.floor_depth_m is not None
         camera, pose = pending.camera, self._localiser.camera_pose(angles)
         scan = self._floor.scan(pending.floor_depth_m, camera.width, camera.height, pose)
-        scan.stamp_ns = pending.stamp_ns
+        scan.stamp_ns, scan.nearest = pending.stamp_ns, pending.nearest
         return scan
 
     def _may_still_come(self, pending: _Pending, now_ns: int) -> bool:

@@ -23,6 +23,9 @@ _BEFORE_M = 0.06
 _MIN_POINTS = 2
 """Fewer points above the floor in a cell are noise."""
 _MOST_CELLS = 600
+BLOCKS = 30, 40
+"""Rows and columns of the blocks whose nearest depth is told."""
+STEP_M = 0.014
 _RAYS = round(360 / _RAY_DEG)
 _ROW_RAD, _CAMERA_M = 0.0125, 0.73
 """Angle between two rows of the grid, and the camera's height."""
@@ -44,8 +47,19 @@ class FloorScanner:
         step = max(image.width // 80, 1)
         return self._robot.depth_m(image.raw_depth[step // 2 :: step, step // 2 :: step])
 
+    def nearest(self, image: RgbdImage) -> bytes:
+        """`Obstacles.nearest` of a frame: from every pixel, so that nothing is too thin to be seen."""
+        rows, columns = (
+            np.arange(blocks) * size // blocks for blocks, size in zip(BLOCKS, image.raw_depth.shape, strict=True)
+        )
+        # Codes rise with the depth, and that of no data is the highest.
+        codes = np.minimum.reduceat(np.minimum.reduceat(image.raw_depth, rows, axis=0), columns, axis=1)
+        steps = np.clip(self._robot.depth_m(codes) / STEP_M, 1.0, 255.0)
+        nearest: bytes = np.nan_to_num(steps, nan=0.0).astype(np.uint8).tobytes()
+        return nearest
+
     def scan(self, depth_m: Float32Array, width: int, height: int, camera_pose: FloatArray) -> Obstacles:
-        """Obstacles and free floor in the body frame, without a stamp.
+        """Obstacles and free floor in the body frame, without a stamp and without `nearest`.
 
         `depth_m` is from `sample`, m, shape (rows, columns), of a frame of `width` x `height` pixels. `camera_pose`
         is the colour camera's pose in the body frame, 4 x 4, m.
@@ -63,7 +77,7 @@ class FloorScanner:
         tolerance = config.floor_tolerance_m + config.floor_tolerance_per_m * distance
         floor = np.abs(points[:, 2]) <= tolerance
         standing = (points[:, 2] > tolerance) & (points[:, 2] < config.obstacle_height_m)
-        cells, heights = _cells(points[standing])
+        cells, heights, lowest = _cells(points[standing])
         bearing = np.arctan2(level[:, 1], level[:, 0])
         ray = np.floor(np.degrees(bearing) / _RAY_DEG).astype(np.int64) % _RAYS
         return Obstacles(
@@ -71,6 +85,7 @@ class FloorScanner:
                 (round(x, 3), round(y, 3), round(z, 3))
                 for (x, y), z in zip(cells.tolist(), heights.tolist(), strict=True)
             ),
+            lowest_m=tuple(round(z, 3) for z in lowest.tolist()),
             free=_free(ray, distance, floor, standing),
             shown=_shown(bearing, distance, floor),
             origin_m=(float(origin[0]), float(origin[1])),
@@ -88,18 +103,19 @@ class FloorScanner:
         return rays
 
 
-def _cells(points: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Centres of the floor cells with enough points, m, shape (n, 2), and the highest point in each, m, shape (n,).
-    `points` has shape (k, 3), m."""
+def _cells(points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Centres of the floor cells with enough points, m, shape (n, 2), and the heights of the highest and the lowest
+    point in each, m, shape (n,). `points` has shape (k, 3), m."""
     if not len(points):
-        return np.zeros((0, 2)), np.zeros(0)
+        return np.zeros((0, 2)), np.zeros(0), np.zeros(0)
     numbers, inverse, counts = np.unique(
         np.floor(points[:, :2] / CELL_M).astype(np.int64), axis=0, return_inverse=True, return_counts=True
     )
-    heights = np.zeros(len(numbers))
+    heights, lowest = np.zeros(len(numbers)), np.full(len(numbers), np.inf)
     np.maximum.at(heights, inverse.reshape(-1), points[:, 2])
+    np.minimum.at(lowest, inverse.reshape(-1), points[:, 2])
     enough = np.flatnonzero(counts >= _MIN_POINTS)[:_MOST_CELLS]
-    return np.asarray((numbers[enough] + 0.5) * CELL_M, dtype=np.float64), heights[enough]
+    return np.asarray((numbers[enough] + 0.5) * CELL_M, dtype=np.float64), heights[enough], lowest[enough]
 
 
 def _free(
@@ -121,7 +137,7 @@ def _free(
 
 def _shown(bearing_rad: FloatArray, distance_m: FloatArray, floor: BoolArray) -> bytes:
     """`Obstacles.shown` by the points' bearings and distances (n,) from the camera."""
-    runs = []
+    runs: list[FloatArray] = []
     for part, width_deg in ((distance_m < _NEAR_M, 2), (distance_m >= _NEAR_M, 1)):
         degree = np.floor(np.degrees(bearing_rad[part]) / width_deg).astype(np.int64) * width_deg % 360
         order = np.lexsort((distance_m[part], degree))

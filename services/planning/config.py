@@ -178,6 +178,8 @@ class HandSightConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 class PlanningConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     rate_hz: Positive = 50.0
+    objects: str | None = None
+    """Path of a catalogue file, for the sizes of the known objects; the project's own by default."""
     marker: str = "hand_marker"
     """Label of the ball on the hand, which is no obstacle and no target."""
     model: str = ""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
@@ -13,6 +14,7 @@ from cocoro.clock import NS
 from cocoro.core import Output, Sample, Schedule, Take
 from cocoro.messages import BaseCommand, Intent, LearnedModel, PlannerStatus, ServoCommand
 from cocoro.messages.actions import Explore, Idle, Search
+from cocoro.objects import Catalogue
 from cocoro.robot import Robot
 from cocoro.topics import Topic
 from services.planning.arm import ArmStep
@@ -35,7 +37,9 @@ class PlanningCore:
 
     def __init__(self, robot: Robot, config: PlanningConfig) -> None:
         self._config = config
-        self._estimator = StateEstimator(config, robot)
+        self._estimator = StateEstimator(
+            config, robot, Catalogue.load(Path(config.objects) if config.objects else None)
+        )
         self.actuators = Actuators(robot, config)
         self._intent = Intent(action=Idle())
         self._behaviour: Behaviour = Idling(Idle())
@@ -128,7 +132,7 @@ class PlanningCore:
             return
         searching = isinstance(current.action, (Search, Explore)) and isinstance(intent.action, (Search, Explore))
         if not searching or intent.task_id != current.task_id:
-            self._estimator.around.seen.end(intent.task_id)
+            self._estimator.seen.end(intent.task_id)
         self._intent = intent
         self._ended = None
         if fresh is None:

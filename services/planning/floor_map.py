@@ -1,7 +1,10 @@
 """Map of the floor around the robot: free, occupied, or not seen yet.
 
-An evidence grid in the odometry frame (derived from occupancy grids, Elfes 1989): rays over free floor decrease the
-evidence of their cells, points above the floor increase it. The map moves with the robot; cells beyond its edge are
+An evidence grid in the odometry frame (derived from occupancy grids, Elfes 1989). Points above the floor increase the
+evidence of their cells, and the map keeps the heights between which they were seen. Evidence decreases where it is
+contradicted: free floor is seen in the cell of low evidence, or the depth image looks through the cell at the heights
+of the evidence. So what has moved leaves nothing behind, and what stands above the floor stays.
+Known objects do not enter: the memory has their places. The map moves with the robot; cells beyond its edge are
 dropped.
 """
 
@@ -9,13 +12,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import cos, sin
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 
 from cocoro.arrays import BoolArray, FloatArray, IntArray
+from cocoro.clock import NS
 from cocoro.frames import Pose2
 from cocoro.messages import Obstacles
+from cocoro.units import Vec3
+from services.planning.seen_through import NEAR_FLOOR_M, DepthView
 
 CELL_M = 0.05
 SIZE = 160
@@ -23,12 +30,39 @@ SIZE = 160
 _HIT, _FREE, _MOST, _LEAST, _OCCUPIED = 2, 1, 8, -4, 4
 _EDGE_CELLS = 40
 """The map moves when the robot is nearer to its edge than this."""
+_SPREAD_RAD = np.radians((-2 / 3, 0.0, 2 / 3))
+_EMPTY_NS = NS // 2
+"""Where the depth image has no data in place of what stood there, evidence decreases once in this time."""
+_OLD_NS = 120 * NS
+"""Evidence that nothing has confirmed for so long is dropped, and its cell counts as not seen."""
+_MARGIN_M = 0.06
+"""Margin about a known object for the cells' size, the depth's noise, and the error of its place."""
+
+
+class Solid(NamedTuple):
+    """A known object where it was seen."""
+
+    place_m: Vec3
+    """Its centre, odometry frame."""
+    radius_m: float
+    height_m: float
+
+    def holds(self, places_m: FloatArray, lowest_m: FloatArray, highest_m: FloatArray) -> BoolArray:
+        """Which things at places (n, 2), odometry frame, between two heights (n,), are part of it."""
+        x, y, z = self.place_m
+        half_m = self.height_m / 2 + _MARGIN_M
+        beside: BoolArray = np.hypot(places_m[:, 0] - x, places_m[:, 1] - y) < self.radius_m + _MARGIN_M
+        return beside & (lowest_m > z - half_m) & (highest_m < z + half_m)
 
 
 class FloorMap:
     def __init__(self) -> None:
         self._evidence = np.zeros((SIZE, SIZE), dtype=np.int8)
         self._looked = np.zeros((SIZE, SIZE), dtype=bool)
+        self._lowest, self._highest = np.zeros((2, SIZE, SIZE))
+        """Heights between which the evidence was seen, m."""
+        self._confirmed_ns = np.zeros((SIZE, SIZE), dtype=np.int64)
+        self._now_ns = 0
         self._corner = np.array([-SIZE // 2, -SIZE // 2])
         """Index of the array's first cell, counted in cells from the odometry frame's origin."""
         self.changes = 0
@@ -41,28 +75,90 @@ class FloorMap:
 
     # --- updates ----------------------------------------------------------------------------------
 
-    def enter(self, seen: Obstacles, body: Pose2, own: tuple[FloatArray, FloatArray] | None) -> None:
+    def enter(
+        self,
+        seen: Obstacles,
+        body: Pose2,
+        own: tuple[FloatArray, FloatArray] | None,
+        known: Sequence[Solid] = (),
+        view: DepthView | None = None,
+    ) -> None:
         """Enter one depth image's floor and obstacles, seen from the body's pose in the odometry frame.
 
         `own`: centres (n, 3) and radii (n,) of the robot's own hull, body frame, metres; points inside are dropped.
+        `known`: known objects; what the map shows of them is dropped. `view`: the image itself.
         """
         self._follow(body)
+        empty_due = seen.stamp_ns // _EMPTY_NS != self._now_ns // _EMPTY_NS
+        self._now_ns = seen.stamp_ns
         origin = np.array(body.apply((*seen.origin_m, 0.0))[:2])
         if seen.free:
-            self._add(self._along(np.array(seen.free), origin, body.yaw_rad), -_FREE)
+            # Thin things are seen by the image itself; without it they must do with the floor around them.
+            up_to_m = NEAR_FLOOR_M if view is not None else np.inf
+            self._free(self._along(np.array(seen.free), origin, body.yaw_rad), up_to_m)
         if seen.points_m:
             points = np.array(seen.points_m)
+            lowest = np.array(seen.lowest_m) if len(seen.lowest_m) == len(points) else points[:, 2]
             if own is not None:
-                points = points[~_inside(points, *own)]
+                others = ~_inside(points, *own)
+                points, lowest = points[others], lowest[others]
             c, s = cos(body.yaw_rad), sin(body.yaw_rad)
-            turned = points[:, :2] @ np.array([[c, s], [-s, c]])
-            self._add(turned + np.array([body.x_m, body.y_m]), _HIT)
+            places = points[:, :2] @ np.array([[c, s], [-s, c]]) + np.array([body.x_m, body.y_m])
+            strange = np.ones(len(points), dtype=bool)
+            for solid in known:
+                strange &= ~solid.holds(places, lowest, points[:, 2])
+            self._hit(places[strange], lowest[strange], points[strange, 2])
+        self._doubt(body, known, view, empty_due=empty_due)
         self.changes += 1
+
+    def _hit(self, places_m: FloatArray, lowest_m: FloatArray, highest_m: FloatArray) -> None:
+        """Add evidence at places (n, 2), odometry frame, between two heights (n,)."""
+        index = self._index(places_m)
+        inside = ((index >= 0) & (index < SIZE)).all(axis=1)
+        rows, columns = index[inside].T
+        fresh = self._evidence[rows, columns] <= 0
+        self._lowest[rows[fresh], columns[fresh]], self._highest[rows[fresh], columns[fresh]] = np.inf, -np.inf
+        np.minimum.at(self._lowest, (rows, columns), lowest_m[inside])
+        np.maximum.at(self._highest, (rows, columns), highest_m[inside])
+        self._confirmed_ns[rows, columns] = self._now_ns
+        self._add(places_m, _HIT)
+
+    def _free(self, places_m: FloatArray, up_to_m: float) -> None:
+        """Decrease the evidence of cells in which floor is seen (n, 2), unless it begins above the floor or reaches
+        higher than `up_to_m`."""
+        index = self._index(places_m)
+        inside = ((index >= 0) & (index < SIZE)).all(axis=1)
+        rows, columns = index[inside].T
+        above = (self._lowest[rows, columns] > NEAR_FLOOR_M) | (self._highest[rows, columns] > up_to_m)
+        above &= self._evidence[rows, columns] > 0
+        self._add(places_m[inside][~above], -_FREE)
+        self._looked[rows, columns] = True
+
+    def _doubt(self, body: Pose2, known: Sequence[Solid], view: DepthView | None, *, empty_due: bool) -> None:
+        """Decrease evidence that this image contradicts, and drop that of known objects and what is old."""
+        rows, columns = np.nonzero(self._evidence > 0)
+        places = ((np.stack([rows, columns], axis=1) + self._corner) + 0.5) * CELL_M
+        lowest, highest = self._lowest[rows, columns], self._highest[rows, columns]
+        for solid in known:
+            theirs = solid.holds(places, lowest, highest)
+            self._evidence[rows[theirs], columns[theirs]] = 0
+        age_ns = self._now_ns - self._confirmed_ns[rows, columns]
+        old = age_ns > _OLD_NS
+        self._evidence[rows[old], columns[old]] = 0
+        self._looked[rows[old], columns[old]] = False
+        if view is None:
+            return
+        c, s = cos(body.yaw_rad), sin(body.yaw_rad)
+        here = (places - np.array([body.x_m, body.y_m])) @ np.array([[c, -s], [s, c]])
+        through = view.look(here, lowest, highest)
+        less = (through.gone | (through.empty & empty_due)) & (age_ns > 0)
+        self._evidence[rows[less], columns[less]] = np.maximum(self._evidence[rows[less], columns[less]] - _FREE, 0)
 
     def bump(self, places_m: Sequence[tuple[float, float]]) -> None:
         """Mark places (odometry frame) as occupied because the robot touched something there."""
+        places, floor = np.array(places_m), np.zeros(len(places_m))
         for _ in range(3):
-            self._add(np.array(places_m), _HIT)
+            self._hit(places, floor, floor)
         self.changes += 1
 
     def pass_over(self, place_m: tuple[float, float]) -> None:
@@ -71,7 +167,10 @@ class FloorMap:
 
     @staticmethod
     def _along(rays: FloatArray, origin: FloatArray, yaw_rad: float) -> FloatArray:
-        """Points (n, 2), odometry frame, every cell along the rays (m, 3): bearing rad, near m, far m."""
+        """Points (n, 2), odometry frame, every cell along the rays (m, 3): bearing rad, near m, far m. A ray stands for
+        2 degrees, so it is spread, or cells between two rays would be left out."""
+        rays = np.repeat(rays, len(_SPREAD_RAD), axis=0)
+        rays[:, 0] += np.tile(_SPREAD_RAD, len(rays) // len(_SPREAD_RAD))
         steps = np.arange(0.0, float(rays[:, 2].max()), CELL_M)
         inside = (steps[None, :] >= rays[:, 1:2]) & (steps[None, :] <= rays[:, 2:3])
         directions = np.stack([np.cos(rays[:, 0] + yaw_rad), np.sin(rays[:, 0] + yaw_rad)], axis=1)
@@ -92,11 +191,11 @@ class FloorMap:
         if ((at >= _EDGE_CELLS) & (at < SIZE - _EDGE_CELLS)).all():
             return
         shift = at - SIZE // 2
-        evidence, looked = np.zeros_like(self._evidence), np.zeros_like(self._looked)
         to, source = overlap(-shift)
-        evidence[to] = self._evidence[source]
-        looked[to] = self._looked[source]
-        self._evidence, self._looked = evidence, looked
+        for cells in (self._evidence, self._looked, self._lowest, self._highest, self._confirmed_ns):
+            moved = np.zeros_like(cells)
+            moved[to] = cells[source]
+            cells[:] = moved
         self._corner = self._corner + shift
 
     # --- queries ---------------------------------------------------------------------------------

@@ -15,6 +15,7 @@ from cocoro.arrays import FloatArray
 from cocoro.clock import NS
 from cocoro.frames import Pose2
 from cocoro.messages import TargetEstimate
+from cocoro.units import Vec3
 from services.planning.config import MemoryConfig
 
 _SURE = 3
@@ -119,6 +120,19 @@ class TargetMemory:
             age_s=age_s,
             odometry_position_m=(float(position[0]), float(position[1]), float(position[2])),
         )
+
+    def sure(self, label: str) -> bool:
+        """Whether an object was seen repeatedly; one sighting may be a mistake."""
+        return self.sightings(label) >= _SURE
+
+    def place(self, label: str, stamp_ns: int, within_s: float) -> Vec3 | None:
+        """Where a sure object was at a time, odometry frame, m; None when its newest sighting is further off than
+        `within_s`."""
+        track = self._tracks.get(label)
+        if track is None or not self.sure(label) or abs(stamp_ns - track.stamp_ns) > within_s * NS:
+            return None
+        x, y, z = _moved(track, max((stamp_ns - track.stamp_ns) / NS, 0.0), self._config.velocity_fade_s).tolist()
+        return x, y, z
 
     def sightings(self, label: str) -> int:
         """Number of sightings that support the object's position."""

@@ -17,15 +17,21 @@ from cocoro.clock import NS, is_fresh
 from cocoro.frames import Pose2
 from cocoro.history import History
 from cocoro.messages import BaseState, Detection, Detections, Intent, Message, Obstacles, ServoState
+from cocoro.objects import Catalogue
 from cocoro.robot import Robot
 from cocoro.topics import Topic
 from cocoro.units import Vec3
 from services.planning.config import PlanningConfig
+from services.planning.floor_map import Solid
 from services.planning.head import PAN, TILT, CameraTilt
 from services.planning.memory import TargetMemory
+from services.planning.seen_floor import SeenFloor
+from services.planning.seen_through import VIEW_BYTES, DepthView
 from services.planning.surroundings import Surroundings
 
 _WAIT_FOR_ODOMETRY_NS = NS // 5
+_JUST_SEEN_S = 0.5
+"""An object that a frame does not show, but which was seen so shortly before it, is still in it."""
 _GLIMPSE_NS = NS // 20
 """Time over which the camera's turn is measured."""
 FLOOR_M, FLOOR_PER_M = 0.040, 0.012
@@ -119,7 +125,10 @@ class Turning:
 class StateEstimator:
     """Takes every input of the planner and answers queries by time."""
 
-    def __init__(self, config: PlanningConfig, robot: Robot) -> None:
+    def __init__(self, config: PlanningConfig, robot: Robot, catalogue: Catalogue | None = None) -> None:
+        """`catalogue`: the known objects, for their sizes."""
+        self._robot = robot
+        self._known = {item.label: item for item in catalogue.targets} if catalogue is not None else {}
         self._joints = tuple(robot.joints)
         self.memory = TargetMemory(config.memory)
         self.base: BaseState | None = None
@@ -131,9 +140,14 @@ class StateEstimator:
         self._odometry = History(3, angular=(2,))
         self._postures: dict[str, tuple[tuple[str, ...], History]] = {}
         self._gap_ns = round(config.odometry_gap_s * NS)
-        self.around = Surroundings(config.marker, config.search, robot)
+        self.around = Surroundings(config.marker, {label: item.planar_radius_m for label, item in self._known.items()})
+        self.seen = SeenFloor(config.search, robot)
         self._waiting: deque[Detections] = deque(maxlen=8)
         self._floors: deque[Obstacles] = deque(maxlen=4)
+        self._localised_ns = 0
+        """Stamp of the newest frame whose detections are in the memory."""
+        self._in_frames: deque[tuple[int, tuple[Solid, ...]]] = deque(maxlen=8)
+        """Known objects by the stamp of the frame that they were seen in."""
         self.sight_lag_s = 0.0
         """Smoothed age of a sighting when the next one arrives; small for a fast perception."""
         self._looked_ns: int | None = None
@@ -156,8 +170,10 @@ class StateEstimator:
                 # The base restarted with a new odometry frame; positions in the old frame are void.
                 self.memory.clear()
                 self.around.clear()
+                self.seen.clear()
                 self._floors.clear()
                 self._waiting.clear()
+                self._localised_ns = 0
         elif isinstance(message, ServoState):
             self._keep_posture(topic.name, message)
             if topic.name == topics.ARM_STATE.name:
@@ -208,13 +224,17 @@ class StateEstimator:
         while self._floors:
             seen = self._floors[0]
             pose = self._odometry.at(seen.stamp_ns, self._gap_ns)
-            if pose is None and now_ns - seen.stamp_ns < _WAIT_FOR_ODOMETRY_NS:
+            early = pose is None or self._localised_ns < seen.stamp_ns
+            if early and 0 <= now_ns - seen.stamp_ns < _WAIT_FOR_ODOMETRY_NS:
                 return
             self._floors.popleft()
             if pose is not None and now_ns - seen.stamp_ns <= topics.OBSTACLES.max_age_s * NS:
                 seen = self._standing(seen)
-                self.around.floor.enter(seen, Pose2(*pose.tolist()), own(self.posture(seen.stamp_ns)))
-                self.around.seen.enter(seen, Pose2(*pose.tolist()), self._turning_radps(seen.stamp_ns))
+                angles = self.posture(seen.stamp_ns)
+                view = DepthView(self._robot, seen.nearest, angles) if len(seen.nearest) == VIEW_BYTES else None
+                known = self._solids(seen.stamp_ns)
+                self.around.floor.enter(seen, Pose2(*pose.tolist()), own(angles), known, view)
+                self.seen.enter(seen, Pose2(*pose.tolist()), self._turning_radps(seen.stamp_ns))
 
     def _turning_radps(self, stamp_ns: int) -> float:
         """The rate at which the camera turned before a time; infinite where that is not known."""
@@ -226,6 +246,15 @@ class StateEstimator:
         pan = angles[PAN] - before[PAN] + float(pose[2] - pose_before[2])
         return hypot(pan, angles[TILT] - before[TILT]) * NS / _GLIMPSE_NS
 
+    def _solids(self, stamp_ns: int) -> list[Solid]:
+        """The known objects that a frame shows, and where those are that were seen shortly before it."""
+        found = [solid for stamp, solids in self._in_frames if stamp == stamp_ns for solid in solids]
+        for label, item in self._known.items():
+            place = self.memory.place(label, stamp_ns, within_s=_JUST_SEEN_S)
+            if place is not None:
+                found.append(Solid(place, item.planar_radius_m, item.size_m[2]))
+        return found
+
     def _standing(self, seen: Obstacles) -> Obstacles:
         """The obstacles without points that appear above the floor only because the camera is tilted."""
         if self.camera_tilt is None or self.camera_tilt.tilt_rad <= 0.0 or not seen.points_m:
@@ -236,6 +265,8 @@ class StateEstimator:
         return msgspec.structs.replace(seen, points_m=tuple(compress(seen.points_m, stands.tolist())))
 
     def _remember(self, detections: Detections, body: Pose2) -> None:
+        self._localised_ns = detections.stamp_ns
+        solids = []
         for detection in detections.detections:
             if detection.position_m is None:
                 self.unlocalised[detection.label] = (detections.stamp_ns, detection.note)
@@ -246,6 +277,11 @@ class StateEstimator:
             if detection.label in self._watched and not doubtful:
                 self._keep_sighting(detection, detections.stamp_ns)
             self.memory.see(detection.label, place, distance_m, detections.stamp_ns, doubtful=doubtful)
+            item = self._known.get(detection.label)
+            if item is not None and self.memory.sure(detection.label):
+                x, y, z = place.tolist()
+                solids.append(Solid((x, y, z), item.planar_radius_m, item.size_m[2]))
+        self._in_frames.append((detections.stamp_ns, tuple(solids)))
 
     def _keep_sighting(self, detection: Detection, stamp_ns: int) -> None:
         angles = self._posture_at(stamp_ns)

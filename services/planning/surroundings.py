@@ -11,15 +11,12 @@ from cocoro.arrays import FloatArray
 from cocoro.clock import NS
 from cocoro.frames import Pose2
 from cocoro.messages import TargetEstimate
-from cocoro.robot import Robot
-from services.planning.config import SearchConfig
 from services.planning.floor_map import ClearanceField, FloorMap
 from services.planning.routes import Routes
-from services.planning.seen_floor import SeenFloor
 
 _KEEP_NS = NS // 10
 _OBJECT_M = 0.033
-"""Radius with which a known object counts as an obstacle: that of the cans."""
+"""Radius with which an object of unknown size counts as an obstacle: that of the cans."""
 _SMEAR_M = 0.09
 """Margin by which the map may show an object wider than it is: cell size, depth noise, odometry drift."""
 
@@ -34,18 +31,17 @@ class Fields(NamedTuple):
 
 
 class Surroundings:
-    def __init__(self, marker: str, search: SearchConfig, robot: Robot) -> None:
-        """`marker`: the label of the ball on the robot's own hand."""
+    def __init__(self, marker: str, radii_m: Mapping[str, float] | None = None) -> None:
+        """`marker`: the label of the ball on the robot's own hand; `radii_m`: of the known objects, by label."""
         self._marker = marker
+        self._radii_m = radii_m or {}
         self.floor = FloorMap()
-        self.seen = SeenFloor(search, robot)
         self._fields: Fields | None = None
         self._built: tuple[int, str] | None = None
         self._built_ns = 0
 
     def clear(self) -> None:
         self.floor.clear()
-        self.seen.clear()
         self._fields = None
 
     def fields(
@@ -63,7 +59,9 @@ class Surroundings:
         stale = self._built is None or self._built[1] != label or now_ns - self._built_ns >= _KEEP_NS
         if self._fields is None or (stale and what != self._built):
             discs = {
-                item.label: (*item.odometry_position_m[:2], _OBJECT_M) for item in known if item.label != self._marker
+                item.label: (*item.odometry_position_m[:2], self._radii_m.get(item.label, _OBJECT_M))
+                for item in known
+                if item.label != self._marker
             }
             seen = [(x, y, radius + _SMEAR_M) for x, y, radius in discs.values()]
             target = [(x, y, radius + _SMEAR_M) for name, (x, y, radius) in discs.items() if name == label]
@@ -76,7 +74,11 @@ class Surroundings:
 
     def discs(self, known: Sequence[TargetEstimate]) -> tuple[tuple[float, float, float], ...]:
         """The floor (x, y, radius), odometry frame, metres, that known objects stand on."""
-        return tuple((*item.odometry_position_m[:2], _OBJECT_M) for item in known if item.label != self._marker)
+        return tuple(
+            (*item.odometry_position_m[:2], self._radii_m.get(item.label, _OBJECT_M))
+            for item in known
+            if item.label != self._marker
+        )
 
     def unseen(self, places_m: FloatArray) -> FloatArray:
         """Which places (n, 2), odometry frame, were not seen yet; shape (n,)."""

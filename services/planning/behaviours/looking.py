@@ -99,7 +99,7 @@ class Searching:
         return self._look(snapshot)
 
     def _look(self, snapshot: Snapshot) -> Plan:
-        config, seen = snapshot.actuators.config, snapshot.estimator.around.seen
+        config, seen = snapshot.actuators.config, snapshot.estimator.seen
         pan, tilt = snapshot.angles[PAN], snapshot.angles[TILT]
         lag_s = snapshot.estimator.sight_lag_s
         if self._checked_ns is None and not seen.running:
@@ -189,7 +189,7 @@ class Exploring:
         self._back_off = BackOff()
 
     def step(self, snapshot: Snapshot) -> Plan:
-        actuators, seen = snapshot.actuators, snapshot.estimator.around.seen
+        actuators, seen = snapshot.actuators, snapshot.estimator.seen
         if not seen.running:  # a planner that restarted knows nothing of the search
             return Plan(snapshot.stand(), snapshot.still(), "there is no search", None, "failed", "not_found")
         if self._time_is_up:
@@ -259,11 +259,11 @@ class Exploring:
         if snapshot.now_ns - self._checked_ns < self.AGAIN_NS:
             return True
         self._checked_ns = snapshot.now_ns
-        cells = snapshot.estimator.around.seen.visible(self._view.place_m, *snapshot.stands_around)
+        cells = snapshot.estimator.seen.visible(self._view.place_m, *snapshot.stands_around)
         return float(cells.sum()) * CELL_M**2 >= self.WORTH * self._view.gain_m2
 
     def _nothing_left(self, snapshot: Snapshot) -> str:
-        rest = snapshot.estimator.around.seen.rest(*snapshot.stands_around)
+        rest = snapshot.estimator.seen.rest(*snapshot.stands_around)
         if rest.patches:
             return f"{self._label} was not found; nowhere else to look from{_not_seen(rest, snapshot.body)}"
         radius_m = snapshot.actuators.config.search.radius_m
