@@ -37,11 +37,10 @@ class Search(Action, frozen=True, tag="search"):
 
 
 class Explore(Action, frozen=True, tag="explore"):
-    """Drive to where floor can be seen that was not seen yet. Fails with `not_found` when there is no such place."""
+    """Drive to where unseen floor can be seen. Fails, and says what was not seen, when there is none or time is up."""
 
     label: str
     time_is_up: bool = False
-    """Fail now, and say what was not seen."""
 
 
 class Approach(Action, frozen=True, tag="approach"):

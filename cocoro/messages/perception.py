@@ -9,8 +9,6 @@ from msgspec import Meta
 
 from cocoro.messages.common import Count, Finite, FiniteVec2, FiniteVec3, Message
 
-SHOWN_STEP_M = 0.012
-
 
 class Detection(msgspec.Struct, kw_only=True):
     """One known object in one frame."""
@@ -58,8 +56,8 @@ class Obstacles(Message):
     free: Annotated[tuple[FiniteVec3, ...], Meta(max_length=1024)] = ()
     """Rays over free floor from `origin_m`: bearing (rad, body frame), nearest and farthest distance (m) at which the
     floor is visible. A ray ends before the first obstacle on it."""
-    shown: bytes = b""
-    """Visible floor, also beyond things: for each stretch its bearing (degree, 2 bytes, lowest first), and nearest and
-    farthest distance (1 byte each, in steps of 12 mm)."""
+    shown: Annotated[bytes, Meta(max_length=6144)] = b""
+    """Visible floor, also beyond things: bearing (degree), nearest and farthest distance (mm) of each stretch, 2 bytes
+    each, lowest first."""
     origin_m: FiniteVec2 = (0.0, 0.0)
     """The camera's position, projected on the floor."""

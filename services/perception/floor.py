@@ -11,7 +11,6 @@ import numpy as np
 
 from cocoro.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from cocoro.messages import Obstacles
-from cocoro.messages.perception import SHOWN_STEP_M
 from cocoro.robot import Robot
 from services.perception.config import PerceptionConfig
 from services.perception.image import RgbdImage
@@ -152,13 +151,11 @@ def _shown(bearing_rad: FloatArray, distance_m: FloatArray, floor: BoolArray) ->
         first, last = np.flatnonzero(begins), np.flatnonzero(ends)
         long = last > first
         first, last = first[long], last[long]
-        runs.extend(np.stack([degree[first] + more, away[first], away[last]], axis=1) for more in range(width_deg))
+        runs.extend(
+            np.stack([(degree[first] + more) % 360, away[first], away[last]], axis=1) for more in range(width_deg)
+        )
     if not runs:
         return b""
     found = np.concatenate(runs)
-    packed = np.zeros(len(found), dtype=[("degree", "<u2"), ("near", "u1"), ("far", "u1")])
-    packed["degree"] = found[:, 0] % 360
-    packed["near"] = np.minimum(np.ceil(found[:, 1] / SHOWN_STEP_M), 255)
-    packed["far"] = np.minimum(found[:, 2] / SHOWN_STEP_M, 255)
-    data: bytes = packed.tobytes()
+    data: bytes = np.round(found * (1.0, 1000.0, 1000.0)).astype("<u2").tobytes()
     return data

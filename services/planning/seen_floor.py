@@ -17,14 +17,12 @@ import numpy as np
 from cocoro.arrays import BoolArray, FloatArray, IntArray
 from cocoro.frames import Pose2
 from cocoro.messages import Obstacles
-from cocoro.messages.perception import SHOWN_STEP_M
 from cocoro.robot import Robot
 from services.planning.config import SearchConfig
 from services.planning.floor_map import CELL_M, SIZE, FloorMap, overlap
 from services.planning.head import PAN, TILT
 
-_STRETCH = np.dtype([("degree", "<u2"), ("near", "u1"), ("far", "u1")])
-"""As `Obstacles.shown` is written."""
+_STRETCH_BYTES = 6
 _SPREAD_DEG = (0.25, 0.75)
 """A stretch is a degree wide."""
 _ENOUGH = 2
@@ -112,12 +110,9 @@ class SeenFloor:
         """Enter the floor of one depth image, taken from the body's pose while the camera turned at a rate."""
         if not self.running or not seen.shown or turning_radps > self._config.turning_radps:
             return
-        shown = np.frombuffer(seen.shown, dtype=_STRETCH)
-        rays = np.repeat(
-            np.stack([np.radians(shown["degree"]), shown["near"] * SHOWN_STEP_M, shown["far"] * SHOWN_STEP_M], axis=1),
-            len(_SPREAD_DEG),
-            axis=0,
-        )
+        whole = len(seen.shown) // _STRETCH_BYTES * _STRETCH_BYTES
+        shown = np.frombuffer(seen.shown[:whole], dtype="<u2").reshape(-1, 3) * (np.pi / 180, 0.001, 0.001)
+        rays = np.repeat(shown, len(_SPREAD_DEG), axis=0)
         rays[:, 0] += np.tile(np.radians(_SPREAD_DEG), len(shown))
         steps = np.arange(0.0, self._config.sight_m, CELL_M / 2)
         inside = (steps[None, :] >= rays[:, 1:2]) & (steps[None, :] <= rays[:, 2:3])

@@ -29,3 +29,4 @@ async def find(skills: Skills, label: str) -> None:
         if failed.reason != "timed_out":
             raise
     await skills.do(Explore(label, time_is_up=True), timeout_s=_ANSWER_S)
+    raise TaskFailedError("not_found", f"time is up; {label} was not found")
