@@ -42,8 +42,13 @@ def draw(
             colour = _bright(known.rgb) if known is not None else fallback
             _draw_detection(image, detection, colour, scale)
     if caption:
-        _text(image, caption, 4, image.shape[0] - 5, LOCALISED)
+        captioned(image, caption)
     return image
+
+
+def captioned(image: ImageArray, caption: str) -> None:
+    """Write a line at the bottom of an RGB image."""
+    _text(image, caption, 4, image.shape[0] - 5, LOCALISED)
 
 
 def save_png(image: ImageArray, path: Path) -> None:
