@@ -85,7 +85,12 @@ def run(
             return CRASHED
         log.error("%s: %s; make room there", error.filename or run_dir.path, error.strerror)
         return MISCONFIGURED
-    except Exception:
+    except Exception as error:
+        from deploy.extras import advice_of
+
+        if sentence := advice_of(error):
+            log.error("%s", sentence)
+            return MISCONFIGURED
         if raise_crashes:
             raise
         log.exception("crashed")

@@ -19,7 +19,7 @@ from apps.cli.listed import COMMANDS
 def load(name: str) -> TyperCommand | TyperGroup:
     """Imports the file of a command and returns the command."""
     match name:
-        case "cancel" | "rehearse":
+        case "cancel" | "wait" | "rehearse":
             from apps.cli.task_commands import app
         case "status":
             from apps.cli.status import app

@@ -28,7 +28,7 @@ from cocoro.held_file import Holder
 from cocoro.robot import Robot
 from cocoro.stop.path import StopPoint
 from cocoro.stop.record import latch_dir, read
-from deploy import profiles
+from deploy import extras, profiles
 from deploy.processes import shared_bytes
 from deploy.profiles import Profile
 from deploy.rundir import RunDir
@@ -89,7 +89,7 @@ def examine(profile: Profile) -> Iterator[Check]:
         running = [service for service in row.services if service in claims]
         if running:
             yield note(row.name, f"runs (pid {claims[running[0]].pid}): `cocoro status` shows its state")
-        else:
+        elif not any(extras.missing([row])):  # its checks need them
             yield from _own_checks(row, profile, robot)
     yield _clock(profile)
     yield _shared_memory(profile, claims)
@@ -113,11 +113,20 @@ def _robot(profile: Profile) -> tuple[Robot, Check | None]:
 
 
 def _libraries(profile: Profile) -> Iterator[Check]:
-    for name in dict.fromkeys(library for row in profile.rows() for library in row.libraries):
-        try:
-            yield ok(name, version(name))
-        except PackageNotFoundError:
-            yield bad(name, f"is not installed: pip install {name}")
+    rows = profile.rows()
+    lacking = set(extras.missing(rows))
+    for name in dict.fromkeys(library for row in rows for library in row.libraries):
+        if name in lacking:
+            yield bad(name, f"is not installed: {extras.advice(name)}")
+        else:
+            yield ok(name, _version(name))
+
+
+def _version(library: str) -> str:
+    try:
+        return version(library)
+    except PackageNotFoundError:  # another distribution has the module, as opencv-python does
+        return "installed"
 
 
 def _own_checks(component: Component, profile: Profile, robot: Robot) -> Iterable[Check]:

@@ -6,73 +6,19 @@ import os
 import sys
 from contextlib import closing
 from pathlib import Path
-from typing import Annotated, TextIO
+from typing import Annotated
 
 import msgspec
 import typer
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from apps.cli import exits
+from apps.cli.experiment_progress import RunProgress
 from apps.cli.options import DescriptionOption, FramesOption, MeasuredOption, frames_of
-from apps.cli.terminal import table
 from apps.experiments.experiments import EXPERIMENTS, run
 from apps.experiments.plan import ExperimentSettings
-from apps.experiments.runs import RunResult
 from cocoro.errors import ConfigError
 
 EVERY = "all"
-
-
-class RunProgress:
-    """Shows a bar, the runs in work and the time left on a terminal; elsewhere prints a line for each finished run."""
-
-    def __init__(self, out: TextIO) -> None:
-        console = Console(file=out)
-        self._out = out
-        self._bar = Progress(
-            BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), TextColumn("{task.description}", markup=False),
-            console=console, transient=True, disable=not console.is_terminal,
-        )  # fmt: skip
-        self._task = self._bar.add_task("")
-        self._total = self._done = self._failed = 0
-        self._running: list[str] = []
-
-    def begin(self, total: int, had: int) -> None:
-        self._total, self._done = total, had
-        kept = f"; {had} of them have a result already" if had else ""
-        self._print(f"{total} runs{kept}")
-        self._bar.start()
-        self._bar.update(self._task, total=total, completed=had)
-
-    def started(self, name: str) -> None:
-        self._running.append(name)
-        self._bar.update(self._task, description=self.text())
-
-    def ended(self, name: str, result: RunResult) -> None:
-        if name in self._running:
-            self._running.remove(name)
-        self._done += 1
-        error = result.get("error")
-        self._failed += error is not None
-        if error is not None or self._bar.disable:
-            self._print(f"{self._done} of {self._total} {name}: {error or result.get('outcome', 'done')}")
-        self._bar.update(self._task, completed=self._done, description=self.text())
-
-    def close(self) -> None:
-        """Leaves the terminal as it was."""
-        self._bar.stop()
-
-    def text(self) -> str:
-        """The runs in work, and how many failed."""
-        failed = f"{self._failed} failed; " if self._failed else ""
-        return f"{failed}{', '.join(self._running)}"
-
-    def _print(self, text: str) -> None:
-        if self._bar.disable:
-            print(text, file=self._out, flush=True)
-        else:
-            self._bar.print(text, markup=False, highlight=False, soft_wrap=True)
 
 
 app = typer.Typer()
@@ -87,7 +33,7 @@ def experiment(
     out: Annotated[
         Path,
         typer.Option(metavar="DIR", help="For report, plots, samples and models; runs with a result are not repeated."),
-    ] = Path("experiments"),
+    ] = Path("out/experiments"),
     sensors: Annotated[str, typer.Option(metavar="ideal|real", help="Sensors without or with errors.")] = "real",
     body: Annotated[
         str, typer.Option(metavar="nominal|worn", help="A body that equals the nominal model, or differs from it.")
@@ -137,19 +83,12 @@ def run_experiments(
     settings.robot()  # refuses files that cannot be read before the first run
     if frames:
         settings = msgspec.structs.replace(settings, **frames_of(frames))
-    progress = RunProgress(sys.stderr)
+    progress = RunProgress(sys.stderr, settings.jobs)
     try:
         with closing(progress):
             sections, path = run(keys, settings, progress, plots=plots)
     except KeyboardInterrupt:
         print("interrupted; finished runs are kept, and the same command continues", file=sys.stderr)
         return exits.REFUSED
-    for section in sections:
-        print(f"{section.key}: {section.title}")
-        heads = ("measure", "who", "mean +- 95% CI", "worst", "unit", "wanted", "")
-        rows = [(r.measure, r.who, r.mean, r.worst, r.unit, r.wanted, r.verdict) for r in section.rows]
-        print(table(heads, rows))
-        for note in (*section.notes, *section.errors):
-            print(f"  {note}")
     print(f"{path} and {path.with_suffix('.html').name} are written")
     return exits.FAILED if any(section.errors for section in sections) else exits.DONE

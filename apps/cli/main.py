@@ -47,7 +47,7 @@ def main(arguments: list[str] | None = None) -> int:
                 return estop.main(arguments[0], arguments[1:])
         return _command(arguments)
     except BaseException as error:
-        return failed(error)
+        return failed(error, arguments[0] if arguments else "")
 
 
 def _command(arguments: list[str]) -> int:
@@ -66,8 +66,9 @@ def _command(arguments: list[str]) -> int:
     return exits.DONE
 
 
-def failed(error: BaseException) -> int:
-    """Reports the error that ended a command in at most one line, and returns the exit code for it."""
+def failed(error: BaseException, command: str = "") -> int:
+    """Reports the error that ended a command in at most one line, and returns the exit code for it. `command` is the
+    command's name."""
     from cocoro.errors import CocoroError
 
     while isinstance(error, BaseExceptionGroup) and len(error.exceptions) == 1:  # a TaskGroup wraps errors
@@ -90,6 +91,12 @@ def failed(error: BaseException) -> int:
     if hiding:
         output.complain(hiding)
         return exits.USAGE
+    if isinstance(error, ModuleNotFoundError):
+        from deploy.extras import advice_of
+
+        if sentence := advice_of(error, command):
+            output.complain(sentence)
+            return exits.USAGE
     _report_bug(error)
     return exits.FAILED
 

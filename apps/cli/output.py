@@ -26,11 +26,15 @@ LEVEL = "COCORO_LOG"
 """Environment variable with the log level; at `debug`, errors are printed with their tracebacks."""
 SPELLING = "cocoro.spelling"
 """Name under which `codecs` knows the streams' error handler."""
+PIECE = 4096
+"""Bytes that a pipe which has room takes at once."""
+UNREAD = OSError(errno.EAGAIN, "its reader reads nothing")
 CLOSED = OSError(errno.EBADF, "it is closed")
 ADVICE = {
     errno.ENOSPC: "make room there, or write it elsewhere",
     errno.EBADF: "redirect it to /dev/null to do without it",
     errno.EPIPE: "its reader ended before it read anything",
+    errno.EAGAIN: "read it, or write it elsewhere",
 }
 
 
@@ -50,6 +54,10 @@ class _Out(io.RawIOBase):
         self.failure: OSError | None = None
         self.arrived = False
         """Whether any byte was written."""
+        self.interruptible = False
+        """Whether `give_up_waiting` ends a write that waits for a reader."""
+        self.waits = False
+        """Whether such a write waits now."""
         self._fd = fd
         self._was_closed = closed
 
@@ -69,8 +77,10 @@ class _Out(io.RawIOBase):
         if self._was_closed:
             raise CLOSED
         while True:
+            if self.interruptible:
+                self._wait_for_room()
             try:
-                count = os.write(self._fd, data)
+                count = os.write(self._fd, data[:PIECE] if self.interruptible else data)
             except BlockingIOError:  # another process set O_NONBLOCK on the shared descriptor
                 import select
 
@@ -78,6 +88,18 @@ class _Out(io.RawIOBase):
                 continue
             self.arrived = True
             return count
+
+    def _wait_for_room(self) -> None:
+        """Waits until the reader takes a piece; the wait can be given up, that of `os.write` could not."""
+        import select
+
+        if select.select([], [self._fd], [], 0)[1]:
+            return
+        self.waits = True
+        try:
+            select.select([], [self._fd], [])
+        finally:
+            self.waits = False
 
     def writable(self) -> bool:
         return True
@@ -166,6 +188,24 @@ def going_on() -> Iterator[None]:
     finally:
         if out is not None:
             out.vital = before
+
+
+@contextmanager
+def interruptible() -> Iterator[None]:
+    """In this context `give_up_waiting` has an effect."""
+    for out in _outs.values():
+        out.interruptible = True
+    try:
+        yield
+    finally:
+        for out in _outs.values():
+            out.interruptible = False
+
+
+def give_up_waiting() -> None:
+    """Ends a write that waits for a reader, as if the stream were lost; called in a signal handler."""
+    if any(out.waits for out in _outs.values()):
+        raise UNREAD
 
 
 def finish(code: int) -> int:

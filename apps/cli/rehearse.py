@@ -15,6 +15,8 @@ from apps.cli import exits
 from apps.cli.options import frames_of, latencies_of
 from apps.cli.running import scene_of
 from apps.cli.tasks import USAGE_REFUSALS
+from apps.cli.terminal import StatusLine
+from apps.rehearsal.progress import Tell, ignored
 from apps.rehearsal.request import RehearsalRequest
 from cocoro.errors import CocoroError, ConfigError
 
@@ -28,8 +30,9 @@ def rehearse(options: dict[str, Any], latency: list[str], frames: str | None, as
     from apps.rehearsal.rehearse import rehearse as run  # imports the simulator, which is slow
 
     try:
-        with _output_to_stderr() if as_json else nullcontext():
-            result: dict[str, Any] = run(request)
+        with _output_to_stderr() if as_json else nullcontext(), StatusLine(sys.stderr) as line:
+            tell: Tell = (lambda progress: line.show(str(progress))) if line.shown else ignored
+            result: dict[str, Any] = run(request, tell)
     except CocoroError as error:
         refusal = getattr(error, "code", None)  # the executive refused the task
         if refusal is None:

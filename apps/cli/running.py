@@ -32,7 +32,7 @@ from apps.cli.output import going_on
 from cocoro import private
 from cocoro.bus import shared
 from cocoro.errors import CocoroError, ConfigError
-from deploy import launch, profiles
+from deploy import extras, launch, profiles
 from deploy.profiles import Profile
 from deploy.rundir import RunDir, Target, robots, targets
 
@@ -76,6 +76,7 @@ def up(
         settings.insert(0, objects_of(objects))
     settings[:0] = model_of(model, reach, adapt)
     read = profiles.read(profile, settings)
+    extras.require(f"cocoro up {profile}", read.rows())
     sys.exit(supervise_detached(read, unattended) if detach else supervise(read, unattended))
 
 

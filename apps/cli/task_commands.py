@@ -56,6 +56,10 @@ Shared = Callable[..., None]
 def operate(
     task: Task,
     timeout: TimeoutOption = None,
+    detach: Annotated[
+        bool,
+        typer.Option("--detach", "-d", help="Print the task's id and end; the task goes on. See `wait`, `cancel`."),
+    ] = False,
     snapshot: Annotated[
         Path | None, typer.Option(metavar="OUT.png", help="Write what the robot sees when it grasps.")
     ] = None,
@@ -63,12 +67,16 @@ def operate(
     profile: MeshOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Ctrl-C cancels it on the robot."""
-    from apps.cli import tasks
+    """Ctrl-C cancels it on the robot, and so does every other end of the command: a closed terminal, a kill."""
+    from apps.cli import task_running
     from cocoro.messages import TaskRequest
 
-    request = TaskRequest(task=task, timeout_s=timeout)
-    sys.exit(asyncio.run(tasks.run(RobotChoice(robot, profile), request, json, snapshot)))
+    choice, request = RobotChoice(robot, profile), TaskRequest(task=task, timeout_s=timeout)
+    if not detach:
+        sys.exit(asyncio.run(task_running.run(choice, request, json, snapshot)))
+    if snapshot is not None:
+        raise ConfigError("--snapshot takes its picture when the robot grasps: leave --detach out")
+    sys.exit(asyncio.run(task_running.detach(choice, request, json)))
 
 
 def rehearse(
@@ -195,12 +203,27 @@ app.add_typer(
 )
 
 
-@app.command()
-def cancel(robot: RobotOption = None, profile: MeshOption = None) -> None:
-    """End the running task; the robot stands still."""
-    from apps.cli import tasks
+TaskIdArgument = Annotated[
+    str, typer.Argument(metavar="[ID]", help="The task's id, as `--detach` prints it; by default the running task.")
+]
 
-    sys.exit(asyncio.run(tasks.cancel(RobotChoice(robot, profile))))
+
+@app.command()
+def cancel(task: TaskIdArgument = "", robot: RobotOption = None, profile: MeshOption = None) -> None:
+    """End the running task; the robot stands still."""
+    from apps.cli import task_running
+
+    sys.exit(asyncio.run(task_running.cancel(RobotChoice(robot, profile), task)))
+
+
+@app.command()
+def wait(
+    task: TaskIdArgument = "", robot: RobotOption = None, profile: MeshOption = None, json: JsonOption = False
+) -> None:
+    """Follow a task to its end, and exit as its own command would have. Ctrl-C ends the waiting, not the task."""
+    from apps.cli import task_running
+
+    sys.exit(asyncio.run(task_running.wait(RobotChoice(robot, profile), task, json)))
 
 
 def _command(name: str, shared: Shared) -> TyperCommand:

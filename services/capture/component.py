@@ -14,4 +14,5 @@ CAPTURE = Component(
     nice=10,
     cpu_share=0.3,
     rss_mb=300.0,
+    libraries=("opencv-python-headless",),
 )

@@ -22,6 +22,8 @@ class ExecutiveConfig(Limits, frozen=True, forbid_unknown_fields=True):
     intent_hz: Positive = 50.0
     progress_hz: Positive = 5.0
     latch_hz: Positive = 5.0
+    latch_wait_s: Positive = 5.0
+    """How long the executive waits at its start until it is known whether the emergency stop is latched."""
     settle_s: Positive = 3.0
     """How long the executive waits after a task for the robot to come to rest."""
     planner_silence_s: Positive = 1.5
