@@ -13,7 +13,7 @@ import typer
 from apps.captures.export.files import refuse_existing
 from apps.captures.reader import Capture
 from apps.cli import exits
-from apps.cli.options import CaptureArgument
+from apps.cli.options import CameraOption, CaptureArgument
 from cocoro.clock import NS
 from cocoro.errors import ConfigError
 
@@ -32,8 +32,11 @@ def export(
     file: CaptureArgument,
     video: Annotated[
         Path | None,
-        typer.Option("--video", metavar="OUT.mp4", help="Film of the camera's pictures with the detections drawn in."),
+        typer.Option(
+            "--video", metavar="OUT.mp4", help="Film of the camera's pictures with the detections; .webp: an animation."
+        ),
     ] = None,
+    camera: CameraOption = "robot",
     foxglove: Annotated[
         Path | None, typer.Option("--foxglove", metavar="OUT.mcap", help="For Foxglove; needs cocoro-mesh[foxglove].")
     ] = None,
@@ -52,7 +55,7 @@ def export(
 ) -> None:
     """Turn a capture into a film, tables, or a file for Foxglove or Rerun; or extract its attachments. Several forms
     at once are possible."""
-    sys.exit(export_capture(file, video, rrd, foxglove, csv, parquet, attachments))
+    sys.exit(export_capture(file, video, rrd, foxglove, csv, parquet, attachments, camera))
 
 
 def export_capture(
@@ -63,6 +66,7 @@ def export_capture(
     csv: Path | None = None,
     parquet: Path | None = None,
     attachments: Path | None = None,
+    camera: str = "robot",
 ) -> int:
     """Writes each form whose path is given, and returns the exit code.
 
@@ -77,11 +81,7 @@ def export_capture(
             refuse_existing(out)  # before the first form has taken minutes
     with Capture.open(file) as capture:
         if video is not None:
-            from apps.captures.export import video as films
-
-            with progress_bar(capture, video) as show:
-                pictures = films.export(capture, video, show)
-            print(f"{video}: {pictures} pictures")
+            film(capture, video, camera)
         if foxglove is not None:
             from apps.captures.export.foxglove import export as export_foxglove
 
@@ -110,6 +110,15 @@ def export_capture(
         if capture.ending:
             print(f"note: {file} was {capture.ending}", file=sys.stderr)
         return exits.FAILED if capture.problems else exits.DONE
+
+
+def film(capture: Capture, out: Path, camera: str) -> None:
+    """Makes a film of a capture. Raises CaptureError when it cannot be made, ConfigError for an unknown camera."""
+    from apps.captures.export import video
+
+    with progress_bar(capture, out) as show:
+        pictures = video.export(capture, out, show, video.camera_of(camera))
+    print(f"{out}: {pictures} pictures")
 
 
 @contextmanager

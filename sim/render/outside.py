@@ -1,7 +1,7 @@
 """Pictures for people: the simulated world from outside, with soft shadows and without jagged edges.
 
 A picture is the mean of several drawings. Each has the camera moved by a part of a pixel, and another light: a lamp
-that is no point, or a part of the sky. So shadows have soft edges, and corners and the floor under the robot are darker.
+that is no point, or a part of the sky. So shadows have soft edges, and corners are darker.
 """
 
 from __future__ import annotations
@@ -84,7 +84,8 @@ class OutsideRenderer:
 def _toned(light: Float32Array) -> ImageArray:
     """The picture of a light, (height, width, 3), 0 to 255."""
     dark = np.clip(1.0 - light / 255.0, 0.0, 1.0)
-    return np.rint(255.0 * (1.0 - dark**BRIGHTEN)).astype(np.uint8)
+    picture: ImageArray = np.rint(255.0 * (1.0 - dark**BRIGHTEN)).astype(np.uint8)
+    return picture
 
 
 def _lights(samples: int, lamp: Vec3) -> list[tuple[OutsideLight, float]]:

@@ -6,7 +6,7 @@ The whole run is known, so the path is smoothed forwards and backwards: the came
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from math import cos, pi, radians, sin, tan
+from math import cos, radians, sin, tan
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d

@@ -12,18 +12,18 @@ from contextlib import closing, contextmanager
 from itertools import pairwise
 from pathlib import Path
 from types import TracebackType
-from typing import Literal, Protocol
+from typing import Literal, Protocol, get_args
 
 import cv2
-import numpy as np
 
-from apps.captures.export.files import making
+from apps.captures.export.files import making, refuse_existing
 from apps.captures.export.story import Story, catalogue_of, read
 from apps.captures.reader import Capture
 from apps.pictures import captioned, draw
 from cocoro.arrays import ImageArray
 from cocoro.capture.conventions import CaptureError
 from cocoro.clock import NS
+from cocoro.errors import ConfigError
 from cocoro.topics import FRAME
 
 CameraChoice = Literal["robot", "outside", "both"]
@@ -33,13 +33,33 @@ RATE_HZ = 30.0
 CODEC, SUFFIX = "mp4v", ".mp4"
 """MPEG-4 part 2, which OpenCV can write on every platform."""
 ANIMATION = ".webp"
-ANIMATION_HZ, ANIMATION_QUALITY = 12.5, 72
+ANIMATION_HZ, ANIMATION_QUALITY = 10.0, 84
 LONGEST_ANIMATION_S = 60.0
 """All pictures of an animation are in memory."""
 OUTSIDE_PX, ANIMATION_PX = (960, 540), (640, 360)
 INSET = 0.3
 """Width of the robot's picture in the corner, as a share of the whole."""
 INSET_EDGE_PX, INSET_RGB = 2, (235, 235, 235)
+
+
+def camera_of(name: str) -> CameraChoice:
+    """Raises ConfigError for a name that is none."""
+    for choice in get_args(CameraChoice):
+        if choice == name:
+            return choice  # type: ignore[no-any-return]
+    raise ConfigError(f"--camera {name}: no such camera; known are {', '.join(get_args(CameraChoice))}")
+
+
+def check(out: Path, length_s: float = 0.0) -> None:
+    """Raises CaptureError when no film of this length could have this name, or the file exists."""
+    refuse_existing(out)
+    if out.suffix.lower() not in (SUFFIX, ANIMATION):
+        raise CaptureError(f"{out}: a film's name ends with {SUFFIX}, that of a small animation with {ANIMATION}")
+    if out.suffix.lower() == ANIMATION and length_s > LONGEST_ANIMATION_S:
+        raise CaptureError(
+            f"{out}: an animation lasts {LONGEST_ANIMATION_S:.0f} s at most, and the capture has {length_s:.0f} s; "
+            f"make a film with a name that ends with {SUFFIX}"
+        )
 
 
 def export(
@@ -51,15 +71,7 @@ def export(
     Returns the number of pictures. Raises CaptureError when the capture has no pictures, or not what the view from
     outside needs, or when the film cannot be written.
     """
-    animated = out.suffix.lower() == ANIMATION
-    if out.suffix.lower() != SUFFIX and not animated:
-        raise CaptureError(f"{out}: a film's name ends with {SUFFIX}, that of a small animation with {ANIMATION}")
-    length_s = (capture.end_ns - capture.start_ns) / NS
-    if animated and length_s > LONGEST_ANIMATION_S:
-        raise CaptureError(
-            f"{out}: an animation lasts {LONGEST_ANIMATION_S:.0f} s at most, and the capture has {length_s:.0f} s; "
-            f"make a film with a name that ends with {SUFFIX}"
-        )
+    check(out, (capture.end_ns - capture.start_ns) / NS)
     with making(out):
         return _export(capture, out, progress, camera)
 
@@ -147,14 +159,14 @@ class _Animation:
             return
         self._due_s = at_s + 0.9 / ANIMATION_HZ
         self._times_s.append(at_s)
-        self._pictures.append(cv2.cvtColor(picture, cv2.COLOR_RGB2BGR).astype(np.uint8))
+        self._pictures.append(cv2.cvtColor(picture, cv2.COLOR_RGB2BGR).astype("uint8"))
 
     def close(self) -> int:
         animation = cv2.Animation()
         animation.frames = self._pictures
         last_s = 1.0  # the end is seen before it begins again
         gaps_s = [*(after - before for before, after in pairwise(self._times_s)), last_s]
-        animation.durations = np.array([round(1000 * gap_s) for gap_s in gaps_s])
+        animation.durations = [round(1000 * gap_s) for gap_s in gaps_s]
         options = [cv2.IMWRITE_WEBP_QUALITY, ANIMATION_QUALITY]
         try:
             written = cv2.imwriteanimation(self._name, animation, options)
@@ -166,9 +178,7 @@ class _Animation:
 
 
 class _Film:
-    def __init__(
-        self, out: Path, name: str, complaints: Complaints, size_px: tuple[int, int], start_s: float
-    ) -> None:
+    def __init__(self, out: Path, name: str, complaints: Complaints, size_px: tuple[int, int], start_s: float) -> None:
         self._out = out
         self._name = name
         self._complaints = complaints
