@@ -29,10 +29,11 @@ import msgspec
 from mcap.opcode import Opcode
 from mcap.records import Attachment, AttachmentIndex, Channel, Schema, Statistics
 
+from apps.captures import mcap_reading
 from apps.captures.contents import Contents, Disk, MessageBlock, miscounted, read_block
 from apps.captures.scan import contents, front_to_back
 from cocoro.capture import mcap
-from cocoro.capture.conventions import CHECKSUM, TALLY, CaptureError, NotAFileError, checksum
+from cocoro.capture.conventions import CHECKSUM, LEFT_OUT, TALLY, CaptureError, NotAFileError, checksum
 from cocoro.capture.mcap import DamageError
 from cocoro.capture.types import JSON, MSGPACK, NotReadableError, reader_of
 from cocoro.keys import matches
@@ -95,7 +96,7 @@ class Capture:
 
     @property
     def closed(self) -> bool:
-        """The file has its footer. A recorder that was killed or is still running leaves none."""
+        """The file has its footer, which a recorder that was killed or is still running leaves out."""
         return self._contents.closed
 
     @property
@@ -143,6 +144,16 @@ class Capture:
             return []
         names = ", ".join(f"{op:#04x}" for op in sorted(kinds))
         return [f"{kinds.total()} records of kinds that are not MCAP's own ({names}) are skipped"]
+
+    @cached_property
+    def left_out(self) -> tuple[tuple[int, int], ...]:
+        """Log times between which large messages were left out by intention; each end is exclusive."""
+        try:
+            stated = msgspec.json.decode(self.metadata[LEFT_OUT]["stretches"], type=list[tuple[int, int | None]])
+        except (KeyError, msgspec.MsgspecError):
+            return ()
+        here = ((start, self.end_ns if end is None else end) for start, end in stated)
+        return tuple(each for each in here if each[1] > self.start_ns and each[0] < self.end_ns)
 
     @property
     def places(self) -> tuple[MessageBlock, ...]:
@@ -206,7 +217,7 @@ class Capture:
     def attachment(self, index: AttachmentIndex) -> Attachment:
         """Read one attachment with its data. Raises DamageError when its checksum is wrong."""
         content = self._disk.read(index.offset, index.length)
-        return mcap.attachment(content[mcap.PREFIX.size :], self._contents.strict)
+        return mcap_reading.attachment(content[mcap.PREFIX.size :], self._contents.strict)
 
     @cached_property
     def robot(self) -> str:

@@ -52,7 +52,7 @@ def record(
     """Record what travels on the mesh into MCAP files, until Ctrl-C. The robot's own recorder keeps running."""
     settings = {
         "folder": str(out.resolve()), "only": only or (), "without": without or (),
-        "compression": compression, "jpeg_quality": jpeg,
+        "compression": compression, "jpeg_quality": jpeg, "per_occasion": False,
     }  # fmt: skip
     sys.exit(asyncio.run(record_mesh(RobotChoice(robot, profile), settings, seconds)))
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import sys
 from collections.abc import Iterator
@@ -18,6 +17,7 @@ from apps.captures.reader import Capture
 from apps.cli import exits
 from apps.cli.export import film
 from apps.cli.options import frames_of, latencies_of
+from apps.cli.output import complain, print_json
 from apps.cli.running import scene_of
 from apps.cli.tasks import USAGE_REFUSALS
 from apps.cli.terminal import StatusLine
@@ -74,9 +74,12 @@ def _run(request: RehearsalRequest, as_json: bool) -> int:
         refusal = getattr(error, "code", None)  # the executive refused the task
         if refusal is None:
             raise
-        print(f"cocoro: refused: {error}", file=sys.stderr)
+        complain(f"refused: {error}")
         return exits.USAGE if refusal in USAGE_REFUSALS else exits.REFUSED
-    print(json.dumps(result) if as_json else summary(result))
+    if as_json:
+        print_json(result)
+    else:
+        print(summary(result))
     return exits.DONE if result["outcome"] == "done" else exits.FAILED
 
 
