@@ -142,7 +142,8 @@ def test_a_film_from_outside_and_one_with_the_robots_picture_in_a_corner(
         out = tmp_path / f"{camera}.mp4"
         assert main(["export", str(run), "--video", str(out), "--camera", camera]) == 0
         film = cv2.VideoCapture(str(out))
-        assert (film.get(cv2.CAP_PROP_FRAME_WIDTH), film.get(cv2.CAP_PROP_FRAME_HEIGHT)) == SIZE
+        size = [film.get(side) for side in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)]
+        assert size == list(SIZE)
         pictures = []
         while True:
             read, picture = film.read()
