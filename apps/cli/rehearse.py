@@ -48,7 +48,7 @@ def rehearse(
         code = _run(msgspec.structs.replace(request, record=record), as_json)
         if Path(record).exists():
             with _output_to_stderr() if as_json else nullcontext(), Capture.open(Path(record)) as capture:
-                film(capture, video, camera)
+                print(f"{video}: {film(capture, video, camera)} pictures")
     return code
 
 
@@ -57,10 +57,11 @@ def _capture_beside(video: Path) -> Iterator[str]:
     """A file for a capture that is there while the context lasts, on the disk that the film is for."""
     try:
         video.parent.mkdir(parents=True, exist_ok=True)
-        with TemporaryDirectory(prefix=".film-", dir=video.parent) as folder:
-            yield str(Path(folder) / "rehearsal.mcap")
+        folder = TemporaryDirectory(prefix=".film-", dir=video.parent)
     except OSError as error:
         raise CocoroError(f"{video.parent}: {error.strerror}; choose another place for the film") from error
+    with folder as path:
+        yield str(Path(path) / "rehearsal.mcap")
 
 
 def _run(request: RehearsalRequest, as_json: bool) -> int:
