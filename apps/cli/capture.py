@@ -1,4 +1,4 @@
-"""`cocoro capture`: look at capture files, repair them, re-execute a service on them."""
+"""`cocoro capture`: list captures, look at them, keep or remove them, repair them, re-execute a service on them."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ import typer
 from apps.captures.info import AttachmentReport, CaptureReport, report
 from apps.captures.reader import Capture
 from apps.captures.rewrite import REPAIRED, rewrite
-from apps.cli import exits
-from apps.cli.options import CaptureArgument, FromOption, JsonOption, OnlyOption, ToOption, WithoutOption
+from apps.cli import exits, shelf
+from apps.cli.options import CaptureArgument, FromOption, JsonOption, OnlyOption, ToOption, WithoutOption, capture_file
 from apps.cli.terminal import Column, fields, table
 from cocoro.capture.conventions import CaptureError
 from cocoro.clock import NS
@@ -35,8 +35,13 @@ COLUMNS = (
 )  # fmt: skip
 
 app = typer.Typer()
-capture = typer.Typer(no_args_is_help=True, help="Look at capture files, repair them, re-execute services on them.")
+capture = typer.Typer(no_args_is_help=True, help="List captures, look at them, keep, repair and re-execute them.")
 app.add_typer(capture, name="capture")
+
+capture.command("list")(shelf.list_captures)
+capture.command()(shelf.pin)
+capture.command()(shelf.unpin)
+capture.command()(shelf.remove)
 
 # --- info -----------------------------------------------------------------------------------------
 
@@ -250,7 +255,10 @@ def check_span(capture: Capture, start_s: float | None, end_s: float | None) -> 
 @capture.command("rerun", hidden=True)
 @capture.command()
 def reexecute(
-    files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="The captures of one run, in order.")],
+    files: Annotated[
+        list[Path],
+        typer.Argument(metavar="FILE...", parser=capture_file, help="The captures of one run, in order."),
+    ],
     service: Annotated[str, typer.Option("--service", help="perception, planning, or another with a pure core.")],
     against: Annotated[
         str, typer.Option(metavar="recorded|nothing", help="What to compare the outputs with.")

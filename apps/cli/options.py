@@ -107,7 +107,22 @@ TimeoutOption = Annotated[
 
 # --- captures and topics --------------------------------------------------------------------------
 
-CaptureArgument = Annotated[Path, typer.Argument(metavar="FILE", help="A capture (MCAP file).")]
+
+def capture_file(text: str) -> Path:
+    """Reads a capture's file or name (latest, fetch, 'fetch red_can', a task's id). Raises ConfigError."""
+    from apps.captures.shelf import find  # slow to import
+
+    return find(text)
+
+
+CaptureArgument = Annotated[
+    Path,
+    typer.Argument(
+        metavar="FILE",
+        parser=capture_file,
+        help="A capture: an MCAP file, latest, latest-1, or a task: 'fetch red_can'.",
+    ),
+]
 OnlyOption = Annotated[
     list[str] | None,
     typer.Option("--only", metavar="KEYEXPR", help="Only these keys: base/state, */health, frames. Repeatable."),
