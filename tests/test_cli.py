@@ -222,7 +222,7 @@ def simulator(monkeypatch: pytest.MonkeyPatch) -> list[RehearsalRequest]:
     """Stands in for the simulator; the requests that it got. It prints, as libraries do."""
     asked: list[RehearsalRequest] = []
 
-    def run(request: RehearsalRequest) -> dict[str, Any]:
+    def run(request: RehearsalRequest, _tell: object) -> dict[str, Any]:
         asked.append(request)
         print("pybullet build time: today", flush=True)
         return RESULT | {"outcome": "failed" if request.task.label == "blue_can" else "done"}
@@ -283,7 +283,7 @@ def test_the_summary_says_outcome_phases_speed_and_truth(
 def test_a_refused_rehearsal_exits_as_the_refused_task_would(
     simulator: list[RehearsalRequest], monkeypatch: pytest.MonkeyPatch, refusal: str, code: int
 ) -> None:
-    def refuse(request: RehearsalRequest) -> dict[str, Any]:
+    def refuse(request: RehearsalRequest, _tell: object) -> dict[str, Any]:
         error = CocoroError("known are red_can")
         error.code = refusal  # type: ignore[attr-defined]
         raise error

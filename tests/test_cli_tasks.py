@@ -17,6 +17,7 @@ from msgspec import to_builtins
 from apps.cli import exits
 from apps.cli.babble import SampleWriter
 from apps.cli.link import MeshLink
+from apps.cli.output import recent_complaints
 from apps.cli.progress import LineDisplay, TaskDisplay
 from apps.cli.tasks import Follower
 from cocoro.bus.local import LocalMesh
@@ -421,6 +422,8 @@ def refused(code: str, text: str) -> TaskReply:
 def test_a_refusal_gives_the_robots_words_and_its_code(
     refusal: str, code: int, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    recent_complaints.clear()  # as each command does; what was just said is not said again
+
     @in_virtual_time
     async def scenario(scene: Scene) -> None:
         Executive(scene.node, replies=[refused(refusal, "what it says")])

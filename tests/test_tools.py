@@ -245,7 +245,7 @@ def test_logs_of_one_process_or_service_or_of_a_level(
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["teapot"], "no log of teapot; there are sim, supervisor"),
+        (["teapot"], "no log of teapot; known are sim, supervisor"),
         (["--level", "loud"], "known are debug"),
         (["--robot", "robbie"], "no logs of robbie"),
     ],

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import sys
 from math import degrees
 
@@ -13,6 +12,7 @@ import typer
 from apps.cli import exits
 from apps.cli.link import joined, within
 from apps.cli.options import JsonOption, MeshOption, RobotChoice, RobotOption
+from apps.cli.output import print_json
 from cocoro.errors import MeshError
 from cocoro.messages import BaseState, RecoverRequest
 from cocoro.topics import BASE_STATE, HEALTH, RECOVER
@@ -53,7 +53,7 @@ async def show(choice: RobotChoice, as_json: bool) -> int:
         await within(WAIT_S, lambda: state.value is not None and health.value is not None, changed)
         newest, faults = state.value, None if health.value is None else health.value.faults
     if as_json:
-        print(json.dumps({"state": msgspec.to_builtins(newest), "faults": list(faults or ())}))
+        print_json({"state": msgspec.to_builtins(newest), "faults": list(faults or ())})
     else:
         _print(newest, faults or ())
     return exits.DONE if newest is not None and faults == () else exits.FAILED

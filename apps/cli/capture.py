@@ -22,7 +22,7 @@ from apps.cli.options import CaptureArgument, FromOption, JsonOption, OnlyOption
 from apps.cli.terminal import Column, fields, table
 from cocoro.capture.conventions import CaptureError
 from cocoro.clock import NS
-from cocoro.errors import ConfigError
+from cocoro.errors import ConfigError, choice_of
 from services.capture.file import COMPRESSIONS, Compression, Packer
 from services.capture.keys import KeyFilter
 from services.capture.log_clock import WALL_CLOCK, WallClockStep, describe_step
@@ -229,7 +229,7 @@ def _compression(text: str) -> Compression:
     for known in COMPRESSIONS:
         if text == known:
             return known
-    raise ConfigError(f"--compression {text}: known are {', '.join(COMPRESSIONS)}")
+    raise ConfigError(f"--compression {text}: {choice_of(text, COMPRESSIONS)}")
 
 
 def check_span(capture: Capture, start_s: float | None, end_s: float | None) -> None:
@@ -281,7 +281,7 @@ def reexecute_service(files: list[Path], service: str, against: str, tolerance: 
     from apps.captures import reexecute as reexecution
 
     if against not in ("recorded", "nothing"):
-        raise ConfigError(f"--against {against}: known are recorded and nothing")
+        raise ConfigError(f"--against {against}: {choice_of(against, ('recorded', 'nothing'))}")
     with ExitStack() as stack:
         captures = [stack.enter_context(Capture.open(file)) for file in files]
         if len({capture.robot for capture in captures}) > 1:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import sys
 import time
 from collections import deque
@@ -23,6 +22,7 @@ from apps.cli.interrupt import interrupt_event
 from apps.cli.link import joined
 from apps.cli.listening import KeyListener, keyexpr_of, takes_frames
 from apps.cli.options import JsonOption, KeyArgument, MeshOption, RobotChoice, RobotOption
+from apps.cli.output import print_json
 from apps.cli.terminal import Column, FittedTable, table
 from cocoro.bus.base import Payload
 from cocoro.installed import topic_named
@@ -219,7 +219,7 @@ class _RateDisplay:
 
     def show(self, reports: list[RateReport], keyexpr: str) -> None:
         if self._as_json:
-            print(json.dumps([asdict(report) for report in reports]), flush=True)
+            print_json([asdict(report) for report in reports])
             return
         nothing = f"nothing on {keyexpr} yet"
         if self._live is not None:

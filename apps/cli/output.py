@@ -112,6 +112,10 @@ class _Out(io.RawIOBase):
 
 
 _outs: dict[str, _Out] = {}
+told = False
+"""Whether the running command has printed JSON."""
+ERRORS = {exits.FAILED: "failed", exits.USAGE: "usage", exits.REFUSED: "refused", exits.NO_MESH: "no_mesh"}
+"""Names of the exit codes in errors as JSON."""
 recent_complaints: deque[str] = deque(maxlen=8)
 """Latest complaints of the running command, so that none is printed twice."""
 
@@ -188,6 +192,33 @@ def going_on() -> Iterator[None]:
     finally:
         if out is not None:
             out.vital = before
+
+
+def print_json(value: Any) -> None:
+    """Prints a result as one line of JSON. A command with `--json` prints all its results by this function; an error
+    is printed by `print_json_error`."""
+    import json
+
+    global told
+    told = True
+    print(json.dumps(value), flush=True)
+
+
+def asks_json(arguments: list[str]) -> bool:
+    """Whether a command's arguments ask for JSON."""
+    end = arguments.index("--") if "--" in arguments else len(arguments)
+    return "--json" in arguments[:end]
+
+
+def json_error(code: int, text: str) -> dict[str, object]:
+    """An error for scripts; `code` is the exit code."""
+    return {"error": {"code": ERRORS.get(code, "failed"), "exit_code": code, "text": text}}
+
+
+def print_json_error(code: int, text: str) -> None:
+    """Prints an error on standard output for scripts."""
+    with going_on():
+        print_json(json_error(code, text))
 
 
 @contextmanager

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import sys
 from collections.abc import Iterator
@@ -13,6 +12,7 @@ import msgspec
 
 from apps.cli import exits
 from apps.cli.options import frames_of, latencies_of
+from apps.cli.output import complain, print_json
 from apps.cli.running import scene_of
 from apps.cli.tasks import USAGE_REFUSALS
 from apps.cli.terminal import StatusLine
@@ -37,9 +37,12 @@ def rehearse(options: dict[str, Any], latency: list[str], frames: str | None, as
         refusal = getattr(error, "code", None)  # the executive refused the task
         if refusal is None:
             raise
-        print(f"cocoro: refused: {error}", file=sys.stderr)
+        complain(f"refused: {error}")
         return exits.USAGE if refusal in USAGE_REFUSALS else exits.REFUSED
-    print(json.dumps(result) if as_json else summary(result))
+    if as_json:
+        print_json(result)
+    else:
+        print(summary(result))
     return exits.DONE if result["outcome"] == "done" else exits.FAILED
 
 

@@ -14,7 +14,7 @@ from typing import IO, Annotated, Any
 import msgspec
 import typer
 
-from apps.cli import exits
+from apps.cli import completions, exits
 from apps.cli.options import (
     AdaptOption,
     FramesOption,
@@ -24,6 +24,7 @@ from apps.cli.options import (
     ProfileArgument,
     ReachOption,
     RobotOption,
+    SceneOption,
     SetOption,
     frames_of,
     latencies_of,
@@ -49,14 +50,23 @@ app = typer.Typer()
 def up(
     profile: ProfileArgument = "sim",
     detach: Annotated[bool, typer.Option("--detach", "-d", help="Return when the robot is up.")] = False,
-    scene: Annotated[str | None, typer.Option(help="Simulator: a scene's name, or its file.")] = None,
+    scene: SceneOption = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Simulator: seed of all random numbers.")] = None,
     sensors: Annotated[
-        str | None, typer.Option(metavar="ideal|real", help="Simulator: sensors without or with errors.")
+        str | None,
+        typer.Option(
+            metavar="ideal|real",
+            autocompletion=completions.of("ideal", "real"),
+            help="Simulator: sensors without or with errors.",
+        ),
     ] = None,
     body: Annotated[
         str | None,
-        typer.Option(metavar="nominal|worn", help="Simulator: a body that equals the nominal model, or differs."),
+        typer.Option(
+            metavar="nominal|worn",
+            autocompletion=completions.of("nominal", "worn"),
+            help="Simulator: a body that equals the nominal model, or differs.",
+        ),
     ] = None,
     model: ModelOption = None,
     reach: ReachOption = None,
@@ -88,9 +98,19 @@ def down(robot: RobotOption = None) -> None:
 
 @app.command()
 def run(
-    process: Annotated[str, typer.Argument(help="A process of the profile, or any other that is installed.")],
+    process: Annotated[
+        str,
+        typer.Argument(
+            help="A process of the profile, or any other that is installed.", autocompletion=completions.processes
+        ),
+    ],
     profile: Annotated[
-        str | None, typer.Option(metavar="PROFILE", help="By default that of the robot that is up here, else sim.")
+        str | None,
+        typer.Option(
+            metavar="PROFILE",
+            autocompletion=completions.profiles,
+            help="By default that of the robot that is up here, else sim.",
+        ),
     ] = None,
     set_: SetOption = None,
 ) -> None:

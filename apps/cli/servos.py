@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import json as json_module
 import select
 import sys
 from collections.abc import Iterator
@@ -25,10 +24,11 @@ from apps.cli.options import (
     RobotChoice,
     RobotOption,
 )
+from apps.cli.output import print_json
 from apps.cli.terminal import StatusLine, print_table
 from apps.cli.toml_files import write_values
 from cocoro.component import load
-from cocoro.errors import CocoroError, ConfigError, MeshError, RefusedError
+from cocoro.errors import CocoroError, ConfigError, MeshError, RefusedError, choice_of
 from cocoro.messages import ServoRequest
 from cocoro.ports import port_path
 from cocoro.robot import Joint, Robot
@@ -128,7 +128,7 @@ def _networks_of(joints: list[str], robot: Robot) -> dict[str, list[str]]:
     """Joints by network; no joints stand for all of both networks. Raises ConfigError for an unknown joint."""
     known = robot.joints
     if unknown := [joint for joint in joints if joint not in known]:
-        raise ConfigError(f"there is no joint {unknown[0]!r}; known are {', '.join(known)}")
+        raise ConfigError(f"there is no joint {unknown[0]!r}; {choice_of(unknown[0], known)}")
     if not joints:
         return {network: [] for network in NETWORKS}
     found: dict[str, list[str]] = {}
@@ -167,7 +167,7 @@ class ServoWorkbench:
 
     def joint(self, name: str) -> Joint:
         if name not in self.robot.joints:
-            raise ConfigError(f"there is no joint {name!r}; known are {', '.join(self.robot.joints)}")
+            raise ConfigError(f"there is no joint {name!r}; {choice_of(name, self.robot.joints)}")
         return self.robot.joints[name]
 
     @contextmanager
@@ -222,7 +222,7 @@ def scan_ports(
     found = list(tools.scan(wanted, bauds or tools.BAUDS, range(1, last + 1), report))
     names = {joint.id: joint for joint in bench.robot.joints.values()}
     if as_json:
-        print(json_module.dumps([one._asdict() for one in found]))
+        print_json([one._asdict() for one in found])
     else:
         _print_found(found, names)
     missing = [joint for number, joint in names.items() if number not in {one.number for one in found}]

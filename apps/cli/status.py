@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import sys
 from collections.abc import Iterator
 from functools import partial
@@ -15,6 +14,7 @@ import typer
 from apps.cli import exits
 from apps.cli.link import MeshLink, joined, within
 from apps.cli.options import JsonOption, MeshOption, RobotChoice, RobotOption
+from apps.cli.output import print_json
 from apps.cli.terminal import Column, fields, print_table
 from cocoro.errors import ConfigError
 from cocoro.messages import Health, Message, TaskState
@@ -44,7 +44,7 @@ async def show_status(choice: RobotChoice, as_json: bool) -> int:
     async with joined(choice) as link:
         report = await Survey(link).take()
     if as_json:
-        print(json.dumps(report))
+        print_json(report)
     else:
         _print(report)
     return exits.DONE if all(service["alive"] for service in report["services"]) else exits.FAILED

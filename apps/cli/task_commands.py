@@ -20,6 +20,7 @@ from msgspec import NODEFAULT, Meta
 from typer.core import TyperCommand, TyperGroup
 from typer.main import get_group
 
+from apps.cli import completions
 from apps.cli.options import (
     AdaptOption,
     BodyOption,
@@ -81,10 +82,17 @@ def operate(
 
 def rehearse(
     task: Task,
-    scene: Annotated[str, typer.Option(help="A scene's name, or its file.")] = "paper",
+    scene: Annotated[
+        str, typer.Option(help="A scene's name, or its file.", autocompletion=completions.scenes)
+    ] = "paper",
     seed: Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")] = 0,
     sensors: Annotated[
-        str, typer.Option(metavar="ideal|real", help="Perfect camera and body, or real ones.")
+        str,
+        typer.Option(
+            metavar="ideal|real",
+            autocompletion=completions.of("ideal", "real"),
+            help="Perfect camera and body, or real ones.",
+        ),
     ] = "ideal",
     body: BodyOption = "nominal",
     description: DescriptionOption = None,
@@ -277,7 +285,7 @@ def _parameter(field: msgspec.structs.FieldInfo) -> inspect.Parameter:
     text = next((meta.description for meta in metas if meta.description), None)
     default = inspect.Parameter.empty if field.default is NODEFAULT else field.default
     if field.name == "label":
-        annotation = _ANNOTATED[plain, typer.Argument(help=text)]
+        annotation = _ANNOTATED[plain, typer.Argument(help=text, autocompletion=completions.labels)]
         return inspect.Parameter(field.name, inspect.Parameter.KEYWORD_ONLY, annotation=annotation, default=default)
     name, metavar = field.name, None
     for unit, word in UNITS.items():

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,7 +10,7 @@ from apps.cli import exits
 from apps.cli.interrupt import HANDS_OFF, SIGNALS, on_reader_gone, on_signals
 from apps.cli.link import MeshLink, joined
 from apps.cli.options import RobotChoice
-from apps.cli.output import going_on
+from apps.cli.output import complain, going_on, print_json
 from apps.cli.progress import task_display
 from apps.cli.snapshot import check
 from apps.cli.tasks import Follower
@@ -35,7 +33,7 @@ async def run(choice: RobotChoice, request: TaskRequest, as_json: bool, picture:
         with hands_on(follower):
             code, result = await follower.run()
     if as_json:
-        print(json.dumps(result))
+        print_json(result)
     return code
 
 
@@ -46,7 +44,7 @@ async def detach(choice: RobotChoice, request: TaskRequest, as_json: bool) -> in
         with hands_on(follower):
             code, result = await follower.ask()
     if as_json:
-        print(json.dumps(result))
+        print_json(result)
     elif code == exits.DONE:
         print(result["task_id"])
     return code
@@ -68,7 +66,7 @@ async def wait(choice: RobotChoice, task_id: str, as_json: bool) -> int:
         with on_signals(SIGNALS, lambda _number: follower.leave()), going_on():
             code, result = await follower.attend(state)
     if as_json:
-        print(json.dumps(result))
+        print_json(result)
     return code
 
 
@@ -77,7 +75,7 @@ async def cancel(choice: RobotChoice, task_id: str = "") -> int:
     async with joined(choice) as link:
         reply = await link.call(CANCEL, CancelRequest(task_id=task_id))
     if not reply.accepted:
-        print(f"cocoro: refused: {reply.text}", file=sys.stderr)
+        complain(f"refused: {reply.text}")
         return exits.REFUSED
     print(reply.text or "cancelled")
     return exits.DONE

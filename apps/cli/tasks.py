@@ -14,6 +14,7 @@ import msgspec
 
 from apps.cli import exits
 from apps.cli.link import MeshLink
+from apps.cli.output import complain, json_error
 from apps.cli.progress import TaskDisplay
 from apps.cli.snapshot import SnapshotTaker
 from cocoro.bus.base import Handle
@@ -284,9 +285,9 @@ class Follower:
 
     def _refused(self, reply: TaskReply) -> Result:
         result = {"task": self._task, "label": self._label, "outcome": "refused"}
-        print(f"cocoro: refused: {reply.text}", file=sys.stderr)
+        complain(f"refused: {reply.text}")
         code = exits.USAGE if reply.refusal in USAGE_REFUSALS else exits.REFUSED
-        return code, result | {"reason": reply.refusal, "text": reply.text}
+        return code, result | {"reason": reply.refusal, "text": reply.text} | json_error(code, reply.text)
 
     def _outcome(self, state: TaskState) -> Result:
         code = {"done": exits.DONE, "failed": exits.FAILED, "cancelled": exits.REFUSED}[state.outcome or "failed"]

@@ -11,6 +11,7 @@ from typing import Any
 from cocoro import topics
 from cocoro.clock import NS
 from cocoro.entry_points import added_to
+from cocoro.errors import choice_of
 from cocoro.messages import (
     BaseState,
     CancelRequest,
@@ -114,11 +115,11 @@ class Executive:
         if task.needs_label:
             known = self._catalogue.get(task.target)
             grasping = task.needs_label == "graspable"
-            targets = ", ".join(item.label for item in self._catalogue.targets if item.graspable or not grasping)
+            targets = [item.label for item in self._catalogue.targets if item.graspable or not grasping]
             if known is None or known.marker:
-                return "unknown_label", f"unknown object {task.target!r}; known are {targets}"
+                return "unknown_label", f"unknown object {task.target!r}; {choice_of(task.target, targets)}"
             if grasping and not known.graspable:
-                return "not_graspable", f"{task.target} does not fit into the hand; what does: {targets}"
+                return "not_graspable", f"{task.target} does not fit into the hand; what does: {', '.join(targets)}"
         if self._running is not None:
             return "busy", f"{self._what()} is running; cancel it first (cocoro cancel)"
         if stopped := self._estop.refusal:
