@@ -19,10 +19,10 @@ from mcap.records import Footer, Metadata, MetadataIndex, Statistics, SummaryOff
 from cocoro.capture import mcap
 from cocoro.capture.mcap import MAGIC, PREFIX, DamageError
 from cocoro.clock import NS
-from cocoro.errors import CocoroError, ConfigError
+from cocoro.errors import CocoroError
 from deploy.rundir import RunDir, robots
 from services.capture.config import CaptureConfig, folder_of
-from services.capture.folder import is_pinned, parsed_name
+from services.capture.folder import captures, is_pinned, parsed_name
 from services.capture.occasions import OCCASION, Note, Occasion, occasion_of
 
 LATEST, IDLE = "latest", "idle"
@@ -186,6 +186,18 @@ def listed(robot: str | None = None) -> Iterator[ListedCapture]:
         yield capture
 
 
+def run_until(path: Path) -> list[Path]:
+    """The captures of a file's run in its folder, in order, up to it; the file alone when no recorder named it."""
+    wanted = parsed_name(path)
+    if wanted is None:
+        return [path]
+    return [
+        each
+        for each in captures(path.parent, wanted.robot)
+        if (name := parsed_name(each)) and name.run == wanted.run and name.number <= wanted.number
+    ]
+
+
 def size_of(path: Path) -> int:
     try:
         return path.stat().st_size
@@ -197,35 +209,33 @@ def find(text: str) -> Path:
     """The file of a name: a path, a file's name in the folder of captures, `latest` or `idle`, a task (`fetch`,
     `fetch red_can`), `stop`, `fault` or `motion`, each with `-N` for the Nth before it, or a task's id.
 
-    A text that is none of them is returned as a path when it looks like one. Raises ConfigError.
+    A text that is none of them is returned as a path, so that reading it fails.
     """
     path = Path(text)
     with suppress(OSError, ValueError):
         if path.exists() and not path.is_dir():
             return path
-    captures = shelf()
-    for name, found in captures:
+    there = shelf()
+    for name, found in there:
         if text in (name, found.name):
             return found
-    if text == LATEST and captures:  # only such in which nothing happened
-        return captures[0][1]
-    if (found_by := _by_label(text, captures)) is not None:
+    if text == LATEST and there:  # only such in which nothing happened
+        return there[0][1]
+    if (found_by := _by_label(text, there)) is not None:
         return found_by
-    for _, found in captures:
+    for _, found in there:
         if _label(found) and (occasion := Ends(found).occasion) is not None and text == occasion.task_id:
             return found
-    if path.suffix or len(path.parts) != 1 or path.is_dir():
-        return path
-    raise ConfigError(f"{text}: no such file, and no capture of that name: {_known(captures)}")
+    return path
 
 
-def _by_label(text: str, captures: Sequence[tuple[str, Path]]) -> Path | None:
+def _by_label(text: str, there: Sequence[tuple[str, Path]]) -> Path | None:
     """The newest capture of a task, with or without its target."""
     wanted = "-".join(text.split())
     counted = _COUNTED.fullmatch(wanted)
     tries = [(wanted, 0), *([(counted["name"], int(counted["back"]))] if counted else [])]
     for name, back in tries:
-        found = [path for _, path in captures if name == (label := _label(path)) or label.startswith(f"{name}-")]
+        found = [path for _, path in there if name == (label := _label(path)) or label.startswith(f"{name}-")]
         if back < len(found):
             return found[back]
     return None
@@ -234,11 +244,3 @@ def _by_label(text: str, captures: Sequence[tuple[str, Path]]) -> Path | None:
 def _label(path: Path) -> str:
     name = parsed_name(path)
     return "" if name is None else name.label
-
-
-def _known(captures: Sequence[tuple[str, Path]]) -> str:
-    if not captures:
-        return f"there is none in {', '.join(map(str, folders()))}"
-    labels = dict.fromkeys(filter(None, (_label(path) for _, path in captures)))
-    names = dict.fromkeys([captures[0][0], *(label.replace("-", " ", 1) for label in labels)])
-    return f"there are {', '.join(list(names)[:8])}; `cocoro capture list` shows all"

@@ -14,6 +14,7 @@ from typing import Annotated, Any
 import msgspec
 import typer
 
+from apps.captures import shelf as captures
 from apps.captures.info import AttachmentReport, CaptureReport, report
 from apps.captures.reader import Capture
 from apps.captures.rewrite import REPAIRED, rewrite
@@ -267,9 +268,15 @@ def reexecute(
         float,
         typer.Option(min=0.0, max=0.1, help="Allowed difference of numbers, relative above 1; 0 compares exactly."),
     ] = 0.0,
+    run: Annotated[
+        bool,
+        typer.Option("--run", help="Begin where the run began: take the files before FILE, too."),
+    ] = False,
     json: JsonOption = False,
 ) -> None:
     """Execute a service again on the inputs that it had then, and compare its outputs. Exit code 1 when they differ."""
+    if run:
+        files = list(dict.fromkeys(each for file in files for each in captures.run_until(file)))
     sys.exit(reexecute_service(files, service, against, tolerance, json))
 
 
@@ -283,13 +290,13 @@ def reexecute_service(files: list[Path], service: str, against: str, tolerance: 
     if against not in ("recorded", "nothing"):
         raise ConfigError(f"--against {against}: {choice_of(against, ('recorded', 'nothing'))}")
     with ExitStack() as stack:
-        captures = [stack.enter_context(Capture.open(file)) for file in files]
-        if len({capture.robot for capture in captures}) > 1:
+        opened = [stack.enter_context(Capture.open(file)) for file in files]
+        if len({capture.robot for capture in opened}) > 1:
             raise CaptureError(
-                f"captures of several robots ({', '.join(sorted({c.robot for c in captures}))}): give those of one run"
+                f"captures of several robots ({', '.join(sorted({c.robot for c in opened}))}): give those of one run"
             )
-        result = reexecution.reexecute(captures, service, tolerance, compare=against == "recorded")
-    for capture in captures:
+        result = reexecution.reexecute(opened, service, tolerance, compare=against == "recorded")
+    for capture in opened:
         if capture.ending:
             print(f"note: {capture.path} was {capture.ending}", file=sys.stderr)
     if as_json:

@@ -137,7 +137,7 @@ TimeoutOption = Annotated[
 
 
 def capture_file(text: str) -> Path:
-    """Reads a capture's file or name (latest, fetch, 'fetch red_can', a task's id). Raises ConfigError."""
+    """Reads a capture's file or name (latest, fetch, 'fetch red_can', a task's id)."""
     from apps.captures.shelf import find  # slow to import
 
     return find(text)

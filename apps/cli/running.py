@@ -268,7 +268,10 @@ def stop_robots(robot: str | None) -> int:
 
 def _stop(run_dir: RunDir) -> bool:
     """Stops one robot; returns whether anything was running."""
+    from apps.captures.shelf import open_captures  # slow to import; `cocoro up` does not need it
+
     found = False
+    recorded = open_captures(run_dir)
     with closing(Target(run_dir.path / "supervisor")) as supervisor:
         if supervisor.pid is not None:
             found = True
@@ -287,6 +290,8 @@ def _stop(run_dir: RunDir) -> bool:
                 target.wait(launch.ORPHAN_S)
     if found:
         _print(f"{run_dir.robot} is down")
+        for path in filter(Path.exists, recorded):
+            _print(f"recorded in {path}")
     return found
 
 

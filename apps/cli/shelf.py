@@ -18,13 +18,14 @@ from apps.cli.output import complain
 from apps.cli.terminal import Column, print_table
 from cocoro.capture.conventions import CaptureError
 from cocoro.clock import NS
+from cocoro.errors import RefusedError
 from deploy.rundir import robots
 from services.capture.folder import delete, is_pinned, pin_of
 
 MB = 1e6
 COLUMNS = (
-    Column("name"), Column("began"), Column("lasts", 1, right=True), Column("size", right=True), Column("pin", 2),
-    Column("what"), Column("outcome"), Column("file", 3),
+    Column("name"), Column("began"), Column("lasts", 2, right=True), Column("size", 1, right=True), Column("pin", 3),
+    Column("outcome"), Column("file", 4), Column("what", text=True),
 )  # fmt: skip
 FilesArgument = Annotated[
     list[Path],
@@ -66,9 +67,9 @@ def _row(each: shelf.ListedCapture) -> tuple[str, ...]:
         f"{each.duration_s:.0f} s" if each.closed else "",
         _size(each.size_bytes),
         "pinned" if each.pinned else "",
-        each.what or "-",
         _outcome(each),
         Path(each.file).name,
+        each.what or "-",
     )
 
 
@@ -110,14 +111,14 @@ def remove(
 
 
 def remove_captures(files: list[Path], yes: bool, as_json: bool) -> int:
-    """Deletes captures; returns the exit code. Nothing is deleted when one of them must stay. Raises CaptureError for a
-    file that is no capture of a recorder, is pinned, or is being written."""
+    """Deletes captures; returns the exit code. Nothing is deleted when one of them must stay. Raises RefusedError for
+    one that is pinned or is being written, CaptureError for what is no capture."""
     for path in files:
         _must_exist(path)
         if is_pinned(path):
-            raise CaptureError(f"{path} is pinned; `cocoro capture unpin {path}` comes first. Nothing was removed")
+            raise RefusedError(f"{path} is pinned; `cocoro capture unpin` comes first; nothing was removed")
         if path in _written():
-            raise CaptureError(f"{path} is being written; `cocoro down` ends that. Nothing was removed")
+            raise RefusedError(f"{path} is being written; `cocoro down` ends that; nothing was removed")
     size = _size(sum(path.stat().st_size for path in files))
     if not yes:
         if as_json or not sys.stdin.isatty():

@@ -16,7 +16,7 @@ NEWEST_IDLE = 2
 """Captures in which nothing happened and that stay as long as others can go: about the last hour."""
 MOTION = "motion"
 _NAME = re.compile(r"(?P<run>(?P<robot>.+)-\d{8}T\d{6}Z)-(?P<number>\d{3,})(?:-(?P<label>[A-Za-z0-9_.+-]+))?\.mcap")
-_UNFIT = re.compile(r"[^A-Za-z0-9_.+]+")
+_UNFIT = re.compile(r"[^A-Za-z0-9_.+-]+")
 LONGEST_LABEL = 60
 
 
