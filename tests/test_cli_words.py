@@ -15,6 +15,17 @@ from apps.cli.output import asks_json
 from apps.cli.walk import commands
 from cocoro.errors import choice_of
 
+COMMANDS = {" ".join(words): command for words, command, _ in commands()}
+TELLS_NOTHING = {
+    "estop": "it reads its own --json, without typer",
+    "run": "its output is the log of a process",
+    "view": "it opens a window",
+    "replay": "it publishes until its end, steered from the keyboard",
+    "kinect tilt": "it prints nothing",
+    "servos calibrate": "a dialogue with a person",
+    "servos limits": "a dialogue with a person",
+}
+
 
 @pytest.fixture(autouse=True)
 def no_robot_here(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
@@ -36,6 +47,16 @@ def test_no_help_loses_what_stands_in_brackets(
         assert "Usage: " in out, words
         lost += [f"{' '.join(words)}: {found}" for found in wanted if found not in out]
     assert not lost
+
+
+def test_every_command_that_tells_something_has_json() -> None:
+    without = [
+        name
+        for name, command in COMMANDS.items()
+        if not any("--json" in param.opts for param in command.params)
+        and not (hasattr(command, "commands") and not command.invoke_without_command)
+    ]
+    assert sorted(without) == sorted(TELLS_NOTHING)
 
 
 @pytest.mark.parametrize(

@@ -20,6 +20,7 @@ from apps.captures.reader import Capture
 from apps.captures.rewrite import REPAIRED, rewrite
 from apps.cli import exits, shelf
 from apps.cli.options import CaptureArgument, FromOption, JsonOption, OnlyOption, ToOption, WithoutOption, capture_file
+from apps.cli.output import print_json
 from apps.cli.terminal import Column, fields, table
 from cocoro.capture.conventions import CaptureError
 from cocoro.clock import NS
@@ -179,9 +180,10 @@ def repair(
     without: WithoutOption = None,
     start: FromOption = None,
     end: ToOption = None,
+    json: JsonOption = False,
 ) -> None:
     """Write everything readable of a damaged or unfinished capture into a whole one; the old file stays."""
-    sys.exit(repair_file(file, out, compression, level, only or [], without or [], start, end))
+    sys.exit(repair_file(file, out, compression, level, only or [], without or [], start, end, json))
 
 
 def repair_file(
@@ -193,6 +195,7 @@ def repair_file(
     without: list[str],
     start_s: float | None,
     end_s: float | None,
+    as_json: bool = False,
 ) -> int:
     """Writes the new capture, prints what is missing in it, and returns the exit code.
 
@@ -211,6 +214,9 @@ def repair_file(
             start_ns=_at(capture, start_s),
             end_ns=_at(capture, end_s),
         )
+    if as_json:
+        print_json(msgspec.to_builtins(done, enc_hook=str) | {"was": capture.ending})
+        return exits.DONE
     attachments = f", {done.attachments} attachments" if done.attachments else ""
     print(f"{done.path}: {done.messages} messages{attachments}, {done.size_bytes / 1e6:.1f} MB")
     for problem in done.problems:
@@ -300,7 +306,7 @@ def reexecute_service(files: list[Path], service: str, against: str, tolerance: 
         if capture.ending:
             print(f"note: {capture.path} was {capture.ending}", file=sys.stderr)
     if as_json:
-        print(msgspec.json.encode(result).decode())
+        print_json(msgspec.to_builtins(result))
     else:
         print("\n".join(reexecution.describe_result(result)))
     bad = result.differing or result.problems or (against == "recorded" and not result.equal)

@@ -13,7 +13,8 @@ import typer
 from apps.captures.export.files import refuse_existing
 from apps.captures.reader import Capture
 from apps.cli import exits
-from apps.cli.options import CaptureArgument
+from apps.cli.options import CaptureArgument, JsonOption
+from apps.cli.output import print_json
 from cocoro.clock import NS
 from cocoro.errors import ConfigError
 
@@ -49,10 +50,11 @@ def export(
     attachments: Annotated[
         Path | None, typer.Option("--attachments", metavar="DIR", help="The files that are attached to the capture.")
     ] = None,
+    json: JsonOption = False,
 ) -> None:
     """Turn a capture into a film, tables, or a file for Foxglove or Rerun; or extract its attachments. Several forms
     at once are possible."""
-    sys.exit(export_capture(file, video, rrd, foxglove, csv, parquet, attachments))
+    sys.exit(export_capture(file, video, rrd, foxglove, csv, parquet, attachments, json))
 
 
 def export_capture(
@@ -63,6 +65,7 @@ def export_capture(
     csv: Path | None = None,
     parquet: Path | None = None,
     attachments: Path | None = None,
+    as_json: bool = False,
 ) -> int:
     """Writes each form whose path is given, and returns the exit code.
 
@@ -75,41 +78,50 @@ def export_capture(
     for out in (video, rrd, foxglove):
         if out is not None:
             refuse_existing(out)  # before the first form has taken minutes
+    written: list[dict[str, object]] = []
+
+    def wrote(path: Path, count: int, what: str, then: str = "") -> None:
+        written.append({"path": str(path), what: count})
+        if not as_json:
+            print(f"{path}: {count} {what}{f'; {then}' if then else ''}")
+
     with Capture.open(file) as capture:
         if video is not None:
             from apps.captures.export import video as films
 
             with progress_bar(capture, video) as show:
                 pictures = films.export(capture, video, show)
-            print(f"{video}: {pictures} pictures")
+            wrote(video, pictures, "pictures")
         if foxglove is not None:
             from apps.captures.export.foxglove import export as export_foxglove
 
             with progress_bar(capture, foxglove) as show:
                 messages = export_foxglove(capture, foxglove, show)
-            print(f"{foxglove}: {messages} messages; open it with Foxglove")
+            wrote(foxglove, messages, "messages", "open it with Foxglove")
         if csv is not None or parquet is not None:
             from apps.captures.export import tables
 
             if csv is not None:
-                print(f"{csv}: {len(tables.export(capture, tables.CsvFolder(csv)))} tables")
+                wrote(csv, len(tables.export(capture, tables.CsvFolder(csv))), "tables")
             if parquet is not None:
-                print(f"{parquet}: {len(tables.export(capture, tables.ParquetFolder(parquet)))} tables")
+                wrote(parquet, len(tables.export(capture, tables.ParquetFolder(parquet))), "tables")
         if rrd is not None:
             from apps.captures.export import rerun_scene
 
             with progress_bar(capture, rrd) as show:
                 messages = rerun_scene.export(capture, rrd, show)
-            print(f"{rrd}: {messages} messages; open it with `rerun {rrd}`")
+            wrote(rrd, messages, "messages", f"open it with `rerun {rrd}`")
         if attachments is not None:
             from apps.captures.export.files import export_attachments
 
-            print(f"{attachments}: {export_attachments(capture, attachments)} attachments")
+            wrote(attachments, export_attachments(capture, attachments), "attachments")
         for problem in capture.problems:
             print(f"missing: {problem}", file=sys.stderr)
         if capture.ending:
             print(f"note: {file} was {capture.ending}", file=sys.stderr)
-        return exits.FAILED if capture.problems else exits.DONE
+    if as_json:
+        print_json({"written": written, "missing": [str(problem) for problem in capture.problems]})
+    return exits.FAILED if capture.problems else exits.DONE
 
 
 @contextmanager

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from datetime import datetime
 from pathlib import Path
@@ -14,7 +13,7 @@ import typer
 from apps.captures import shelf
 from apps.cli import exits
 from apps.cli.options import JsonOption, capture_file
-from apps.cli.output import complain
+from apps.cli.output import complain, print_json
 from apps.cli.terminal import Column, print_table
 from cocoro.capture.conventions import CaptureError
 from cocoro.clock import NS
@@ -46,7 +45,7 @@ def list_captures(
     """The captures that recorders made on this machine, oldest first; JSON lists all."""
     found = list(shelf.listed(robot))
     if as_json:
-        print(json.dumps(msgspec.to_builtins(found)))
+        print_json(msgspec.to_builtins(found))
         return
     if not found:
         places = ", ".join(map(str, shelf.folders()))
@@ -146,7 +145,7 @@ def _each(files: list[Path], as_json: bool, word: str, work: Any) -> int:
         except OSError as error:
             raise CaptureError(f"{path}: {error.strerror or error}") from error
     if as_json:
-        print(json.dumps({"files": [str(path) for path in files], "done": word}))
+        print_json({"files": [str(path) for path in files], "done": word})
     else:
         for path in files:
             print(f"{path}: {word}")

@@ -217,11 +217,13 @@ TaskIdArgument = Annotated[
 
 
 @app.command()
-def cancel(task: TaskIdArgument = "", robot: RobotOption = None, profile: MeshOption = None) -> None:
+def cancel(
+    task: TaskIdArgument = "", robot: RobotOption = None, profile: MeshOption = None, json: JsonOption = False
+) -> None:
     """End the running task; the robot stands still."""
     from apps.cli import task_running
 
-    sys.exit(asyncio.run(task_running.cancel(RobotChoice(robot, profile), task)))
+    sys.exit(asyncio.run(task_running.cancel(RobotChoice(robot, profile), task, json)))
 
 
 @app.command()

@@ -10,7 +10,7 @@ from apps.cli import exits
 from apps.cli.interrupt import HANDS_OFF, SIGNALS, on_reader_gone, on_signals
 from apps.cli.link import MeshLink, joined
 from apps.cli.options import RobotChoice
-from apps.cli.output import complain, going_on, print_json
+from apps.cli.output import complain, going_on, print_json, tell
 from apps.cli.progress import task_display
 from apps.cli.snapshot import check
 from apps.cli.tasks import Follower
@@ -70,14 +70,14 @@ async def wait(choice: RobotChoice, task_id: str, as_json: bool) -> int:
     return code
 
 
-async def cancel(choice: RobotChoice, task_id: str = "") -> int:
+async def cancel(choice: RobotChoice, task_id: str = "", as_json: bool = False) -> int:
     """Cancels the running task, or that task if it runs; the exit code is 3 when it does not."""
     async with joined(choice) as link:
         reply = await link.call(CANCEL, CancelRequest(task_id=task_id))
     if not reply.accepted:
         complain(f"refused: {reply.text}")
         return exits.REFUSED
-    print(reply.text or "cancelled")
+    tell(as_json, {"task_id": reply.task_id, "cancelled": True}, reply.text or "cancelled")
     return exits.DONE
 
 

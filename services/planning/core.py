@@ -13,7 +13,7 @@ from cocoro.arrays import FloatArray
 from cocoro.clock import NS
 from cocoro.core import Output, Sample, Schedule, Take
 from cocoro.messages import BaseCommand, Intent, LearnedModel, PlannerStatus, ServoCommand
-from cocoro.messages.actions import Idle
+from cocoro.messages.actions import Explore, Idle, Search
 from cocoro.objects import Catalogue
 from cocoro.robot import Robot
 from cocoro.topics import Topic
@@ -130,6 +130,9 @@ class PlanningCore:
         intent = fresh or Intent(task_id=current.task_id, step=current.step, action=Idle())
         if (intent.task_id, intent.step, intent.action) == (current.task_id, current.step, current.action):
             return
+        searching = isinstance(current.action, (Search, Explore)) and isinstance(intent.action, (Search, Explore))
+        if not searching or intent.task_id != current.task_id:
+            self._estimator.seen.end(intent.task_id)
         self._intent = intent
         self._ended = None
         if fresh is None:

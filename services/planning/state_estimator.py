@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Mapping
 from itertools import compress
-from math import cos, sin
+from math import cos, hypot, inf, sin
 from typing import Any, NamedTuple
 
 import msgspec
@@ -23,14 +23,17 @@ from cocoro.topics import Topic
 from cocoro.units import Vec3
 from services.planning.config import PlanningConfig
 from services.planning.floor_map import Solid
-from services.planning.head import CameraTilt
+from services.planning.head import PAN, TILT, CameraTilt
 from services.planning.memory import TargetMemory
+from services.planning.seen_floor import SeenFloor
 from services.planning.seen_through import VIEW_BYTES, DepthView
 from services.planning.surroundings import Surroundings
 
 _WAIT_FOR_ODOMETRY_NS = NS // 5
 _JUST_SEEN_S = 0.5
 """An object that a frame does not show, but which was seen so shortly before it, is still in it."""
+_GLIMPSE_NS = NS // 20
+"""Time over which the camera's turn is measured."""
 FLOOR_M, FLOOR_PER_M = 0.040, 0.012
 """Height below which a point counts as floor for a tilted camera, and its growth per metre of distance: more than
 perception's limit, because a tilted camera is likely to be rolled a little, too."""
@@ -138,6 +141,7 @@ class StateEstimator:
         self._postures: dict[str, tuple[tuple[str, ...], History]] = {}
         self._gap_ns = round(config.odometry_gap_s * NS)
         self.around = Surroundings(config.marker, {label: item.planar_radius_m for label, item in self._known.items()})
+        self.seen = SeenFloor(config.search, robot)
         self._waiting: deque[Detections] = deque(maxlen=8)
         self._floors: deque[Obstacles] = deque(maxlen=4)
         self._localised_ns = 0
@@ -166,6 +170,7 @@ class StateEstimator:
                 # The base restarted with a new odometry frame; positions in the old frame are void.
                 self.memory.clear()
                 self.around.clear()
+                self.seen.clear()
                 self._floors.clear()
                 self._waiting.clear()
                 self._localised_ns = 0
@@ -229,6 +234,17 @@ class StateEstimator:
                 view = DepthView(self._robot, seen.nearest, angles) if len(seen.nearest) == VIEW_BYTES else None
                 known = self._solids(seen.stamp_ns)
                 self.around.floor.enter(seen, Pose2(*pose.tolist()), own(angles), known, view)
+                self.seen.enter(seen, Pose2(*pose.tolist()), self._turning_radps(seen.stamp_ns))
+
+    def _turning_radps(self, stamp_ns: int) -> float:
+        """The rate at which the camera turned before a time; infinite where that is not known."""
+        before_ns = stamp_ns - _GLIMPSE_NS
+        angles, before = self._posture_at(stamp_ns), self._posture_at(before_ns)
+        pose, pose_before = (self._odometry.at(at_ns, self._gap_ns) for at_ns in (stamp_ns, before_ns))
+        if angles is None or before is None or pose is None or pose_before is None:
+            return inf
+        pan = angles[PAN] - before[PAN] + float(pose[2] - pose_before[2])
+        return hypot(pan, angles[TILT] - before[TILT]) * NS / _GLIMPSE_NS
 
     def _solids(self, stamp_ns: int) -> list[Solid]:
         """The known objects that a frame shows, and where those are that were seen shortly before it."""
