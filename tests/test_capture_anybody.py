@@ -217,7 +217,7 @@ def test_two_channels_of_one_topic_stay_two_when_told_and_repaired(
         assert main(["capture", "info", str(path)]) == 0
         out = capsys.readouterr().out
         assert "arm2/x#1 " in out
-        assert "calliope/arm2/x#2 " in out
+        assert "arm2/x#2 " in out
         with Capture.open(path) as capture:
             assert [capture.decode(record) for record in capture.messages()] == [{"n": n} for n in range(20)]
             assert capture.channels[2].metadata == {"a": "b"}

@@ -14,6 +14,7 @@ from typing import IO, Annotated, Any, TextIO
 import msgspec
 import typer
 
+from apps.captures.names import open_captures
 from apps.cli import completions, exits
 from apps.cli.options import (
     AdaptOption,
@@ -279,8 +280,6 @@ def stop_robots(robot: str | None, as_json: bool = False) -> int:
 
 def _stop(run_dir: RunDir, quiet: bool = False) -> bool:
     """Stops one robot; returns whether anything was running."""
-    from apps.captures.shelf import open_captures  # slow to import; `cocoro up` does not need it
-
     found = False
     recorded = open_captures(run_dir)
     with closing(Target(run_dir.path / "supervisor")) as supervisor:

@@ -11,6 +11,7 @@ import msgspec
 import typer
 
 from apps.captures import shelf
+from apps.captures.names import folders, open_captures
 from apps.cli import exits
 from apps.cli.options import JsonOption, capture_file
 from apps.cli.output import complain, print_json
@@ -48,7 +49,7 @@ def list_captures(
         print_json(msgspec.to_builtins(found))
         return
     if not found:
-        places = ", ".join(map(str, shelf.folders()))
+        places = ", ".join(map(str, folders()))
         print(f"no captures{f' of {robot}' if robot else ''} in {places}")
         return
     shown = found if everything else [each for each in found if each.what][:count]
@@ -133,7 +134,7 @@ def remove_captures(files: list[Path], yes: bool, as_json: bool) -> int:
 
 def _written() -> set[Path]:
     """Captures that recorders of this machine have open now."""
-    return {path for run_dir in robots() for path in shelf.open_captures(run_dir)}
+    return {path for run_dir in robots() for path in open_captures(run_dir)}
 
 
 def _each(files: list[Path], as_json: bool, word: str, work: Any) -> int:
