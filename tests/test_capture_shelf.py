@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from apps.captures import shelf
-from apps.cli import exits
+from apps.cli import completions, exits
 from apps.cli.main import main
 from cocoro.clock import NS
 from services.capture.file import CaptureFile, Packer
@@ -61,6 +61,11 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 )  # fmt: skip
 def test_a_name_stands_for_a_file(folder: Path, name: str, number: int) -> None:
     assert shelf.find(name).name.startswith(f"{RUN}-{number:03}")
+
+
+def test_a_shell_completes_names(folder: Path) -> None:
+    assert completions.captures("latest") == ["latest", "latest-1", "latest-2"]
+    assert completions.captures("fe") == ["fetch-blue_can", "fetch-red_can"]
 
 
 def test_a_path_is_a_path(folder: Path) -> None:
