@@ -148,7 +148,16 @@ CaptureArgument = Annotated[
     typer.Argument(
         metavar="FILE",
         parser=capture_file,
+        autocompletion=completions.captures,
         help="A capture: an MCAP file, latest, latest-1, or a task: 'fetch red_can'.",
+    ),
+]
+CameraOption = Annotated[
+    str,
+    typer.Option(
+        "--camera",
+        metavar="robot|outside|both",
+        help="For the film: the robot's camera, one that films the simulated robot, or both.",
     ),
 ]
 OnlyOption = Annotated[
