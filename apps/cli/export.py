@@ -13,7 +13,7 @@ import typer
 from apps.captures.export.files import refuse_existing
 from apps.captures.reader import Capture
 from apps.cli import exits
-from apps.cli.options import CaptureArgument, JsonOption
+from apps.cli.options import CameraOption, CaptureArgument, JsonOption
 from apps.cli.output import print_json
 from cocoro.clock import NS
 from cocoro.errors import ConfigError
@@ -33,8 +33,11 @@ def export(
     file: CaptureArgument,
     video: Annotated[
         Path | None,
-        typer.Option("--video", metavar="OUT.mp4", help="Film of the camera's pictures with the detections drawn in."),
+        typer.Option(
+            "--video", metavar="OUT.mp4", help="Film of the camera's pictures with the detections; .webp: an animation."
+        ),
     ] = None,
+    camera: CameraOption = "robot",
     foxglove: Annotated[
         Path | None, typer.Option("--foxglove", metavar="OUT.mcap", help="For Foxglove; needs cocoro-mesh[foxglove].")
     ] = None,
@@ -54,7 +57,7 @@ def export(
 ) -> None:
     """Turn a capture into a film, tables, or a file for Foxglove or Rerun; or extract its attachments. Several forms
     at once are possible."""
-    sys.exit(export_capture(file, video, rrd, foxglove, csv, parquet, attachments, json))
+    sys.exit(export_capture(file, video, rrd, foxglove, csv, parquet, attachments, camera, json))
 
 
 def export_capture(
@@ -65,6 +68,7 @@ def export_capture(
     csv: Path | None = None,
     parquet: Path | None = None,
     attachments: Path | None = None,
+    camera: str = "robot",
     as_json: bool = False,
 ) -> int:
     """Writes each form whose path is given, and returns the exit code.
@@ -87,11 +91,7 @@ def export_capture(
 
     with Capture.open(file) as capture:
         if video is not None:
-            from apps.captures.export import video as films
-
-            with progress_bar(capture, video) as show:
-                pictures = films.export(capture, video, show)
-            wrote(video, pictures, "pictures")
+            wrote(video, film(capture, video, camera), "pictures")
         if foxglove is not None:
             from apps.captures.export.foxglove import export as export_foxglove
 
@@ -122,6 +122,17 @@ def export_capture(
     if as_json:
         print_json({"written": written, "missing": [str(problem) for problem in capture.problems]})
     return exits.FAILED if capture.problems else exits.DONE
+
+
+def film(capture: Capture, out: Path, camera: str) -> int:
+    """Makes a film of a capture, and returns the number of its pictures.
+
+    Raises CaptureError when it cannot be made, ConfigError for an unknown camera.
+    """
+    from apps.captures.export import video
+
+    with progress_bar(capture, out) as show:
+        return video.export(capture, out, show, video.camera_of(camera))
 
 
 @contextmanager

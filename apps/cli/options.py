@@ -136,6 +136,14 @@ TimeoutOption = Annotated[
 # --- captures and topics --------------------------------------------------------------------------
 
 CaptureArgument = Annotated[Path, typer.Argument(metavar="FILE", help="A capture (MCAP file).")]
+CameraOption = Annotated[
+    str,
+    typer.Option(
+        "--camera",
+        metavar="robot|outside|both",
+        help="For the film: the robot's camera, one that films the simulated robot, or both.",
+    ),
+]
 OnlyOption = Annotated[
     list[str] | None,
     typer.Option("--only", metavar="KEYEXPR", help="Only these keys: base/state, */health, frames. Repeatable."),

@@ -24,6 +24,7 @@ from apps.cli import completions
 from apps.cli.options import (
     AdaptOption,
     BodyOption,
+    CameraOption,
     DescriptionOption,
     FramesOption,
     JsonOption,
@@ -124,6 +125,10 @@ def rehearse(
         Path | None, typer.Option(metavar="OUT.png", help="Write what the robot saw when it grasped.")
     ] = None,
     record: Annotated[Path | None, typer.Option(metavar="OUT.mcap", help="Record everything.")] = None,
+    video: Annotated[
+        Path | None, typer.Option(metavar="OUT.mp4", help="Film it; a name with .webp is a small animation.")
+    ] = None,
+    camera: CameraOption = "outside",
     json: JsonOption = False,
 ) -> None:
     """The whole robot is simulated in one process, in virtual time, and judged by the simulator's truth."""
@@ -136,7 +141,7 @@ def rehearse(
         "wait_s": wait, "then": [task_of(words, "--then") for words in then or []],
         "objects": _text(objects), "timeout_s": timeout, "picture": _text(picture), "record": _text(record),
     }  # fmt: skip
-    sys.exit(rehearsing.rehearse(options, latency or [], frames, json))
+    sys.exit(rehearsing.rehearse(options, latency or [], frames, json, video, camera))
 
 
 def _text(path: Path | None) -> str | None:

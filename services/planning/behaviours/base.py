@@ -158,7 +158,7 @@ class Behaviour(Protocol):
 
     @property
     def needs_sight(self) -> bool:
-        """Whether it drives or looks for something, so that it pauses while perception is silent."""
+        """Whether it drives or looks for something, so that it pauses while perception is late."""
 
     def step(self, snapshot: Snapshot) -> Plan: ...
 
