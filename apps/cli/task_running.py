@@ -29,7 +29,9 @@ async def run(choice: RobotChoice, request: TaskRequest, as_json: bool, picture:
     if picture is not None:
         check(picture)
     async with joined(choice, frames=picture is not None) as link:
-        follower = Follower(link, request, task_display(as_json), picture, _contact(link))
+        follower = Follower(
+            link, request, task_display(as_json), picture, _contact(link), rejoin=lambda: joined(choice)
+        )
         with hands_on(follower):
             code, result = await follower.run()
     if as_json:
@@ -54,7 +56,7 @@ async def wait(choice: RobotChoice, task_id: str, as_json: bool) -> int:
     """Follows a task that somebody else asked for (the running one, or the last, without an id) to its outcome; returns
     the exit code of that. Ctrl-C ends the waiting alone."""
     async with joined(choice) as link:
-        follower = Follower(link, None, task_display(as_json), None, _contact(link))
+        follower = Follower(link, None, task_display(as_json), None, _contact(link), rejoin=lambda: joined(choice))
         follower.listen()  # before the question, so that no state is missed
         state = await link.call(REPORT, ReportRequest(task_id=task_id))
         if not state.task_id:
