@@ -14,6 +14,7 @@ from typing import IO, Annotated, Any, TextIO
 import msgspec
 import typer
 
+from apps.captures.names import open_captures
 from apps.cli import completions, exits
 from apps.cli.options import (
     AdaptOption,
@@ -280,6 +281,7 @@ def stop_robots(robot: str | None, as_json: bool = False) -> int:
 def _stop(run_dir: RunDir, quiet: bool = False) -> bool:
     """Stops one robot; returns whether anything was running."""
     found = False
+    recorded = open_captures(run_dir)
     with closing(Target(run_dir.path / "supervisor")) as supervisor:
         if supervisor.pid is not None:
             found = True
@@ -298,6 +300,8 @@ def _stop(run_dir: RunDir, quiet: bool = False) -> bool:
                 target.wait(launch.ORPHAN_S)
     if found and not quiet:
         _print(f"{run_dir.robot} is down")
+        for path in filter(Path.exists, recorded):
+            _print(f"recorded in {path}")
     return found
 
 

@@ -292,7 +292,7 @@ def _parameter(field: msgspec.structs.FieldInfo) -> inspect.Parameter:
     text = next((meta.description for meta in metas if meta.description), None)
     default = inspect.Parameter.empty if field.default is NODEFAULT else field.default
     if field.name == "label":
-        annotation = _ANNOTATED[plain, typer.Argument(help=text, autocompletion=completions.labels)]
+        annotation = _ANNOTATED[plain, typer.Argument(metavar="LABEL", help=text, autocompletion=completions.labels)]
         return inspect.Parameter(field.name, inspect.Parameter.KEYWORD_ONLY, annotation=annotation, default=default)
     name, metavar = field.name, None
     for unit, word in UNITS.items():

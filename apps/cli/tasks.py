@@ -22,7 +22,7 @@ from cocoro.bus.base import Handle
 from cocoro.errors import CallTimeoutError, CocoroError
 from cocoro.messages import CancelRequest, TaskReply, TaskRequest, TaskState
 from cocoro.tasks import Task
-from cocoro.topics import CANCEL, LATCH, RUN, TASK
+from cocoro.topics import CANCEL, LATCH, RECORDING, RUN, TASK
 from deploy.contact import ProcessContact
 from deploy.processor import ProcessorWatch
 from services.executive.askers import asker_key
@@ -36,6 +36,7 @@ ASK_AGAIN_S = 0.1
 """Time between two of these requests."""
 CANCEL_S = 10.0
 """Wait for the outcome of a cancelled task, before a line says that there is none."""
+RECORDER = "capture"
 Result = tuple[int, dict[str, object]]
 """Exit code, and the result as data."""
 
@@ -73,6 +74,8 @@ class Follower:
         self._token: Handle | None = None
         self._news: asyncio.Queue[TaskState | bool] = asyncio.Queue()
         """States of the task, and whether the executive's liveliness token is present, at each change."""
+        self._files: dict[str, str] = {}
+        """The file in which a task is recorded, by its id."""
         self._let_go = asyncio.Event()
         self._left = asyncio.Event()
         self._signals = 0
@@ -106,6 +109,9 @@ class Follower:
     def listen(self) -> None:
         """Keeps the states of tasks from now on."""
         self._link.inbox(TASK).add(lambda _key, state: self._news.put_nowait(state))
+        self._link.inbox(RECORDING.of(RECORDER)).add(
+            lambda _key, state: self._files.update({state.task_id: state.file})
+        )
 
     async def attend(self, state: TaskState) -> Result:
         """Follows a task that runs already, or has ended; returns the exit code and the result as data."""
@@ -295,8 +301,10 @@ class Follower:
         time = f" {'in' if state.outcome == 'done' else 'after'} {state.elapsed_s:.1f} s" if state.elapsed_s else ""
         reason = f": {state.reason}" if state.reason and state.outcome != "done" else ""
         starved = self._starved() if state.outcome == "failed" else {}
-        self._view.result(f"{state.outcome}: {self._name}{time}{reason}")
-        return code, msgspec.to_builtins(state) | starved
+        file = self._files.get(state.task_id, "")
+        lines = [f"{state.outcome}: {self._name}{time}{reason}", *([f"recorded in {file}"] if file else [])]
+        self._view.result("\n".join(lines))
+        return code, msgspec.to_builtins(state) | {"recorded_in": file} | starved
 
     def _unknown(self, why: str) -> Result:
         """The result when the executive cannot tell the task's outcome. A task ends with its executive."""
