@@ -120,12 +120,12 @@ class Inbox(Generic[M]):
 
     def _refuse(self, key: str, tracker: SequenceTracker, message: M, why: str) -> None:
         tracker.refuse(message.incarnation, message.seq)
-        self._reject(key, why)
+        self._reject(key, why, untimely=self.judge is None)
 
-    def _reject(self, key: str, why: str) -> None:
+    def _reject(self, key: str, why: str, untimely: bool = False) -> None:
         self.rejected += 1
         self.last_error = why
-        self.rejections.rejected(key)
+        self.rejections.rejected(key, untimely)
 
     def health(self, now_ns: int) -> TopicHealth:
         overwritten = self.subscription.skipped if self.subscription is not None else 0
