@@ -100,7 +100,7 @@ def report() -> dict[str, Any]:
     return {
         "robot": "calliope", "profile": "sim", "machine": {"cores": 2, "cpu_share": 0.5}, "clock": None,
         "task": msgspec.to_builtins(task),
-        "plan": msgspec.to_builtins(PlannerStatus(behaviour="search", why=SENTENCE)), "latch": None,
+        "plan": msgspec.to_builtins(PlannerStatus(behaviour="search", why=SENTENCE)), "latch": None, "recording": None,
         "base": msgspec.to_builtins(BaseState((0.0, 0.0), 0.0, 0.0, 0.0)), "services": services, "topics": listed,
     }  # fmt: skip
 

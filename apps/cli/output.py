@@ -204,6 +204,14 @@ def print_json(value: Any) -> None:
     print(json.dumps(value), flush=True)
 
 
+def tell(as_json: bool, data: Any, text: str) -> None:
+    """Prints a result, as JSON or as text."""
+    if as_json:
+        print_json(data)
+    else:
+        print(text, flush=True)
+
+
 def asks_json(arguments: list[str]) -> bool:
     """Whether a command's arguments ask for JSON."""
     end = arguments.index("--") if "--" in arguments else len(arguments)
