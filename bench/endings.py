@@ -352,12 +352,14 @@ async def bench(first: int, count: int, seed: int, only: str, phase: str) -> boo
                     print(f"  {one.number:3d}: {one.phase} was not reached, which is no case", flush=True)
                     continue
                 verdicts.append(verdict)
-                print(
-                    f"  {one.number:3d}: {one.kind:27s} {one.phase:10s} body {verdict.body_s:.3f} s, joints"
-                    f" {verdict.joints_s:.3f} s, claws {verdict.claws_s:.3f} s{' (hold)' * verdict.held}; code {verdict.code} {'; '.join(verdict.faults)}",
-                    flush=True,
-                )
+                print(f"  {_line(verdict)}", flush=True)
     return _summary(verdicts)
+
+
+def _line(verdict: Verdict) -> str:
+    one, holds = verdict.case, " (hold)" if verdict.held else ""
+    times = f"body {verdict.body_s:.3f} s, joints {verdict.joints_s:.3f} s, claws {verdict.claws_s:.3f} s{holds}"
+    return f"{one.number:3d}: {one.kind:27s} {one.phase:10s} {times}; code {verdict.code} {'; '.join(verdict.faults)}"
 
 
 def _summary(verdicts: list[Verdict]) -> bool:
