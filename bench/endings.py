@@ -26,7 +26,7 @@ import tempfile
 import termios
 import threading
 import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -64,13 +64,13 @@ ABSENT = "yellow_ball"
 class Command:
     """`cocoro ...` with a terminal or pipes of its own. `end` ends it or lets go of it."""
 
-    def __init__(self, cocoro: Operator, arguments: list[str], kind: str) -> None:
+    def __init__(self, environment: Mapping[str, str], arguments: list[str], kind: str) -> None:
         self._fds: dict[str, int] = {}
         self.said = bytearray()
         code = [sys.executable, "-m", "apps.cli.main", *arguments]
         out, err = self._stream("out", kind), self._stream("err", kind)
         self.process = subprocess.Popen(
-            code, env=cocoro.environment, stdin=subprocess.DEVNULL if "pipe" in kind else out, stdout=out, stderr=err,
+            code, env=environment, stdin=subprocess.DEVNULL if "pipe" in kind else out, stdout=out, stderr=err,
             start_new_session=True, preexec_fn=lambda: _own(out, kind),
         )  # fmt: skip
         for fd in {out, err}:
@@ -280,7 +280,7 @@ class Verdict:
 async def judge(robot: Watched, one: Case, folder: Path) -> Verdict | None:
     """None when the task ended before the phase was reached."""
     out = ["--out", str(folder / f"{one.number}.jsonl")] if one.phase == "babble-arm" else []
-    command = Command(robot.cocoro, [*one.arguments, *out], one.kind)
+    command = Command(robot.cocoro.environment, [*one.arguments, *out], one.kind)
     before = robot.state.task_id
     try:
         if one.phase != "start":
