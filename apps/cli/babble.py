@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import json as json_module
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +13,7 @@ from msgspec.structs import replace
 
 from apps.cli.link import MeshLink, joined
 from apps.cli.options import JsonOption, MeshOption, RobotChoice, RobotOption, SamplesOutOption
+from apps.cli.output import print_json
 from apps.cli.progress import TaskDisplay, task_display
 from apps.cli.task_running import hands_on
 from apps.cli.tasks import Follower
@@ -146,7 +146,7 @@ async def collect(
                 )
             result |= {"file": str(file), "samples": len(kept)}
     if as_json:
-        print(json_module.dumps(result))
+        print_json(result)
     return code
 
 

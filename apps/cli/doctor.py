@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import json as json_module
 import os
 import shutil
 import socket
@@ -19,6 +18,7 @@ import typer
 
 from apps.cli import exits
 from apps.cli.options import DescriptionOption, JsonOption, MeasuredOption, ProfileArgument
+from apps.cli.output import print_json
 from apps.cli.stop_asking import addresses
 from cocoro.bus import shared
 from cocoro.checks import Check, bad, note, ok
@@ -62,7 +62,7 @@ def print_checks(profile_name: str, as_json: bool, description: Path | None, mea
     profile = profiles.read(profile_name).with_robot(description, measured)
     checks = list(examine(profile))
     if as_json:
-        print(json_module.dumps([check._asdict() for check in checks]))
+        print_json([check._asdict() for check in checks])
     else:
         width = max(len(check.name) for check in checks)
         for check in checks:

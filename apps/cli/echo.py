@@ -17,7 +17,7 @@ import typer
 from apps.cli import exits
 from apps.cli.interrupt import interrupt_event
 from apps.cli.link import joined
-from apps.cli.listening import KeyListener, ReceivedPayload, keyexpr_of, takes_frames
+from apps.cli.listening import KeyListener, ReceivedPayload, keyexpr_of, nothing_on, takes_frames
 from apps.cli.options import JsonOption, KeyArgument, MeshOption, RobotChoice, RobotOption
 from cocoro.bus.base import Payload
 from cocoro.installed import topic_named
@@ -86,8 +86,7 @@ async def _print(
         if not await listener.wait(end, wait_s):
             if not (printed or hinted or end.is_set()) and (left_s is None or left_s > HINT_S):
                 hinted = True
-                print(f"nothing on {listener.keyexpr} yet; `cocoro topics` lists topics, `cocoro top` the live ones",
-                      file=sys.stderr)  # fmt: skip
+                print(nothing_on(listener.keyexpr), file=sys.stderr)
             continue
         for received in listener.take()[: None if count is None else count - printed]:
             decoded = read(received.payload, received.key.removeprefix(f"{robot}/"))

@@ -20,9 +20,11 @@ from msgspec import NODEFAULT, Meta
 from typer.core import TyperCommand, TyperGroup
 from typer.main import get_group
 
+from apps.cli import completions
 from apps.cli.options import (
     AdaptOption,
     BodyOption,
+    CameraOption,
     DescriptionOption,
     FramesOption,
     JsonOption,
@@ -81,10 +83,17 @@ def operate(
 
 def rehearse(
     task: Task,
-    scene: Annotated[str, typer.Option(help="A scene's name, or its file.")] = "paper",
+    scene: Annotated[
+        str, typer.Option(help="A scene's name, or its file.", autocompletion=completions.scenes)
+    ] = "paper",
     seed: Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")] = 0,
     sensors: Annotated[
-        str, typer.Option(metavar="ideal|real", help="Perfect camera and body, or real ones.")
+        str,
+        typer.Option(
+            metavar="ideal|real",
+            autocompletion=completions.of("ideal", "real"),
+            help="Perfect camera and body, or real ones.",
+        ),
     ] = "ideal",
     body: BodyOption = "nominal",
     description: DescriptionOption = None,
@@ -116,6 +125,10 @@ def rehearse(
         Path | None, typer.Option(metavar="OUT.png", help="Write what the robot saw when it grasped.")
     ] = None,
     record: Annotated[Path | None, typer.Option(metavar="OUT.mcap", help="Record everything.")] = None,
+    video: Annotated[
+        Path | None, typer.Option(metavar="OUT.mp4", help="Film it; a name with .webp is a small animation.")
+    ] = None,
+    camera: CameraOption = "outside",
     json: JsonOption = False,
 ) -> None:
     """The whole robot is simulated in one process, in virtual time, and judged by the simulator's truth."""
@@ -128,7 +141,7 @@ def rehearse(
         "wait_s": wait, "then": [task_of(words, "--then") for words in then or []],
         "objects": _text(objects), "timeout_s": timeout, "picture": _text(picture), "record": _text(record),
     }  # fmt: skip
-    sys.exit(rehearsing.rehearse(options, latency or [], frames, json))
+    sys.exit(rehearsing.rehearse(options, latency or [], frames, json, video, camera))
 
 
 def _text(path: Path | None) -> str | None:
@@ -209,11 +222,13 @@ TaskIdArgument = Annotated[
 
 
 @app.command()
-def cancel(task: TaskIdArgument = "", robot: RobotOption = None, profile: MeshOption = None) -> None:
+def cancel(
+    task: TaskIdArgument = "", robot: RobotOption = None, profile: MeshOption = None, json: JsonOption = False
+) -> None:
     """End the running task; the robot stands still."""
     from apps.cli import task_running
 
-    sys.exit(asyncio.run(task_running.cancel(RobotChoice(robot, profile), task)))
+    sys.exit(asyncio.run(task_running.cancel(RobotChoice(robot, profile), task, json)))
 
 
 @app.command()
@@ -277,7 +292,7 @@ def _parameter(field: msgspec.structs.FieldInfo) -> inspect.Parameter:
     text = next((meta.description for meta in metas if meta.description), None)
     default = inspect.Parameter.empty if field.default is NODEFAULT else field.default
     if field.name == "label":
-        annotation = _ANNOTATED[plain, typer.Argument(help=text)]
+        annotation = _ANNOTATED[plain, typer.Argument(metavar="LABEL", help=text, autocompletion=completions.labels)]
         return inspect.Parameter(field.name, inspect.Parameter.KEYWORD_ONLY, annotation=annotation, default=default)
     name, metavar = field.name, None
     for unit, word in UNITS.items():

@@ -78,9 +78,13 @@ def output_width() -> int:
 class FittedTable:
     """A table for rich's consoles that fits itself to the width that it is drawn with."""
 
-    def __init__(self, columns: Sequence[str | Column], rows: Iterable[Sequence[str | Text]]) -> None:
+    def __init__(
+        self, columns: Sequence[str | Column], rows: Iterable[Sequence[str | Text]], *, fold: bool = True
+    ) -> None:
+        """`fold`: sentences that are too long go on in further lines; otherwise they are cut."""
         from rich.text import Text
 
+        self._fold = fold
         self._columns = [Column(column) if isinstance(column, str) else column for column in columns]
         self._rows = [[cell if isinstance(cell, Text) else Text(cell) for cell in row] for row in rows]
         self._natural = [
@@ -98,7 +102,7 @@ class FittedTable:
             cells = [list(self._folded(row[number], widths[number])) for number in shown]
             for at in range(max(map(len, cells), default=0)):
                 yield self._line([cell[at] if at < len(cell) else Text() for cell in cells], shown, widths)
-            for line in self._second(row, below, options.max_width - SHIFT):
+            for line in () if not self._fold else self._second(row, below, options.max_width - SHIFT):
                 yield Text(" " * SHIFT).append_text(line)
         away = {*range(len(self._columns))} - {*shown, *below}
         if left_out := [self._columns[number].head for number in sorted(away) if self._is_filled(number)]:
@@ -142,6 +146,9 @@ class FittedTable:
         return line
 
     def _folded(self, cell: Text, width: int) -> Iterator[Text]:
+        if not self._fold:
+            cell = cell.copy()
+            cell.truncate(width, overflow="ellipsis")
         if cell.cell_len <= width:
             yield cell
             return

@@ -25,7 +25,7 @@ from cocoro import topics
 from cocoro.bus.local import LocalMesh
 from cocoro.clock import NS, VirtualClock
 from cocoro.component import load
-from cocoro.errors import CocoroError, ConfigError
+from cocoro.errors import CocoroError, ConfigError, choice_of
 from cocoro.inbox import Stream
 from cocoro.messages import Detections, Frame, Recording, TaskReply, TaskRequest, TaskState, Truth
 from cocoro.node import Node
@@ -55,7 +55,7 @@ def rehearse(request: RehearsalRequest, tell: Tell = ignored) -> dict[str, Any]:
     started = time.perf_counter()
     unknown = sorted(set(request.latency) - set(PROCESSES))
     if unknown:
-        raise ConfigError(f"--latency {unknown[0]}: no such service; known are {', '.join(PROCESSES)}")
+        raise ConfigError(f"--latency {unknown[0]}: no such service; {choice_of(unknown[0], PROCESSES)}")
     if request.record is not None and Path(request.record).exists():
         raise ConfigError(f"--record {request.record}: there is such a file already")
     result = run_virtual(_Rehearsal(request, tell).run())
