@@ -41,6 +41,10 @@ SLOW = {
     "cocoro learn arm --send": "needs the samples of the babbling",
     "cocoro learn wheels --send": "needs the trials of the babbling",
     "cocoro experiment E3 --seeds 3": "computes for 2 minutes",
+    "cocoro up sim --scene unknown --objects objects.toml --detach": "tests/test_learn_object_cli.py has it",
+    "cocoro fetch orange_can": "tests/test_learn_object_cli.py has it, in virtual time",
+    "cocoro rehearse follow": "tests/test_rehearse.py has it",
+    "cocoro rehearse fetch red_can --then": "tests/test_rehearse.py has it",
 }
 """Commands that continuous integration has no time for, and why."""
 ENDLESS = ("cocoro top", "cocoro echo", "cocoro hz", "cocoro logs -f", "cocoro view", "cocoro replay")
@@ -77,13 +81,28 @@ class Ran:
 def blocks(page: Path = PAGE) -> list[Block]:
     """The page's blocks of shell commands, without their comments."""
     found, section = [], ""
-    for part in re.finditer(r"^## ([^\n]*)$|^```sh\n(.*?)^```", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL):
+    for part in re.finditer(
+        r"^## ([^\n]*)$|^```sh\n(.*?)^```", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL
+    ):
         if part[1] is not None:
             section = part[1]
             continue
-        lines = (re.sub(r"\s+#.*$", "", line).strip() for line in part[2].replace("\\\n", " ").splitlines())
+        lines = (_without_comment(line) for line in part[2].replace("\\\n", " ").splitlines())
         found.append(Block(section, tuple(line for line in lines if line)))
     return found
+
+
+def _without_comment(line: str) -> str:
+    """The line up to a '#' that begins a word outside of quotes."""
+    quote = ""
+    for at, character in enumerate(line):
+        if quote:
+            quote = "" if character == quote else quote
+        elif character in "'\"":
+            quote = character
+        elif character == "#" and (at == 0 or line[at - 1].isspace()):
+            return line[:at].strip()
+    return line.strip()
 
 
 def begins(command: str, words: str) -> bool:
