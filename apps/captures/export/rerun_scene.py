@@ -6,6 +6,7 @@ stage the simulated robot and its scene are there too, seen from outside. Needs 
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -48,6 +49,7 @@ BONE, UNKNOWN, TRUE = (217, 217, 230), (255, 255, 255), (50, 230, 80)
 
 def library() -> Any:
     """The rerun package. Raises CaptureError with the command that installs it."""
+    os.environ.setdefault("RUST_LOG", "off")  # its errors are raised as well, and told once
     try:
         import rerun
     except ModuleNotFoundError as error:
@@ -68,8 +70,16 @@ def export(
         recording = rr.RecordingStream(APPLICATION)
         recording.save(str(out))
         count = log_capture(capture, recording, progress, stage)
-        recording.flush()
+        flush(recording, out)
         return count
+
+
+def flush(recording: Any, out: Path) -> None:
+    """Wait until everything is in the file. Raises CaptureError when it is not."""
+    try:
+        recording.flush()
+    except RuntimeError as error:
+        raise CaptureError(f"{out}: it could not be written to its end ({error}); make room there") from error
 
 
 def log_capture(
