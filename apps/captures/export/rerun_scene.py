@@ -54,6 +54,7 @@ def library() -> Any:
         import rerun
     except ModuleNotFoundError as error:
         raise CaptureError("this needs Rerun: pip install 'cocoro-mesh[view]'") from error
+    rerun.unregister_shutdown()  # at the process's end it would wait for ever for a viewer that takes nothing
     return rerun
 
 
