@@ -14,7 +14,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from apps.captures.export.files import making
-from apps.captures.export.geometry import CAMERA, Posture, about_z, conjugate, points, quaternion, rotated
+from apps.captures.export.geometry import (
+    CAMERA,
+    POINTS_PERIOD_NS,
+    Posture,
+    about_z,
+    conjugate,
+    points,
+    quaternion,
+    rotated,
+)
 from apps.captures.export.story import catalogue_of, robot_of
 from apps.captures.reader import Capture
 from apps.pictures import describe
@@ -115,6 +124,8 @@ class RerunScene:
         self._posture = Posture(robot)
         self._phase = ""
         self._why = ""
+        self._cloud_ns = -POINTS_PERIOD_NS
+        """Stamp of the newest cloud of points."""
         self._stage: StageLogger | None = None
         self._log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         if stage is not None:
@@ -157,6 +168,9 @@ class RerunScene:
         )  # fmt: skip
         pixels = np.frombuffer(frame.colour, dtype=np.uint8).reshape(frame.height, frame.width, 3)
         self._log("world/body/camera/colour", rr.Image(pixels).compress(jpeg_quality=JPEG_QUALITY))
+        if 0 <= frame.stamp_ns - self._cloud_ns < POINTS_PERIOD_NS:
+            return
+        self._cloud_ns = frame.stamp_ns
         places, colours = points(frame, self._robot, DEPTH_STEP)
         links = self._posture.links()
         if links:  # below the body, because entities below a camera are drawn into its picture
