@@ -42,7 +42,7 @@ def no_robot_here(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 def test_help_lists_every_command(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--help"]) == 0
     out = capsys.readouterr().out
-    assert all(f" {command} " in out for command in COMMANDS)
+    assert all(f" {command} " in out for command in (*COMMANDS, "--version", "--install-completion"))
 
 
 @pytest.mark.parametrize(

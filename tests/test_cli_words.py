@@ -88,6 +88,31 @@ def test_an_error_is_one_object_on_standard_output_where_json_is_asked_for(
     assert capsys.readouterr().out == ""
 
 
+@pytest.mark.parametrize(
+    ("arguments", "keys"),
+    [
+        (["down"], {"down"}),
+        (["new", "service", "greeter"], {"files", "next"}),
+        (["new", "task", "greet"], {"files", "next"}),
+        (["doctor", "sim"], None),
+        (["topics"], None),
+        (["capture", "list"], None),
+    ],
+)
+def test_a_result_is_one_document_of_json(
+    arguments: list[str],
+    keys: set[str] | None,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COCORO_CAPTURE_DIR", str(tmp_path))
+    main([*arguments, "--json"])
+    result = json.loads(capsys.readouterr().out)
+    assert isinstance(result, list) if keys is None else result.keys() == keys
+
+
 def test_json_is_asked_for_before_the_end_of_the_options_alone() -> None:
     assert asks_json(["new", "task", "a", "--json"])
     assert not asks_json(["new", "task", "--", "--json"])

@@ -39,7 +39,7 @@ def labels() -> Iterable[str]:
 
 @_names
 def scenes() -> Iterable[str]:
-    from sim.scene import GENERATED, scene_names
+    from sim.scene_names import GENERATED, scene_names
 
     return [*scene_names(), *GENERATED]
 

@@ -90,5 +90,5 @@ def _contact(link: MeshLink) -> ProcessContact:
 @contextmanager
 def hands_on(follower: Follower) -> Iterator[None]:
     """Cancels the follower's task when a person ends this command or lets go of it."""
-    with on_signals(HANDS_OFF, follower.signalled), on_reader_gone(follower.cancel), going_on():
+    with on_signals(HANDS_OFF, follower.signalled, hurried=True), on_reader_gone(follower.cancel), going_on():
         yield
