@@ -81,6 +81,7 @@ class Executive:
         now_ns = self._node.now_ns()
         task_id = f"{task.name}-{now_ns}-{self._count}"
         self.state = TaskState(task_id=task_id, task=task.name, label=task.target, phase="start", started_ns=now_ns)
+        self._skills.measures = self.state.measures
         self._ended = asyncio.get_running_loop().create_future()
         timeout_s = request.timeout_s or task.limit_s(self._config)
         self._running = self._node.spawn(self._carry_out(task, timeout_s, self._ended))
