@@ -1,9 +1,9 @@
 """Measures pursuits by the true state: `python -m bench.pursuit travels --seeds 0:20` and `walls --seeds 0:10`.
 
 `travels`: a ball is carried round for 30 s before the robot is asked to follow it for 20 s. Reached: the task is done,
-and the robot never stood for longer than 0.3 s while it was off its distance. `walls`: a ball stands or is carried behind
-a wall that it is seen beside or above. Reached: the task is done, at least half of the time was with the ball, and
-nothing was touched. Real sensors; exit code 1 where fewer than `--least` of the set were reached.
+and the robot never stood for longer than 0.3 s while it was off its distance. `walls`: a ball stands or is carried
+behind a wall that it is seen beside or above. Reached: the task is done, at least half of the time was with the ball,
+and nothing was touched. Real sensors; exit code 1 where fewer than `--least` of the set were reached.
 """
 
 from __future__ import annotations

@@ -66,8 +66,7 @@ class Clock(Protocol):
         """Announces that the caller will call `tick` itself."""
 
     def tick(self, stamp_ns: int, incarnation: int, rate: float = 1.0) -> str:
-        """Takes a sample of the clock key. Returns why it is rejected, '' otherwise. A clock with an own source of time
-        ignores it."""
+        """Takes a sample of the clock key; returns why it is rejected, or ''. A clock with an own source ignores it."""
 
     async def wait_started(self) -> None:
         """Returns when the clock has a time."""
@@ -195,8 +194,7 @@ class FollowedClock:
         self._pace = 1.0
         self._doubted: Ticks | None = None
         self._sleeping: dict[asyncio.Future[None], int] = {}
-        """Wake-up time of each sleeper. A tick wakes only those that it concerns: there are a hundred ticks a
-        second."""
+        """Wake-up time of each sleeper. Of a hundred ticks a second each wakes only those that it concerns."""
 
     @property
     def epoch(self) -> int:

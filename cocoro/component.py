@@ -82,8 +82,7 @@ class Component:
     stop_s: float = 5.0
     """Time from SIGTERM to SIGKILL."""
     frames: Literal["", "reads", "publishes"] = ""
-    """Whether it publishes or reads frames: these travel in shared memory then. Otherwise they are copied, which costs
-    more."""
+    """Whether it publishes or reads frames, which then travel in shared memory; otherwise they are copied."""
     nice: int = 0
     """Scheduling priority relative to the others: above 0 it yields to them, below 0 they yield to it, where that is
     allowed (LimitNICE in the unit file)."""

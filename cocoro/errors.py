@@ -2,15 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from os import PathLike, fspath
+from typing import Any, get_args, get_type_hints
+
+
+def choice_of(given: object, known: Iterable[str]) -> str:
+    """Text for a name that is not among the known ones: 'known are red_can, blue_can; did you mean red_can?'."""
+    from difflib import get_close_matches
+
+    names = [*known]
+    close = get_close_matches(str(given), names, 1)
+    return f"known are {', '.join(names) or 'none'}{f'; did you mean {close[0]}?' if close else ''}"
+
+
+def field_text(error: Exception, kind: Any = None) -> str:
+    """msgspec's 'what - at `$.field`' as 'field: what', for an unknown field or value of the struct `kind` with those
+    that are known."""
+    text, _, path = str(error).partition(" - at `$")
+    path, fields = path.strip(".`"), getattr(kind, "__struct_encode_fields__", ())
+    if "unknown field `" in text and not path:
+        name = text.split("`")[1]
+        text = f"unknown field {name!r}; {choice_of(name, fields)}"
+    elif "enum value '" in text and path in fields:
+        name, hint = text.split("'")[1], get_type_hints(kind)[kind.__struct_fields__[fields.index(path)]]
+        text = f"unknown value {name!r}; {choice_of(name, get_args(hint))}"
+    return f"{path}: {text}" if path else text
 
 
 @contextmanager
 def naming(path: PathLike[str]) -> Iterator[None]:
-    """Adds the path to an OSError in the block: the system names a file that cannot be opened, not one that cannot be
-    written."""
+    """Adds the path to an OSError in the block: the system names only files that cannot be opened."""
     try:
         yield
     except OSError as error:

@@ -80,8 +80,7 @@ def all_requests() -> tuple[Request[Any, Any], ...]:
 
 
 def _new(declared: Iterable[Any], own: Iterable[Any], theirs: dict[str, Any]) -> dict[str, Any]:
-    """Those of the declared rows that are not known yet, by name. Raises ConfigError for one whose name means something
-    else already."""
+    """The declared rows that are new, by name. Raises ConfigError for a name that means something else already."""
     known = {row.name: row for row in own} | theirs
     found: dict[str, Any] = {}
     for row in declared:

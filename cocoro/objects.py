@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import tomllib
 from collections.abc import Iterator
 from importlib import resources
@@ -13,7 +12,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta
 
-from cocoro.errors import ConfigError
+from cocoro.errors import ConfigError, field_text
 from cocoro.units import Positive, Share, Vec3
 
 Label = Annotated[str, Meta(pattern=r"\A[a-z][a-z0-9_-]{0,63}\Z")]
@@ -119,7 +118,7 @@ class Catalogue:
             try:
                 known = msgspec.convert(row, ObjectSpec)
             except msgspec.ValidationError as error:
-                raise ConfigError(f"known objects {where}: {table}: {_field(error)}") from error
+                raise ConfigError(f"known objects {where}: {table}: {field_text(error, ObjectSpec)}") from error
             for earlier in objects:
                 if known.label == earlier.label:
                     raise ConfigError(f"known objects {where}: {table}: label: an earlier object has it already")
@@ -162,11 +161,3 @@ class Catalogue:
 def own_text() -> str:
     """The text of the project's own catalogue."""
     return resources.files("cocoro").joinpath(DEFAULT_FILE).read_text()
-
-
-def _field(error: msgspec.ValidationError) -> str:
-    """msgspec's 'what - at `$.lab[0].low`' as 'lab[0].low: what'."""
-    match = re.fullmatch(r"(.*) - at `\$\.?(.*)`", str(error), re.DOTALL)
-    if match and match[2]:
-        return f"{match[2]}: {match[1]}"
-    return match[1] if match else str(error)

@@ -18,7 +18,7 @@ import numpy as np
 from msgspec import Meta
 
 from cocoro.arrays import CodeArray, Float32Array, FloatArray
-from cocoro.errors import ConfigError
+from cocoro.errors import ConfigError, field_text
 from cocoro.kinematics import Chain, Link, Tree
 from cocoro.units import Positive, Vec3
 
@@ -78,8 +78,7 @@ class Kinect(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     mount_max_m: Vec3
     colour_lens: LensValues | None = None
     depth_lens: LensValues | None = None
-    """Calibration of the two lenses. The driver rectifies its images by it, so readers of frames use the fields of view
-    above."""
+    """Calibration of both lenses. The driver rectifies its images; readers of frames use the fields of view above."""
     depth_rotation_rad: Vec3 = (0.0, 0.0, 0.0)
     """Rotation vector from the depth camera's frame to the colour camera's."""
 
@@ -145,8 +144,7 @@ class Joint(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     torque_nm: Positive
     max_speed_radps: Positive
     compliance_deg: Annotated[float, Meta(ge=0)] = 0.0
-    """Distance from the goal beyond which the servo pushes with all of `torque_nm`; nearer it pushes less. 0: always
-    all of it."""
+    """Distance from the goal beyond which the servo pushes with all of `torque_nm`; 0: always."""
     overload_s: Positive = 5.0
     """A servo that pushes at its limit for this long is overloaded."""
     direction: Literal[-1, 1] = 1
@@ -311,7 +309,7 @@ class Robot:
         try:
             return cls(msgspec.convert(_completed(data), _DescriptionFile))
         except msgspec.ValidationError as error:
-            raise ConfigError(f"{where}: {error}") from error
+            raise ConfigError(f"{where}: {field_text(error, _DescriptionFile)}") from error
 
     def to_data(self) -> dict[str, Any]:
         """The whole description as plain data."""

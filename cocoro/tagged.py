@@ -7,6 +7,8 @@ from typing import Generic, TypeVar
 
 import msgspec
 
+from cocoro.errors import choice_of, field_text
+
 T = TypeVar("T", bound="Tagged")
 
 
@@ -47,12 +49,10 @@ class Registry(Generic[T]):
 
     def kind(self, name: object) -> type[T]:
         """The type of a name. Raises ValueError, which lists the known names."""
-        found = self._own.get(name) if isinstance(name, str) else None
+        text = name if isinstance(name, str) else ""
+        found = self._own.get(text) or self.all().get(text)
         if found is None:
-            known = self.all()
-            if not isinstance(name, str) or name not in known:
-                raise ValueError(f"unknown {self._word} {name!r}; known are {', '.join(known)}")
-            found = known[name]
+            raise ValueError(f"unknown {self._word} {name!r}; {choice_of(name, self.all())}")
         return found
 
     def read(self, data: object) -> T:
@@ -66,6 +66,4 @@ class Registry(Generic[T]):
         try:
             return msgspec.convert(data, kind)
         except msgspec.ValidationError as error:
-            text, _, path = str(error).partition(" - at `$.")
-            field = path.rstrip("`")
-            raise ValueError(f"{kind.tag()}: {f'{field}: ' if field else ''}{text}") from error
+            raise ValueError(f"{kind.tag()}: {field_text(error, kind)}") from error

@@ -16,10 +16,9 @@ point of the group `cocoro.tasks` that points to the type (docs/tasks.md).
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from typing import Annotated, Any, ClassVar, Literal, Protocol
+from typing import Any, ClassVar, Literal, Protocol
 
 import msgspec
-from msgspec import Meta
 
 from cocoro.entry_points import added_to
 from cocoro.messages import PlannerStatus
@@ -35,11 +34,9 @@ UNLIMITED_S = 86_400.0
 class Limits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Time limits and tries of the routines; a profile's `[service.executive]` table sets them."""
 
-    task_timeout_s: Positive = 180.0
-    search_timeout_s: Positive = 60.0
-    viewpoints: Annotated[int, Meta(ge=1)] = 3
-    """Places from which a target is looked for before it is not found."""
-    explore_timeout_s: Positive = 20.0
+    task_timeout_s: Positive = 240.0
+    search_timeout_s: Positive = 130.0
+    """A whole search, from all the places that it looks from."""
     approach_timeout_s: Positive = 60.0
     carry_timeout_s: Positive = 90.0
     reach_timeout_s: Positive = 20.0

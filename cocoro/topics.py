@@ -197,7 +197,6 @@ STEPS = Topic(
     "{service}/steps", m.StepRecord, Qos.EVENT, None, 1.0,
     "The inputs and outputs of each step of a pure core, when recording of steps is on.",
 )  # fmt: skip
-
 EXCHANGES = Topic(
     "{service}/requests", m.Exchange, Qos.EVENT, None, 1.0,
     "Every request to a service, with its answer, for recorders.", max_bytes=4 * 1024 * 1024,
@@ -220,6 +219,10 @@ RUN = Request(
 CANCEL = Request(
     "executive/cancel", m.CancelRequest, m.TaskReply,
     "End the running task; the robot stops.",
+)  # fmt: skip
+REPORT = Request(
+    "executive/report", m.ReportRequest, m.TaskState,
+    "The state of a task, running or ended; one without an id for a task that is not known.",
 )  # fmt: skip
 OBJECTS = Request(
     "executive/objects", m.ObjectsRequest, m.ObjectsReply,
@@ -250,4 +253,4 @@ ABOUT = Request(
     "The component, settings and versions of a service; answered by every service.",
 )  # fmt: skip
 
-REQUESTS: tuple[Request[Any, Any], ...] = (RUN, CANCEL, OBJECTS, ESTOP, LEARNED, RECOVER, SERVOS, ABOUT)
+REQUESTS: tuple[Request[Any, Any], ...] = (RUN, CANCEL, REPORT, OBJECTS, ESTOP, LEARNED, RECOVER, SERVOS, ABOUT)

@@ -48,6 +48,12 @@ if [[ "$(cat $installed 2>/dev/null)" != "$PWD "* ]] || ! .venv/bin/python -m pi
     fi
 fi
 
-echo "Installing the project and its libraries (about 0.8 GB)"
-.venv/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+echo "Installing the project, the simulator and the tools of its tests (docs/install.md has smaller installations)"
+PYTHONUNBUFFERED=1 .venv/bin/python -m pip install --progress-bar off --disable-pip-version-check \
+    --log .venv/install.log -c constraints.txt -e '.[dev]' 2>&1 | "$python" deploy/install_progress.py || {
+    echo "The installation failed; all that pip said is in .venv/install.log" >&2
+    exit 2
+}
+.venv/bin/python deploy/install_progress.py sizes
+mkdir -p .venv/share/man/man1 && ln -sf "$PWD/docs/cocoro.1" .venv/share/man/man1/ # pip leaves it out of editable installs
 echo "$wanted" >$installed

@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import asyncio
 import faulthandler
+import json
 import logging
 import os
 import signal
@@ -18,6 +19,8 @@ from collections.abc import Awaitable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
+
+import msgspec
 
 from cocoro import private
 from cocoro.errors import CocoroError, RefusedError
@@ -31,7 +34,7 @@ LEVEL = "COCORO_LOG"
 """Environment variable with the log level; info when it is not set."""
 
 
-class _Line(logging.Formatter):
+class Line(logging.Formatter):
     """One line per record: time, level, process, message."""
 
     def __init__(self, process: str) -> None:
@@ -43,10 +46,23 @@ class _Line(logging.Formatter):
 
 def set_up_logging(process: str) -> logging.Logger:
     handler = logging.StreamHandler()
-    handler.setFormatter(_Line(process))
+    handler.setFormatter(Line(process))
     logging.basicConfig(handlers=[handler], level=os.environ.get(LEVEL, "info").upper(), force=True)
     logging.captureWarnings(True)
     return logging.getLogger(f"cocoro.{process}")
+
+
+def changed(config: Any, path: str = "") -> list[str]:
+    """The settings that differ from their defaults, as `head.sweep_speed_radps = 0.5`; all of them would be 2 KB."""
+    defaults = type(config)()
+    found = []
+    for name in config.__struct_fields__:
+        value, default = getattr(config, name), getattr(defaults, name)
+        if isinstance(value, msgspec.Struct) and type(value) is type(default):
+            found += changed(value, f"{path}{name}.")
+        elif value != default:
+            found.append(f"{path}{name} = {json.dumps(value, default=str)}")
+    return found
 
 
 def watch_parent(fd: int) -> None:
@@ -85,7 +101,12 @@ def run(
             return CRASHED
         log.error("%s: %s; make room there", error.filename or run_dir.path, error.strerror)
         return MISCONFIGURED
-    except Exception:
+    except Exception as error:
+        from deploy.extras import advice_of
+
+        if sentence := advice_of(error):
+            log.error("%s", sentence)
+            return MISCONFIGURED
         if raise_crashes:
             raise
         log.exception("crashed")
@@ -113,7 +134,7 @@ async def _main(process: str, run_dir: RunDir, data: dict[str, Any], profile_nam
         launch = profile.launch(process)
         robot = Robot.load(_path(profile.description), _path(profile.measured))
         log = logging.getLogger(f"cocoro.{process}")
-        log.info("%s with %s", row.module, config)
+        log.info("%s with %s", row.module, "; ".join(changed(config)) or "the default settings")
         stop = _stop_signal()
         # Without a supervisor, the first process fixes the robot's time for those that come later.
         real_clock = robot_time.clock if run_dir.populated else robot_time.fix

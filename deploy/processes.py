@@ -12,7 +12,7 @@ from typing import Any
 
 from cocoro.bus.shared import need_bytes
 from cocoro.component import Component
-from cocoro.errors import ConfigError
+from cocoro.errors import ConfigError, choice_of
 from cocoro.installed import third_parties
 from cocoro.topics import ANY, Topic
 from services.base.component import BASE
@@ -57,7 +57,7 @@ def named(name: str) -> Component:
         if component.name == name:
             return component
     if name not in table():
-        raise ConfigError(f"there is no process {name!r}; known are {', '.join(table())}")
+        raise ConfigError(f"there is no process {name!r}; {choice_of(name, table())}")
     return table()[name]
 
 

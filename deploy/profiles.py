@@ -24,7 +24,7 @@ import msgspec
 from msgspec import Meta
 
 from cocoro.component import Component
-from cocoro.errors import ConfigError
+from cocoro.errors import ConfigError, choice_of, field_text
 from deploy.processes import named, needs
 from deploy.rundir import Mesh
 
@@ -106,7 +106,7 @@ class Profile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
         try:
             return msgspec.convert(table, kind)
         except msgspec.ValidationError as error:
-            raise ConfigError(f"profile {self.name}, [service.{process}]: {_describe(error)}") from error
+            raise ConfigError(f"profile {self.name}, [service.{process}]: {field_text(error, kind)}") from error
 
 
 def names() -> list[str]:
@@ -144,7 +144,7 @@ def from_data(data: dict[str, Any], name: str) -> Profile:
     try:
         profile = msgspec.structs.replace(msgspec.convert(data, Profile), name=name)
     except msgspec.ValidationError as error:
-        raise ConfigError(f"profile {name}: {_describe(error)}") from error
+        raise ConfigError(f"profile {name}: {field_text(error, Profile)}") from error
     if len(set(profile.processes)) < len(profile.processes):
         raise ConfigError(f"profile {name}: processes names a process twice")
     try:
@@ -172,7 +172,7 @@ def _find(which: str) -> Path | Traversable:
     known = names()
     if which not in known:
         raise ConfigError(
-            f"there is no profile {which!r}; known are {', '.join(known)}, or give the path of a .toml file"
+            f"there is no profile {which!r}, and it is not the path of a .toml file; {choice_of(which, known)}"
         )
     return resources.files(PACKAGE).joinpath("profiles", f"{which}.toml")
 
@@ -199,9 +199,3 @@ def _absolute(file: str | None, home: Path | None) -> str | None:
     if file is None or home is None:
         return file
     return str((home / file).resolve())
-
-
-def _describe(error: msgspec.ValidationError) -> str:
-    """msgspec's message with the field first: 'seed: Expected `int`, got `str`'."""
-    text, at, path = str(error).partition(" - at `$.")
-    return f"{path.rstrip('`')}: {text}" if at else text

@@ -28,7 +28,7 @@ from cocoro.keys import alive_key, service_of
 from cocoro.stop.record import latch_dir, prepare
 from deploy import robot_time, service_manager
 from deploy.contact import SleepDetector
-from deploy.launch import CRASHED
+from deploy.launch import CRASHED, Line
 from deploy.processes import shared_bytes, stoppable
 from deploy.profiles import Profile, from_data
 from deploy.quit import quit_process
@@ -188,7 +188,7 @@ class Supervisor:
 
     def _log_to_file(self) -> None:
         handler = _log_handler(self._run_dir, self._report_to_people)
-        handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)-7s supervisor: %(message)s"))
+        handler.setFormatter(Line("supervisor"))
         log.handlers[:] = [handler]
         log.setLevel(logging.INFO)
         log.propagate = False

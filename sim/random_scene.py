@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cocoro.errors import ConfigError
+from cocoro.errors import ConfigError, choice_of
 from cocoro.objects import Catalogue, ObjectSpec
 from sim.scene import Light, Obstacle, Scene, SceneObject, load_scene
 from sim.seeds import stream
@@ -43,7 +43,7 @@ def random_scene(seed: int, target: str = "", catalogue: Catalogue | None = None
     if target:
         wanted = catalogue.get(target)
         if wanted is None:
-            raise ConfigError(f"scene random: no known object {target!r}; known are {', '.join(catalogue.labels)}")
+            raise ConfigError(f"scene random: no known object {target!r}; {choice_of(target, catalogue.labels)}")
         if wanted not in chosen:
             chosen[0] = wanted
     places = _places(rng, len(chosen))

@@ -11,10 +11,11 @@ from typing import Annotated, Any, TypeVar
 import msgspec
 from msgspec import Meta
 
-from cocoro.errors import ConfigError
+from cocoro.errors import ConfigError, choice_of, field_text
 from cocoro.objects import Catalogue
 from cocoro.units import Vec3
 from sim.render.interface import Shape
+from sim.scene_names import GENERATED, scene_names
 from sim.seeds import stream
 
 ScenePoint = Annotated[tuple[float, ...], Meta(min_length=2, max_length=3)]
@@ -218,7 +219,7 @@ def load_scene(name_or_path: str | Path, seed: int = 0, catalogue: Catalogue | N
         raise ConfigError(f"{where}: not TOML: {error}") from error
     known = {"name", "object", "obstacle", "light", "robot", "scatter"}
     if extra := sorted(set(data) - known):
-        raise ConfigError(f"{where}: unknown table or field {extra[0]!r}; known are {', '.join(sorted(known))}")
+        raise ConfigError(f"{where}: unknown table or field {extra[0]!r}; {choice_of(extra[0], sorted(known))}")
     name = data.get("name", Path(name_or_path).stem)
     if not isinstance(name, str):
         raise ConfigError(f"{where}: name must be text")
@@ -235,12 +236,6 @@ def load_scene(name_or_path: str | Path, seed: int = 0, catalogue: Catalogue | N
     return _scattered(scene, scatter, seed)
 
 
-def scene_names() -> list[str]:
-    """Names of the scenes that come with the project."""
-    folder = resources.files("sim").joinpath("scenes")
-    return sorted(file.name.removesuffix(".toml") for file in folder.iterdir() if file.name.endswith(".toml"))
-
-
 _T = TypeVar("_T", bound=_Table)
 
 
@@ -250,7 +245,7 @@ def _read(name_or_path: str | Path) -> tuple[str, str]:
         return resources.files("sim").joinpath("scenes", f"{name}.toml").read_text(), f"scene {name}"
     path = Path(name_or_path)
     if path.suffix != ".toml" and not path.exists():
-        raise ConfigError(f"no scene {name!r}: give a .toml file or one of {', '.join(scene_names())}")
+        raise ConfigError(f"no scene {name!r}, and no such .toml file; {choice_of(name, [*scene_names(), *GENERATED])}")
     try:
         return path.read_text(), f"scene {path.name}"
     except (OSError, UnicodeDecodeError) as error:
@@ -272,9 +267,7 @@ def _table(data: Any, kind: type[_T], where: str) -> _T:
     try:
         table = msgspec.convert(data, kind)
     except msgspec.ValidationError as error:
-        what, _, place = str(error).partition(" - at `$")
-        field = place.strip(".`")
-        raise ConfigError(f"{where}: {field + ': ' if field else ''}{what}") from error
+        raise ConfigError(f"{where}: {field_text(error, kind)}") from error
     for name in table.__struct_fields__:
         if not all(isfinite(number) for number in _numbers(getattr(table, name))):
             raise ConfigError(f"{where}: {name} must be finite")

@@ -8,10 +8,10 @@ from cocoro.messages import Intent, TaskRequest
 from cocoro.messages.actions import ACTIONS, Action, Idle
 
 
-def asked(task: str, label: str = "", timeout_s: float | None = None, **fields: Any) -> TaskRequest:
+def asked(task: str, label: str = "", timeout_s: float | None = None, asker: str = "", **fields: Any) -> TaskRequest:
     """A request as it travels; a label only where one is given."""
     wire = {"task": task, **({"label": label} if label else {}), **fields}
-    return TaskRequest(task=wire, timeout_s=timeout_s)
+    return TaskRequest(task=wire, timeout_s=timeout_s, asker=asker)
 
 
 def action(name: str, label: str = "", **fields: Any) -> Action:

@@ -13,8 +13,8 @@ from apps.captures.info import report
 from apps.captures.reader import Capture
 from apps.cli import capture as capture_command
 from cocoro.clock import NS, steady_ns
+from services.capture.folder import captures, file_name, make_room
 from services.capture.log_clock import KEPT_STEPS, TOGETHER_NS, WALL_CLOCK, LogClock
-from services.capture.service import captures, file_name, make_room
 from services.capture.writer import FileLimits
 
 START_NS = 1_750_000_000 * NS
@@ -150,7 +150,7 @@ def test_the_run_that_goes_on_is_the_newest_though_the_clock_was_set_back_before
     names = [file_name("calliope", before, 1), *(file_name("calliope", now, n) for n in (999, 1000))]
     for name in names:
         (tmp_path / name).write_bytes(bytes(1000))
-    assert [path.name for path in make_room(tmp_path, "calliope", 2000, now)] == names[:1]
-    assert [path.name for path in make_room(tmp_path, "calliope", 1000, now)] == names[1:2]
-    assert make_room(tmp_path, "calliope", 0, now) == []
+    assert [path.name for path in make_room(tmp_path, "calliope", 2000, now).gone] == names[:1]
+    assert [path.name for path in make_room(tmp_path, "calliope", 1000, now).gone] == names[1:2]
+    assert make_room(tmp_path, "calliope", 0, now).gone == []
     assert [path.name for path in captures(tmp_path, "calliope")] == names[2:]

@@ -293,7 +293,7 @@ def test_the_mesh_hears_of_a_removal_and_of_a_move(tmp_path: Path, monkeypatch: 
             second.unlink()
             await drive(room, 2.0)
 
-    run_virtual(Room().recorded({"folder": str(tmp_path)}, scenario))
+    run_virtual(Room().recorded({"folder": str(tmp_path), "per_occasion": False}, scenario))
     assert (health[-1].state, health[-1].text) == ("degraded", "messages are lost")
     assert "messages are lost" in health[-1].faults[-1]
     last = said[-1]

@@ -20,17 +20,17 @@ from message_samples import data_of
 
 from apps.captures.compare import changes, known_to
 from apps.captures.info import report
+from apps.captures.mcap_reading import unpack
 from apps.captures.reader import Capture
 from apps.captures.rewrite import rewrite
 from cocoro.capture.conventions import CaptureError
-from cocoro.capture.mcap import unpack
 from cocoro.capture.types import Alive, LossyFrame, NotReadableError, schema_of
 from cocoro.errors import ConfigError
 from cocoro.messages import BaseState, Detections, Frame, Message, PlannerStatus
 from cocoro.topics import TOPICS
 from services.capture.file import COMPRESSIONS, Compression, Packer
+from services.capture.folder import captures, make_room
 from services.capture.keys import KeyFilter, lossy
-from services.capture.service import captures, make_room
 from services.capture.writer import FileLimits, Missing
 
 BIG = msgspec.msgpack.encode(frame(7, 320, 240))
@@ -172,7 +172,7 @@ def test_the_oldest_captures_make_room_and_nothing_else_does(tmp_path: Path) -> 
     names = [f"calliope-2026010{day}T000000Z-001.mcap" for day in range(1, 5)]
     for name in (*names, "calliope-notes.mcap", "other-20260101T000000Z-001.mcap"):
         (tmp_path / name).write_bytes(bytes(1000))
-    assert [path.name for path in make_room(tmp_path, "calliope", 2500)] == names[:2]
+    assert [path.name for path in make_room(tmp_path, "calliope", 2500).gone] == names[:2]
     assert [path.name for path in captures(tmp_path, "calliope")] == names[2:]
     make_room(tmp_path, "calliope", 0)
     assert {path.name for path in tmp_path.iterdir()} == {

@@ -14,8 +14,9 @@ from capture_rig import ROBOT, Room, all_of, drive, entry, record, writer
 
 from apps.captures.player import AT_ONCE, FASTEST, Player
 from apps.captures.reader import Capture
-from apps.captures.replay import Replay, played_keys, refuse_if_alive, restarted, services_of, with_rate
+from apps.captures.replay import Replay, heard_as, played_keys, refuse_if_alive, restarted, services_of, with_rate
 from cocoro import topics
+from cocoro.bus.base import Qos
 from cocoro.clock import FollowedClock
 from cocoro.core import Output, Sample, Schedule, Take
 from cocoro.errors import ConfigError, RefusedError
@@ -232,6 +233,35 @@ def test_hardware_alone_impersonates_the_robot_with_a_clock(tmp_path: Path) -> N
     assert alive == {"kinect", "base", "arm", "hand"}
     assert len(followed) > 120
     assert all(abs(now_ns - stamp_ns) < 10**8 for stamp_ns, now_ns in followed[2:])
+
+
+def test_a_capture_is_heard_by_a_robot_of_another_name(tmp_path: Path) -> None:
+    path = record(tmp_path / "first.mcap", think)
+    heard: list[str] = []
+
+    async def listen(room: Room) -> None:
+        bus = room.mesh.join()
+        bus.subscribe("**", Qos.EVENT, lambda key, _: heard.append(key), depth=0)
+        bus.watch_alive("*/*/alive", lambda key, alive: heard.append(key))
+        with Capture.open(path) as capture:
+            player = Player(capture, played_keys(capture, (), hardware=True).__contains__)
+            await Replay(room.mesh.join(), capture, player, hardware=True, robot="other").run()
+
+    run_virtual(listen(Room()))
+    assert heard.count("other/base/state") == 100
+    assert {"other/sim/clock", "other/kinect/frame", "other/base/alive"} <= set(heard)
+    assert {key.partition("/")[0] for key in heard} == {"other"}
+
+
+def test_the_robot_that_waits_for_hardware_is_found_or_must_be_named() -> None:
+    waiting, whole = {"perception", "planning"}, {"planning", "base", "kinect"}
+    assert heard_as("r1", {}) == "r1"
+    assert heard_as("r1", {"calliope": waiting}) == "calliope"
+    assert heard_as("r1", {"calliope": waiting, "r1": waiting}) == "r1"
+    assert heard_as("r1", {"calliope": waiting, "busy": whole, "simulated": {"sim"}}) == "calliope"
+    assert heard_as("r1", {"busy": whole}) == "r1"
+    with pytest.raises(ConfigError, match="--robot one or --robot two"):
+        heard_as("r1", {"one": waiting, "two": waiting})
 
 
 class Counting:

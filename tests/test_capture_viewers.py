@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+import threading
 import types
 from math import pi
 from pathlib import Path
@@ -18,15 +19,21 @@ from mcap.reader import make_reader
 from apps.captures.export import rerun_scene
 from apps.captures.export.geometry import Posture, about_z, conjugate, points, quaternion, rotated
 from apps.captures.export.story import catalogue_of, robot_of
+from apps.captures.export.viewer import Attempt, Pulse, Target, ViewerProcess, address_of, free_port, sent
 from apps.captures.reader import Capture
-from apps.cli.export import watch
 from apps.cli.main import main
+from apps.cli.view import WAITING, Waiting, watch
 from cocoro import topics
 from cocoro.bus.base import Qos
+from cocoro.capture.conventions import CaptureError
+from cocoro.errors import ConfigError
 from cocoro.kinematics import turn_z
 from cocoro.messages import BaseCommand, Frame, ServoState
 from cocoro.objects import Catalogue
 from cocoro.vloop import run_virtual
+from sim.outside import OutsideStage
+from sim.scene import load_scene
+from sim.world import World
 
 GOLDEN = Path(__file__).parent / "golden" / "fetch.mcap"
 
@@ -44,6 +51,8 @@ def fox(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_file_for_foxglove_has_its_schemas_in_the_robots_time(fox: Path) -> None:
     """tests/test_capture_foreign.py decodes and validates each message with npm packages."""
+    from foxglove import messages as sdk
+
     shown: dict[str, list[bytes]] = {}
     recorded: dict[str, list[Any]] = {}
     last = 0
@@ -54,6 +63,7 @@ def test_the_file_for_foxglove_has_its_schemas_in_the_robots_time(fox: Path) -> 
             last = message.log_time
             if schema.name.startswith("foxglove."):
                 assert schema.encoding == channel.message_encoding == "protobuf"
+                assert schema.data == getattr(sdk, schema.name.removeprefix("foxglove.")).get_schema().data
                 shown.setdefault(schema.name, []).append(message.data)
             else:
                 assert channel.message_encoding == "json"
@@ -62,11 +72,24 @@ def test_the_file_for_foxglove_has_its_schemas_in_the_robots_time(fox: Path) -> 
         "foxglove.CompressedImage", "foxglove.CameraCalibration", "foxglove.PointCloud", "foxglove.FrameTransforms",
         "foxglove.SceneUpdate", "foxglove.ImageAnnotations", "foxglove.Log",
     } == set(shown)  # fmt: skip
-    assert len(shown["foxglove.CompressedImage"]) == len(shown["foxglove.PointCloud"]) == 60
+    assert len(shown["foxglove.CompressedImage"]) == 60
     assert len(recorded["calliope/base/state"]) == 300
     transforms = b"".join(shown["foxglove.FrameTransforms"])
     assert all(frame in transforms for frame in (b"body", b"camera", b"gripper"))
     assert any(b"approach" in log for log in shown["foxglove.Log"])
+
+
+def test_the_file_for_foxglove_is_no_larger_than_an_ordinary_capture(fox: Path) -> None:
+    """Clouds of points come at 10 Hz at most, whatever the camera's rate is, and the chassis comes once."""
+    stamps: dict[str, list[int]] = {}
+    with fox.open("rb") as stream:
+        for _, channel, message in make_reader(stream).iter_messages():
+            stamps.setdefault(channel.topic, []).append(message.log_time)
+    clouds = stamps["/camera/points"]
+    assert min(np.diff(clouds)) >= 10**8
+    assert len(clouds) > 50
+    assert len(stamps["/robot/chassis"]) == 1
+    assert fox.stat().st_size < 1.2 * GOLDEN.stat().st_size  # its pictures are tiny, of 160 x 120 pixels
 
 
 def test_without_foxglove_one_line_says_how_to_install_it(
@@ -119,8 +142,11 @@ class Stream:
     def save(self, path: str) -> None:
         self.saved = path
 
-    def flush(self) -> None:
+    def flush(self, timeout_sec: float = 0.0) -> None:
         pass
+
+    def send_blueprint(self, blueprint: Any) -> None:
+        self.blueprint = blueprint
 
 
 class FakeRerun(types.ModuleType):
@@ -153,17 +179,19 @@ def test_rerun_gets_the_messages_of_a_live_mesh(monkeypatch: pytest.MonkeyPatch)
     async def look() -> None:
         room = Room()
         bus = room.mesh.join()
-        watch(bus, "calliope", rerun_scene.RerunScene(Stream("cocoro"), ROBOT, Catalogue.load()))
+        watch(bus, "calliope", waiting)
         bus.publisher("calliope/base/state", Qos.STATE).put(b"no message")
         async with room.node("planning") as planning:
             await room.clock.sleep_until(10**9)
             planning.publish(topics.BASE_COMMAND, BaseCommand(left_mps=0.1, right_mps=0.2), stamp_ns=5)
-            await drive(room, 1.0)
+            await drive(room, 0.2, frames=False)
 
+    waiting = Waiting()
     run_virtual(look())
+    waiting.close()
+    waiting.log_to(rerun_scene.RerunScene(Stream("cocoro"), ROBOT, Catalogue.load()))
     logged = Stream.newest.logged
-    assert len(logged["world/body"]) == 50
-    assert len(logged["world/body/camera/colour"]) == 10
+    assert len(logged["world/body"]) == 10
     (command,) = logged["curves/wheels/commanded_left"]  # however old it is
     assert command[1].args == (0.1,)
 
@@ -179,25 +207,140 @@ def test_without_rerun_one_line_says_how_to_install_it(
         assert len(err.splitlines()) == 1
 
 
-def test_without_a_screen_one_line_says_what_to_do(
+def test_what_the_viewer_is_too_slow_for_is_dropped_and_a_frame_first() -> None:
+    waiting = Waiting()
+    picture = Frame(width=1, height=1, colour=memoryview(b"abc"), depth=memoryview(b"ab"))
+    for _ in range(5):
+        waiting.put(topics.FRAME.name, picture)
+    assert waiting.dropped == 3
+    for _ in range(WAITING):
+        waiting.put(topics.BASE_COMMAND.name, BaseCommand(left_mps=0.0, right_mps=0.0))
+    assert waiting.dropped == 5
+
+
+DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET")
+
+
+@pytest.mark.parametrize("what", [[str(GOLDEN)], [], [str(GOLDEN), "--sim"]])
+def test_without_a_display_one_line_says_what_to_do(
+    what: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "rerun", FakeRerun("rerun"))
+    for name in DISPLAYS:
+        monkeypatch.delenv(name, raising=False)
+    assert main(["view", *what]) == 2
+    err = capsys.readouterr().err
+    assert all(option in err for option in ("--web", "--save", "--connect", "DISPLAY"))
+    assert len(err.splitlines()) == 1
+
+
+def test_only_one_place_can_be_chosen(tmp_path: Path) -> None:
+    for target in (
+        Target(web=True, save=tmp_path / "a.rrd"), Target(web=True, connect="there"), Target(bind="0.0.0.0"),
+    ):  # fmt: skip
+        with pytest.raises(ConfigError, match=r"choose one|give --web too"):
+            target.check()
+    Target(web=True, bind="0.0.0.0").check()
+
+
+def test_the_address_of_a_viewer_is_a_host_a_port_or_the_whole() -> None:
+    assert address_of("laptop") == ("rerun+http://laptop:9876/proxy", "laptop", 9876)
+    assert address_of("10.0.0.7:99") == ("rerun+http://10.0.0.7:99/proxy", "10.0.0.7", 99)
+    assert address_of("[::1]:99") == ("rerun+http://[::1]:99/proxy", "::1", 99)
+    assert address_of("rerun+https://a.b:4/proxy") == ("rerun+https://a.b:4/proxy", "a.b", 4)
+    for wrong in ("", "http://laptop", "laptop:port", ":99"):
+        with pytest.raises(ConfigError, match="HOST:PORT"):
+            address_of(wrong)
+
+
+def test_nobody_at_an_address_is_told_before_the_work(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def spawn(_: Stream) -> None:
-        raise RuntimeError("Failed to find Rerun Viewer executable in PATH")
-
     monkeypatch.setitem(sys.modules, "rerun", FakeRerun("rerun"))
-    monkeypatch.setattr(Stream, "spawn", spawn, raising=False)
-    monkeypatch.setenv("PATH", "")
-    assert main(["view", str(GOLDEN)]) == 1
+    port = free_port(0, "127.0.0.1")
+    assert main(["view", str(GOLDEN), "--connect", f"127.0.0.1:{port}"]) == 1
     err = capsys.readouterr().err
-    assert "--rrd OUT.rrd" in err
+    assert f"no viewer listens at 127.0.0.1 port {port}" in err
     assert len(err.splitlines()) == 1
+
+
+def test_a_viewer_that_takes_nothing_any_more_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("apps.captures.export.viewer.STALLED_S", 0.05)
+    never = threading.Event()
+    with pytest.raises(CaptureError, match="viewer at there has taken nothing"):
+        sent(lambda _: never.wait(), "there")
+    never.set()
+
+    def beating(pulse: Pulse) -> int:
+        for _ in range(20):
+            pulse.beat()
+        return 20
+
+    assert sent(beating, "there") == 20
+
+
+def test_an_error_of_rerun_is_told_as_ours() -> None:
+    def fails() -> None:
+        raise RuntimeError("broken pipe")
+
+    attempt = Attempt(fails)
+    assert attempt.join(10.0)
+    with pytest.raises(CaptureError, match="broken pipe"):
+        attempt.result()
+
+
+@pytest.mark.process
+def test_a_viewer_that_cannot_open_its_window_says_why(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    program = tmp_path / "rerun"
+    program.write_text("#!/bin/sh\necho 'Error: winit at x.rs:7: no server at :77' >&2\nexit 1\n")
+    program.chmod(0o700)
+    monkeypatch.setattr("apps.captures.export.viewer._program", lambda: str(program))
+    monkeypatch.setenv("DISPLAY", ":77")
+    with ViewerProcess(Target()) as viewer, pytest.raises(CaptureError, match="no server at :77; --web shows it"):
+        viewer.wait_until_ready()
+    monkeypatch.setattr("apps.captures.export.viewer._program", lambda: str(tmp_path / "none"))
+    with pytest.raises(CaptureError, match="does not start"):
+        ViewerProcess(Target())
+
+
+@pytest.mark.process
+def test_the_page_is_served_to_this_machine_alone(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    program = tmp_path / "rerun"
+    program.write_text('#!/bin/sh\necho "$@" > "$0.arguments"\n')
+    program.chmod(0o700)
+    monkeypatch.setattr("apps.captures.export.viewer._program", lambda: str(program))
+    with ViewerProcess(Target(web=True), tmp_path / "a.rrd") as viewer:
+        viewer.wait()
+    arguments = (tmp_path / "rerun.arguments").read_text().split()
+    assert arguments[:3] == [str(tmp_path / "a.rrd"), "--bind", "127.0.0.1"]
+    assert "--serve-web" in arguments
+    assert viewer.page.startswith("http://127.0.0.1:")
+    assert "url=rerun%2Bhttp%3A%2F%2F127.0.0.1%3A" in viewer.page
+
+
+@pytest.mark.sim
+def test_the_simulated_robot_stands_in_the_view_from_outside_where_the_truth_has_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setitem(sys.modules, "rerun", FakeRerun("rerun"))
+    stage = OutsideStage(ROBOT, load_scene("paper", 0))
+    with World(ROBOT, stage.scene) as world:
+        truth = world.truth()
+    rerun_scene.RerunScene(Stream("cocoro"), ROBOT, Catalogue.load(), stage).log("sim/truth", truth)
+    logged = Stream.newest.logged
+    assert len(Stream.newest.blueprint.args) == 1
+    mesh, place = (what for _, what in logged["sim/scene/red_can"])
+    assert np.ptp(mesh.options["vertex_positions"][:, 2]) == pytest.approx(0.12)
+    assert np.linalg.norm(mesh.options["vertex_normals"], axis=1) == pytest.approx(1.0)
+    (can,) = (item for item in truth.objects if item.label == "red_can")
+    assert place.options["translation"] == pytest.approx(can.position_m)
+    assert {"sim/robot/chassis", "sim/robot/wrist_roll", "sim/robot/wheel_left", "sim/floor"} <= set(logged)
 
 
 @pytest.mark.process
 def test_rerun_itself_takes_it(tmp_path: Path) -> None:
     pytest.importorskip("rerun", reason="Rerun is an extra, and not installed here")
-    assert main(["export", str(GOLDEN), "--rrd", str(tmp_path / "out.rrd")]) == 0
+    assert main(["view", str(GOLDEN), "--save", str(tmp_path / "out.rrd")]) == 0
     assert (tmp_path / "out.rrd").stat().st_size > 500_000
     subprocess.run([sys.executable, "-m", "rerun", "rrd", "verify", str(tmp_path / "out.rrd")], check=True)
 

@@ -42,13 +42,7 @@ def no_robot_here(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 def test_help_lists_every_command(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--help"]) == 0
     out = capsys.readouterr().out
-    assert all(f" {command} " in out for command in COMMANDS)
-
-
-@pytest.mark.parametrize("command", [*COMMANDS, "stop"])
-def test_every_command_has_help(command: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main([command, "--help"]) == 0
-    assert len(capsys.readouterr().out) > 100
+    assert all(f" {command} " in out for command in (*COMMANDS, "--version", "--install-completion"))
 
 
 @pytest.mark.parametrize(
@@ -222,7 +216,7 @@ def simulator(monkeypatch: pytest.MonkeyPatch) -> list[RehearsalRequest]:
     """Stands in for the simulator; the requests that it got. It prints, as libraries do."""
     asked: list[RehearsalRequest] = []
 
-    def run(request: RehearsalRequest) -> dict[str, Any]:
+    def run(request: RehearsalRequest, _tell: object) -> dict[str, Any]:
         asked.append(request)
         print("pybullet build time: today", flush=True)
         return RESULT | {"outcome": "failed" if request.task.label == "blue_can" else "done"}
@@ -283,7 +277,7 @@ def test_the_summary_says_outcome_phases_speed_and_truth(
 def test_a_refused_rehearsal_exits_as_the_refused_task_would(
     simulator: list[RehearsalRequest], monkeypatch: pytest.MonkeyPatch, refusal: str, code: int
 ) -> None:
-    def refuse(request: RehearsalRequest) -> dict[str, Any]:
+    def refuse(request: RehearsalRequest, _tell: object) -> dict[str, Any]:
         error = CocoroError("known are red_can")
         error.code = refusal  # type: ignore[attr-defined]
         raise error

@@ -83,8 +83,9 @@ async def test_progress_is_told_in_the_planners_words_and_the_intent_is_repeated
         ({"approach": ["lost"] * 9}, "failed", "lost"),
         ({"reach": ["blocked"]}, "failed", "blocked"),
         ({"approach": ["stale"]}, "failed", "stale"),
-        ({"search": ["not_found"] * 9}, "failed", "not_found"),
-        ({"search": ["never"]}, "failed", "timed_out"),
+        ({"search": ["not_found"] * 9}, "done", ""),
+        ({"search": ["not_found"] * 3, "explore": ["done", "done", "not_found"]}, "failed", "not_found"),
+        ({"search": ["never"]}, "failed", "not_found"),
     ],
 )
 def test_what_is_tried_again_and_what_is_not(script: dict[str, list[str]], outcome: str, reason: str) -> None:

@@ -27,6 +27,24 @@ async def test_when_nobody_knows_the_latch_nobody_ever_latched_it() -> None:
 
 
 @in_virtual_time
+async def test_a_robot_is_up_when_the_latch_is_known_or_has_not_become_known_for_long() -> None:
+    async with robot(ready=False) as it:
+        it.says = {}
+        await it.service.advance(1.0)
+        assert not it.service.alive
+        it.says = dict.fromkeys(stoppable(), "released")
+        await it.service.advance(0.1)
+        assert (it.service.alive, it.latch()) == (True, "released")
+    async with robot(ready=False) as it:
+        it.says = {"base": "released"}
+        await it.service.advance(5.1)
+        assert (it.service.alive, it.latch()) == (True, "unknown")
+        refused = await it.ask()
+        assert refused.refusal == "estop"
+        assert "arm, hand did not report it" in refused.text
+
+
+@in_virtual_time
 async def test_while_one_has_not_been_heard_the_others_not_knowing_says_nothing() -> None:
     async with robot(ready=False) as it:
         it.says = {"base": "unknown", "arm": "unknown"}

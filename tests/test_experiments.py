@@ -5,25 +5,29 @@ from __future__ import annotations
 import io
 import json
 import sys
+from collections.abc import Sequence
 from math import cos, isnan, sin
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
+import psutil
 import pytest
 from learning_arm import sightings
 
 from apps.cli import experiment as experimenting
-from apps.cli.experiment import RunProgress
+from apps.cli.experiment_progress import RunProgress, TimeLeft
 from apps.cli.main import main
 from apps.experiments import lessons, plan, report
+from apps.experiments.carry_out import LESSONS, RunResult
 from apps.experiments.experiments import EXPERIMENTS
 from apps.experiments.plan import ExperimentSettings
-from apps.experiments.results import summarise
-from apps.experiments.runs import ExperimentRun, RunResult, perform
+from apps.experiments.results import Section, summarise
+from apps.experiments.runs import ExperimentRun, perform
 from apps.learning.dataset import HandRow, SampleFile, WheelRow, hand_header, wheel_header
 from apps.learning.study import BEST
+from apps.rehearsal.progress import RehearsalProgress
 from apps.rehearsal.request import RehearsalRequest
 from cocoro.learning.handmap import NominalModel
 from cocoro.robot import Robot
@@ -54,7 +58,13 @@ class Quiet:
     def __init__(self) -> None:
         self.begun: list[str] = []
 
-    def begin(self, total: int, had: int) -> None: ...
+    def begin(self, waiting: Sequence[str], had: int) -> None: ...
+
+    def advanced(self, name: str, progress: RehearsalProgress) -> None: ...
+
+    def reported(self, section: Section) -> None: ...
+
+    def tick(self) -> None: ...
 
     def started(self, name: str) -> None:
         self.begun.append(name)
@@ -73,7 +83,7 @@ def test_every_experiment_asks_for_rehearsals_that_are_possible_and_names_what_i
                 request = msgspec.convert(run.fields, RehearsalRequest)
                 assert (request.sensors, request.body) == ("real", "worn")
             else:
-                assert hasattr(lessons, run.kind)
+                assert run.kind in LESSONS
             msgspec.json.encode(run.fields)
 
 
@@ -176,7 +186,7 @@ FETCHED = {"held": True, "knocked_over": []}
 
 def made_up(run: ExperimentRun, lesson: RunResult) -> dict[str, Any]:
     """A plausible result of a run."""
-    if run.kind == "learn":
+    if run.kind in ("learn", "learn-wheels"):
         return lesson
     if run.kind == "bend":
         return {"bent_at": 20, "fixed_m": [0.004] * 20 + [0.03] * 180, "adapted_m": [0.004] * 200, "changes": 1}
@@ -231,44 +241,86 @@ def test_runs_that_could_not_be_are_reported_and_hold_nothing(learned: tuple[Exp
 
 def test_an_unknown_experiment_is_refused_with_those_there_are(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["experiment", "E9"]) == 2
-    assert "known are E1, E2, E3, E4, E5, E6 and all" in capsys.readouterr().err
+    assert "known are E1, E2, E3, E4, E5, E6, all" in capsys.readouterr().err
 
 
 def test_a_wrong_body_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["experiment", "E1", "--body", "bent"]) == 2
-    assert "nominal and worn" in capsys.readouterr().err
+    assert "nominal, worn" in capsys.readouterr().err
 
 
-def test_progress_without_a_terminal_is_a_line_for_each_finished_run() -> None:
-    out = io.StringIO()
-    progress = RunProgress(out)
-    progress.begin(4, 1)
-    progress.started("learn-0")
+def test_progress_without_a_terminal_is_lines_of_what_runs_how_far_it_is_and_what_came_out() -> None:
+    out, clock = io.StringIO(), Clock()
+    progress = RunProgress(out, 2, clock)
+    progress.begin(["babble-arm-0", "babble-wheels-0", "learn-0"], 1)
+    progress.started("babble-arm-0")
+    progress.started("babble-wheels-0")
+    clock.now_s = 20.0
+    progress.advanced("babble-arm-0", RehearsalProgress("babble-arm", 55.0, 0.1, "260 samples, coverage 40%"))
+    progress.tick()
+    clock.now_s = 30.0
+    progress.ended("babble-wheels-0", {"outcome": "done", "said": "40 trials", "sim_s": 97.0})
     progress.ended("babble-arm-0", {"error": "it broke"})
     progress.close()
-    assert out.getvalue().splitlines() == ["4 runs; 1 of them have a result already", "2 of 4 babble-arm-0: it broke"]
-    assert progress.text() == "1 failed; learn-0"
+    assert out.getvalue().splitlines() == [
+        "4 runs; 1 of them have a result already",
+        "babble-arm-0 begins",
+        "babble-wheels-0 begins",
+        "20 s, 1 of 4 done: at least 3 min left; babble-arm-0 10% 260 samples, coverage 40%, babble-wheels-0",
+        "2 of 4 babble-wheels-0 (30 s): done, 40 trials, 97 simulated s",
+        "3 of 4 babble-arm-0 (30 s): it broke",
+    ]
 
 
-def test_progress_on_a_terminal_is_a_bar_and_the_runs_in_work(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_time_left_is_that_of_ended_runs_of_the_same_kind() -> None:
+    clock = Clock()
+    left = TimeLeft([f"fetch-{seed}" for seed in range(5)], 2, clock)
+    left.started("fetch-0")
+    assert str(left) == ""
+    clock.now_s = 20.0
+    left.ended("fetch-0")
+    assert str(left) == "about 40 s left"  # four runs of 20 s, two at a time
+
+
+def test_progress_on_a_terminal_is_a_bar_the_runs_in_work_and_their_results(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TERM", "xterm")
     out = Terminal()
     progress = RunProgress(out)
-    progress.begin(4, 1)
+    progress.begin(["babble-arm-0", "learn-0", "learn-1"], 1)
     progress.started("learn-0")
     progress.ended("babble-arm-0", {"outcome": "done"})
     progress.close()
     shown = out.getvalue()
     assert "2/4" in shown
     assert "learn-0" in shown
-    assert "babble-arm-0" not in shown  # a run that succeeded is counted, not listed
+    assert "2 of 4 babble-arm-0: done" in shown
+
+
+def test_a_worker_that_is_killed_fails_its_run_alone(tmp_path: Path) -> None:
+    class Killer(Quiet):
+        def started(self, name: str) -> None:
+            if name == "one":
+                self.begun.append(name)
+                return
+            super().started(name)
+
+        def tick(self) -> None:
+            for child in psutil.Process().children():
+                if "--multiprocessing-fork" in child.cmdline() and len(self.begun) == 1:
+                    child.kill()
+
+    lost = {"arm": "a", "wheels": "w", "into": str(tmp_path / "m.json")}
+    runs = [ExperimentRun("one", "rehearse", {"task": {"task": "babble-arm"}}), ExperimentRun("two", "learn", lost)]
+    results = perform(runs, tmp_path / "runs", 1, Killer())
+    assert results["one"] == {"error": "its process ended: killed by SIGKILL"}
+    assert "No such file" in results["two"]["error"]
 
 
 def test_the_terminal_is_as_before_when_the_experiments_end_with_an_error(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     def fail(_keys: Any, _settings: Any, progress: RunProgress, *, plots: bool) -> None:
-        progress.begin(4, 1)
+        progress.begin(["one"], 1)
         raise OSError("the disk is full")
 
     out = Terminal()
@@ -278,6 +330,13 @@ def test_the_terminal_is_as_before_when_the_experiments_end_with_an_error(
     assert main(["experiment", "E3", "--out", str(tmp_path)]) == 1
     shown = out.getvalue()
     assert shown.index(HIDE_CURSOR) < shown.index(SHOW_CURSOR) < shown.index("the disk is full")
+
+
+class Clock:
+    now_s = 0.0
+
+    def __call__(self) -> float:
+        return self.now_s
 
 
 class Terminal(io.StringIO):

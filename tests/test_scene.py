@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from cocoro.errors import ConfigError
-from sim.scene import Scene, load_scene, scene_names
+from sim.scene import Scene, load_scene
+from sim.scene_names import scene_names
 
 CAN = """
 [[object]]
@@ -102,7 +103,7 @@ def test_positions_are_in_the_frame_of_the_robots_start(tmp_path: Path) -> None:
         ),
         (
             CAN + "colour = 3\n",
-            "scene mine.toml, [[object]] 1 'red_can': Object contains unknown field `colour`",
+            "scene mine.toml, [[object]] 1 'red_can': unknown field 'colour'; known are",
         ),
         (CAN + "mass_kg = 0.0\n", "scene mine.toml, [[object]] 1 'red_can': mass_kg must be > 0"),
         (CAN + "mass_kg = nan\n", "scene mine.toml, [[object]] 1 'red_can': mass_kg must be finite"),
@@ -123,7 +124,10 @@ def test_positions_are_in_the_frame_of_the_robots_start(tmp_path: Path) -> None:
         (CAN + "[light]\ndirection = [0, 0, 0]\n", "scene mine.toml, [light]: direction must not be zero"),
         (CAN + "[lamp]\n", "scene mine.toml: unknown table or field 'lamp'"),
         ("[object]\n", "scene mine.toml: [object] must be written [[object]], once for each"),
-        ("[[obstacle]]\nshape = 'cone'\n", "scene mine.toml, [[obstacle]] 1: shape: Invalid enum value 'cone'"),
+        (
+            "[[obstacle]]\nshape = 'cone'\n",
+            "scene mine.toml, [[obstacle]] 1: shape: unknown value 'cone'; known are box, cylinder, sphere",
+        ),
         ("[[object]\n", "scene mine.toml: not TOML: "),
         ("name = 5\n", "scene mine.toml: name must be text"),
     ],
@@ -133,7 +137,7 @@ def test_an_error_names_the_field_and_its_table(tmp_path: Path, text: str, messa
 
 
 def test_an_unknown_scene_is_told_which_ones_there_are(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"no scene 'papr': give a \.toml file or one of .*paper"):
+    with pytest.raises(ConfigError, match=r"no scene 'papr', and no such .toml file; .*did you mean paper"):
         load_scene("papr")
     with pytest.raises(ConfigError, match="No such file"):
         load_scene(tmp_path / "none.toml")

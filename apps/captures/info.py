@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from typing import Any
 
 import msgspec
@@ -20,6 +19,7 @@ from cocoro.installed import topic_named
 from cocoro.messages import Message
 from cocoro.topics import RECORDING
 from services.capture.file import packed
+from services.capture.writer import Missing
 
 MESSAGE_HEAD_BYTES = mcap.MESSAGE_HEAD.size
 
@@ -44,6 +44,8 @@ class KeyReport(msgspec.Struct, kw_only=True):
     """Gaps in the sequence numbers, since the recorder's start."""
     dropped: int = 0
     """Received but not written because the queue was full, since the recorder's start."""
+    left_out: int = 0
+    """Left out by intention while nothing happened. No loss."""
     changed: tuple[str, ...] = ()
     """Differences of today's type from the recorded schema, in words."""
 
@@ -91,11 +93,11 @@ def report(capture: Capture, check: bool = False) -> CaptureReport:
     checked = check or tallies is not stated
     if checked:
         capture.check()
-    notes = [*capture.notes, *_contradictions(capture)]
-    dropped, lost = missing_of(capture)
+    missing = missing_of(capture)
+    notes = [*capture.notes, *_contradictions(capture), *describe_left_out(capture, missing)]
     names = sorted(capture.keys)
     keys = tuple(
-        _key_report(capture, channel, tallies[channel], dropped, lost) for key in names for channel in capture.keys[key]
+        _key_report(capture, channel, tallies[channel], missing) for key in names for channel in capture.keys[key]
     )
     return CaptureReport(
         path=str(capture.path),
@@ -179,27 +181,40 @@ def _contradictions(capture: Capture) -> list[str]:
     return found
 
 
-def missing_of(capture: Capture) -> tuple[dict[str, int], dict[str, int]]:
-    """Dropped and lost messages by key, from the tally of a complete file, else from the recorder's last progress
-    message."""
+def missing_of(capture: Capture) -> Missing:
+    """Dropped, lost and left out messages by key, from the tally of a complete file, else from the recorder's progress
+    messages."""
     stated = capture.metadata.get(TALLY)
+    counts = dict[str, int]
     try:
         if stated is not None:
-            counts = dict[str, int]
-            return msgspec.json.decode(stated["dropped"], type=counts), msgspec.json.decode(stated["lost"], type=counts)
-        dropped: dict[str, int] = {}
-        lost: dict[str, int] = {}
+            return Missing(*(msgspec.json.decode(stated.get(name, "{}"), type=counts) for name in Missing._fields))
+        first: counts | None = None
+        found = Missing({}, {})
         for record in capture.messages(f"*/{RECORDING.name.partition('/')[2]}"):
             progress = capture.decode(record)
-            dropped, lost = progress["dropped"], progress["lost"]
-        return dropped, lost
-    except (KeyError, TypeError, msgspec.MsgspecError, DamageError):
-        return {}, {}
+            left_out = progress.get("left_out", {})
+            first = left_out if first is None else first
+            more = {key: count - first.get(key, 0) for key, count in left_out.items() if count > first.get(key, 0)}
+            found = Missing(progress["dropped"], progress["lost"], more)
+        return found
+    except (KeyError, TypeError, AttributeError, msgspec.MsgspecError, DamageError):
+        return Missing({}, {})
 
 
-def _key_report(
-    capture: Capture, channel: int, tally: KeyTally, dropped: Mapping[str, int], lost: Mapping[str, int]
-) -> KeyReport:
+def describe_left_out(capture: Capture, missing: Missing) -> list[str]:
+    """What was left out by intention, in words: one line, or none."""
+    if not missing.left_out:
+        return []
+    counts = ", ".join(
+        f"{count} of {key.removeprefix(f'{capture.robot}/')}" for key, count in sorted(missing.left_out.items())
+    )
+    spans = [f"{(a - capture.start_ns) / NS:.1f} to {(b - capture.start_ns) / NS:.1f} s" for a, b in capture.left_out]
+    when = f" (from {', '.join(spans[:3])}{' and later' if len(spans) > 3 else ''})" if spans else ""
+    return [f"while nothing happened{when}, these large messages were left out, which is no loss: {counts}"]
+
+
+def _key_report(capture: Capture, channel: int, tally: KeyTally, missing: Missing) -> KeyReport:
     span_s = (tally.last_ns - tally.first_ns) / NS
     schema = capture.schema(channel)
     key = capture.channels[channel].topic
@@ -214,8 +229,9 @@ def _key_report(
         size_bytes=tally.size_bytes,
         longest_gap_s=tally.longest_gap_ns / NS,
         longest_gap_from_s=max(tally.longest_gap_from_ns - capture.start_ns, 0) / NS,
-        lost=lost.get(key, 0) if first else 0,
-        dropped=dropped.get(key, 0) if first else 0,
+        lost=missing.lost.get(key, 0) if first else 0,
+        dropped=missing.dropped.get(key, 0) if first else 0,
+        left_out=missing.left_out.get(key, 0) if first else 0,
         changed=tuple(changed_since(capture, channel)),
     )
 

@@ -4,8 +4,7 @@
         for record in capture.messages("base/state", "kinect/frame"):
             print(record.log_ns, record.key, capture.decode(record))
 
-Channels are identified by number, since a key may have several. Unreadable parts are skipped and listed in
-`capture.problems`; look there after reading.
+Channels are identified by number: a key may have several. `capture.problems` lists the unreadable parts so far.
 
 The `mcap` package's readers stop at the first damage, know channels only from the summary, and copy every payload. They
 take 1.0 to 1.4 times as long for frames, 1.5 to 2.0 times for small messages (`python bench/capture_format.py files`).
@@ -20,6 +19,7 @@ import stat
 from collections import Counter, deque
 from collections.abc import Collection, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from errno import ENOENT
 from functools import cached_property
 from pathlib import Path
 from types import TracebackType
@@ -29,10 +29,11 @@ import msgspec
 from mcap.opcode import Opcode
 from mcap.records import Attachment, AttachmentIndex, Channel, Schema, Statistics
 
+from apps.captures import mcap_reading
 from apps.captures.contents import Contents, Disk, MessageBlock, miscounted, read_block
 from apps.captures.scan import contents, front_to_back
 from cocoro.capture import mcap
-from cocoro.capture.conventions import CHECKSUM, TALLY, CaptureError, NotAFileError, checksum
+from cocoro.capture.conventions import CHECKSUM, LEFT_OUT, TALLY, CaptureError, NotAFileError, checksum
 from cocoro.capture.mcap import DamageError
 from cocoro.capture.types import JSON, MSGPACK, NotReadableError, reader_of
 from cocoro.keys import matches
@@ -79,11 +80,12 @@ class Capture:
         """Raises CaptureError when the file cannot be read or is not MCAP, NotAFileError for a pipe or a device."""
         try:
             mode = path.stat().st_mode
-            if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):  # opening a device may block, or have an effect
+            if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):  # opening a device may block
                 raise NotAFileError(f"{path} is {_kind(mode)} and no file; copy its output into a file, and name that")
             fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
         except OSError as error:
-            raise CaptureError(f"{path} cannot be read: {error.strerror}") from error
+            hint = "" if path.suffix or error.errno != ENOENT else "; `cocoro capture list` shows those with a name"
+            raise CaptureError(f"{path} cannot be read: {error.strerror}{hint}") from error
         return cls(path, fd)
 
     # --- what it is -------------------------------------------------------------------------------
@@ -95,12 +97,12 @@ class Capture:
 
     @property
     def closed(self) -> bool:
-        """The file has its footer. A recorder that was killed or is still running leaves none."""
+        """The file has its footer, which a recorder that was killed or is still running leaves out."""
         return self._contents.closed
 
     @property
     def summarised(self) -> bool:
-        """The contents come from the file's summary, so not all of the file has been read."""
+        """The contents come from the file's summary, so not all of it has been read."""
         return self._contents.summarised
 
     @property
@@ -127,7 +129,7 @@ class Capture:
 
     @property
     def problems(self) -> list[str]:
-        """Unreadable parts and wrong counts found so far, in words."""
+        """Unreadable parts and wrong counts so far, in words."""
         more = [f"and {self._not_listed} more problems"] if self._not_listed else []
         return [*self._problems, *more]
 
@@ -143,6 +145,16 @@ class Capture:
             return []
         names = ", ".join(f"{op:#04x}" for op in sorted(kinds))
         return [f"{kinds.total()} records of kinds that are not MCAP's own ({names}) are skipped"]
+
+    @cached_property
+    def left_out(self) -> tuple[tuple[int, int], ...]:
+        """Log times between which large messages were left out by intention; each end is exclusive."""
+        try:
+            stated = msgspec.json.decode(self.metadata[LEFT_OUT]["stretches"], type=list[tuple[int, int | None]])
+        except (KeyError, msgspec.MsgspecError):
+            return ()
+        here = ((start, self.end_ns if end is None else end) for start, end in stated)
+        return tuple(each for each in here if each[1] > self.start_ns and each[0] < self.end_ns)
 
     @property
     def places(self) -> tuple[MessageBlock, ...]:
@@ -161,7 +173,7 @@ class Capture:
 
     @cached_property
     def channels(self) -> dict[int, Channel]:
-        """Channels by number, including those without messages."""
+        """By number, including those without messages."""
         return dict(sorted(self._contents.channels.items()))
 
     @cached_property
@@ -206,12 +218,11 @@ class Capture:
     def attachment(self, index: AttachmentIndex) -> Attachment:
         """Read one attachment with its data. Raises DamageError when its checksum is wrong."""
         content = self._disk.read(index.offset, index.length)
-        return mcap.attachment(content[mcap.PREFIX.size :], self._contents.strict)
+        return mcap_reading.attachment(content[mcap.PREFIX.size :], self._contents.strict)
 
     @cached_property
     def robot(self) -> str:
-        """The robot's name, with which its keys begin; '' when the capture names none and its keys differ in the
-        beginning."""
+        """The robot's name, with which its keys begin; '' when the capture names none and its keys have several."""
         name = self.metadata.get("run", {}).get("robot")
         if name is not None:
             return name
@@ -271,8 +282,8 @@ class Capture:
             yield heapq.heappop(waiting)[3]
 
     def check(self) -> None:
-        """Verify what reading messages does not: the checksum over all data, the attachments, and for a recorder's file
-        every record front to back. Adds to `problems`. Raises CaptureError when the disk fails."""
+        """Verify the checksum over all data, the attachments, and a recorder's file front to back. Adds to `problems`.
+        Raises CaptureError when the disk fails."""
         found = self._contents
         try:
             if found.strict and found.summarised:

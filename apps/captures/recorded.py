@@ -7,7 +7,7 @@ import hashlib
 import json
 import tempfile
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import resources
@@ -50,13 +50,16 @@ class RecordedStep(NamedTuple):
     log_ns: int
     messages: dict[MessageId, FoundMessage]
     """The consumed and produced messages that the captures contain."""
+    thinned: bool = False
+    """It was recorded while large messages were left out by intention."""
 
 
 def steps_of(captures: Sequence[Capture], service: str) -> list[tuple[int, StepRecord]]:
     """Log time and content of every recorded step. Raises CaptureError when there is none, or one cannot be read."""
     found = []
+    once = Once()
     for capture in captures:
-        for record in capture.messages(f"{capture.robot}/{STEPS.of(service).name}"):
+        for record in once.each(capture.messages(f"{capture.robot}/{STEPS.of(service).name}")):
             try:
                 step = capture.read(record)
             except NotReadableError as error:
@@ -71,6 +74,22 @@ def steps_of(captures: Sequence[Capture], service: str) -> list[tuple[int, StepR
     return found
 
 
+class Once:
+    """Leaves out messages of a run that an earlier one of its captures had already: a file that begins with a task
+    repeats those of the seconds before."""
+
+    def __init__(self) -> None:
+        self._newest_ns: dict[str, int] = {}
+
+    def each(self, records: Iterable[Record]) -> Iterator[Record]:
+        """The records of the next capture."""
+        before = dict(self._newest_ns)
+        for record in records:
+            if record.log_ns > before.get(record.key, -1):
+                self._newest_ns[record.key] = max(record.log_ns, self._newest_ns.get(record.key, 0))
+                yield record
+
+
 def with_messages(captures: Sequence[Capture], steps: Sequence[tuple[int, StepRecord]]) -> Iterator[RecordedStep]:
     """The steps in order, found in one pass. Each comes when all its messages are found, or when the missing ones can
     no longer come."""
@@ -81,9 +100,12 @@ def with_messages(captures: Sequence[Capture], steps: Sequence[tuple[int, StepRe
     waiting = deque(steps)
     known: dict[MessageId, FoundMessage] = {}
     counts: dict[str, KeyCounts] = {}
+    once = Once()
+    thinned = [stretch for capture in captures for stretch in capture.left_out]
     for capture in captures:
         decoder = msgspec.msgpack.Decoder(MessageHead)
-        for record in capture.messages(*(f"{capture.robot}/{topic}" for topic in topics)) if topics else ():
+        keys = [f"{capture.robot}/{topic}" for topic in topics]
+        for record in once.each(capture.messages(*keys)) if topics else ():
             head = _head(decoder, record)
             if head is None:
                 continue
@@ -95,9 +117,9 @@ def with_messages(captures: Sequence[Capture], steps: Sequence[tuple[int, StepRe
             if name in wanted and (in_sequence or name not in known) and not _lossy(capture, record):
                 known[name] = FoundMessage(capture, record)
             while waiting and (_complete(waiting[0][1], known) or record.log_ns > waiting[0][0] + LATE_NS):
-                yield _taken(waiting.popleft(), known, wanted)
+                yield _taken(waiting.popleft(), known, wanted, thinned)
     while waiting:
-        yield _taken(waiting.popleft(), known, wanted)
+        yield _taken(waiting.popleft(), known, wanted, thinned)
 
 
 def _head(decoder: msgspec.msgpack.Decoder[MessageHead], record: Record) -> MessageHead | None:
@@ -111,13 +133,19 @@ def _complete(step: StepRecord, known: dict[MessageId, FoundMessage]) -> bool:
     return all(name in known for name in step.consumed) and all(name in known for name in step.produced)
 
 
-def _taken(step: tuple[int, StepRecord], known: dict[MessageId, FoundMessage], wanted: set[MessageId]) -> RecordedStep:
+def _taken(
+    step: tuple[int, StepRecord],
+    known: dict[MessageId, FoundMessage],
+    wanted: set[MessageId],
+    thinned: Sequence[tuple[int, int]],
+) -> RecordedStep:
     """Remove a step's messages from `known` and `wanted`: each message belongs to one step."""
     log_ns, record = step
     names = (*record.consumed, *record.produced)
     wanted.difference_update(names)
     messages = {name: known.pop(name) for name in names if name in known}
-    return RecordedStep(record, log_ns, messages)
+    left_out = any(start <= log_ns < end + LATE_NS for start, end in thinned)
+    return RecordedStep(record, log_ns, messages, left_out)
 
 
 def _lossy(capture: Capture, record: Record) -> bool:

@@ -16,13 +16,16 @@ import msgspec
 import numpy as np
 
 from apps.captures.compare import difference, known_to
-from apps.captures.info import changed_since
+from apps.captures.info import changed_since, missing_of
 from apps.captures.reader import Capture
 from apps.captures.recorded import FoundMessage, MessageId, Origin, RecordedStep, origins, steps_of, with_messages
 from cocoro.capture.types import NotReadableError
 from cocoro.clock import NS
 from cocoro.core import Core, Output, Sample
 from cocoro.messages import Message
+
+SETTLE_NS = NS
+"""After a step whose inputs were left out, a core has its former state again within this time."""
 
 
 class FirstDifference(msgspec.Struct, kw_only=True):
@@ -43,6 +46,12 @@ class ReexecutionResult(msgspec.Struct, kw_only=True):
     """Steps whose outputs all equal the recorded ones."""
     differing: int = 0
     not_executable: int = 0
+    left_out: int = 0
+    """Steps whose large inputs were left out of the captures by intention, while nothing happened."""
+    unsettled: int = 0
+    """Steps that differ within a second after such steps."""
+    begins_late: bool = False
+    """The captures lack the beginning of the run, so the core begins without what it knew."""
     outputs: int = 0
     """Compared outputs."""
     reasons: dict[str, int] = {}
@@ -75,10 +84,11 @@ def reexecute(
     started, cpu_started = time.perf_counter(), time.process_time()
     with origins(captures, service) as made:
         steps = steps_of(captures, service)
-        run = _Reexecution(service, made, captures[0], tolerance if compare else None)
+        run = _Reexecution(service, made, captures, tolerance if compare else None)
         for step in with_messages(captures, steps):
             run.execute(step)
     result = run.result
+    result.begins_late = steps[0][1].seq > 0
     result.recorded_s = (steps[-1][0] - steps[0][0]) / NS
     result.changed = tuple(run.changed)
     result.problems = tuple(problem for capture in captures for problem in capture.problems)
@@ -87,11 +97,20 @@ def reexecute(
 
 
 class _Reexecution:
-    def __init__(self, service: str, made: Sequence[Origin], first: Capture, tolerance: float | None) -> None:
+    def __init__(
+        self, service: str, made: Sequence[Origin], captures: Sequence[Capture], tolerance: float | None
+    ) -> None:
         self.result = ReexecutionResult(service=service, tolerance=tolerance or 0.0)
         self._made = made
         self._tolerance = tolerance
-        self._start_ns = first.start_ns
+        self._start_ns = captures[0].start_ns
+        self._thinned = {
+            key.removeprefix(f"{each.robot}/")
+            for each in captures
+            if each.left_out
+            for key in missing_of(each).left_out
+        }
+        self._settled_ns = 0
         self._incarnation: int | None = None
         self._starts = 0
         self._seq = -1
@@ -119,6 +138,10 @@ class _Reexecution:
             outputs, failure = (), f"the core fails: {type(error).__name__}: {error}"
         else:
             failure = ""
+        if missing and step.thinned and self._large_only(step):
+            self.result.left_out += 1
+            self._settled_ns = step.log_ns + SETTLE_NS
+            return
         if missing:
             self._cannot(missing)
             return
@@ -127,10 +150,16 @@ class _Reexecution:
         reason, text = ("", failure) if failure else self._compare(step, outputs)
         if reason:
             self._cannot(reason, inputs=False)
+        elif text and step.log_ns < self._settled_ns:
+            self.result.unsettled += 1
         elif text:
             self._differs(step, text)
         else:
             self.result.equal += 1
+
+    def _large_only(self, step: RecordedStep) -> bool:
+        """Whether the step's missing inputs are of keys of which large messages were left out."""
+        return all(name[0] in self._thinned for name in step.record.consumed if name not in step.messages)
 
     def _begin(self, incarnation: int) -> None:
         """The service was started: make a new core with the configuration of that start."""
@@ -242,7 +271,8 @@ def describe_result(result: ReexecutionResult) -> list[str]:
     """One line per fact."""
     within = f" within {result.tolerance:g}" if result.tolerance else ""
     compared = f"{result.service}: {result.steps} steps, {result.outputs} outputs compared{within}: "
-    verdict = "every one equal" if result.equal == result.steps else f"{result.equal} steps equal"
+    whole = result.equal == result.steps - result.left_out - result.unsettled
+    verdict = "every one equal" if whole else f"{result.equal} steps equal"
     lines = [compared + verdict]
     if result.differing:
         lines.append(f"  {result.differing} steps differ")
@@ -253,6 +283,12 @@ def describe_result(result: ReexecutionResult) -> list[str]:
     if result.not_executable:
         lines.append(f"  {result.not_executable} steps not executable")
         lines += [f"    {count}: {reason}" for reason, count in _by_count(result.reasons)]
+    if result.begins_late:
+        lines.append("  the captures begin in the middle of the run; --run takes those before them, too")
+    if result.left_out:
+        lines.append(f"  {result.left_out} steps of the time in which nothing happened have no frames, as configured")
+    if result.unsettled:
+        lines.append(f"  {result.unsettled} steps differ within a second after these")
     lines += [f"  changed since, {change}" for change in result.changed]
     lines += [f"  not read: {problem}" for problem in result.problems]
     times = f"{result.wall_s:.1f} s ({result.cpu_s:.1f} s of CPU time)"

@@ -1,4 +1,5 @@
-"""Publishes a capture on a mesh again, all of it or the hardware's topics alone.
+"""Publishes a capture on a mesh again, all of it or the hardware's topics alone, under the recorded robot's name or
+another one.
 
 Readers reject a message that they have had from the same start of a publisher. So from the second pass on, each
 message gets another incarnation, and so does every reference to a message: fields named `*incarnation`, and the
@@ -8,7 +9,7 @@ lists of a StepRecord. In the first pass payloads are sent unchanged.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable, Mapping
 from contextlib import suppress
 from typing import Any
 
@@ -61,6 +62,24 @@ def services_of(keys: Iterable[str]) -> frozenset[str]:
     return frozenset(service_of(key) for key in keys)
 
 
+def heard_as(recorded: str, up: Mapping[str, Collection[str]]) -> str:
+    """The name under which what the hardware published is heard: the recorded robot's, or that of the only robot that
+    is up without hardware.
+
+    `up` has the services of each robot that is up on this machine. Raises ConfigError when several could be meant.
+    """
+    simulated_or_real = {*processes.hardware(), SIMULATOR}
+    listening = [name for name, services in up.items() if not simulated_or_real & set(services)]
+    if recorded in up or not listening:
+        return recorded
+    if len(listening) > 1:
+        choices = " or ".join(f"--robot {name}" for name in listening)
+        raise ConfigError(
+            f"the capture is of {recorded}, and {' and '.join(listening)} wait for hardware; choose one: {choices}"
+        )
+    return listening[0]
+
+
 async def refuse_if_alive(bus: Bus, robot: str, services: frozenset[str]) -> None:
     """Raises RefusedError when a robot of this name is alive, or a service whose keys are to be played."""
     alive = {service_of(key) for key in await bus.alive(alive_key(robot))}
@@ -80,8 +99,11 @@ async def refuse_if_alive(bus: Bus, robot: str, services: frozenset[str]) -> Non
 class Replay:
     """Plays on a bus until the capture ends. After each change of `player` from outside, call `changed`."""
 
-    def __init__(self, bus: Bus, capture: Capture, player: Player, *, hardware: bool = False) -> None:
-        """With `hardware` the hardware's services are declared alive, and there is always a clock."""
+    def __init__(
+        self, bus: Bus, capture: Capture, player: Player, *, hardware: bool = False, robot: str | None = None
+    ) -> None:
+        """With `hardware` the hardware's services are declared alive, and there is always a clock. `robot` is the name
+        that the messages are published under; None: the recorded one."""
         self.sent = 0
         self._bus = bus
         self._capture = capture
@@ -90,6 +112,7 @@ class Replay:
         self._publishers: dict[str, RawPublisher] = {}
         self._handles: list[Handle] = []
         self._changed = asyncio.Event()
+        self._robot = robot or capture.robot
         self._clock_key = CLOCK.key(capture.robot)
         self._ticks = 0
         self._incarnation = bus.new_incarnation()
@@ -103,9 +126,7 @@ class Replay:
         for key in self._player.keys:
             self._publisher(key)
         if self._hardware:
-            self._handles += [
-                self._bus.declare_alive(alive_key(self._capture.robot, name)) for name in processes.hardware()
-            ]
+            self._handles += [self._bus.declare_alive(alive_key(self._robot, name)) for name in processes.hardware()]
         ticking = None
         if self._hardware and self._clock_key not in self._player.keys:
             ticking = asyncio.create_task(self._tick_for_ever())
@@ -156,10 +177,11 @@ class Replay:
             return record.payload
 
     def _publisher(self, key: str) -> RawPublisher:
-        """All keys are published as events, so that none is dropped under load."""
+        """The publisher for a recorded key. All keys are published as events, so that none is dropped under load."""
         publisher = self._publishers.get(key)
         if publisher is None:
-            publisher = self._publishers[key] = self._bus.publisher(key, Qos.EVENT)
+            renamed = f"{self._robot}/{key.removeprefix(f'{self._capture.robot}/')}"
+            publisher = self._publishers[key] = self._bus.publisher(renamed, Qos.EVENT)
         return publisher
 
     async def _tick_for_ever(self) -> None:

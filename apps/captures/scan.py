@@ -16,6 +16,7 @@ from collections.abc import Iterator
 from mcap.opcode import Opcode
 from mcap.records import ChunkIndex, Footer, MetadataIndex, Statistics
 
+from apps.captures import mcap_reading
 from apps.captures.contents import Contents, Disk, MessageBlock, compare, read_chunk, read_header
 from apps.captures.walk import Walk
 from cocoro.capture import mcap
@@ -116,7 +117,7 @@ def _summary(disk: Disk, strict: bool) -> tuple[bytes, int]:
     if not len(MAGIC) <= footer.summary_start <= footer_at or footer_at - footer.summary_start > LARGEST_SUMMARY:
         raise _UnsureError(_FOOTER_DAMAGED)
     summary = disk.read(footer.summary_start, footer_at - footer.summary_start)
-    if not mcap.checksum_is_right(footer, summary, strict):
+    if not mcap_reading.checksum_is_right(footer, summary, strict):
         raise _UnsureError("the file's summary is damaged")
     return summary, footer.summary_start
 

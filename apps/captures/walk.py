@@ -21,9 +21,11 @@ from mcap.records import (
     SummaryOffset,
 )
 
+from apps.captures import mcap_reading
 from apps.captures.contents import LARGEST_RECORD, Contents, Disk, MessageBlock, unpacked
+from apps.captures.mcap_reading import KNOWN
 from cocoro.capture import mcap
-from cocoro.capture.mcap import KNOWN, MAGIC, PREFIX, CutOffError, DamageError
+from cocoro.capture.mcap import MAGIC, PREFIX, CutOffError, DamageError
 
 RUN_BYTES = 1 << 20
 """A run of messages outside of chunks ends at this size, which bounds a reader's memory."""
@@ -180,9 +182,9 @@ class Walk:
         return taken
 
     def _message_index(self, content: bytes) -> int:
-        taken = mcap.check_message_index(content)
+        taken = mcap_reading.check_message_index(content)
         if self._found.strict:
-            channel, entries = mcap.index_entries(content)
+            channel, entries = mcap_reading.index_entries(content)
             if sorted(entries) != sorted(self._due.pop(channel, ())):
                 place = self._found.places[-1].offset if self._found.places else 0
                 self._found.problems.append(f"an index of the chunk at byte {place} differs from its messages")
@@ -190,10 +192,10 @@ class Walk:
 
     def _attachment(self, at: int, start: int, end: int) -> int:
         head = self._disk.read_cached(start, min(end - start, HEAD_BYTES))
-        index, data_at = mcap.attachment_index(head, at, end - at)
+        index, data_at = mcap_reading.attachment_index(head, at, end - at)
         if self._check:
             try:
-                mcap.attachment(self._disk.read(start, end - start), self._found.strict)
+                mcap_reading.attachment(self._disk.read(start, end - start), self._found.strict)
             except DamageError as damage:  # the record's length is right, so reading can continue after it
                 self._found.problems.append(f"bytes {at} to {end} are not readable: {damage}")
                 return data_at + index.data_size + 4

@@ -7,7 +7,8 @@ made from the types of tasks by `task_commands`; `tasks` sends the request and f
 
 from __future__ import annotations
 
-from typing import Any
+import re
+from typing import Annotated, Any
 
 import typer
 from typer.core import TyperCommand, TyperGroup
@@ -19,7 +20,7 @@ from apps.cli.listed import COMMANDS
 def load(name: str) -> TyperCommand | TyperGroup:
     """Imports the file of a command and returns the command."""
     match name:
-        case "cancel" | "rehearse":
+        case "cancel" | "wait" | "rehearse":
             from apps.cli.task_commands import app
         case "status":
             from apps.cli.status import app
@@ -35,8 +36,10 @@ def load(name: str) -> TyperCommand | TyperGroup:
             from apps.cli.record import app
         case "replay":
             from apps.cli.replay import app
-        case "export" | "view":
+        case "export":
             from apps.cli.export import app
+        case "view":
+            from apps.cli.view import app
         case "top":
             from apps.cli.top import app
         case "echo":
@@ -95,8 +98,35 @@ class CommandGroup(TyperGroup):
         return task_command(cmd_name)
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        self._list_tasks(args)
         name, command, rest = super().resolve_command(ctx, args)
-        return name, command if name is None or name not in _NAMES else load(name), rest
+        if name is not None and name in _NAMES:
+            command = load(name)
+        return name, command if command is None else with_brackets(command), rest
+
+    def _list_tasks(self, args: list[str]) -> None:
+        """Makes typer suggest tasks, too, for a mistyped command; it looks into `commands` alone."""
+        if not args or args[0] in self.commands:
+            return
+        from apps.cli.task_commands import task_command, task_names
+
+        if task_command(args[0]) is None:
+            for name in task_names():
+                self.add_command(TyperCommand(name))
+
+
+_TAG = re.compile(r"\[[a-z#/@][^\[]*?\]")
+"""What `rich.markup` takes for a tag; it is not imported, since a shell that completes a word waits for it."""
+
+
+def with_brackets(command: Any) -> Any:
+    """Escapes the help of a command and of what is below it: typer would take '[view]' for markup and print nothing."""
+    for part in (command, *command.params):
+        if text := getattr(part, "help", None):
+            part.help = _TAG.sub(r"\\\g<0>", text.replace("\\[", "["))
+    for below in getattr(command, "commands", {}).values():
+        with_brackets(below)
+    return command
 
 
 _NAMES = frozenset(row.name for row in COMMANDS)
@@ -104,10 +134,27 @@ _NAMES = frozenset(row.name for row in COMMANDS)
 app = typer.Typer(
     cls=CommandGroup,
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
     help="Start, command and watch a CoCoRo robot.\n\n"
     "First `cocoro up sim --detach`, then `cocoro fetch red_can`, at last `cocoro down`.",
     epilog="Exit codes: 0 done, 1 the task failed, 2 bad usage, 3 refused or cancelled, 4 the mesh is not there.",
 )
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+        from platform import python_version
+
+        print(f"cocoro-mesh {version('cocoro-mesh')}, python {python_version()}, zenoh {version('eclipse-zenoh')}")
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    version: Annotated[
+        bool, typer.Option("--version", is_eager=True, callback=_print_version, help="Show the versions and exit.")
+    ] = False,
+) -> None:
+    """The options before the name of a command."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import json as json_module
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -12,11 +11,11 @@ from typing import Annotated, Any
 import typer
 from msgspec.structs import replace
 
-from apps.cli.interrupt import on_interrupt
 from apps.cli.link import MeshLink, joined
 from apps.cli.options import JsonOption, MeshOption, RobotChoice, RobotOption, SamplesOutOption
-from apps.cli.output import going_on
+from apps.cli.output import print_json
 from apps.cli.progress import TaskDisplay, task_display
+from apps.cli.task_running import hands_on
 from apps.cli.tasks import Follower
 from apps.learning.collector import SampleCollector, collector
 from cocoro.errors import CocoroError, MeshError
@@ -138,7 +137,7 @@ async def collect(
             follower = Follower(link, TaskRequest(task=task), shown, None)
             writer = SampleWriter(kept, follower.cancel)
             samples.add(lambda _key, message: writer.take(message))
-            with on_interrupt(follower.interrupt), going_on():
+            with hands_on(follower):
                 code, result = await follower.run()
             if writer.failure is not None:
                 raise CocoroError(
@@ -147,7 +146,7 @@ async def collect(
                 )
             result |= {"file": str(file), "samples": len(kept)}
     if as_json:
-        print(json_module.dumps(result))
+        print_json(result)
     return code
 
 

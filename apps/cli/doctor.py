@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import json as json_module
 import os
 import shutil
 import socket
@@ -19,7 +18,9 @@ import typer
 
 from apps.cli import exits
 from apps.cli.options import DescriptionOption, JsonOption, MeasuredOption, ProfileArgument
+from apps.cli.output import print_json
 from apps.cli.stop_asking import addresses
+from apps.cli.terminal import folded
 from cocoro.bus import shared
 from cocoro.checks import Check, bad, note, ok
 from cocoro.component import Component, load, machine_checks
@@ -28,7 +29,7 @@ from cocoro.held_file import Holder
 from cocoro.robot import Robot
 from cocoro.stop.path import StopPoint
 from cocoro.stop.record import latch_dir, read
-from deploy import profiles
+from deploy import extras, profiles
 from deploy.processes import shared_bytes
 from deploy.profiles import Profile
 from deploy.rundir import RunDir
@@ -62,11 +63,11 @@ def print_checks(profile_name: str, as_json: bool, description: Path | None, mea
     profile = profiles.read(profile_name).with_robot(description, measured)
     checks = list(examine(profile))
     if as_json:
-        print(json_module.dumps([check._asdict() for check in checks]))
+        print_json([check._asdict() for check in checks])
     else:
         width = max(len(check.name) for check in checks)
         for check in checks:
-            print(f"{MARKS[check.state]}  {check.name:<{width}}  {check.text}")
+            print(*folded(f"{MARKS[check.state]}  {check.name:<{width}}  ", check.text), sep="\n")
     return exits.FAILED if any(check.state == "bad" for check in checks) else exits.DONE
 
 
@@ -89,7 +90,7 @@ def examine(profile: Profile) -> Iterator[Check]:
         running = [service for service in row.services if service in claims]
         if running:
             yield note(row.name, f"runs (pid {claims[running[0]].pid}): `cocoro status` shows its state")
-        else:
+        elif not any(extras.missing([row])):  # its checks need them
             yield from _own_checks(row, profile, robot)
     yield _clock(profile)
     yield _shared_memory(profile, claims)
@@ -113,11 +114,20 @@ def _robot(profile: Profile) -> tuple[Robot, Check | None]:
 
 
 def _libraries(profile: Profile) -> Iterator[Check]:
-    for name in dict.fromkeys(library for row in profile.rows() for library in row.libraries):
-        try:
-            yield ok(name, version(name))
-        except PackageNotFoundError:
-            yield bad(name, f"is not installed: pip install {name}")
+    rows = profile.rows()
+    lacking = set(extras.missing(rows))
+    for name in dict.fromkeys(library for row in rows for library in row.libraries):
+        if name in lacking:
+            yield bad(name, f"is not installed: {extras.advice(name)}")
+        else:
+            yield ok(name, _version(name))
+
+
+def _version(library: str) -> str:
+    try:
+        return version(library)
+    except PackageNotFoundError:  # another distribution has the module, as opencv-python does
+        return "installed"
 
 
 def _own_checks(component: Component, profile: Profile, robot: Robot) -> Iterable[Check]:

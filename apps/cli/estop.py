@@ -10,7 +10,8 @@ import sys
 import time
 from typing import TextIO
 
-from apps.cli import exits
+from apps.cli import exits, output
+from apps.cli.output import complain, recent_complaints
 from apps.cli.stop_asking import STOPPABLE, Asking, Point, StopResult
 
 EXECUTIVE = "executive"
@@ -41,6 +42,7 @@ def main(command: str, arguments: list[str]) -> int:
         try:
             options = parser.parse_args(arguments)
         except SystemExit as end:
+            recent_complaints.append(f"wrong arguments: see `cocoro {command} --help`")  # argparse has printed more
             return end.code if isinstance(end.code, int) else exits.USAGE
         robot, profile, as_json = options.robot, options.profile, options.json
     if profile is not None:
@@ -50,7 +52,7 @@ def main(command: str, arguments: list[str]) -> int:
         try:
             robot = robot or profiles.read(profile).robot
         except ConfigError as error:
-            print(f"cocoro: {error}", file=sys.stderr)
+            complain(str(error))
             return exits.USAGE
     stops, troubles = by_path(robot)
     started_s = _process_start_s()
@@ -67,6 +69,7 @@ def main(command: str, arguments: list[str]) -> int:
         printed = _report(stop, as_json)
         code = code or stop.code or (exits.DONE if printed else exits.FAILED)
     for trouble in troubles:
+        recent_complaints.append(trouble)
         _print(f"cocoro: {trouble}", sys.stderr)
     return code
 
@@ -174,6 +177,7 @@ def _report(stop: StopResult, as_json: bool) -> bool:
     if as_json:
         import json
 
+        output.told = True
         text = json.dumps(stop._asdict())
     else:
         text = str(stop)

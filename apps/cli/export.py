@@ -2,31 +2,24 @@
 
 from __future__ import annotations
 
-import asyncio
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
-from functools import partial
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
-import msgspec
 import typer
 
 from apps.captures.export.files import refuse_existing
 from apps.captures.reader import Capture
 from apps.cli import exits
-from apps.cli.interrupt import interrupt_event
-from apps.cli.link import joined
-from apps.cli.options import CaptureArgument, MeshOption, RobotChoice, RobotOption
-from cocoro.bus.base import Bus, Payload
+from apps.cli.options import CameraOption, CaptureArgument, JsonOption
+from apps.cli.output import print_json
 from cocoro.clock import NS
 from cocoro.errors import ConfigError
-from cocoro.messages import Message
-from cocoro.topics import TOPICS, Topic
 
 if TYPE_CHECKING:
-    from apps.captures.export.rerun_scene import RerunScene
+    pass
 
 PER_SERVICE = "{service}"
 DEPTH = 4
@@ -40,8 +33,11 @@ def export(
     file: CaptureArgument,
     video: Annotated[
         Path | None,
-        typer.Option("--video", metavar="OUT.mp4", help="Film of the camera's pictures with the detections drawn in."),
+        typer.Option(
+            "--video", metavar="OUT.mp4", help="Film of the camera's pictures with the detections; .webp: an animation."
+        ),
     ] = None,
+    camera: CameraOption = "robot",
     foxglove: Annotated[
         Path | None, typer.Option("--foxglove", metavar="OUT.mcap", help="For Foxglove; needs cocoro-mesh[foxglove].")
     ] = None,
@@ -57,10 +53,11 @@ def export(
     attachments: Annotated[
         Path | None, typer.Option("--attachments", metavar="DIR", help="The files that are attached to the capture.")
     ] = None,
+    json: JsonOption = False,
 ) -> None:
     """Turn a capture into a film, tables, or a file for Foxglove or Rerun; or extract its attachments. Several forms
     at once are possible."""
-    sys.exit(export_capture(file, video, rrd, foxglove, csv, parquet, attachments))
+    sys.exit(export_capture(file, video, rrd, foxglove, csv, parquet, attachments, camera, json))
 
 
 def export_capture(
@@ -71,6 +68,8 @@ def export_capture(
     csv: Path | None = None,
     parquet: Path | None = None,
     attachments: Path | None = None,
+    camera: str = "robot",
+    as_json: bool = False,
 ) -> int:
     """Writes each form whose path is given, and returns the exit code.
 
@@ -83,45 +82,61 @@ def export_capture(
     for out in (video, rrd, foxglove):
         if out is not None:
             refuse_existing(out)  # before the first form has taken minutes
+    written: list[dict[str, object]] = []
+
+    def wrote(path: Path, count: int, what: str, then: str = "") -> None:
+        written.append({"path": str(path), what: count})
+        if not as_json:
+            print(f"{path}: {count} {what}{f'; {then}' if then else ''}")
+
     with Capture.open(file) as capture:
         if video is not None:
-            from apps.captures.export import video as films
-
-            with _progress_bar(capture, video) as show:
-                pictures = films.export(capture, video, show)
-            print(f"{video}: {pictures} pictures")
+            wrote(video, film(capture, video, camera), "pictures")
         if foxglove is not None:
             from apps.captures.export.foxglove import export as export_foxglove
 
-            with _progress_bar(capture, foxglove) as show:
+            with progress_bar(capture, foxglove) as show:
                 messages = export_foxglove(capture, foxglove, show)
-            print(f"{foxglove}: {messages} messages; open it with Foxglove")
+            wrote(foxglove, messages, "messages", "open it with Foxglove")
         if csv is not None or parquet is not None:
             from apps.captures.export import tables
 
             if csv is not None:
-                print(f"{csv}: {len(tables.export(capture, tables.CsvFolder(csv)))} tables")
+                wrote(csv, len(tables.export(capture, tables.CsvFolder(csv))), "tables")
             if parquet is not None:
-                print(f"{parquet}: {len(tables.export(capture, tables.ParquetFolder(parquet)))} tables")
+                wrote(parquet, len(tables.export(capture, tables.ParquetFolder(parquet))), "tables")
         if rrd is not None:
             from apps.captures.export import rerun_scene
 
-            with _progress_bar(capture, rrd) as show:
+            with progress_bar(capture, rrd) as show:
                 messages = rerun_scene.export(capture, rrd, show)
-            print(f"{rrd}: {messages} messages; open it with `rerun {rrd}`")
+            wrote(rrd, messages, "messages", f"open it with `rerun {rrd}`")
         if attachments is not None:
             from apps.captures.export.files import export_attachments
 
-            print(f"{attachments}: {export_attachments(capture, attachments)} attachments")
+            wrote(attachments, export_attachments(capture, attachments), "attachments")
         for problem in capture.problems:
             print(f"missing: {problem}", file=sys.stderr)
         if capture.ending:
             print(f"note: {file} was {capture.ending}", file=sys.stderr)
-        return exits.FAILED if capture.problems else exits.DONE
+    if as_json:
+        print_json({"written": written, "missing": [str(problem) for problem in capture.problems]})
+    return exits.FAILED if capture.problems else exits.DONE
+
+
+def film(capture: Capture, out: Path, camera: str) -> int:
+    """Makes a film of a capture, and returns the number of its pictures.
+
+    Raises CaptureError when it cannot be made, ConfigError for an unknown camera.
+    """
+    from apps.captures.export import video
+
+    with progress_bar(capture, out) as show:
+        return video.export(capture, out, show, video.camera_of(camera))
 
 
 @contextmanager
-def _progress_bar(capture: Capture, out: Path) -> Iterator[Callable[[float], None]]:
+def progress_bar(capture: Capture, out: Path) -> Iterator[Callable[[float], None]]:
     """Yields a function that moves a bar to a position, s from the capture's start; shows none without a terminal."""
     if not sys.stdout.isatty():
         yield lambda _at_s: None
@@ -132,64 +147,3 @@ def _progress_bar(capture: Capture, out: Path) -> Iterator[Callable[[float], Non
     with Progress(transient=True, redirect_stdout=False, redirect_stderr=False) as progress:
         bar = progress.add_task(escape(str(out)), total=(capture.end_ns - capture.start_ns) / NS)
         yield lambda at_s: progress.update(bar, completed=at_s)
-
-
-# --- the viewer -----------------------------------------------------------------------------------
-
-
-@app.command()
-def view(
-    file: Annotated[
-        Path | None, typer.Argument(metavar="[FILE]", help="A capture; without one, the running robot is shown.")
-    ] = None,
-    robot: RobotOption = None,
-    profile: MeshOption = None,
-) -> None:
-    """Open Rerun on a capture, or live on the mesh. Needs the extra `view`."""
-    if file is not None:
-        sys.exit(view_file(file))
-    sys.exit(asyncio.run(view_mesh(RobotChoice(robot, profile))))
-
-
-def view_file(file: Path) -> int:
-    """Opens Rerun on a capture. Raises CaptureError when Rerun is not installed, or the file cannot be read."""
-    from apps.captures.export.rerun_scene import library, log_capture, no_viewer, opened
-
-    rerun = library()
-    with Capture.open(file) as capture:
-        recording = opened(rerun)
-        with no_viewer():
-            count = log_capture(capture, recording)
-            recording.flush()
-        print(f"{count} messages are in Rerun")
-        return exits.FAILED if capture.problems else exits.DONE
-
-
-async def view_mesh(choice: RobotChoice) -> int:
-    """Opens Rerun on a robot's mesh until Ctrl-C.
-
-    Raises CaptureError when Rerun is not installed, MeshError when there is no mesh.
-    """
-    from apps.captures.export.rerun_scene import RerunScene, library, opened
-
-    rerun = library()
-    async with joined(choice, frames=True) as link:
-        recording = opened(rerun)
-        watch(link.bus, link.robot, RerunScene(recording, link.described(), link.catalogue()))
-        print("Ctrl-C ends it")
-        with interrupt_event() as end:
-            await end.wait()
-    return exits.DONE
-
-
-def watch(bus: Bus, robot: str, scene: RerunScene) -> None:
-    """Sends every message that arrives from now on to the viewer, however old it is: a viewer controls nothing."""
-
-    def receive(topic: Topic[Any], decoder: msgspec.msgpack.Decoder[Message], _key: str, payload: Payload) -> None:
-        with suppress(msgspec.MsgspecError, ValueError, RecursionError):
-            scene.log(topic.name, decoder.decode(payload))
-
-    for topic in TOPICS:
-        if PER_SERVICE not in topic.name:
-            handler = partial(receive, topic, msgspec.msgpack.Decoder(topic.type))
-            bus.subscribe(topic.key(robot), topic.qos, handler, depth=DEPTH)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import sys
 import tempfile
@@ -16,7 +15,7 @@ from apps.appearance.learn import LearnedObject, ObjectHints, learn
 from apps.cli import exits
 from apps.cli.camera_view import CameraView, of_picture, of_robot, preview
 from apps.cli.options import RobotChoice
-from apps.cli.output import complain
+from apps.cli.output import complain, print_json
 from apps.cli.toml_files import save, text_of, with_object
 from apps.pictures import save_png
 from cocoro.errors import ConfigError, naming
@@ -64,7 +63,7 @@ async def learn_object(
     picture = saving.picture or Path(f"{hints.label}.png")
     seen = _preview(view, learned, path, picture)
     if saving.as_json:
-        print(json.dumps(_report(learned, seen, picture, path, saved=saving.yes is True)))
+        print_json(_report(learned, seen, picture, path, saved=saving.yes is True))
     else:
         print(_text(learned, seen, picture))
     if saving.yes is False:

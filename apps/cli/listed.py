@@ -19,6 +19,7 @@ class CommandRow(NamedTuple):
 
 COMMANDS = (
     CommandRow("cancel", TASKS, "End the running task; the robot stands still."),
+    CommandRow("wait", TASKS, "Follow a task to its end, and exit as its own command would have."),
     CommandRow("rehearse", TASKS, "Try a task in simulation: the whole robot in one process, in virtual time."),
     CommandRow("status", WATCH, "The running services, their health, the task and the planner's reason."),
     CommandRow("objects", WATCH, "The objects that the robot knows, and where it saw each last; `learn` adds one."),
@@ -28,7 +29,7 @@ COMMANDS = (
         WATCH,
         "List the topics and requests of all installed components: type, rate, age, quality of service, publisher.",
     ),
-    CommandRow("capture", CAPTURES, "Look at capture files, repair them, re-execute services on them."),
+    CommandRow("capture", CAPTURES, "List captures, look at them, keep, repair and re-execute them."),
     CommandRow("record", CAPTURES, "Record what travels on the mesh into MCAP files, until Ctrl-C."),
     CommandRow("replay", CAPTURES, "Send a capture into the mesh again."),
     CommandRow(

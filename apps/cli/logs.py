@@ -10,22 +10,27 @@ import sys
 from collections import deque
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Annotated, NamedTuple, TextIO
+from typing import Annotated, Any, NamedTuple, TextIO
 
 import typer
 
-from apps.cli import exits
+from apps.cli import completions, exits
 from apps.cli.interrupt import elapsed, interrupt_event
-from apps.cli.options import RobotOption
+from apps.cli.options import JsonOption, RobotOption
+from apps.cli.output import print_json
+from apps.cli.terminal import folded, output_width
 from cocoro.bus.endpoints import default_run_dir
-from cocoro.errors import ConfigError
+from cocoro.errors import ConfigError, choice_of
 from deploy.processes import components
 from deploy.rundir import RunDir, folders
 
 LOOK_S = 0.2
 """Time between two looks for new lines."""
+PROCESS_WIDTH = 10
+"""Columns of the process's name on a terminal; a longer name takes more."""
 LEVELS = ("debug", "info", "warning", "error", "critical")
 _STAMP = re.compile(r"(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d:\d\d)[.,](\d{3}) +(\w+) ")
+_HEAD = re.compile(_STAMP.pattern + r" *([\w-]+): (.*)", re.DOTALL)
 _CRASHES = ("Traceback (most recent call last)", "Fatal Python error")
 """First lines of crashes, which Python writes without a level; they count as critical."""
 
@@ -38,6 +43,24 @@ class LogEntry(NamedTuple):
     level: str
     """Lower case; empty for lines without a level."""
     lines: tuple[str, ...]
+
+    def data(self) -> dict[str, Any]:
+        """The entry for scripts. The process is empty for lines without a time."""
+        first, *rest = self.lines
+        match = _HEAD.match(first)
+        process, text = (match[5], match[6]) if match else ("", first)
+        return {"time": self.stamp, "level": self.level, "process": process, "text": text, "more": rest}
+
+    def shown(self, width: int) -> Iterator[str]:
+        """The entry for a terminal of that width: no date, no level but one above info, long lines folded."""
+        match = _HEAD.match(self.lines[0])
+        if match is None:
+            yield from self.lines
+            return
+        level = "" if match[4].lower() in ("info", "debug") else f"{match[4]}: "
+        head = f"{match[2]}.{match[3]} {match[5]:<{PROCESS_WIDTH}} "
+        yield from folded(head, f"{level}{match[6]}", width)
+        yield from self.lines[1:]
 
 
 def robot_of(robot: str | None) -> RunDir:
@@ -63,7 +86,7 @@ def files_of(run_dir: RunDir, name: str | None) -> list[Path]:
         return list(known.values())
     process = name if name in known else _process_of(run_dir, name)
     if process not in known:
-        raise ConfigError(f"{run_dir.robot} has no log of {name}; there are {', '.join(known) or 'none'}")
+        raise ConfigError(f"{run_dir.robot} has no log of {name}; {choice_of(name, known)}")
     return [known[process]]
 
 
@@ -138,36 +161,50 @@ app = typer.Typer()
 
 @app.command()
 def logs(
-    service: Annotated[str | None, typer.Argument(help="A process or a service; all by default.")] = None,
+    service: Annotated[
+        str | None, typer.Argument(help="A process or a service; all by default.", autocompletion=completions.services)
+    ] = None,
     follow: Annotated[bool, typer.Option("--follow", "-f", help="Print new entries, too, until Ctrl-C.")] = False,
     lines: Annotated[int, typer.Option("--lines", "-n", min=0, help="Number of newest entries to begin with.")] = 100,
     level: Annotated[
-        str | None, typer.Option(metavar="LEVEL", help="Only this level and above: debug, info, warning, error.")
+        str | None,
+        typer.Option(
+            metavar="LEVEL",
+            autocompletion=completions.of(*LEVELS),
+            help="Only this level and above: debug, info, warning, error.",
+        ),
     ] = None,
     robot: RobotOption = None,
+    json: JsonOption = False,
 ) -> None:
-    """Logs of the robot's processes on this machine since their start, merged by time. Works when it is down."""
-    sys.exit(asyncio.run(print_logs(robot, service, follow, lines, level)))
+    """Logs of the robot's processes on this machine since their start, merged by time. Works when it is down.
+
+    A terminal gets times without the date; a file or a pipe gets the lines as they were logged.
+    """
+    sys.exit(asyncio.run(print_logs(robot, service, follow, lines, level, json)))
 
 
-async def print_logs(robot: str | None, name: str | None, follow: bool, count: int, level: str | None) -> int:
+async def print_logs(
+    robot: str | None, name: str | None, follow: bool, count: int, level: str | None, as_json: bool = False
+) -> int:
     """Prints the newest `count` entries, and with `follow` new ones until interrupted; returns the exit code.
 
     Raises ConfigError for an unknown level, robot or name.
     """
     if level is not None and level not in LEVELS:
-        raise ConfigError(f"--level {level}: known are {', '.join(LEVELS)}")
+        raise ConfigError(f"--level {level}: {choice_of(level, LEVELS)}")
     run_dir = robot_of(robot)
     wanted = {*LEVELS, ""} if level is None else set(LEVELS[LEVELS.index(level) :])
     tails = {path: LogTail(path) for path in files_of(run_dir, name)}
+    show = _Printer(as_json)
     try:
-        _print(deque(_chosen(tails.values(), wanted), maxlen=count))
+        show(deque(_chosen(tails.values(), wanted), maxlen=count))
         if follow:
             with interrupt_event() as end:
                 while await elapsed(end, LOOK_S):
                     if name is None:
                         tails |= {path: LogTail(path) for path in files_of(run_dir, None) if path not in tails}
-                    _print(_chosen(tails.values(), wanted))
+                    show(_chosen(tails.values(), wanted))
     finally:
         for tail in tails.values():
             tail.close()
@@ -180,6 +217,21 @@ def _chosen(tails: Iterable[LogTail], wanted: set[str]) -> Iterator[LogEntry]:
     return (entry for entry in merged if entry.level in wanted)
 
 
-def _print(found: Iterable[LogEntry]) -> None:
-    for entry in found:
-        print(*entry.lines, sep="\n", flush=True)
+class _Printer:
+    """Prints entries as JSON, fitted to a terminal, or as they were logged; on a terminal with a line for each day."""
+
+    def __init__(self, as_json: bool) -> None:
+        self._as_json = as_json
+        self._day = ""
+
+    def __call__(self, found: Iterable[LogEntry]) -> None:
+        for entry in found:
+            if self._as_json:
+                print_json(entry.data())
+            elif sys.stdout.isatty():
+                if (day := entry.stamp.partition("T")[0]) != self._day:
+                    self._day = day
+                    print(f"--- {day}")
+                print(*entry.shown(output_width()), sep="\n", flush=True)
+            else:
+                print(*entry.lines, sep="\n", flush=True)

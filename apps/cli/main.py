@@ -39,35 +39,49 @@ def main(arguments: list[str] | None = None) -> int:
     """Runs a command and returns its exit code. An operator's mistake gets one line and no traceback."""
     arguments = sys.argv[1:] if arguments is None else arguments
     output.recent_complaints.clear()
+    output.told = False
     try:
-        if arguments and arguments[0] in ESTOP:
-            from apps.cli import estop
-
-            with output.going_on():
-                return estop.main(arguments[0], arguments[1:])
-        return _command(arguments)
+        code = _run(arguments)
     except BaseException as error:
-        return failed(error)
+        output.told = False  # the error is printed after the results of before
+        code = failed(error, arguments[0] if arguments else "")
+    if code != exits.DONE and not output.told and output.asks_json(arguments):
+        said = "; ".join(text.removeprefix("cocoro: ") for text in output.recent_complaints)
+        output.print_json_error(code, said or ("cancelled" if code == exits.REFUSED else "no result"))
+    return code
+
+
+def _run(arguments: list[str]) -> int:
+    if arguments and arguments[0] in ESTOP:
+        from apps.cli import estop
+
+        with output.going_on():
+            return estop.main(arguments[0], arguments[1:])
+    return _command(arguments)
 
 
 def _command(arguments: list[str]) -> int:
-    from typer.main import get_group
+    from typer.main import get_command
 
     from apps.cli.app import app
 
     if output.taken_over():
         output.log_to_stderr()
     try:
-        get_group(app)(args=arguments, prog_name="cocoro")  # calling `app` would replace sys.excepthook
+        get_command(app)(args=arguments, prog_name="cocoro")  # calling `app` would replace sys.excepthook
     except SystemExit as end:
         if _interrupted(end):  # typer has another exit code for it
             return _cancelled()
+        said = getattr(end.__context__, "format_message", None)  # typer has printed what is wrong with the arguments
+        if said is not None and output.asks_json(arguments):
+            output.print_json_error(exits.USAGE, said())
         return end.code if isinstance(end.code, int) else exits.DONE if end.code is None else exits.FAILED
     return exits.DONE
 
 
-def failed(error: BaseException) -> int:
-    """Reports the error that ended a command in at most one line, and returns the exit code for it."""
+def failed(error: BaseException, command: str = "") -> int:
+    """Reports the error that ended a command in at most one line, and returns the exit code for it. `command` is the
+    command's name."""
     from cocoro.errors import CocoroError
 
     while isinstance(error, BaseExceptionGroup) and len(error.exceptions) == 1:  # a TaskGroup wraps errors
@@ -90,6 +104,12 @@ def failed(error: BaseException) -> int:
     if hiding:
         output.complain(hiding)
         return exits.USAGE
+    if isinstance(error, ModuleNotFoundError):
+        from deploy.extras import advice_of
+
+        if sentence := advice_of(error, command):
+            output.complain(sentence)
+            return exits.USAGE
     _report_bug(error)
     return exits.FAILED
 

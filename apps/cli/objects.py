@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import json as json_module
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -14,6 +13,7 @@ import typer
 from apps.cli import exits
 from apps.cli.link import joined
 from apps.cli.options import DescriptionOption, JsonOption, MeasuredOption, MeshOption, RobotChoice, RobotOption
+from apps.cli.output import print_json
 from apps.cli.snapshot import check
 from apps.cli.terminal import Column, print_table
 from cocoro.messages import KnownObject, ObjectsRequest
@@ -102,7 +102,7 @@ async def list_objects(choice: RobotChoice, as_json: bool) -> int:
     async with joined(choice) as link:
         reply = await link.call(OBJECTS, ObjectsRequest())
     if as_json:
-        print(json_module.dumps(msgspec.to_builtins(reply.objects)))
+        print_json(msgspec.to_builtins(reply.objects))
     else:
         columns = ("object", Column("shape", 1), "size (cm)", "graspable", Column("seen", text=True))
         print_table(columns, [_row(known) for known in reply.objects])

@@ -13,17 +13,26 @@ from typing import Annotated
 
 import typer
 
+from apps.cli import completions
 from cocoro.errors import ConfigError
 
 # --- which robot, and how to print ----------------------------------------------------------------
 
 RobotOption = Annotated[
-    str | None, typer.Option("--robot", help="Name of the robot; needed only when several are up on this machine.")
+    str | None,
+    typer.Option(
+        "--robot",
+        autocompletion=completions.robots,
+        help="Name of the robot; needed only when several are up on this machine.",
+    ),
 ]
 MeshOption = Annotated[
     str | None,
     typer.Option(
-        "--profile", metavar="PROFILE", help="Reach a robot on another machine through the mesh of this profile."
+        "--profile",
+        metavar="PROFILE",
+        help="Reach a robot on another machine through the mesh of this profile.",
+        autocompletion=completions.profiles,
     ),
 ]
 
@@ -41,19 +50,30 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON, for script
 
 # --- profiles and the simulator -------------------------------------------------------------------
 
-ProfileArgument = Annotated[str, typer.Argument(help="A profile's name (sim, robot) or file.")]
+ProfileArgument = Annotated[
+    str, typer.Argument(help="A profile's name (sim, robot) or file.", autocompletion=completions.profiles)
+]
 ProfileOption = Annotated[
     str,
     typer.Option(
-        "--profile", metavar="PROFILE", help="Take the ports and the robot's measured file from this profile."
+        "--profile",
+        metavar="PROFILE",
+        help="Take the ports and the robot's measured file from this profile.",
+        autocompletion=completions.profiles,
     ),
+]
+SceneOption = Annotated[
+    str | None, typer.Option(help="Simulator: a scene's name, or its file.", autocompletion=completions.scenes)
 ]
 SetOption = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="Any setting of the profile: service.sim.seed=3. Repeatable."),
 ]
 FramesOption = Annotated[
-    str | None, typer.Option("--frames", metavar="WxH@HZ", help="Size and rate of the camera's frames: 320x240@15.")
+    str | None,
+    typer.Option(
+        "--frames", metavar="WxH@HZ", envvar="COCORO_FRAMES", help="Size and rate of the camera's frames: 320x240@15."
+    ),
 ]
 LatencyOption = Annotated[
     list[str] | None,
@@ -66,7 +86,13 @@ ObjectsOption = Annotated[
     ),
 ]
 BodyOption = Annotated[
-    str, typer.Option("--body", metavar="nominal|worn", help="A body like the nominal model, or one that differs.")
+    str,
+    typer.Option(
+        "--body",
+        metavar="nominal|worn",
+        autocompletion=completions.of("nominal", "worn"),
+        help="A body like the nominal model, or one that differs.",
+    ),
 ]
 DescriptionOption = Annotated[
     Path | None,
@@ -84,7 +110,12 @@ ModelOption = Annotated[
 ]
 ReachOption = Annotated[
     str | None,
-    typer.Option("--reach", metavar="learned|rigid", help="rigid: reach without the learned model of the arm."),
+    typer.Option(
+        "--reach",
+        metavar="learned|rigid",
+        autocompletion=completions.of("learned", "rigid"),
+        help="rigid: reach without the learned model of the arm.",
+    ),
 ]
 AdaptOption = Annotated[
     bool, typer.Option("--adapt", help="Keep training the learned model of the arm with what the camera sees at work.")
@@ -107,7 +138,31 @@ TimeoutOption = Annotated[
 
 # --- captures and topics --------------------------------------------------------------------------
 
-CaptureArgument = Annotated[Path, typer.Argument(metavar="FILE", help="A capture (MCAP file).")]
+
+def capture_file(text: str) -> Path:
+    """Reads a capture's file or name (latest, fetch, 'fetch red_can', a task's id)."""
+    from apps.captures.shelf import find  # slow to import
+
+    return find(text)
+
+
+CaptureArgument = Annotated[
+    Path,
+    typer.Argument(
+        metavar="FILE",
+        parser=capture_file,
+        autocompletion=completions.captures,
+        help="A capture: an MCAP file, latest, latest-1, or a task: 'fetch red_can'.",
+    ),
+]
+CameraOption = Annotated[
+    str,
+    typer.Option(
+        "--camera",
+        metavar="robot|outside|both",
+        help="For the film: the robot's camera, one that films the simulated robot, or both.",
+    ),
+]
 OnlyOption = Annotated[
     list[str] | None,
     typer.Option("--only", metavar="KEYEXPR", help="Only these keys: base/state, */health, frames. Repeatable."),
@@ -122,7 +177,12 @@ ToOption = Annotated[
     float | None, typer.Option("--to", metavar="S", help="End before this, in seconds from the capture's start.")
 ]
 KeyArgument = Annotated[
-    str, typer.Argument(metavar="KEY", help="base/state, */health, ** (all); `cocoro topics` lists the known keys.")
+    str,
+    typer.Argument(
+        metavar="KEY",
+        autocompletion=completions.topics,
+        help="base/state, */health, ** (all); `cocoro topics` lists the known keys.",
+    ),
 ]
 
 # --- values with a form of their own --------------------------------------------------------------

@@ -26,11 +26,16 @@ LEVEL = "COCORO_LOG"
 """Environment variable with the log level; at `debug`, errors are printed with their tracebacks."""
 SPELLING = "cocoro.spelling"
 """Name under which `codecs` knows the streams' error handler."""
+PIECE = 4096
+"""Bytes that a pipe which has room takes at once."""
+HURRIED_S = 0.1
+UNREAD = OSError(errno.EAGAIN, "its reader reads nothing")
 CLOSED = OSError(errno.EBADF, "it is closed")
 ADVICE = {
     errno.ENOSPC: "make room there, or write it elsewhere",
     errno.EBADF: "redirect it to /dev/null to do without it",
     errno.EPIPE: "its reader ended before it read anything",
+    errno.EAGAIN: "read it, or write it elsewhere",
 }
 
 
@@ -50,6 +55,12 @@ class _Out(io.RawIOBase):
         self.failure: OSError | None = None
         self.arrived = False
         """Whether any byte was written."""
+        self.interruptible = False
+        """Whether `give_up_waiting` ends a write that waits for a reader."""
+        self.hurried = False
+        """Whether no write waits for longer than HURRIED_S: the command is being ended."""
+        self.waits = False
+        """Whether an interruptible write waits now."""
         self._fd = fd
         self._was_closed = closed
 
@@ -69,8 +80,10 @@ class _Out(io.RawIOBase):
         if self._was_closed:
             raise CLOSED
         while True:
+            if self.interruptible or self.hurried:
+                self._wait_for_room()
             try:
-                count = os.write(self._fd, data)
+                count = os.write(self._fd, data[:PIECE] if self.interruptible or self.hurried else data)
             except BlockingIOError:  # another process set O_NONBLOCK on the shared descriptor
                 import select
 
@@ -78,6 +91,20 @@ class _Out(io.RawIOBase):
                 continue
             self.arrived = True
             return count
+
+    def _wait_for_room(self) -> None:
+        """Waits until the reader takes a piece; the wait can be given up, that of `os.write` could not."""
+        import select
+
+        if select.select([], [self._fd], [], HURRIED_S if self.hurried else 0)[1]:
+            return
+        if self.hurried:
+            raise UNREAD
+        self.waits = True
+        try:
+            select.select([], [self._fd], [])
+        finally:
+            self.waits = False
 
     def writable(self) -> bool:
         return True
@@ -90,6 +117,10 @@ class _Out(io.RawIOBase):
 
 
 _outs: dict[str, _Out] = {}
+told = False
+"""Whether the running command has printed JSON."""
+ERRORS = {exits.FAILED: "failed", exits.USAGE: "usage", exits.REFUSED: "refused", exits.NO_MESH: "no_mesh"}
+"""Names of the exit codes in errors as JSON."""
 recent_complaints: deque[str] = deque(maxlen=8)
 """Latest complaints of the running command, so that none is printed twice."""
 
@@ -166,6 +197,62 @@ def going_on() -> Iterator[None]:
     finally:
         if out is not None:
             out.vital = before
+
+
+def print_json(value: Any) -> None:
+    """Prints a result as one line of JSON. A command with `--json` prints all its results by this function; an error
+    is printed by `print_json_error`."""
+    import json
+
+    global told
+    told = True
+    print(json.dumps(value), flush=True)
+
+
+def tell(as_json: bool, data: Any, text: str) -> None:
+    """Prints a result, as JSON or as text."""
+    if as_json:
+        print_json(data)
+    else:
+        print(text, flush=True)
+
+
+def asks_json(arguments: list[str]) -> bool:
+    """Whether a command's arguments ask for JSON."""
+    end = arguments.index("--") if "--" in arguments else len(arguments)
+    return "--json" in arguments[:end]
+
+
+def json_error(code: int, text: str) -> dict[str, object]:
+    """An error for scripts; `code` is the exit code."""
+    return {"error": {"code": ERRORS.get(code, "failed"), "exit_code": code, "text": text}}
+
+
+def print_json_error(code: int, text: str) -> None:
+    """Prints an error on standard output for scripts."""
+    with going_on():
+        print_json(json_error(code, text))
+
+
+@contextmanager
+def interruptible() -> Iterator[None]:
+    """In this context `give_up_waiting` has an effect."""
+    for out in _outs.values():
+        out.interruptible = True
+    try:
+        yield
+    finally:
+        for out in _outs.values():
+            out.interruptible = False
+
+
+def give_up_waiting(for_good: bool) -> None:
+    """Ends a write that waits for a reader, as if the stream were lost; called in a signal handler. `for_good`: no
+    later write waits for long."""
+    for out in _outs.values():
+        out.hurried = out.hurried or for_good
+    if any(out.waits for out in _outs.values()):
+        raise UNREAD
 
 
 def finish(code: int) -> int:

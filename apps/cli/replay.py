@@ -17,7 +17,7 @@ import typer
 
 from apps.captures.player import Player
 from apps.captures.reader import Capture
-from apps.captures.replay import SIMULATOR, Replay, played_keys, refuse_if_alive, services_of
+from apps.captures.replay import SIMULATOR, Replay, heard_as, played_keys, refuse_if_alive, services_of
 from apps.cli import exits
 from apps.cli.capture import check_span
 from apps.cli.options import CaptureArgument, FromOption, OnlyOption, ToOption
@@ -27,7 +27,7 @@ from cocoro.capture.conventions import CaptureError
 from cocoro.errors import ConfigError, RefusedError
 from cocoro.keys import alive_key, service_of
 from deploy import processes
-from deploy.rundir import RunDir
+from deploy.rundir import RunDir, robots
 
 SHOW_S = 0.1
 JUMP_S = 5.0
@@ -53,17 +53,28 @@ def replay(
     hardware: Annotated[
         bool, typer.Option("--hardware", help="Publish only what the robot's hardware published: replace the robot.")
     ] = False,
+    robot: Annotated[
+        str | None,
+        typer.Option(
+            "--robot",
+            metavar="NAME",
+            help="Publish under this robot's name. Default: the recorded name; with --hardware the robot that waits.",
+        ),
+    ] = None,
 ) -> None:
     """Send a capture into the mesh again. With --hardware, `cocoro up replay` in another terminal works on it.
 
     Keys: space pauses, . goes to the next picture, left and right 5 s, + and - change the rate, q ends.
     """
     options = {"start_s": 0.0 if start is None else start, "end_s": end, "rate": rate, "loop": loop, "paused": paused}
-    sys.exit(asyncio.run(replay_file(file, only or [], hardware, options)))
+    sys.exit(asyncio.run(replay_file(file, only or [], hardware, options, robot)))
 
 
-async def replay_file(file: Path, only: list[str], hardware: bool, options: dict[str, Any]) -> int:
-    """Plays a capture to its end, or until interrupted, and returns the exit code. `options` go to the Player.
+async def replay_file(
+    file: Path, only: list[str], hardware: bool, options: dict[str, Any], robot: str | None = None
+) -> int:
+    """Plays a capture to its end, or until interrupted, and returns the exit code. `options` go to the Player; `robot`
+    is the name to publish under, see `_name`.
 
     Raises CaptureError for a file that is no capture of a robot, RefusedError when a service that it would play is
     alive, ConfigError when there is nothing to play.
@@ -79,13 +90,14 @@ async def replay_file(file: Path, only: list[str], hardware: bool, options: dict
         keys = played_keys(capture, only, hardware)
         player = Player(capture, keys.__contains__, **options)
         services = services_of(keys) | (set(processes.hardware()) if hardware else set())
-        run_dir = RunDir(capture.robot)
+        name = robot or _name(capture.robot, hardware)
+        run_dir = RunDir(name)
         run_dir.make()
         claims = run_dir.claim("replay", services)
         try:
             async with await ZenohBus.open(run_dir.join_as("replay", frames=True)) as bus:
-                await refuse_if_alive(bus, capture.robot, services)
-                await _play(bus, capture, player, hardware, services)
+                await refuse_if_alive(bus, name, services)
+                await _play(bus, capture, player, hardware, services, name)
         finally:
             for claim in claims:
                 claim.release()
@@ -96,8 +108,25 @@ async def replay_file(file: Path, only: list[str], hardware: bool, options: dict
         return exits.FAILED if capture.problems else exits.DONE
 
 
-async def _play(bus: ZenohBus, capture: Capture, player: Player, hardware: bool, services: frozenset[str]) -> None:
-    replaying = Replay(bus, capture, player, hardware=hardware)
+def _name(recorded: str, hardware: bool) -> str:
+    """The name to publish a capture of the robot `recorded` under, when none is asked for. Says on standard error when
+    it differs, or when nothing of this machine listens. Raises ConfigError when several robots could be meant."""
+    if not hardware:
+        return recorded
+    up = {it.robot: set(it.claims()) for it in robots() if it.supervisor() is not None or it.claims()}
+    name = heard_as(recorded, up)
+    if name != recorded:
+        print(f"note: published as {name}, which waits for hardware; the capture is of {recorded}", file=sys.stderr)
+    elif recorded not in up:
+        start = f"`cocoro up replay --set robot={recorded} --detach`"
+        print(f"note: {recorded} is not up on this machine; {start} starts what listens", file=sys.stderr)
+    return name
+
+
+async def _play(
+    bus: ZenohBus, capture: Capture, player: Player, hardware: bool, services: frozenset[str], name: str
+) -> None:
+    replaying = Replay(bus, capture, player, hardware=hardware, robot=name)
     end = asyncio.Event()
     intruder: list[str] = []
 
@@ -107,7 +136,7 @@ async def _play(bus: ZenohBus, capture: Capture, player: Player, hardware: bool,
             intruder.append(service)
             end.set()
 
-    watch = bus.watch_alive(alive_key(capture.robot), on_alive)
+    watch = bus.watch_alive(alive_key(name), on_alive)
     work = asyncio.ensure_future(replaying.run())
     with (
         _keyboard(lambda text: _handle_key(text, player, replaying, end)) as has_keys,
@@ -128,7 +157,7 @@ async def _play(bus: ZenohBus, capture: Capture, player: Player, hardware: bool,
     print(_position(player, replaying))
     if intruder:
         raise RefusedError(
-            f"stopped: {intruder[0]} of {capture.robot} has started and publishes the same keys; `cocoro down` ends it"
+            f"stopped: {intruder[0]} of {name} has started and publishes the same keys; `cocoro down` ends it"
         )
 
 

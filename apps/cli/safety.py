@@ -13,7 +13,8 @@ import typer
 from apps.cli import estop as stopping
 from apps.cli import exits
 from apps.cli.link import Answer, joined
-from apps.cli.options import MeshOption, RobotChoice, RobotOption
+from apps.cli.options import JsonOption, MeshOption, RobotChoice, RobotOption
+from apps.cli.output import complain, print_json
 from cocoro.errors import MeshError
 from cocoro.messages import EstopReply, EstopRequest
 from cocoro.topics import ESTOP
@@ -36,12 +37,12 @@ def stop(context: typer.Context) -> None:
 
 
 @app.command()
-def reset(robot: RobotOption = None, profile: MeshOption = None) -> None:
+def reset(robot: RobotOption = None, profile: MeshOption = None, json: JsonOption = False) -> None:
     """Release the emergency stop. The executive may refuse; the command then prints its reason."""
-    sys.exit(asyncio.run(release(RobotChoice(robot, profile))))
+    sys.exit(asyncio.run(release(RobotChoice(robot, profile), json)))
 
 
-async def release(choice: RobotChoice) -> int:
+async def release(choice: RobotChoice, as_json: bool = False) -> int:
     """Releases a robot's latches; returns the exit code. Raises MeshError when nothing that moves is alive.
 
     The executive is asked first: when it refuses, everything stays latched.
@@ -57,10 +58,13 @@ async def release(choice: RobotChoice) -> int:
         answers = await link.call_all(ESTOP.of("*"), question)
         if _refused(moving, answers):
             return exits.REFUSED
-    print(f"{link.robot}: released {', '.join(sorted(moving))}")
+    if as_json:
+        print_json({"robot": link.robot, "released": sorted(moving)})
+    else:
+        print(f"{link.robot}: released {', '.join(sorted(moving))}")
     for answer in answers:
         if answer.reply is not None and answer.reply.text:
-            print(f"cocoro: {answer.service}: {answer.reply.text}", file=sys.stderr)
+            complain(f"{answer.service}: {answer.reply.text}")
     return exits.DONE
 
 
@@ -72,6 +76,6 @@ def _refused(wanted: set[str], answers: list[Answer[EstopReply]]) -> bool:
         answer = by_service.get(service, Answer(service, None, "no answer"))
         if answer.reply is None or answer.reply.latch != "released":
             why = answer.error or (answer.reply.text if answer.reply else "") or "it is still latched"
-            print(f"cocoro: {service} does not release the emergency stop: {why}", file=sys.stderr)
+            complain(f"{service} does not release the emergency stop: {why}")
             refused = True
     return refused

@@ -20,9 +20,11 @@ from msgspec import NODEFAULT, Meta
 from typer.core import TyperCommand, TyperGroup
 from typer.main import get_group
 
+from apps.cli import completions
 from apps.cli.options import (
     AdaptOption,
     BodyOption,
+    CameraOption,
     DescriptionOption,
     FramesOption,
     JsonOption,
@@ -56,6 +58,10 @@ Shared = Callable[..., None]
 def operate(
     task: Task,
     timeout: TimeoutOption = None,
+    detach: Annotated[
+        bool,
+        typer.Option("--detach", "-d", help="Print the task's id and end; the task goes on. See `wait`, `cancel`."),
+    ] = False,
     snapshot: Annotated[
         Path | None, typer.Option(metavar="OUT.png", help="Write what the robot sees when it grasps.")
     ] = None,
@@ -63,20 +69,31 @@ def operate(
     profile: MeshOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Ctrl-C cancels it on the robot."""
-    from apps.cli import tasks
+    """Ctrl-C cancels it on the robot, and so does every other end of the command: a closed terminal, a kill."""
+    from apps.cli import task_running
     from cocoro.messages import TaskRequest
 
-    request = TaskRequest(task=task, timeout_s=timeout)
-    sys.exit(asyncio.run(tasks.run(RobotChoice(robot, profile), request, json, snapshot)))
+    choice, request = RobotChoice(robot, profile), TaskRequest(task=task, timeout_s=timeout)
+    if not detach:
+        sys.exit(asyncio.run(task_running.run(choice, request, json, snapshot)))
+    if snapshot is not None:
+        raise ConfigError("--snapshot takes its picture when the robot grasps: leave --detach out")
+    sys.exit(asyncio.run(task_running.detach(choice, request, json)))
 
 
 def rehearse(
     task: Task,
-    scene: Annotated[str, typer.Option(help="A scene's name, or its file.")] = "paper",
+    scene: Annotated[
+        str, typer.Option(help="A scene's name, or its file.", autocompletion=completions.scenes)
+    ] = "paper",
     seed: Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")] = 0,
     sensors: Annotated[
-        str, typer.Option(metavar="ideal|real", help="Perfect camera and body, or real ones.")
+        str,
+        typer.Option(
+            metavar="ideal|real",
+            autocompletion=completions.of("ideal", "real"),
+            help="Perfect camera and body, or real ones.",
+        ),
     ] = "ideal",
     body: BodyOption = "nominal",
     description: DescriptionOption = None,
@@ -108,6 +125,10 @@ def rehearse(
         Path | None, typer.Option(metavar="OUT.png", help="Write what the robot saw when it grasped.")
     ] = None,
     record: Annotated[Path | None, typer.Option(metavar="OUT.mcap", help="Record everything.")] = None,
+    video: Annotated[
+        Path | None, typer.Option(metavar="OUT.mp4", help="Film it; a name with .webp is a small animation.")
+    ] = None,
+    camera: CameraOption = "outside",
     json: JsonOption = False,
 ) -> None:
     """The whole robot is simulated in one process, in virtual time, and judged by the simulator's truth."""
@@ -120,7 +141,7 @@ def rehearse(
         "wait_s": wait, "then": [task_of(words, "--then") for words in then or []],
         "objects": _text(objects), "timeout_s": timeout, "picture": _text(picture), "record": _text(record),
     }  # fmt: skip
-    sys.exit(rehearsing.rehearse(options, latency or [], frames, json))
+    sys.exit(rehearsing.rehearse(options, latency or [], frames, json, video, camera))
 
 
 def _text(path: Path | None) -> str | None:
@@ -195,12 +216,29 @@ app.add_typer(
 )
 
 
-@app.command()
-def cancel(robot: RobotOption = None, profile: MeshOption = None) -> None:
-    """End the running task; the robot stands still."""
-    from apps.cli import tasks
+TaskIdArgument = Annotated[
+    str, typer.Argument(metavar="[ID]", help="The task's id, as `--detach` prints it; by default the running task.")
+]
 
-    sys.exit(asyncio.run(tasks.cancel(RobotChoice(robot, profile))))
+
+@app.command()
+def cancel(
+    task: TaskIdArgument = "", robot: RobotOption = None, profile: MeshOption = None, json: JsonOption = False
+) -> None:
+    """End the running task; the robot stands still."""
+    from apps.cli import task_running
+
+    sys.exit(asyncio.run(task_running.cancel(RobotChoice(robot, profile), task, json)))
+
+
+@app.command()
+def wait(
+    task: TaskIdArgument = "", robot: RobotOption = None, profile: MeshOption = None, json: JsonOption = False
+) -> None:
+    """Follow a task to its end, and exit as its own command would have. Ctrl-C ends the waiting, not the task."""
+    from apps.cli import task_running
+
+    sys.exit(asyncio.run(task_running.wait(RobotChoice(robot, profile), task, json)))
 
 
 def _command(name: str, shared: Shared) -> TyperCommand:
@@ -254,7 +292,7 @@ def _parameter(field: msgspec.structs.FieldInfo) -> inspect.Parameter:
     text = next((meta.description for meta in metas if meta.description), None)
     default = inspect.Parameter.empty if field.default is NODEFAULT else field.default
     if field.name == "label":
-        annotation = _ANNOTATED[plain, typer.Argument(help=text)]
+        annotation = _ANNOTATED[plain, typer.Argument(metavar="LABEL", help=text, autocompletion=completions.labels)]
         return inspect.Parameter(field.name, inspect.Parameter.KEYWORD_ONLY, annotation=annotation, default=default)
     name, metavar = field.name, None
     for unit, word in UNITS.items():

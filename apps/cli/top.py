@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import os
 import sys
 import time
@@ -18,6 +17,7 @@ from apps.cli import exits
 from apps.cli.interrupt import elapsed, interrupt_event
 from apps.cli.link import MeshLink, joined, within
 from apps.cli.options import JsonOption, MeshOption, RobotChoice, RobotOption
+from apps.cli.output import print_json
 from apps.cli.status import expected
 from apps.cli.top_view import Screen, print_report
 from cocoro.component import Component
@@ -76,7 +76,7 @@ async def show_top(choice: RobotChoice, once: bool, as_json: bool, every_s: floa
 
 def _print(report: dict[str, Any], as_json: bool) -> None:
     if as_json:
-        print(json.dumps(report), flush=True)
+        print_json(report)
     else:
         print_report(report)
 

@@ -7,10 +7,11 @@ from functools import partial
 from typing import Any
 
 from apps.experiments import figures, plan
+from apps.experiments.carry_out import RunResult
 from apps.experiments.lessons import SIZES
 from apps.experiments.plan import ExperimentSettings
 from apps.experiments.results import Plot, Section, row
-from apps.experiments.runs import ExperimentRun, RunResult
+from apps.experiments.runs import ExperimentRun
 from apps.learning.study import BEST, METHODS
 from services.executive.tasks import BabbleArmTask
 

@@ -7,23 +7,24 @@ from functools import partial
 from typing import Any
 
 from apps.experiments import figures, plan
+from apps.experiments.carry_out import RunResult
 from apps.experiments.plan import ExperimentSettings
 from apps.experiments.results import Plot, ResultRow, Section, row
-from apps.experiments.runs import ExperimentRun, RunResult
+from apps.experiments.runs import ExperimentRun
 
 KEY, TITLE = "E3", "The distance between the wheels, from babbling"
 MEDIAN_M, WORST_M = 0.003, 0.008
 
 
 def runs(settings: ExperimentSettings) -> list[ExperimentRun]:
-    return [run for seed in settings.seeds for run in plan.learned(settings, seed)]
+    return [run for seed in settings.seeds for run in plan.learned_wheels(settings, seed)]
 
 
 def section(settings: ExperimentSettings, results: Mapping[str, RunResult]) -> Section:
     good = [
-        (results[plan.learned_name(seed)]["wheels"], results[f"babble-wheels-{seed}"]["body"])
+        (results[plan.wheels_name(seed)]["wheels"], results[f"babble-wheels-{seed}"]["body"])
         for seed in settings.seeds
-        if "error" not in results[plan.learned_name(seed)]
+        if "error" not in results[plan.wheels_name(seed)]
     ]
     made = Section(
         KEY,

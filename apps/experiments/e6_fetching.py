@@ -8,9 +8,10 @@ from math import ceil
 from typing import Any
 
 from apps.experiments import figures, plan
+from apps.experiments.carry_out import RunResult
 from apps.experiments.plan import ExperimentSettings
 from apps.experiments.results import Plot, Section, row
-from apps.experiments.runs import ExperimentRun, RunResult
+from apps.experiments.runs import ExperimentRun
 from services.executive.tasks import FetchTask
 
 KEY, TITLE = "E6", "Fetching"

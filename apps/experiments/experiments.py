@@ -16,9 +16,10 @@ from apps.experiments import (
     figures,
     report,
 )
+from apps.experiments.carry_out import RunResult
 from apps.experiments.plan import ExperimentSettings
 from apps.experiments.results import Section
-from apps.experiments.runs import ExperimentRun, RunDisplay, RunResult, perform
+from apps.experiments.runs import ExperimentRun, RunDisplay, perform
 
 
 class Experiment(Protocol):
@@ -41,18 +42,27 @@ def run(
 ) -> tuple[list[Section], Path]:
     """Runs experiments and writes the report; returns its sections and the path of its Markdown file.
 
-    Finished runs are kept when it is interrupted. Raises ConfigError when `plots` needs a missing library.
+    Each section is displayed as soon as its runs have ended. Finished runs are kept when it is interrupted. Raises
+    ConfigError when `plots` needs a missing library.
     """
     if plots:
         figures.available()
     runs: dict[str, ExperimentRun] = {}
     for key in keys:
         runs |= {run.name: run for run in EXPERIMENTS[key].runs(settings)}
-    results = perform(runs.values(), settings.out / "runs", settings.jobs, display)
-    sections = []
-    for key in keys:
-        section = EXPERIMENTS[key].section(settings, results)
-        needed = EXPERIMENTS[key].runs(settings)
-        section.errors = [f"{run.name}: {results[run.name]['error']}" for run in needed if "error" in results[run.name]]
-        sections.append(section)
-    return sections, report.write(sections, settings, plots=plots)
+    sections: dict[str, Section] = {}
+
+    def ended(results: dict[str, RunResult]) -> None:
+        for key in keys:
+            needed = EXPERIMENTS[key].runs(settings)
+            if key in sections or any(run.name not in results for run in needed):
+                continue
+            sections[key] = section = EXPERIMENTS[key].section(settings, results)
+            section.errors = [
+                f"{run.name}: {results[run.name]['error']}" for run in needed if "error" in results[run.name]
+            ]
+            display.reported(section)
+
+    perform(runs.values(), settings.out / "runs", settings.jobs, display, ended)
+    found = [sections[key] for key in keys]
+    return found, report.write(found, settings, plots=plots)

@@ -12,7 +12,7 @@ import numpy as np
 from apps.learning import dataset, study
 from apps.learning.dataset import HandRow, WheelRow
 from apps.learning.lesson import learn_arm, learn_wheels, sightings
-from apps.learning.wheels import fit_wheels
+from apps.learning.wheels import WheelFit, fit_wheels
 from cocoro.clock import NS
 from cocoro.learning import model
 from cocoro.learning.handmap import NominalModel
@@ -47,7 +47,6 @@ def learn(
     sizes = [size for size in SIZES if size <= len(learn)]
     draws = np.unique([row.draw for row in rows])
     trials = dataset.read(Path(wheels), WheelRow, robot).rows
-    after = [fit_wheels(trials[:count]) for count in range(2, len(trials) + 1, 2)]
     return {
         "arm": report.data(),
         "learn": len(learn),
@@ -59,11 +58,24 @@ def learn(
         "draws_used": len(draws),
         "draws_looked_at": int(draws.max() - draws.min() + 1),
         "babbled_s": _babbled_s(rows),
-        "wheels": {
-            "separation_m": fit.separation_m, "sigma_m": fit.sigma_m, "median_m": fit.median_m,
-            "estimates_m": list(fit.estimates_m), "left_scale": fit.left_scale, "right_scale": fit.right_scale,
-            "after_m": [one.separation_m if one is not None else None for one in after],
-        },
+        "wheels": _fitted(fit, trials),
+    }
+
+
+def wheels(trials: str, into: str, description: str | None = None, measured: str | None = None) -> dict[str, Any]:
+    """Learns the wheels alone and writes the model to `into`. Returns the fit."""
+    robot, file = load_robot(description, measured), Path(into)
+    file.unlink(missing_ok=True)
+    _, fit = learn_wheels(Path(trials), file, robot)
+    return {"wheels": _fitted(fit, dataset.read(Path(trials), WheelRow, robot).rows)}
+
+
+def _fitted(fit: WheelFit, trials: Sequence[WheelRow]) -> dict[str, Any]:
+    after = [fit_wheels(trials[:count]) for count in range(2, len(trials) + 1, 2)]
+    return {
+        "separation_m": fit.separation_m, "sigma_m": fit.sigma_m, "median_m": fit.median_m,
+        "estimates_m": list(fit.estimates_m), "left_scale": fit.left_scale, "right_scale": fit.right_scale,
+        "after_m": [one.separation_m if one is not None else None for one in after],
     }  # fmt: skip
 
 

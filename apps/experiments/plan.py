@@ -80,6 +80,20 @@ def babbled(settings: ExperimentSettings, seed: int) -> list[ExperimentRun]:
     ]
 
 
+def learned_wheels(settings: ExperimentSettings, seed: int) -> list[ExperimentRun]:
+    """Babbling of one body's wheels, and learning the distance between them; the arm's babbling takes far longer."""
+    fields = {
+        "trials": str(settings.wheels_file(seed)), "into": str(settings.model_file(seed).with_suffix(".wheels.json")),
+        **settings.robot_files,
+    }  # fmt: skip
+    run = babbled(settings, seed)[1]
+    return [run, ExperimentRun(wheels_name(seed), "learn-wheels", fields, needs=(run.name,))]
+
+
+def wheels_name(seed: int) -> str:
+    return f"learn-wheels-{seed}"
+
+
 def learned(settings: ExperimentSettings, seed: int) -> list[ExperimentRun]:
     """Babbling of one body, and learning its model."""
     fields = {

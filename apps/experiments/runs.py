@@ -5,26 +5,21 @@ from __future__ import annotations
 
 import hashlib
 import json
-import multiprocessing
-import os
-from collections.abc import Callable, Iterable, Mapping
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
 import msgspec
 
-from apps.experiments import lessons
-from apps.rehearsal.rehearse import rehearse
-from apps.rehearsal.request import RehearsalRequest
-from cocoro.errors import CocoroError, naming
+from apps.experiments.carry_out import RunResult
+from apps.experiments.results import Section
+from apps.experiments.workers import Workers
+from apps.rehearsal.progress import RehearsalProgress
+from cocoro.errors import naming
 
-TASKS_A_PROCESS = 25
-"""Runs after which a worker process is replaced, against growing memory; starting one takes as long as a short run."""
-LESSONS: dict[str, Callable[..., dict[str, Any]]] = {"learn": lessons.learn, "bend": lessons.bend}
-RunResult = dict[str, Any]
-"""A run's result as JSON data; a failed run has its message under 'error'."""
+REFRESH_S = 1.0
+"""Longest time between two ticks of the display."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +28,7 @@ class ExperimentRun:
 
     name: str
     """Name of its result's file in the folder `runs`."""
-    kind: Literal["rehearse", "learn", "bend"]
+    kind: Literal["rehearse", "learn", "learn-wheels", "bend"]
     fields: dict[str, Any] = field(hash=False)
     """Rehearse: the request's fields; otherwise the arguments of the lesson of that name."""
     needs: tuple[str, ...] = ()
@@ -43,39 +38,35 @@ class ExperimentRun:
 class RunDisplay(Protocol):
     """Shows the progress of `perform`."""
 
-    def begin(self, total: int, had: int) -> None:
-        """`had` of the `total` runs have a result from an earlier time."""
+    def begin(self, waiting: Sequence[str], had: int) -> None:
+        """The runs that are to be performed; `had` others have a result from an earlier time."""
 
     def started(self, name: str) -> None: ...
 
+    def advanced(self, name: str, progress: RehearsalProgress) -> None: ...
+
     def ended(self, name: str, result: RunResult) -> None: ...
 
+    def reported(self, section: Section) -> None:
+        """All runs of an experiment have ended."""
 
-def carry_out(kind: str, fields: dict[str, Any]) -> RunResult:
-    """Performs one run in a worker process; errors become part of the result."""
-    try:
-        if kind == "rehearse":
-            request = msgspec.convert(fields, RehearsalRequest)
-            if request.samples is not None and request.bend_s is not None:
-                # Samples of an interrupted run do not contain the bend at that time.
-                Path(request.samples).unlink(missing_ok=True)
-            return dict(rehearse(request))
-        return dict(LESSONS[kind](**fields))
-    except (CocoroError, msgspec.ValidationError) as error:
-        return {"error": str(error)}
-    except Exception as error:  # a failed run must not end hundreds of others
-        return {"error": f"{type(error).__name__}: {error}"}
+    def tick(self) -> None:
+        """Time has passed."""
 
 
-def perform(runs: Iterable[ExperimentRun], folder: Path, jobs: int, display: RunDisplay) -> dict[str, RunResult]:
-    """Performs all runs in `jobs` worker processes and returns their results by name.
+def perform(
+    runs: Iterable[ExperimentRun], folder: Path, jobs: int, display: RunDisplay,
+    ended: Callable[[dict[str, RunResult]], None] = lambda _: None,
+) -> dict[str, RunResult]:  # fmt: skip
+    """Performs all runs in `jobs` worker processes and returns their results by name. `ended` gets the results so far.
 
     A run starts when the runs that it needs have finished, and fails when one of them failed. A result in `folder` is
     used again when the run's fields and the results that it used are the same.
     """
+    of = {run.name: run for run in runs}
     results: dict[str, RunResult] = {}
     waiting: dict[str, ExperimentRun] = {}
-    for run in runs:
+    for run in of.values():
         stored = _stored(run, folder, results) if all(name in results for name in run.needs) else None
         if stored is not None:
             results[run.name] = stored
@@ -84,34 +75,26 @@ def perform(runs: Iterable[ExperimentRun], folder: Path, jobs: int, display: Run
     for run in waiting.values():
         lacking = [name for name in run.needs if name not in waiting and name not in results]
         assert not lacking, f"{run.name} needs {lacking}, which are not among the runs"
-    display.begin(len(waiting) + len(results), len(results))
-    # One thread of linear algebra in each process, since there is a process for each core.
-    os.environ |= {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(jobs, context, initializer=_quiet, max_tasks_per_child=TASKS_A_PROCESS) as pool:
-        running: dict[Future[RunResult], ExperimentRun] = {}
-        try:
-            while waiting or running:
-                _start(waiting, running, results, jobs, pool.submit, display)
-                done, _ = wait(running, return_when=FIRST_COMPLETED) if running else (set(), set())
-                for future in done:
-                    run = running.pop(future)
-                    results[run.name] = result = future.result()
-                    _store(run, folder, results)
-                    display.ended(run.name, result)
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
+    display.begin(list(waiting), len(results))
+    with Workers(jobs) as workers:
+        while waiting or workers.busy:
+            _start(waiting, results, workers, display)
+            for report in workers.reports(REFRESH_S):
+                if report.result is None:
+                    assert report.progress is not None
+                    display.advanced(report.run, report.progress)
+                    continue
+                results[report.run] = report.result
+                _store(of[report.run], folder, results)
+                display.ended(report.run, report.result)
+                ended(results)
+            display.tick()
+    ended(results)
     return results
 
 
 def _start(
-    waiting: dict[str, ExperimentRun],
-    running: dict[Future[RunResult], ExperimentRun],
-    results: dict[str, RunResult],
-    jobs: int,
-    submit: Callable[..., Future[RunResult]],
-    display: RunDisplay,
+    waiting: dict[str, ExperimentRun], results: dict[str, RunResult], workers: Workers, display: RunDisplay
 ) -> None:
     for run in list(waiting.values()):
         failed = next((name for name in run.needs if "error" in results.get(name, {})), None)
@@ -119,17 +102,10 @@ def _start(
             del waiting[run.name]
             results[run.name] = {"error": f"{failed} failed: {results[failed]['error']}"}
             display.ended(run.name, results[run.name])
-        elif len(running) < jobs and all(name in results for name in run.needs):
+        elif workers.free and all(name in results for name in run.needs):
             del waiting[run.name]
             display.started(run.name)
-            running[submit(carry_out, run.kind, run.fields)] = run
-
-
-def _quiet() -> None:
-    """Discards what a worker prints, because the display has the terminal."""
-    null = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(null, 1)
-    os.dup2(null, 2)
+            workers.begin(run.name, run.kind, run.fields)
 
 
 def _path(run: ExperimentRun, folder: Path) -> Path:

@@ -19,12 +19,13 @@ from msgspec.structs import replace
 from apps.learning.collector import SampleCollector, collector
 from apps.pictures import draw, save_png
 from apps.rehearsal.lockstep import LOCKSTEP_PLANNER, LOCKSTEP_SETTINGS, LockstepCycle, LockstepNode
+from apps.rehearsal.progress import RehearsalProgress, Tell, ignored
 from apps.rehearsal.request import RehearsalRequest
 from cocoro import topics
 from cocoro.bus.local import LocalMesh
 from cocoro.clock import NS, VirtualClock
 from cocoro.component import load
-from cocoro.errors import CocoroError, ConfigError
+from cocoro.errors import CocoroError, ConfigError, choice_of
 from cocoro.inbox import Stream
 from cocoro.messages import Detections, Frame, Recording, TaskReply, TaskRequest, TaskState, Truth
 from cocoro.node import Node
@@ -47,16 +48,19 @@ START_S = 5.0
 """Longest time until the robot accepts a task, simulated seconds."""
 
 
-def rehearse(request: RehearsalRequest) -> dict[str, Any]:
-    """Run the tasks and return the result of the last one, as `--json` prints it, with that of each in `tasks`. Raises
-    TaskRefusedError when the robot refuses one, ConfigError for a wrong scene or service name."""
+def rehearse(request: RehearsalRequest, tell: Tell = ignored) -> dict[str, Any]:
+    """Run the tasks and return the result of the last one, as `--json` prints it, with that of each in `tasks`.
+
+    `tell` gets the progress at each state of a task. Raises TaskRefusedError when the robot refuses one, ConfigError
+    for a wrong scene or service name.
+    """
     started = time.perf_counter()
     unknown = sorted(set(request.latency) - set(PROCESSES))
     if unknown:
-        raise ConfigError(f"--latency {unknown[0]}: no such service; known are {', '.join(PROCESSES)}")
+        raise ConfigError(f"--latency {unknown[0]}: no such service; {choice_of(unknown[0], PROCESSES)}")
     if request.record is not None and Path(request.record).exists():
         raise ConfigError(f"--record {request.record}: there is such a file already")
-    result = run_virtual(_Rehearsal(request).run())
+    result = run_virtual(_Rehearsal(request, tell).run())
     result["wall_s"] = round(time.perf_counter() - started, 3)
     return result
 
@@ -70,8 +74,9 @@ class TaskRefusedError(CocoroError):
 
 
 class _Rehearsal:
-    def __init__(self, request: RehearsalRequest) -> None:
+    def __init__(self, request: RehearsalRequest, tell: Tell) -> None:
         self._request = request
+        self._tell = tell
         self._robot = Robot.load(*(Path(file) if file else None for file in (request.description, request.measured)))
         self._task: Task = request.task
         """The task that runs now."""
@@ -211,9 +216,19 @@ class _Rehearsal:
             if phase and phase == self._task.snapshot_phase != state.phase:
                 self._take_picture()
             phase = state.phase
+            self._tell(self._progress(state))
             if state.outcome is not None:
                 return state
         raise AssertionError("a stream has no end")
+
+    def _progress(self, state: TaskState) -> RehearsalProgress:
+        """How far the task is: by the samples that it is to report, or by the time that it is to last."""
+        share, said, for_s = None, "", getattr(self._task, "for_s", None)
+        if self._collector is not None and self._task is self._request.task:
+            share, said = len(self._collector) / self._task.count, self._collector.summary
+        elif for_s and state.phase == self._task.pursuit_phase:
+            share = min(state.elapsed_s / for_s, 1.0)
+        return RehearsalProgress(state.phase, state.elapsed_s, share, said)
 
     def _keep_step(self, state: TaskState) -> None:
         """Keep the result of one task, by the truth at its end."""

@@ -30,8 +30,7 @@ samples invalid (see `read`)."""
 
 
 class SharedPool:
-    """Shared memory of one publisher. It is made and mapped at once, so that the first sample is as fast as the
-    rest."""
+    """Shared memory of one publisher, made and mapped at once, so that the first sample is as fast as the rest."""
 
     def __init__(self) -> None:
         self.missed = 0

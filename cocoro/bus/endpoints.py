@@ -41,8 +41,7 @@ class ZenohConfig:
     listen: tuple[str, ...] = ()
     connect: tuple[str, ...] = ()
     lease_s: float = 4.0
-    """Time of silence (stopped, cut off) after which a process's liveliness tokens drop. Those of a killed process drop
-    immediately."""
+    """Time of silence (stopped, cut off) after which liveliness tokens drop; those of a killed process drop at once."""
     patience_s: float = 1.0
     """Longest wait for the mesh, or for a member that does not answer, when joining."""
     shared_memory: bool = False

@@ -89,8 +89,7 @@ class Membership:
 
 
 def members(directory: Path) -> list[Member]:
-    """The members of the mesh now; none when there is no such directory. Raises ConfigError when the directory is not
-    this user's alone."""
+    """Members of the mesh; none without its directory. Raises ConfigError when that is not this user's alone."""
     try:
         with private.directory(directory) as fd, _locked(directory) as locked:
             return _living(fd, tidy=locked)

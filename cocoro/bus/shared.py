@@ -23,8 +23,7 @@ from pathlib import Path
 
 PLACE = Path("/dev/shm")
 POOL_BYTES = 24 * 1024 * 1024
-"""One publisher's pool: fifteen colour and depth frames of 640 x 480. A receiver holds one or two; a stopped one
-all."""
+"""One publisher's pool: fifteen frames of 640 x 480. A receiver holds one or two; a stopped one all."""
 PROCESS_BYTES = 1_310_720
 """Zenoh's register of shared buffers, per process that publishes frames."""
 SESSION_BYTES = 12_288
@@ -70,8 +69,7 @@ def obstacle(wanted_bytes: int) -> str:
 
 
 def lockable_bytes() -> int | None:
-    """Memory that this process may lock, bytes; None for any amount. Raises the process's soft limit to its hard
-    limit."""
+    """Memory that this process may lock, bytes; None: any amount. Raises its soft limit to its hard limit."""
     with suppress(OSError, ValueError):
         capabilities = re.search(r"^CapEff:\s*([0-9a-f]+)", Path("/proc/self/status").read_text(), re.MULTILINE)
         if capabilities is not None and int(capabilities[1], 16) & _IPC_LOCK:
@@ -112,8 +110,7 @@ def drop_failed() -> int:
 
 
 def release() -> int:
-    """Removes the segments that only this process holds; for its end, after its sessions are closed. Returns their
-    number."""
+    """Removes segments that only this process holds, after its sessions are closed; returns their number."""
     removed = 0
     for fd in _held():
         with suppress(OSError):

@@ -51,6 +51,8 @@ class KeyTally(msgspec.Struct):
 
 TALLY = "tally"
 """Metadata record at the end of a complete file: counts by key, and the number of dropped and lost messages."""
+LEFT_OUT = "left_out"
+"""Metadata record with the times in which large messages were left out, since nothing happened."""
 
 
 def tally_names(channels: Mapping[int, Channel]) -> dict[int, str]:

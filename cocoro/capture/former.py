@@ -47,8 +47,7 @@ def todays_name(schema: str) -> str:
 
 
 def todays_payload(kind: str, payload: bytes | memoryview) -> bytes | memoryview:
-    """A recorded payload in today's shape of its type; as it is where no rule applies. `kind`: today's name of the
-    type."""
+    """A recorded payload in today's shape of its type `kind` (today's name); as it is where no rule applies."""
     convert = _RULES.get(kind)
     if convert is None:
         return payload

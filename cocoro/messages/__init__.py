@@ -27,6 +27,7 @@ from cocoro.messages.executive import (
     Outcome,
     Phase,
     RefusalCode,
+    ReportRequest,
     TaskReply,
     TaskRequest,
     TaskState,
@@ -72,6 +73,7 @@ __all__ = [
     "FiniteNonNegative", "FiniteQuaternion", "FiniteVec2", "FiniteVec3", "Frame", "HandSample", "Health", "Intent",
     "KnownObject", "Latch", "LatchState", "LearnedModel", "LoopHealth", "Message", "ModelReply", "ModelRequest",
     "ObjectsReply", "ObjectsRequest", "Obstacles", "Outcome", "Phase", "PlannerStatus", "Recording", "RecoverReply",
-    "RecoverRequest", "RefusalCode", "ServoCommand", "ServoReply", "ServoRequest", "ServoState", "StepRecord",
-    "TargetEstimate", "TaskReply", "TaskRequest", "TaskState", "TopicHealth", "TrueObject", "Truth", "WheelTrial",
+    "RecoverRequest", "RefusalCode", "ReportRequest", "ServoCommand", "ServoReply", "ServoRequest", "ServoState",
+    "StepRecord", "TargetEstimate", "TaskReply", "TaskRequest", "TaskState", "TopicHealth", "TrueObject", "Truth",
+    "WheelTrial",
 ]  # fmt: skip

@@ -31,15 +31,16 @@ class Park(Action, frozen=True, tag="park"):
 
 
 class Search(Action, frozen=True, tag="search"):
-    """Look all around for an object; the base stands."""
+    """Look from here for an object, at the floor that was not seen yet; the base stands."""
 
     label: str
 
 
 class Explore(Action, frozen=True, tag="explore"):
-    """Drive to a place from which hidden floor can be seen."""
+    """Drive to where unseen floor can be seen. Fails, and says what was not seen, when there is none or time is up."""
 
     label: str
+    time_is_up: bool = False
 
 
 class Approach(Action, frozen=True, tag="approach"):

@@ -47,5 +47,19 @@ class Recording(Message):
     """Longest time that the disk needed for a sync."""
     fault: str = ""
     """Why recording has stopped; empty while it works."""
+    left_out: dict[str, Count] = {}
+    """By key: large messages that were left out by intention, while nothing happened. They are no loss."""
+    occasion: str = ""
+    """What happens and is recorded whole, in words; empty while nothing does."""
+    task_id: str = ""
+    """The newest task that the file contains."""
+    rate_bytes_per_s: FiniteNonNegative = 0.0
+    """Growth on disk over the last minute."""
+    free_bytes: Count = 0
+    """Free room on the disk, without what the recorder leaves free."""
+    kept_bytes: Count = 0
+    """Size of this robot's captures, without pinned ones, when the file began."""
+    keep_bytes: Count | None = None
+    """Limit of that; None without one."""
     ended: bool = False
     """True when the recorder was stopped and its file is complete."""

@@ -46,11 +46,13 @@ class TaskRequest(msgspec.Struct, kw_only=True):
     fields."""
     timeout_s: Annotated[float, Meta(gt=0, le=3600)] | None = None
     """None: the task's own limit."""
+    asker: str = ""
+    """When the liveliness token `<robot>/<asker>/asker` is gone, the task is cancelled. Empty: nobody is watched."""
 
 
 RefusalCode = Literal[
     "unknown_label", "not_graspable", "busy", "estop", "not_alive", "battery", "holding", "not_holding", "bad_request",
-    "no_task",
+    "no_task", "asker_gone",
 ]  # fmt: skip
 
 
@@ -66,6 +68,11 @@ class TaskReply(msgspec.Struct, kw_only=True):
 class CancelRequest(msgspec.Struct, kw_only=True):
     task_id: str = ""
     """Empty: cancel the running task, whichever it is."""
+
+
+class ReportRequest(msgspec.Struct, kw_only=True):
+    task_id: str = ""
+    """Empty: the running task, or the last one."""
 
 
 class ObjectsRequest(msgspec.Struct, kw_only=True):

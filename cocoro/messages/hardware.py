@@ -23,10 +23,7 @@ class Frame(Message):
 
     def __post_init__(self) -> None:
         pixels = self.width * self.height
-        for name, have, want in (
-            ("colour", self.colour.nbytes, 3 * pixels),
-            ("depth", self.depth.nbytes, 2 * pixels),
-        ):
+        for name, have, want in (("colour", self.colour.nbytes, 3 * pixels), ("depth", self.depth.nbytes, 2 * pixels)):
             if have != want:
                 raise ValueError(f"{name} has {have} bytes, {self.width} x {self.height} needs {want}")
 

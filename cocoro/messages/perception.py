@@ -56,5 +56,8 @@ class Obstacles(Message):
     free: Annotated[tuple[FiniteVec3, ...], Meta(max_length=1024)] = ()
     """Rays over free floor from `origin_m`: bearing (rad, body frame), nearest and farthest distance (m) at which the
     floor is visible. A ray ends before the first obstacle on it."""
+    shown: Annotated[bytes, Meta(max_length=6144)] = b""
+    """Visible floor, also beyond things: bearing (degree), nearest and farthest distance (mm) of each stretch, 2 bytes
+    each, lowest first."""
     origin_m: FiniteVec2 = (0.0, 0.0)
     """The camera's position, projected on the floor."""

@@ -134,8 +134,7 @@ def listen(point: StopPoint, halt: Callable[[str], None], keep: Callable[[str], 
 
 
 def _answer_when_kept(point: StopPoint, asked: Asked, kept: Future[str], room: threading.BoundedSemaphore) -> None:
-    """Answers again when the write is done, without waiting; while the disk hangs, for `WAITING_FOR_THE_DISK`
-    senders."""
+    """Answers again when the write is done, at once; while the disk hangs, for `WAITING_FOR_THE_DISK` senders."""
 
     def answer(kept: Future[str]) -> None:
         room.release()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Annotated
 
@@ -11,9 +10,7 @@ from msgspec import Meta
 
 from cocoro.units import Positive
 from services.capture.file import Compression
-
-FOLDER = "COCORO_CAPTURE_DIR"
-"""Environment variable with the captures' folder, used when the configuration names none."""
+from services.capture.folder import default_folder
 
 
 class CaptureConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -34,11 +31,25 @@ class CaptureConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     jpeg_quality: Annotated[int, Meta(ge=1, le=100)] | None = None
     """Store the frames' colour as JPEG of this quality: far smaller, but perception cannot be re-executed from it."""
 
+    per_occasion: bool = True
+    """A new file starts when a task, a stop, a fault or motion begins, with the seconds before it, and after its end.
+    Has no effect with `file`."""
+    idle_period_s: Annotated[float, Meta(ge=0)] = 30.0
+    """While nothing happens, one frame in this time is recorded, and one of any other large message; 0: all of them.
+    Has no effect without `per_occasion`."""
+    before_s: Annotated[float, Meta(ge=0, le=3)] = 3.0
+    """Seconds of everything that are kept in memory, for the file of the next occasion."""
+    before_mb: Positive = 140.0
+    """Limit of that memory. 3 s of 30 frames of 640 x 480 take 138 MB."""
+
     rotate_mb: Positive = 2000.0
     rotate_s: Positive = 600.0
     """A new file starts at this size or length, whichever comes first."""
+    idle_rotate_s: Positive = 3600.0
+    """The same, of files in which nothing happens."""
     keep_gb: Positive | None = None
-    """With each new file the oldest captures of this robot are deleted until those in the folder take no more."""
+    """With each new file captures of this robot are deleted until those in the folder take no more: first those in
+    which nothing happened, then those of mere motion, last those with a task, a stop or a fault; the oldest first."""
     min_free_mb: Annotated[float, Meta(ge=0)] = 500.0
     """Recording stops before it leaves less room on the disk."""
 
@@ -51,8 +62,4 @@ class CaptureConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
 
 
 def folder_of(config: CaptureConfig) -> Path:
-    if config.folder is not None:
-        return Path(config.folder)
-    if explicit := os.environ.get(FOLDER):
-        return Path(explicit)
-    return Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local/state") / "cocoro" / "captures"
+    return default_folder() if config.folder is None else Path(config.folder)

@@ -197,12 +197,16 @@ class CaptureFile:
         self._write([record])
         self._attached.append(index)
 
-    def tally(self, dropped: Mapping[str, int], lost: Mapping[str, int]) -> None:
-        """Write the counts by channel, and the dropped and lost messages by key. To be called before `finish`."""
+    def tally(
+        self, dropped: Mapping[str, int], lost: Mapping[str, int], left_out: Mapping[str, int] | None = None
+    ) -> None:
+        """Write the counts by channel, and the missing messages by key. To be called before `finish`."""
         self.flush()
         names = tally_names(self._channels)
         tallies = {names[channel_id]: msgspec.to_builtins(tally) for channel_id, tally in self.tallies.items()}
         entries = {"keys": json.dumps(tallies), "dropped": json.dumps(dict(dropped)), "lost": json.dumps(dict(lost))}
+        if left_out:
+            entries["left_out"] = json.dumps(dict(left_out))
         self.metadata(TALLY, entries)
 
     def finish(self) -> int:

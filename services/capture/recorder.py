@@ -7,6 +7,7 @@ import asyncio
 import base64
 import json
 import platform
+from collections import deque
 from contextlib import suppress
 from datetime import UTC, datetime
 from typing import Any
@@ -26,6 +27,7 @@ from cocoro.stream_checks import ANY_HZ, SequenceTracker
 from cocoro.topics import ABOUT, CLOCK, RECORDING
 from services.capture.keys import ALIVE_INFO, KeyFilter, KeyInfo, QueuedMessage
 from services.capture.log_clock import WALL_CLOCK, LogClock, describe_step
+from services.capture.occasions import Occasion, OccasionNews, Watch
 from services.capture.sink import RecordingProgress, RecordingSink
 from services.capture.writer import Missing, describe_disturbance
 
@@ -35,6 +37,7 @@ TRIES, RETRY_S = 10, 1.0
 """How often a service is asked for its configuration, and the pause before the next try."""
 FETCH_S = 0.02
 """Period at which received messages are fetched. Each was stamped on arrival."""
+GROWTH_S = 60.0
 POLL_S = 0.1
 """Period of the checks for new faults and for steps of the wall clock."""
 
@@ -101,6 +104,21 @@ class Ledger:
         )
 
 
+class Growth:
+    """The growth of the captures over the last minute."""
+
+    def __init__(self) -> None:
+        self._sizes: deque[tuple[int, int]] = deque()
+
+    def rate(self, size_bytes: int, now_ns: int) -> float:
+        """Bytes per second since a minute ago; 0 at first."""
+        self._sizes.append((now_ns, size_bytes))
+        while now_ns - self._sizes[0][0] > GROWTH_S * NS and len(self._sizes) > 2:
+            self._sizes.popleft()
+        first_ns, first_bytes = self._sizes[0]
+        return max(size_bytes - first_bytes, 0) * NS / (now_ns - first_ns) if now_ns > first_ns else 0.0
+
+
 class Recorder:
     """Usage: `start`, then `report` until cancelled, `close` to stop receiving, and `end` after the sink has been
     closed."""
@@ -119,6 +137,9 @@ class Recorder:
         self._time = msgspec.msgpack.Decoder(ClockTick)
         self._newest_ns = 0
         self._alive: dict[str, bool] = {}
+        self._watch = Watch(node.robot_name, self._on_occasion)
+        self._growth = Growth()
+        self._deleted = 0
 
     def start(self) -> None:
         robot, bus = self._node.robot_name, self._node.bus
@@ -135,13 +156,18 @@ class Recorder:
     def close(self) -> None:
         for handle in self._handles:
             handle.close()
+        self._watch.close(self._log_ns(None))
 
     async def report(self) -> None:
-        """Publish progress every REPORT_S, and immediately after a new fault."""
-        fault, reported_s = "", -REPORT_S
+        """Publish progress every REPORT_S, and immediately after a new fault and when an occasion begins or ends."""
+        fault, reported_s, occasion = "", -REPORT_S, ""
         loop = asyncio.get_running_loop()
         while True:
+            self._watch.look(self._log_ns(None))
+            self._report_deleted()
             progress = self._sink.progress()
+            if (now := f"{progress.file} {progress.occasion}") != occasion:
+                occasion, reported_s = now, -REPORT_S
             if progress.fault != fault or progress.disturbed != self._disturbed:
                 fault, reported_s = progress.fault, -REPORT_S
                 self._report_faults(progress)
@@ -187,8 +213,29 @@ class Recorder:
         missing, progress = self._ledger.missing(), self._sink.progress()
         self._node.publish(
             RECORDING.of(self._node.name),
-            Recording(**progress._asdict(), dropped=dict(missing.dropped), lost=dict(missing.lost), ended=ended),
+            Recording(
+                **progress._asdict(),
+                dropped=dict(missing.dropped),
+                lost=dict(missing.lost),
+                rate_bytes_per_s=self._growth.rate(progress.size_bytes, self._log_ns(None)),
+                ended=ended,
+            ),
         )
+
+    def _on_occasion(self, what: OccasionNews, occasion: Occasion) -> None:
+        # A copy, since the writer may be in another thread.
+        self._sink.tell(what, msgspec.structs.replace(occasion))
+        if what == "begin":
+            self._node.log.info("recorded whole from now on: %s", occasion.what)
+
+    def _report_deleted(self) -> None:
+        """Log which captures made room, and put it into the node's health."""
+        deleted = self._sink.deleted()
+        for name in deleted[self._deleted :]:
+            self._node.log.info("deleted to make room for new captures: %s", name)
+        if len(deleted) > self._deleted and self._node.state == "ready":
+            self._node.ready(f"deleted {len(deleted)} captures to make room, the last of them {deleted[-1]}")
+        self._deleted = len(deleted)
 
     # --- messages ----------------------------------------------------------------------------------
 
@@ -205,6 +252,7 @@ class Recorder:
                 head = MessageHead(seq=counts.arrived)
             counts.count(head)
             self._put(counts, key, head.seq, head.stamp_ns, payload, None, arrival_ns)
+            self._watch.see(key, payload, self._newest_ns)
 
     def _advance_clock(self, payload: Payload) -> None:
         """The recorder receives every key, so the clock needs no subscription."""
@@ -224,6 +272,8 @@ class Recorder:
             self._put(counts, key, message.seq, message.stamp_ns, data, ALIVE_INFO, None)
         _, _, rest = key.partition("/")
         service, _, what = rest.partition("/")
+        if changed and what == "alive" and service != self._node.name:
+            self._watch.alive(service, alive, self._newest_ns)
         if alive and what == "alive" and service != self._node.name:
             self._node.spawn(self._ask_configuration(service))
 

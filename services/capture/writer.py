@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +18,7 @@ from cocoro.clock import NS
 from cocoro.messages import DisturbedFile
 from services.capture.file import CaptureFile, Packer
 from services.capture.keys import KeyInfo, PreparedMessage, QueuedMessage
+from services.capture.occasions import Occasion, OccasionNews
 
 MB = 1_000_000
 LOOK_S = 1.0
@@ -50,6 +52,8 @@ class Missing(NamedTuple):
 
     dropped: Mapping[str, int]
     lost: Mapping[str, int]
+    left_out: Mapping[str, int] = {}
+    """Of this file, by intention, while nothing happened; it is no loss."""
 
 
 class CaptureWriter:
@@ -71,7 +75,7 @@ class CaptureWriter:
         `release` takes the descriptor of a completed file. `prepare` may replace each message."""
         self._place = place
         self._packer = packer
-        self._limits = limits
+        self.limits = limits
         self._info = info
         self._missing = missing
         self._release = release
@@ -89,6 +93,12 @@ class CaptureWriter:
         self._closed_raw_bytes = 0
         self._ended: CaptureFile | None = None
         """The file that was closed last."""
+        self.occasion: Occasion | None = None
+        """What happens now, for a writer that records that in another way than the rest."""
+        self.left_out: Counter[str] = Counter()
+        """By key: messages that were left out since the start, by intention."""
+        self.free_bytes = 0
+        """Room on the disk at the last flush, without what stays free."""
         self.messages = 0
         """Written messages, without those of files that were removed during recording."""
         self.removed = 0
@@ -111,8 +121,7 @@ class CaptureWriter:
         if self._first_ns is None:
             self._first_ns = message.log_ns
         elif (
-            self.file.size_bytes >= self._limits.file_bytes
-            or message.log_ns - self._first_ns >= self._limits.file_s * NS
+            self.file.size_bytes >= self.limits.file_bytes or message.log_ns - self._first_ns >= self.limits.file_s * NS
         ):
             self._rotate()
             self._first_ns = message.log_ns
@@ -149,10 +158,11 @@ class CaptureWriter:
             room = os.fstatvfs(self.file.fileno())
         except OSError as error:
             raise self._failed(error) from error
-        if room.f_bavail * room.f_frsize < self._limits.min_free_bytes:
+        self.free_bytes = max(room.f_bavail * room.f_frsize - self.limits.min_free_bytes, 0)
+        if room.f_bavail * room.f_frsize < self.limits.min_free_bytes:
             self.close()
             raise CaptureError(
-                f"{self.file.path.parent}: less than {self._limits.min_free_bytes / MB:.0f} MB are free; "
+                f"{self.file.path.parent}: less than {self.limits.min_free_bytes / MB:.0f} MB are free; "
                 f"make room, or write elsewhere"
             )
 
@@ -165,6 +175,38 @@ class CaptureWriter:
             self.file.metadata(name, entries)
         except OSError as error:
             raise self._failed(error) from error
+
+    @property
+    def kept_bytes(self) -> int:
+        """Size of the captures in the folder when the file began; 0 when nobody looks after them."""
+        return 0
+
+    @property
+    def keep_bytes(self) -> int | None:
+        """Limit of that; None without one."""
+        return None
+
+    @property
+    def deleted(self) -> tuple[str, ...]:
+        """Names of the captures that made room."""
+        return ()
+
+    @property
+    def thins(self) -> bool:
+        """Whether large messages are left out now."""
+        return False
+
+    def forget(self, name: str) -> None:
+        """Later files have no metadata of this name."""
+        self._metadata.pop(name, None)
+
+    def tell(self, what: OccasionNews, occasion: Occasion) -> None:
+        """An occasion began, changed or ended."""
+
+    def rotate(self) -> None:
+        """Begin a new file."""
+        self._rotate()
+        self._first_ns = None
 
     def close(self) -> None:
         """Complete the file."""
@@ -181,8 +223,7 @@ class CaptureWriter:
             return
         self._look_at_s = now_s + LOOK_S
         if locate(self.file.path, self.file.fileno()).state != "there":
-            self._rotate()
-            self._first_ns = None
+            self.rotate()
 
     def _open(self) -> CaptureFile:
         self._number += 1

@@ -12,6 +12,7 @@ from cocoro.topics import (
     LATCH,
     OBJECTS,
     PLAN,
+    REPORT,
     RUN,
     TASK,
 )
@@ -22,7 +23,7 @@ EXECUTIVE = Component(
     doc="Runs the tasks: fetch, park, put-down; keeps the emergency stop's latch.",
     reads=(BASE_STATE, ARM_STATE, HAND_STATE, PLAN, HEALTH),
     publishes=(INTENT, TASK, LATCH),
-    serves=(RUN, CANCEL, OBJECTS, ESTOP),
+    serves=(RUN, CANCEL, REPORT, OBJECTS, ESTOP),
     needs=("base", "arm", "hand", "planning"),
     cpu_share=0.2,
 )

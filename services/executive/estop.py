@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from typing import Any
 
@@ -34,6 +36,7 @@ class Estop:
         self._reported: dict[str, LatchState] = {}
         self._all_unknown_since_ns: int | None = None
         self._state: LatchState = "unknown"
+        self._known = asyncio.Event()
         self._latch = ServiceLatch(node, self._on_change, follows=False)
         for service, topic in _STATES.items():
             node.on(topic, partial(self._hardware, service))
@@ -44,9 +47,23 @@ class Estop:
         return self._state
 
     @property
-    def words(self) -> str:
-        """The state and who caused it, for people."""
-        return f"{self._state} by {self._by}" if self._state == "latched" and self._by else self._state
+    def refusal(self) -> str:
+        """Why no task may start, and what to do; empty when the stop is released."""
+        if self._state == "released":
+            return ""
+        if self._state == "latched":
+            by = f" by {self._by}" if self._by else ""
+            return f"the emergency stop is latched{by}; release it first (cocoro reset)"
+        unheard = ", ".join(service for service in _STATES if service not in self._reported)
+        why = f"{unheard} did not report it" if unheard else "the robot has only just started"
+        return f"it is not known yet whether the emergency stop is latched ({why}); see cocoro status"
+
+    async def known(self, timeout_s: float) -> bool:
+        """Waits until the state is known, for at most `timeout_s` by the machine's clock; returns whether it is."""
+        with suppress(TimeoutError):
+            async with asyncio.timeout(timeout_s):
+                await self._known.wait()
+        return self._known.is_set()
 
     def _hardware(self, service: str, state: BaseState | ServoState) -> None:
         latch = state.latch
@@ -70,6 +87,7 @@ class Estop:
     def _on_change(self, state: LatchState, by: str) -> None:
         if state != self._state:
             self._state, self._by = state, by
+            self._known.set()
             self._changed(state == "latched", by)
             self._publish()
 

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import asyncio
+from collections import deque
 from collections.abc import Awaitable, Callable
+from copy import copy
 from typing import Any
 
 from cocoro import topics
 from cocoro.clock import NS
 from cocoro.entry_points import added_to
+from cocoro.errors import choice_of
 from cocoro.messages import (
     BaseState,
     CancelRequest,
@@ -19,6 +22,7 @@ from cocoro.messages import (
     Outcome,
     Phase,
     RefusalCode,
+    ReportRequest,
     TaskReply,
     TaskRequest,
     TaskState,
@@ -27,6 +31,7 @@ from cocoro.messages.actions import TASK_GROUP, Idle
 from cocoro.node import Node
 from cocoro.objects import Catalogue
 from cocoro.tasks import Task, TaskFailedError
+from services.executive.askers import Askers
 from services.executive.config import ExecutiveConfig
 from services.executive.estop import Estop
 from services.executive.skills import PlannerSkills
@@ -34,6 +39,11 @@ from services.executive.tasks import TASKS
 
 Ending = tuple[Outcome, str | Awaitable[str]]
 """A task's outcome and its reason, which may still have to be found out."""
+LOOK_S = 0.02
+"""Time between two looks whether a service that is not heard has died."""
+GONE = "the command or program that asked for it has ended, or is not heard any more"
+REMEMBERED = 64
+"""How many ended tasks the executive knows."""
 _CLOCK_STANDS_S = 1.0
 """A clock that takes longer than this for 20 ms stands still."""
 
@@ -44,6 +54,8 @@ class Executive:
         self._config = config
         self._catalogue = catalogue
         self._alive: set[str] = set()
+        self._unheard: dict[str, str] = {}
+        """By needed service that the task waits for: what is known of it."""
         self._unreadable: dict[str, str] = {}
         """By service: the input that it cannot read, and the reason."""
         self._running: asyncio.Task[Any] | None = None
@@ -51,15 +63,26 @@ class Executive:
         """Gets the running task's outcome when something outside of it ends it."""
         self._count = 0
         self.state = TaskState()
+        self._asker = ""
+        """Who asked for the running task and is watched; empty when nobody is."""
+        self._over: deque[TaskState] = deque(maxlen=REMEMBERED)
         self._base = node.latest(topics.BASE_STATE)
         self._publisher = node.publisher(topics.TASK)
         self._skills = PlannerSkills(node, config, catalogue, self._enter_phase)
+        self._askers = Askers(node, self._on_asker_gone)
         self._estop = Estop(node, config.latch_hz, self._on_latch)
         node.watch_alive(self._on_alive)
         node.on(topics.HEALTH, self._on_health, service="*")
         node.serve(topics.RUN, self._run)
         node.serve(topics.CANCEL, self._cancel)
+        node.serve(topics.REPORT, self._report)
         node.serve(topics.OBJECTS, self._objects)
+
+    async def settle(self) -> None:
+        """Wait until it is known whether the emergency stop is latched, so that a robot that is up takes a task. Does
+        not wait long, because a part that reports it may be broken."""
+        if not await self._estop.known(self._config.latch_wait_s):
+            self._node.log.warning("%s", self._estop.refusal)
 
     async def publish_progress(self) -> None:
         """Publish the task's progress until the service is ended."""
@@ -73,6 +96,10 @@ class Executive:
             task = TASKS.read(request.task)
         except ValueError as error:
             return TaskReply(accepted=False, refusal="bad_request", text=_with_faults(str(error)))
+        # All that follows happens at once, so that an asker who leaves after this finds his task running.
+        gone = bool(request.asker) and not await self._askers.present(request.asker)
+        if gone:
+            return TaskReply(accepted=False, refusal="asker_gone", text=GONE)
         refusal = self._refusal(task)
         if refusal is not None:
             code, text = refusal
@@ -82,6 +109,7 @@ class Executive:
         task_id = f"{task.name}-{now_ns}-{self._count}"
         self.state = TaskState(task_id=task_id, task=task.name, label=task.target, phase="start", started_ns=now_ns)
         self._skills.measures = self.state.measures
+        self._asker = request.asker
         self._ended = asyncio.get_running_loop().create_future()
         timeout_s = request.timeout_s or task.limit_s(self._config)
         self._running = self._node.spawn(self._carry_out(task, timeout_s, self._ended))
@@ -92,15 +120,15 @@ class Executive:
         if task.needs_label:
             known = self._catalogue.get(task.target)
             grasping = task.needs_label == "graspable"
-            targets = ", ".join(item.label for item in self._catalogue.targets if item.graspable or not grasping)
+            targets = [item.label for item in self._catalogue.targets if item.graspable or not grasping]
             if known is None or known.marker:
-                return "unknown_label", f"unknown object {task.target!r}; known are {targets}"
+                return "unknown_label", f"unknown object {task.target!r}; {choice_of(task.target, targets)}"
             if grasping and not known.graspable:
-                return "not_graspable", f"{task.target} does not fit into the hand; what does: {targets}"
+                return "not_graspable", f"{task.target} does not fit into the hand; what does: {', '.join(targets)}"
         if self._running is not None:
             return "busy", f"{self._what()} is running; cancel it first (cocoro cancel)"
-        if self._estop.state != "released":
-            return "estop", f"the emergency stop is {self._estop.words}; release it first (cocoro reset)"
+        if stopped := self._estop.refusal:
+            return "estop", stopped
         missing = [service for service in self._config.needed if service not in self._alive]
         if missing:
             return "not_alive", f"{self._what_of(missing)}; see cocoro status"
@@ -134,6 +162,10 @@ class Executive:
             return TaskReply(accepted=False, refusal="no_task", text="no such task is running")
         self._end("cancelled", "by the operator")
         return TaskReply(accepted=True, task_id=self.state.task_id)
+
+    async def _report(self, request: ReportRequest) -> TaskState:
+        known = (self.state, *self._over)
+        return next((state for state in known if request.task_id in ("", state.task_id)), TaskState())
 
     async def _objects(self, request: ObjectsRequest) -> ObjectsReply:
         status = self._skills.status
@@ -217,6 +249,7 @@ class Executive:
         self.state.text = reason or outcome
         self._node.log.info("%s %s %s", self._what(), outcome, reason)
         self._publish()
+        self._over.append(copy(self.state))
 
     def _end(self, outcome: Outcome, reason: str | Callable[[], Awaitable[str]]) -> None:
         """End the running task from outside. `reason` may be a function that begins to find out the reason."""
@@ -235,10 +268,34 @@ class Executive:
         self._alive.discard(service)
         self._unreadable.pop(service, None)
         if service in self._config.needed:
-            self._end("failed", lambda: self._node.spawn(self._lost(service)))
+            if not self._node.contact.lives(service):
+                self._end("failed", lambda: self._node.spawn(self._lost(service)))
+            elif service not in self._unheard:
+                self._unheard[service] = f"lost contact with {service}"
+                self._skills.pause(True)
+                self._node.spawn(self._wait_for(service))
 
     async def _lost(self, service: str) -> str:
         return f"not_alive: {await self._node.contact.lost(service)}"
+
+    async def _wait_for(self, service: str) -> None:
+        """End the task when a service with a living process is not heard again in time, or dies meanwhile. Until then
+        the robot stands. The time is that of the loop: the simulator may be what is not heard."""
+        contact, loop = self._node.contact, asyncio.get_running_loop()
+        end_s = loop.time() + self._config.contact_s
+        why = self._unheard[service] = await contact.lost(service)
+        self._node.log.warning("%s", why)
+        while service not in self._alive and contact.lives(service) and loop.time() < end_s:  # noqa: ASYNC110 # a lock
+            await asyncio.sleep(LOOK_S)
+        del self._unheard[service]
+        if not self._unheard:
+            self._skills.pause(False)
+        if service not in self._alive:
+            self._end("failed", f"not_alive: {f'{service} died' if contact.dead(service) else why}")
+
+    def _on_asker_gone(self, asker: str) -> None:
+        if asker == self._asker:
+            self._end("cancelled", f"asker_gone: {GONE}")
 
     def _on_health(self, health: Health) -> None:
         """End the task when a needed service can no longer read its input: it is as good as dead, and reports why."""
@@ -279,6 +336,8 @@ class Executive:
             state.elapsed_s = self._elapsed_s()
             if status is not None:
                 state.text, state.distance_m = status.why, status.distance_m
+            if waits := self._skills.waits or next(iter(self._unheard.values()), ""):
+                state.text = waits
         state.stamp_ns = self._node.now_ns()
         self._publisher.put(state)
 

@@ -15,6 +15,7 @@ async def run(node: Node, config: ExecutiveConfig) -> None:
     """Take tasks until the service is ended."""
     catalogue = Catalogue.load(Path(config.objects) if config.objects else None)
     executive = Executive(node, config, catalogue)
+    await executive.settle()
     node.ready()
     await executive.publish_progress()
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -60,7 +61,7 @@ class PerceptionCore:
         self._max_gap_ns = round(config.max_head_gap_s * NS)
         self._pending: deque[_Pending] = deque()
         self._floor = FloorScanner(robot, config)
-        self._floor_ns: int | None = None
+        self._floor_period: int | None = None
         self._now_ns = 0
         self.stale_frames = 0
         """Frames that were ignored because they were too old."""
@@ -79,7 +80,7 @@ class PerceptionCore:
         if now_ns < self._now_ns:  # the clock restarted: the earlier epoch's data are meaningless
             self._pending.clear()
             self._head.clear()
-            self._floor_ns = None
+            self._floor_period = None
         self._now_ns = now_ns
         for sample in inputs:
             if isinstance(sample.message, ServoState):
@@ -128,10 +129,12 @@ class PerceptionCore:
         return outputs
 
     def _floor_due(self, stamp_ns: int) -> bool:
-        if self._floor_ns is not None and 0 <= stamp_ns - self._floor_ns < 0.99 * NS / self._config.floor_rate_hz:
-            return False
-        self._floor_ns = stamp_ns
-        return True
+        """The first frame of each period by the clock: which frames these are does not depend on earlier ones for
+        long, so that a core that begins in the middle of a run soon does the same."""
+        edge = 0.01  # of a period, so that frames of just this rate are not at its edges
+        period = math.floor(stamp_ns * self._config.floor_rate_hz / NS - edge)
+        due, self._floor_period = period != self._floor_period, period
+        return due
 
     def _scanned(self, pending: _Pending, angles: FloatArray) -> Obstacles:
         assert pending.floor_depth_m is not None

@@ -26,6 +26,12 @@ BLOCKS = 30, 40
 """Rows and columns of the blocks whose nearest depth is told."""
 STEP_M = 0.014
 _RAYS = round(360 / _RAY_DEG)
+_ROW_RAD, _CAMERA_M = 0.0125, 0.73
+"""Angle between two rows of the grid, and the camera's height."""
+_NEAR_M = 1.0
+"""Nearer, neighbouring pixels may be more than a degree apart."""
+_GAP = 2.2
+"""Floor is shown without a gap where two pixels are less than so many rows apart."""
 
 
 class FloorScanner:
@@ -80,6 +86,7 @@ class FloorScanner:
             ),
             lowest_m=tuple(round(z, 3) for z in lowest.tolist()),
             free=_free(ray, distance, floor, standing),
+            shown=_shown(bearing, distance, floor),
             origin_m=(float(origin[0]), float(origin[1])),
         )
 
@@ -125,3 +132,30 @@ def _free(
     rays = np.flatnonzero(farthest > nearest)
     found = zip(bearings[rays].tolist(), nearest[rays].tolist(), farthest[rays].tolist(), strict=True)
     return tuple((round(bearing, 4), round(near, 3), round(far, 3)) for bearing, near, far in found)
+
+
+def _shown(bearing_rad: FloatArray, distance_m: FloatArray, floor: BoolArray) -> bytes:
+    """`Obstacles.shown` by the points' bearings and distances (n,) from the camera."""
+    runs: list[FloatArray] = []
+    for part, width_deg in ((distance_m < _NEAR_M, 2), (distance_m >= _NEAR_M, 1)):
+        degree = np.floor(np.degrees(bearing_rad[part]) / width_deg).astype(np.int64) * width_deg % 360
+        order = np.lexsort((distance_m[part], degree))
+        degree, away, flat = degree[order], distance_m[part][order], floor[part][order]
+        if not flat.any():
+            continue
+        begins = np.ones(len(degree), dtype=bool)
+        rows_m = _GAP * _ROW_RAD * (away[1:] ** 2 / _CAMERA_M + _CAMERA_M)
+        begins[1:] = (degree[1:] != degree[:-1]) | ~flat[:-1] | (np.diff(away) > rows_m)
+        begins &= flat
+        ends = np.append(begins[1:] | ~flat[1:], True) & flat
+        first, last = np.flatnonzero(begins), np.flatnonzero(ends)
+        long = last > first
+        first, last = first[long], last[long]
+        runs.extend(
+            np.stack([(degree[first] + more) % 360, away[first], away[last]], axis=1) for more in range(width_deg)
+        )
+    if not runs:
+        return b""
+    found = np.concatenate(runs)
+    data: bytes = np.round(found * (1.0, 1000.0, 1000.0)).astype("<u2").tobytes()
+    return data

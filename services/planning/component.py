@@ -28,4 +28,5 @@ PLANNING = Component(
     needs=("base", "arm", "hand", "perception"),
     cpu_share=0.4,
     rss_mb=200.0,
+    libraries=("numpy", "scipy", "opencv-python-headless"),
 )

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 import msgspec
+from msgspec import Meta
 
 from cocoro.units import Positive
 
@@ -34,11 +35,42 @@ class HeadConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Pan to the first side before the sweep of the whole range."""
     sweep_tilts_rad: tuple[float, float] = (-0.30, -0.92)
     """For the floor from 0.9 m on, and from 0.2 to 1.2 m (the camera is 0.73 m high)."""
+    middle_tilt_rad: float = -0.60
+    middle_m: tuple[float, float] = (0.55, 1.0)
+    """At the middle tilt the camera sees the floor from the first distance on. Floor nearer than the second belongs to
+    the near tilt of a sweep where both are needed."""
+    view_rad: Positive = 0.38
+    """Half of the width that a glance shows for certain; half of the camera's field of view is 0.5."""
+    between_speed_radps: Positive = 2.5
+    """Speed between two parts of the floor that are to be looked at."""
     tilt_range_rad: tuple[float, float] = (-1.2, 0.5)
     """Below it the camera sees the robot itself, and its housing comes near the mount."""
     fixate_speed_radps: Positive = 4.0
     look_where_it_was_s: Positive = 1.5
     """Time for which a remembered object is looked for at its place before a sweep."""
+
+
+class SearchConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The search for an object that is not in view: the floor that must be seen, and from where."""
+
+    radius_m: Annotated[float, Meta(gt=0, le=2.8)] = 2.0
+    """The floor is searched up to this distance from where the task began."""
+    sight_m: Positive = 2.6
+    """Distance up to which floor counts as seen: the smallest object is found there."""
+    turning_radps: Positive = 1.4
+    """A camera that turns faster finds nothing."""
+    margin_m: Positive = 0.5
+    """How far into unseen floor a place to look from is expected to see."""
+    outside_m: float = 0.3
+    """How far outside of the radius the robot goes to look into it."""
+    least_m2: Positive = 0.01
+    """Least unseen floor for which the robot goes to another place."""
+    drive_mps: Positive = 0.2
+    turn_radps: Positive = 0.7
+    look_s: Positive = 5.0
+    """Speeds on the way and time for a look, by which places to look from are compared."""
+    steady_s: Positive = 0.3
+    """Time for which the head rests at the end of a look."""
 
 
 class NavigationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -163,15 +195,19 @@ class PlanningConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     sight: HandSightConfig = HandSightConfig()
     memory: MemoryConfig = MemoryConfig()
     head: HeadConfig = HeadConfig()
+    search: SearchConfig = SearchConfig()
     navigation: NavigationConfig = NavigationConfig()
     arm: ArmConfig = ArmConfig()
     hand: HandConfig = HandConfig()
     follow: FollowConfig = FollowConfig()
     blind_periods: Positive = 2.0
-    """Perception may be silent for this many of its own periods where that is longer than `Base.command_timeout_s`, so
-    that a slow perception does not stop the robot."""
+    """The robot drives on without news of perception for this many of perception's own periods where that is longer
+    than `Base.command_timeout_s`, so that a slow perception does not stop it."""
     blind_for_good_s: Positive = 5.0
-    """A task that needs sight fails when perception is silent for this much longer."""
+    """A task that needs sight fails when there is no news of perception for this much longer. Until then the robot
+    stands, and goes on when there is some."""
+    stale_for_good_s: Positive = 5.0
+    """The same for the states of base, arm and hand, which every task needs."""
     odometry_gap_s: Positive = 0.1
     """Longest gap over which odometry is interpolated."""
     stale_target_s: Positive = 4.0

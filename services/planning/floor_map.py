@@ -191,7 +191,7 @@ class FloorMap:
         if ((at >= _EDGE_CELLS) & (at < SIZE - _EDGE_CELLS)).all():
             return
         shift = at - SIZE // 2
-        to, source = _overlap(-shift)
+        to, source = overlap(-shift)
         for cells in (self._evidence, self._looked, self._lowest, self._highest, self._confirmed_ns):
             moved = np.zeros_like(cells)
             moved[to] = cells[source]
@@ -203,6 +203,11 @@ class FloorMap:
     def _index(self, points_m: FloatArray) -> IntArray:
         index: IntArray = np.floor(np.asarray(points_m)[:, :2] / CELL_M).astype(np.int64) - self._corner
         return index
+
+    @property
+    def corner(self) -> IntArray:
+        """Index of the map's first cell, (2,), counted in cells from the odometry frame's origin."""
+        return self._corner
 
     def centre(self, row: int, column: int) -> tuple[float, float]:
         """A cell's centre (x, y), odometry frame, metres."""
@@ -278,7 +283,7 @@ def _inside(points: FloatArray, centres: FloatArray, radii: FloatArray) -> BoolA
     return inside
 
 
-def _overlap(shift: IntArray) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
+def overlap(shift: IntArray) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
     """Destination and source slices for an array that moves by `shift` (2,) cells."""
     to, source = [], []
     for step in shift:

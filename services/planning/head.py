@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from math import atan2, cos, hypot, sin
+from typing import NamedTuple
 
 import numpy as np
 
@@ -77,6 +78,51 @@ class Sweep:
                 return pan, tilt
             self.swept += 1
         return self._corners[-1]
+
+
+class Glance(NamedTuple):
+    """Where the head goes next: pan and tilt, rad, and the speed, rad/s."""
+
+    pan_rad: float
+    tilt_rad: float
+    speed_radps: float
+
+
+def glances(config: HeadConfig, pan_rad: float, floor: FloatArray) -> list[Glance]:
+    """The way of the head over parts of the floor: bearings, rad, and distances, m, of places (n, 2), body frame.
+
+    It passes slowly over the parts and fast between them, at one tilt, or where floor near the robot is wanted at two.
+    """
+    far, near = config.sweep_tilts_rad
+    close = floor[:, 1] < config.middle_m[0]
+    rows = [(far, floor[floor[:, 1] >= config.middle_m[1]]), (near, floor[floor[:, 1] < config.middle_m[1]])]
+    if not close.any():
+        rows = [(config.middle_tilt_rad, floor)]
+    way: list[Glance] = []
+    for tilt, places in rows:
+        if not len(places):
+            continue
+        parts = _parts(np.sort(places[:, 0]), config)
+        last = way[-1].pan_rad if way else pan_rad
+        if abs(parts[0][0] - last) > abs(parts[-1][1] - last):
+            parts = [(end, begin) for begin, end in reversed(parts)]
+        for begin, end in parts:
+            way.append(Glance(begin, tilt, config.between_speed_radps))
+            way.append(Glance(end, tilt, config.sweep_speed_radps))
+    return way
+
+
+def _parts(bearings_rad: FloatArray, config: HeadConfig) -> list[tuple[float, float]]:
+    """First and last pan, rad, for each group of bearings (n,), sorted."""
+    groups = np.split(bearings_rad, np.flatnonzero(np.diff(bearings_rad) > 2 * config.view_rad) + 1)
+    parts = []
+    for group in groups:
+        low, high = float(group[0]) + config.view_rad, float(group[-1]) - config.view_rad
+        if low > high:
+            low = high = (low + high) / 2
+        limit = config.sweep_pan_rad
+        parts.append((min(max(low, -limit), limit), min(max(high, -limit), limit)))
+    return parts
 
 
 class CameraTilt:

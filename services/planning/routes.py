@@ -45,6 +45,10 @@ class Routes:
         cell = self._floor.cell(x_m, y_m)
         return float(self._distance[cell[0] * SIZE + cell[1]]) if cell is not None else float("inf")
 
+    def costs(self) -> FloatArray:
+        """`cost` of the path to every cell, (SIZE, SIZE)."""
+        return self._distance.reshape(SIZE, SIZE)
+
     def path(self, x_m: float, y_m: float) -> list[tuple[float, float]]:
         """Cell centres from the start to a place, odometry frame, metres; empty where there is no path."""
         cell = self._floor.cell(x_m, y_m)

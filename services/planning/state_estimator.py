@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Mapping
 from itertools import compress
-from math import cos, sin
+from math import cos, hypot, inf, sin
 from typing import Any, NamedTuple
 
 import msgspec
@@ -23,24 +23,27 @@ from cocoro.topics import Topic
 from cocoro.units import Vec3
 from services.planning.config import PlanningConfig
 from services.planning.floor_map import Solid
-from services.planning.head import CameraTilt
+from services.planning.head import PAN, TILT, CameraTilt
 from services.planning.memory import TargetMemory
+from services.planning.seen_floor import SeenFloor
 from services.planning.seen_through import VIEW_BYTES, DepthView
 from services.planning.surroundings import Surroundings
 
 _WAIT_FOR_ODOMETRY_NS = NS // 5
 _JUST_SEEN_S = 0.5
 """An object that a frame does not show, but which was seen so shortly before it, is still in it."""
+_GLIMPSE_NS = NS // 20
+"""Time over which the camera's turn is measured."""
 FLOOR_M, FLOOR_PER_M = 0.040, 0.012
 """Height below which a point counts as floor for a tilted camera, and its growth per metre of distance: more than
 perception's limit, because a tilted camera is likely to be rolled a little, too."""
 
 
 class PerceptionWatch:
-    """Whether perception is alive, by the arrival of its messages, however slow it is and even if it sees nothing."""
+    """Whether perception is late, by the arrival of its messages, however slow it is and even if it sees nothing."""
 
     def __init__(self, least_s: float, periods: float) -> None:
-        """It may be silent for `least_s`, or for `periods` of its own periods where that is longer."""
+        """It has `least_s` for a message, or `periods` of its own periods where that is longer."""
         self._least_ns = round(least_s * NS)
         self._periods = periods
         self._arrived_ns: int | None = None
@@ -62,8 +65,13 @@ class PerceptionWatch:
             self._blind_since_ns = now_ns
         return (now_ns - self._blind_since_ns) / NS
 
+    def unheard_s(self, now_ns: int) -> float:
+        """Time since the last arrival; since the first call of `blind_s` where nothing has arrived yet."""
+        since_ns = self._arrived_ns if self._arrived_ns is not None else self._blind_since_ns
+        return 0.0 if since_ns is None else max(now_ns - since_ns, 0) / NS
+
     def age_s(self, now_ns: int) -> float:
-        """Time since the last arrival, less the extra silence that a slow perception may have."""
+        """Time since the last arrival, less the extra time that a slow perception has."""
         if self._arrived_ns is None or now_ns < self._arrived_ns:
             return float("inf")
         return max(now_ns - self._arrived_ns - (self._patience_ns() - self._least_ns), 0) / NS
@@ -138,6 +146,7 @@ class StateEstimator:
         self._postures: dict[str, tuple[tuple[str, ...], History]] = {}
         self._gap_ns = round(config.odometry_gap_s * NS)
         self.around = Surroundings(config.marker, {label: item.planar_radius_m for label, item in self._known.items()})
+        self.seen = SeenFloor(config.search, robot)
         self._waiting: deque[Detections] = deque(maxlen=8)
         self._floors: deque[Obstacles] = deque(maxlen=4)
         self._localised_ns = 0
@@ -166,6 +175,7 @@ class StateEstimator:
                 # The base restarted with a new odometry frame; positions in the old frame are void.
                 self.memory.clear()
                 self.around.clear()
+                self.seen.clear()
                 self._floors.clear()
                 self._waiting.clear()
                 self._localised_ns = 0
@@ -229,6 +239,17 @@ class StateEstimator:
                 view = DepthView(self._robot, seen.nearest, angles) if len(seen.nearest) == VIEW_BYTES else None
                 known = self._solids(seen.stamp_ns)
                 self.around.floor.enter(seen, Pose2(*pose.tolist()), own(angles), known, view)
+                self.seen.enter(seen, Pose2(*pose.tolist()), self._turning_radps(seen.stamp_ns))
+
+    def _turning_radps(self, stamp_ns: int) -> float:
+        """The rate at which the camera turned before a time; infinite where that is not known."""
+        before_ns = stamp_ns - _GLIMPSE_NS
+        angles, before = self._posture_at(stamp_ns), self._posture_at(before_ns)
+        pose, pose_before = (self._odometry.at(at_ns, self._gap_ns) for at_ns in (stamp_ns, before_ns))
+        if angles is None or before is None or pose is None or pose_before is None:
+            return inf
+        pan = angles[PAN] - before[PAN] + float(pose[2] - pose_before[2])
+        return hypot(pan, angles[TILT] - before[TILT]) * NS / _GLIMPSE_NS
 
     def _solids(self, stamp_ns: int) -> list[Solid]:
         """The known objects that a frame shows, and where those are that were seen shortly before it."""
@@ -320,8 +341,12 @@ class StateEstimator:
         return ""
 
     def blind_s(self, now_ns: int) -> float | None:
-        """Time, s, for which perception has exceeded its permitted silence; None while it has not."""
+        """Time, s, for which perception has been later than it may be; None while it is not."""
         return self._sight.blind_s(now_ns)
+
+    def unseen_s(self, now_ns: int) -> float:
+        """Time, s, since perception's last message arrived."""
+        return self._sight.unheard_s(now_ns)
 
     def _age_s(self, topic: Topic[Any], now_ns: int) -> float:
         """Age, s, of a topic's newest message by its stamp, or by its arrival where the stamp is in the future."""

@@ -73,6 +73,14 @@ class Surroundings:
             self._built, self._built_ns = what, now_ns
         return self._fields
 
+    def discs(self, known: Sequence[TargetEstimate]) -> tuple[tuple[float, float, float], ...]:
+        """The floor (x, y, radius), odometry frame, metres, that known objects stand on."""
+        return tuple(
+            (*item.odometry_position_m[:2], self._radii_m.get(item.label, _OBJECT_M))
+            for item in known
+            if item.label != self._marker
+        )
+
     def unseen(self, places_m: FloatArray) -> FloatArray:
         """Which places (n, 2), odometry frame, were not seen yet; shape (n,)."""
         looked = self.floor.looked_at()

@@ -14,5 +14,5 @@ WIRE = Component(
     start_s=60.0,
     cpu_share=1.0,
     rss_mb=600.0,
-    libraries=("pybullet", "moderngl"),
+    libraries=("pybullet", "moderngl", "opencv-python-headless"),
 )

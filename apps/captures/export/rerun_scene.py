@@ -1,17 +1,14 @@
 """The Rerun viewer: pictures, depth points, the robot, believed and true objects, curves and phases.
 
-`RerunScene` logs one message at a time, from a capture (`--rrd`, `cocoro view FILE`) or live (`cocoro view`). Needs
-the package rerun-sdk, an extra.
+`RerunScene` logs one message at a time, from a capture (`--rrd`, `cocoro view FILE`) or live (`cocoro view`). With a
+stage the simulated robot and its scene are there too, seen from outside. Needs the package rerun-sdk, an extra.
 """
 
 from __future__ import annotations
 
-import os
-import sysconfig
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -37,6 +34,10 @@ from cocoro.messages import (
 from cocoro.objects import Catalogue
 from cocoro.robot import Robot
 
+if TYPE_CHECKING:
+    from apps.captures.export.rerun_stage import StageLogger
+    from sim.outside import OutsideStage
+
 APPLICATION = "cocoro"
 TIMELINE = "robot"
 """Name of the time line of stamps."""
@@ -54,43 +55,31 @@ def library() -> Any:
     return rerun
 
 
-def export(capture: Capture, out: Path, progress: Callable[[float], None] = lambda _: None) -> int:
+def export(
+    capture: Capture,
+    out: Path,
+    progress: Callable[[float], None] = lambda _: None,
+    stage: OutsideStage | None = None,
+) -> int:
     """Write a recording that Rerun opens. Returns the number of messages in it. Raises CaptureError when it cannot be
     written."""
     rr = library()
     with making(out):
         recording = rr.RecordingStream(APPLICATION)
         recording.save(str(out))
-        count = log_capture(capture, recording, progress)
+        count = log_capture(capture, recording, progress, stage)
         recording.flush()
         return count
 
 
-def opened(rr: Any) -> Any:
-    """Open a viewer and return the recording that it shows. Raises CaptureError when the viewer does not start."""
-    beside_us = sysconfig.get_path("scripts")  # the viewer's folder, which need not be in PATH
-    os.environ["PATH"] = os.pathsep.join(filter(None, (beside_us, os.environ.get("PATH"))))
-    recording = rr.RecordingStream(APPLICATION)
-    with no_viewer():
-        recording.spawn()
-    return recording
-
-
-@contextmanager
-def no_viewer() -> Iterator[None]:
-    """Turns the error of a viewer that does not start, or has gone, into a CaptureError."""
-    try:
-        yield
-    except RuntimeError as error:
-        raise CaptureError(
-            "Rerun's viewer could not be opened, or has gone; it needs a screen. "
-            "`cocoro export FILE --rrd OUT.rrd` makes a file that it opens elsewhere"
-        ) from error
-
-
-def log_capture(capture: Capture, recording: Any, progress: Callable[[float], None] = lambda _: None) -> int:
+def log_capture(
+    capture: Capture,
+    recording: Any,
+    progress: Callable[[float], None] = lambda _: None,
+    stage: OutsideStage | None = None,
+) -> int:
     """Log every message of a capture to a recording. Returns their number."""
-    scene = RerunScene(recording, robot_of(capture), catalogue_of(capture))
+    scene = RerunScene(recording, robot_of(capture), catalogue_of(capture), stage)
     count = 0
     for record in capture.messages():
         try:
@@ -107,15 +96,21 @@ def log_capture(capture: Capture, recording: Any, progress: Callable[[float], No
 class RerunScene:
     """Logs messages to a recording, at their stamps."""
 
-    def __init__(self, recording: Any, robot: Robot, catalogue: Catalogue) -> None:
-        self._rr = library()
+    def __init__(self, recording: Any, robot: Robot, catalogue: Catalogue, stage: OutsideStage | None = None) -> None:
+        self._rr = rr = library()
         self._to = recording
         self._robot = robot
         self._catalogue = catalogue
         self._posture = Posture(robot)
         self._phase = ""
         self._why = ""
-        self._log("world", self._rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        self._stage: StageLogger | None = None
+        self._log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        if stage is not None:
+            from apps.captures.export.rerun_stage import StageLogger
+
+            self._stage = StageLogger(rr, recording, stage)
+            recording.send_blueprint(self._stage.layout())
 
     def log(self, topic: str, message: Message) -> None:
         """`topic` is the key without the robot's name."""
@@ -228,7 +223,9 @@ class RerunScene:
         self._phase = phase
 
     def _truth(self, truth: Truth) -> None:
-        """In the body frame, as the believed objects."""
+        """In the body frame, as the believed objects; with a stage also in the world's."""
+        if self._stage is not None:
+            self._stage.log(truth)
         there = [item for item in truth.objects if item.kind == "object"]
         back = conjugate(truth.body_orientation)
         places = []

@@ -16,6 +16,7 @@ from cocoro.messages import BaseCommand, TargetEstimate
 from cocoro.robot import Robot
 from services.planning.arm import ArmController, ArmStep
 from services.planning.config import PlanningConfig
+from services.planning.floor_map import FloorMap
 from services.planning.hand import Grip
 from services.planning.head import CameraTilt, Gaze
 from services.planning.navigation import Driver
@@ -101,6 +102,12 @@ class Snapshot:
             known.append(target)
         return self.estimator.around.fields(label, known, self.now_ns, ignore)
 
+    @property
+    def stands_around(self) -> tuple[FloorMap, tuple[tuple[float, float, float], ...]]:
+        """The floor map, and the discs (x, y, radius), odometry frame, m, of the known objects."""
+        around = self.estimator.around
+        return around.floor, around.discs(self.estimator.memory.all(self.body, self.now_ns, sure=True))
+
     def unseen_under_swing(self) -> tuple[float, float] | None:
         """Middle of the unseen floor under the arm's swing, odometry frame, m; None when all of it was seen. The floor
         under the robot does not count."""
@@ -140,7 +147,7 @@ class Plan:
     arm: ArmStep
     why: str
     head: tuple[float, float, float] | None = None
-    """Pan and tilt, rad, and speed, rad/s; None holds the head where it is."""
+    """Pan and tilt, rad, and speed, rad/s; None leaves the head at the goal before."""
     state: State = "running"
     reason: str = ""
     distance_m: float | None = None
@@ -154,7 +161,7 @@ class Behaviour(Protocol):
 
     @property
     def needs_sight(self) -> bool:
-        """Whether it drives or looks for something, so that it pauses while perception is silent."""
+        """Whether it drives or looks for something, so that it pauses while perception is late."""
 
     def step(self, snapshot: Snapshot) -> Plan: ...
 

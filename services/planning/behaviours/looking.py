@@ -2,27 +2,37 @@
 
 from __future__ import annotations
 
-from math import atan2
+from math import atan2, hypot
 
 from cocoro.clock import NS
 from cocoro.frames import Pose2
 from cocoro.messages.actions import Explore, Idle, Park, Search
 from services.planning.behaviours.base import Plan, Snapshot, planar_m
+from services.planning.behaviours.driving import BackOff
 from services.planning.course import Course
-from services.planning.floor_map import CELL_M, SIZE
-from services.planning.head import PAN, TILT, Sweep
+from services.planning.floor_map import CELL_M
+from services.planning.head import PAN, TILT, Glance, Sweep, glances
+from services.planning.seen_floor import Rest, Viewpoint, describe
 
 
 class Idling:
-    """Stands still and holds everything as it is."""
+    """Stands still and holds everything as it is: also a head and claws that the task before had sent somewhere."""
 
     needs_sight = False
+    HEAD_RADPS = 1.0
 
     def __init__(self, action: Idle, why: str = "nothing is asked") -> None:
         self._why = why
+        self._halted = False
 
     def step(self, snapshot: Snapshot) -> Plan:
-        return Plan(snapshot.actuators.driver.halt(), snapshot.still(), self._why, state="done")
+        plan = Plan(snapshot.actuators.driver.halt(), snapshot.still(), self._why, state="done")
+        hand = snapshot.estimator.hand
+        if not self._halted and hand is not None:
+            self._halted = True
+            snapshot.actuators.grip.halt(hand)
+            plan.head = (snapshot.angles[PAN], snapshot.angles[TILT], self.HEAD_RADPS)
+        return plan
 
 
 class Parking:
@@ -45,8 +55,9 @@ class Parking:
 
 
 class Searching:
-    """Looks where the target was last, then sweeps the head over the whole surroundings. A target that shows up in the
-    sweep is looked at until it is confirmed."""
+    """Looks where the target was last, then at the floor that can be seen from here and that this search has not seen:
+    in its first look with a sweep over the whole surroundings. A target that shows up is looked at until it is
+    confirmed."""
 
     needs_sight = True
     CONFIRMED = 2
@@ -54,11 +65,17 @@ class Searching:
     """Age of the newest sighting, beyond perception's own lag, up to which a target counts as in view."""
 
     BACK_M = 0.4
+    CHECK_NS = NS // 5
+    """Period at which it checks what is left to look at."""
 
     def __init__(self, action: Search) -> None:
         self._label = action.label
         self._start: Pose2 | None = None
         self._sweep: Sweep | None = None
+        self._glances: list[Glance] | None = None
+        self._rests_since_ns: int | None = None
+        self._checked_ns: int | None = None
+        self._left_m2 = 0.0
         self._looked_at_ns: int | None = None
         self._looked_from = 0
         """Number of sightings when looking at the remembered place began."""
@@ -66,32 +83,80 @@ class Searching:
     def step(self, snapshot: Snapshot) -> Plan:
         config = snapshot.actuators.config.head
         target = snapshot.target(self._label)
-        base, arm = snapshot.stand(), snapshot.still()
         if target is not None:
             head = snapshot.look_at(target.position_m)
             sightings = snapshot.estimator.memory.sightings(self._label)
             lag_s = snapshot.estimator.sight_lag_s
             if sightings >= self.CONFIRMED and target.age_s < self.IN_VIEW_S + lag_s:
-                return Plan(base, arm, f"{self._label} is in view", head, "done", distance_m=planar_m(target))
+                return Plan(
+                    snapshot.stand(),
+                    snapshot.still(),
+                    f"{self._label} is in view",
+                    head,
+                    "done",
+                    distance_m=planar_m(target),
+                )
             if self._looked_at_ns is None or sightings > self._looked_from:
                 self._looked_at_ns, self._looked_from = snapshot.now_ns, sightings
             if snapshot.now_ns - self._looked_at_ns < (config.look_where_it_was_s + 2 * lag_s) * 1e9:
                 why = f"{self._label} was seen {target.age_s:.1f} s ago: looking there"
-                return Plan(base, arm, why, head, distance_m=planar_m(target))
+                return Plan(snapshot.stand(), snapshot.still(), why, head, distance_m=planar_m(target))
         too_near = self._back_away(snapshot)
         if too_near is not None:
             return too_near
+        return self._look(snapshot)
+
+    def _look(self, snapshot: Snapshot) -> Plan:
+        config, seen = snapshot.actuators.config, snapshot.estimator.seen
         pan, tilt = snapshot.angles[PAN], snapshot.angles[TILT]
-        if self._sweep is None:
-            self._sweep = Sweep(config, pan)
-        goal = self._sweep.next(pan, tilt)
+        lag_s = snapshot.estimator.sight_lag_s
+        if self._checked_ns is None and not seen.running:
+            seen.begin(snapshot.body)
+            self._sweep = Sweep(config.head, pan)
+        seen.stand_at(snapshot.body)
+        if self._checked_ns is None or snapshot.now_ns - self._checked_ns >= self.CHECK_NS:
+            first = self._checked_ns is None
+            self._checked_ns = snapshot.now_ns
+            cells = seen.shown(snapshot.body, *snapshot.stands_around)
+            self._left_m2 = float(cells.sum()) * CELL_M**2
+            if first and self._sweep is None:
+                self._glances = glances(config.head, pan, seen.bearings(cells, snapshot.body))
+        if self._left_m2 < config.search.least_m2:
+            self._sweep, self._glances = None, []
         # Even slow perception must see every direction twice while the view passes over it.
-        speed = min(config.sweep_speed_radps, 0.4 / max(snapshot.estimator.sight_lag_s, 1e-3))
-        head = (*goal, speed)
-        if self._sweep.done:
-            why = f"the whole surroundings were searched, {self._label} is not there"
-            return Plan(base, arm, why, head, "failed", "not_found")
-        return Plan(base, arm, f"sweeping for {self._label}: {self._sweep.share:.0%} done", head)
+        slow = 0.4 / max(lag_s, 1e-3)
+        if self._sweep is not None:
+            goal = self._sweep.next(pan, tilt)
+            head = (*goal, min(config.head.sweep_speed_radps, slow))
+            if not self._sweep.done:
+                why = f"sweeping for {self._label}: {self._sweep.share:.0%} done"
+                return Plan(snapshot.stand(), snapshot.still(), why, head)
+            self._sweep, self._glances = None, []
+        while self._glances:
+            glance = self._glances[0]
+            if abs(glance.pan_rad - pan) > 0.05 or abs(glance.tilt_rad - tilt) > 0.05:
+                fast = glance.speed_radps > config.head.sweep_speed_radps
+                head = (glance.pan_rad, glance.tilt_rad, glance.speed_radps if fast else min(glance.speed_radps, slow))
+                self._rests_since_ns = None
+                return Plan(snapshot.stand(), snapshot.still(), self._why(), head)
+            if not self._rested(snapshot, lag_s):
+                return Plan(snapshot.stand(), snapshot.still(), self._why())
+            self._glances.pop(0)
+            self._rests_since_ns = None
+        if self._left_m2 >= config.search.least_m2 and not self._rested(snapshot, 2 * lag_s):
+            return Plan(snapshot.stand(), snapshot.still(), self._why())
+        seen.looked_from(snapshot.body, *snapshot.stands_around)
+        why = f"{self._label} is not to be seen from here"
+        return Plan(snapshot.stand(), snapshot.still(), why, None, "failed", "not_found")
+
+    def _rested(self, snapshot: Snapshot, more_s: float) -> bool:
+        """Whether the head has been at rest for long enough to see."""
+        if self._rests_since_ns is None:
+            self._rests_since_ns = snapshot.now_ns
+        return (snapshot.now_ns - self._rests_since_ns) / NS >= snapshot.actuators.config.search.steady_s + more_s
+
+    def _why(self) -> str:
+        return f"looking for {self._label}: {self._left_m2:.2f} m2 to look at from here"
 
     def _back_away(self, snapshot: Snapshot) -> Plan | None:
         """Back away from a target that is too near for the depth camera; None when there is none."""
@@ -112,67 +177,107 @@ class Searching:
 
 
 class Exploring:
-    """Drives to the place from which most of the hidden floor can be seen; the next search begins there."""
+    """Drives to the place from which the most unseen floor can be seen for the time that it takes. The next search
+    looks from there. Fails with `not_found`, and with what was not seen, when there is no such place."""
 
     needs_sight = True
-    NEAR_M, FAR_M = 0.5, 1.6
-    SIGHT_M = 1.5
+    AGAIN_NS = NS
+    """Period at which it checks whether the place is still worth the way."""
+    HERE_M = 0.05
+    AHEAD_RAD = 0.3
+    WORTH = 0.3
+    """Share of the place's unseen floor that must be left."""
 
     def __init__(self, action: Explore) -> None:
         self._label = action.label
+        self._time_is_up = action.time_is_up
         self._course: Course | None = None
-        self._goal: tuple[float, float] | None = None
+        self._view: Viewpoint | None = None
+        self._checked_ns = 0
+        self._back_off = BackOff()
 
     def step(self, snapshot: Snapshot) -> Plan:
-        actuators = snapshot.actuators
+        actuators, seen = snapshot.actuators, snapshot.estimator.seen
+        if not seen.running:  # a planner that restarted knows nothing of the search
+            return Plan(snapshot.stand(), snapshot.still(), "there is no search", None, "failed", "not_found")
+        if self._time_is_up:
+            rest = seen.rest(*snapshot.stands_around)
+            why = f"time is up; {self._label} was not found{_not_seen(rest, snapshot.body)}"
+            return Plan(snapshot.stand(), snapshot.still(), why, None, "failed", "not_found")
+        if self._in_view(snapshot):
+            return Plan(snapshot.stand(), snapshot.still(), f"{self._label} came into view", state="done")
+        seen.stand_at(snapshot.body)
         fields = snapshot.fields("")
-        if self._goal is None:
-            self._goal = self._viewpoint(snapshot)
-            if self._goal is None:
-                return Plan(snapshot.stand(), snapshot.still(), "there is nowhere else to look from", state="done")
+        if self._view is None:
+            navigation = actuators.config.navigation
+            radius = actuators.robot.base.chassis_diameter_m / 2 + navigation.clearance_m
+            around = snapshot.estimator.around
+            routes = around.routes(fields.body, snapshot.body, radius, navigation.comfort_m)
+            self._view = seen.viewpoint(snapshot.body, routes.costs(), *snapshot.stands_around)
+            self._checked_ns = snapshot.now_ns
+            if self._view is None:
+                return Plan(
+                    snapshot.stand(), snapshot.still(), self._nothing_left(snapshot), None, "failed", "not_found"
+                )
         if self._course is None:
             self._course = Course(actuators.robot, actuators.config, (0.0, 0.0), arm="folded", arrive_m=0.12)
-        target = snapshot.target(self._label)
-        if (
-            target is not None
-            and target.age_s < 0.3
-            and snapshot.estimator.memory.sightings(self._label) >= Searching.CONFIRMED
-        ):
-            return Plan(snapshot.stand(), snapshot.still(), f"{self._label} came into view", state="done")
-        arm = actuators.arm.park(snapshot.angles, snapshot.dt_s)
+        place = snapshot.body.inverse().apply((*self._view.middle_m, 0.0))
+        head = snapshot.look_at(place)
+        if hypot(self._view.place_m[0] - snapshot.body.x_m, self._view.place_m[1] - snapshot.body.y_m) < self.HERE_M:
+            return self._turn(snapshot, atan2(place[1], place[0]), head)
+        backing = self._back_off.step(snapshot, head)
+        if backing is not None:
+            return backing
         move = self._course.step(
-            self._goal, snapshot.body, snapshot.estimator.around, fields, actuators.driver, snapshot.now_ns
+            self._view.place_m, snapshot.body, snapshot.estimator.around, fields, actuators.driver, snapshot.now_ns
         )
+        arm = actuators.arm.park(snapshot.angles, snapshot.dt_s)
         if not actuators.arm.parked(snapshot.angles):
             move = move._replace(speed_mps=0.0, turn_radps=0.0)
+        if move.look_at is not None:
+            head = snapshot.look_at(snapshot.body.inverse().apply((*move.look_at, 0.0)))
         base = actuators.driver.command(move.speed_mps, move.turn_radps, snapshot.dt_s)
-        place = move.look_at or self._goal
-        head = snapshot.look_at(snapshot.body.inverse().apply((*place, 0.0)))
-        plan = Plan(base, arm, f"going to look from elsewhere: {move.why}", head, distance_m=move.left_m)
-        if move.blocked or (move.arrived and snapshot.standing):
-            # Also a place on the way serves as a viewpoint.
+        why = f"going where {self._view.gain_m2:.2f} m2 of unseen floor can be seen: {move.why}"
+        plan = Plan(base, arm, why, head, distance_m=move.left_m)
+        if move.blocked:
+            seen.avoid(self._view.place_m)
+        if move.blocked or move.arrived or not self._worth_it(snapshot):
             plan.state = "done"
         return plan
 
-    def _viewpoint(self, snapshot: Snapshot) -> tuple[float, float] | None:
-        """The reachable place with the most unseen floor nearby, odometry frame, m; None when there is none."""
-        around, actuators = snapshot.estimator.around, snapshot.actuators
-        navigation = actuators.config.navigation
-        fields = snapshot.fields("")
-        radius = actuators.robot.base.chassis_diameter_m / 2 + navigation.clearance_m
-        routes = around.routes(fields.body, snapshot.body, radius, navigation.comfort_m)
-        unseen = ~around.floor.looked_at()
-        best: tuple[float, tuple[float, float]] | None = None
-        for row in range(0, SIZE, 4):
-            for column in range(0, SIZE, 4):
-                x, y = around.floor.centre(row, column)
-                cost = routes.cost(x, y)
-                if not self.NEAR_M <= cost <= self.FAR_M:
-                    continue
-                reach = round(self.SIGHT_M / CELL_M)
-                hidden = unseen[max(row - reach, 0) : row + reach, max(column - reach, 0) : column + reach].sum()
-                turn = abs(atan2(y - snapshot.body.y_m, x - snapshot.body.x_m))
-                gain = float(hidden) * CELL_M**2 - cost - 0.05 * turn
-                if best is None or gain > best[0]:
-                    best = gain, (x, y)
-        return best[1] if best is not None else None
+    def _turn(self, snapshot: Snapshot, bearing_rad: float, head: tuple[float, float, float]) -> Plan:
+        arm = snapshot.actuators.arm.park(snapshot.angles, snapshot.dt_s)
+        turn = 1.8 * bearing_rad if snapshot.actuators.arm.parked(snapshot.angles) else 0.0
+        base = snapshot.actuators.driver.command(0.0, turn, snapshot.dt_s)
+        plan = Plan(
+            base, arm, f"turning to look where the camera's mount hides the floor: {bearing_rad:+.2f} rad", head
+        )
+        if abs(bearing_rad) < self.AHEAD_RAD:
+            plan.state = "done"
+        return plan
+
+    def _in_view(self, snapshot: Snapshot) -> bool:
+        target = snapshot.target(self._label)
+        fresh_s = Searching.IN_VIEW_S + snapshot.estimator.sight_lag_s
+        sightings = snapshot.estimator.memory.sightings(self._label)
+        return target is not None and target.age_s < fresh_s and sightings >= Searching.CONFIRMED
+
+    def _worth_it(self, snapshot: Snapshot) -> bool:
+        assert self._view is not None
+        if snapshot.now_ns - self._checked_ns < self.AGAIN_NS:
+            return True
+        self._checked_ns = snapshot.now_ns
+        cells = snapshot.estimator.seen.visible(self._view.place_m, *snapshot.stands_around)
+        return float(cells.sum()) * CELL_M**2 >= self.WORTH * self._view.gain_m2
+
+    def _nothing_left(self, snapshot: Snapshot) -> str:
+        rest = snapshot.estimator.seen.rest(*snapshot.stands_around)
+        if rest.patches:
+            return f"{self._label} was not found; nowhere else to look from{_not_seen(rest, snapshot.body)}"
+        radius_m = snapshot.actuators.config.search.radius_m
+        enclosed = f", except {rest.enclosed_m2:.2f} m2 that obstacles enclose" if rest.enclosed_m2 >= 0.01 else ""
+        return f"the whole surroundings were searched, {radius_m:.1f} m wide{enclosed}; {self._label} is not there"
+
+
+def _not_seen(rest: Rest, body: Pose2) -> str:
+    return f": not seen were {describe(rest, body)}" if rest.patches else ""

@@ -1,0 +1,103 @@
+"""Names for the shell to complete: of objects, scenes, profiles, robots, captures, services, topics and the like.
+
+Each function gets the beginning of a word and returns the names that begin so. A shell calls the command for each press
+of the Tab key, so a function imports little, and an error becomes no names.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from functools import wraps
+
+
+def _names(find: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
+    """A completion from a function that returns all names."""
+
+    @wraps(find)
+    def complete(incomplete: str) -> list[str]:
+        try:
+            return [name for name in find() if name.startswith(incomplete)]
+        except Exception:  # whatever is wrong here, a shell must not be filled with it
+            return []
+
+    del complete.__wrapped__  # typer reads the signature
+    return complete
+
+
+@_names
+def labels() -> Iterable[str]:
+    """Labels of the objects that the robot knows which is up here, else of the project's own."""
+    from pathlib import Path
+
+    from cocoro.objects import Catalogue
+    from deploy.rundir import robots
+
+    files = {run_dir.resolved().get("objects") for run_dir in robots()}
+    file = files.pop() if len(files) == 1 else None
+    return [known.label for known in Catalogue.load(Path(file) if file else None).targets]
+
+
+@_names
+def scenes() -> Iterable[str]:
+    from sim.scene_names import GENERATED, scene_names
+
+    return [*scene_names(), *GENERATED]
+
+
+@_names
+def profiles() -> Iterable[str]:
+    from deploy.profiles import names
+
+    return names()
+
+
+@_names
+def robots() -> Iterable[str]:
+    from deploy.rundir import robots as up
+
+    return [run_dir.robot for run_dir in up()]
+
+
+@_names
+def processes() -> Iterable[str]:
+    from deploy.processes import components
+
+    return [component.name for component in components()]
+
+
+@_names
+def services() -> Iterable[str]:
+    from deploy.processes import components
+
+    return dict.fromkeys(service for component in components() for service in (component.name, *component.services))
+
+
+@_names
+def topics() -> Iterable[str]:
+    from cocoro.installed import all_topics
+
+    names = [topic.name for topic in all_topics()]
+    return dict.fromkeys(name.replace("{service}", service) for name in names for service in services(""))
+
+
+@_names
+def joints() -> Iterable[str]:
+    from cocoro.robot import Robot
+
+    return Robot.load().joints
+
+
+def of(*names: str) -> Callable[[str], list[str]]:
+    """A completion of the given names."""
+    return _names(lambda: names)
+
+
+@_names
+def captures() -> Iterable[str]:
+    """Names of captures, and of the tasks in them."""
+    from apps.captures.names import shelf
+    from services.capture.folder import parsed_name
+
+    there = shelf()
+    labels = (name.label for _, path in there if (name := parsed_name(path)) and name.label)
+    return dict.fromkeys([*(name for name, _ in there), *labels])

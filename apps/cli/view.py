@@ -1,0 +1,245 @@
+"""`cocoro view`: a capture or a running robot in Rerun: in a window, in a browser, in a file, or elsewhere."""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+from collections import deque
+from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+from threading import Condition
+from typing import TYPE_CHECKING, Annotated, Any
+
+import msgspec
+import typer
+
+from apps.captures.export.viewer import Attempt, Pulse, Target, ViewerProcess, refuse_nobody, sent, temporary_rrd
+from apps.captures.reader import Capture
+from apps.cli import exits
+from apps.cli.export import progress_bar
+from apps.cli.interrupt import interrupt_event
+from apps.cli.link import MeshLink, joined
+from apps.cli.options import MeshOption, RobotChoice, RobotOption, capture_file
+from cocoro.bus.base import Bus, Payload
+from cocoro.capture.conventions import CaptureError
+from cocoro.errors import ConfigError
+from cocoro.messages import AboutRequest, Message
+from cocoro.topics import ABOUT, FRAME, TOPICS, Topic
+
+if TYPE_CHECKING:
+    from apps.captures.export.rerun_scene import RerunScene
+    from sim.outside import OutsideStage
+
+PER_SERVICE = "{service}"
+DEPTH = 4
+"""Messages of one key that may wait; a viewer that is late shows the newest."""
+WAITING, WAITING_FRAMES = 500, 2
+"""Messages, and frames among them, that may wait for the viewer."""
+FLUSH_S = 10.0
+LOOK_S = 0.2
+"""How often it is seen that the viewer was closed."""
+
+app = typer.Typer()
+
+
+@app.command()
+def view(
+    file: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="[FILE]", parser=capture_file, help="A capture; without one, the running robot is shown."
+        ),
+    ] = None,
+    sim: Annotated[
+        bool, typer.Option("--sim", help="Show the simulated robot and its scene from outside; the mouse turns it.")
+    ] = False,
+    web: Annotated[bool, typer.Option("--web", help="Serve it as a page for a browser; needs no display.")] = False,
+    bind: Annotated[
+        str, typer.Option("--bind", metavar="ADDRESS", help="With --web: serve it here; 0.0.0.0 is every address.")
+    ] = "127.0.0.1",
+    save: Annotated[
+        Path | None, typer.Option("--save", metavar="OUT.rrd", help="Write it to a file for Rerun; needs no display.")
+    ] = None,
+    connect: Annotated[
+        str | None, typer.Option("--connect", metavar="HOST[:PORT]", help="Send it to a viewer that runs there.")
+    ] = None,
+    robot: RobotOption = None,
+    profile: MeshOption = None,
+) -> None:
+    """Open Rerun on a capture, or live on the mesh. Needs the extra `view`."""
+    target = Target(save=save, web=web, bind=bind, connect=connect)
+    if file is not None:
+        sys.exit(view_file(file, target, sim))
+    sys.exit(asyncio.run(view_mesh(RobotChoice(robot, profile), target, sim)))
+
+
+# --- a capture ------------------------------------------------------------------------------------
+
+
+def view_file(file: Path, target: Target, sim: bool = False) -> int:
+    """Shows a capture, until the viewer is closed or Ctrl-C.
+
+    Raises CaptureError when Rerun is not installed, the file cannot be read, or the viewer cannot be reached;
+    ConfigError when there is no display, or nothing that `target` says.
+    """
+    from apps.captures.export.rerun_scene import APPLICATION, export, library, log_capture
+
+    rerun = library()
+    target.check()
+    with Capture.open(file) as capture:
+        stage = _recorded_stage(capture) if sim else None
+        if target.connect is not None:
+            address = refuse_nobody(target.connect)
+            recording = rerun.RecordingStream(APPLICATION)
+            recording.connect_grpc(address)
+
+            def log(pulse: Pulse) -> int:
+                count = log_capture(capture, recording, lambda _: pulse.beat(), stage)
+                recording.flush(timeout_sec=FLUSH_S)
+                return count
+
+            print(f"{sent(log, target.connect)} messages are in the viewer at {target.connect}")
+        elif target.save is not None:
+            with progress_bar(capture, target.save) as show:
+                count = export(capture, target.save, show, stage)
+            print(f"{target.save}: {count} messages; open it with `rerun {target.save}`")
+        else:
+            _show(capture, target, stage, export)
+        for problem in capture.problems:
+            print(f"missing: {problem}", file=sys.stderr)
+        return exits.FAILED if capture.problems else exits.DONE
+
+
+def _recorded_stage(capture: Capture) -> OutsideStage:
+    from apps.captures.export.stage import recorded_stage
+
+    return recorded_stage(capture)
+
+
+def _show(capture: Capture, target: Target, stage: OutsideStage | None, export: Callable[..., int]) -> None:
+    """In a window or a browser: a file is made first, so that nothing waits for a viewer that takes nothing."""
+    with temporary_rrd() as rrd:
+        with progress_bar(capture, capture.path) as show:
+            count = export(capture, rrd, show, stage)
+        with ViewerProcess(target, rrd) as viewer, suppress(KeyboardInterrupt):
+            if viewer.page:
+                viewer.wait_until_ready()
+                print(f"{count} messages at {viewer.page}\nCtrl-C ends it", flush=True)
+            else:
+                print(f"{count} messages are in Rerun; close its window, or Ctrl-C here", flush=True)
+            viewer.wait()
+
+
+# --- a running robot ------------------------------------------------------------------------------
+
+
+async def view_mesh(choice: RobotChoice, target: Target, sim: bool = False) -> int:
+    """Shows a robot's mesh, until the viewer is closed or Ctrl-C.
+
+    Raises CaptureError when Rerun is not installed or the viewer cannot be reached, ConfigError when there is no
+    display, MeshError when there is no mesh.
+    """
+    from apps.captures.export.files import making
+    from apps.captures.export.rerun_scene import APPLICATION, RerunScene, library
+
+    rerun = library()
+    target.check()
+    address = refuse_nobody(target.connect) if target.connect is not None else None
+    async with joined(choice, frames=True) as link:
+        stage = await _stated_stage(link) if sim else None
+        recording = rerun.RecordingStream(APPLICATION)
+        viewer: ViewerProcess | None = None
+        try:
+            if target.save is not None:
+                with making(target.save):
+                    recording.save(str(target.save))
+            elif address is None:
+                viewer = ViewerProcess(target)
+                viewer.wait_until_ready()
+                address = viewer.address
+            if address is not None:
+                recording.connect_grpc(address)
+            waiting = Waiting()
+            watch(link.bus, link.robot, waiting)
+            scene = RerunScene(recording, link.described(), link.catalogue(), stage)
+            writing = Attempt(partial(waiting.log_to, scene))
+            print(f"at {viewer.page}\nCtrl-C ends it" if viewer and viewer.page else "Ctrl-C ends it", flush=True)
+            with interrupt_event() as end:
+                while not end.is_set() and not writing.join(0.0) and not (viewer is not None and viewer.ended):
+                    with suppress(TimeoutError):
+                        async with asyncio.timeout(LOOK_S):
+                            await end.wait()
+            waiting.close()
+            if viewer is not None and viewer.failed:
+                raise CaptureError(viewer.reason())
+            if viewer is None or not viewer.ended:
+                ended = writing.join(FLUSH_S) and Attempt(recording.flush).join(FLUSH_S)
+                if not ended:
+                    raise CaptureError(f"the viewer took nothing any more; {waiting.dropped} messages were not shown")
+                writing.result()
+            return exits.DONE
+        finally:
+            if viewer is not None:
+                viewer.close()
+
+
+async def _stated_stage(link: MeshLink) -> OutsideStage:
+    """The stage of the robot's simulator. Raises ConfigError when the robot is not simulated."""
+    from apps.captures.export.stage import SIMULATORS, stated_stage
+
+    for answer in await link.call_all(ABOUT.of("*"), AboutRequest()):
+        if answer.reply is not None and answer.reply.module in SIMULATORS:
+            return stated_stage(answer.reply)
+    raise ConfigError(f"--sim: {link.robot} has no simulator that runs; leave --sim out to see what the robot reports")
+
+
+class Waiting:
+    """Messages on their way to the viewer, which a thread of its own logs: the mesh never waits for a viewer."""
+
+    def __init__(self) -> None:
+        self.dropped = 0
+        self._messages: deque[tuple[str, Message]] = deque()
+        self._changed = Condition()
+        self._open = True
+
+    def put(self, topic: str, message: Message) -> None:
+        """When too many wait, the message is dropped; a frame earlier than others."""
+        with self._changed:
+            frames = sum(name == FRAME.name for name, _ in self._messages) if topic == FRAME.name else 0
+            if len(self._messages) >= WAITING or frames >= WAITING_FRAMES:
+                self.dropped += 1
+                return
+            self._messages.append((topic, message))
+            self._changed.notify()
+
+    def close(self) -> None:
+        """What waits is still logged."""
+        with self._changed:
+            self._open = False
+            self._changed.notify()
+
+    def log_to(self, scene: RerunScene) -> None:
+        """Until `close`. Raises ConfigError when the truth is of another scene than the one stated."""
+        while True:
+            with self._changed:
+                while self._open and not self._messages:
+                    self._changed.wait()
+                if not self._messages:
+                    return
+                topic, message = self._messages.popleft()
+            scene.log(topic, message)
+
+
+def watch(bus: Bus, robot: str, waiting: Waiting) -> None:
+    """Keeps every message that arrives from now on for the viewer, however old it is: a viewer controls nothing."""
+
+    def receive(topic: Topic[Any], decoder: msgspec.msgpack.Decoder[Message], _key: str, payload: Payload) -> None:
+        with suppress(msgspec.MsgspecError, ValueError, RecursionError):
+            waiting.put(topic.name, decoder.decode(bytes(payload)))  # a copy: the bus takes its memory back
+
+    for topic in TOPICS:
+        if PER_SERVICE not in topic.name:
+            handler = partial(receive, topic, msgspec.msgpack.Decoder(topic.type))
+            bus.subscribe(topic.key(robot), topic.qos, handler, depth=DEPTH)
