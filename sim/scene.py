@@ -241,7 +241,7 @@ def scene_names() -> list[str]:
     return sorted(file.name.removesuffix(".toml") for file in folder.iterdir() if file.name.endswith(".toml"))
 
 
-GENERATED = ("random",)
+GENERATED = ("random", "rooms", "rooms-empty")
 """Names of the scenes that `sim.random_scene` makes."""
 _T = TypeVar("_T", bound=_Table)
 
