@@ -25,9 +25,7 @@ def colour_of(frame: Frame) -> ImageArray:
     return np.frombuffer(frame.colour, dtype=np.uint8).reshape(frame.height, frame.width, 3)
 
 
-def draw(
-    frame: Frame, detections: Detections | None = None, catalogue: Catalogue | None = None, caption: str = ""
-) -> ImageArray:
+def draw(frame: Frame, detections: Detections | None = None, catalogue: Catalogue | None = None) -> ImageArray:
     """A copy of the colour image with each detection's box, centroid, label, distance and note; RGB.
 
     The distance is from the body frame's origin, level. With a catalogue each box has its object's colour. A frame
@@ -41,9 +39,12 @@ def draw(
             fallback = LOCALISED if detection.position_m is not None else UNLOCALISED
             colour = _bright(known.rgb) if known is not None else fallback
             _draw_detection(image, detection, colour, scale)
-    if caption:
-        _text(image, caption, 4, image.shape[0] - 5, LOCALISED)
     return image
+
+
+def captioned(image: ImageArray, caption: str) -> None:
+    """Write a line at the bottom of an RGB image."""
+    _text(image, caption, 4, image.shape[0] - 5, LOCALISED)
 
 
 def save_png(image: ImageArray, path: Path) -> None:

@@ -43,12 +43,14 @@ class Operator:
 
     def __init__(self, root: Path) -> None:
         self.run_dir = RunDir(NAME, root)
-        self._env = os.environ | {"COCORO_RUN_DIR": str(root), "COCORO_CAPTURE_DIR": str(root / "captures")}
-        self._env |= {"COCORO_STATE_DIR": str(root / "state")}
+        self.environment = os.environ | {"COCORO_RUN_DIR": str(root), "COCORO_CAPTURE_DIR": str(root / "captures")}
+        self.environment |= {"COCORO_STATE_DIR": str(root / "state")}
 
     def start(self, *arguments: str) -> subprocess.Popen[str]:
         command = [sys.executable, "-m", "apps.cli.main", *arguments]
-        return subprocess.Popen(command, env=self._env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+        return subprocess.Popen(
+            command, env=self.environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        )
 
     def __call__(self, *arguments: str) -> tuple[int, str, float]:
         """Exit code, what was printed, and seconds."""

@@ -19,6 +19,10 @@ class Contact:
         """Whether the process that was this service is known to have ended."""
         return False
 
+    def lives(self, service: str) -> bool:
+        """Whether the process that was this service is known to live, so that only the contact with it is lost."""
+        return False
+
     async def lost(self, service: str) -> str:
         """A service's token dropped. Returns what is known of it, in words."""
         return f"lost contact with {service}"

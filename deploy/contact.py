@@ -1,18 +1,20 @@
 """Finds out what became of a service whose liveliness token dropped, and whether this process itself was asleep.
 
 A token drops when its process ends, and also when the mesh has not heard from that process for the lease: because it
-was stopped, it hangs, the connection is broken, or this process was asleep. A dead process of this machine no longer
-holds its claim (see `deploy.rundir`); about processes of other machines nothing more is known.
+was stopped, it hangs, gets no processor time, the connection is broken, or this process was asleep. A dead process of
+this machine no longer holds its claim (see `deploy.rundir`); where its claim cannot be read, /proc no longer has its
+number with its start time. About processes of other machines nothing more is known.
 """
 
 from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
-from contextlib import suppress
+from typing import NamedTuple
 
 from cocoro.clock import NS, steady_ns
 from cocoro.contact import Contact
+from deploy.processor import start_of
 
 CLAIM_S = 0.5
 """A dying process may lose its claim this much later than its liveliness token."""
@@ -64,6 +66,15 @@ class SleepDetector:
         return f"this machine was asleep or starved for {self._slept_ns / NS:.0f} s"
 
 
+class _Met(NamedTuple):
+    """The process that was a service when it was met."""
+
+    pid: int
+    """0 while its number is not known."""
+    start: int | None
+    """Its start time as /proc has it; None where it cannot be read."""
+
+
 class ProcessContact(Contact):
     """Knows the processes behind the services of this machine. Call `met` for each token that appears.
 
@@ -78,33 +89,41 @@ class ProcessContact(Contact):
         self._claimant = claimant
         self._sleep_detector = sleep_detector
         self.keeps = sleep_detector is not None
-        self._pids: dict[str, int] = {}
-        """By service: the process of this machine that was it when it was met."""
+        self._met: dict[str, _Met] = {}
 
     async def keep(self) -> None:
         if self._sleep_detector is not None:
             await self._sleep_detector.keep()
 
     def met(self, service: str) -> None:
-        self._pids.pop(service, None)
-        with suppress(OSError):
+        self._met.pop(service, None)
+        try:
             pid = None if self._claimant is None else self._claimant(service)
-            if pid is not None:
-                self._pids[service] = pid
+        except OSError:
+            return
+        if pid is not None:
+            self._met[service] = _Met(pid, start_of(pid))
 
     def dead(self, service: str) -> bool:
-        if self._claimant is None or service not in self._pids:
+        if self._claimant is None or service not in self._met:
             return False
+        met = self._met[service]
         try:
             pid = self._claimant(service)
-        except OSError:
+        except OSError:  # its claim cannot be read
+            return met.start is not None and start_of(met.pid) != met.start
+        if met.pid == 0 and pid:  # now its number is known
+            self._met[service] = _Met(pid, start_of(pid))
             return False
-        return pid is None or pid not in (self._pids[service], 0)  # 0: the claim is held, by a number not known yet
+        return pid is None or pid not in (met.pid, 0)  # 0: the claim is held, by a number not known yet
+
+    def lives(self, service: str) -> bool:
+        return service in self._met and not self.dead(service)
 
     async def lost(self, service: str) -> str:
         """As the base class; returns within `CLAIM_S`."""
         asleep = "" if self._sleep_detector is None else self._sleep_detector.look()
-        if service in self._pids:
+        if service in self._met:
             for _ in range(round(CLAIM_S / LOOK_S)):
                 if self.dead(service):
                     return f"{service} died"

@@ -55,4 +55,5 @@ PYTHONUNBUFFERED=1 .venv/bin/python -m pip install --progress-bar off --disable-
     exit 2
 }
 .venv/bin/python deploy/install_progress.py sizes
+mkdir -p .venv/share/man/man1 && ln -sf "$PWD/docs/cocoro.1" .venv/share/man/man1/ # pip leaves it out of editable installs
 echo "$wanted" >$installed

@@ -171,7 +171,9 @@ def _find(which: str) -> Path | Traversable:
         return path
     known = names()
     if which not in known:
-        raise ConfigError(f"there is no profile {which!r}; {choice_of(which, known)}, or give the path of a .toml file")
+        raise ConfigError(
+            f"there is no profile {which!r}, and it is not the path of a .toml file; {choice_of(which, known)}"
+        )
     return resources.files(PACKAGE).joinpath("profiles", f"{which}.toml")
 
 

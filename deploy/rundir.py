@@ -112,9 +112,14 @@ class RunDir:
         return holder(self.path / "claims" / service)
 
     def claimant_pid(self, service: str) -> int | None:
-        """The number of that process, for `deploy.contact.ProcessContact`; 0 when it cannot be read."""
+        """The number of that process, for `deploy.contact.ProcessContact`; 0 when it cannot be read. Raises
+        FileNotFoundError when there is no file to claim it by: this process may never have been here, or its file was
+        removed while it lives."""
         by = self.claimant(service)
-        return None if by is None else by.pid
+        if by is None:
+            (self.path / "claims" / service).stat()
+            return None
+        return by.pid
 
     def claims(self) -> dict[str, Holder]:
         """The process behind each service of this machine, by service."""

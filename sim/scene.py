@@ -15,6 +15,7 @@ from cocoro.errors import ConfigError, choice_of, field_text
 from cocoro.objects import Catalogue
 from cocoro.units import Vec3
 from sim.render.interface import Shape
+from sim.scene_names import GENERATED, scene_names
 from sim.seeds import stream
 
 ScenePoint = Annotated[tuple[float, ...], Meta(min_length=2, max_length=3)]
@@ -235,14 +236,6 @@ def load_scene(name_or_path: str | Path, seed: int = 0, catalogue: Catalogue | N
     return _scattered(scene, scatter, seed)
 
 
-def scene_names() -> list[str]:
-    """Names of the scenes that come with the project."""
-    folder = resources.files("sim").joinpath("scenes")
-    return sorted(file.name.removesuffix(".toml") for file in folder.iterdir() if file.name.endswith(".toml"))
-
-
-GENERATED = ("random", "rooms", "rooms-empty")
-"""Names of the scenes that `sim.random_scene` makes."""
 _T = TypeVar("_T", bound=_Table)
 
 

@@ -51,7 +51,8 @@ class Robot:
         service.tester.spawn(self._work())
 
     def _hear(self, intent: Intent) -> None:
-        if (intent.task_id, intent.step) == (self._intent.task_id, self._intent.step):
+        before = self._intent
+        if (intent.task_id, intent.step, intent.action) == (before.task_id, before.step, before.action):
             return
         self._intent, self._since_ns = intent, self.service.tester.now_ns()
         self.asked.append(intent.action.name)

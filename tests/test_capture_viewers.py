@@ -51,6 +51,8 @@ def fox(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_file_for_foxglove_has_its_schemas_in_the_robots_time(fox: Path) -> None:
     """tests/test_capture_foreign.py decodes and validates each message with npm packages."""
+    from foxglove import messages as sdk
+
     shown: dict[str, list[bytes]] = {}
     recorded: dict[str, list[Any]] = {}
     last = 0
@@ -61,6 +63,7 @@ def test_the_file_for_foxglove_has_its_schemas_in_the_robots_time(fox: Path) -> 
             last = message.log_time
             if schema.name.startswith("foxglove."):
                 assert schema.encoding == channel.message_encoding == "protobuf"
+                assert schema.data == getattr(sdk, schema.name.removeprefix("foxglove.")).get_schema().data
                 shown.setdefault(schema.name, []).append(message.data)
             else:
                 assert channel.message_encoding == "json"
@@ -69,11 +72,24 @@ def test_the_file_for_foxglove_has_its_schemas_in_the_robots_time(fox: Path) -> 
         "foxglove.CompressedImage", "foxglove.CameraCalibration", "foxglove.PointCloud", "foxglove.FrameTransforms",
         "foxglove.SceneUpdate", "foxglove.ImageAnnotations", "foxglove.Log",
     } == set(shown)  # fmt: skip
-    assert len(shown["foxglove.CompressedImage"]) == len(shown["foxglove.PointCloud"]) == 60
+    assert len(shown["foxglove.CompressedImage"]) == 60
     assert len(recorded["calliope/base/state"]) == 300
     transforms = b"".join(shown["foxglove.FrameTransforms"])
     assert all(frame in transforms for frame in (b"body", b"camera", b"gripper"))
     assert any(b"approach" in log for log in shown["foxglove.Log"])
+
+
+def test_the_file_for_foxglove_is_no_larger_than_an_ordinary_capture(fox: Path) -> None:
+    """Clouds of points come at 10 Hz at most, whatever the camera's rate is, and the chassis comes once."""
+    stamps: dict[str, list[int]] = {}
+    with fox.open("rb") as stream:
+        for _, channel, message in make_reader(stream).iter_messages():
+            stamps.setdefault(channel.topic, []).append(message.log_time)
+    clouds = stamps["/camera/points"]
+    assert min(np.diff(clouds)) >= 10**8
+    assert len(clouds) > 50
+    assert len(stamps["/robot/chassis"]) == 1
+    assert fox.stat().st_size < 1.2 * GOLDEN.stat().st_size  # its pictures are tiny, of 160 x 120 pixels
 
 
 def test_without_foxglove_one_line_says_how_to_install_it(

@@ -42,13 +42,7 @@ def no_robot_here(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 def test_help_lists_every_command(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--help"]) == 0
     out = capsys.readouterr().out
-    assert all(f" {command} " in out for command in COMMANDS)
-
-
-@pytest.mark.parametrize("command", [*COMMANDS, "stop"])
-def test_every_command_has_help(command: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main([command, "--help"]) == 0
-    assert len(capsys.readouterr().out) > 100
+    assert all(f" {command} " in out for command in (*COMMANDS, "--version", "--install-completion"))
 
 
 @pytest.mark.parametrize(

@@ -19,6 +19,8 @@ BLOCK = re.compile(r"^```sh\n(.*?)^```", re.MULTILINE | re.DOTALL)
 INLINE = re.compile(r"`(cocoro [^`]+)`")
 THIRD_PARTY = ("nod", "rehearse nod")
 """Commands of what a page installs."""
+EAGER = {"-h", "--help", "--version", "--install-completion"}
+"""Options that act while they are read; `cocoro --help` lists them."""
 ENDS = ("|", "&", "&&", ";", ">", ">>", "2>")
 
 
@@ -54,7 +56,7 @@ def test_the_commands_of_a_page_can_be_given_as_they_are_written(page: Path) -> 
     wrong = []
     for line, whole in dict.fromkeys(shown(page)):
         words = arguments(line)
-        if not words or ("..." in line and not whole) or {"-h", "--help"} & {*words} or words[0] in ("stop", "estop"):
+        if not words or ("..." in line and not whole) or EAGER & {*words} or words[0] in ("stop", "estop"):
             continue
         if words[0] in THIRD_PARTY or " ".join(words[:2]) in THIRD_PARTY:
             continue

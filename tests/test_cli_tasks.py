@@ -6,7 +6,9 @@ import asyncio
 import errno
 import io
 import signal
-from collections.abc import Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
+from copy import copy
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -29,13 +31,14 @@ from cocoro.messages import (
     LatchState,
     Message,
     Phase,
+    ReportRequest,
     TaskReply,
     TaskRequest,
     TaskState,
 )
 from cocoro.node import Node
 from cocoro.robot import Robot
-from cocoro.topics import CANCEL, LATCH, RUN, TASK
+from cocoro.topics import CANCEL, LATCH, REPORT, RUN, TASK
 from cocoro.vloop import run_virtual
 from deploy.rundir import RunDir
 from services.executive.askers import asker_key
@@ -53,12 +56,14 @@ class Executive:
     replies: list[TaskReply] = field(default_factory=lambda: [TaskReply(accepted=True, task_id=ID)])
     asked: list[TaskRequest] = field(default_factory=list)
     cancelled: list[str] = field(default_factory=list)
+    known: dict[str, TaskState] = field(default_factory=lambda: {ID: TaskState(task_id=ID, task="fetch")})
     on_run: Callable[[], None] = lambda: None
     on_cancel: Callable[[], None] = lambda: None
 
     def __post_init__(self) -> None:
         self.node.serve(RUN, self._run)
         self.node.serve(CANCEL, self._cancel)
+        self.node.serve(REPORT, self._report)
         self.node.ready()
 
     async def _run(self, request: TaskRequest) -> TaskReply:
@@ -71,14 +76,20 @@ class Executive:
         self.on_cancel()
         return TaskReply(accepted=True, task_id=request.task_id)
 
+    async def _report(self, request: ReportRequest) -> TaskState:
+        return self.known.get(request.task_id, TaskState())
+
     def tell(self, phase: str, elapsed_s: float, task_id: str = ID, **fields: Any) -> None:
-        self.node.publish(
-            TASK,
-            TaskState(
-                task_id=task_id, task="fetch", label="red_can", phase=phase, elapsed_s=elapsed_s,
-                phases=(Phase(name=phase, start_ns=0),), **fields,
-            ),
+        state = self.knows(phase, elapsed_s, task_id, **fields)
+        self.node.publish(TASK, copy(state))
+
+    def knows(self, phase: str, elapsed_s: float, task_id: str = ID, **fields: Any) -> TaskState:
+        """The state that it tells who asks."""
+        self.known[task_id] = TaskState(
+            task_id=task_id, task="fetch", label="red_can", phase=phase, elapsed_s=elapsed_s,
+            phases=(Phase(name=phase, start_ns=0),), **fields,
         )  # fmt: skip
+        return self.known[task_id]
 
 
 class Scene:
@@ -225,7 +236,7 @@ async def test_an_executive_that_is_lost_and_heard_again_says_the_outcome_itself
     executive.tell("end", 40.0, outcome="done")
     code, _ = await running
     assert code == exits.DONE
-    assert scene.out.getvalue().splitlines()[0] == "lost contact with executive: waiting for the executive"
+    assert scene.out.getvalue().splitlines()[0] == "lost contact with executive: looking again"
 
 
 @with_claim
@@ -246,7 +257,7 @@ async def test_of_an_executive_that_is_not_heard_any_more_it_is_not_said_that_it
     scene.bus.kill()
     code, result = await asyncio.wait_for(running, 15.0)
     reason = "lost contact with executive; the task may still be running; see cocoro status"
-    assert (code, result["outcome"], result["reason"]) == (exits.FAILED, "failed", reason)
+    assert (code, result["outcome"], result["reason"]) == (exits.FAILED, "unknown", reason)
 
 
 @with_claim
@@ -255,9 +266,55 @@ async def test_an_executive_that_comes_back_without_the_task_is_not_waited_for(s
     running = await following(scene.follower())
     scene.bus.kill()
     await asyncio.sleep(5.0)
-    scene.returns().tell("", 0.0, task_id="")
+    executive = scene.returns()
+    executive.known.clear()
+    executive.tell("", 0.0, task_id="")
     code, result = await asyncio.wait_for(running, 1.0)
-    assert (code, result["reason"]) == (exits.FAILED, "the executive restarted and no longer knows the task")
+    reason = "the executive was restarted meanwhile and does not know the task"
+    assert (code, result["outcome"], result["reason"]) == (exits.FAILED, "unknown", reason)
+
+
+@with_claim
+async def test_an_outcome_that_was_told_while_contact_was_lost_is_asked_for(scene: Claimed) -> None:
+    Executive(scene.node)
+    running = await following(scene.follower())
+    scene.bus.kill()
+    await asyncio.sleep(5.0)
+    executive = scene.returns()
+    executive.knows("end", 9.0, outcome="done")
+    executive.tell("search", 1.0, task_id="fetch-2")  # another's task runs by now
+    assert (await asyncio.wait_for(running, 1.0))[0] == exits.DONE
+    assert scene.out.getvalue().splitlines()[-1] == "done: fetch red_can in 9.0 s"
+
+
+@with_claim
+async def test_a_broken_session_is_replaced_by_another(scene: Claimed) -> None:
+    """The executive goes on, and is heard by everybody but this command."""
+    Executive(scene.node)
+
+    @asynccontextmanager
+    async def rejoin() -> AsyncIterator[MeshLink]:
+        yield MeshLink(scene.link.run_dir, other.join())
+
+    follower = Follower(scene.link, REQUEST, LineDisplay(scene.out), None, rejoin=rejoin)
+    running = await following(follower)
+    other = LocalMesh()
+    scene.bus.kill()
+    node = Node("executive", other.join(), VirtualClock(), Robot.load())
+    executive = Executive(node)
+    executive.tell("approach", 2.0)
+    await asyncio.sleep(3.0)
+    executive.tell("end", 5.0, outcome="failed", reason="blocked")
+    code, result = await asyncio.wait_for(running, 1.0)
+    assert (code, result["outcome"], result["reason"]) == (exits.FAILED, "failed", "blocked")
+
+
+@in_virtual_time
+async def test_when_no_news_arrives_the_executive_is_asked(scene: Scene) -> None:
+    executive = Executive(scene.node)
+    running = await following(scene.follower())
+    executive.knows("end", 3.0, outcome="done")
+    assert (await asyncio.wait_for(running, 6.0))[0] == exits.DONE
 
 
 @in_virtual_time

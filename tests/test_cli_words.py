@@ -5,15 +5,29 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
 from places import in_short_folder
 
+from apps.cli import manual
+from apps.cli.listening import nothing_on
 from apps.cli.main import main
 from apps.cli.output import asks_json
 from apps.cli.walk import commands
 from cocoro.errors import choice_of
+
+COMMANDS = {" ".join(words): command for words, command, _ in commands()}
+TELLS_NOTHING = {
+    "estop": "it reads its own --json, without typer",
+    "run": "its output is the log of a process",
+    "view": "it opens a window",
+    "replay": "it publishes until its end, steered from the keyboard",
+    "kinect tilt": "it prints nothing",
+    "servos calibrate": "a dialogue with a person",
+    "servos limits": "a dialogue with a person",
+}
 
 
 @pytest.fixture(autouse=True)
@@ -38,12 +52,22 @@ def test_no_help_loses_what_stands_in_brackets(
     assert not lost
 
 
+def test_every_command_that_tells_something_has_json() -> None:
+    without = [
+        name
+        for name, command in COMMANDS.items()
+        if not any("--json" in param.opts for param in command.params)
+        and not (hasattr(command, "commands") and not command.invoke_without_command)
+    ]
+    assert sorted(without) == sorted(TELLS_NOTHING)
+
+
 @pytest.mark.parametrize(
     ("arguments", "code", "name", "words"),
     [
         (["status"], 4, "no_mesh", "no robot is up"),
         (["fetch", "red_can"], 4, "no_mesh", "no robot is up"),
-        (["fetch"], 2, "usage", "label"),
+        (["fetch"], 2, "usage", "LABEL"),
         (["fetch", "red_can", "--timeout", "-1"], 2, "usage", "--timeout"),
         (["logs", "--level", "erorr"], 2, "usage", "did you mean error?"),
         (["hz", "a//b"], 4, "no_mesh", "no robot is up"),
@@ -64,9 +88,44 @@ def test_an_error_is_one_object_on_standard_output_where_json_is_asked_for(
     assert capsys.readouterr().out == ""
 
 
+@pytest.mark.parametrize(
+    ("arguments", "keys"),
+    [
+        (["down"], {"down"}),
+        (["new", "service", "greeter"], {"files", "next"}),
+        (["new", "task", "greet"], {"files", "next"}),
+        (["doctor", "sim"], None),
+        (["topics"], None),
+        (["capture", "list"], None),
+    ],
+)
+def test_a_result_is_one_document_of_json(
+    arguments: list[str],
+    keys: set[str] | None,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COCORO_CAPTURE_DIR", str(tmp_path))
+    main([*arguments, "--json"])
+    result = json.loads(capsys.readouterr().out)
+    assert isinstance(result, list) if keys is None else result.keys() == keys
+
+
 def test_json_is_asked_for_before_the_end_of_the_options_alone() -> None:
     assert asks_json(["new", "task", "a", "--json"])
     assert not asks_json(["new", "task", "--", "--json"])
+
+
+def test_the_manual_page_is_up_to_date_and_describes_every_command() -> None:
+    text = (Path(__file__).parent.parent / "docs" / "cocoro.1").read_text()
+    assert text == manual.page(), "make manual"
+    headings = re.findall(r'^\.SS "cocoro ([^"]*)"$', text, re.MULTILINE)
+    plain = [heading.replace("\\-", "-") for heading in headings]
+    for words, command, _ in commands():
+        if words and words[0] != "rehearse" and not hasattr(command, "commands"):
+            assert any(f"{heading} ".startswith(f"{' '.join(words)} ") for heading in plain), words
 
 
 def test_version_names_what_matters_in_a_report(capsys: pytest.CaptureFixture[str]) -> None:
@@ -84,6 +143,12 @@ def test_version_names_what_matters_in_a_report(capsys: pytest.CaptureFixture[st
 )
 def test_a_wrong_name_is_answered_by_those_that_are_known(given: str, known: list[str], text: str) -> None:
     assert choice_of(given, known) == text
+
+
+def test_a_key_that_nobody_knows_is_answered_by_one_that_is_like_it() -> None:
+    assert nothing_on("calliope/arm/stat").endswith("did you mean arm/state?")
+    assert "did you mean" not in nothing_on("calliope/arm/state")
+    assert "did you mean" not in nothing_on("calliope/parts/**")
 
 
 @pytest.mark.parametrize(

@@ -105,12 +105,9 @@ def test_a_simulator_that_dies_fails_the_task_comes_back_and_the_robot_is_used_a
     assert shell.pid("base") != killed
 
 
-@pytest.mark.parametrize(
-    ("service", "said", "reason"),
-    [("planning", topics.BASE_COMMAND, "the planner is silent"), ("executive", topics.INTENT, None)],
-)
-def test_who_is_frozen_while_driving_leaves_a_robot_that_stands(
-    shell: Shell, service: str, said: Topic[Any], reason: str | None
+@pytest.mark.parametrize(("service", "said"), [("planning", topics.BASE_COMMAND), ("executive", topics.INTENT)])
+def test_who_is_frozen_while_driving_leaves_a_robot_that_stands_and_then_goes_on(
+    shell: Shell, service: str, said: Topic[Any]
 ) -> None:
     """All times are the simulator's, so load affects only messages under way."""
     patient = ("--set", "mesh.lease_s=60")  # on a busy machine two simulated seconds may be longer than the usual lease
@@ -139,12 +136,7 @@ def test_who_is_frozen_while_driving_leaves_a_robot_that_stands(
             os.kill(shell.pid(service), signal.SIGCONT)
 
     asyncio.run(scenario())
-    code = fetch.end()
-    if reason is not None:
-        assert code == exits.FAILED
-        assert reason in fetch.lines[-1]
-    else:
-        assert code == exits.DONE, fetch.lines  # it goes on where it was
+    assert fetch.end() == exits.DONE, fetch.lines
 
 
 async def speeds(truths: Stream[Truth]) -> AsyncIterator[tuple[float, int]]:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from perception_scenes import CATALOGUE, Canvas, seen
 
-from apps.pictures import colour_of, describe, draw, save_png
+from apps.pictures import captioned, colour_of, describe, draw, save_png
 from cocoro.errors import CocoroError
 from cocoro.messages import Detection, Detections, Frame
 
@@ -36,7 +36,9 @@ def test_without_detections_it_is_the_frame() -> None:
 
 
 def test_a_caption_is_written_at_the_bottom() -> None:
-    changed = np.nonzero((draw(scene(), caption="at the grasp") != draw(scene())).any(axis=2))
+    image = draw(scene())
+    captioned(image, "at the grasp")
+    changed = np.nonzero((image != draw(scene())).any(axis=2))
     assert changed[0].min() > 440
 
 

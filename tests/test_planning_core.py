@@ -76,9 +76,9 @@ def test_a_silent_executive_first_halts_the_wheels_and_then_ends_what_was_asked(
     assert not standing(planner)
     status = planner.tick()
     assert standing(planner)
-    assert (status.behaviour, status.why) == ("approach", "standing still: the executive is silent")
+    assert (status.behaviour, status.why) == ("approach", "standing still: nothing from the executive for 0.2 s")
     status = planner.run(0.2)
-    assert (status.behaviour, status.why) == ("idle", "standing still: the executive is silent")
+    assert (status.behaviour, status.why) == ("idle", "standing still: nothing from the executive for 0.4 s")
     assert standing(planner)
 
 
@@ -103,7 +103,13 @@ def test_beyond_its_states_age_it_only_stands_and_in_time_it_gives_up(planner: P
     status = planner.run(0.04)
     assert only_stands(planner)
     assert (status.state, topic.name in status.why) == ("running", True)
-    status = planner.run(1.1)
+    planner.run(3.0)
+    planner.silent.clear()
+    assert planner.run(0.3).state == "running"
+    assert not standing(planner), "it goes on"
+    planner.silent.add(topic.name)
+    assert planner.run(topic.max_age_s + 4.9).state == "running"
+    status = planner.run(0.2)
     assert (status.state, status.reason) == ("failed", "stale")
     planner.silent.clear()
     planner.tick()

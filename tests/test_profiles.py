@@ -107,7 +107,9 @@ def test_a_mistake_in_a_profile_says_where(tmp_path: Path, text: str, message: s
 
 
 def test_a_profile_that_is_not_there_lists_those_that_are(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"no profile 'simm'; known are .*robot, sim.*, or give the path of a .toml"):
+    with pytest.raises(
+        ConfigError, match=r"no profile 'simm', and .* a .toml file; known are .*robot, sim.*did you mean sim"
+    ):
         profiles.read("simm")
     with pytest.raises(ConfigError, match=r"no profile file .*mine.toml"):
         profiles.read(str(tmp_path / "mine.toml"))

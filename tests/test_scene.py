@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from cocoro.errors import ConfigError
-from sim.scene import Scene, load_scene, scene_names
+from sim.scene import Scene, load_scene
+from sim.scene_names import scene_names
 
 CAN = """
 [[object]]

@@ -26,12 +26,6 @@ from cocoro.messages import BaseCommand
 from deploy.rundir import RunDir
 
 
-@pytest.mark.parametrize("command", ["top", "echo", "hz", "logs"])
-def test_each_tool_has_help(command: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main([command, "--help"]) == 0
-    assert "Ctrl-C" in (out := capsys.readouterr().out) or "KEY" in out
-
-
 def test_frames_may_be_among_what_is_not_known_to_be_something_else() -> None:
     for text in ("kinect/frame", "**", "kinect/*", "calliope/base/state", "parts/other"):
         assert takes_frames(text)

@@ -4,8 +4,7 @@
         for record in capture.messages("base/state", "kinect/frame"):
             print(record.log_ns, record.key, capture.decode(record))
 
-Channels are identified by number, since a key may have several. Unreadable parts are skipped and listed in
-`capture.problems`; look there after reading.
+Channels are identified by number: a key may have several. `capture.problems` lists the unreadable parts so far.
 
 The `mcap` package's readers stop at the first damage, know channels only from the summary, and copy every payload. They
 take 1.0 to 1.4 times as long for frames, 1.5 to 2.0 times for small messages (`python bench/capture_format.py files`).
@@ -20,6 +19,7 @@ import stat
 from collections import Counter, deque
 from collections.abc import Collection, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from errno import ENOENT
 from functools import cached_property
 from pathlib import Path
 from types import TracebackType
@@ -80,11 +80,12 @@ class Capture:
         """Raises CaptureError when the file cannot be read or is not MCAP, NotAFileError for a pipe or a device."""
         try:
             mode = path.stat().st_mode
-            if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):  # opening a device may block, or have an effect
+            if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):  # opening a device may block
                 raise NotAFileError(f"{path} is {_kind(mode)} and no file; copy its output into a file, and name that")
             fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
         except OSError as error:
-            raise CaptureError(f"{path} cannot be read: {error.strerror}") from error
+            hint = "" if path.suffix or error.errno != ENOENT else "; `cocoro capture list` shows those with a name"
+            raise CaptureError(f"{path} cannot be read: {error.strerror}{hint}") from error
         return cls(path, fd)
 
     # --- what it is -------------------------------------------------------------------------------
@@ -101,7 +102,7 @@ class Capture:
 
     @property
     def summarised(self) -> bool:
-        """The contents come from the file's summary, so not all of the file has been read."""
+        """The contents come from the file's summary, so not all of it has been read."""
         return self._contents.summarised
 
     @property
@@ -128,7 +129,7 @@ class Capture:
 
     @property
     def problems(self) -> list[str]:
-        """Unreadable parts and wrong counts found so far, in words."""
+        """Unreadable parts and wrong counts so far, in words."""
         more = [f"and {self._not_listed} more problems"] if self._not_listed else []
         return [*self._problems, *more]
 
@@ -172,7 +173,7 @@ class Capture:
 
     @cached_property
     def channels(self) -> dict[int, Channel]:
-        """Channels by number, including those without messages."""
+        """By number, including those without messages."""
         return dict(sorted(self._contents.channels.items()))
 
     @cached_property
@@ -221,8 +222,7 @@ class Capture:
 
     @cached_property
     def robot(self) -> str:
-        """The robot's name, with which its keys begin; '' when the capture names none and its keys differ in the
-        beginning."""
+        """The robot's name, with which its keys begin; '' when the capture names none and its keys have several."""
         name = self.metadata.get("run", {}).get("robot")
         if name is not None:
             return name
@@ -282,8 +282,8 @@ class Capture:
             yield heapq.heappop(waiting)[3]
 
     def check(self) -> None:
-        """Verify what reading messages does not: the checksum over all data, the attachments, and for a recorder's file
-        every record front to back. Adds to `problems`. Raises CaptureError when the disk fails."""
+        """Verify the checksum over all data, the attachments, and a recorder's file front to back. Adds to `problems`.
+        Raises CaptureError when the disk fails."""
         found = self._contents
         try:
             if found.strict and found.summarised:

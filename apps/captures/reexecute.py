@@ -50,6 +50,8 @@ class ReexecutionResult(msgspec.Struct, kw_only=True):
     """Steps whose large inputs were left out of the captures by intention, while nothing happened."""
     unsettled: int = 0
     """Steps that differ within a second after such steps."""
+    begins_late: bool = False
+    """The captures lack the beginning of the run, so the core begins without what it knew."""
     outputs: int = 0
     """Compared outputs."""
     reasons: dict[str, int] = {}
@@ -86,6 +88,7 @@ def reexecute(
         for step in with_messages(captures, steps):
             run.execute(step)
     result = run.result
+    result.begins_late = steps[0][1].seq > 0
     result.recorded_s = (steps[-1][0] - steps[0][0]) / NS
     result.changed = tuple(run.changed)
     result.problems = tuple(problem for capture in captures for problem in capture.problems)
@@ -280,6 +283,8 @@ def describe_result(result: ReexecutionResult) -> list[str]:
     if result.not_executable:
         lines.append(f"  {result.not_executable} steps not executable")
         lines += [f"    {count}: {reason}" for reason, count in _by_count(result.reasons)]
+    if result.begins_late:
+        lines.append("  the captures begin in the middle of the run; --run takes those before them, too")
     if result.left_out:
         lines.append(f"  {result.left_out} steps of the time in which nothing happened have no frames, as configured")
     if result.unsettled:

@@ -12,7 +12,7 @@ import typer
 from apps.cli import exits
 from apps.cli.link import joined, within
 from apps.cli.options import JsonOption, MeshOption, RobotChoice, RobotOption
-from apps.cli.output import print_json
+from apps.cli.output import complain, print_json, tell
 from cocoro.errors import MeshError
 from cocoro.messages import BaseState, RecoverRequest
 from cocoro.topics import BASE_STATE, HEALTH, RECOVER
@@ -36,9 +36,9 @@ def show_base(
 
 
 @base.command()
-def recover(robot: RobotOption = None, profile: MeshOption = None) -> None:
+def recover(robot: RobotOption = None, profile: MeshOption = None, json: JsonOption = False) -> None:
     """Put a Create that left its mode (a cliff, a wheel drop, the charger) back into it."""
-    sys.exit(asyncio.run(recover_base(RobotChoice(robot, profile))))
+    sys.exit(asyncio.run(recover_base(RobotChoice(robot, profile), json)))
 
 
 async def show(choice: RobotChoice, as_json: bool) -> int:
@@ -86,13 +86,13 @@ def _print(state: BaseState | None, faults: tuple[str, ...]) -> None:
         print(f"fault      {fault}")
 
 
-async def recover_base(choice: RobotChoice) -> int:
+async def recover_base(choice: RobotChoice, as_json: bool = False) -> int:
     """Asks the base to recover; the exit code is 3 when it cannot."""
     async with joined(choice) as link:
         reply = await link.call(RECOVER, RecoverRequest())
         robot = link.robot
     if not reply.recovered:
-        print(f"{robot}: the base does not recover: {reply.text}")
+        complain(f"{robot}: the base does not recover: {reply.text}")
         return exits.REFUSED
-    print(f"{robot}: the base obeys")
+    tell(as_json, {"robot": robot, "recovered": True}, f"{robot}: the base obeys")
     return exits.DONE

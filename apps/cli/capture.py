@@ -1,4 +1,4 @@
-"""`cocoro capture`: look at capture files, repair them, re-execute a service on them."""
+"""`cocoro capture`: list captures, look at them, keep or remove them, repair them, re-execute a service on them."""
 
 from __future__ import annotations
 
@@ -14,11 +14,13 @@ from typing import Annotated, Any
 import msgspec
 import typer
 
+from apps.captures import shelf as captures
 from apps.captures.info import AttachmentReport, CaptureReport, report
 from apps.captures.reader import Capture
 from apps.captures.rewrite import REPAIRED, rewrite
-from apps.cli import exits
-from apps.cli.options import CaptureArgument, FromOption, JsonOption, OnlyOption, ToOption, WithoutOption
+from apps.cli import completions, exits, shelf
+from apps.cli.options import CaptureArgument, FromOption, JsonOption, OnlyOption, ToOption, WithoutOption, capture_file
+from apps.cli.output import print_json
 from apps.cli.terminal import Column, fields, table
 from cocoro.capture.conventions import CaptureError
 from cocoro.clock import NS
@@ -35,8 +37,13 @@ COLUMNS = (
 )  # fmt: skip
 
 app = typer.Typer()
-capture = typer.Typer(no_args_is_help=True, help="Look at capture files, repair them, re-execute services on them.")
+capture = typer.Typer(no_args_is_help=True, help="List captures, look at them, keep, repair and re-execute them.")
 app.add_typer(capture, name="capture")
+
+capture.command("list")(shelf.list_captures)
+capture.command()(shelf.pin)
+capture.command()(shelf.unpin)
+capture.command()(shelf.remove)
 
 # --- info -----------------------------------------------------------------------------------------
 
@@ -167,15 +174,23 @@ def repair(
     out: Annotated[
         Path | None, typer.Option("--out", metavar="FILE", help="The new file; FILE.repaired.mcap by default.")
     ] = None,
-    compression: Annotated[str, typer.Option(metavar="zstd|lz4|none", help="Compression of the new file.")] = "zstd",
+    compression: Annotated[
+        str,
+        typer.Option(
+            metavar="zstd|lz4|none",
+            autocompletion=completions.of("zstd", "lz4", "none"),
+            help="Compression of the new file.",
+        ),
+    ] = "zstd",
     level: Annotated[int, typer.Option(min=1, max=19, help="Level for zstd; 19 is small and slow.")] = 1,
     only: OnlyOption = None,
     without: WithoutOption = None,
     start: FromOption = None,
     end: ToOption = None,
+    json: JsonOption = False,
 ) -> None:
     """Write everything readable of a damaged or unfinished capture into a whole one; the old file stays."""
-    sys.exit(repair_file(file, out, compression, level, only or [], without or [], start, end))
+    sys.exit(repair_file(file, out, compression, level, only or [], without or [], start, end, json))
 
 
 def repair_file(
@@ -187,6 +202,7 @@ def repair_file(
     without: list[str],
     start_s: float | None,
     end_s: float | None,
+    as_json: bool = False,
 ) -> int:
     """Writes the new capture, prints what is missing in it, and returns the exit code.
 
@@ -205,6 +221,9 @@ def repair_file(
             start_ns=_at(capture, start_s),
             end_ns=_at(capture, end_s),
         )
+    if as_json:
+        print_json(msgspec.to_builtins(done, enc_hook=str) | {"was": capture.ending})
+        return exits.DONE
     attachments = f", {done.attachments} attachments" if done.attachments else ""
     print(f"{done.path}: {done.messages} messages{attachments}, {done.size_bytes / 1e6:.1f} MB")
     for problem in done.problems:
@@ -250,18 +269,37 @@ def check_span(capture: Capture, start_s: float | None, end_s: float | None) -> 
 @capture.command("rerun", hidden=True)
 @capture.command()
 def reexecute(
-    files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="The captures of one run, in order.")],
-    service: Annotated[str, typer.Option("--service", help="perception, planning, or another with a pure core.")],
+    files: Annotated[
+        list[Path],
+        typer.Argument(metavar="FILE...", parser=capture_file, help="The captures of one run, in order."),
+    ],
+    service: Annotated[
+        str,
+        typer.Option(
+            "--service", autocompletion=completions.services, help="perception, planning, or another with a pure core."
+        ),
+    ],
     against: Annotated[
-        str, typer.Option(metavar="recorded|nothing", help="What to compare the outputs with.")
+        str,
+        typer.Option(
+            metavar="recorded|nothing",
+            autocompletion=completions.of("recorded", "nothing"),
+            help="What to compare the outputs with.",
+        ),
     ] = "recorded",
     tolerance: Annotated[
         float,
         typer.Option(min=0.0, max=0.1, help="Allowed difference of numbers, relative above 1; 0 compares exactly."),
     ] = 0.0,
+    run: Annotated[
+        bool,
+        typer.Option("--run", help="Begin where the run began: take the files before FILE, too."),
+    ] = False,
     json: JsonOption = False,
 ) -> None:
     """Execute a service again on the inputs that it had then, and compare its outputs. Exit code 1 when they differ."""
+    if run:
+        files = list(dict.fromkeys(each for file in files for each in captures.run_until(file)))
     sys.exit(reexecute_service(files, service, against, tolerance, json))
 
 
@@ -275,17 +313,17 @@ def reexecute_service(files: list[Path], service: str, against: str, tolerance: 
     if against not in ("recorded", "nothing"):
         raise ConfigError(f"--against {against}: {choice_of(against, ('recorded', 'nothing'))}")
     with ExitStack() as stack:
-        captures = [stack.enter_context(Capture.open(file)) for file in files]
-        if len({capture.robot for capture in captures}) > 1:
+        opened = [stack.enter_context(Capture.open(file)) for file in files]
+        if len({capture.robot for capture in opened}) > 1:
             raise CaptureError(
-                f"captures of several robots ({', '.join(sorted({c.robot for c in captures}))}): give those of one run"
+                f"captures of several robots ({', '.join(sorted({c.robot for c in opened}))}): give those of one run"
             )
-        result = reexecution.reexecute(captures, service, tolerance, compare=against == "recorded")
-    for capture in captures:
+        result = reexecution.reexecute(opened, service, tolerance, compare=against == "recorded")
+    for capture in opened:
         if capture.ending:
             print(f"note: {capture.path} was {capture.ending}", file=sys.stderr)
     if as_json:
-        print(msgspec.json.encode(result).decode())
+        print_json(msgspec.to_builtins(result))
     else:
         print("\n".join(reexecution.describe_result(result)))
     bad = result.differing or result.problems or (against == "recorded" and not result.equal)

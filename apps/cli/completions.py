@@ -39,7 +39,7 @@ def labels() -> Iterable[str]:
 
 @_names
 def scenes() -> Iterable[str]:
-    from sim.scene import GENERATED, scene_names
+    from sim.scene_names import GENERATED, scene_names
 
     return [*scene_names(), *GENERATED]
 
@@ -90,3 +90,14 @@ def joints() -> Iterable[str]:
 def of(*names: str) -> Callable[[str], list[str]]:
     """A completion of the given names."""
     return _names(lambda: names)
+
+
+@_names
+def captures() -> Iterable[str]:
+    """Names of captures, and of the tasks in them."""
+    from apps.captures.names import shelf
+    from services.capture.folder import parsed_name
+
+    there = shelf()
+    labels = (name.label for _, path in there if (name := parsed_name(path)) and name.label)
+    return dict.fromkeys([*(name for name, _ in there), *labels])

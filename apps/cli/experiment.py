@@ -11,12 +11,13 @@ from typing import Annotated
 import msgspec
 import typer
 
-from apps.cli import exits
+from apps.cli import completions, exits
 from apps.cli.experiment_progress import RunProgress
-from apps.cli.options import DescriptionOption, FramesOption, MeasuredOption, frames_of
+from apps.cli.options import DescriptionOption, FramesOption, JsonOption, MeasuredOption, frames_of
+from apps.cli.output import tell
 from apps.experiments.experiments import EXPERIMENTS, run
 from apps.experiments.plan import ExperimentSettings
-from cocoro.errors import ConfigError
+from cocoro.errors import ConfigError, choice_of
 
 EVERY = "all"
 
@@ -26,7 +27,14 @@ app = typer.Typer()
 
 @app.command()
 def experiment(
-    which: Annotated[str, typer.Argument(metavar="E1|E2|E3|E4|E5|E6|all", help="Which of the paper's experiments.")],
+    which: Annotated[
+        str,
+        typer.Argument(
+            metavar="E1|E2|E3|E4|E5|E6|all",
+            autocompletion=completions.of(*EXPERIMENTS, "all"),
+            help="Which of the paper's experiments.",
+        ),
+    ],
     seeds: Annotated[
         int, typer.Option(min=1, max=1000, metavar="N", help="Number of seeds, from 0 on; each is another body.")
     ] = 10,
@@ -49,6 +57,7 @@ def experiment(
         int | None, typer.Option(min=1, metavar="N", help="Runs at the same time; by default one per core.")
     ] = None,
     no_plots: Annotated[bool, typer.Option("--no-plots", help="Tables only, without matplotlib.")] = False,
+    json: JsonOption = False,
 ) -> None:
     """Run the paper's experiments in virtual time and report them beside the paper's text and baselines.
 
@@ -56,13 +65,15 @@ def experiment(
     command continues.
     """
     sys.exit(
-        run_experiments(which, seeds, out, sensors, body, (description, measured), frames, samples, jobs, not no_plots)
+        run_experiments(
+            which, seeds, out, sensors, body, (description, measured), frames, samples, jobs, not no_plots, json
+        )
     )
 
 
 def run_experiments(
     which: str, seeds: int, out: Path, sensors: str, body: str, robot_files: tuple[Path | None, Path | None],
-    frames: str | None, samples: int, jobs: int | None, plots: bool,
+    frames: str | None, samples: int, jobs: int | None, plots: bool, as_json: bool = False,
 ) -> int:  # fmt: skip
     """Runs, writes the report, prints its tables; the exit code is 1 when a run failed.
 
@@ -70,10 +81,10 @@ def run_experiments(
     """
     keys = list(EXPERIMENTS) if which == EVERY else [which.upper()]
     if keys[0] not in EXPERIMENTS:
-        raise ConfigError(f"there is no experiment {which!r}; known are {', '.join(EXPERIMENTS)} and {EVERY}")
+        raise ConfigError(f"there is no experiment {which!r}; {choice_of(which.upper(), [*EXPERIMENTS, EVERY])}")
     for name, value, known in (("sensors", sensors, ("ideal", "real")), ("body", body, ("nominal", "worn"))):
         if value not in known:
-            raise ConfigError(f"--{name} {value}: known are {' and '.join(known)}")
+            raise ConfigError(f"--{name} {value}: {choice_of(value, known)}")
     description, measured = (None if file is None else str(file.resolve()) for file in robot_files)
     settings = ExperimentSettings(
         seeds=tuple(range(seeds)), out=out.resolve(), sensors="real" if sensors == "real" else "ideal",
@@ -90,5 +101,6 @@ def run_experiments(
     except KeyboardInterrupt:
         print("interrupted; finished runs are kept, and the same command continues", file=sys.stderr)
         return exits.REFUSED
-    print(f"{path} and {path.with_suffix('.html').name} are written")
+    data = {"report": str(path), "sections": [section.data() for section in sections]}
+    tell(as_json, data, f"{path} and {path.with_suffix('.html').name} are written")
     return exits.FAILED if any(section.errors for section in sections) else exits.DONE

@@ -13,7 +13,8 @@ import typer
 from apps.captures.export.files import refuse_existing
 from apps.captures.reader import Capture
 from apps.cli import exits
-from apps.cli.options import CaptureArgument
+from apps.cli.options import CameraOption, CaptureArgument, JsonOption
+from apps.cli.output import print_json
 from cocoro.clock import NS
 from cocoro.errors import ConfigError
 
@@ -32,8 +33,11 @@ def export(
     file: CaptureArgument,
     video: Annotated[
         Path | None,
-        typer.Option("--video", metavar="OUT.mp4", help="Film of the camera's pictures with the detections drawn in."),
+        typer.Option(
+            "--video", metavar="OUT.mp4", help="Film of the camera's pictures with the detections; .webp: an animation."
+        ),
     ] = None,
+    camera: CameraOption = "robot",
     foxglove: Annotated[
         Path | None, typer.Option("--foxglove", metavar="OUT.mcap", help="For Foxglove; needs cocoro-mesh[foxglove].")
     ] = None,
@@ -49,10 +53,11 @@ def export(
     attachments: Annotated[
         Path | None, typer.Option("--attachments", metavar="DIR", help="The files that are attached to the capture.")
     ] = None,
+    json: JsonOption = False,
 ) -> None:
     """Turn a capture into a film, tables, or a file for Foxglove or Rerun; or extract its attachments. Several forms
     at once are possible."""
-    sys.exit(export_capture(file, video, rrd, foxglove, csv, parquet, attachments))
+    sys.exit(export_capture(file, video, rrd, foxglove, csv, parquet, attachments, camera, json))
 
 
 def export_capture(
@@ -63,6 +68,8 @@ def export_capture(
     csv: Path | None = None,
     parquet: Path | None = None,
     attachments: Path | None = None,
+    camera: str = "robot",
+    as_json: bool = False,
 ) -> int:
     """Writes each form whose path is given, and returns the exit code.
 
@@ -75,41 +82,57 @@ def export_capture(
     for out in (video, rrd, foxglove):
         if out is not None:
             refuse_existing(out)  # before the first form has taken minutes
+    written: list[dict[str, object]] = []
+
+    def wrote(path: Path, count: int, what: str, then: str = "") -> None:
+        written.append({"path": str(path), what: count})
+        if not as_json:
+            print(f"{path}: {count} {what}{f'; {then}' if then else ''}")
+
     with Capture.open(file) as capture:
         if video is not None:
-            from apps.captures.export import video as films
-
-            with progress_bar(capture, video) as show:
-                pictures = films.export(capture, video, show)
-            print(f"{video}: {pictures} pictures")
+            wrote(video, film(capture, video, camera), "pictures")
         if foxglove is not None:
             from apps.captures.export.foxglove import export as export_foxglove
 
             with progress_bar(capture, foxglove) as show:
                 messages = export_foxglove(capture, foxglove, show)
-            print(f"{foxglove}: {messages} messages; open it with Foxglove")
+            wrote(foxglove, messages, "messages", "open it with Foxglove")
         if csv is not None or parquet is not None:
             from apps.captures.export import tables
 
             if csv is not None:
-                print(f"{csv}: {len(tables.export(capture, tables.CsvFolder(csv)))} tables")
+                wrote(csv, len(tables.export(capture, tables.CsvFolder(csv))), "tables")
             if parquet is not None:
-                print(f"{parquet}: {len(tables.export(capture, tables.ParquetFolder(parquet)))} tables")
+                wrote(parquet, len(tables.export(capture, tables.ParquetFolder(parquet))), "tables")
         if rrd is not None:
             from apps.captures.export import rerun_scene
 
             with progress_bar(capture, rrd) as show:
                 messages = rerun_scene.export(capture, rrd, show)
-            print(f"{rrd}: {messages} messages; open it with `rerun {rrd}`")
+            wrote(rrd, messages, "messages", f"open it with `rerun {rrd}`")
         if attachments is not None:
             from apps.captures.export.files import export_attachments
 
-            print(f"{attachments}: {export_attachments(capture, attachments)} attachments")
+            wrote(attachments, export_attachments(capture, attachments), "attachments")
         for problem in capture.problems:
             print(f"missing: {problem}", file=sys.stderr)
         if capture.ending:
             print(f"note: {file} was {capture.ending}", file=sys.stderr)
-        return exits.FAILED if capture.problems else exits.DONE
+    if as_json:
+        print_json({"written": written, "missing": [str(problem) for problem in capture.problems]})
+    return exits.FAILED if capture.problems else exits.DONE
+
+
+def film(capture: Capture, out: Path, camera: str) -> int:
+    """Makes a film of a capture, and returns the number of its pictures.
+
+    Raises CaptureError when it cannot be made, ConfigError for an unknown camera.
+    """
+    from apps.captures.export import video
+
+    with progress_bar(capture, out) as show:
+        return video.export(capture, out, show, video.camera_of(camera))
 
 
 @contextmanager

@@ -20,7 +20,7 @@ from rich.text import Text
 from apps.cli import exits
 from apps.cli.interrupt import interrupt_event
 from apps.cli.link import joined
-from apps.cli.listening import KeyListener, keyexpr_of, takes_frames
+from apps.cli.listening import KeyListener, keyexpr_of, nothing_on, takes_frames
 from apps.cli.options import JsonOption, KeyArgument, MeshOption, RobotChoice, RobotOption
 from apps.cli.output import print_json
 from apps.cli.terminal import Column, FittedTable, table
@@ -221,7 +221,7 @@ class _RateDisplay:
         if self._as_json:
             print_json([asdict(report) for report in reports])
             return
-        nothing = f"nothing on {keyexpr} yet"
+        nothing = nothing_on(keyexpr)
         if self._live is not None:
             shown = FittedTable(COLUMNS, map(_row, reports)) if reports else Text(nothing)
             self._live.update(shown, refresh=True)

@@ -17,9 +17,11 @@ HANDS_OFF = (*SIGNALS, signal.SIGQUIT, signal.SIGTSTP)
 
 
 @contextmanager
-def on_signals(numbers: Iterable[signal.Signals], handler: Callable[[signal.Signals], None]) -> Iterator[None]:
+def on_signals(
+    numbers: Iterable[signal.Signals], handler: Callable[[signal.Signals], None], *, hurried: bool = False
+) -> Iterator[None]:
     """Calls `handler`, in the event loop, at each of these signals while the context lasts. A write that waits for a
-    reader is given up then, so that it does not keep the loop from the handler.
+    reader is given up then, so that it does not keep the loop from the handler; with `hurried` so are all later ones.
 
     A signal that the process ignores stays ignored (nohup, and scripts in the background), except SIGTERM.
     """
@@ -29,7 +31,7 @@ def on_signals(numbers: Iterable[signal.Signals], handler: Callable[[signal.Sign
     for number in kept:
         loop.add_signal_handler(number, handler, number)
         # The loop's own handler, which does nothing, would let a waiting write wait on.
-        signal.signal(number, lambda *_: output.give_up_waiting())
+        signal.signal(number, lambda *_: output.give_up_waiting(hurried))
     try:
         with output.interruptible():
             yield

@@ -11,7 +11,8 @@ from typing import Annotated, Any
 import typer
 
 from apps.cli import exits
-from apps.cli.options import DescriptionOption, MeasuredOption, ProfileOption
+from apps.cli.options import DescriptionOption, JsonOption, MeasuredOption, ProfileOption
+from apps.cli.output import tell
 from apps.cli.toml_files import write_values
 from cocoro.component import load
 from cocoro.errors import ConfigError, RefusedError
@@ -50,9 +51,10 @@ def calibrate(
         Path | None,
         typer.Option("--write", metavar="FILE", help="Write the result into this file, not the robot's measured file."),
     ] = None,
+    json: JsonOption = False,
 ) -> None:
     """Measure lenses, registration and depth curve from views of a chessboard. The robot must be down."""
-    sys.exit(calibrate_from_views(profile, board, square, views, source, keep, write, description, measured))
+    sys.exit(calibrate_from_views(profile, board, square, views, source, keep, write, description, measured, json))
 
 
 @kinect.command()
@@ -66,7 +68,7 @@ def tilt(
 
 def calibrate_from_views(
     profile_name: str, size: str, square_mm: float, views: int, source: Path | None, keep: Path | None,
-    write: Path | None, description: Path | None = None, measured: Path | None = None,
+    write: Path | None, description: Path | None = None, measured: Path | None = None, as_json: bool = False,
 ) -> int:  # fmt: skip
     """Takes views or reads them from `source`, calibrates, and writes the result into the robot's measured file.
 
@@ -85,10 +87,11 @@ def calibrate_from_views(
         report(f"show the board ({size} inner corners) 0.6 to 2 m away, in every part of the picture, tilted every way")
         taken = tools.capture(_config(profile), board, views, keep, report)
     found = calibration.calibrate(taken, board, robot)
-    _print(found)
+    if not as_json:
+        _print(found)
     write_values(file, "kinect", found.values())
-    print(f"written to {file}")
-    if profile.measured is None:
+    tell(as_json, {"file": str(file), "views": found.views, "kinect": found.values()}, f"written to {file}")
+    if not as_json and profile.measured is None:
         print(f'Name the file in the profile: measured = "{file}"')
     return exits.DONE
 

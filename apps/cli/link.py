@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from apps.cli.options import RobotChoice
 from cocoro.bus.base import Bus
 from cocoro.bus.zenoh import ZenohBus
-from cocoro.errors import ConfigError, MeshError
+from cocoro.errors import ConfigError, MeshError, choice_of
 from cocoro.participant import Answer, Participant
 from cocoro.topics import Request
 from deploy import robot_time
@@ -105,7 +105,9 @@ async def joined(
         run_dir = find(choice)
         config = run_dir.join_as("operator")
         if config.directory is not None and not run_dir.populated:
-            raise MeshError(f"{run_dir.robot} is not up on this machine: {START}")
+            up = [other.robot for other in robots()]
+            advice = choice_of(run_dir.robot, up) if up else START
+            raise MeshError(f"{run_dir.robot} is not up on this machine: {advice}")
     config = replace(config, shared_memory=frames)
     if patience_s is not None:
         config = replace(config, patience_s=patience_s)

@@ -29,7 +29,7 @@ COMMANDS = (
         WATCH,
         "List the topics and requests of all installed components: type, rate, age, quality of service, publisher.",
     ),
-    CommandRow("capture", CAPTURES, "Look at capture files, repair them, re-execute services on them."),
+    CommandRow("capture", CAPTURES, "List captures, look at them, keep, repair and re-execute them."),
     CommandRow("record", CAPTURES, "Record what travels on the mesh into MCAP files, until Ctrl-C."),
     CommandRow("replay", CAPTURES, "Send a capture into the mesh again."),
     CommandRow(

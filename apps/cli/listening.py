@@ -6,8 +6,10 @@ import asyncio
 import time
 from collections import deque
 from contextlib import suppress
+from difflib import get_close_matches
 from typing import NamedTuple
 
+from apps.cli.completions import topics
 from apps.cli.link import MeshLink
 from cocoro.bus.base import Payload, Qos
 from cocoro.errors import ConfigError
@@ -41,6 +43,14 @@ def takes_frames(text: str) -> bool:
     """Whether frames may be among the messages of this key."""
     topic = topic_named(text)
     return topic is None or topic.qos is Qos.FRAME
+
+
+def nothing_on(keyexpr: str) -> str:
+    """Text for a key without messages: which known key is like it, or where keys are listed."""
+    key = keyexpr.partition("/")[2]
+    close = get_close_matches(key, {*topics("")} - {key}, 1) if topic_named(key) is None and "*" not in key else []
+    advice = f"did you mean {close[0]}?" if close else "`cocoro topics` lists topics, `cocoro top` the live ones"
+    return f"nothing on {keyexpr} yet; {advice}"
 
 
 class KeyListener:

@@ -16,6 +16,8 @@ import typer
 
 from apps.cli import exits
 from apps.cli.listed import COMMANDS
+from apps.cli.options import JsonOption
+from apps.cli.output import print_json
 from cocoro.errors import ConfigError
 from deploy import processes
 from services.executive.tasks import TASKS
@@ -38,39 +40,40 @@ app.add_typer(new, name="new")
 def service(
     name: Annotated[str, typer.Argument(help="Name of the service, the first part of its keys: nearest.")],
     into: Annotated[Path, typer.Option(metavar="DIR", help="The folder that its folder goes into.")] = Path(),
+    json: JsonOption = False,
 ) -> None:
     """A working component with its test, as a package of your own."""
-    sys.exit(write_service(name, into))
+    sys.exit(write_service(name, into, json))
 
 
 @new.command()
 def task(
     name: Annotated[str, typer.Argument(help="Name of the task, and of its command: greet.")],
     into: Annotated[Path, typer.Option(metavar="DIR", help="The folder that its folder goes into.")] = Path(),
+    json: JsonOption = False,
 ) -> None:
     """A working task with its test, as a package of your own."""
-    sys.exit(write_task(name, into))
+    sys.exit(write_task(name, into, json))
 
 
-def write_service(name: str, into: Path) -> int:
+def write_service(name: str, into: Path, as_json: bool = False) -> int:
     """Writes the component into the folder `into`/`name`. Raises ConfigError for an invalid or taken name."""
     folder = into / name
     if folder.exists():
         raise ConfigError(f"{folder} exists already; choose another name, or another place with --into")
     package = package_of(name)
-    write(SERVICE, name, folder)
+    made = write(SERVICE, name, folder)
     hints = (
         (f"pytest {folder}", "runs its tests"),
         (f"pip install -e {folder}", "installs it"),
         (f"cocoro run {name}", "runs it beside a robot that is up"),
         (f"cocoro echo {name}/travelled", "prints its messages"),
     )
-    print(f"\nIts computation is in {folder / package / 'core.py'}. Next:")
-    print_hints(hints)
+    tell_of(made, f"Its computation is in {folder / package / 'core.py'}.", hints, as_json)
     return exits.DONE
 
 
-def write_task(name: str, into: Path) -> int:
+def write_task(name: str, into: Path, as_json: bool = False) -> int:
     """Writes the task into the folder `into`/`name`. Raises ConfigError for an invalid or taken name."""
     folder = into / name
     if folder.exists():
@@ -80,26 +83,24 @@ def write_task(name: str, into: Path) -> int:
         raise ConfigError(f"there is a task {name} already; choose another name")
     if name in {row.name for row in COMMANDS}:
         raise ConfigError(f"there is a command `cocoro {name}` already; choose another name")
-    write(TASK, name, folder)
-    print(f"\nIts type is in {folder / package}.py. Next:")
-    print_hints(
-        (
-            (f"pip install -e {folder}", "installs it"),
-            (f"pytest {folder}", "runs its test"),
-            (f"cocoro rehearse {name}", "tries it in simulation"),
-            (f"cocoro {name}", "runs it on a robot that is up"),
-        )
+    hints = (
+        (f"pip install -e {folder}", "installs it"),
+        (f"pytest {folder}", "runs its test"),
+        (f"cocoro rehearse {name}", "tries it in simulation"),
+        (f"cocoro {name}", "runs it on a robot that is up"),
     )
+    tell_of(write(TASK, name, folder), f"Its type is in {folder / package}.py.", hints, as_json)
     return exits.DONE
 
 
-def write(template: str, name: str, folder: Path) -> None:
-    """Writes the files of a template and prints their paths. Raises ConfigError when one cannot be written."""
+def write(template: str, name: str, folder: Path) -> list[Path]:
+    """Writes the files of a template and returns their paths. Raises ConfigError when one cannot be written."""
     words = {
         "name": name,
         "package": name.replace("-", "_"),
         "class": "".join(part.capitalize() for part in re.split("[-_]+", name)),
     }
+    made = []
     for path, text in files(template, words):
         target = folder / path
         try:
@@ -107,10 +108,17 @@ def write(template: str, name: str, folder: Path) -> None:
             target.write_text(text, encoding="utf-8")
         except OSError as error:
             raise ConfigError(f"{target} cannot be written: {error.strerror}") from error
-        print(target)
+        made.append(target)
+    return made
 
 
-def print_hints(hints: Iterable[tuple[str, str]]) -> None:
+def tell_of(made: list[Path], where: str, hints: Iterable[tuple[str, str]], as_json: bool) -> None:
+    """Prints the new files, where to begin, and what to do next."""
+    if as_json:
+        print_json({"files": [str(path) for path in made], "next": [command for command, _ in hints]})
+        return
+    print(*made, f"\n{where} Next:", sep="\n")
+    hints = tuple(hints)
     width = max(len(command) for command, _ in hints)
     for command, what in hints:
         print(f"  {command:<{width}}  # {what}")

@@ -70,7 +70,10 @@ SetOption = Annotated[
     typer.Option("--set", metavar="KEY=VALUE", help="Any setting of the profile: service.sim.seed=3. Repeatable."),
 ]
 FramesOption = Annotated[
-    str | None, typer.Option("--frames", metavar="WxH@HZ", help="Size and rate of the camera's frames: 320x240@15.")
+    str | None,
+    typer.Option(
+        "--frames", metavar="WxH@HZ", envvar="COCORO_FRAMES", help="Size and rate of the camera's frames: 320x240@15."
+    ),
 ]
 LatencyOption = Annotated[
     list[str] | None,
@@ -135,7 +138,31 @@ TimeoutOption = Annotated[
 
 # --- captures and topics --------------------------------------------------------------------------
 
-CaptureArgument = Annotated[Path, typer.Argument(metavar="FILE", help="A capture (MCAP file).")]
+
+def capture_file(text: str) -> Path:
+    """Reads a capture's file or name (latest, fetch, 'fetch red_can', a task's id)."""
+    from apps.captures.shelf import find  # slow to import
+
+    return find(text)
+
+
+CaptureArgument = Annotated[
+    Path,
+    typer.Argument(
+        metavar="FILE",
+        parser=capture_file,
+        autocompletion=completions.captures,
+        help="A capture: an MCAP file, latest, latest-1, or a task: 'fetch red_can'.",
+    ),
+]
+CameraOption = Annotated[
+    str,
+    typer.Option(
+        "--camera",
+        metavar="robot|outside|both",
+        help="For the film: the robot's camera, one that films the simulated robot, or both.",
+    ),
+]
 OnlyOption = Annotated[
     list[str] | None,
     typer.Option("--only", metavar="KEYEXPR", help="Only these keys: base/state, */health, frames. Repeatable."),

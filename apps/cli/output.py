@@ -28,6 +28,7 @@ SPELLING = "cocoro.spelling"
 """Name under which `codecs` knows the streams' error handler."""
 PIECE = 4096
 """Bytes that a pipe which has room takes at once."""
+HURRIED_S = 0.1
 UNREAD = OSError(errno.EAGAIN, "its reader reads nothing")
 CLOSED = OSError(errno.EBADF, "it is closed")
 ADVICE = {
@@ -56,8 +57,10 @@ class _Out(io.RawIOBase):
         """Whether any byte was written."""
         self.interruptible = False
         """Whether `give_up_waiting` ends a write that waits for a reader."""
+        self.hurried = False
+        """Whether no write waits for longer than HURRIED_S: the command is being ended."""
         self.waits = False
-        """Whether such a write waits now."""
+        """Whether an interruptible write waits now."""
         self._fd = fd
         self._was_closed = closed
 
@@ -77,10 +80,10 @@ class _Out(io.RawIOBase):
         if self._was_closed:
             raise CLOSED
         while True:
-            if self.interruptible:
+            if self.interruptible or self.hurried:
                 self._wait_for_room()
             try:
-                count = os.write(self._fd, data[:PIECE] if self.interruptible else data)
+                count = os.write(self._fd, data[:PIECE] if self.interruptible or self.hurried else data)
             except BlockingIOError:  # another process set O_NONBLOCK on the shared descriptor
                 import select
 
@@ -93,8 +96,10 @@ class _Out(io.RawIOBase):
         """Waits until the reader takes a piece; the wait can be given up, that of `os.write` could not."""
         import select
 
-        if select.select([], [self._fd], [], 0)[1]:
+        if select.select([], [self._fd], [], HURRIED_S if self.hurried else 0)[1]:
             return
+        if self.hurried:
+            raise UNREAD
         self.waits = True
         try:
             select.select([], [self._fd], [])
@@ -204,6 +209,14 @@ def print_json(value: Any) -> None:
     print(json.dumps(value), flush=True)
 
 
+def tell(as_json: bool, data: Any, text: str) -> None:
+    """Prints a result, as JSON or as text."""
+    if as_json:
+        print_json(data)
+    else:
+        print(text, flush=True)
+
+
 def asks_json(arguments: list[str]) -> bool:
     """Whether a command's arguments ask for JSON."""
     end = arguments.index("--") if "--" in arguments else len(arguments)
@@ -233,8 +246,11 @@ def interruptible() -> Iterator[None]:
             out.interruptible = False
 
 
-def give_up_waiting() -> None:
-    """Ends a write that waits for a reader, as if the stream were lost; called in a signal handler."""
+def give_up_waiting(for_good: bool) -> None:
+    """Ends a write that waits for a reader, as if the stream were lost; called in a signal handler. `for_good`: no
+    later write waits for long."""
+    for out in _outs.values():
+        out.hurried = out.hurried or for_good
     if any(out.waits for out in _outs.values()):
         raise UNREAD
 

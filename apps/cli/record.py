@@ -12,11 +12,11 @@ from typing import Annotated, Any
 import msgspec
 import typer
 
-from apps.cli import exits
+from apps.cli import completions, exits
 from apps.cli.interrupt import interrupt_event
 from apps.cli.link import joined
-from apps.cli.options import MeshOption, OnlyOption, RobotChoice, RobotOption, WithoutOption
-from apps.cli.output import going_on
+from apps.cli.options import JsonOption, MeshOption, OnlyOption, RobotChoice, RobotOption, WithoutOption
+from apps.cli.output import complain, going_on, tell
 from apps.cli.terminal import StatusLine
 from cocoro.clock import FollowedClock
 from cocoro.component import load as load_component
@@ -40,7 +40,12 @@ def record(
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Where the files go.")] = Path(),
     only: OnlyOption = None,
     without: WithoutOption = None,
-    compression: Annotated[str, typer.Option(metavar="zstd|lz4|none", help="Lossless compression.")] = "zstd",
+    compression: Annotated[
+        str,
+        typer.Option(
+            metavar="zstd|lz4|none", autocompletion=completions.of("zstd", "lz4", "none"), help="Lossless compression."
+        ),
+    ] = "zstd",
     jpeg: Annotated[
         int | None,
         typer.Option(min=1, max=100, metavar="QUALITY", help="Store pictures as JPEG: lossy and far smaller."),
@@ -48,16 +53,19 @@ def record(
     seconds: Annotated[float | None, typer.Option("--for", min=0.1, metavar="S", help="Stop after this time.")] = None,
     robot: RobotOption = None,
     profile: MeshOption = None,
+    json: JsonOption = False,
 ) -> None:
     """Record what travels on the mesh into MCAP files, until Ctrl-C. The robot's own recorder keeps running."""
     settings = {
         "folder": str(out.resolve()), "only": only or (), "without": without or (),
         "compression": compression, "jpeg_quality": jpeg, "per_occasion": False,
     }  # fmt: skip
-    sys.exit(asyncio.run(record_mesh(RobotChoice(robot, profile), settings, seconds)))
+    sys.exit(asyncio.run(record_mesh(RobotChoice(robot, profile), settings, seconds, json)))
 
 
-async def record_mesh(choice: RobotChoice, settings: dict[str, Any], seconds: float | None) -> int:
+async def record_mesh(
+    choice: RobotChoice, settings: dict[str, Any], seconds: float | None, as_json: bool = False
+) -> int:
     """Records until interrupted, or for `seconds`, and returns the exit code.
 
     `settings` are fields of the recorder's configuration. Raises MeshError when there is no mesh, ConfigError for a
@@ -78,8 +86,8 @@ async def record_mesh(choice: RobotChoice, settings: dict[str, Any], seconds: fl
         async with Node(
             name, link.bus, clock, robot, robot_name=link.robot, module=CAPTURE.module, config=config, profile=resolved
         ) as node:
-            with interrupt_event() as end, going_on(), StatusLine() as line:
-                display = _RecordingDisplay(line)
+            with interrupt_event() as end, going_on(), StatusLine(sys.stderr if as_json else None) as line:
+                display = _RecordingDisplay(line, as_json)
                 node.on(RECORDING.of(name), display.show)
                 await _run_until(component.run(node, config), end, display.failed, seconds)
                 with suppress(TimeoutError):
@@ -101,10 +109,11 @@ async def _run_until(work: Any, end: asyncio.Event, failed: asyncio.Event, secon
 class _RecordingDisplay:
     """Shows a recording: on a terminal one line rewritten in place, elsewhere the name of each file."""
 
-    def __init__(self, line: StatusLine) -> None:
+    def __init__(self, line: StatusLine, as_json: bool = False) -> None:
         self.failed = asyncio.Event()
         self.ended = asyncio.Event()
         self._line = line
+        self._as_json = as_json
         self._newest: Recording | None = None
         self._files: set[str] = set()
 
@@ -121,18 +130,18 @@ class _RecordingDisplay:
             self.failed.set()
         elif self._line.shown:
             self._line.show(_recording_line(recording))
-        elif recording.file and (before is None or before.file != recording.file):
+        elif not self._as_json and recording.file and (before is None or before.file != recording.file):
             print(recording.file, flush=True)
 
     def finish(self) -> int:
         """Prints the summary, disturbed files and the fault, and returns the exit code."""
         newest = self._newest
         if newest is None:
-            print("nothing was recorded")
+            complain("nothing was recorded")
             return exits.FAILED
         others = len(self._files - {newest.file, ""} - {file.file for file in newest.disturbed})
         others += sum(file.became == "moved" and file.now != newest.file for file in newest.disturbed)
-        print(_recording_line(newest, others))
+        tell(self._as_json, msgspec.to_builtins(newest), _recording_line(newest, others))
         for file in newest.disturbed:
             print(f"cocoro: {describe_disturbance(file)}", file=sys.stderr)
         if newest.fault:

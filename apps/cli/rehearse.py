@@ -6,11 +6,16 @@ import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext, redirect_stdout
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import msgspec
 
+from apps.captures.export import video as films
+from apps.captures.reader import Capture
 from apps.cli import exits
+from apps.cli.export import film
 from apps.cli.options import frames_of, latencies_of
 from apps.cli.output import complain, print_json
 from apps.cli.running import scene_of
@@ -21,12 +26,45 @@ from apps.rehearsal.request import RehearsalRequest
 from cocoro.errors import CocoroError, ConfigError
 
 
-def rehearse(options: dict[str, Any], latency: list[str], frames: str | None, as_json: bool) -> int:
-    """Runs a rehearsal and returns the exit code. `options` are fields of the request.
+def rehearse(
+    options: dict[str, Any],
+    latency: list[str],
+    frames: str | None,
+    as_json: bool,
+    video: Path | None = None,
+    camera: str = "outside",
+) -> int:
+    """Runs a rehearsal, makes a film of it when `video` is its file, and returns the exit code. `options` are fields of
+    the request.
 
-    Raises ConfigError for an impossible option.
+    Raises ConfigError for an impossible option, CaptureError for a film that cannot be made.
     """
     request = request_of(options, latency, frames)
+    if video is None:
+        return _run(request, as_json)
+    films.camera_of(camera)
+    films.check(video)
+    with nullcontext(request.record) if request.record is not None else _capture_beside(video) as record:
+        code = _run(msgspec.structs.replace(request, record=record), as_json)
+        if Path(record).exists():
+            with _output_to_stderr() if as_json else nullcontext(), Capture.open(Path(record)) as capture:
+                print(f"{video}: {film(capture, video, camera)} pictures")
+    return code
+
+
+@contextmanager
+def _capture_beside(video: Path) -> Iterator[str]:
+    """A file for a capture that is there while the context lasts, on the disk that the film is for."""
+    try:
+        video.parent.mkdir(parents=True, exist_ok=True)
+        folder = TemporaryDirectory(prefix=".film-", dir=video.parent)
+    except OSError as error:
+        raise CocoroError(f"{video.parent}: {error.strerror}; choose another place for the film") from error
+    with folder as path:
+        yield str(Path(path) / "rehearsal.mcap")
+
+
+def _run(request: RehearsalRequest, as_json: bool) -> int:
     from apps.rehearsal.rehearse import rehearse as run  # imports the simulator, which is slow
 
     try:

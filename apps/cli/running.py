@@ -9,15 +9,17 @@ import subprocess
 import sys
 from contextlib import closing
 from pathlib import Path
-from typing import IO, Annotated, Any
+from typing import IO, Annotated, Any, TextIO
 
 import msgspec
 import typer
 
+from apps.captures.names import open_captures
 from apps.cli import completions, exits
 from apps.cli.options import (
     AdaptOption,
     FramesOption,
+    JsonOption,
     LatencyOption,
     ModelOption,
     ObjectsOption,
@@ -29,7 +31,7 @@ from apps.cli.options import (
     frames_of,
     latencies_of,
 )
-from apps.cli.output import going_on
+from apps.cli.output import going_on, print_json
 from cocoro import private
 from cocoro.bus import shared
 from cocoro.errors import CocoroError, ConfigError
@@ -79,6 +81,7 @@ def up(
         bool,
         typer.Option("--unattended", help="No person is present: the robot's first start has the emergency stop set."),
     ] = False,
+    json: JsonOption = False,
 ) -> None:
     """Start a robot's processes and stay until Ctrl-C (or, with --detach, until they are ready)."""
     settings = overrides(scene, seed, sensors, body, frames, latency or [], set_ or [])
@@ -87,13 +90,20 @@ def up(
     settings[:0] = model_of(model, reach, adapt)
     read = profiles.read(profile, settings)
     extras.require(f"cocoro up {profile}", read.rows())
-    sys.exit(supervise_detached(read, unattended) if detach else supervise(read, unattended))
+    if json and not detach:
+        raise ConfigError("--json says when the robot is up, so it needs --detach")
+    if not detach:
+        sys.exit(supervise(read, unattended))
+    code = supervise_detached(read, unattended, sys.stderr if json else sys.stdout)
+    if json and code == exits.DONE:
+        print_json({"robot": read.robot, "profile": read.name, "up": True, "services": read.services()})
+    sys.exit(code)
 
 
 @app.command()
-def down(robot: RobotOption = None) -> None:
+def down(robot: RobotOption = None, json: JsonOption = False) -> None:
     """Stop a robot's processes. It is no error when none run."""
-    sys.exit(stop_robots(robot))
+    sys.exit(stop_robots(robot, json))
 
 
 @app.command()
@@ -185,7 +195,7 @@ def supervise(profile: Profile, unattended: bool) -> int:
     return supervisor.supervise(profile, run_dir, _print, lambda: _print("Ctrl-C stops it"), by_hand=not unattended)
 
 
-def supervise_detached(profile: Profile, unattended: bool) -> int:
+def supervise_detached(profile: Profile, unattended: bool, out: TextIO | None = None) -> int:
     """Starts a supervisor in a session of its own; returns when the robot is up, or with the exit code of its failure.
 
     Raises CocoroError when the supervisor dies.
@@ -221,7 +231,7 @@ def supervise_detached(profile: Profile, unattended: bool) -> int:
         try:
             for report in map(json.loads, reports):
                 if "line" in report:
-                    _print(report["line"])
+                    _print(report["line"], out)
                 else:
                     code = report["code"]
         except KeyboardInterrupt:
@@ -256,19 +266,22 @@ def _last_error(run_dir: RunDir) -> str:
 # --- down and run -----------------------------------------------------------------------------------
 
 
-def stop_robots(robot: str | None) -> int:
+def stop_robots(robot: str | None, as_json: bool = False) -> int:
     """Stops one robot, or all that are up on this machine; returns the exit code."""
     chosen = [RunDir(robot)] if robot is not None else [r for r in robots() if r.supervisor() or r.claims()]
-    stopped = [_stop(run_dir) for run_dir in chosen]
+    stopped = [run_dir.robot for run_dir in chosen if _stop(run_dir, as_json)]
     shared.sweep()  # shared memory that killed processes left
-    if not any(stopped):
+    if as_json:
+        print_json({"down": stopped})
+    elif not stopped:
         _print(f"{robot} was not up" if robot else "nothing was up")
     return exits.DONE
 
 
-def _stop(run_dir: RunDir) -> bool:
+def _stop(run_dir: RunDir, quiet: bool = False) -> bool:
     """Stops one robot; returns whether anything was running."""
     found = False
+    recorded = open_captures(run_dir)
     with closing(Target(run_dir.path / "supervisor")) as supervisor:
         if supervisor.pid is not None:
             found = True
@@ -285,8 +298,10 @@ def _stop(run_dir: RunDir) -> bool:
             if not target.wait(launch.ORPHAN_S):
                 target.signal(signal.SIGKILL)
                 target.wait(launch.ORPHAN_S)
-    if found:
+    if found and not quiet:
         _print(f"{run_dir.robot} is down")
+        for path in filter(Path.exists, recorded):
+            _print(f"recorded in {path}")
     return found
 
 
@@ -308,6 +323,6 @@ def run_process(process: str, profile: str | None, settings: list[str]) -> int:
         return launch.run(process, run_dir, msgspec.to_builtins(read), read.name, raise_crashes=True)
 
 
-def _print(text: str) -> None:
+def _print(text: str, out: TextIO | None = None) -> None:
     with going_on():  # a closed standard output, as in `cocoro up | head`, must not stop the robot
-        print(text, flush=True)
+        print(text, file=out, flush=True)

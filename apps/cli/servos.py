@@ -13,7 +13,7 @@ from typing import Annotated, Any, cast
 
 import typer
 
-from apps.cli import exits
+from apps.cli import completions, exits
 from apps.cli.link import MeshLink, joined
 from apps.cli.options import (
     DescriptionOption,
@@ -24,12 +24,12 @@ from apps.cli.options import (
     RobotChoice,
     RobotOption,
 )
-from apps.cli.output import print_json
+from apps.cli.output import complain, print_json, tell
 from apps.cli.terminal import StatusLine, print_table
 from apps.cli.toml_files import write_values
 from cocoro.component import load
 from cocoro.errors import CocoroError, ConfigError, MeshError, RefusedError, choice_of
-from cocoro.messages import ServoRequest
+from cocoro.messages import ServoReply, ServoRequest
 from cocoro.ports import port_path
 from cocoro.robot import Joint, Robot
 from cocoro.topics import SERVOS
@@ -46,10 +46,16 @@ REPLY_S = 0.05
 """Longest wait for one servo's reply on the serial line."""
 
 JointsArgument = Annotated[
-    list[str] | None, typer.Argument(metavar="[JOINT]...", help="Names of joints; all joints by default.")
+    list[str] | None,
+    typer.Argument(
+        metavar="[JOINT]...", autocompletion=completions.joints, help="Names of joints; all joints by default."
+    ),
 ]
 JointArguments = Annotated[
-    list[str], typer.Argument(metavar="JOINT...", help="Names of joints, worked on one after the other.")
+    list[str],
+    typer.Argument(
+        metavar="JOINT...", autocompletion=completions.joints, help="Names of joints, worked on one after the other."
+    ),
 ]
 PortOption = Annotated[
     str | None, typer.Option("--port", metavar="DEVICE", help="Serial port, instead of the profile's.")
@@ -77,29 +83,35 @@ app.add_typer(servos, name="servos")
 
 
 @servos.command()
-def clear(joints: JointsArgument = None, robot: RobotOption = None, profile: MeshOption = None) -> None:
+def clear(
+    joints: JointsArgument = None, robot: RobotOption = None, profile: MeshOption = None, json: JsonOption = False
+) -> None:
     """Clear latched faults, such as an overload; the joints then hold where they are."""
-    sys.exit(asyncio.run(request(RobotChoice(robot, profile), "clear", joints or [])))
+    sys.exit(asyncio.run(request(RobotChoice(robot, profile), "clear", joints or [], json)))
 
 
 @servos.command()
-def relax(joints: JointsArgument = None, robot: RobotOption = None, profile: MeshOption = None) -> None:
+def relax(
+    joints: JointsArgument = None, robot: RobotOption = None, profile: MeshOption = None, json: JsonOption = False
+) -> None:
     """Make joints limp, so that they can be turned by hand. The arm sinks: hold it."""
-    sys.exit(asyncio.run(request(RobotChoice(robot, profile), "relax", joints or [])))
+    sys.exit(asyncio.run(request(RobotChoice(robot, profile), "relax", joints or [], json)))
 
 
 @servos.command()
-def hold(joints: JointsArgument = None, robot: RobotOption = None, profile: MeshOption = None) -> None:
+def hold(
+    joints: JointsArgument = None, robot: RobotOption = None, profile: MeshOption = None, json: JsonOption = False
+) -> None:
     """Make joints hold where they are."""
-    sys.exit(asyncio.run(request(RobotChoice(robot, profile), "hold", joints or [])))
+    sys.exit(asyncio.run(request(RobotChoice(robot, profile), "hold", joints or [], json)))
 
 
-async def request(choice: RobotChoice, action: str, joints: list[str]) -> int:
+async def request(choice: RobotChoice, action: str, joints: list[str], as_json: bool = False) -> int:
     """Sends an action to the networks that have these joints; the exit code is 3 when one could not do it.
 
     Raises MeshError when a network's service is not running, ConfigError for an unknown joint.
     """
-    code = exits.DONE
+    code, done = exits.DONE, list[dict[str, Any]]()
     async with joined(choice) as link:
         networks = _networks_of(joints, link.described())
         alive = await link.alive()
@@ -107,21 +119,24 @@ async def request(choice: RobotChoice, action: str, joints: list[str]) -> int:
         if missing:
             raise MeshError(f"{link.robot} has no {missing[0]} running: see `cocoro status`")
         for network, names in networks.items():
-            code = max(code, await _request_one(link, network, action, names))
+            reply = await _request_one(link, network, action, names)
+            done.append({"network": network, "done": DONE_WORDS[action], "joints": reply.joints, "problem": reply.text})
+            if not as_json:
+                print(f"{network}: {DONE_WORDS[action]}: {', '.join(reply.joints) or 'none'}")
+            if reply.text:
+                complain(f"{network}: {reply.text}")
+                code = exits.REFUSED
+    if as_json:
+        print_json(done)
     return code
 
 
-async def _request_one(link: MeshLink, network: str, action: str, joints: list[str]) -> int:
+async def _request_one(link: MeshLink, network: str, action: str, joints: list[str]) -> ServoReply:
     question = ServoRequest(action=action, joints=tuple(joints))  # type: ignore[arg-type] # one of three, by the command
     try:
-        reply = await link.call(SERVOS.of(network), question)
+        return await link.call(SERVOS.of(network), question)
     except MeshError as error:
         raise MeshError(f"{network} does not answer `{action}`; only real servos do, not simulated ones") from error
-    print(f"{network}: {DONE_WORDS[action]}: {', '.join(reply.joints) or 'none'}")
-    if reply.text:
-        print(f"cocoro: {network}: {reply.text}", file=sys.stderr)
-        return exits.REFUSED
-    return exits.DONE
 
 
 def _networks_of(joints: list[str], robot: Robot) -> dict[str, list[str]]:
@@ -273,11 +288,13 @@ def set_id(
     new: Annotated[int, typer.Argument(min=0, max=253, help="Its new ID.")],
     port: Annotated[str, typer.Option(metavar="DEVICE", help="The serial port that it is connected to.")],
     baud: Annotated[int, typer.Option(metavar="RATE", help="The servo's baud rate.")] = 1_000_000,
+    json: JsonOption = False,
 ) -> None:
     """Give a servo another ID, and set its return delay to 0. Best with no other servo on the line."""
     with ServoBus(port, baud, REPLY_S) as line:
         tools.set_number(line, old, new)
-    print(f"the servo on {port} has ID {new} and return delay 0")
+    data = {"port": port, "id": new, "return_delay_us": 0}
+    tell(json, data, f"the servo on {port} has ID {new} and return delay 0")
 
 
 @servos.command()

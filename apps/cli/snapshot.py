@@ -12,7 +12,8 @@ import typer
 
 from apps.cli import exits
 from apps.cli.link import MeshLink, joined, within
-from apps.cli.options import MeshOption, RobotChoice, RobotOption
+from apps.cli.options import JsonOption, MeshOption, RobotChoice, RobotOption
+from apps.cli.output import tell
 from cocoro.errors import ConfigError, MeshError
 from cocoro.messages import Detections, Frame
 from cocoro.topics import DETECTIONS, FRAME
@@ -36,18 +37,20 @@ def snapshot(
     out: Annotated[Path, typer.Argument(metavar="OUT.png", help="The picture's file.")],
     robot: RobotOption = None,
     profile: MeshOption = None,
+    json: JsonOption = False,
 ) -> None:
     """Write a picture of what the robot sees now, with its detections drawn in."""
-    sys.exit(asyncio.run(take_snapshot(RobotChoice(robot, profile), out)))
+    sys.exit(asyncio.run(take_snapshot(RobotChoice(robot, profile), out, json)))
 
 
-async def take_snapshot(choice: RobotChoice, out: Path) -> int:
+async def take_snapshot(choice: RobotChoice, out: Path, as_json: bool = False) -> int:
     """Writes the picture and returns the exit code. Raises ConfigError for a name that is not OUT.png, MeshError."""
     check(out)
     async with joined(choice, frames=True) as link:
         camera = SnapshotTaker(link)
         camera.open()
-        print(await camera.write(out))
+        text = await camera.write(out)
+        tell(as_json, {"file": str(out), "detected": camera.labels}, text)
     return exits.DONE
 
 
@@ -65,6 +68,8 @@ class SnapshotTaker:
         self._frames: OrderedDict[tuple[int, int], Frame] = OrderedDict()
         self._pair: tuple[Frame, Detections] | None = None
         self._changed = asyncio.Event()
+        self.labels: list[str] | None = None
+        """What is detected in the written picture; None when perception is silent."""
 
     def open(self) -> None:
         frames, detections = self._link.inbox(FRAME), self._link.inbox(DETECTIONS)
@@ -84,8 +89,8 @@ class SnapshotTaker:
         _write(out, frame, detections, self._link.catalogue())
         if detections is None:
             return f"{out}: {frame.width} x {frame.height}, without detections (perception is silent)"
-        labels = ", ".join(sorted(detection.label for detection in detections.detections)) or "nothing known"
-        return f"{out}: {frame.width} x {frame.height}, {labels}"
+        self.labels = sorted(detection.label for detection in detections.detections)
+        return f"{out}: {frame.width} x {frame.height}, {', '.join(self.labels) or 'nothing known'}"
 
     def _on_frame(self, frame: Frame) -> None:
         self._frames[frame.incarnation, frame.seq] = frame

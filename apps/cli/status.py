@@ -17,11 +17,12 @@ from apps.cli.options import JsonOption, MeshOption, RobotChoice, RobotOption
 from apps.cli.output import print_json
 from apps.cli.terminal import Column, fields, print_table
 from cocoro.errors import ConfigError
-from cocoro.messages import Health, Message, TaskState
-from cocoro.topics import BASE_STATE, HEALTH, LATCH, PLAN, TASK, Topic
+from cocoro.messages import Health, Message, Recording, TaskState
+from cocoro.topics import BASE_STATE, HEALTH, LATCH, PLAN, RECORDING, TASK, Topic
 from deploy import profiles
 
-NEWS: tuple[Topic[Any], ...] = (PLAN, TASK, LATCH, BASE_STATE)
+RECORDER = RECORDING.of("capture")
+NEWS: tuple[Topic[Any], ...] = (PLAN, TASK, LATCH, BASE_STATE, RECORDER)
 HEALTH_S = 2.5
 """Longest wait for the health of every live service; each publishes it once a second of the robot's time."""
 
@@ -91,6 +92,7 @@ class Survey:
             "plan": self._newest_of(PLAN.name),
             "latch": self._newest_of(LATCH.name),
             "base": self._newest_of(BASE_STATE.name),
+            "recording": self._newest_of(RECORDER.name),
         }
 
     def _state(self, service: str, alive: bool) -> str:
@@ -146,6 +148,22 @@ def _facts(report: dict[str, Any]) -> Iterator[tuple[str, str]]:
     if (plan := report["plan"]) is not None:
         yield "planner", ": ".join(filter(None, (plan["behaviour"], plan["why"])))
         yield "reaches with", plan["model"]
+    if (told := report["recording"]) is not None:
+        recording = msgspec.convert(told, Recording)
+        yield "records", recording.fault or f"{recording.occasion or 'nothing that happens'}, in {recording.file}"
+        yield "space", space(recording)
+
+
+def space(recording: Recording) -> str:
+    """How much room the captures have, and how long it lasts."""
+    if recording.fault:
+        return ""
+    rate = recording.rate_bytes_per_s
+    hours = f", {recording.free_bytes / rate / 3600:.0f} hours at {3600 * rate / 1e6:.0f} MB an hour" if rate else ""
+    kept = ""
+    if recording.keep_bytes is not None:
+        kept = f"; {recording.kept_bytes / 1e9:.1f} GB kept of at most {recording.keep_bytes / 1e9:.1f}"
+    return f"{recording.free_bytes / 1e9:.1f} GB left{hours}{kept}"
 
 
 def _task(task: TaskState) -> str:

@@ -24,6 +24,7 @@ from apps.cli import completions
 from apps.cli.options import (
     AdaptOption,
     BodyOption,
+    CameraOption,
     DescriptionOption,
     FramesOption,
     JsonOption,
@@ -124,6 +125,10 @@ def rehearse(
         Path | None, typer.Option(metavar="OUT.png", help="Write what the robot saw when it grasped.")
     ] = None,
     record: Annotated[Path | None, typer.Option(metavar="OUT.mcap", help="Record everything.")] = None,
+    video: Annotated[
+        Path | None, typer.Option(metavar="OUT.mp4", help="Film it; a name with .webp is a small animation.")
+    ] = None,
+    camera: CameraOption = "outside",
     json: JsonOption = False,
 ) -> None:
     """The whole robot is simulated in one process, in virtual time, and judged by the simulator's truth."""
@@ -136,7 +141,7 @@ def rehearse(
         "wait_s": wait, "then": [task_of(words, "--then") for words in then or []],
         "objects": _text(objects), "timeout_s": timeout, "picture": _text(picture), "record": _text(record),
     }  # fmt: skip
-    sys.exit(rehearsing.rehearse(options, latency or [], frames, json))
+    sys.exit(rehearsing.rehearse(options, latency or [], frames, json, video, camera))
 
 
 def _text(path: Path | None) -> str | None:
@@ -217,11 +222,13 @@ TaskIdArgument = Annotated[
 
 
 @app.command()
-def cancel(task: TaskIdArgument = "", robot: RobotOption = None, profile: MeshOption = None) -> None:
+def cancel(
+    task: TaskIdArgument = "", robot: RobotOption = None, profile: MeshOption = None, json: JsonOption = False
+) -> None:
     """End the running task; the robot stands still."""
     from apps.cli import task_running
 
-    sys.exit(asyncio.run(task_running.cancel(RobotChoice(robot, profile), task)))
+    sys.exit(asyncio.run(task_running.cancel(RobotChoice(robot, profile), task, json)))
 
 
 @app.command()
@@ -285,7 +292,7 @@ def _parameter(field: msgspec.structs.FieldInfo) -> inspect.Parameter:
     text = next((meta.description for meta in metas if meta.description), None)
     default = inspect.Parameter.empty if field.default is NODEFAULT else field.default
     if field.name == "label":
-        annotation = _ANNOTATED[plain, typer.Argument(help=text, autocompletion=completions.labels)]
+        annotation = _ANNOTATED[plain, typer.Argument(metavar="LABEL", help=text, autocompletion=completions.labels)]
         return inspect.Parameter(field.name, inspect.Parameter.KEYWORD_ONLY, annotation=annotation, default=default)
     name, metavar = field.name, None
     for unit, word in UNITS.items():

@@ -10,7 +10,7 @@ from apps.cli import exits
 from apps.cli.interrupt import HANDS_OFF, SIGNALS, on_reader_gone, on_signals
 from apps.cli.link import MeshLink, joined
 from apps.cli.options import RobotChoice
-from apps.cli.output import complain, going_on, print_json
+from apps.cli.output import complain, going_on, print_json, tell
 from apps.cli.progress import task_display
 from apps.cli.snapshot import check
 from apps.cli.tasks import Follower
@@ -29,7 +29,9 @@ async def run(choice: RobotChoice, request: TaskRequest, as_json: bool, picture:
     if picture is not None:
         check(picture)
     async with joined(choice, frames=picture is not None) as link:
-        follower = Follower(link, request, task_display(as_json), picture, _contact(link))
+        follower = Follower(
+            link, request, task_display(as_json), picture, _contact(link), rejoin=lambda: joined(choice)
+        )
         with hands_on(follower):
             code, result = await follower.run()
     if as_json:
@@ -54,7 +56,7 @@ async def wait(choice: RobotChoice, task_id: str, as_json: bool) -> int:
     """Follows a task that somebody else asked for (the running one, or the last, without an id) to its outcome; returns
     the exit code of that. Ctrl-C ends the waiting alone."""
     async with joined(choice) as link:
-        follower = Follower(link, None, task_display(as_json), None, _contact(link))
+        follower = Follower(link, None, task_display(as_json), None, _contact(link), rejoin=lambda: joined(choice))
         follower.listen()  # before the question, so that no state is missed
         state = await link.call(REPORT, ReportRequest(task_id=task_id))
         if not state.task_id:
@@ -70,14 +72,14 @@ async def wait(choice: RobotChoice, task_id: str, as_json: bool) -> int:
     return code
 
 
-async def cancel(choice: RobotChoice, task_id: str = "") -> int:
+async def cancel(choice: RobotChoice, task_id: str = "", as_json: bool = False) -> int:
     """Cancels the running task, or that task if it runs; the exit code is 3 when it does not."""
     async with joined(choice) as link:
         reply = await link.call(CANCEL, CancelRequest(task_id=task_id))
     if not reply.accepted:
         complain(f"refused: {reply.text}")
         return exits.REFUSED
-    print(reply.text or "cancelled")
+    tell(as_json, {"task_id": reply.task_id, "cancelled": True}, reply.text or "cancelled")
     return exits.DONE
 
 
@@ -88,5 +90,5 @@ def _contact(link: MeshLink) -> ProcessContact:
 @contextmanager
 def hands_on(follower: Follower) -> Iterator[None]:
     """Cancels the follower's task when a person ends this command or lets go of it."""
-    with on_signals(HANDS_OFF, follower.signalled), on_reader_gone(follower.cancel), going_on():
+    with on_signals(HANDS_OFF, follower.signalled, hurried=True), on_reader_gone(follower.cancel), going_on():
         yield

@@ -14,6 +14,7 @@ import msgspec
 
 from apps.cli import exits
 from apps.cli.link import MeshLink
+from apps.cli.looking_again import EXECUTIVE, LATE_S, LookingAgain, LostTaskError, Rejoin
 from apps.cli.output import complain, json_error
 from apps.cli.progress import TaskDisplay
 from apps.cli.snapshot import SnapshotTaker
@@ -21,8 +22,9 @@ from cocoro.bus.base import Handle
 from cocoro.errors import CallTimeoutError, CocoroError
 from cocoro.messages import CancelRequest, TaskReply, TaskRequest, TaskState
 from cocoro.tasks import Task
-from cocoro.topics import CANCEL, LATCH, RUN, TASK
-from deploy.contact import RECOVERY_S, ProcessContact
+from cocoro.topics import CANCEL, LATCH, RECORDING, RUN, TASK
+from deploy.contact import ProcessContact
+from deploy.processor import ProcessorWatch
 from services.executive.askers import asker_key
 
 USAGE_REFUSALS = ("unknown_label", "not_graspable", "bad_request")
@@ -34,9 +36,7 @@ ASK_AGAIN_S = 0.1
 """Time between two of these requests."""
 CANCEL_S = 10.0
 """Wait for the outcome of a cancelled task, before a line says that there is none."""
-EXECUTIVE = "executive"
-LOOK_S = 0.2
-"""Time between two checks whether a silent executive has died."""
+RECORDER = "capture"
 Result = tuple[int, dict[str, object]]
 """Exit code, and the result as data."""
 
@@ -54,10 +54,13 @@ class Follower:
         contact: ProcessContact | None = None,
         *,
         watched: bool = True,
+        rejoin: Rejoin | None = None,
     ) -> None:
         """`request` is None for a task that is only attended. `contact` finds out what happened to an executive that is
-        silent. With `watched=False` the task outlives this process."""
+        not heard, and `rejoin` joins its mesh anew. With `watched=False` the task outlives this process."""
         self._contact = contact or ProcessContact(link.run_dir.claimant_pid)
+        self._looking = LookingAgain(link, self._contact, rejoin)
+        self._processor = ProcessorWatch()
         self._link = link
         self._request = request
         self._watched = watched
@@ -71,6 +74,8 @@ class Follower:
         self._token: Handle | None = None
         self._news: asyncio.Queue[TaskState | bool] = asyncio.Queue()
         """States of the task, and whether the executive's liveliness token is present, at each change."""
+        self._files: dict[str, str] = {}
+        """The file in which a task is recorded, by its id."""
         self._let_go = asyncio.Event()
         self._left = asyncio.Event()
         self._signals = 0
@@ -104,6 +109,9 @@ class Follower:
     def listen(self) -> None:
         """Keeps the states of tasks from now on."""
         self._link.inbox(TASK).add(lambda _key, state: self._news.put_nowait(state))
+        self._link.inbox(RECORDING.of(RECORDER)).add(
+            lambda _key, state: self._files.update({state.task_id: state.file})
+        )
 
     async def attend(self, state: TaskState) -> Result:
         """Follows a task that runs already, or has ended; returns the exit code and the result as data."""
@@ -172,14 +180,17 @@ class Follower:
         beside = [asyncio.create_task(self._cancel_when_let_go())]
         if self._contact.keeps:
             beside.append(asyncio.create_task(self._contact.keep()))
+        self._processor.take(self._processes())
         try:
-            state = await self._until_over()
+            return self._outcome(await self._until_over())
+        except LostTaskError as lost:
+            return self._unknown(str(lost))
         finally:
             self._view.close()
             alive.close()
             for task in beside:
                 task.cancel()
-        return self._outcome(state)
+            await self._looking.close()
 
     def _on_alive(self, _service: str, alive: bool) -> None:
         if alive:
@@ -204,11 +215,11 @@ class Follower:
         return None
 
     async def _until_over(self) -> TaskState:
-        """The task's last state, from the executive, or composed here when the executive died or stays silent."""
+        """The task's last state. Raises LostTaskError when it cannot be known."""
         camera: SnapshotTaker | None = None
         while True:
-            news = await self._news.get()
-            state = await self._after_silence() if news is False else news
+            news = await self._next_news()
+            state = await self._looked_for() if news is False else news
             if isinstance(state, bool) or state.task_id != self._task_id:
                 continue
             if self._picture is not None:
@@ -222,35 +233,31 @@ class Follower:
                 return state
             self._view.show(state)
 
-    async def _after_silence(self) -> TaskState:
-        """The task's next state after the executive's token was lost; a failed state when the executive died or stays
-        silent."""
+    async def _looked_for(self) -> TaskState:
+        """The task's state after the executive's token was lost. Raises LostTaskError."""
         lost = await self._contact.lost(EXECUTIVE)
         if not self._contact.dead(EXECUTIVE):
-            self._view.say(f"{lost}: waiting for the executive")
-        end_s = asyncio.get_running_loop().time() + RECOVERY_S
-        while (left_s := end_s - asyncio.get_running_loop().time()) > 0:
-            if self._contact.dead(EXECUTIVE):
-                return self._failed(f"{EXECUTIVE} died")
-            with suppress(TimeoutError):
-                news = await asyncio.wait_for(self._news.get(), min(left_s, LOOK_S))
-                if isinstance(news, bool):
-                    continue
-                if news.task_id == self._task_id:
-                    return news
-                # An executive that publishes another task now has restarted without this one.
-                return self._failed("the executive restarted and no longer knows the task")
-        return self._failed(f"{lost}; the task may still be running; see cocoro status")
+            self._view.say(f"{lost}: looking again")
+        state = await self._looking.find(self._task_id, lost, self._heard)
+        if self._looking.link is not self._link:
+            self._link = self._looking.link
+            self.listen()
+            self._link.watch_alive(self._on_alive, EXECUTIVE)
+        return state
 
-    def _failed(self, reason: str) -> TaskState:
-        """A failed state, composed when the executive cannot publish it."""
-        return TaskState(
-            task_id=self._task_id,
-            task=self._task,
-            label=self._label,
-            outcome="failed",
-            reason=reason,
-        )
+    async def _heard(self, timeout_s: float) -> bool:
+        """Waits for a sign of the executive; its state of the task is asked for then, since some may have been lost."""
+        with suppress(TimeoutError):
+            return await asyncio.wait_for(self._news.get(), timeout_s) is not False
+        return False
+
+    async def _next_news(self) -> TaskState | bool:
+        """What arrives next; what the executive answers when nothing arrives for long although it is present."""
+        while True:
+            with suppress(TimeoutError):
+                return await asyncio.wait_for(self._news.get(), LATE_S)
+            if (state := await self._looking.ask(self._task_id)) is not None:
+                return state
 
     async def _take(self, camera: SnapshotTaker, picture: Path) -> None:
         try:
@@ -293,5 +300,29 @@ class Follower:
         code = {"done": exits.DONE, "failed": exits.FAILED, "cancelled": exits.REFUSED}[state.outcome or "failed"]
         time = f" {'in' if state.outcome == 'done' else 'after'} {state.elapsed_s:.1f} s" if state.elapsed_s else ""
         reason = f": {state.reason}" if state.reason and state.outcome != "done" else ""
-        self._view.result(f"{state.outcome}: {self._name}{time}{reason}")
-        return code, msgspec.to_builtins(state)
+        starved = self._starved() if state.outcome == "failed" else {}
+        file = self._files.get(state.task_id, "")
+        lines = [f"{state.outcome}: {self._name}{time}{reason}", *([f"recorded in {file}"] if file else [])]
+        self._view.result("\n".join(lines))
+        return code, msgspec.to_builtins(state) | {"recorded_in": file} | starved
+
+    def _unknown(self, why: str) -> Result:
+        """The result when the executive cannot tell the task's outcome. A task ends with its executive."""
+        outcome = "failed" if self._contact.dead(EXECUTIVE) else "unknown"
+        starved = self._starved()
+        self._view.result(f"{outcome}: {self._name}: {why}")
+        return exits.FAILED, {**self._named, "outcome": outcome, "reason": why, **starved}
+
+    def _starved(self) -> dict[str, object]:
+        """Says that this machine was short of processor time while the task ran, if it was; the same as data."""
+        use = self._processor.take(self._processes())
+        if use is None or not use.words:
+            return {}
+        self._view.say(use.words)
+        return {"machine": use.words}
+
+    def _processes(self) -> dict[str, int]:
+        """The robot's processes of this machine."""
+        with suppress(OSError, CocoroError):
+            return {by.name: by.pid for by in self._link.run_dir.claims().values()}
+        return {}

@@ -58,16 +58,18 @@ def table(columns: Sequence[str | Column], rows: Iterable[Sequence[str]], width:
 
 def fields(pairs: Iterable[tuple[str, str]]) -> str:
     """Returns lines `name  value` as text, the values below one another and folded to the terminal's width."""
-    from textwrap import wrap
-
     found = [(name, value) for name, value in pairs if value]
     indent = max((len(name) for name, _ in found), default=0) + GAP
-    room = max(output_width() - indent, 10)
-    lines = []
-    for name, value in found:
-        first, *rest = wrap(value, room, break_on_hyphens=False) if len(value) > room else [value]
-        lines += [f"{name:<{indent}}{first}", *(f"{'':<{indent}}{line}" for line in rest)]
-    return "".join(f"{line}\n" for line in lines)
+    return "".join(f"{line}\n" for name, value in found for line in folded(f"{name:<{indent}}", value))
+
+
+def folded(head: str, text: str, width: int | None = None) -> list[str]:
+    """The lines of `head` and `text`, folded to the terminal's width below the text's beginning."""
+    from textwrap import wrap
+
+    room = max((output_width() if width is None else width) - len(head), 10)
+    first, *rest = (wrap(text, room, break_on_hyphens=False) if len(text) > room else []) or [text]
+    return [head + first, *(" " * len(head) + line for line in rest)]
 
 
 def output_width() -> int:
@@ -78,9 +80,13 @@ def output_width() -> int:
 class FittedTable:
     """A table for rich's consoles that fits itself to the width that it is drawn with."""
 
-    def __init__(self, columns: Sequence[str | Column], rows: Iterable[Sequence[str | Text]]) -> None:
+    def __init__(
+        self, columns: Sequence[str | Column], rows: Iterable[Sequence[str | Text]], *, fold: bool = True
+    ) -> None:
+        """`fold`: sentences that are too long go on in further lines; otherwise they are cut."""
         from rich.text import Text
 
+        self._fold = fold
         self._columns = [Column(column) if isinstance(column, str) else column for column in columns]
         self._rows = [[cell if isinstance(cell, Text) else Text(cell) for cell in row] for row in rows]
         self._natural = [
@@ -98,7 +104,7 @@ class FittedTable:
             cells = [list(self._folded(row[number], widths[number])) for number in shown]
             for at in range(max(map(len, cells), default=0)):
                 yield self._line([cell[at] if at < len(cell) else Text() for cell in cells], shown, widths)
-            for line in self._second(row, below, options.max_width - SHIFT):
+            for line in () if not self._fold else self._second(row, below, options.max_width - SHIFT):
                 yield Text(" " * SHIFT).append_text(line)
         away = {*range(len(self._columns))} - {*shown, *below}
         if left_out := [self._columns[number].head for number in sorted(away) if self._is_filled(number)]:
@@ -142,6 +148,9 @@ class FittedTable:
         return line
 
     def _folded(self, cell: Text, width: int) -> Iterator[Text]:
+        if not self._fold:
+            cell = cell.copy()
+            cell.truncate(width, overflow="ellipsis")
         if cell.cell_len <= width:
             yield cell
             return

@@ -55,7 +55,9 @@ def print_report(report: dict[str, Any]) -> None:
 
 def render(report: dict[str, Any], screen: Console | None = None) -> RenderableType:
     """The whole report; for a `screen` only topics that have a rate or a problem, as many as have room on it."""
-    services, topics, hidden = _services(report["services"]), report["topics"], list[Text]()
+    topics, hidden = report["topics"], list[Text]()
+    needed = len(report["services"]) + len(topics) + 2 * OTHER_LINES
+    services = _services(report["services"], fold=screen is None or screen.height > needed)
     if screen is None:
         room = len(topics)
     else:
@@ -112,9 +114,9 @@ def _headline(report: dict[str, Any]) -> Text:
 BAD_STATES = ("not alive", "no contact", "silent")
 
 
-def _services(services: list[dict[str, Any]]) -> FittedTable:
+def _services(services: list[dict[str, Any]], fold: bool) -> FittedTable:
     shown: dict[int, str] = {}
-    return FittedTable(SERVICES, [_service(service, shown) for service in services])
+    return FittedTable(SERVICES, [_service(service, shown) for service in services], fold=fold)
 
 
 def _service(service: dict[str, Any], shown: dict[int, str]) -> list[str | Text]:

@@ -21,7 +21,7 @@ from apps.cli import exits
 from apps.cli.export import progress_bar
 from apps.cli.interrupt import interrupt_event
 from apps.cli.link import MeshLink, joined
-from apps.cli.options import MeshOption, RobotChoice, RobotOption
+from apps.cli.options import MeshOption, RobotChoice, RobotOption, capture_file
 from cocoro.bus.base import Bus, Payload
 from cocoro.capture.conventions import CaptureError
 from cocoro.errors import ConfigError
@@ -47,7 +47,10 @@ app = typer.Typer()
 @app.command()
 def view(
     file: Annotated[
-        Path | None, typer.Argument(metavar="[FILE]", help="A capture; without one, the running robot is shown.")
+        Path | None,
+        typer.Argument(
+            metavar="[FILE]", parser=capture_file, help="A capture; without one, the running robot is shown."
+        ),
     ] = None,
     sim: Annotated[
         bool, typer.Option("--sim", help="Show the simulated robot and its scene from outside; the mouse turns it.")

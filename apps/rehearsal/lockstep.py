@@ -26,7 +26,7 @@ from services.planning.service import plan
 LONG_S = 60.0
 LOCKSTEP_SETTINGS: Mapping[str, dict[str, Any]] = {
     "sim": {"command_timeout_s": LONG_S},
-    "executive": {"planner_silence_s": LONG_S},
+    "executive": {"planner_late_s": LONG_S, "planner_silence_s": LONG_S},
 }
 """Settings of the other services, by service: commands are held, and the planner is silent, for a whole cycle."""
 

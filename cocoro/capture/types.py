@@ -17,9 +17,7 @@ from collections.abc import Callable
 from functools import cache
 from typing import Annotated, Any, NamedTuple
 
-import cv2
 import msgspec
-import numpy as np
 from msgspec import Meta
 
 from cocoro.capture.former import todays_name, todays_payload
@@ -64,6 +62,9 @@ class LossyFrame(Message):
 def expand(lossy: LossyFrame) -> Frame:
     """Returns a frame that looks like the recorded one; perception is not reproducible from it. Raises DamageError when
     the picture is damaged."""
+    import cv2  # `cv2` and `numpy` take a third of a second, and few readers of captures need a picture
+    import numpy as np
+
     pixels = cv2.imdecode(np.frombuffer(lossy.colour_jpeg, dtype=np.uint8), cv2.IMREAD_COLOR)
     if pixels is None or pixels.shape[:2] != (lossy.height, lossy.width):
         raise DamageError("a frame's picture is damaged")

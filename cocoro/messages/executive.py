@@ -68,7 +68,8 @@ class CancelRequest(msgspec.Struct, kw_only=True):
     """Empty: cancel the running task, whichever it is."""
 
 
-class ReportRequest(CancelRequest, kw_only=True):
+class ReportRequest(msgspec.Struct, kw_only=True):
+    task_id: str = ""
     """Empty: the running task, or the last one."""
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Annotated
 
@@ -11,9 +10,7 @@ from msgspec import Meta
 
 from cocoro.units import Positive
 from services.capture.file import Compression
-
-FOLDER = "COCORO_CAPTURE_DIR"
-"""Environment variable with the captures' folder, used when the configuration names none."""
+from services.capture.folder import default_folder
 
 
 class CaptureConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -65,8 +62,4 @@ class CaptureConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
 
 
 def folder_of(config: CaptureConfig) -> Path:
-    if config.folder is not None:
-        return Path(config.folder)
-    if explicit := os.environ.get(FOLDER):
-        return Path(explicit)
-    return Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local/state") / "cocoro" / "captures"
+    return default_folder() if config.folder is None else Path(config.folder)

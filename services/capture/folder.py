@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 from collections.abc import Callable, Iterable
@@ -10,13 +11,15 @@ from datetime import datetime, timedelta
 from pathlib import Path
 from typing import NamedTuple
 
+FOLDER = "COCORO_CAPTURE_DIR"
+"""Environment variable with the captures' folder, used when the configuration names none."""
 PIN = ".pin"
 """A file with this ending beside a capture pins it: the recorder never deletes it."""
 NEWEST_IDLE = 2
 """Captures in which nothing happened and that stay as long as others can go: about the last hour."""
 MOTION = "motion"
 _NAME = re.compile(r"(?P<run>(?P<robot>.+)-\d{8}T\d{6}Z)-(?P<number>\d{3,})(?:-(?P<label>[A-Za-z0-9_.+-]+))?\.mcap")
-_UNFIT = re.compile(r"[^A-Za-z0-9_.+]+")
+_UNFIT = re.compile(r"[^A-Za-z0-9_.+-]+")
 LONGEST_LABEL = 60
 
 
@@ -34,6 +37,13 @@ class CaptureName(NamedTuple):
     def rank(self) -> int:
         """The lower, the earlier it makes room."""
         return 0 if not self.label else 1 if self.label == MOTION else 2
+
+
+def default_folder() -> Path:
+    """The captures' folder where no configuration names one."""
+    if explicit := os.environ.get(FOLDER):
+        return Path(explicit)
+    return Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local/state") / "cocoro" / "captures"
 
 
 def file_name(robot: str, started: datetime, number: int, label: str = "") -> str:

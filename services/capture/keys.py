@@ -6,9 +6,7 @@ import json
 from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
-import cv2
 import msgspec
-import numpy as np
 
 from cocoro.bus.base import Qos
 from cocoro.capture.types import JSON, MADE_HERE, MSGPACK, OTHER, Alive, LossyFrame, TypeSchema, schema_of
@@ -103,6 +101,9 @@ def lossy(quality: int) -> Callable[[QueuedMessage], PreparedMessage]:
 
 
 def compress(frame: Frame, quality: int) -> LossyFrame:
+    import cv2  # slow to import, and most recorders keep the pictures as they are
+    import numpy as np
+
     pixels = np.frombuffer(frame.colour, dtype=np.uint8).reshape(frame.height, frame.width, 3)
     _, jpeg = cv2.imencode(".jpg", cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])
     return LossyFrame(

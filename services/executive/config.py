@@ -26,5 +26,10 @@ class ExecutiveConfig(Limits, frozen=True, forbid_unknown_fields=True):
     """How long the executive waits at its start until it is known whether the emergency stop is latched."""
     settle_s: Positive = 3.0
     """How long the executive waits after a task for the robot to come to rest."""
-    planner_silence_s: Positive = 1.5
-    """Silence of the planner that fails the task. The hardware stops long before by itself."""
+    planner_late_s: Positive = 0.5
+    """After so long without news of the planner, the task's state says that it waits for the planner. The hardware has
+    stopped by itself before; the task goes on when there is news."""
+    planner_silence_s: Positive = 10.0
+    """After so long without news of the planner, while this process runs, the task fails."""
+    contact_s: Positive = 10.0
+    """After so long without contact to a needed service whose process lives, the task fails."""

@@ -39,6 +39,8 @@ from services.executive.tasks import TASKS
 
 Ending = tuple[Outcome, str | Awaitable[str]]
 """A task's outcome and its reason, which may still have to be found out."""
+LOOK_S = 0.02
+"""Time between two looks whether a service that is not heard has died."""
 GONE = "the command or program that asked for it has ended, or is not heard any more"
 REMEMBERED = 64
 """How many ended tasks the executive knows."""
@@ -52,6 +54,8 @@ class Executive:
         self._config = config
         self._catalogue = catalogue
         self._alive: set[str] = set()
+        self._unheard: dict[str, str] = {}
+        """By needed service that the task waits for: what is known of it."""
         self._unreadable: dict[str, str] = {}
         """By service: the input that it cannot read, and the reason."""
         self._running: asyncio.Task[Any] | None = None
@@ -263,10 +267,30 @@ class Executive:
         self._alive.discard(service)
         self._unreadable.pop(service, None)
         if service in self._config.needed:
-            self._end("failed", lambda: self._node.spawn(self._lost(service)))
+            if not self._node.contact.lives(service):
+                self._end("failed", lambda: self._node.spawn(self._lost(service)))
+            elif service not in self._unheard:
+                self._unheard[service] = f"lost contact with {service}"
+                self._skills.pause(True)
+                self._node.spawn(self._wait_for(service))
 
     async def _lost(self, service: str) -> str:
         return f"not_alive: {await self._node.contact.lost(service)}"
+
+    async def _wait_for(self, service: str) -> None:
+        """End the task when a service with a living process is not heard again in time, or dies meanwhile. Until then
+        the robot stands. The time is that of the loop: the simulator may be what is not heard."""
+        contact, loop = self._node.contact, asyncio.get_running_loop()
+        end_s = loop.time() + self._config.contact_s
+        why = self._unheard[service] = await contact.lost(service)
+        self._node.log.warning("%s", why)
+        while service not in self._alive and contact.lives(service) and loop.time() < end_s:  # noqa: ASYNC110 # a lock
+            await asyncio.sleep(LOOK_S)
+        del self._unheard[service]
+        if not self._unheard:
+            self._skills.pause(False)
+        if service not in self._alive:
+            self._end("failed", f"not_alive: {f'{service} died' if contact.dead(service) else why}")
 
     def _on_asker_gone(self, asker: str) -> None:
         if asker == self._asker:
@@ -311,6 +335,8 @@ class Executive:
             state.elapsed_s = self._elapsed_s()
             if status is not None:
                 state.text, state.distance_m = status.why, status.distance_m
+            if waits := self._skills.waits or next(iter(self._unheard.values()), ""):
+                state.text = waits
         state.stamp_ns = self._node.now_ns()
         self._publisher.put(state)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
-from copy import copy
 
 from cocoro import topics
 from cocoro.clock import NS
@@ -21,7 +20,8 @@ LOOSE_S = 0.5
 a moment, and then need a quarter of a second until they trust their grip again."""
 
 LISTEN_S = 0.25
-"""Shortest silence, while this process runs, after which the planner counts as silent."""
+"""Time after which this process notes that it heard nothing of the planner. However long it really was, it counts as
+this much: a process that did not run heard nothing, whoever spoke."""
 
 
 class PlannerSkills:
@@ -35,6 +35,11 @@ class PlannerSkills:
         self._plan = node.latest(topics.PLAN)
         self._publisher = node.publisher(topics.INTENT)
         self._step = 0
+        self.paused = False
+        """Whether the planner is to stand still now, whatever the task wants; it begins the wanted action anew
+        afterwards."""
+        self.waits = ""
+        """Why a task waits for the planner; empty when it does not."""
         self.intent = Intent(action=Idle())
         node.spawn(self._repeat(config.intent_hz))
 
@@ -67,8 +72,15 @@ class PlannerSkills:
         self.intent = Intent(task_id=task_id, step=self._step, action=action)
         self._publish()
 
+    def pause(self, paused: bool) -> None:
+        self.paused = paused
+        self._publish()
+
     def _publish(self) -> None:
-        self._publisher.put(copy(self.intent))
+        wanted = self.intent
+        self._publisher.put(
+            Intent(task_id=wanted.task_id, step=wanted.step, action=Idle() if self.paused else wanted.action)
+        )
 
     async def _repeat(self, rate_hz: float) -> None:
         async for _ in self._node.every(rate_hz, "intent"):
@@ -126,22 +138,23 @@ class PlannerSkills:
                 raise TaskFailedError("slipped", "the hand has lost what it held")
 
     async def _next_status(self) -> PlannerStatus:
-        """The next status. Raises TaskFailedError when none comes for too long."""
-        while True:
-            waiting = asyncio.ensure_future(self._plan.next())
-            try:
-                # In two parts: a process that was suspended reads what arrived meanwhile only after it has woken.
-                for part_s in (max(self._config.planner_silence_s - LISTEN_S, 0.0), LISTEN_S):
-                    began_s = self.now_s()
-                    timer = asyncio.ensure_future(self._node.sleep(part_s))
-                    try:
-                        await asyncio.wait((waiting, timer), return_when=asyncio.FIRST_COMPLETED)
-                    finally:
-                        timer.cancel()
-                    if waiting.done():
-                        return waiting.result()
-            finally:
-                waiting.cancel()
-            if self.now_s() - began_s < 2 * LISTEN_S:
-                raise TaskFailedError("not_alive", "the planner is silent")
-            # Otherwise this process was itself suspended during the last part.
+        """The next status. Waits for a planner that is late; raises TaskFailedError when it is late for too long."""
+        heard_nothing_s = 0.0
+        waiting = asyncio.ensure_future(self._plan.next())
+        try:
+            while True:
+                timer = asyncio.ensure_future(self._node.sleep(LISTEN_S))
+                try:
+                    await asyncio.wait((waiting, timer), return_when=asyncio.FIRST_COMPLETED)
+                finally:
+                    timer.cancel()
+                if waiting.done():
+                    return waiting.result()
+                heard_nothing_s += LISTEN_S
+                if heard_nothing_s >= self._config.planner_silence_s:
+                    raise TaskFailedError("not_alive", f"nothing from the planner for {heard_nothing_s:g} s")
+                if heard_nothing_s >= self._config.planner_late_s:
+                    self.waits = f"waiting: nothing from the planner for {heard_nothing_s:.1f} s"
+        finally:
+            self.waits = ""
+            waiting.cancel()

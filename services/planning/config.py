@@ -199,10 +199,13 @@ class PlanningConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     hand: HandConfig = HandConfig()
     follow: FollowConfig = FollowConfig()
     blind_periods: Positive = 2.0
-    """Perception may be silent for this many of its own periods where that is longer than `Base.command_timeout_s`, so
-    that a slow perception does not stop the robot."""
+    """The robot drives on without news of perception for this many of perception's own periods where that is longer
+    than `Base.command_timeout_s`, so that a slow perception does not stop it."""
     blind_for_good_s: Positive = 5.0
-    """A task that needs sight fails when perception is silent for this much longer."""
+    """A task that needs sight fails when there is no news of perception for this much longer. Until then the robot
+    stands, and goes on when there is some."""
+    stale_for_good_s: Positive = 5.0
+    """The same for the states of base, arm and hand, which every task needs."""
     odometry_gap_s: Positive = 0.1
     """Longest gap over which odometry is interpolated."""
     stale_target_s: Positive = 4.0

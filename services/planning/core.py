@@ -25,9 +25,6 @@ from services.planning.learned import Learned
 from services.planning.reach import ARM
 from services.planning.state_estimator import StateEstimator
 
-_STALE_NS = NS
-"""Time without the robot's state after which a running behaviour fails."""
-
 
 class PlanningCore:
     """The planner as a `cocoro.core.Core`. Without a fresh state of the robot it stands still and reports why."""
@@ -74,7 +71,7 @@ class PlanningCore:
 
     @property
     def schedule(self) -> Schedule:
-        return Schedule(self._config.rate_hz, (topics.DETECTIONS,))
+        return Schedule(self._config.rate_hz)  # without triggers, which would make its commands uneven
 
     def step(self, inputs: Sequence[Sample], now_ns: int) -> Sequence[Output]:
         for sample in inputs:
@@ -96,6 +93,7 @@ class PlanningCore:
         self.actuators.grip.feel(hand, now_ns)
         latched = self._estimator.latched()
         if latched:
+            self.actuators.grip.keep()
             return self._halt(latched, now_ns)
         self._missing_since_ns = None
         self._estimator.look_around(now_ns, self._own_hull)
@@ -136,7 +134,7 @@ class PlanningCore:
         self._intent = intent
         self._ended = None
         if fresh is None:
-            self._behaviour = Idling(Idle(), "the executive is silent")
+            self._behaviour = Idling(Idle(), f"nothing from the executive for over {topics.INTENT.max_age_s:g} s")
         else:
             self._behaviour = behaviour_for(intent.action)
 
@@ -160,11 +158,13 @@ class PlanningCore:
 
     def slow_down(self, plan: Plan, snapshot: Snapshot) -> None:
         """Limit the speed so that the robot can still stop in time if the service with the oldest message has died. A
-        late service slows the robot down, a silent one stops it."""
+        late service slows the robot down, and then stops it."""
         driver, base = self.actuators.driver, self.actuators.robot.base
         who, age_s = self._estimator.oldest(snapshot.now_ns, sight=self._behaviour.needs_sight)
-        if self._estimator.intent_age_s(snapshot.now_ns) > base.command_timeout_s:
-            plan.base, plan.why = driver.pause(snapshot.dt_s), "standing still: the executive is silent"
+        unheard_s = self._estimator.intent_age_s(snapshot.now_ns)
+        if unheard_s > base.command_timeout_s:
+            plan.base = driver.pause(snapshot.dt_s)
+            plan.why = f"standing still: nothing from the executive for {unheard_s:.1f} s"
             return
         # The command holds until the next step.
         limit_mps = base.speed_at_age_mps(age_s + 1.0 / self._config.rate_hz)
@@ -173,29 +173,31 @@ class PlanningCore:
             plan.base, plan.why = slower, f"slower, for {who} is late; {plan.why}"
 
     def _blind(self, snapshot: Snapshot) -> Plan | None:
-        """Pause a behaviour that needs sight while perception is silent, and fail it after `blind_for_good_s`. None
+        """Pause a behaviour that needs sight while perception is late, and fail it after `blind_for_good_s`. None
         while there is no reason to pause."""
         if not self._behaviour.needs_sight:
             return None
         blind_s = self._estimator.blind_s(snapshot.now_ns)
         if blind_s is None:
             return None
-        plan = Plan(
-            snapshot.actuators.driver.pause(snapshot.dt_s), snapshot.still(), "standing still: perception is silent"
-        )
+        why = f"standing still: nothing from perception for {self._estimator.unseen_s(snapshot.now_ns):.1f} s"
+        plan = Plan(snapshot.actuators.driver.pause(snapshot.dt_s), snapshot.still(), why)
         if blind_s > self._config.blind_for_good_s:
             plan.state, plan.reason = "failed", "stale"
         return plan
 
     def _halt(self, why: str, now_ns: int) -> Sequence[Output]:
-        """Command nothing, so that the hardware stops by itself, and restart later from the measured state."""
+        """Command nothing, so that the hardware stops by itself, and restart later from the measured state. The claws'
+        goals stay: the last ones may have been lost on their way."""
         self.actuators.arm.resync()
         self.actuators.driver.reset()
-        self.actuators.grip.keep()
         self._head_goal = None
         if self._missing_since_ns is None or now_ns < self._missing_since_ns:
             self._missing_since_ns = now_ns
-        failed = not isinstance(self._intent.action, Idle) and now_ns - self._missing_since_ns > _STALE_NS
+        failed = (
+            not isinstance(self._intent.action, Idle)
+            and now_ns - self._missing_since_ns > self._config.stale_for_good_s * NS
+        )
         body = self._estimator.body()
         status = PlannerStatus(
             task_id=self._intent.task_id,

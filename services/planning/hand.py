@@ -35,6 +35,15 @@ class Grip:
             name: angle - self._config.clamp_rad for name, angle in zip(CLAWS, self.opening(hand), strict=True)
         }
 
+    def halt(self, hand: ServoState) -> None:
+        """Stop claws that open or close; those that have met an object clamp it. Claws that clamp already do nothing
+        else, so that nothing is dropped."""
+        opening, closing = self._config.open_rad, -self._config.close_rad
+        if self._goals == dict.fromkeys(CLAWS, closing) and self._pressed(hand):
+            self.clamp(hand)
+        elif self._goals in (dict.fromkeys(CLAWS, opening), dict.fromkeys(CLAWS, closing)):
+            self._goals = dict(zip(CLAWS, self.opening(hand), strict=True))
+
     def keep(self) -> None:
         """Leave the claws as they are."""
         self._goals = None

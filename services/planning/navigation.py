@@ -130,7 +130,7 @@ class Driver:
         return BaseCommand(left_mps=share * command.left_mps, right_mps=share * command.right_mps)
 
     def pause(self, dt_s: float) -> BaseCommand:
-        """A zero command while a publisher is silent. The next command continues from the speed that the base's own
+        """A zero command while a publisher is late. The next command continues from the speed that the base's own
         ramp has left."""
         half = self._turn_radps * self._separation_m / 2
         faster_mps = max(abs(self._speed_mps - half), abs(self._speed_mps + half))

@@ -40,10 +40,10 @@ perception's limit, because a tilted camera is likely to be rolled a little, too
 
 
 class PerceptionWatch:
-    """Whether perception is alive, by the arrival of its messages, however slow it is and even if it sees nothing."""
+    """Whether perception is late, by the arrival of its messages, however slow it is and even if it sees nothing."""
 
     def __init__(self, least_s: float, periods: float) -> None:
-        """It may be silent for `least_s`, or for `periods` of its own periods where that is longer."""
+        """It has `least_s` for a message, or `periods` of its own periods where that is longer."""
         self._least_ns = round(least_s * NS)
         self._periods = periods
         self._arrived_ns: int | None = None
@@ -65,8 +65,13 @@ class PerceptionWatch:
             self._blind_since_ns = now_ns
         return (now_ns - self._blind_since_ns) / NS
 
+    def unheard_s(self, now_ns: int) -> float:
+        """Time since the last arrival; since the first call of `blind_s` where nothing has arrived yet."""
+        since_ns = self._arrived_ns if self._arrived_ns is not None else self._blind_since_ns
+        return 0.0 if since_ns is None else max(now_ns - since_ns, 0) / NS
+
     def age_s(self, now_ns: int) -> float:
-        """Time since the last arrival, less the extra silence that a slow perception may have."""
+        """Time since the last arrival, less the extra time that a slow perception has."""
         if self._arrived_ns is None or now_ns < self._arrived_ns:
             return float("inf")
         return max(now_ns - self._arrived_ns - (self._patience_ns() - self._least_ns), 0) / NS
@@ -336,8 +341,12 @@ class StateEstimator:
         return ""
 
     def blind_s(self, now_ns: int) -> float | None:
-        """Time, s, for which perception has exceeded its permitted silence; None while it has not."""
+        """Time, s, for which perception has been later than it may be; None while it is not."""
         return self._sight.blind_s(now_ns)
+
+    def unseen_s(self, now_ns: int) -> float:
+        """Time, s, since perception's last message arrived."""
+        return self._sight.unheard_s(now_ns)
 
     def _age_s(self, topic: Topic[Any], now_ns: int) -> float:
         """Age, s, of a topic's newest message by its stamp, or by its arrival where the stamp is in the future."""

@@ -17,7 +17,7 @@ import moderngl
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cocoro.arrays import FloatArray
+from cocoro.arrays import FloatArray, ImageArray
 from cocoro.robot import Camera
 from sim.render.interface import Images, Lighting, Visual
 from sim.render.meshes import floor_mesh, instanced_meshes, wall_mesh
@@ -89,31 +89,38 @@ class GlRenderer:
         light: Lighting,
         projector_pose: FloatArray | None = None,
     ) -> Images:
+        self.place(poses)
+        self.draw(camera_pose, light, _floor_ahead(camera_pose))
+        self._draw_depth(depth_camera_pose, projector_pose)
+        colour = self.picture()
+        self._depth_target.read_into(self._depth_m, components=1, dtype="f4")
+        return Images(colour, self._depth_m)
+
+    # --- a colour picture alone -------------------------------------------------------------------
+
+    def place(self, poses: FloatArray) -> None:
+        """Set the world poses of the visuals, (n, 4, 4), for the drawings that follow."""
         self._ctx.enable_only(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
         placed = poses.astype(np.float32)
         for mesh in self._objects:
             mesh.place(placed)
-        self._draw_colour(camera_pose, light)
-        self._draw_depth(depth_camera_pose, projector_pose)
-        self._colour_target.read_into(self._rgba, components=4)
-        cv2.cvtColor(self._rgba, cv2.COLOR_RGBA2RGB, dst=self._rgb)
-        self._depth_target.read_into(self._depth_m, components=1, dtype="f4")
-        return Images(self._rgb, self._depth_m)
 
-    def close(self) -> None:
-        for thing in self._owned:
-            thing.release()
-        self._owned.clear()
-
-    # --- passes -----------------------------------------------------------------------------------
-
-    def _draw_colour(self, pose: FloatArray, light: Lighting) -> None:
+    def draw(
+        self,
+        camera_pose: FloatArray,
+        light: Lighting,
+        shadows_about_m: FloatArray,
+        shift_px: tuple[float, float] = (0.0, 0.0),
+    ) -> None:
+        """Draw the colour picture, moved by a part of a pixel, with shadows around a point, (3,)."""
         direction = np.asarray(light.direction) / np.linalg.norm(light.direction)
-        lamp = lamp_view(direction, _floor_ahead(pose), LAMP_HALF_WIDTH_M, LAMP_TEXELS)
+        lamp = lamp_view(direction, shadows_about_m, LAMP_HALF_WIDTH_M, LAMP_TEXELS)
         # The lamp's map holds the faces away from the lamp, so that a lit surface never shades itself.
         self._draw_shadow_map(self._lamp_map, lamp, front_face="ccw")
 
-        view = self._projection @ rigid_inverse(pose)
+        shift = np.eye(4)
+        shift[:2, 3] = 2 * shift_px[0] / self.camera.width, 2 * shift_px[1] / self.camera.height
+        view = shift @ self._projection @ rigid_inverse(camera_pose)
         tint = lamp_tint(light.temperature_k)
         ambient, diffuse = light.ambient * tint, light.diffuse * tint
         on_floor = max(-direction[2], 0.0)
@@ -125,6 +132,19 @@ class GlRenderer:
         for mesh in (*self._objects, self._walls):
             mesh.draw(self._lambert)
         self._floor.draw(self._tiles)
+
+    def picture(self) -> ImageArray:
+        """The newest colour picture, RGB, (height, width, 3), which the next one overwrites."""
+        self._colour_target.read_into(self._rgba, components=4)
+        cv2.cvtColor(self._rgba, cv2.COLOR_RGBA2RGB, dst=self._rgb)
+        return self._rgb
+
+    def close(self) -> None:
+        for thing in self._owned:
+            thing.release()
+        self._owned.clear()
+
+    # --- passes -----------------------------------------------------------------------------------
 
     def _draw_depth(self, pose: FloatArray, projector_pose: FloatArray | None) -> None:
         if projector_pose is not None:

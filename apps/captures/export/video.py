@@ -1,4 +1,7 @@
-"""`--video`: the camera's pictures with detections and a caption drawn in."""
+"""`--video`: the camera's pictures with detections and a caption drawn in; or a simulated run from outside.
+
+A name that ends with .mp4 is a film, one that ends with .webp a small animation for a page of text.
+"""
 
 from __future__ import annotations
 
@@ -6,61 +9,180 @@ import os
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
+from itertools import pairwise
 from pathlib import Path
 from types import TracebackType
+from typing import Literal, Protocol, get_args
 
 import cv2
 
-from apps.captures.export.files import making
+from apps.captures.export.files import making, refuse_existing
 from apps.captures.export.story import Story, catalogue_of, read
 from apps.captures.reader import Capture
-from apps.pictures import draw
+from apps.pictures import captioned, draw
 from cocoro.arrays import ImageArray
 from cocoro.capture.conventions import CaptureError
 from cocoro.clock import NS
-from cocoro.messages import Frame
+from cocoro.errors import ConfigError
 from cocoro.topics import FRAME
+
+CameraChoice = Literal["robot", "outside", "both"]
+"""The robot's own camera; one that films the simulated robot; or this one with the robot's picture in a corner."""
 
 RATE_HZ = 30.0
 CODEC, SUFFIX = "mp4v", ".mp4"
 """MPEG-4 part 2, which OpenCV can write on every platform."""
+ANIMATION = ".webp"
+ANIMATION_HZ, ANIMATION_QUALITY = 10.0, 84
+LONGEST_ANIMATION_S = 60.0
+"""All pictures of an animation are in memory."""
+OUTSIDE_PX, ANIMATION_PX = (960, 540), (640, 360)
+INSET = 0.3
+"""Width of the robot's picture in the corner, as a share of the whole."""
+INSET_EDGE_PX, INSET_RGB = 2, (235, 235, 235)
 
 
-def export(capture: Capture, out: Path, progress: Callable[[float], None] = lambda _: None) -> int:
-    """Write the film in real time: each frame is shown until the next one, and frames beyond the film's rate are left
-    out.
+def camera_of(name: str) -> CameraChoice:
+    """Raises ConfigError for a name that is none."""
+    for choice in get_args(CameraChoice):
+        if choice == name:
+            return choice  # type: ignore[no-any-return]
+    raise ConfigError(f"--camera {name}: no such camera; known are {', '.join(get_args(CameraChoice))}")
 
-    Returns the number of pictures. Raises CaptureError when the capture has no pictures or the film cannot be
-    written.
+
+def check(out: Path, length_s: float = 0.0) -> None:
+    """Raises CaptureError when no film of this length could have this name, or the file exists."""
+    refuse_existing(out)
+    if out.suffix.lower() not in (SUFFIX, ANIMATION):
+        raise CaptureError(f"{out}: a film's name ends with {SUFFIX}, that of a small animation with {ANIMATION}")
+    if out.suffix.lower() == ANIMATION and length_s > LONGEST_ANIMATION_S:
+        raise CaptureError(
+            f"{out}: an animation lasts {LONGEST_ANIMATION_S:.0f} s at most, and the capture has {length_s:.0f} s; "
+            f"make a film with a name that ends with {SUFFIX}"
+        )
+
+
+def export(
+    capture: Capture, out: Path, progress: Callable[[float], None] = lambda _: None, camera: CameraChoice = "robot"
+) -> int:
+    """Write the film in real time: each picture is shown until the next one, and pictures beyond the film's rate are
+    left out.
+
+    Returns the number of pictures. Raises CaptureError when the capture has no pictures, or not what the view from
+    outside needs, or when the film cannot be written.
     """
-    if out.suffix.lower() != SUFFIX:
-        raise CaptureError(f"{out}: a film's name ends with {SUFFIX}")
+    check(out, (capture.end_ns - capture.start_ns) / NS)
     with making(out):
-        return _export(capture, out, progress)
+        return _export(capture, out, progress, camera)
 
 
-def _export(capture: Capture, out: Path, progress: Callable[[float], None]) -> int:
-    story, catalogue = Story(capture), catalogue_of(capture)
-    film: _Film | None = None
+def _export(capture: Capture, out: Path, progress: Callable[[float], None], camera: CameraChoice) -> int:
+    story = Story(capture)
+    animated = out.suffix.lower() == ANIMATION
+    if camera == "robot":
+        pictures = _seen(capture, story)
+    else:
+        pictures = _from_outside(capture, story, ANIMATION_PX if animated else OUTSIDE_PX, animated, camera == "both")
+    film: _Pictures | None = None
     with spelt_for_opencv(out) as name, closing(Complaints()) as complaints:
-        for record, frame in read(capture, FRAME):
-            at_s = (record.log_ns - capture.start_ns) / NS
+        for log_ns, picture in pictures:
+            at_s = (log_ns - capture.start_ns) / NS
             if film is None:
-                film = _Film(out, name, complaints, frame, at_s)
-            seen = story.seen_in(frame.incarnation, frame.seq)
-            film.show(at_s, draw(frame, seen, catalogue, _caption(story, record.log_ns, at_s)))
+                size = picture.shape[1], picture.shape[0]
+                film = _Animation(out, name, at_s) if animated else _Film(out, name, complaints, size, at_s)
+            captioned(picture, _caption(story, log_ns, at_s))
+            film.show(at_s, picture)
             progress(at_s)
         if film is None:
             raise CaptureError(f"{capture.path}: it has no pictures")
         return film.close()
 
 
+def _seen(capture: Capture, story: Story) -> Iterator[tuple[int, ImageArray]]:
+    """Log time and picture of each frame, with the detections."""
+    catalogue = catalogue_of(capture)
+    for record, frame in read(capture, FRAME):
+        yield record.log_ns, draw(frame, story.seen_in(frame.incarnation, frame.seq), catalogue)
+
+
+def _from_outside(
+    capture: Capture, story: Story, size_px: tuple[int, int], fine: bool, inset: bool
+) -> Iterator[tuple[int, ImageArray]]:
+    """Log time and picture from outside; with `inset` the robot's newest picture is in a corner."""
+    from apps.captures.export.outside import OutsideFilm
+    from sim.render.outside import FAST, FINE
+
+    seen = _seen(capture, story) if inset else iter(())
+    newest: ImageArray | None = None
+    waiting = next(seen, None)
+    with closing(OutsideFilm(capture, story, *size_px, FINE if fine else FAST)) as film:
+        for log_ns, picture in film.pictures(1 / ANIMATION_HZ if fine else 1 / RATE_HZ):
+            while waiting is not None and waiting[0] <= log_ns:
+                newest, waiting = waiting[1], next(seen, None)
+            if newest is not None:
+                _put_inset(picture, newest)
+            yield log_ns, picture
+
+
+def _put_inset(picture: ImageArray, inset: ImageArray) -> None:
+    width = round(INSET * picture.shape[1])
+    height = round(width * inset.shape[0] / inset.shape[1])
+    edge, gap = INSET_EDGE_PX, picture.shape[1] // 60
+    top, right = gap + edge, picture.shape[1] - gap - edge
+    picture[top - edge : top + height + edge, right - width - edge : right + edge] = INSET_RGB
+    picture[top : top + height, right - width : right] = cv2.resize(
+        inset, (width, height), interpolation=cv2.INTER_AREA
+    )
+
+
+class _Pictures(Protocol):
+    """What takes the pictures of a film."""
+
+    def show(self, at_s: float, picture: ImageArray) -> None: ...
+
+    def close(self) -> int:
+        """Finish the file. Returns the number of pictures in it."""
+
+
+class _Animation:
+    """A WebP animation, which web pages show without a player."""
+
+    def __init__(self, out: Path, name: str, start_s: float) -> None:
+        self._out = out
+        self._name = name
+        self._due_s = start_s
+        self._times_s: list[float] = []
+        self._pictures: list[ImageArray] = []
+
+    def show(self, at_s: float, picture: ImageArray) -> None:
+        if at_s < self._due_s:
+            return
+        self._due_s = at_s + 0.9 / ANIMATION_HZ
+        self._times_s.append(at_s)
+        self._pictures.append(cv2.cvtColor(picture, cv2.COLOR_RGB2BGR).astype("uint8"))
+
+    def close(self) -> int:
+        animation = cv2.Animation()
+        animation.frames = self._pictures
+        last_s = 1.0  # the end is seen before it begins again
+        gaps_s = [*(after - before for before, after in pairwise(self._times_s)), last_s]
+        animation.durations = [round(1000 * gap_s) for gap_s in gaps_s]
+        options = [cv2.IMWRITE_WEBP_QUALITY, ANIMATION_QUALITY]
+        try:
+            written = cv2.imwriteanimation(self._name, animation, options)
+        except cv2.error as error:
+            raise CaptureError(f"{self._out}: OpenCV cannot write an animation here: {error.err}") from error
+        if not written or (reason := why_not_more(self._out)):
+            raise CaptureError(f"{self._out}: the animation could not be written: {reason if written else 'no room'}")
+        return len(self._pictures)
+
+
 class _Film:
-    def __init__(self, out: Path, name: str, complaints: Complaints, first: Frame, start_s: float) -> None:
+    def __init__(self, out: Path, name: str, complaints: Complaints, size_px: tuple[int, int], start_s: float) -> None:
         self._out = out
         self._name = name
         self._complaints = complaints
-        self._size = first.width, first.height
+        self._size = size_px
         self._start_s = start_s
         self._count = 0
         self._picture: ImageArray | None = None

@@ -258,7 +258,8 @@ def sent(work: Callable[[Pulse], R], where: str) -> R:
 def temporary_rrd() -> Iterator[Path]:
     """The path for a file that is there while the context lasts. Raises CaptureError when there is no room for one."""
     try:
-        with tempfile.TemporaryDirectory(prefix="cocoro-view-") as folder:
-            yield Path(folder) / "view.rrd"
+        folder = tempfile.TemporaryDirectory(prefix="cocoro-view-")
     except OSError as error:
         raise CaptureError(f"{tempfile.gettempdir()}: {error.strerror}; choose another place by TMPDIR") from error
+    with folder as path:
+        yield Path(path) / "view.rrd"

@@ -144,7 +144,7 @@ class Plan:
     arm: ArmStep
     why: str
     head: tuple[float, float, float] | None = None
-    """Pan and tilt, rad, and speed, rad/s; None holds the head where it is."""
+    """Pan and tilt, rad, and speed, rad/s; None leaves the head at the goal before."""
     state: State = "running"
     reason: str = ""
     distance_m: float | None = None
@@ -158,7 +158,7 @@ class Behaviour(Protocol):
 
     @property
     def needs_sight(self) -> bool:
-        """Whether it drives or looks for something, so that it pauses while perception is silent."""
+        """Whether it drives or looks for something, so that it pauses while perception is late."""
 
     def step(self, snapshot: Snapshot) -> Plan: ...
 

@@ -16,15 +16,23 @@ from services.planning.seen_floor import Rest, Viewpoint, describe
 
 
 class Idling:
-    """Stands still and holds everything as it is."""
+    """Stands still and holds everything as it is: also a head and claws that the task before had sent somewhere."""
 
     needs_sight = False
+    HEAD_RADPS = 1.0
 
     def __init__(self, action: Idle, why: str = "nothing is asked") -> None:
         self._why = why
+        self._halted = False
 
     def step(self, snapshot: Snapshot) -> Plan:
-        return Plan(snapshot.actuators.driver.halt(), snapshot.still(), self._why, state="done")
+        plan = Plan(snapshot.actuators.driver.halt(), snapshot.still(), self._why, state="done")
+        hand = snapshot.estimator.hand
+        if not self._halted and hand is not None:
+            self._halted = True
+            snapshot.actuators.grip.halt(hand)
+            plan.head = (snapshot.angles[PAN], snapshot.angles[TILT], self.HEAD_RADPS)
+        return plan
 
 
 class Parking:

@@ -1,0 +1,393 @@
+"""Endings of a task's command, over real processes: `python -m bench.endings [--count 60] [--seed 0] [--only KIND]`
+
+Each case starts `cocoro fetch LABEL --bring` (or `babble`) on a simulated robot, waits for a phase of the task, and
+ends the command, or lets go of it, in one of the ways of `KINDS`. It then judges by the simulator's truth when the
+robot came to rest, in simulated seconds from the last physics step before the ending (240 Hz for the body, 30 Hz for
+the joints); that the task was cancelled; and that the next task is accepted.
+
+Case N is the same for the same seed, so a bench in parts (`--from 20 --count 20`) is the same bench. Exit code 1 when a
+case missed the bound.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import fcntl
+import os
+import pty
+import random
+import select
+import signal
+import statistics
+import subprocess
+import sys
+import tempfile
+import termios
+import threading
+import time
+from collections.abc import AsyncIterator, Callable, Mapping
+from contextlib import asynccontextmanager, suppress
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+
+from bench.live import Operator, operator
+from cocoro import topics
+from cocoro.bus.zenoh import ZenohBus
+from cocoro.clock import NS, FollowedClock
+from cocoro.errors import CocoroError
+from cocoro.messages import ReportRequest, TaskReply, TaskRequest, TaskState, Truth
+from cocoro.node import Node
+from cocoro.robot import Robot
+from cocoro.tasks import Task
+from services.executive.tasks import ParkTask, PutDownTask
+from services.planning.hand import CLAWS
+from sim.motion import MotionRow, read_motion
+
+BOUND_S = 0.5
+STANDING_MPS = 0.01
+STANDING_RADPS = 0.05
+"""Speed of a joint that holds its position: its truth trembles by less."""
+WATCH_S = 1.5
+PATIENCE_S = 90.0
+PHASES = ("start", "search", "approach", "reach", "grasp", "lift", "hold", "carry", "place", "babble-arm")
+"""`start`: the command has only just been started, and may or may not have asked for its task."""
+CANS = ("red_can", "green_can", "blue_can")
+ABSENT = "yellow_ball"
+"""An object that is not in the scene, so that the search lasts."""
+
+
+# --- the command and its terminal ----------------------------------------------------------------
+
+
+class Command:
+    """`cocoro ...` with a terminal or pipes of its own. `end` ends it or lets go of it."""
+
+    def __init__(self, environment: Mapping[str, str], arguments: list[str], kind: str) -> None:
+        self._fds: dict[str, int] = {}
+        self.said = bytearray()
+        code = [sys.executable, "-m", "apps.cli.main", *arguments]
+        out, err = self._stream("out", kind), self._stream("err", kind)
+        self.process = subprocess.Popen(
+            code, env=environment, stdin=subprocess.DEVNULL if "pipe" in kind else out, stdout=out, stderr=err,
+            start_new_session=True, preexec_fn=lambda: _own(out, kind),
+        )  # fmt: skip
+        for fd in {out, err}:
+            os.close(fd)
+        for name, fd in self._fds.items():
+            if (name, kind) != ("out", "unread pipe, SIGINT"):
+                threading.Thread(target=self._drain, args=(fd,), daemon=True).start()
+
+    def _stream(self, name: str, kind: str) -> int:
+        if "pipe" not in kind:
+            if "terminal" not in self._fds:
+                self._fds["terminal"], self._slave = pty.openpty()
+            return self._slave if name == "out" else os.dup(self._slave)
+        self._fds[name], writer = os.pipe()
+        if kind.startswith("unread") and name == "out":
+            os.set_blocking(writer, False)
+            with suppress(BlockingIOError):
+                while True:
+                    os.write(writer, bytes(4096))
+            os.set_blocking(writer, True)
+        return writer
+
+    def _drain(self, fd: int) -> None:
+        """Reads what comes. Never waits in `read`, which would keep the pipe open for longer than its number."""
+        with suppress(OSError, ValueError):
+            while True:
+                if select.select([fd], [], [], 0.01)[0]:
+                    self.said += (data := os.read(fd, 4096))
+                    if not data:
+                        return
+
+    def keys(self, *keys: bytes) -> None:
+        for key in keys:
+            os.write(self._fds["terminal"], key)
+            time.sleep(0.05)
+
+    def hang_up(self) -> None:
+        os.close(self._fds.pop("terminal"))
+
+    def close_reader(self, name: str) -> None:
+        """Closes the reading end; its number stays taken, because a thread reads it."""
+        null = os.open(os.devnull, os.O_RDONLY)
+        os.dup2(null, self._fds[name])
+        os.close(null)
+
+    def finish(self) -> int | None:
+        """The exit code; None for one that had to be killed."""
+        try:
+            code: int | None = self.process.wait(20.0)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+            code = None
+        for fd in self._fds.values():
+            with suppress(OSError):
+                os.close(fd)
+        return code
+
+
+def _own(terminal: int, kind: str) -> None:
+    """In the child: its controlling terminal, as a shell gives it; a hang-up that is ignored."""
+    if "pipe" not in kind:
+        fcntl.ioctl(terminal, termios.TIOCSCTTY, 0)
+    if "unheard" in kind:
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)
+
+
+KINDS: dict[str, Callable[[Command], None]] = {
+    "Ctrl-C": lambda command: command.keys(b"\x03"),
+    "SIGTERM": lambda command: command.process.send_signal(signal.SIGTERM),
+    "terminal closed": Command.hang_up,
+    "stdout's reader gone, pipe": lambda command: command.close_reader("out"),
+    "SIGKILL": lambda command: command.process.send_signal(signal.SIGKILL),
+    "Ctrl-\\": lambda command: command.keys(b"\x1c"),
+    "stderr's reader gone, pipe": lambda command: command.close_reader("err"),
+    "SIGHUP": lambda command: command.process.send_signal(signal.SIGHUP),
+    "terminal gone unheard": Command.hang_up,
+    "unread pipe, SIGINT": lambda command: command.process.send_signal(signal.SIGINT),
+    "crash (SIGSEGV)": lambda command: command.process.send_signal(signal.SIGSEGV),
+    "Ctrl-Z": lambda command: command.keys(b"\x1a"),
+    "Ctrl-C twice": lambda command: command.keys(b"\x03", b"\x03"),
+}
+"""By name, what a person or the machine does. With `pipe` in its name a command has pipes instead of a terminal."""
+ENDS = {"SIGKILL": -signal.SIGKILL, "crash (SIGSEGV)": -signal.SIGSEGV}
+"""Exit codes that are not those of a cancelled command."""
+
+
+# --- the robot -----------------------------------------------------------------------------------
+
+
+@dataclass
+class Watched:
+    """A robot that is up, and what is seen of it."""
+
+    cocoro: Operator
+    node: Node
+    motion: Path
+    state: TaskState = field(default_factory=TaskState)
+    holding: bool = False
+    truths: list[Truth] = field(default_factory=list)
+    rows: list[MotionRow] = field(default_factory=list)
+
+    def read(self) -> None:
+        self.rows += read_motion(self.motion, len(self.rows))
+
+    async def until(self, good: Callable[[], bool], timeout_s: float = PATIENCE_S) -> bool:
+        """Waits until it is so; returns whether it is."""
+        with suppress(TimeoutError):
+            async with asyncio.timeout(timeout_s):
+                while not good():  # noqa: ASYNC110 # what is awaited is in files and messages
+                    await asyncio.sleep(0.005)
+        return good()
+
+    async def report(self) -> TaskState:
+        return await self.node.call(topics.REPORT, ReportRequest(), 10.0)
+
+    async def ask(self, task: Task) -> TaskReply:
+        return await self.node.call(topics.RUN, TaskRequest(task=task), 10.0)
+
+    async def do(self, task: Task) -> TaskReply:
+        """Asks for a task and waits for its end."""
+        reply = await self.ask(task)
+        if reply.accepted:
+            await self.until(lambda: self.state.task_id == reply.task_id and self.state.outcome is not None)
+        return reply
+
+    def body_rest_s(self, since_ns: int) -> float:
+        moving = [row.sim_ns for row in self.rows if row.sim_ns > since_ns and row.moves_mps >= STANDING_MPS]
+        return (max(moving, default=since_ns) - since_ns) / NS
+
+    def joints_rest_s(self, since_ns: int) -> tuple[float, float]:
+        """When the last joint came to rest, without the claws and of the claws."""
+        last = {False: since_ns, True: since_ns}
+        for before, after in pairwise([truth for truth in self.truths if truth.stamp_ns > since_ns]):
+            dt_s = (after.stamp_ns - before.stamp_ns) / NS
+            for joint, angle in after.joints_rad.items():
+                if abs(angle - before.joints_rad[joint]) / dt_s > STANDING_RADPS:
+                    last[joint in CLAWS] = after.stamp_ns
+        return (last[False] - since_ns) / NS, (last[True] - since_ns) / NS
+
+
+@asynccontextmanager
+async def robot_up(folder: Path) -> AsyncIterator[Watched]:
+    with operator() as cocoro:
+        motion = folder / "motion"
+        settings = [
+            "--set",
+            f"service.sim.motion={motion}",
+            "--set",
+            'processes=["sim","perception","planning","executive"]',
+        ]
+        code, said, _ = await asyncio.to_thread(cocoro, "up", "sim", "--detach", "--frames", "320x240@15", *settings)
+        if code:
+            raise CocoroError(said)
+        async with (
+            await ZenohBus.open(cocoro.run_dir.join_as("bench")) as bus,
+            Node("bench", bus, FollowedClock(), Robot.load()) as node,
+        ):
+            watched = Watched(cocoro, node, motion)
+            node.on(topics.TASK, lambda state: setattr(watched, "state", state))
+            node.on(topics.PLAN, lambda plan: setattr(watched, "holding", plan.holding))
+            node.on(topics.TRUTH, watched.truths.append)
+            yield watched
+
+
+# --- a case --------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Case:
+    number: int
+    kind: str
+    phase: str
+    label: str
+    wait_s: float
+
+    @property
+    def arguments(self) -> list[str]:
+        if self.phase == "babble-arm":
+            return ["babble", "arm", "--samples", "1000"]
+        return ["fetch", self.label, "--bring"]
+
+
+def case(number: int, seed: int) -> Case:
+    rng = random.Random(f"endings/{seed}/{number}")
+    kinds = list(KINDS)
+    turn, place = divmod(number, len(kinds))
+    phase = PHASES[(place + 3 * turn) % len(PHASES)]
+    label = ABSENT if phase == "search" else CANS[number % len(CANS)]
+    wait_s = rng.uniform(0.1, 0.9) if phase == "start" else rng.uniform(0.0, 0.6)
+    return Case(number, kinds[place], phase, label, wait_s)
+
+
+@dataclass
+class Verdict:
+    case: Case
+    body_s: float = 0.0
+    joints_s: float = 0.0
+    claws_s: float = 0.0
+    held: bool = False
+    """Claws that hold something swing with it until their torques balance; they are reported, not judged."""
+    real_s: float = 0.0
+    code: int | None = None
+    faults: list[str] = field(default_factory=list)
+
+
+async def judge(robot: Watched, one: Case, folder: Path) -> Verdict | None:
+    """None when the task ended before the phase was reached."""
+    out = ["--out", str(folder / f"{one.number}.jsonl")] if one.phase == "babble-arm" else []
+    command = Command(robot.cocoro.environment, [*one.arguments, *out], one.kind)
+    before = robot.state.task_id
+    try:
+        if one.phase != "start":
+
+            def reached() -> bool:
+                state = robot.state
+                return state.task_id != before and (state.phase == one.phase or state.outcome is not None)
+
+            if not await robot.until(reached) or robot.state.outcome is not None:
+                return None
+        await asyncio.sleep(one.wait_s)
+        if one.phase != "start" and robot.state.outcome is not None:
+            return None
+        ended_ns = time.monotonic_ns()
+        await asyncio.to_thread(KINDS[one.kind], command)
+        verdict = Verdict(one)
+        since_ns = robot.node.now_ns()
+        await robot.until(lambda: robot.node.now_ns() > since_ns + WATCH_S * NS)
+    finally:
+        if one.kind == "Ctrl-Z" and one.phase == "start":  # nothing handles it yet: the command is suspended
+            command.process.send_signal(signal.SIGCONT)
+            command.process.send_signal(signal.SIGTERM)
+        code = await asyncio.to_thread(command.finish)
+    robot.read()
+    last_ns = max(row.sim_ns for row in robot.rows if row.real_ns <= ended_ns)
+    verdict.body_s = robot.body_rest_s(last_ns)
+    verdict.joints_s, verdict.claws_s = robot.joints_rest_s(last_ns)
+    verdict.held = robot.holding
+    moved_ns = [row.real_ns for row in robot.rows if row.sim_ns > last_ns and row.moves_mps >= STANDING_MPS]
+    verdict.real_s = (max(moved_ns, default=ended_ns) - ended_ns) / NS
+    verdict.code = code
+    await _judge_task(robot, verdict, before, command)
+    return verdict
+
+
+async def _judge_task(robot: Watched, verdict: Verdict, before: str, command: Command) -> None:
+    state = await robot.report()
+    begun = state.task_id != before
+    if begun and state.outcome != "cancelled":
+        verdict.faults.append(f"the task is {state.outcome or 'running'} ({state.reason or state.phase})")
+    if verdict.case.phase != "start" and verdict.code != ENDS.get(verdict.case.kind, 3):
+        verdict.faults.append(f"exit code {verdict.code}")
+    if b"Traceback" in command.said:
+        verdict.faults.append(command.said.decode(errors="replace"))
+    if verdict.body_s > BOUND_S:
+        verdict.faults.append(f"the body moved for {verdict.body_s:.3f} s")
+    if verdict.joints_s > BOUND_S or (verdict.claws_s > BOUND_S and not verdict.held):
+        verdict.faults.append(f"joints moved for {verdict.joints_s:.3f} s, claws for {verdict.claws_s:.3f} s")
+    following = await robot.do(PutDownTask() if robot.holding else ParkTask())
+    if not following.accepted:
+        verdict.faults.append(f"the next task is refused: {following.text}")
+
+
+async def bench(first: int, count: int, seed: int, only: str, phase: str) -> bool:
+    verdicts: list[Verdict] = []
+    cases = [case(number, seed) for number in range(first, first + count)]
+    cases = [one for one in cases if only in one.kind and phase in one.phase]
+    with tempfile.TemporaryDirectory(prefix="endings") as name:
+        async with robot_up(Path(name)) as robot:
+            await robot.until(lambda: bool(robot.truths))
+            for one in cases:
+                for _ in range(4):
+                    robot.truths.clear()
+                    if (verdict := await judge(robot, one, Path(name))) is not None:
+                        break
+                    await robot.until(lambda: robot.state.outcome is not None)
+                    await robot.do(PutDownTask() if robot.holding else ParkTask())
+                else:
+                    print(f"  {one.number:3d}: {one.phase} was not reached, which is no case", flush=True)
+                    continue
+                verdicts.append(verdict)
+                print(f"  {_line(verdict)}", flush=True)
+    return _summary(verdicts)
+
+
+def _line(verdict: Verdict) -> str:
+    one, holds = verdict.case, " (hold)" if verdict.held else ""
+    times = f"body {verdict.body_s:.3f} s, joints {verdict.joints_s:.3f} s, claws {verdict.claws_s:.3f} s{holds}"
+    return f"{one.number:3d}: {one.kind:27s} {one.phase:10s} {times}; code {verdict.code} {'; '.join(verdict.faults)}"
+
+
+def _summary(verdicts: list[Verdict]) -> bool:
+    if not verdicts:
+        return False
+    rest = sorted(
+        max(verdict.body_s, verdict.joints_s, 0.0 if verdict.held else verdict.claws_s) for verdict in verdicts
+    )
+    good = sum(not verdict.faults for verdict in verdicts)
+    print(
+        f"{good} of {len(verdicts)}: at rest after {statistics.median(rest):.3f} s (median), {rest[-1]:.3f} s"
+        f" (longest); the body {max(verdict.body_s for verdict in verdicts):.3f} s, by the machine's clock"
+        f" {max(verdict.real_s for verdict in verdicts):.3f} s"
+    )
+    return good == len(verdicts)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--count", type=int, default=60)
+    parser.add_argument("--from", dest="first", type=int, default=0)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", default="", metavar="KIND", help=f"one of: {', '.join(KINDS)}")
+    parser.add_argument("--phase", default="", metavar="PHASE", help=f"one of: {', '.join(PHASES)}")
+    arguments = parser.parse_args()
+    well = asyncio.run(bench(arguments.first, arguments.count, arguments.seed, arguments.only, arguments.phase))
+    return 0 if well else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

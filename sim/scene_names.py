@@ -1,0 +1,14 @@
+"""The names of the scenes, apart from what reads them: a shell that completes one must not wait for numpy."""
+
+from __future__ import annotations
+
+from importlib import resources
+
+GENERATED = ("random", "rooms", "rooms-empty")
+"""Names of the scenes that `sim.random_scene` makes."""
+
+
+def scene_names() -> list[str]:
+    """Names of the scenes that come with the project as files."""
+    folder = resources.files("sim").joinpath("scenes")
+    return sorted(file.name.removesuffix(".toml") for file in folder.iterdir() if file.name.endswith(".toml"))

@@ -1,0 +1,98 @@
+"""Every way in which a person ends a task's command or lets go of it, over real processes: the task is cancelled."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+from pathlib import Path
+
+import pytest
+
+from bench.endings import ENDS, KINDS, Command
+from cocoro.bus.endpoints import default
+from cocoro.bus.zenoh import ZenohBus
+from cocoro.clock import RealClock
+from cocoro.messages import CancelRequest, TaskReply, TaskRequest, TaskState
+from cocoro.node import Node
+from cocoro.robot import Robot
+from cocoro.topics import CANCEL, RUN, TASK
+from services.executive.askers import Askers
+
+pytestmark = [pytest.mark.zenoh, pytest.mark.process]
+
+PATIENCE_S = 60.0
+
+
+class Executive:
+    """Takes any number of tasks at a time, and notes who ended each: `operator` by a request, or `gone`. A task's id is
+    its time limit, by which a test tells its commands apart."""
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._asked: dict[str, str] = {}
+        """Task by asker."""
+        self.ended: dict[str, str] = {}
+        self.changed = asyncio.Event()
+        Askers(node, lambda asker: self._end(self._asked[asker], "gone"))
+        node.serve(RUN, self._run)
+        node.serve(CANCEL, self._cancel)
+        node.ready()
+
+    async def _run(self, request: TaskRequest) -> TaskReply:
+        task_id = f"{request.timeout_s:g}"
+        self._asked[request.asker] = task_id
+        self.changed.set()
+        return TaskReply(accepted=True, task_id=task_id)
+
+    async def _cancel(self, request: CancelRequest) -> TaskReply:
+        self._end(request.task_id, "operator")
+        return TaskReply(accepted=True, task_id=request.task_id)
+
+    def _end(self, task_id: str, by: str) -> None:
+        self.ended.setdefault(task_id, by)
+        self._node.publish(TASK, TaskState(task_id=task_id, task="fetch", label="red_can", outcome="cancelled"))
+        self.changed.set()
+
+    async def until_asked(self, task_id: str) -> None:
+        while task_id not in self._asked.values():
+            await self._change()
+
+    async def until_ended(self, task_id: str) -> str:
+        while task_id not in self.ended:
+            await self._change()
+        return self.ended[task_id]
+
+    async def _change(self) -> None:
+        self.changed.clear()
+        async with asyncio.timeout(PATIENCE_S):
+            await self.changed.wait()
+
+
+async def end(executive: Executive, number: int, kind: str) -> tuple[str, int | None, bytes]:
+    """Ends one command once its task runs. Returns who ended the task, the exit code, and what the command printed."""
+    task_id = str(100 + number)
+    command = Command(os.environ, ["fetch", "red_can", "--timeout", task_id], kind)
+    try:
+        await executive.until_asked(task_id)
+        await asyncio.to_thread(KINDS[kind], command)
+        by = await executive.until_ended(task_id)
+    finally:
+        code = await asyncio.to_thread(command.finish)
+    return by, code, bytes(command.said)
+
+
+def test_a_task_is_cancelled_by_every_signal_hang_up_and_lost_reader(root: Path) -> None:
+    async def scenario() -> None:
+        async with (
+            await ZenohBus.open(default("calliope", "executive")) as bus,
+            Node("executive", bus, RealClock(), Robot.load()) as node,
+        ):
+            executive = Executive(node)
+            ends = await asyncio.gather(*(end(executive, *one) for one in enumerate(KINDS)))
+        by = {kind: by for kind, (by, _, _) in zip(KINDS, ends, strict=True)}
+        assert by == {kind: "gone" if kind in ENDS else "operator" for kind in KINDS}
+        codes = {kind: code for kind, (_, code, _) in zip(KINDS, ends, strict=True)}
+        assert codes == {kind: ENDS.get(kind, 3) for kind in KINDS}
+        assert not [said for _, _, said in ends if b"Traceback" in said]
+
+    asyncio.run(scenario())
