@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import re
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -178,6 +181,18 @@ def test_the_shell_completes_names(
     found = set(capsys.readouterr().out.split())
     assert some <= found
     assert all(name.startswith(line.split()[-1]) for name in found)
+
+
+@pytest.mark.process
+@pytest.mark.parametrize("line", ["cocoro replay l", "cocoro up --scene p"])
+def test_a_completion_waits_for_no_heavy_library(line: str) -> None:
+    code = "import sys; from apps.cli.main import main; main([]); print(*sys.modules, file=sys.stderr)"
+    environment = {"_COCORO_COMPLETE": "complete_bash", "COMP_WORDS": line, "COMP_CWORD": str(line.count(" "))}
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, env=os.environ | environment
+    )
+    assert done.stdout
+    assert not {"numpy", "cv2", "scipy", "pybullet"} & {*done.stderr.split()}
 
 
 def test_a_completion_that_fails_completes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
