@@ -9,9 +9,13 @@ from pathlib import Path
 import pytest
 
 from apps.captures import shelf
+from apps.captures.names import open_captures
 from apps.cli import completions, exits
 from apps.cli.main import main
+from apps.cli.status import space
 from cocoro.clock import NS
+from cocoro.messages import Recording
+from deploy.rundir import RunDir
 from services.capture.file import CaptureFile, Packer
 from services.capture.folder import is_pinned
 from services.capture.occasions import OCCASION, Occasion
@@ -130,3 +134,21 @@ def test_commands_take_names(folder: Path, capsys: pytest.CaptureFixture[str]) -
 def test_a_run_up_to_a_file(folder: Path, tmp_path: Path) -> None:
     assert [path.name[-8:-5] for path in shelf.run_until(folder / f"{RUN}-003.mcap")] == ["001", "can", "003"]
     assert shelf.run_until(tmp_path / "mine.mcap") == [tmp_path / "mine.mcap"]
+
+
+def test_status_says_how_long_the_room_lasts() -> None:
+    told = Recording(free_bytes=60 * 10**9, rate_bytes_per_s=1e9 / 3600, kept_bytes=3 * 10**9, keep_bytes=5 * 10**9)
+    assert space(told) == "60.0 GB left, 60 hours at 1000 MB an hour; 3.0 GB kept of at most 5.0"
+    assert space(Recording(free_bytes=10**9)) == "1.0 GB left"
+
+
+def test_the_file_of_a_recorder_that_is_up_is_found_by_its_process(short_path: Path, tmp_path: Path) -> None:
+    run_dir = RunDir("robbie", short_path / "robbie")
+    run_dir.make()
+    (claim,) = run_dir.claim("capture", ["capture"])
+    try:
+        with (tmp_path / "open.mcap").open("wb"):
+            assert open_captures(run_dir) == [tmp_path / "open.mcap"]
+        assert open_captures(run_dir) == []
+    finally:
+        claim.release()
