@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from pathlib import Path
 
 import pytest
@@ -127,6 +128,8 @@ def test_pinned_captures_are_kept_and_only_a_person_removes_one(
 def test_commands_take_names(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["capture", "info", "fetch red_can", "--check", "--json"]) == exits.DONE
     assert json.loads(capsys.readouterr().out)["path"].endswith("-002-fetch-red_can.mcap")
+    assert main(["capture", "info", "fetch"]) == exits.DONE
+    assert re.search(r"^happened +fetch blue_can \(failed\)$", capsys.readouterr().out, re.MULTILINE)
     assert main(["replay", "stop"]) == exits.FAILED  # it names no robot
     assert f"{RUN}-004-stop.mcap: it names no robot" in capsys.readouterr().err
 
