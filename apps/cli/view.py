@@ -142,7 +142,7 @@ async def view_mesh(choice: RobotChoice, target: Target, sim: bool = False) -> i
     display, MeshError when there is no mesh.
     """
     from apps.captures.export.files import making
-    from apps.captures.export.rerun_scene import APPLICATION, RerunScene, library
+    from apps.captures.export.rerun_scene import APPLICATION, RerunScene, flush, library
 
     rerun = library()
     target.check()
@@ -175,10 +175,11 @@ async def view_mesh(choice: RobotChoice, target: Target, sim: bool = False) -> i
             if viewer is not None and viewer.failed:
                 raise CaptureError(viewer.reason())
             if viewer is None or not viewer.ended:
-                ended = writing.join(FLUSH_S) and Attempt(recording.flush).join(FLUSH_S)
-                if not ended:
+                flushing = Attempt(partial(flush, recording, target.save) if target.save else recording.flush)
+                if not (writing.join(FLUSH_S) and flushing.join(FLUSH_S)):
                     raise CaptureError(f"the viewer took nothing any more; {waiting.dropped} messages were not shown")
                 writing.result()
+                flushing.result()
             return exits.DONE
         finally:
             if viewer is not None:
