@@ -18,7 +18,7 @@ from apps.captures import shelf as captures
 from apps.captures.info import AttachmentReport, CaptureReport, report
 from apps.captures.reader import Capture
 from apps.captures.rewrite import REPAIRED, rewrite
-from apps.cli import exits, shelf
+from apps.cli import completions, exits, shelf
 from apps.cli.options import CaptureArgument, FromOption, JsonOption, OnlyOption, ToOption, WithoutOption, capture_file
 from apps.cli.output import print_json
 from apps.cli.terminal import Column, fields, table
@@ -174,7 +174,14 @@ def repair(
     out: Annotated[
         Path | None, typer.Option("--out", metavar="FILE", help="The new file; FILE.repaired.mcap by default.")
     ] = None,
-    compression: Annotated[str, typer.Option(metavar="zstd|lz4|none", help="Compression of the new file.")] = "zstd",
+    compression: Annotated[
+        str,
+        typer.Option(
+            metavar="zstd|lz4|none",
+            autocompletion=completions.of("zstd", "lz4", "none"),
+            help="Compression of the new file.",
+        ),
+    ] = "zstd",
     level: Annotated[int, typer.Option(min=1, max=19, help="Level for zstd; 19 is small and slow.")] = 1,
     only: OnlyOption = None,
     without: WithoutOption = None,
@@ -266,9 +273,19 @@ def reexecute(
         list[Path],
         typer.Argument(metavar="FILE...", parser=capture_file, help="The captures of one run, in order."),
     ],
-    service: Annotated[str, typer.Option("--service", help="perception, planning, or another with a pure core.")],
+    service: Annotated[
+        str,
+        typer.Option(
+            "--service", autocompletion=completions.services, help="perception, planning, or another with a pure core."
+        ),
+    ],
     against: Annotated[
-        str, typer.Option(metavar="recorded|nothing", help="What to compare the outputs with.")
+        str,
+        typer.Option(
+            metavar="recorded|nothing",
+            autocompletion=completions.of("recorded", "nothing"),
+            help="What to compare the outputs with.",
+        ),
     ] = "recorded",
     tolerance: Annotated[
         float,

@@ -35,6 +35,8 @@ from cocoro.tasks import Task
 from cocoro.vloop import run_virtual
 from deploy.delayed import DelayedNode
 from deploy.processes import named, needs
+from services.executive.tasks.follow import CATCH_UP_S, WITHIN_M
+from services.planning.config import FollowConfig
 from sim.judge import Judge, PursuitJudge
 from sim.random_scene import find_scene
 from sim.realism import REALISM, body_of, wheel_scales
@@ -145,7 +147,10 @@ class _Rehearsal:
     def _judge_of(self, task: Task) -> Judge | PursuitJudge:
         present = self._present(task)
         if task.pursuit_phase and present:
-            return PursuitJudge(self._robot, self._scene, present)
+            return PursuitJudge(
+                self._robot, self._scene, present,
+                distance_m=FollowConfig().distance_m, within_m=WITHIN_M, catch_up_s=CATCH_UP_S,
+            )  # fmt: skip
         return Judge(self._scene, present)
 
     def _feed_judge(self, truth: Truth) -> None:
@@ -237,6 +242,7 @@ class _Rehearsal:
                 "outcome": state.outcome,
                 "reason": state.reason,
                 "sim_s": round(state.elapsed_s, 3),
+                "measures": state.measures,
                 "hand_to_target": self._trace.hand_gap(),
                 "target_edge_m": edge_m,
                 "longest_stall_s": round(self._trace.longest_stall_s(), 3),
@@ -296,6 +302,7 @@ class _Rehearsal:
             "reason": state.reason,
             "sim_s": round(state.elapsed_s, 3),
             "wall_s": 0.0,
+            "measures": state.measures,
             "phases": [
                 {"name": phase.name, "sim_s": round(((phase.end_ns or state.stamp_ns) - phase.start_ns) / NS, 3)}
                 for phase in state.phases

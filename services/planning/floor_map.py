@@ -226,6 +226,16 @@ class FloorMap:
             cells &= ~self._disc(x, y, radius)
         return cells
 
+    def taller(self, points_m: FloatArray) -> BoolArray:
+        """In which points (n, 3), odometry frame, metres, something was seen to reach higher; shape (n,)."""
+        index = self._index(points_m)
+        inside = ((index >= 0) & (index < SIZE)).all(axis=1)
+        taller = np.zeros(len(index), dtype=bool)
+        rows, columns = index[inside].T
+        stands = self._evidence[rows, columns] >= _OCCUPIED
+        taller[inside] = stands & (self._highest[rows, columns] > points_m[inside, 2] - CELL_M / 2)
+        return taller
+
     def looked_at(self) -> BoolArray:
         """Cells that were seen, (SIZE, SIZE)."""
         return self._looked
