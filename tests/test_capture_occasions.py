@@ -19,7 +19,7 @@ from apps.captures.recorded import Once
 from cocoro import topics
 from cocoro.bus.base import Qos
 from cocoro.clock import NS
-from cocoro.messages import BaseState, Health, Latch, Recording, ServoState, TaskState
+from cocoro.messages import BaseState, Health, Latch, Recording, ServoState, TaskState, TopicHealth
 from cocoro.node import Node
 from cocoro.vloop import run_virtual
 from deploy import profiles
@@ -111,6 +111,9 @@ def test_a_fault_is_one_when_it_is_new() -> None:
     for second in range(30):
         heard.see(health, Health(service="arm", state="ready", faults=(f"elbow: {second} bad packets",)), second)
     assert heard.look(30.0) == [("begin", "fault"), ("end", "fault")]
+    late = TopicHealth(key="calliope/arm/command", direction="in", fault="arm/command of planning: 1 rejected: stale")
+    heard.see(health, Health(service="arm", state="ready", topics=(late,), faults=(late.fault,)), 30.5)
+    assert heard.look(30.6) == [("begin", "fault"), ("end", "fault")]  # a late message is none
     heard.see(health, Health(service="arm", state="degraded", text="no link"), 31.0)
     assert heard.look(31.0)[2:] == [("begin", "fault")]
 

@@ -75,6 +75,7 @@ def test_every_command_that_tells_something_has_json() -> None:
         (["logs", "--level", "erorr"], 2, "usage", "did you mean error?"),
         (["hz", "a//b"], 4, "no_mesh", "no robot is up"),
         (["ftch", "red_can"], 2, "usage", "Did you mean 'fetch'"),
+        (["rehearse", "ftch", "red_can"], 2, "usage", "did you mean fetch?"),
         (["estop", "--robot", "nobody"], 4, "no_mesh", "no nobody is up"),
     ],
 )

@@ -185,7 +185,8 @@ class Watch:
         self._cause("stop", f"emergency stop {latch.state}{by}", log_ns)
 
     def _on_health(self, _key: str, health: Health, log_ns: int) -> None:
-        troubles = [f"{health.service}: {fault}" for fault in health.faults]
+        late = {topic.fault for topic in health.topics if not topic.unreadable}  # a few rejections are no event
+        troubles = [f"{health.service}: {fault}" for fault in health.faults if fault not in late]
         if health.state == "degraded" and not troubles:
             troubles = [f"{health.service} is degraded: {health.text}"]
         for trouble in troubles:
