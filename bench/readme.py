@@ -47,8 +47,11 @@ SLOW = {
     "cocoro rehearse fetch red_can --then": "tests/test_rehearse.py has it",
 }
 """Commands that continuous integration has no time for, and why."""
-ENDLESS = ("cocoro top", "cocoro echo", "cocoro hz", "cocoro logs -f", "cocoro view", "cocoro replay")
+ENDLESS = ("cocoro top", "cocoro echo", "cocoro hz", "cocoro logs -f", "cocoro view")
 """Commands that go on until Ctrl-C, which they get when they have printed something."""
+LONG = ("cocoro replay",)
+"""Commands that last as long as a capture; continuous integration cancels them after `LONG_S`."""
+LONG_S = 5.0
 CODES = {"cocoro doctor": 1}
 """Exit codes other than 0: the machine lacks the robot's hardware."""
 PATIENCE_S = 600.0
@@ -73,9 +76,13 @@ class Ran:
     seconds: float
     output: str
 
+    cancelled: bool = False
+    """Whether it got a Ctrl-C before its end."""
+
     @property
     def wrong(self) -> bool:
-        return self.code != CODES.get(self.command, 0) or "internal error" in self.output or "Traceback" in self.output
+        code = 3 if self.cancelled else CODES.get(self.command, 0)
+        return self.code != code or "internal error" in self.output or "Traceback" in self.output
 
 
 def blocks(page: Path = PAGE) -> list[Block]:
@@ -116,6 +123,7 @@ class Terminal:
     folder: Path
     frames: str | None = None
     """Size and rate of all robots' frames."""
+    quick: bool = False
     environment: dict[str, str] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -136,8 +144,14 @@ class Terminal:
             stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
         )  # fmt: skip
         assert process.stdout is not None
-        output = b""
-        if any(begins(command, words) for words in ENDLESS):
+        output, cancelled = b"", False
+        if self.quick and any(begins(command, words) for words in LONG):
+            try:
+                process.wait(LONG_S)
+            except subprocess.TimeoutExpired:
+                cancelled = True
+                process.send_signal(signal.SIGINT)
+        elif any(begins(command, words) for words in ENDLESS):
             if select.select([process.stdout], [], [], PATIENCE_S)[0]:
                 output = os.read(process.stdout.fileno(), 65536)
             time.sleep(SHOWN_S)
@@ -147,15 +161,15 @@ class Terminal:
         except subprocess.TimeoutExpired:
             process.kill()
             output += process.communicate()[0] + b"\nit did not end"
-        return Ran(command, process.returncode, time.monotonic() - begun_s, output.decode(errors="replace"))
+        return Ran(command, process.returncode, time.monotonic() - begun_s, output.decode(errors="replace"), cancelled)
 
 
-def run_blocks(chosen: list[Block], terminal: Terminal, *, quick: bool) -> Iterator[Ran]:
+def run_blocks(chosen: list[Block], terminal: Terminal) -> Iterator[Ran]:
     """Runs what can be run of the blocks, one command after the other. Leaves no robot behind."""
     try:
         for block in chosen:
             for command in block.commands:
-                if not any(begins(command, words) for words in (*NOT_RUN, *(SLOW if quick else ()))):
+                if not any(begins(command, words) for words in (*NOT_RUN, *(SLOW if terminal.quick else ()))):
                     yield terminal.run(command)
     finally:
         terminal.run("cocoro down")
@@ -170,8 +184,8 @@ def main() -> int:
     chosen = [block for block in blocks() if block.section.startswith(tuple(options.sections) or "")]
     wrong, total_s = 0, 0.0
     with tempfile.TemporaryDirectory(prefix="readme-") as folder:
-        terminal = Terminal(Path(folder), options.frames)
-        for ran in run_blocks(chosen, terminal, quick=options.quick):
+        terminal = Terminal(Path(folder), options.frames, options.quick)
+        for ran in run_blocks(chosen, terminal):
             last = (ran.output.strip().splitlines() or [""])[-1]
             print(
                 f"{'WRONG' if ran.wrong else 'ok   '} {ran.code} {ran.seconds:6.1f} s  {ran.command:<60} {last[:80]}",

@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from pathlib import Path
 
 import pytest
 
 from apps.captures import shelf
+from apps.captures.names import open_captures
 from apps.cli import completions, exits
 from apps.cli.main import main
+from apps.cli.status import space
 from cocoro.clock import NS
+from cocoro.messages import Recording
+from deploy.rundir import RunDir
 from services.capture.file import CaptureFile, Packer
 from services.capture.folder import is_pinned
 from services.capture.occasions import OCCASION, Occasion
@@ -123,6 +128,8 @@ def test_pinned_captures_are_kept_and_only_a_person_removes_one(
 def test_commands_take_names(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["capture", "info", "fetch red_can", "--check", "--json"]) == exits.DONE
     assert json.loads(capsys.readouterr().out)["path"].endswith("-002-fetch-red_can.mcap")
+    assert main(["capture", "info", "fetch"]) == exits.DONE
+    assert re.search(r"^happened +fetch blue_can \(failed\)$", capsys.readouterr().out, re.MULTILINE)
     assert main(["replay", "stop"]) == exits.FAILED  # it names no robot
     assert f"{RUN}-004-stop.mcap: it names no robot" in capsys.readouterr().err
 
@@ -130,3 +137,21 @@ def test_commands_take_names(folder: Path, capsys: pytest.CaptureFixture[str]) -
 def test_a_run_up_to_a_file(folder: Path, tmp_path: Path) -> None:
     assert [path.name[-8:-5] for path in shelf.run_until(folder / f"{RUN}-003.mcap")] == ["001", "can", "003"]
     assert shelf.run_until(tmp_path / "mine.mcap") == [tmp_path / "mine.mcap"]
+
+
+def test_status_says_how_long_the_room_lasts() -> None:
+    told = Recording(free_bytes=60 * 10**9, rate_bytes_per_s=1e9 / 3600, kept_bytes=3 * 10**9, keep_bytes=5 * 10**9)
+    assert space(told) == "60.0 GB left, 60 hours at 1000 MB an hour; 3.0 GB kept of at most 5.0"
+    assert space(Recording(free_bytes=10**9)) == "1.0 GB left"
+
+
+def test_the_file_of_a_recorder_that_is_up_is_found_by_its_process(short_path: Path, tmp_path: Path) -> None:
+    run_dir = RunDir("robbie", short_path / "robbie")
+    run_dir.make()
+    (claim,) = run_dir.claim("capture", ["capture"])
+    try:
+        with (tmp_path / "open.mcap").open("wb"):
+            assert open_captures(run_dir) == [tmp_path / "open.mcap"]
+        assert open_captures(run_dir) == []
+    finally:
+        claim.release()

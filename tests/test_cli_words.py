@@ -17,7 +17,7 @@ from places import in_short_folder
 from apps.cli import manual
 from apps.cli.listening import nothing_on
 from apps.cli.main import main
-from apps.cli.output import asks_json
+from apps.cli.output import asks_json, print_json
 from apps.cli.walk import commands
 from cocoro.errors import choice_of
 
@@ -75,6 +75,7 @@ def test_every_command_that_tells_something_has_json() -> None:
         (["logs", "--level", "erorr"], 2, "usage", "did you mean error?"),
         (["hz", "a//b"], 4, "no_mesh", "no robot is up"),
         (["ftch", "red_can"], 2, "usage", "Did you mean 'fetch'"),
+        (["rehearse", "ftch", "red_can"], 2, "usage", "did you mean fetch?"),
         (["estop", "--robot", "nobody"], 4, "no_mesh", "no nobody is up"),
     ],
 )
@@ -114,6 +115,11 @@ def test_a_result_is_one_document_of_json(
     main([*arguments, "--json"])
     result = json.loads(capsys.readouterr().out)
     assert isinstance(result, list) if keys is None else result.keys() == keys
+
+
+def test_what_json_lacks_is_null(capsys: pytest.CaptureFixture[str]) -> None:
+    print_json({"rate_hz": float("nan"), "gaps": [1.5, float("inf")]})
+    assert capsys.readouterr().out == '{"rate_hz": null, "gaps": [1.5, null]}\n'
 
 
 def test_json_is_asked_for_before_the_end_of_the_options_alone() -> None:

@@ -50,7 +50,7 @@ def runs(pid: int) -> bool:
         return False
 
 
-def test_a_robot_is_started_fetches_is_stopped_and_leaves_nothing_behind(shell: Shell) -> None:
+def test_a_robot_is_started_used_stopped_and_leaves_nothing_behind(shell: Shell) -> None:
     up = shell("up", "sim", "--detach", "--frames", "320x240@15")
     assert up.returncode == exits.DONE, up.stdout + up.stderr
     claims = shell.run_dir.claims()
@@ -59,11 +59,11 @@ def test_a_robot_is_started_fetches_is_stopped_and_leaves_nothing_behind(shell: 
     assert supervisor is not None
     pids = {holder.pid for holder in (*claims.values(), supervisor)}
 
-    fetch = shell("fetch", "red_can", "--json")
-    assert fetch.returncode == exits.DONE, fetch.stdout + fetch.stderr
-    result = json.loads(fetch.stdout)
-    assert (result["outcome"], result["task"], result["label"]) == ("done", "fetch", "red_can")
-    assert [phase["name"] for phase in result["phases"]][-2:] == ["lift", "hold"]
+    park = shell("park", "--json")  # tests/test_readme.py fetches
+    assert park.returncode == exits.DONE, park.stdout + park.stderr
+    result = json.loads(park.stdout)
+    assert (result["outcome"], result["task"]) == ("done", "park")
+    assert [phase["name"] for phase in result["phases"]] == ["park"]
 
     estop = shell("estop", "--json", "--robot", "calliope")
     assert estop.returncode == exits.DONE, estop.stderr
@@ -75,8 +75,8 @@ def test_a_robot_is_started_fetches_is_stopped_and_leaves_nothing_behind(shell: 
     assert "cocoro reset" in refused.stderr
     assert shell("reset").returncode == exits.DONE
 
-    put_down = shell("put-down")
-    assert put_down.returncode == exits.DONE, put_down.stdout + put_down.stderr
+    again = shell("park")
+    assert again.returncode == exits.DONE, again.stdout + again.stderr
     assert shell("fetch", "teapot").returncode == exits.USAGE
 
     down = shell("down")

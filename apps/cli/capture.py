@@ -28,6 +28,7 @@ from cocoro.errors import ConfigError, choice_of
 from services.capture.file import COMPRESSIONS, Compression, Packer
 from services.capture.keys import KeyFilter
 from services.capture.log_clock import WALL_CLOCK, WallClockStep, describe_step
+from services.capture.occasions import OCCASION, Occasion
 
 MB = 1e6
 COLUMNS = (
@@ -111,6 +112,7 @@ def _head(found: CaptureReport) -> list[str]:
         ("robot", found.robot or "unknown"),
         ("started", start if found.messages else ""),
         ("lasts", f"{found.duration_s:.3f} s"),
+        ("happened", _happened(found.metadata.get(OCCASION, {}))),
         ("clock", "; ".join(_clock_steps(found))),
         ("messages", f"{found.messages}"),
         ("size", f"{found.size_bytes / MB:.1f} MB, of {found.raw_bytes / MB:.1f} MB of payloads"),
@@ -123,6 +125,17 @@ def _head(found: CaptureReport) -> list[str]:
         ("metadata", ", ".join(found.metadata)),
     ]
     return fields(lines).splitlines()
+
+
+def _happened(occasion: Mapping[str, Any]) -> str:
+    """The task or other occasion for which the capture was made, its outcome, and the faults meanwhile."""
+    try:
+        found = msgspec.convert(occasion, Occasion, strict=False)
+    except msgspec.ValidationError:  # none, or another program's metadata of this name
+        return ""
+    outcome = ": ".join(filter(None, (found.outcome, found.reason)))
+    notes = [note.text for note in found.notes if note.text != found.what]
+    return "; ".join(filter(None, (f"{found.what}{f' ({outcome})' if outcome else ''}", *notes[:3])))
 
 
 def _clock_steps(found: CaptureReport) -> list[str]:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from apps.captures.export.files import refuse_existing
+from apps.captures.info import left_out_notes
 from apps.captures.reader import Capture
 from apps.cli import exits
 from apps.cli.options import CameraOption, CaptureArgument, JsonOption
@@ -119,6 +120,8 @@ def export_capture(
             print(f"missing: {problem}", file=sys.stderr)
         if capture.ending:
             print(f"note: {file} was {capture.ending}", file=sys.stderr)
+        for note in left_out_notes(capture):
+            print(f"note: {note}", file=sys.stderr)
     if as_json:
         print_json({"written": written, "missing": [str(problem) for problem in capture.problems]})
     return exits.FAILED if capture.problems else exits.DONE

@@ -16,6 +16,7 @@ from typing import Annotated, Any
 import msgspec
 import typer
 
+from apps.captures.info import left_out_notes
 from apps.captures.player import Player
 from apps.captures.reader import Capture
 from apps.captures.replay import SIMULATOR, Replay, heard_as, played_keys, refuse_if_alive, services_of
@@ -106,6 +107,8 @@ async def replay_file(
             print(f"not played: {problem}", file=sys.stderr)
         if capture.ending:
             print(f"note: {file} was {capture.ending}", file=sys.stderr)
+        for note in left_out_notes(capture):
+            print(f"note: {note}", file=sys.stderr)
         return exits.FAILED if capture.problems else exits.DONE
 
 

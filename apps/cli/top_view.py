@@ -14,8 +14,8 @@ SLOW, STALLED = 0.85, 0.4
 """Shares of the nominal rate: one below SLOW, or as far above 1, is yellow, one below STALLED red."""
 LATE, VERY_LATE = 0.01, 0.1
 """Shares of a loop's periods without a step that are yellow and red."""
-OTHER_LINES = 7
-"""Lines of the screen beside services and topics: the headline's two, two blank ones, the topics' head, and two that
+OTHER_LINES = 8
+"""Lines of the screen beside services and topics: the headline's three, two blank ones, the topics' head, and two that
 tell what is left out."""
 BAD, DOUBTFUL, GOOD, FAINT = "bold red", "yellow", "green", "dim"
 COUNTED = ("skipped", "lost", "rejected", "expired")

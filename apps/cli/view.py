@@ -16,6 +16,7 @@ import msgspec
 import typer
 
 from apps.captures.export.viewer import Attempt, Pulse, Target, ViewerProcess, refuse_nobody, sent, temporary_rrd
+from apps.captures.info import left_out_notes
 from apps.captures.reader import Capture
 from apps.cli import exits
 from apps.cli.export import progress_bar
@@ -109,6 +110,8 @@ def view_file(file: Path, target: Target, sim: bool = False) -> int:
             _show(capture, target, stage, export)
         for problem in capture.problems:
             print(f"missing: {problem}", file=sys.stderr)
+        for note in left_out_notes(capture):
+            print(f"note: {note}", file=sys.stderr)
         return exits.FAILED if capture.problems else exits.DONE
 
 

@@ -37,6 +37,7 @@ from deploy.delayed import DelayedNode
 from deploy.processes import named, needs
 from services.executive.tasks.follow import CATCH_UP_S, WITHIN_M
 from services.planning.config import FollowConfig
+from sim.coverage import CoverageJudge
 from sim.judge import Judge, PursuitJudge
 from sim.random_scene import find_scene
 from sim.realism import REALISM, body_of, wheel_scales
@@ -84,6 +85,10 @@ class _Rehearsal:
         self._judge = self._judge_of(self._task)
         self._body = body_of(self._robot, request.body, request.seed).robot
         self._trace = Trace(self._body, self._present(self._task))
+        self._coverage = (
+            CoverageJudge(self._robot, self._scene, request.seen_within_m) if request.seen_within_m else None
+        )
+        self._asked = False
         self._steps: list[dict[str, Any]] = []
         """Results of the tasks that have ended, in order."""
         self._frame: Frame | None = None
@@ -155,6 +160,8 @@ class _Rehearsal:
 
     def _feed_judge(self, truth: Truth) -> None:
         self._judge.feed(truth)
+        if self._coverage is not None and self._asked:
+            self._coverage.feed(truth)
 
     def _settings(self, name: str) -> dict[str, Any]:
         request = self._request
@@ -193,7 +200,7 @@ class _Rehearsal:
                 task = replace(task, first=self._collector.next, count=max(left, 1))
             question = TaskRequest(task=task, timeout_s=request.timeout_s)
             self._trace.begin(self._present(task))
-            asked_ns = operator.now_ns()
+            asked_ns, self._asked = operator.now_ns(), True
             reply = await self._ask(operator, question)
             while reply.refusal in ("not_alive", "estop") and operator.now_ns() - asked_ns < START_S * NS:
                 await operator.sleep(0.1)
@@ -310,5 +317,6 @@ class _Rehearsal:
             "truth": msgspec.to_builtins(self._judge.result()),
             "tasks": self._steps,
             "body": self._true_body(),
+            **({} if self._coverage is None else {"seen_floor": msgspec.to_builtins(self._coverage.result())}),
             **({"trace": self._trace.data()} if request.trace else {}),
         }

@@ -23,8 +23,8 @@ _GLANCE_S = 0.6
 """Age of the target's newest sighting up to which the head may look at the floor ahead instead."""
 _LOOK_S = 1.5
 """Time for which it looks at the place where the target must be, before that counts as lost."""
-_SIGHT_M = 3.0
-"""Farther away a target may be too small to be found."""
+_AHEAD_S = 3.0
+"""Time for which a lost target is thought to have gone on as it went."""
 _NO_NEED_M = 0.10
 """A gap below this needs no way."""
 
@@ -43,6 +43,10 @@ class Following:
         self._back_off = BackOff()
         self._place_m: Vec3 = (0.0, 0.0, 0.0)
         """The target's, odometry frame."""
+        self._velocity_mps: Vec3 = (0.0, 0.0, 0.0)
+        """The target's when it was last in sight, odometry frame."""
+        self._counted_s = 0.0
+        """Time of that motion that the estimate of a lost target contains."""
         self._looking_since_ns: int | None = None
 
     def step(self, snapshot: Snapshot) -> Plan:
@@ -62,12 +66,16 @@ class Following:
         if target.age_s > config.lost_s + snapshot.estimator.sight_lag_s:
             return self._look_for(snapshot, target, arm, fields)
         self._looking_since_ns = None
+        fade_s = snapshot.actuators.config.memory.velocity_fade_s
+        self._velocity_mps = target.velocity_mps
+        self._counted_s = fade_s  # the memory lets a lost target run out by so much
         gap = planar_m(target) - config.distance_m
         move = self._straight(target, snapshot, config)
         if self._free(snapshot, move, gap, fields):
             self._course = None
         elif gap > _NO_NEED_M:
             move = self._round(snapshot, fields)
+            move = move._replace(why=f"going round what is between us: {move.why}")
             if move.look_at is not None and target.age_s < _GLANCE_S + snapshot.estimator.sight_lag_s:
                 head = self._look_down(snapshot, move)
         else:
@@ -111,7 +119,7 @@ class Following:
         return bool((clearance >= margin).all())
 
     def _round(self, snapshot: Snapshot, fields: Fields) -> Move:
-        """One step on the way round to where the target is seen from the wanted distance."""
+        """One step on the way to where the target is seen from the wanted distance."""
         actuators, now_ns = snapshot.actuators, snapshot.now_ns
         config = actuators.config
         if self._course is None:
@@ -124,7 +132,7 @@ class Following:
         move = self._course.step(place, snapshot.body, around, fields, actuators.driver, now_ns)
         if move.blocked:
             self._course = None  # which begins anew: what blocks may move
-        return move._replace(why=f"going round what is between us: {move.why}")
+        return move
 
     def _seen_from(self, snapshot: Snapshot, pose: Pose2) -> bool:
         """Whether nothing known hides the target from the camera of a robot at a pose."""
@@ -138,26 +146,29 @@ class Following:
     # --- lost -------------------------------------------------------------------------------------
 
     def _look_for(self, snapshot: Snapshot, target: TargetEstimate, arm: ArmStep, fields: Fields) -> Plan:
-        """Drive to where the place is in sight at which the target must be by its last motion, and look there."""
-        off_m = abs(planar_m(target) - snapshot.actuators.config.follow.distance_m)
-        head = snapshot.look_at(target.position_m)
-        if planar_m(target) <= _SIGHT_M and self._seen_from(snapshot, snapshot.body):
-            if self._looking_since_ns is None:
-                self._looking_since_ns = snapshot.now_ns
-            patience_s = _LOOK_S + 2 * snapshot.estimator.sight_lag_s
-            if snapshot.now_ns - self._looking_since_ns > patience_s * NS:
-                return self._lost(snapshot, target)
-            turn = 1.5 * atan2(target.position_m[1], target.position_m[0])
-            base = snapshot.actuators.driver.command(0.0, turn, snapshot.dt_s)
-            return Plan(base, arm, "lost it: looking where it was going", head, distance_m=off_m)
-        self._looking_since_ns = None
+        """Drive to where the target must be by its last motion, and look there."""
+        x, y, z = target.odometry_position_m
+        extra_s = min(target.age_s, _AHEAD_S) - self._counted_s
+        place = (x + extra_s * self._velocity_mps[0], y + extra_s * self._velocity_mps[1], z)
+        self._place_m = place
+        here = snapshot.body.inverse().apply(place)
+        off_m = abs(hypot(here[0], here[1]) - snapshot.actuators.config.follow.distance_m)
+        head = snapshot.look_at(here)
         move = self._round(snapshot, fields)
-        if move.blocked or move.arrived:
+        if move.blocked:
             return self._lost(snapshot, target)
-        if move.look_at is not None:
-            head = self._look_down(snapshot, move)
-        base = snapshot.actuators.driver.command(move.speed_mps, move.turn_radps, snapshot.dt_s)
-        return Plan(base, arm, f"lost it: going where it was going: {move.why}", head, distance_m=off_m)
+        if not move.arrived:
+            self._looking_since_ns = None
+            if move.look_at is not None:
+                head = self._look_down(snapshot, move)
+            base = snapshot.actuators.driver.command(move.speed_mps, move.turn_radps, snapshot.dt_s)
+            return Plan(base, arm, f"lost it: {move.why}", head, distance_m=off_m)
+        if self._looking_since_ns is None:
+            self._looking_since_ns = snapshot.now_ns
+        patience_s = _LOOK_S + 2 * snapshot.estimator.sight_lag_s
+        if snapshot.now_ns - self._looking_since_ns > patience_s * NS:
+            return self._lost(snapshot, target)
+        return Plan(snapshot.stand(), arm, "lost it: looking where it was going", head, distance_m=off_m)
 
     def _lost(self, snapshot: Snapshot, target: TargetEstimate) -> Plan:
         why = f"{self._label} has not been seen for {target.age_s:.0f} s"
