@@ -43,6 +43,8 @@ _WILD = 16.0
 """Squared Mahalanobis distance beyond which a match is refused."""
 _MARK_M, _MARK_PER_M = 0.02, 0.02
 """Error of a known object's place, and its growth with the distance."""
+_FIRST = 3
+"""Sightings whose mean is the place of a known object."""
 _ROUNDS = 5
 _USUAL_M = 1.5
 _MOVED_M, _TURNED_RAD, _PANNED_RAD = 0.04, 0.05, 0.30
@@ -297,7 +299,7 @@ class PoseMatching:
         pose = self.place(odometry)
         there = np.array(pose.apply((*place_m, 0.0))[:2])
         mark = self._marks.get(label)
-        if mark is None or mark.sightings < _FROZEN:
+        if mark is None or mark.sightings < _FIRST:
             if self.sigma_m < _SURE_M and self.sigma_rad < _SURE_RAD:
                 before, count = (mark.place_m, mark.sightings) if mark is not None else (there, 0)
                 self._marks[label] = Mark(before + (there - before) / (count + 1), count + 1, odometry)

@@ -34,7 +34,7 @@ from services.planning.turning import Turning
 _WAIT_FOR_ODOMETRY_NS = NS // 5
 _JUST_SEEN_S = 0.5
 """An object that a frame does not show, but which was seen so shortly before it, is still in it."""
-_STEADY_RADPS = 0.8
+_STEADY_RADPS = 1.0
 """A camera that turns faster does not correct the body's pose."""
 _GLIMPSE_NS = NS // 20
 """Time over which the camera's turn is measured."""
