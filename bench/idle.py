@@ -24,8 +24,9 @@ from apps.captures.info import missing_of
 from apps.captures.reader import Capture
 from cocoro.clock import NS
 from deploy.rundir import RunDir
-from services.capture.file import LARGE_BYTES, Packer
+from services.capture.file import LARGE_BYTES
 from services.capture.folder import captures
+from services.capture.packing import Packer
 
 COCORO = [sys.executable, "-m", "apps.cli.main"]
 ROBOT = "bench-idle"

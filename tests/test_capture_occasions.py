@@ -24,10 +24,10 @@ from cocoro.node import Node
 from cocoro.vloop import run_virtual
 from deploy import profiles
 from services.capture.config import CaptureConfig
-from services.capture.file import Packer
 from services.capture.folder import RecordingFolder, captures, make_room, parsed_name, pin_of
 from services.capture.keys import QueuedMessage, info_of
 from services.capture.occasions import Occasion, Watch, occasion_of
+from services.capture.packing import Packer
 from services.capture.thinning import ThinningLimits, ThinningWriter
 from services.capture.writer import FileLimits, Missing
 
@@ -276,7 +276,7 @@ def test_the_mesh_hears_what_is_recorded_whole_and_where(tmp_path: Path) -> None
     assert told[-1].task_id == ""
     assert told[-1].left_out
     assert max(each.rate_bytes_per_s for each in told) > 100_000
-    assert max(each.free_bytes for each in told) > 0
+    assert {each.free_bytes for each in told} == {0}  # the disk is none of virtual time's
 
 
 # --- what makes room --------------------------------------------------------------------------------

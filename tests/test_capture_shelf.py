@@ -17,9 +17,10 @@ from apps.cli.status import space
 from cocoro.clock import NS
 from cocoro.messages import Recording
 from deploy.rundir import RunDir
-from services.capture.file import CaptureFile, Packer
+from services.capture.file import CaptureFile
 from services.capture.folder import is_pinned
 from services.capture.occasions import OCCASION, Occasion
+from services.capture.packing import Packer
 from services.capture.writer import sync_and_close
 
 RUN = "calliope-20260101T000000Z"

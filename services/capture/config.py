@@ -9,8 +9,8 @@ import msgspec
 from msgspec import Meta
 
 from cocoro.units import Positive
-from services.capture.file import Compression
 from services.capture.folder import default_folder
+from services.capture.packing import Compression
 
 
 class CaptureConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -16,9 +16,10 @@ from cocoro.capture.conventions import CaptureError
 from cocoro.capture.types import TypeSchema
 from cocoro.clock import NS
 from cocoro.messages import DisturbedFile
-from services.capture.file import CaptureFile, Packer
+from services.capture.file import CaptureFile
 from services.capture.keys import KeyInfo, PreparedMessage, QueuedMessage
 from services.capture.occasions import Occasion, OccasionNews
+from services.capture.packing import PackedMessage, Packer
 
 MB = 1_000_000
 LOOK_S = 1.0
@@ -83,10 +84,12 @@ class CaptureWriter:
         self._monotonic_s = monotonic_s
         self._look_at_s = 0.0
         self._metadata: dict[str, dict[str, str]] = {}
-        self._infos: dict[ChannelName, KeyInfo] = {}
-        self._channels: dict[ChannelName, int] = {}
+        self._numbers: dict[ChannelName, int] = {}
+        """Numbers of the channels, the same in all files."""
+        self._channels: dict[int, tuple[Channel, Schema | None]] = {}
         self._schemas: dict[TypeSchema, int] = {}
-        """Numbers of channels and schemas in the current file."""
+        self._declared: set[int] = set()
+        """Channels in the current file."""
         self._number = 0
         self._first_ns: int | None = None
         self._closed_bytes = 0
@@ -118,37 +121,67 @@ class CaptureWriter:
         return self._closed_raw_bytes + (0 if self._ended is self.file else self.file.raw_bytes)
 
     def put(self, message: QueuedMessage) -> None:
-        if self._first_ns is None:
-            self._first_ns = message.log_ns
-        elif (
-            self.file.size_bytes >= self.limits.file_bytes or message.log_ns - self._first_ns >= self.limits.file_s * NS
-        ):
-            self._rotate()
-            self._first_ns = message.log_ns
-        schema = None
-        if self._prepare is not None:
-            message, schema = self._prepare(message)
+        self._turn(message.log_ns)
+        message, number = self._numbered(message)
         try:
-            name: ChannelName = message.key if message.channel is None else (message.key, message.channel)
-            channel = self._channels.get(name) or self._channel(name, message, schema)
-            self.file.add(channel, message.sequence, message.log_ns, message.publish_ns, message.payload)
+            self._declare(number)
+            self.file.add(number, message.sequence, message.log_ns, message.publish_ns, message.payload)
         except OSError as error:
             raise self._failed(error) from error
         self.messages += 1
 
-    def _channel(self, name: ChannelName, message: QueuedMessage, schema: TypeSchema | None) -> int:
-        """Declare a channel in the current file."""
-        info = self._infos.get(name)
-        if info is None:
+    def pack(self, message: QueuedMessage) -> PackedMessage:
+        """The same message for `put_packed`, into this file or a later one."""
+        message, number = self._numbered(message)
+        return self._packer.message(number, message.sequence, message.log_ns, message.publish_ns, message.payload)
+
+    def put_packed(self, packed: PackedMessage) -> None:
+        self._turn(packed.log_ns)
+        try:
+            self._declare(packed.channel_id)
+            self.file.add_packed(packed)
+        except OSError as error:
+            raise self._failed(error) from error
+        self.messages += 1
+
+    def _turn(self, log_ns: int) -> None:
+        """Begin a new file where the current one is large or long enough."""
+        if self._first_ns is None:
+            self._first_ns = log_ns
+        elif self.file.size_bytes >= self.limits.file_bytes or log_ns - self._first_ns >= self.limits.file_s * NS:
+            self._rotate()
+            self._first_ns = log_ns
+
+    def _numbered(self, message: QueuedMessage) -> tuple[QueuedMessage, int]:
+        """The message as it is to be written, and its channel's number."""
+        schema = None
+        if self._prepare is not None:
+            message, schema = self._prepare(message)
+        name: ChannelName = message.key if message.channel is None else (message.key, message.channel)
+        number = self._numbers.get(name)
+        if number is None:
+            number = self._numbers[name] = len(self._numbers) + 1
             info = message.info or self._info(message.key, message.payload)
-            info = self._infos[name] = info if schema is None else info._replace(schema=schema)
-        schema_id = 0
-        if info.schema is not None:
-            schema_id = self._schemas.setdefault(info.schema, len(self._schemas) + 1)
-            self.file.schema(Schema(schema_id, info.schema.data, info.schema.encoding, info.schema.name))
-        channel = self._channels[name] = len(self._channels) + 1
-        self.file.channel(Channel(channel, message.key, info.encoding, info.metadata, schema_id))
-        return channel
+            self._channels[number] = self._channel(number, message.key, info, schema or info.schema)
+        return message, number
+
+    def _channel(
+        self, number: int, key: str, info: KeyInfo, schema: TypeSchema | None
+    ) -> tuple[Channel, Schema | None]:
+        if schema is None:
+            return Channel(number, key, info.encoding, info.metadata, 0), None
+        schema_id = self._schemas.setdefault(schema, len(self._schemas) + 1)
+        declared = Schema(schema_id, schema.data, schema.encoding, schema.name)
+        return Channel(number, key, info.encoding, info.metadata, schema_id), declared
+
+    def _declare(self, number: int) -> None:
+        """Declare a channel in the current file."""
+        if number not in self._declared:
+            self._declared.add(number)
+            channel, schema = self._channels[number]
+            if schema is not None:
+                self.file.schema(schema)
+            self.file.channel(channel)
 
     def flush(self) -> None:
         """Hand everything to the operating system; check that the file is at its path and the disk has room."""
@@ -255,7 +288,7 @@ class CaptureWriter:
         except CaptureError:
             self.close()
             raise
-        self.file, self._channels, self._schemas = after, {}, {}
+        self.file, self._declared = after, set()
         try:
             self._finish(before)
         except OSError as error:
