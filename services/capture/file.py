@@ -162,7 +162,7 @@ class CaptureFile:
         chunk, self._chunk = self._chunk, _Chunk()
         if chunk.parts:
             raw = b"".join(chunk.parts)
-            name, packed = self._packer.pack(raw)
+            name, packed = self._packer.pack_small(raw)
             head = mcap.ChunkHead(chunk.start_ns, chunk.end_ns, len(raw), zlib.crc32(raw), name, len(packed))
             self._write_chunk(head, packed, chunk.places)
 

@@ -29,6 +29,11 @@ WORTH = 0.95
 QUICK = zstandard.ZstdCompressionParameters.from_level(1, window_log=17, hash_log=12, chain_log=12, min_match=7)
 """zstd level 1 with a table that fits the level 1 cache, and without short matches: 6% less time for frames at the
 same size."""
+SMALL_LEVEL = 3
+"""zstd level of small messages at least. It makes those of 0.1 s 8% smaller than QUICK, for 0.01% of a core."""
+
+
+_Pack = Callable[[bytes | memoryview], bytes]
 
 
 class Packer:
@@ -37,19 +42,27 @@ class Packer:
     def __init__(self, compression: Compression, level: int = 1) -> None:
         """`level` is the zstd level: 1 is fast, 19 thorough."""
         self._name = "" if compression == "none" else compression
-        self._pack: Callable[[bytes | memoryview], bytes] | None = None
-        if compression == "zstd" and level == 1:
-            self._pack = zstandard.ZstdCompressor(compression_params=QUICK).compress
-        elif compression == "zstd":
-            self._pack = zstandard.ZstdCompressor(level=level).compress
+        self._pack: _Pack | None = None
+        self._pack_small: _Pack | None = None
+        if compression == "zstd":
+            quick = {"compression_params": QUICK} if level == 1 else {"level": level}
+            self._pack = zstandard.ZstdCompressor(**quick).compress
+            self._pack_small = zstandard.ZstdCompressor(level=max(level, SMALL_LEVEL)).compress
         elif compression == "lz4":
-            self._pack = lz4.frame.compress
+            self._pack = self._pack_small = lz4.frame.compress
 
     def pack(self, raw: bytes) -> tuple[str, bytes]:
         """Returns the compression's name in MCAP ('' for none) and the compressed bytes."""
-        if self._pack is None:
+        return self._by(self._pack, raw)
+
+    def pack_small(self, raw: bytes) -> tuple[str, bytes]:
+        """The same, for small messages."""
+        return self._by(self._pack_small, raw)
+
+    def _by(self, pack: _Pack | None, raw: bytes) -> tuple[str, bytes]:
+        if pack is None:
             return "", raw
-        packed = self._pack(raw)
+        packed = pack(raw)
         return (self._name, packed) if len(packed) < WORTH * len(raw) else ("", raw)
 
     def message(

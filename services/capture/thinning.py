@@ -102,7 +102,8 @@ class ThinningWriter(CaptureWriter):
         return self.folder.deleted
 
     @property
-    def thins(self) -> bool:
+    def _thins(self) -> bool:
+        """Whether large messages are left out now."""
         return self.occasion is None and self._thinning.period_s > 0
 
     @property
@@ -116,7 +117,7 @@ class ThinningWriter(CaptureWriter):
             super().put(message)
         elif len(message.payload) >= LARGE_BYTES:
             packed = self.pack(message)
-            waits = self.thins and self._may_be_left_out(message.key)
+            waits = self._thins and self._may_be_left_out(message.key)
             if not waits:
                 self.put_packed(packed)
             self._hold(_Held(message.key, message.log_ns, packed, written=not waits))

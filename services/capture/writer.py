@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import stat
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
@@ -41,9 +42,17 @@ class FileLimits:
     """Recording stops when the disk has less room left, to leave some for the robot."""
 
 
+def sync(fd: int) -> None:
+    """Sync a file's content, or the entries of a folder."""
+    if stat.S_ISDIR(os.fstat(fd).st_mode):
+        os.fsync(fd)
+    else:
+        os.fdatasync(fd)
+
+
 def sync_and_close(fd: int) -> None:
     try:
-        os.fdatasync(fd)
+        sync(fd)
     finally:
         os.close(fd)
 
@@ -73,7 +82,8 @@ class CaptureWriter:
         monotonic_s: Callable[[], float] = time.monotonic,
     ) -> None:
         """`place(n)` is the path of the nth file, from 1 on. `info(key, payload)` gives a new channel's information.
-        `release` takes the descriptor of a completed file. `prepare` may replace each message."""
+        `release` takes the descriptor of a completed file, or of the folder of a new one, to sync and close it.
+        `prepare` may replace each message."""
         self._place = place
         self._packer = packer
         self.limits = limits
@@ -224,11 +234,6 @@ class CaptureWriter:
         """Names of the captures that made room."""
         return ()
 
-    @property
-    def thins(self) -> bool:
-        """Whether large messages are left out now."""
-        return False
-
     def forget(self, name: str) -> None:
         """Later files have no metadata of this name."""
         self._metadata.pop(name, None)
@@ -272,7 +277,8 @@ class CaptureWriter:
             try:
                 for name, entries in self._metadata.items():
                     file.metadata(name, entries)
-                _sync_folder(path.parent)
+                # Syncs the folder, so that the new file's entry survives a loss of power.
+                self._release(os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC))
             except OSError:
                 file.abandon()
                 raise
@@ -336,15 +342,6 @@ class CaptureWriter:
 
 def _error(error: OSError, path: Path) -> CaptureError:
     return CaptureError(f"{path}: {error.strerror or error}")
-
-
-def _sync_folder(folder: Path) -> None:
-    """Makes the new file's directory entry survive a loss of power."""
-    fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(fd)
-    finally:
-        os.close(fd)
 
 
 class FileLocation(NamedTuple):
