@@ -93,6 +93,23 @@ def test_a_task_whose_executive_is_gone_is_none_any_more() -> None:
     assert "executive is gone" in heard.last.notes[-1].text
 
 
+@pytest.mark.parametrize("later", [TaskState(), task("two", "done"), task("two")], ids=["none", "ended", "running"])
+def test_a_task_whose_end_was_not_heard_is_over_when_another_state_comes(later: TaskState) -> None:
+    heard = Heard()
+    heard.see(topics.TASK, task("one"), 1.0)
+    heard.see(topics.TASK, later, 2.0)
+    if later.outcome is None and later.task_id:
+        heard.see(topics.TASK, task("two", "done"), 3.0)
+    assert heard.look(9.0)[-1] == ("end", "task")
+
+
+def test_a_task_by_the_name_of_nothing_is_one_all_the_same() -> None:
+    heard = Heard()
+    heard.see(topics.TASK, TaskState(task_id="one", task="idle"), 1.0)
+    assert heard.last is not None
+    assert heard.last.label == "task-idle"
+
+
 def test_the_emergency_stop_is_one_and_its_state_after_a_start_is_none() -> None:
     heard = Heard()
     heard.see(topics.LATCH, Latch(state="unknown"), 0.0)
@@ -283,17 +300,17 @@ def test_the_mesh_hears_what_is_recorded_whole_and_where(tmp_path: Path) -> None
 
 
 def test_captures_in_which_nothing_happened_make_room_first_and_pinned_ones_never(tmp_path: Path) -> None:
-    labels = ("-fetch", "", "", "-motion", "-fetch", "-fault", "", "")
+    labels = ("-fetch", "-idle", "-idle", "-motion", "", "-fault", "-idle", "-idle")  # one of a former recorder
     for day, label in enumerate(labels, 1):
         path = tmp_path / f"calliope-2026010{day}T000000Z-001{label}.mcap"
         path.write_bytes(bytes(1000))
-    pin_of(tmp_path / "calliope-20260102T000000Z-001.mcap").touch()
+    pin_of(tmp_path / "calliope-20260102T000000Z-001-idle.mcap").touch()
     order = []
     for keep in range(7000, -1, -1000):
         kept = make_room(tmp_path, "calliope", keep)
         order += [f"{path.name[16]}{parsed_name(path).label}" for path in kept.gone]  # type: ignore[union-attr]
-    assert order == ["3", "4motion", "1fetch", "5fetch", "7"]
-    assert pin_of(tmp_path / "calliope-20260102T000000Z-001.mcap").exists()
+    assert order == ["3idle", "4motion", "1fetch", "5", "7idle"]
+    assert pin_of(tmp_path / "calliope-20260102T000000Z-001-idle.mcap").exists()
     assert len(captures(tmp_path, "calliope")) == 3  # the pinned one, the newest fault, the newest of all
 
 

@@ -27,8 +27,8 @@ RUN = "calliope-20260101T000000Z"
 
 
 def make(folder: Path, number: int, what: str = "", outcome: str = "", close: bool = True) -> Path:
-    label = what.replace(" ", "-")
-    path = folder / f"{RUN}-{number:03}{f'-{label}' if label else ''}.mcap"
+    label = what.replace(" ", "-") or "idle"
+    path = folder / f"{RUN}-{number:03}-{label}.mcap"
     file = CaptureFile(path, Packer("zstd"))
     if what:
         kind = "task" if outcome else what
@@ -62,7 +62,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     ("name", "number"),
     [
         ("latest", 5), ("latest-1", 4), ("latest-2", 2), ("idle", 6), ("idle-2", 1), ("fetch", 5), ("fetch-1", 2),
-        ("fetch red_can", 2), ("fetch-red_can", 2), ("stop", 4), ("fetch-2", 2), (f"{RUN}-003.mcap", 3),
+        ("fetch red_can", 2), ("fetch-red_can", 2), ("stop", 4), ("fetch-2", 2), (f"{RUN}-003-idle.mcap", 3),
     ],
 )  # fmt: skip
 def test_a_name_stands_for_a_file(folder: Path, name: str, number: int) -> None:
@@ -75,8 +75,13 @@ def test_a_shell_completes_names(folder: Path) -> None:
 
 
 def test_a_path_is_a_path(folder: Path) -> None:
-    (folder.parent / "fetch").touch()
-    assert shelf.find("fetch") == Path("fetch")
+    (folder.parent / "fetch").write_text("a list of what to fetch")
+    assert shelf.find("fetch").name == f"{RUN}-005-fetch-blue_can.mcap"
+    assert shelf.find("./fetch") == Path("fetch")
+    make(folder.parent, 9).rename(folder.parent / "latest")
+    (folder.parent / "fetch.mcap").touch()
+    for path in ("latest", "fetch.mcap"):
+        assert shelf.find(path) == Path(path)
     for path in ("no/such/thing", "nothing.mcap", "/dev/null", str(folder)):
         assert shelf.find(path) == Path(path)
     (folder.parent / "stop").mkdir()
@@ -136,7 +141,11 @@ def test_commands_take_names(folder: Path, capsys: pytest.CaptureFixture[str]) -
 
 
 def test_a_run_up_to_a_file(folder: Path, tmp_path: Path) -> None:
-    assert [path.name[-8:-5] for path in shelf.run_until(folder / f"{RUN}-003.mcap")] == ["001", "can", "003"]
+    assert [path.name.removeprefix(RUN)[1:4] for path in shelf.run_until(folder / f"{RUN}-003-idle.mcap")] == [
+        "001",
+        "002",
+        "003",
+    ]
     assert shelf.run_until(tmp_path / "mine.mcap") == [tmp_path / "mine.mcap"]
 
 

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -18,13 +18,6 @@ from apps.cli.options import CameraOption, CaptureArgument, JsonOption
 from apps.cli.output import print_json
 from cocoro.clock import NS
 from cocoro.errors import ConfigError
-
-if TYPE_CHECKING:
-    pass
-
-PER_SERVICE = "{service}"
-DEPTH = 4
-"""Messages of one key that may wait; a viewer that is late shows the newest."""
 
 app = typer.Typer()
 

@@ -17,7 +17,7 @@ from cocoro.capture.conventions import LEFT_OUT
 from cocoro.clock import NS
 from cocoro.installed import topic_named
 from services.capture.file import LARGE_BYTES
-from services.capture.folder import RecordingFolder
+from services.capture.folder import IDLE, RecordingFolder
 from services.capture.keys import KeyInfo, PreparedMessage, QueuedMessage
 from services.capture.occasions import OCCASION, Occasion, OccasionNews
 from services.capture.packing import PackedMessage, Packer
@@ -70,6 +70,7 @@ class ThinningWriter(CaptureWriter):
         release: Callable[[int], None] = sync_and_close,
         prepare: Callable[[QueuedMessage], PreparedMessage] | None = None,
     ) -> None:
+        folder.label = IDLE
         super().__init__(folder.place, packer, limits, info, self._with_left_out, release, prepare)
         self.folder = folder
         self._known_missing = missing
@@ -166,7 +167,7 @@ class ThinningWriter(CaptureWriter):
         self._end_stretch()
         self.forget(OCCASION)
         self.occasion = occasion
-        self.folder.label = "" if occasion is None else occasion.label
+        self.folder.label = IDLE if occasion is None else occasion.label
         self.rotate()
         self._set_limits()
 

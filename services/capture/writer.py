@@ -141,9 +141,14 @@ class CaptureWriter:
         self.messages += 1
 
     def pack(self, message: QueuedMessage) -> PackedMessage:
-        """The same message for `put_packed`, into this file or a later one."""
+        """The same message for `put_packed`, into this file or a later one.
+
+        Its bytes are a copy. The packer makes room for a message that does not shrink and gives the rest back, and many
+        such rests, none of which fits the next message, take as much memory as if nothing had been packed.
+        """
         message, number = self._numbered(message)
-        return self._packer.message(number, message.sequence, message.log_ns, message.publish_ns, message.payload)
+        packed = self._packer.message(number, message.sequence, message.log_ns, message.publish_ns, message.payload)
+        return packed._replace(data=bytes(memoryview(packed.data)))
 
     def put_packed(self, packed: PackedMessage) -> None:
         self._turn(packed.log_ns)
