@@ -11,6 +11,8 @@ from typing import Any
 import msgspec
 import pytest
 from capture_rig import STILL, Room, all_of
+from mcap.records import Channel, Message
+from mcap.stream_reader import StreamReader
 from msgspec import structs
 
 from apps.captures.info import missing_of, report
@@ -27,7 +29,7 @@ from services.capture.config import CaptureConfig
 from services.capture.folder import RecordingFolder, captures, make_room, parsed_name, pin_of
 from services.capture.keys import QueuedMessage, info_of
 from services.capture.occasions import Occasion, Watch, occasion_of
-from services.capture.packing import Packer
+from services.capture.packing import Compression, Packer
 from services.capture.thinning import ThinningLimits, ThinningWriter
 from services.capture.writer import FileLimits, Missing
 
@@ -242,6 +244,36 @@ def test_while_nothing_happens_what_is_large_is_left_out_and_no_loss(tmp_path: P
             assert any("were left out" in note for note in found.notes)
     assert missing.left_out["calliope/lidar/scan"] + len(scans) == pytest.approx(370, abs=2)
     assert (start_ns / NS, end_ns / NS) == pytest.approx((0.1, 37.0), abs=0.2)
+
+
+@pytest.mark.parametrize(("compression", "kept"), [("zstd", 30), ("lz4", 30), ("none", 2)])
+def test_what_waits_is_packed_as_its_file_packs_it(tmp_path: Path, compression: Compression, kept: int) -> None:
+    """30 scans of 100 kB wait in 300 kB, and come out as they were."""
+    folder = RecordingFolder(tmp_path, "calliope", datetime(2026, 1, 1, tzinfo=UTC), None, 0)
+    held = ThinningLimits(before_s=3.0, before_bytes=300_000, period_s=30.0, idle_file_s=3600.0)
+    written = ThinningWriter(
+        folder, "calliope", held, Packer(compression), FileLimits(), lambda key, data: info_of(key, "calliope", data),
+        lambda: Missing({}, {}),
+    )  # fmt: skip
+    scans = [bytes([number]) * 100_000 for number in range(40)]
+    for number, scan in enumerate(scans):
+        if number == 30:
+            written.tell("begin", Occasion(kind="stop", what="stop", label="stop", began_ns=0))
+        for key, payload in (("arm/health", b"\xc0"), ("lidar/scan", b"\xc0"), ("lidar/scan", scan)):
+            at_ns = NS + len(payload) + number * NS // 10
+            written.put(QueuedMessage(f"calliope/{key}", number, at_ns, at_ns, payload))
+    written.close()
+    idle, stop = captures(tmp_path, "calliope")
+    whole = [each.payload for each in all_of(stop, "lidar/scan") if len(each.payload) > 1]
+    assert whole == scans[30 - kept :]
+    for path in (idle, stop):
+        with Capture.open(path) as capture:
+            assert not report(capture, check=True).problems
+        with path.open("rb") as stream:  # another reader, front to back: each message comes after its channel
+            declared = set()
+            for record in StreamReader(stream, validate_crcs=True).records:
+                declared.update([record.id] if isinstance(record, Channel) else [])
+                assert not isinstance(record, Message) or record.channel_id in declared
 
 
 def test_the_run_has_every_message_once_although_files_overlap(tmp_path: Path) -> None:

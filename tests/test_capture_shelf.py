@@ -165,3 +165,21 @@ def test_the_file_of_a_recorder_that_is_up_is_found_by_its_process(short_path: P
         assert tmp_path / "open.mcap" not in open_captures(run_dir)
     finally:
         claim.release()
+
+
+def test_what_is_being_written_stays_whatever_its_path_is_called(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr("apps.cli.shelf.robots", lambda: [RunDir("robbie", folder)])
+    monkeypatch.setattr("apps.cli.shelf.open_captures", lambda _: [folder / f"{RUN}-006-idle.mcap"])
+    assert main(["capture", "remove", f"{RUN}-006-idle.mcap", "--yes"]) == exits.REFUSED
+    assert "is being written" in capsys.readouterr().err
+    assert main(["capture", "remove", f"{RUN}-001-idle.mcap", f"./{RUN}-001-idle.mcap", "--yes"]) == exits.DONE
+    assert sorted(path.name[len(RUN) + 1 :][:3] for path in folder.glob("*.mcap")) == [
+        "002",
+        "003",
+        "004",
+        "005",
+        "006",
+    ]
