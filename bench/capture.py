@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import json
 import os
 import random
 import subprocess
@@ -24,6 +25,7 @@ import sys
 import tempfile
 import time
 from collections import defaultdict
+from contextlib import ExitStack
 from pathlib import Path
 
 import psutil
@@ -42,7 +44,7 @@ from cocoro.messages import BaseState, Frame
 from cocoro.node import Node
 from cocoro.robot import Robot
 from deploy.rundir import RunDir
-from services.capture.file import Packer
+from services.capture.packing import Packer
 from services.executive.tasks import FetchTask
 
 COCORO = [sys.executable, "-m", "apps.cli.main"]
@@ -58,6 +60,7 @@ sensors = "{sensors}"
 folder = "{folder}"
 compression = "{compression}"
 min_free_mb = 100.0
+per_occasion = {per_occasion}
 [service.perception]
 record_steps = true
 [service.planning]
@@ -65,10 +68,12 @@ record_steps = true
 """
 
 
-def traffic(folder: Path, seconds: float, sensors: str, compression: str) -> None:
-    """Record a live fetch."""
+def traffic(folder: Path, seconds: float, sensors: str, compression: str, per_occasion: bool) -> None:
+    """Record a live fetch, into one file for it and others around it, or into one."""
     profile = folder / "bench.toml"
-    profile.write_text(PROFILE.format(folder=folder, sensors=sensors, compression=compression))
+    profile.write_text(
+        PROFILE.format(folder=folder, sensors=sensors, compression=compression, per_occasion=json.dumps(per_occasion))
+    )
     subprocess.run([*COCORO, "up", str(profile), "--detach"], check=True, stdout=subprocess.DEVNULL)
     try:
         recorder = psutil.Process(RunDir("calliope").claims()["capture"].pid)
@@ -82,7 +87,7 @@ def traffic(folder: Path, seconds: float, sensors: str, compression: str) -> Non
         rss_mb = recorder.memory_info().rss / 1e6
     finally:
         subprocess.run([*COCORO, "down"], check=True, stdout=subprocess.DEVNULL)
-    print(done.stdout.strip().splitlines()[-1] if done.stdout else done.stderr)
+    print("\n".join(done.stdout.strip().splitlines()[-2:]) if done.stdout else done.stderr)
     print(f"recorder: {100 * cpu_s / lasted_s:.1f}% of one core over {lasted_s:.0f} s, {rss_mb:.0f} MB resident")
     for path in sorted(folder.glob("*.mcap")):
         with Capture.open(path) as capture:
@@ -156,10 +161,10 @@ async def _publish(base: Node) -> None:
 
 
 def execute(folder: Path) -> None:
-    (path,) = sorted(folder.glob("*.mcap"))[:1]
     for service in ("perception", "planning"):
-        with Capture.open(path) as capture:
-            print("\n".join(describe_result(reexecute([capture], service))))
+        with ExitStack() as stack:
+            opened = [stack.enter_context(Capture.open(path)) for path in sorted(folder.glob("*.mcap"))]
+            print("\n".join(describe_result(reexecute(opened, service))))
 
 
 def again(folder: Path) -> None:
@@ -234,7 +239,7 @@ def main() -> None:
         if options.what == "kill":
             asyncio.run(kill(folder, options.times))
             return
-        traffic(folder, options.seconds, options.sensors, options.compression)
+        traffic(folder, options.seconds, options.sensors, options.compression, options.what != "again")
         if options.what == "reexecute":
             execute(folder)
         if options.what == "again":

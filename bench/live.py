@@ -118,7 +118,7 @@ def fetches(count: int, profile: str, sensors: str) -> bool:
         good += well
         for name, seconds in zip(took, (took_up, took_fetch, took_down), strict=True):
             took[name].append(seconds)
-        last = said_fetch.strip().splitlines()[-1] if said_fetch.strip() else "no fetch"
+        last = said_fetch.partition("\nrecorded in ")[0].strip().splitlines()[-1] if said_fetch.strip() else "no fetch"
         print(f"{'ok  ' if well else 'FAIL'} {number + 1:3d}  up {took_up:.1f} s  {last}  down {took_down:.1f} s")
         if not well:
             print(said_up, said_fetch, said_down, f"left: {left}", truth, sep="\n")
@@ -142,7 +142,7 @@ async def _commands(cocoro: Operator) -> dict[str, list[int]]:
             node.on(topic, lambda message, arrived=arrived: arrived.append(message.stamp_ns))  # type: ignore[misc]
         process = cocoro.start("fetch", "red_can")
         said, _ = await asyncio.to_thread(process.communicate)
-        print(said.strip().splitlines()[-1])
+        print(said.partition("\nrecorded in ")[0].strip().splitlines()[-1])
     return stamps
 
 

@@ -10,13 +10,15 @@ from collections.abc import Iterator
 from functools import cache
 from importlib import metadata, resources
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
 from cocoro.messages import AboutFile, AboutReply
 from cocoro.objects import DEFAULT_FILE
-from cocoro.robot import Robot
+
+if TYPE_CHECKING:
+    from cocoro.robot import Robot  # imports numpy, which is slow
 
 LARGEST_FILE = 1024 * 1024
 """Bytes; of a larger file only the fingerprint is reported."""

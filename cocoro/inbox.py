@@ -37,6 +37,8 @@ class Inbox(Generic[M]):
         self.keyexpr = keyexpr
         self.rate = Rate()
         self.rejected = 0
+        self.expired = 0
+        """Of the rejected messages: commands that were good and came too late."""
         self.unread = 0
         """Messages that a newer one replaced before a reader took them."""
         self.last_error = ""
@@ -79,6 +81,7 @@ class Inbox(Generic[M]):
         if self._expires:
             now_ns = self._clock.now_ns()
             if not is_fresh(stamp_ns, now_ns, self.topic.max_age_s):
+                self.expired += stamp_ns < now_ns
                 self._refuse(key, tracker, message, _untimely(stamp_ns - now_ns))
                 return
         elif stamp_ns > self._horizon_ns and (ahead_ns := self._ahead_ns(stamp_ns)) > CLOCKS_APART_NS:
@@ -117,12 +120,12 @@ class Inbox(Generic[M]):
 
     def _refuse(self, key: str, tracker: SequenceTracker, message: M, why: str) -> None:
         tracker.refuse(message.incarnation, message.seq)
-        self._reject(key, why)
+        self._reject(key, why, untimely=self.judge is None)
 
-    def _reject(self, key: str, why: str) -> None:
+    def _reject(self, key: str, why: str, untimely: bool = False) -> None:
         self.rejected += 1
         self.last_error = why
-        self.rejections.rejected(key)
+        self.rejections.rejected(key, untimely)
 
     def health(self, now_ns: int) -> TopicHealth:
         overwritten = self.subscription.skipped if self.subscription is not None else 0
@@ -138,6 +141,7 @@ class Inbox(Generic[M]):
             skipped=overwritten + self.unread,
             lost=max(gaps - overwritten, 0),
             rejected=self.rejected,
+            expired=self.expired,
             last_error=self.last_error,
             fault=self.rejections.fault(self.rejected, self.last_error),
             unreadable=self.rejections.unreadable,
@@ -157,22 +161,17 @@ class Latest(Generic[M]):
         self._inbox = inbox
         self._clock = clock
         self._message: M | None = None
-        self._read = True
         self._changed = asyncio.Event()
         inbox.add(self._take)
 
     def _take(self, _key: str, message: M) -> None:
-        if not self._read:
-            self._inbox.unread += 1
         self._message = message
-        self._read = False
         changed, self._changed = self._changed, asyncio.Event()
         changed.set()
 
     @property
     def value(self) -> M | None:
         """The newest message, however old; None before the first."""
-        self._read = True
         return self._message
 
     def fresh(self, max_age_s: float | None = None) -> M | None:

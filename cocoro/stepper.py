@@ -72,8 +72,8 @@ class Intake:
         def take(_key: str, message: M) -> None:
             if not take_all:
                 older = self._last_of.get(topic.name)
-                if older is not None and self._samples.pop(older, None) is not None:
-                    inbox.unread += 1
+                if older is not None and self._samples.pop(older, None) is not None and wake is not None:
+                    inbox.unread += 1  # the core was too slow; others' newest message alone is wanted
                 self._last_of[topic.name] = self._next
             elif len(self._samples) >= self._limit:
                 del self._samples[next(iter(self._samples))]

@@ -35,6 +35,9 @@ FOLLOWED_AFTER = 3
 UNREADABLE_S, UNREADABLE_PERIODS, UNREADABLE_COUNT = 0.6, 6, 3
 """A topic with a rate is unreadable when for both this time and this number of its periods nothing was accepted, and at
 least this many messages were rejected. A restarted stream is followed sooner than that."""
+UNTIMELY_S = 5.0
+"""The same time for messages that are good but late or ahead: where processor time is short they may be so for seconds,
+and the robot stands meanwhile."""
 REPORTED_S = 10.0
 """The reader's health reports a rejected message for this long."""
 
@@ -141,14 +144,15 @@ class RejectionMonitor:
         self._newest_s = -inf
         self._run = 0
 
-    def rejected(self, key: str) -> None:
-        """A message on `key` was rejected."""
+    def rejected(self, key: str, untimely: bool = False) -> None:
+        """A message on `key` was rejected; `untimely`: for its stamp."""
         self._newest_s = now_s = _now_s()
         self._key = key
         if self.since_s is None:
             self.since_s, self._run = now_s, 0
         self._run += 1
-        if not self.unreadable and self._run >= UNREADABLE_COUNT and now_s - self.since_s >= self._limit_s:
+        limit_s = max(self._limit_s, UNTIMELY_S) if untimely else self._limit_s
+        if not self.unreadable and self._run >= UNREADABLE_COUNT and now_s - self.since_s >= limit_s:
             self._set(True)
 
     def accepted(self) -> None:

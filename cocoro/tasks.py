@@ -15,7 +15,7 @@ point of the group `cocoro.tasks` that points to the type (docs/tasks.md).
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, ClassVar, Literal, Protocol
 
 import msgspec
@@ -77,8 +77,11 @@ class Skills(Protocol):
         """Have the planner carry out an action to its end. Raises TaskFailedError('timed_out') when it takes longer
         than `timeout_s`."""
 
-    async def keep_doing(self, action: Action, *, until_s: float) -> None:
-        """Have the planner carry out an action that has no end, until a time (`now_s`)."""
+    async def keep_doing(self, action: Action, *, until_s: float, watch: Callable[[PlannerStatus], None] = ...) -> None:
+        """Have the planner carry out an action that has no end, until a time (`now_s`). `watch` gets its statuses."""
+
+    def measure(self, name: str, value: float) -> None:
+        """Set one of the task's `measures`, which its state tells."""
 
     async def watch_hold(self, seconds: float) -> None:
         """Hold still for a time; raises TaskFailedError('slipped') when the hand loses what it holds."""

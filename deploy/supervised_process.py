@@ -58,11 +58,12 @@ class SupervisedProcess:
         self._report = report
         self._sleep_detector = sleep_detector
         self._delayed_report: asyncio.TimerHandle | None = None
-        """Reports that the process is silent, unless it is back by then."""
+        """Reports that contact is lost, unless the process is back by then."""
         self._alive: set[str] = set()
         self._ready = asyncio.Event()
         self._was_ready = False
-        self._silent = False
+        self._unheard = False
+        """Whether contact with the living process is lost, as reported."""
         self._process: subprocess.Popen[bytes] | None = None
         self._exit: asyncio.Future[int] = asyncio.get_running_loop().create_future()
         self._started_s = 0.0
@@ -144,30 +145,30 @@ class SupervisedProcess:
             self._ready.set()
         else:
             self._ready.clear()
-        self._report_silence(ready)
+        self._report_contact(ready)
 
-    def _report_silence(self, ready: bool) -> None:
-        """Report that the process is silent or back. After a sleep of the supervisor itself, silence is reported only
-        when it lasts."""
+    def _report_contact(self, ready: bool) -> None:
+        """Report that contact with the process, which lives, is lost, or that it is back. After a sleep of the
+        supervisor itself, a loss is reported only when it lasts."""
         if self._delayed_report is not None and ready:
             self._delayed_report.cancel()
             self._delayed_report = None
-        if not self._was_ready or self.pid is None or self._stopping or ready != self._silent:
+        if not self._was_ready or self.pid is None or self._stopping or ready != self._unheard:
             return
         if ready:
-            self._silent = False
+            self._unheard = False
             self._report(f"{self.row.name} is back")
         elif self._sleep_detector.look():
             if self._delayed_report is None:
-                self._delayed_report = asyncio.get_running_loop().call_later(RECOVERY_S, self._report_lasting_silence)
+                self._delayed_report = asyncio.get_running_loop().call_later(RECOVERY_S, self._report_lasting_loss)
         else:
-            self._silent = True
+            self._unheard = True
             missing = ", ".join(sorted(set(self.row.services) - self._alive))
-            self._report(f"{self.row.name} is silent: no sign of {missing}")
+            self._report(f"lost contact with {missing}: no sign of it on the mesh, though its process {self.pid} lives")
 
-    def _report_lasting_silence(self) -> None:
+    def _report_lasting_loss(self) -> None:
         self._delayed_report = None
-        self._report_silence(self._alive >= set(self.row.services))
+        self._report_contact(self._alive >= set(self.row.services))
 
     # --- the process ------------------------------------------------------------------------------
 
@@ -224,7 +225,7 @@ class SupervisedProcess:
         return self._ready.is_set() and not self._exit.done()
 
     def _report_ready(self) -> None:
-        self._was_ready, self._silent = True, False
+        self._was_ready, self._unheard = True, False
         services = "" if self.row.services == (self.row.name,) else f" ({', '.join(self.row.services)})"
         self._report(f"{self.row.name}{services} ready in {time.monotonic() - self._started_s:.1f} s")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from math import acos, degrees, hypot, sqrt
 
 import msgspec
@@ -161,13 +162,40 @@ class Pursuit(msgspec.Struct, frozen=True, kw_only=True):
     """Longest time for which the target's centre was outside the camera's picture."""
     contacts: int
     """How many times the robot began to touch anything except the floor."""
+    near_share: float = 0.0
+    """Share of the time for which it was off its distance by at most `within_m`, from when it first was, at the latest
+    `catch_up_s` after following began; 0 where it was not and that time did not come."""
+    stood_s: float = 0.0
+    """Longest time for which the robot neither drove nor turned although it was off its distance by more than
+    `STOOD_M`."""
+
+
+STOOD_M, STOOD_MPS, STOOD_RADPS = 0.15, 0.02, 0.05
+"""Off its distance by more than this, and slower than this, a robot that follows stands."""
 
 
 class PursuitJudge:
     """Judges a pursuit. Feed it every truth, and call `begin` when following begins. Raises KeyError for a target that
     is not in the scene."""
 
-    def __init__(self, robot: Robot, scene: Scene, target: str) -> None:
+    def __init__(
+        self,
+        robot: Robot,
+        scene: Scene,
+        target: str,
+        *,
+        distance_m: float = 0.8,
+        within_m: float = 0.4,
+        catch_up_s: float = 10.0,
+    ) -> None:
+        """`distance_m`: that which the robot is to keep from centre to centre, over the floor."""
+        self._distance_m, self._within_m, self._catch_up_s = distance_m, within_m, catch_up_s
+        self._began_ns = self._last_ns = 0
+        self._from_ns: int | None = None
+        self._near_ns = 0
+        self._moving_ns = self._stood_ns = 0
+        self._poses: deque[tuple[int, FloatArray]] = deque(maxlen=5)
+        """Stamps and poses (x, y, yaw), from which speeds are taken."""
         self._camera = robot.camera
         self._chain = robot.chain("camera")
         self._radius_m = scene.object(target).dimensions_m[0]
@@ -187,6 +215,7 @@ class PursuitJudge:
             return
         target = next(item for item in truth.objects if item.label == self._target)
         distance_m = hypot(target.position_m[0] - truth.body_m[0], target.position_m[1] - truth.body_m[1])
+        self._feed_distance(truth, abs(distance_m - self._distance_m))
         self._gaps_m.append(distance_m - self._radius_m)
         if self._seen_ns is None or self._in_picture(truth, target):
             self._seen_ns = truth.stamp_ns
@@ -194,6 +223,31 @@ class PursuitJudge:
         touching = frozenset(truth.collisions)
         self._contacts += len(touching - self._touching)
         self._touching = touching
+
+    def _feed_distance(self, truth: Truth, off_m: float) -> None:
+        now_ns = truth.stamp_ns
+        if not self._gaps_m:
+            self._began_ns = self._last_ns = self._moving_ns = now_ns
+        near = off_m <= self._within_m
+        if self._from_ns is None and (near or now_ns - self._began_ns > self._catch_up_s * 1e9):
+            self._from_ns = self._last_ns = now_ns
+        if near:
+            self._near_ns += now_ns - self._last_ns
+        self._last_ns = now_ns
+        turn = rotation(truth.body_orientation)
+        self._poses.append((now_ns, np.array([*truth.body_m[:2], np.arctan2(turn[1, 0], turn[0, 0])])))
+        (then_ns, then), (_, here) = self._poses[0], self._poses[-1]
+        way = here - then
+        time_s = max((now_ns - then_ns) / 1e9, 1e-3)
+        turned = abs((way[2] + np.pi) % (2 * np.pi) - np.pi)
+        if off_m <= STOOD_M or hypot(way[0], way[1]) > STOOD_MPS * time_s or turned > STOOD_RADPS * time_s:
+            self._moving_ns = now_ns
+        self._stood_ns = max(self._stood_ns, now_ns - self._moving_ns)
+
+    def _near_share(self) -> float:
+        if self._from_ns is None:
+            return 0.0
+        return self._near_ns / (self._last_ns - self._from_ns) if self._last_ns > self._from_ns else 1.0
 
     def _in_picture(self, truth: Truth, target: TrueObject) -> bool:
         body = np.eye(4)
@@ -214,4 +268,6 @@ class PursuitJudge:
             min_gap_m=min(gaps),
             lost_s=self._longest_ns / 1e9,
             contacts=self._contacts,
+            near_share=round(self._near_share(), 3),
+            stood_s=round(self._stood_ns / 1e9, 3),
         )

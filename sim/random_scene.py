@@ -9,10 +9,12 @@ import numpy as np
 
 from cocoro.errors import ConfigError, choice_of
 from cocoro.objects import Catalogue, ObjectSpec
+from sim.rooms import draw_room
 from sim.scene import Light, Obstacle, Scene, SceneObject, load_scene
 from sim.seeds import stream
 
 NAME = "random"
+ROOMS, EMPTY = "rooms", "rooms-empty"
 DISTANCE_M = (0.8, 2.0)
 BEARING_DEG = 120.0
 APART_M = 0.25
@@ -56,12 +58,36 @@ def random_scene(seed: int, target: str = "", catalogue: Catalogue | None = None
     return Scene(name=NAME, objects=objects, obstacles=tuple(obstacles), light=light)
 
 
+def room_scene(seed: int, target: str = "", catalogue: Catalogue | None = None, *, empty: bool = False) -> Scene:
+    """Draw a room: 1 to 3 walls, and a known object that fits into the hand, 0.9 to 1.9 m away in any direction, behind
+    a wall that hides it from the start.
+
+    `empty`: the same walls without the object. `target`, if given, takes the place of the object that is drawn. Raises
+    ConfigError for a target that is no known object.
+    """
+    rng = stream(seed, "room")
+    catalogue = Catalogue.load() if catalogue is None else catalogue
+    graspable = [known for known in catalogue.targets if known.graspable]
+    chosen = graspable[int(rng.integers(len(graspable)))]
+    if target and not empty:
+        wanted = catalogue.get(target)
+        if wanted is None:
+            raise ConfigError(f"scene {ROOMS}: no known object {target!r}; {choice_of(target, catalogue.labels)}")
+        chosen = wanted
+    walls, place = draw_room(rng, chosen)
+    light = Light(ambient=float(rng.uniform(0.45, 0.65)), temperature_k=float(rng.uniform(4500, 6500)))
+    objects = () if empty else (_object(chosen, place),)
+    return Scene(name=EMPTY if empty else ROOMS, objects=objects, obstacles=walls, light=light)
+
+
 def find_scene(name_or_path: str, seed: int, target: str = "", objects: str = "") -> Scene:
-    """The random scene for the name `random`, otherwise the scene that `load_scene` finds. `objects` is the robot's
-    file of known objects, '' the project's own. Raises ConfigError."""
+    """A random scene for the names `random`, `rooms` and `rooms-empty`, otherwise the scene that `load_scene` finds.
+    `objects` is the robot's file of known objects, '' the project's own. Raises ConfigError."""
     catalogue = Catalogue.load(Path(objects) if objects else None)
     if name_or_path == NAME:
         return random_scene(seed, target, catalogue)
+    if name_or_path in (ROOMS, EMPTY):
+        return room_scene(seed, target, catalogue, empty=name_or_path == EMPTY)
     return load_scene(name_or_path, seed, catalogue)
 
 

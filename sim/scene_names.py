@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from importlib import resources
 
-GENERATED = ("random",)
+GENERATED = ("random", "rooms", "rooms-empty")
 """Names of the scenes that `sim.random_scene` makes."""
 
 

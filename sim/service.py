@@ -35,8 +35,9 @@ TICK_HZ = 120
 FRAME_LATENCY_S = 0.020
 STATE_LATENCY_S = 0.005
 """Latencies from stamp to publication, with real sensors."""
-LATE_S = 0.1
-"""When it is further behind real time than this, simulated time slips instead of catching up."""
+LATE_S = 0.05
+"""When it is further behind real time than this, simulated time slips instead of catching up: a clock that hurries
+makes the others' messages late."""
 
 
 class SimConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -15,7 +15,9 @@ from cocoro.robot import Robot
 from services.perception.config import PerceptionConfig
 from services.perception.floor import FloorScanner
 from services.perception.image import RgbdImage
+from services.planning.config import SearchConfig
 from services.planning.floor_map import FloorMap, Solid
+from services.planning.seen_floor import SeenFloor
 from services.planning.seen_through import DepthView
 
 ROBOT = Robot.load()
@@ -40,6 +42,7 @@ class Room:
 
     def __post_init__(self) -> None:
         self.floor = FloorMap()
+        self.seen = SeenFloor(SearchConfig(), ROBOT)
         self.now_ns = NS
         self._scanner = FloorScanner(ROBOT, PerceptionConfig())
         self._draws = np.random.default_rng(1)
@@ -54,6 +57,7 @@ class Room:
         tilt: float = -0.4,
         body: Pose2 = Pose2(),  # noqa: B008 - immutable
         known: Sequence[Solid] = (),
+        turning_radps: float = 0.0,
     ) -> None:
         angles = dict.fromkeys(ROBOT.joints, 0.0) | {"neck_pan": pan, "neck_tilt": tilt}
         pose = ROBOT.chain("camera").pose(angles)
@@ -62,6 +66,7 @@ class Room:
             self.now_ns += NS // RATE_HZ
             seen = self._obstacles(depth, pose)
             self.floor.enter(seen, body, None, known, DepthView(ROBOT, seen.nearest, angles))
+            self.seen.enter(seen, body, turning_radps)
 
     def occupied(self, near: tuple[float, float], within_m: float = 0.25) -> int:
         """How many cells are occupied near a place."""

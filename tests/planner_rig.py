@@ -75,9 +75,9 @@ class Planner:
             status = self.tick()
         return status
 
-    def want(self, name: str, label: str = "") -> None:
+    def want(self, name: str, label: str = "", **more: Any) -> None:
         step = self.wants.step + 1 if self.wants is not None else 1
-        self.wants = Intent(task_id="task", step=step, action=action(name, label))
+        self.wants = Intent(task_id="task", step=step, action=action(name, label, **more))
 
     @property
     def status(self) -> PlannerStatus:

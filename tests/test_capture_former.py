@@ -12,12 +12,12 @@ from cocoro.capture.former import todays_payload
 from cocoro.messages import ClockTick, Exchange, Intent, TaskRequest
 from services.executive.tasks import TASKS, GoToTask
 
-GOLDEN = Path(__file__).parent / "golden" / "fetch.mcap"
-"""Recorded by an earlier version."""
+FORMER = Path(__file__).parent / "golden" / "former.mcap"
+"""Clock and intents of a fetch, 2 s, recorded by a version that had other shapes; it cannot be made anew."""
 
 
 def test_a_renamed_type_is_read_as_todays() -> None:
-    with Capture.open(GOLDEN) as capture:
+    with Capture.open(FORMER) as capture:
         ticks = list(capture.messages("sim/clock"))
         schema = capture.schema(ticks[0].channel)
         assert schema is not None
@@ -29,7 +29,7 @@ def test_a_renamed_type_is_read_as_todays() -> None:
 
 
 def test_a_former_intent_is_read_and_replayed_in_todays_shape() -> None:
-    with Capture.open(GOLDEN) as capture:
+    with Capture.open(FORMER) as capture:
         records = list(capture.messages("executive/intent"))
         raw = capture.decode(records[-1])
         assert isinstance(raw["behaviour"], str)

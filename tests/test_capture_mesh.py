@@ -33,8 +33,8 @@ from cocoro.node import Node
 from cocoro.robot import Robot
 from deploy.rundir import RunDir
 from services.capture.config import CaptureConfig
-from services.capture.file import Packer
 from services.capture.log_clock import WALL_CLOCK, LogClock
+from services.capture.packing import Packer
 from services.capture.service import run
 
 pytestmark = pytest.mark.zenoh
@@ -202,7 +202,7 @@ def test_a_recorder_whose_wall_clock_is_set_goes_on_as_if_it_had_not_been_and_no
     by_s: int, short_path: Path
 ) -> None:
     out, wall = short_path / "out", Wall()
-    config = CaptureConfig(folder=str(out), rotate_s=0.5)
+    config = CaptureConfig(folder=str(out), rotate_s=0.5, per_occasion=False)
 
     async def scenario() -> None:
         async with (

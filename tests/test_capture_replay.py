@@ -15,6 +15,7 @@ from capture_rig import ROBOT, Room, all_of, drive, entry, record, writer
 from apps.captures.player import AT_ONCE, FASTEST, Player
 from apps.captures.reader import Capture
 from apps.captures.replay import Replay, heard_as, played_keys, refuse_if_alive, restarted, services_of, with_rate
+from apps.cli.main import main
 from cocoro import topics
 from cocoro.bus.base import Qos
 from cocoro.clock import FollowedClock
@@ -358,3 +359,9 @@ def test_lossy_frames_are_played_as_frames(tmp_path: Path) -> None:
 
     run_virtual(listen(Room()))
     assert [frame.seq for frame in got] == list(range(20))
+
+
+def test_a_replay_is_refused_a_name_that_is_no_robots(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = record(tmp_path / "first.mcap", drive)
+    assert main(["replay", str(path), "--robot", "../other"]) == 2
+    assert "--robot ../other: a robot's name" in capsys.readouterr().err

@@ -279,6 +279,21 @@ def test_a_viewer_that_takes_nothing_any_more_is_given_up(monkeypatch: pytest.Mo
     assert sent(beating, "there") == 20
 
 
+def test_a_file_that_the_disk_did_not_take_whole_is_removed(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def flush(_: Stream, timeout_sec: float = 0.0) -> None:
+        raise RuntimeError("File-writer thread shut down prematurely")
+
+    monkeypatch.setitem(sys.modules, "rerun", FakeRerun("rerun"))
+    monkeypatch.setattr(Stream, "flush", flush)
+    assert main(["view", str(GOLDEN), "--save", str(tmp_path / "a.rrd")]) == 1
+    err = capsys.readouterr().err
+    assert "could not be written to its end" in err
+    assert len(err.splitlines()) == 1
+    assert not (tmp_path / "a.rrd").exists()
+
+
 def test_an_error_of_rerun_is_told_as_ours() -> None:
     def fails() -> None:
         raise RuntimeError("broken pipe")

@@ -247,7 +247,8 @@ async def see(calliope: FakeRobot, detect: bool) -> None:
 
 
 @pytest.mark.parametrize(
-    ("detect", "words"), [(True, "64 x 48, red_can"), (False, "64 x 48, without detections (perception is silent)")]
+    ("detect", "words"),
+    [(True, "64 x 48, red_can"), (False, "64 x 48, without detections (none came from perception)")],
 )
 def test_a_snapshot_is_a_frame_with_what_was_detected_in_that_frame(
     root: Path,

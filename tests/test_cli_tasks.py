@@ -31,6 +31,7 @@ from cocoro.messages import (
     LatchState,
     Message,
     Phase,
+    Recording,
     ReportRequest,
     TaskReply,
     TaskRequest,
@@ -38,7 +39,7 @@ from cocoro.messages import (
 )
 from cocoro.node import Node
 from cocoro.robot import Robot
-from cocoro.topics import CANCEL, LATCH, REPORT, RUN, TASK
+from cocoro.topics import CANCEL, LATCH, RECORDING, REPORT, RUN, TASK
 from cocoro.vloop import run_virtual
 from deploy.rundir import RunDir
 from services.executive.askers import asker_key
@@ -143,6 +144,20 @@ async def test_a_task_that_is_done_is_followed_phase_by_phase_and_exits_with_0(s
         "done: fetch red_can in 9.5 s",
     ]
     assert (result["outcome"], result["elapsed_s"]) == ("done", 9.5)
+
+
+@in_virtual_time
+async def test_where_the_task_is_recorded_is_told_with_its_outcome(scene: Scene) -> None:
+    executive = Executive(scene.node)
+    recorder = Node("capture", scene.bus, VirtualClock(), Robot.load())
+    running = await following(scene.follower())
+    for task_id, file in (("", "idle.mcap"), (ID, "fetch.mcap"), ("another", "other.mcap")):
+        recorder.publish(RECORDING.of("capture"), Recording(file=file, task_id=task_id))
+    executive.tell("end", 9.5, outcome="done")
+    code, result = await running
+    assert code == exits.DONE
+    assert scene.out.getvalue().splitlines() == ["done: fetch red_can in 9.5 s", "recorded in fetch.mcap"]
+    assert result["recorded_in"] == "fetch.mcap"
 
 
 @in_virtual_time

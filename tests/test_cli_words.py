@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import re
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -14,7 +17,7 @@ from places import in_short_folder
 from apps.cli import manual
 from apps.cli.listening import nothing_on
 from apps.cli.main import main
-from apps.cli.output import asks_json
+from apps.cli.output import asks_json, print_json
 from apps.cli.walk import commands
 from cocoro.errors import choice_of
 
@@ -72,6 +75,7 @@ def test_every_command_that_tells_something_has_json() -> None:
         (["logs", "--level", "erorr"], 2, "usage", "did you mean error?"),
         (["hz", "a//b"], 4, "no_mesh", "no robot is up"),
         (["ftch", "red_can"], 2, "usage", "Did you mean 'fetch'"),
+        (["rehearse", "ftch", "red_can"], 2, "usage", "did you mean fetch?"),
         (["estop", "--robot", "nobody"], 4, "no_mesh", "no nobody is up"),
     ],
 )
@@ -86,6 +90,36 @@ def test_an_error_is_one_object_on_standard_output_where_json_is_asked_for(
     assert said.err
     assert main(arguments) == code
     assert capsys.readouterr().out == ""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "keys"),
+    [
+        (["down"], {"down"}),
+        (["new", "service", "greeter"], {"files", "next"}),
+        (["new", "task", "greet"], {"files", "next"}),
+        (["doctor", "sim"], None),
+        (["topics"], None),
+        (["capture", "list"], None),
+    ],
+)
+def test_a_result_is_one_document_of_json(
+    arguments: list[str],
+    keys: set[str] | None,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COCORO_CAPTURE_DIR", str(tmp_path))
+    main([*arguments, "--json"])
+    result = json.loads(capsys.readouterr().out)
+    assert isinstance(result, list) if keys is None else result.keys() == keys
+
+
+def test_what_json_lacks_is_null(capsys: pytest.CaptureFixture[str]) -> None:
+    print_json({"rate_hz": float("nan"), "gaps": [1.5, float("inf")]})
+    assert capsys.readouterr().out == '{"rate_hz": null, "gaps": [1.5, null]}\n'
 
 
 def test_json_is_asked_for_before_the_end_of_the_options_alone() -> None:
@@ -153,6 +187,18 @@ def test_the_shell_completes_names(
     found = set(capsys.readouterr().out.split())
     assert some <= found
     assert all(name.startswith(line.split()[-1]) for name in found)
+
+
+@pytest.mark.process
+@pytest.mark.parametrize("line", ["cocoro replay l", "cocoro up --scene p"])
+def test_a_completion_waits_for_no_heavy_library(line: str) -> None:
+    code = "import sys; from apps.cli.main import main; main([]); print(*sys.modules, file=sys.stderr)"
+    environment = {"_COCORO_COMPLETE": "complete_bash", "COMP_WORDS": line, "COMP_CWORD": str(line.count(" "))}
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, env=os.environ | environment
+    )
+    assert done.stdout
+    assert not {"numpy", "cv2", "scipy", "pybullet"} & {*done.stderr.split()}
 
 
 def test_a_completion_that_fails_completes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:

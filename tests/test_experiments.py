@@ -112,6 +112,17 @@ def test_what_cannot_be_run_fails_with_its_reason_and_so_does_what_needs_it(tmp_
     assert not (tmp_path / "runs").exists()  # errors are not kept: the next time tries again
 
 
+def test_an_interrupted_experiment_leaves_no_worker_behind(tmp_path: Path) -> None:
+    class Interrupted(Quiet):
+        def tick(self) -> None:
+            raise KeyboardInterrupt
+
+    runs = [ExperimentRun("one", "rehearse", {"task": {"task": "babble-arm"}})]
+    with pytest.raises(KeyboardInterrupt):
+        perform(runs, tmp_path / "runs", 1, Interrupted())
+    assert not [child for child in psutil.Process().children() if "--multiprocessing-fork" in child.cmdline()]
+
+
 def arm_and_wheels(settings: ExperimentSettings, robot: Robot) -> None:
     seen = sightings(robot, draws=60)
     header = hand_header(robot, NominalModel(robot).joints, robot.claw.level_roll_rad)

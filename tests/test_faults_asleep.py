@@ -58,14 +58,15 @@ def test_when_all_sleep_for_longer_than_the_lease_the_robot_stands_and_nobody_is
                 assert float(awake.partition(SAID)[2].split()[0]) >= ASLEEP_S - 1.0
                 code = await asyncio.to_thread(fetch.end)
                 if code != 0:  # a connection broke: the task has ended, and the robot stands
-                    assert code == 1
+                    assert code in (1, 3)
                     ended_s = robot.now_s
                     await robot.passes(0.5)
                     assert robot.stood_since(ended_s)
-                    assert SAID in fetch.lines[-1] or "planner is silent" in fetch.lines[-1], fetch.lines
+                    whys = (SAID, "nothing from the planner", "asker_gone", "looking again")
+                    assert any(why in line for why in whys for line in fetch.lines), fetch.lines
                 said = said_by_all(robot, fetch)
                 assert " died" not in said
-                assert said.count("is silent") == said.count("is back") == 0, said
+                assert said.count("no sign of it") == said.count("is back") == 0, said
                 code, answer = await robot.command("park")
                 assert code == 0, answer
                 assert {service: by.pid for service, by in robot.run_dir.claims().items()} == pids
@@ -82,9 +83,10 @@ def test_of_one_that_alone_is_stopped_for_longer_than_the_lease_contact_is_lost(
             task_id = await robot.driving()
             stopped_s = await fault(robot, "planning", signal.SIGSTOP)
             state = await robot.outcome(task_id)
-            assert state.reason in ("not_alive: lost contact with planning", "not_alive: the planner is silent")
+            late = "not_alive: nothing from the planner for 10 s"
+            assert state.reason in ("not_alive: lost contact with planning", late)
             await stands_in_time(robot, stopped_s)
-            await robot.told("planning is silent: no sign of planning")
+            await robot.told("lost contact with planning: no sign of it")
             code, said = await robot.command("status")
             assert code == 1
             assert "no contact" in next(line for line in said.splitlines() if line.startswith("planning "))

@@ -8,12 +8,24 @@ import pytest
 from inbox_rig import KEY, inbox_of, payload
 
 from cocoro import topics
-from cocoro.stream_checks import REPORTED_S, UNREADABLE_S
+from cocoro.stream_checks import REPORTED_S, UNREADABLE_S, UNTIMELY_S
 from cocoro.testing import in_virtual_time
 
 
-@in_virtual_time
-async def test_a_topic_of_which_everything_is_rejected_is_unreadable_and_says_whose_fault_it_is() -> None:
+@pytest.mark.parametrize(
+    ("bad", "limit_s", "what"),
+    [
+        ({"stamp_ns": 1}, UNTIMELY_S, "stale: stamped 100.000 s ago"),
+        ({"seq": 0}, UNREADABLE_S, "sequence number 0 after 0 was there before"),
+    ],
+)
+def test_a_topic_of_which_everything_is_rejected_is_unreadable_and_says_whose_fault_it_is(
+    bad: dict[str, int], limit_s: float, what: str
+) -> None:
+    in_virtual_time(unreadable_after)(bad, limit_s, what)
+
+
+async def unreadable_after(bad: dict[str, int], limit_s: float, what: str) -> None:
     inbox, _ = inbox_of(topics.BASE_COMMAND)
     told: list[bool] = []
     inbox.rejections.changed = lambda: told.append(inbox.rejections.unreadable)
@@ -21,10 +33,10 @@ async def test_a_topic_of_which_everything_is_rejected_is_unreadable_and_says_wh
     assert (inbox.health(0).fault, inbox.health(0).unreadable) == ("", False)
     began_s = asyncio.get_running_loop().time()
     while not inbox.rejections.unreadable:
-        inbox.deliver("calliope/base/command", payload(topics.BASE_COMMAND, stamp_ns=1))
+        inbox.deliver("calliope/base/command", payload(topics.BASE_COMMAND, **bad))
         await asyncio.sleep(0.02)
-    assert asyncio.get_running_loop().time() - began_s == pytest.approx(UNREADABLE_S, abs=0.05)
-    why = f"base/command of planning: {inbox.rejected} rejected: stale: stamped 100.000 s ago"
+    assert asyncio.get_running_loop().time() - began_s == pytest.approx(limit_s, abs=0.05)
+    why = f"base/command of planning: {inbox.rejected} rejected: {what}"
     assert (inbox.health(0).fault, inbox.health(0).unreadable) == (why, True)
     inbox.deliver("calliope/base/command", payload(topics.BASE_COMMAND, seq=1))
     assert (inbox.health(0).fault, inbox.health(0).unreadable) == (why, False)

@@ -9,8 +9,9 @@ import msgspec
 import pytest
 
 from cocoro.messages import TrueObject, Truth
+from cocoro.robot import Robot
 from cocoro.units import Vec3
-from sim.judge import Judge
+from sim.judge import Judge, PursuitJudge
 from sim.scene import Scene, SceneObject
 
 HZ = 30
@@ -207,3 +208,23 @@ def test_what_the_hand_holds_at_the_start_is_not_knocked_over_when_it_is_put_dow
     judge.feed(truth(0.0, {"red_can": (0.4, -0.1, 0.2)}, touching=BOTH))
     judge.feed(truth(1.0, {"red_can": (0.5, -0.1, 0.06)}))
     assert judge.result().knocked_over == ()
+
+
+def test_a_pursuit_is_judged_by_the_time_with_the_target_and_by_how_long_the_robot_stood_off_it() -> None:
+    robot = Robot.load()
+    judge = PursuitJudge(robot, SCENE, "red_can", distance_m=0.8, within_m=0.4)
+    judge.begin()
+
+    def feed(time_s: float, gap_m: float) -> None:
+        place = (0.8 + gap_m, 0.0, 0.06)
+        judge.feed(
+            msgspec.structs.replace(truth(time_s, {"red_can": place}), joints_rad=dict.fromkeys(robot.joints, 0.0))
+        )
+
+    for tick in range(21):
+        feed(tick / 10, 0.0)
+    assert (judge.result().near_share, judge.result().stood_s) == (1.0, 0.0)
+    for tick in range(21, 41):
+        feed(tick / 10, 1.0)
+    assert judge.result().near_share == pytest.approx(0.5, abs=0.05)
+    assert judge.result().stood_s == pytest.approx(2.0, abs=0.2)

@@ -35,6 +35,23 @@ def test_search_that_finds_nothing_looks_everywhere_and_says_so(planner: Planner
     assert (min(pans), max(pans)) == pytest.approx((-2.6, 2.6), abs=0.1)
 
 
+def test_a_search_whose_time_is_up_says_what_it_has_not_seen(planner: Planner) -> None:
+    planner.sees = None
+    planner.want("search", "blue_can")
+    planner.run(0.2)
+    planner.want("explore", "blue_can", time_is_up=True)
+    status = planner.tick()
+    assert (status.state, status.reason) == ("failed", "not_found")
+    assert "time is up" in status.why
+    assert "m2 at" in status.why
+    assert standing(planner)
+
+
+def test_exploring_without_a_search_before_finds_nothing(planner: Planner) -> None:
+    planner.want("explore", "blue_can")
+    assert planner.tick().reason == "not_found"
+
+
 def test_approach_to_what_was_never_seen_is_lost(planner: Planner) -> None:
     planner.want("approach", "blue_can")
     assert planner.tick().reason == "lost"

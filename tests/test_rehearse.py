@@ -79,9 +79,12 @@ def test_in_lock_step_the_same_robot_is_slower(fetched: dict[str, Any]) -> None:
 def test_what_is_not_there_is_not_found_and_the_robot_stands(tmp_path: Path) -> None:
     scene = tmp_path / "green.toml"
     scene.write_text(ONLY_GREEN)
-    result = rehearse(small(scene=str(scene)))
+    result = rehearse(small(scene=str(scene), seen_within_m=2.0))
     assert result["outcome"] == "failed"
-    assert result["reason"].startswith("not_found")
+    assert result["reason"].startswith("not_found: the whole surroundings were searched")
+    floor = result["seen_floor"]
+    assert floor["missed"] <= 5, "of 5,000 cells: the sentence is true but for a strip beside the can"
+    assert floor["cells"] - floor["seen"] - floor["unseeable"] == floor["missed"]
     assert result["sim_s"] < 90.0
     assert not result["truth"]["collisions"]
     assert not result["truth"]["knocked_over"]

@@ -94,7 +94,7 @@ def report(capture: Capture, check: bool = False) -> CaptureReport:
     if checked:
         capture.check()
     missing = missing_of(capture)
-    notes = [*capture.notes, *_contradictions(capture), *describe_left_out(capture, missing)]
+    notes = [*capture.notes, *_contradictions(capture), *left_out_notes(capture, missing)]
     names = sorted(capture.keys)
     keys = tuple(
         _key_report(capture, channel, tallies[channel], missing) for key in names for channel in capture.keys[key]
@@ -202,8 +202,10 @@ def missing_of(capture: Capture) -> Missing:
         return Missing({}, {})
 
 
-def describe_left_out(capture: Capture, missing: Missing) -> list[str]:
-    """What was left out by intention, in words: one line, or none."""
+def left_out_notes(capture: Capture, missing: Missing | None = None) -> list[str]:
+    """What was left out by intention, in words: one line, or none. `missing` is what the capture says, where it was
+    read already."""
+    missing = missing or (missing_of(capture) if capture.left_out else Missing({}, {}))
     if not missing.left_out:
         return []
     counts = ", ".join(

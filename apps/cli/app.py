@@ -7,6 +7,7 @@ made from the types of tasks by `task_commands`; `tasks` sends the request and f
 
 from __future__ import annotations
 
+import re
 from typing import Annotated, Any
 
 import typer
@@ -114,13 +115,15 @@ class CommandGroup(TyperGroup):
                 self.add_command(TyperCommand(name))
 
 
+_TAG = re.compile(r"\[[a-z#/@][^\[]*?\]")
+"""What `rich.markup` takes for a tag; it is not imported, since a shell that completes a word waits for it."""
+
+
 def with_brackets(command: Any) -> Any:
     """Escapes the help of a command and of what is below it: typer would take '[view]' for markup and print nothing."""
-    from rich.markup import escape
-
     for part in (command, *command.params):
         if text := getattr(part, "help", None):
-            part.help = escape(text.replace("\\[", "["))
+            part.help = _TAG.sub(r"\\\g<0>", text.replace("\\[", "["))
     for below in getattr(command, "commands", {}).values():
         with_brackets(below)
     return command

@@ -18,16 +18,17 @@ from apps.captures import shelf as captures
 from apps.captures.info import AttachmentReport, CaptureReport, report
 from apps.captures.reader import Capture
 from apps.captures.rewrite import REPAIRED, rewrite
-from apps.cli import exits, shelf
+from apps.cli import completions, exits, shelf
 from apps.cli.options import CaptureArgument, FromOption, JsonOption, OnlyOption, ToOption, WithoutOption, capture_file
 from apps.cli.output import print_json
 from apps.cli.terminal import Column, fields, table
 from cocoro.capture.conventions import CaptureError
 from cocoro.clock import NS
 from cocoro.errors import ConfigError, choice_of
-from services.capture.file import COMPRESSIONS, Compression, Packer
 from services.capture.keys import KeyFilter
 from services.capture.log_clock import WALL_CLOCK, WallClockStep, describe_step
+from services.capture.occasions import OCCASION, Occasion
+from services.capture.packing import COMPRESSIONS, Compression, Packer
 
 MB = 1e6
 COLUMNS = (
@@ -111,6 +112,7 @@ def _head(found: CaptureReport) -> list[str]:
         ("robot", found.robot or "unknown"),
         ("started", start if found.messages else ""),
         ("lasts", f"{found.duration_s:.3f} s"),
+        ("happened", _happened(found.metadata.get(OCCASION, {}))),
         ("clock", "; ".join(_clock_steps(found))),
         ("messages", f"{found.messages}"),
         ("size", f"{found.size_bytes / MB:.1f} MB, of {found.raw_bytes / MB:.1f} MB of payloads"),
@@ -123,6 +125,17 @@ def _head(found: CaptureReport) -> list[str]:
         ("metadata", ", ".join(found.metadata)),
     ]
     return fields(lines).splitlines()
+
+
+def _happened(occasion: Mapping[str, Any]) -> str:
+    """The task or other occasion for which the capture was made, its outcome, and the faults meanwhile."""
+    try:
+        found = msgspec.convert(occasion, Occasion, strict=False)
+    except msgspec.ValidationError:  # none, or another program's metadata of this name
+        return ""
+    outcome = ": ".join(filter(None, (found.outcome, found.reason)))
+    notes = [note.text for note in found.notes if note.text != found.what]
+    return "; ".join(filter(None, (f"{found.what}{f' ({outcome})' if outcome else ''}", *notes[:3])))
 
 
 def _clock_steps(found: CaptureReport) -> list[str]:
@@ -174,7 +187,14 @@ def repair(
     out: Annotated[
         Path | None, typer.Option("--out", metavar="FILE", help="The new file; FILE.repaired.mcap by default.")
     ] = None,
-    compression: Annotated[str, typer.Option(metavar="zstd|lz4|none", help="Compression of the new file.")] = "zstd",
+    compression: Annotated[
+        str,
+        typer.Option(
+            metavar="zstd|lz4|none",
+            autocompletion=completions.of("zstd", "lz4", "none"),
+            help="Compression of the new file.",
+        ),
+    ] = "zstd",
     level: Annotated[int, typer.Option(min=1, max=19, help="Level for zstd; 19 is small and slow.")] = 1,
     only: OnlyOption = None,
     without: WithoutOption = None,
@@ -266,9 +286,19 @@ def reexecute(
         list[Path],
         typer.Argument(metavar="FILE...", parser=capture_file, help="The captures of one run, in order."),
     ],
-    service: Annotated[str, typer.Option("--service", help="perception, planning, or another with a pure core.")],
+    service: Annotated[
+        str,
+        typer.Option(
+            "--service", autocompletion=completions.services, help="perception, planning, or another with a pure core."
+        ),
+    ],
     against: Annotated[
-        str, typer.Option(metavar="recorded|nothing", help="What to compare the outputs with.")
+        str,
+        typer.Option(
+            metavar="recorded|nothing",
+            autocompletion=completions.of("recorded", "nothing"),
+            help="What to compare the outputs with.",
+        ),
     ] = "recorded",
     tolerance: Annotated[
         float,

@@ -20,6 +20,7 @@ from apps.cli import exits
 from apps.cli.options import DescriptionOption, JsonOption, MeasuredOption, ProfileArgument
 from apps.cli.output import print_json
 from apps.cli.stop_asking import addresses
+from apps.cli.terminal import folded
 from cocoro.bus import shared
 from cocoro.checks import Check, bad, note, ok
 from cocoro.component import Component, load, machine_checks
@@ -66,7 +67,7 @@ def print_checks(profile_name: str, as_json: bool, description: Path | None, mea
     else:
         width = max(len(check.name) for check in checks)
         for check in checks:
-            print(f"{MARKS[check.state]}  {check.name:<{width}}  {check.text}")
+            print(*folded(f"{MARKS[check.state]}  {check.name:<{width}}  ", check.text), sep="\n")
     return exits.FAILED if any(check.state == "bad" for check in checks) else exits.DONE
 
 

@@ -19,6 +19,7 @@ from apps.cli.interrupt import interrupt_event
 from apps.cli.link import joined
 from apps.cli.listening import KeyListener, ReceivedPayload, keyexpr_of, nothing_on, takes_frames
 from apps.cli.options import JsonOption, KeyArgument, MeshOption, RobotChoice, RobotOption
+from apps.cli.terminal import folded
 from cocoro.bus.base import Payload
 from cocoro.installed import topic_named
 
@@ -90,7 +91,9 @@ async def _print(
             continue
         for received in listener.take()[: None if count is None else count - printed]:
             decoded = read(received.payload, received.key.removeprefix(f"{robot}/"))
-            print(_as_json(received, decoded) if as_json else _as_text(received, decoded, everything), flush=True)
+            print(
+                _as_json(received, decoded) if as_json else _fitted(_as_text(received, decoded, everything)), flush=True
+            )
             printed += 1
     return printed
 
@@ -98,6 +101,17 @@ async def _print(
 def _as_json(received: ReceivedPayload, decoded: DecodedPayload) -> str:
     entry = {"key": received.key, "type": decoded.type or None, "message": jsonable(decoded.value)}
     return json_module.dumps(entry | ({"problem": decoded.problem} if decoded.problem else {}))
+
+
+def _fitted(text: str) -> str:
+    """The lines of a text, each folded to the terminal's width two columns to the right of its beginning."""
+    found = []
+    for line in text.splitlines():
+        words = line.lstrip()
+        shift = " " * (len(line) - len(words))
+        first, *rest = folded(f"{shift}  ", words)
+        found += [shift + first.lstrip(), *rest]
+    return "\n".join(found)
 
 
 def _as_text(received: ReceivedPayload, decoded: DecodedPayload, everything: bool) -> str:

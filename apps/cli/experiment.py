@@ -11,7 +11,7 @@ from typing import Annotated
 import msgspec
 import typer
 
-from apps.cli import exits
+from apps.cli import completions, exits
 from apps.cli.experiment_progress import RunProgress
 from apps.cli.options import DescriptionOption, FramesOption, JsonOption, MeasuredOption, frames_of
 from apps.cli.output import tell
@@ -27,7 +27,14 @@ app = typer.Typer()
 
 @app.command()
 def experiment(
-    which: Annotated[str, typer.Argument(metavar="E1|E2|E3|E4|E5|E6|all", help="Which of the paper's experiments.")],
+    which: Annotated[
+        str,
+        typer.Argument(
+            metavar="E1|E2|E3|E4|E5|E6|all",
+            autocompletion=completions.of(*EXPERIMENTS, "all"),
+            help="Which of the paper's experiments.",
+        ),
+    ],
     seeds: Annotated[
         int, typer.Option(min=1, max=1000, metavar="N", help="Number of seeds, from 0 on; each is another body.")
     ] = 10,

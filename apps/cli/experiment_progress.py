@@ -11,6 +11,7 @@ from typing import TextIO
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+from rich.table import Column
 
 from apps.cli.terminal import print_table
 from apps.experiments.carry_out import RunResult
@@ -82,11 +83,13 @@ class RunProgress:
 
     def __init__(self, out: TextIO, jobs: int = 1, clock: Clock = time.monotonic) -> None:
         console = Console(file=out)
+        cut = Column(no_wrap=True, overflow="ellipsis")
+        text = TextColumn("{task.description}", markup=False, table_column=cut)
         self._out = out
         self._jobs = jobs
         self._clock = clock
         self._bar = Progress(
-            BarColumn(bar_width=20), MofNCompleteColumn(), TextColumn("{task.description}", markup=False),
+            BarColumn(bar_width=20), MofNCompleteColumn(), text,
             console=console, transient=True, disable=not console.is_terminal,
         )  # fmt: skip
         self._task = self._bar.add_task("")

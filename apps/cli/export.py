@@ -6,24 +6,18 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from apps.captures.export.files import refuse_existing
+from apps.captures.info import left_out_notes
 from apps.captures.reader import Capture
 from apps.cli import exits
 from apps.cli.options import CameraOption, CaptureArgument, JsonOption
 from apps.cli.output import print_json
 from cocoro.clock import NS
 from cocoro.errors import ConfigError
-
-if TYPE_CHECKING:
-    pass
-
-PER_SERVICE = "{service}"
-DEPTH = 4
-"""Messages of one key that may wait; a viewer that is late shows the newest."""
 
 app = typer.Typer()
 
@@ -119,6 +113,8 @@ def export_capture(
             print(f"missing: {problem}", file=sys.stderr)
         if capture.ending:
             print(f"note: {file} was {capture.ending}", file=sys.stderr)
+        for note in left_out_notes(capture):
+            print(f"note: {note}", file=sys.stderr)
     if as_json:
         print_json({"written": written, "missing": [str(problem) for problem in capture.problems]})
     return exits.FAILED if capture.problems else exits.DONE

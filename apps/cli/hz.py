@@ -27,6 +27,7 @@ from apps.cli.terminal import Column, FittedTable, table
 from cocoro.bus.base import Payload
 from cocoro.installed import topic_named
 from cocoro.stream_checks import ANY_HZ, SequenceTracker
+from deploy.rates import meant_hz, off
 
 COLUMNS = (
     "key", Column("rate", right=True), Column("nominal", right=True), Column("by stamp", 4, right=True),
@@ -36,7 +37,7 @@ COLUMNS = (
 )  # fmt: skip
 SHOW_S = 1.0
 SILENT_PERIODS = 3.0
-"""A key that is silent for this many of its periods counts as stopped."""
+"""When nothing arrives for this many of its periods, that is said."""
 
 
 class MessageHeader(msgspec.Struct, gc=False):
@@ -59,7 +60,7 @@ class RateReport:
 
     key: str
     nominal_hz: float | None
-    """Nominal rate by the table of topics, in the robot's time."""
+    """The rate that is meant on this robot, in the robot's time; None for what is published on change."""
     rate_hz: float
     """Rate of arrival here."""
     stamped_hz: float | None
@@ -78,6 +79,8 @@ class RateReport:
     """Missing sequence numbers since the start."""
     silent_s: float
     """Time since the newest message."""
+    off: str
+    """Whether the rate by the stamps, or the rate of arrival where there are none, differs from the meant one."""
 
 
 class RateMeter:
@@ -141,6 +144,7 @@ class RateMeter:
             messages=len(arrivals),
             lost=self._source.gaps,
             silent_s=silent_s,
+            off=off(len(periods_s) / stamped_s if stamped_s > 0 else rate_hz, self._nominal_hz) if periods_s else "",
         )
 
 
@@ -158,7 +162,10 @@ def hz(
     profile: MeshOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Rate, jitter and amount of data on a key, as it arrives here, over the last seconds."""
+    """Rate, jitter and amount of data on a key, as it arrives here, over the last seconds.
+
+    NOMINAL is the rate that is meant, in the robot's time; BY STAMP, the rate in that time, is judged against it.
+    """
     sys.exit(asyncio.run(show_rates(RobotChoice(robot, profile), key, window, once, json)))
 
 
@@ -167,13 +174,15 @@ async def show_rates(choice: RobotChoice, text: str, window_s: float, once: bool
     meters: dict[str, RateMeter] = {}
     async with joined(choice, frames=takes_frames(text)) as link:
         listener = KeyListener(link, keyexpr_of(text, link.robot))
+        resolved = link.run_dir.resolved()
         with interrupt_event() as end, _view(as_json, once) as view:
             show_s = time.monotonic() + (window_s if once else SHOW_S)
             while not end.is_set():
                 await listener.wait(end, max(show_s - time.monotonic(), 0.0))
                 for received in listener.take():
                     if received.key not in meters:
-                        meters[received.key] = RateMeter(received.key, _nominal_hz(received.key, link.robot), window_s)
+                        topic = topic_named(received.key.removeprefix(f"{link.robot}/"))
+                        meters[received.key] = RateMeter(received.key, meant_hz(topic, resolved), window_s)
                     meters[received.key].hear(received.payload, received.at_s)
                 if time.monotonic() >= show_s:
                     show_s = time.monotonic() + SHOW_S
@@ -194,11 +203,6 @@ def _reports(meters: Iterable[RateMeter]) -> list[RateReport]:
     now_s = time.monotonic()
     found = (meter.report(now_s) for meter in sorted(meters, key=lambda meter: meter.key))
     return [report for report in found if report is not None]
-
-
-def _nominal_hz(key: str, robot: str) -> float | None:
-    topic = topic_named(key.removeprefix(f"{robot}/"))
-    return None if topic is None else topic.rate_hz
 
 
 class _RateDisplay:
@@ -250,7 +254,7 @@ def _row(report: RateReport) -> tuple[str, ...]:
         report.key.partition("/")[2], per_s(report.rate_hz), per_s(report.nominal_hz), per_s(report.stamped_hz),
         ms(report.period_ms), ms(report.jitter_ms), ms(report.min_ms), ms(report.max_ms),
         f"{size_text(report.bytes_per_s)}/s", size_text(report.size_bytes), str(report.lost),
-        f"silent for {report.silent_s:.1f} s" if stopped else "",
+        f"nothing for {report.silent_s:.1f} s" if stopped else report.off,
     )  # fmt: skip
 
 

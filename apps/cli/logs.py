@@ -7,7 +7,6 @@ import heapq
 import os
 import re
 import sys
-import textwrap
 from collections import deque
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -19,7 +18,7 @@ from apps.cli import completions, exits
 from apps.cli.interrupt import elapsed, interrupt_event
 from apps.cli.options import JsonOption, RobotOption
 from apps.cli.output import print_json
-from apps.cli.terminal import output_width
+from apps.cli.terminal import folded, output_width
 from cocoro.bus.endpoints import default_run_dir
 from cocoro.errors import ConfigError, choice_of
 from deploy.processes import components
@@ -60,9 +59,7 @@ class LogEntry(NamedTuple):
             return
         level = "" if match[4].lower() in ("info", "debug") else f"{match[4]}: "
         head = f"{match[2]}.{match[3]} {match[5]:<{PROCESS_WIDTH}} "
-        first, *rest = textwrap.wrap(f"{level}{match[6]}", max(width - len(head), 20), break_on_hyphens=False) or [""]
-        yield head + first
-        yield from (" " * len(head) + line for line in rest)
+        yield from folded(head, f"{level}{match[6]}", width)
         yield from self.lines[1:]
 
 

@@ -70,7 +70,10 @@ SetOption = Annotated[
     typer.Option("--set", metavar="KEY=VALUE", help="Any setting of the profile: service.sim.seed=3. Repeatable."),
 ]
 FramesOption = Annotated[
-    str | None, typer.Option("--frames", metavar="WxH@HZ", help="Size and rate of the camera's frames: 320x240@15.")
+    str | None,
+    typer.Option(
+        "--frames", metavar="WxH@HZ", envvar="COCORO_FRAMES", help="Size and rate of the camera's frames: 320x240@15."
+    ),
 ]
 LatencyOption = Annotated[
     list[str] | None,

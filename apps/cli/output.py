@@ -206,7 +206,11 @@ def print_json(value: Any) -> None:
 
     global told
     told = True
-    print(json.dumps(value), flush=True)
+    try:
+        text = json.dumps(value, allow_nan=False)
+    except ValueError:  # JSON has no NaN and no infinity
+        text = json.dumps(json.loads(json.dumps(value), parse_constant=lambda _: None))
+    print(text, flush=True)
 
 
 def tell(as_json: bool, data: Any, text: str) -> None:

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import msgspec
 import typer
 
-from apps.cli import exits
+from apps.cli import completions, exits
 from apps.cli.interrupt import interrupt_event
 from apps.cli.link import joined
 from apps.cli.options import JsonOption, MeshOption, OnlyOption, RobotChoice, RobotOption, WithoutOption
@@ -40,7 +40,12 @@ def record(
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Where the files go.")] = Path(),
     only: OnlyOption = None,
     without: WithoutOption = None,
-    compression: Annotated[str, typer.Option(metavar="zstd|lz4|none", help="Lossless compression.")] = "zstd",
+    compression: Annotated[
+        str,
+        typer.Option(
+            metavar="zstd|lz4|none", autocompletion=completions.of("zstd", "lz4", "none"), help="Lossless compression."
+        ),
+    ] = "zstd",
     jpeg: Annotated[
         int | None,
         typer.Option(min=1, max=100, metavar="QUALITY", help="Store pictures as JPEG: lossy and far smaller."),

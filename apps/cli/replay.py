@@ -13,8 +13,10 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Annotated, Any
 
+import msgspec
 import typer
 
+from apps.captures.info import left_out_notes
 from apps.captures.player import Player
 from apps.captures.reader import Capture
 from apps.captures.replay import SIMULATOR, Replay, heard_as, played_keys, refuse_if_alive, services_of
@@ -26,7 +28,7 @@ from cocoro.bus.zenoh import ZenohBus
 from cocoro.capture.conventions import CaptureError
 from cocoro.errors import ConfigError, RefusedError
 from cocoro.keys import alive_key, service_of
-from deploy import processes
+from deploy import processes, profiles
 from deploy.rundir import RunDir, robots
 
 SHOW_S = 0.1
@@ -90,7 +92,7 @@ async def replay_file(
         keys = played_keys(capture, only, hardware)
         player = Player(capture, keys.__contains__, **options)
         services = services_of(keys) | (set(processes.hardware()) if hardware else set())
-        name = robot or _name(capture.robot, hardware)
+        name = _named(robot) if robot is not None else _name(capture.robot, hardware)
         run_dir = RunDir(name)
         run_dir.make()
         claims = run_dir.claim("replay", services)
@@ -105,7 +107,17 @@ async def replay_file(
             print(f"not played: {problem}", file=sys.stderr)
         if capture.ending:
             print(f"note: {file} was {capture.ending}", file=sys.stderr)
+        for note in left_out_notes(capture):
+            print(f"note: {note}", file=sys.stderr)
         return exits.FAILED if capture.problems else exits.DONE
+
+
+def _named(robot: str) -> str:
+    """Raises ConfigError for what can be no robot's name."""
+    try:
+        return msgspec.convert(robot, profiles.Name)
+    except msgspec.ValidationError as error:
+        raise ConfigError(f"--robot {robot}: a robot's name has 1 to 32 small letters, digits, '-' and '_'") from error
 
 
 def _name(recorded: str, hardware: bool) -> str:

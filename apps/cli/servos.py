@@ -13,7 +13,7 @@ from typing import Annotated, Any, cast
 
 import typer
 
-from apps.cli import exits
+from apps.cli import completions, exits
 from apps.cli.link import MeshLink, joined
 from apps.cli.options import (
     DescriptionOption,
@@ -46,10 +46,16 @@ REPLY_S = 0.05
 """Longest wait for one servo's reply on the serial line."""
 
 JointsArgument = Annotated[
-    list[str] | None, typer.Argument(metavar="[JOINT]...", help="Names of joints; all joints by default.")
+    list[str] | None,
+    typer.Argument(
+        metavar="[JOINT]...", autocompletion=completions.joints, help="Names of joints; all joints by default."
+    ),
 ]
 JointArguments = Annotated[
-    list[str], typer.Argument(metavar="JOINT...", help="Names of joints, worked on one after the other.")
+    list[str],
+    typer.Argument(
+        metavar="JOINT...", autocompletion=completions.joints, help="Names of joints, worked on one after the other."
+    ),
 ]
 PortOption = Annotated[
     str | None, typer.Option("--port", metavar="DEVICE", help="Serial port, instead of the profile's.")

@@ -88,7 +88,7 @@ class SnapshotTaker:
         frame, detections = self._pair or (next(reversed(self._frames.values())), None)
         _write(out, frame, detections, self._link.catalogue())
         if detections is None:
-            return f"{out}: {frame.width} x {frame.height}, without detections (perception is silent)"
+            return f"{out}: {frame.width} x {frame.height}, without detections (none came from perception)"
         self.labels = sorted(detection.label for detection in detections.detections)
         return f"{out}: {frame.width} x {frame.height}, {', '.join(self.labels) or 'nothing known'}"
 

@@ -98,7 +98,7 @@ class Survey:
     def _state(self, service: str, alive: bool) -> str:
         if not alive:
             return self._link.unheard(service)
-        return self._health[service].state if service in self._health else "silent"
+        return self._health[service].state if service in self._health else "no report"
 
     def _newest_of(self, topic: str) -> Any:
         return msgspec.to_builtins(self._newest[topic]) if topic in self._newest else None

@@ -38,7 +38,7 @@ from apps.cli.options import (
     RobotOption,
     TimeoutOption,
 )
-from cocoro.errors import CocoroError, ConfigError
+from cocoro.errors import CocoroError, ConfigError, choice_of
 from cocoro.tasks import Task
 from services.executive.tasks import TASKS
 
@@ -202,7 +202,11 @@ class RehearsalGroup(TyperGroup):
         return list(TASKS.all())
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        return _command(cmd_name, rehearse) if _is_known(cmd_name) else None
+        if _is_known(cmd_name):
+            return _command(cmd_name, rehearse)
+        if ctx is not None and not ctx.resilient_parsing and not cmd_name.startswith("-"):
+            ctx.fail(f"There is no task {cmd_name!r}; {choice_of(cmd_name, TASKS.all())}")
+        return None
 
 
 app = typer.Typer()

@@ -58,16 +58,18 @@ def table(columns: Sequence[str | Column], rows: Iterable[Sequence[str]], width:
 
 def fields(pairs: Iterable[tuple[str, str]]) -> str:
     """Returns lines `name  value` as text, the values below one another and folded to the terminal's width."""
-    from textwrap import wrap
-
     found = [(name, value) for name, value in pairs if value]
     indent = max((len(name) for name, _ in found), default=0) + GAP
-    room = max(output_width() - indent, 10)
-    lines = []
-    for name, value in found:
-        first, *rest = wrap(value, room, break_on_hyphens=False) if len(value) > room else [value]
-        lines += [f"{name:<{indent}}{first}", *(f"{'':<{indent}}{line}" for line in rest)]
-    return "".join(f"{line}\n" for line in lines)
+    return "".join(f"{line}\n" for name, value in found for line in folded(f"{name:<{indent}}", value))
+
+
+def folded(head: str, text: str, width: int | None = None) -> list[str]:
+    """The lines of `head` and `text`, folded to the terminal's width below the text's beginning."""
+    from textwrap import wrap
+
+    room = max((output_width() if width is None else width) - len(head), 10)
+    first, *rest = (wrap(text, room, break_on_hyphens=False) if len(text) > room else []) or [text]
+    return [head + first, *(" " * len(head) + line for line in rest)]
 
 
 def output_width() -> int:

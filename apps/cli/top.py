@@ -6,6 +6,7 @@ import asyncio
 import os
 import sys
 import time
+from contextlib import suppress
 from functools import partial
 from typing import Annotated, Any
 
@@ -21,16 +22,19 @@ from apps.cli.output import print_json
 from apps.cli.status import expected
 from apps.cli.top_view import Screen, print_report
 from cocoro.component import Component
+from cocoro.errors import CocoroError
 from cocoro.installed import topic_named
 from cocoro.keys import matches
 from cocoro.messages import Health, Message, TopicHealth
 from cocoro.topics import BASE_STATE, CLOCK, HEALTH, LATCH, PLAN, TASK, Topic
 from deploy import processes
+from deploy.processor import ProcessorUse, ProcessorWatch
+from deploy.rates import meant_hz
 
 FIRST_S = 2.5
 """Longest wait for the health of every live service; each publishes it once a second of the robot's time."""
-SILENT_S = 3.0
-"""A live service that publishes no health for this long hangs, or the robot's clock is paused."""
+UNREPORTED_S = 3.0
+"""A live service that publishes no health for this long of the robot's time is late, or hangs."""
 NEWS: dict[str, Topic[Any]] = {"clock": CLOCK, "task": TASK, "plan": PLAN, "latch": LATCH, "base": BASE_STATE}
 
 
@@ -47,7 +51,10 @@ def top(
 ) -> None:
     """Services and topics, live: cpu, memory, rates against nominal, ages, and what was skipped, lost or rejected.
 
-    Ctrl-C ends it. Counts are since the start; a value that is wrong now, or grows and should not, is red.
+    Ctrl-C ends it. Counts are since the start; a value that is wrong now, or grows and should not, is red. LATE is for
+    a service the share of its loop's periods that just passed without a step, for a topic the commands that came too
+    late to be obeyed. SKIPPED are messages that a newer one replaced because the reader was too slow, which is no
+    loss.
     """
     sys.exit(asyncio.run(show_top(RobotChoice(robot, profile), once, json, every)))
 
@@ -92,8 +99,12 @@ class MeshWatch:
         self._news: dict[str, Message] = {}
         self._before: dict[tuple[str, str, str], int] = {}
         """Counts of the last report, by reader, key and name of the count."""
+        self._loops: dict[str, tuple[float, int, float]] = {}
+        """By service: uptime and overruns at its last health, and the share of late periods in it."""
+        self._processor = ProcessorWatch()
+        self._resolved: dict[str, Any] = {}
         self._changed = asyncio.Event()
-        _machine()  # the CPU share is measured between two calls
+        self._machine()  # the CPU share is measured between two calls
         link.inbox(HEALTH.of("*")).add(lambda _key, health: self._on_health(health))
         for what, topic in NEWS.items():
             link.inbox(topic).add(partial(self._on_news, what))
@@ -118,15 +129,32 @@ class MeshWatch:
 
     # --- the report -------------------------------------------------------------------------------
 
+    def _machine(self) -> dict[str, Any]:
+        """Number of cores, their used share since the last call (None where /proc is not readable), and who of the
+        robot's processes of this machine waited for a processor meanwhile."""
+        try:
+            used = psutil.cpu_percent() / 100
+        except (psutil.Error, OSError):
+            used = None
+        use: ProcessorUse | None = None
+        with suppress(OSError, CocoroError):
+            use = self._processor.take({by.name: by.pid for by in self._link.run_dir.claims().values()})
+        return {
+            "cores": os.cpu_count() or 1,
+            "cpu_share": used,
+            "waited": {} if use is None else use.waited,
+            "starved": "" if use is None else use.words,
+        }
+
     def report(self) -> dict[str, Any]:
-        resolved = self._link.run_dir.resolved()
+        resolved = self._resolved = self._link.run_dir.resolved()
         rows = _rows(resolved)
         names = dict.fromkeys([*expected(resolved), *sorted(self._alive | set(self._health))])
         ordered = sorted(names, key=lambda name: _place(name, rows, list(names)))
         return {
             "robot": self._link.robot,
             "profile": resolved.get("name", ""),
-            "machine": _machine(),
+            "machine": self._machine(),
             **{what: msgspec.to_builtins(self._news.get(what)) for what in NEWS},
             "services": [self._service(name, rows.get(name)) for name in ordered],
             "topics": self._topics(),
@@ -136,17 +164,44 @@ class MeshWatch:
         health, heard_s = self._health.get(name), self._heard_s.get(name)
         silent_s = None if heard_s is None else time.monotonic() - heard_s
         alive = name in self._alive
-        hangs = alive and (silent_s is None or silent_s > SILENT_S)
+        unreported = alive and self._clock_goes and (silent_s is None or silent_s * self._clock_rate > UNREPORTED_S)
+        state = "no report" if unreported else "" if health is None else health.state
         return {
             "service": name,
             "process": row.name if row is not None else name,
             "alive": alive,
-            "state": self._link.unheard(name) if not alive else "silent" if hangs else health.state if health else "",
+            "state": state if alive else self._link.unheard(name),
             "silent_s": silent_s,
             "cpu_budget": None if row is None else row.cpu_share,
             "rss_budget_mb": None if row is None else row.rss_mb,
+            "late_share": self._late_share(health),
             "health": None if health is None else _without_topics(health),
         }
+
+    @property
+    def _clock_rate(self) -> float:
+        clock = self._news.get("clock")
+        return 1.0 if clock is None else getattr(clock, "rate", 1.0)
+
+    @property
+    def _clock_goes(self) -> bool:
+        return not getattr(self._news.get("clock"), "paused", False)
+
+    def _late_share(self, health: Health | None) -> float | None:
+        """Share of a service's loop's periods that passed without a step, because it was late, since the last report
+        that had another health; None without a loop."""
+        loop = None if health is None else max(health.loops, key=lambda loop: loop.rate_hz, default=None)
+        if health is None or loop is None:
+            return None
+        uptime_s, overruns, share = self._loops.get(health.service, (0.0, 0, 0.0))
+        passed_s = health.uptime_s - uptime_s
+        if passed_s < 0 or overruns > loop.overruns:  # it was restarted
+            uptime_s, overruns, passed_s = 0.0, 0, health.uptime_s
+        if passed_s > 0:
+            late = loop.overruns - overruns
+            share = late / max(late + loop.rate_hz * passed_s, 1.0)
+            self._loops[health.service] = (health.uptime_s, loop.overruns, share)
+        return share
 
     def _topics(self) -> list[dict[str, Any]]:
         """Every key that a service publishes, or reads although nothing publishes it; each with its readers."""
@@ -161,7 +216,7 @@ class MeshWatch:
                         read.append((service, topic))
         keys = list(sent)
         keys += dict.fromkeys(topic.key for _, topic in read if not any(matches(topic.key, key) for key in sent))
-        now = {(service, topic.key, what): getattr(topic, what) for service, topic in read for what in COUNTS}
+        now = {(service, topic.key, what): count(topic, what) for service, topic in read for what in COUNTS}
         found = [self._topic(key, sent.get(key), read) for key in keys]
         self._before = now
         return sorted(found, key=lambda topic: topic["topic"])
@@ -174,9 +229,9 @@ class MeshWatch:
         readers = [
             {
                 "service": service, "rate_hz": health.rate_hz, "age_s": health.age_s,
-                **{what: getattr(health, what) for what in COUNTS},
+                **{what: count(health, what) for what in COUNTS},
                 "growing": any(
-                    getattr(health, what) > self._before.get((service, health.key, what), getattr(health, what))
+                    count(health, what) > self._before.get((service, health.key, what), count(health, what))
                     for what in COUNTS
                 ),
                 "last_error": health.last_error,
@@ -190,23 +245,20 @@ class MeshWatch:
             "published": sent is not None,
             "count": sent[1].count if sent is not None else 0,
             "rate_hz": sent[1].rate_hz if sent is not None else 0.0,
-            "nominal_hz": None if topic is None else topic.rate_hz,
+            "nominal_hz": meant_hz(topic, self._resolved),
             "age_s": sent[1].age_s if sent is not None else None,
             "max_age_s": None if topic is None else topic.max_age_s,
             "readers": readers,
         }
 
 
-COUNTS = ("skipped", "lost", "rejected")
+COUNTS = ("skipped", "lost", "rejected", "expired")
 
 
-def _machine() -> dict[str, Any]:
-    """Number of cores, and their used share since the last call; None where /proc is not readable."""
-    try:
-        used = psutil.cpu_percent() / 100
-    except (psutil.Error, OSError):
-        used = None
-    return {"cores": os.cpu_count() or 1, "cpu_share": used}
+def count(health: TopicHealth, what: str) -> int:
+    """A count of a reader's health; here expired messages do not count as rejected."""
+    value: int = getattr(health, what)
+    return value - health.expired if what == "rejected" else value
 
 
 def _place(name: str, rows: dict[str, Component], names: list[str]) -> tuple[int, bool, int]:

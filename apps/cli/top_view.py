@@ -11,20 +11,25 @@ from rich.text import Text
 from apps.cli.terminal import PLAIN_WIDTH, Column, FittedTable
 
 SLOW, STALLED = 0.85, 0.4
-"""Shares of the nominal rate: a rate below SLOW is yellow, one below STALLED red."""
-OTHER_LINES = 7
-"""Lines of the screen beside services and topics: the headline's two, two blank ones, the topics' head, and two that
+"""Shares of the nominal rate: one below SLOW, or as far above 1, is yellow, one below STALLED red."""
+LATE, VERY_LATE = 0.01, 0.1
+"""Shares of a loop's periods without a step that are yellow and red."""
+OTHER_LINES = 8
+"""Lines of the screen beside services and topics: the headline's three, two blank ones, the topics' head, and two that
 tell what is left out."""
 BAD, DOUBTFUL, GOOD, FAINT = "bold red", "yellow", "green", "dim"
-COUNTED = ("skipped", "lost", "rejected")
+COUNTED = ("skipped", "lost", "rejected", "expired")
+WORDS = {"expired": "late"}
+"""How a count is called here, where not by its name."""
 SERVICES = (
     "service", "state", Column("pid", 4, right=True), Column("cpu", right=True), Column("memory", right=True),
     Column("loop", right=True), Column("p99", 2, right=True), Column("step", 3, right=True),
-    Column("missed", right=True), Column("up", 5, right=True), Column("", text=True),
+    Column("late", right=True), Column("up", 5, right=True), Column("", text=True),
 )  # fmt: skip
 TOPICS = (
     "topic", Column("from", 3), Column("rate", right=True), Column("nominal", right=True), Column("age", right=True),
     Column("skipped", right=True), Column("lost", right=True), Column("rejected", right=True),
+    Column("late", right=True),
     Column("read by", 2, text=True),
 )  # fmt: skip
 
@@ -97,6 +102,8 @@ def _headline(report: dict[str, Any]) -> Text:
     if (base := report["base"]) is not None:
         text.append(f"  battery {100 * base['battery_fraction']:.0f}%")
     text.append("\n")
+    if machine.get("starved"):
+        text.append(f"{machine['starved']}\n", BAD)
     task, plan = report["task"], report["plan"]
     if task is not None and task["task_id"]:
         name = f"{task['task']} {task['label']}".strip()
@@ -111,7 +118,7 @@ def _headline(report: dict[str, Any]) -> Text:
 # --- services -------------------------------------------------------------------------------------
 
 
-BAD_STATES = ("not alive", "no contact", "silent")
+BAD_STATES = ("not alive", "no contact", "no report")
 
 
 def _services(services: list[dict[str, Any]], fold: bool) -> FittedTable:
@@ -127,8 +134,8 @@ def _service(service: dict[str, Any], shown: dict[int, str]) -> list[str | Text]
         return [service["service"], state, *[""] * 9]
     loop = max(health["loops"], key=lambda loop: loop["rate_hz"], default=None)
     text = "; ".join(filter(None, (health["text"], *health["faults"])))
-    if service["state"] == "silent" and service["silent_s"] is not None:
-        text = f"silent for {service['silent_s']:.0f} s"
+    if service["state"] == "no report" and service["silent_s"] is not None:
+        text = f"no report of its health for {service['silent_s']:.0f} s"
     pid = health["pid"]
     costs: list[str | Text]
     if pid in shown:  # several services in one process: its cost is shown once
@@ -146,12 +153,19 @@ def _service(service: dict[str, Any], shown: dict[int, str]) -> list[str | Text]
         "" if loop is None else f"{loop['rate_hz']:.1f} Hz",
         "" if loop is None else f"{loop['period_p99_ms']:.1f} ms",
         "" if loop is None else f"{loop['step_median_ms']:.1f} ms",
-        "" if loop is None else str(loop["overruns"]),
+        _late(service.get("late_share")),
         _duration(health["uptime_s"]), text,
     ]  # fmt: skip
     return (
         [row[0], row[1], *[""] * 8, Text(f"{'was' if dead else 'pid'} {pid}", FAINT)] if not service["alive"] else row
     )
+
+
+def _late(share: float | None) -> Text:
+    if share is None:
+        return Text("")
+    style = BAD if share > VERY_LATE else DOUBTFUL if share > LATE else FAINT if share == 0 else ""
+    return Text(f"{share:.0%}", style)
 
 
 def _cost(value: float, budget: float, unit: str) -> Text:
@@ -191,7 +205,7 @@ def _topic(topic: dict[str, Any]) -> list[str | Text]:
 
 def _rate(rate_hz: float, nominal_hz: float | None) -> Text:
     share = 1.0 if not nominal_hz else rate_hz / nominal_hz
-    return Text(f"{rate_hz:.1f} Hz", BAD if share < STALLED else DOUBTFUL if share < SLOW else "")
+    return Text(f"{rate_hz:.1f} Hz", BAD if share < STALLED else DOUBTFUL if not SLOW <= share <= 2 - SLOW else "")
 
 
 def _age(topic: dict[str, Any]) -> Text:
@@ -210,7 +224,7 @@ def _count(readers: list[dict[str, Any]], what: str) -> Text:
     if not total:
         return Text("0" if readers else "", FAINT)
     grows = what != "skipped" and any(reader[what] and reader["growing"] for reader in readers)
-    return Text(str(total), BAD if grows else "")
+    return Text(str(total), "" if not grows else DOUBTFUL if what == "expired" else BAD)
 
 
 def _read_by(readers: list[dict[str, Any]]) -> Text:
@@ -219,7 +233,7 @@ def _read_by(readers: list[dict[str, Any]]) -> Text:
     for number, reader in enumerate(readers):
         text.append(", " if number else "")
         text.append(reader["service"])
-        missed = [f"{reader[what]} {what}" for what in COUNTED if reader[what]]
+        missed = [f"{reader[what]} {WORDS.get(what, what)}" for what in COUNTED if reader[what]]
         if missed and len(readers) > 1:
             text.append(f" ({', '.join(missed)})", FAINT)
         if reader["rejected"] and reader["last_error"]:

@@ -16,6 +16,7 @@ import msgspec
 import typer
 
 from apps.captures.export.viewer import Attempt, Pulse, Target, ViewerProcess, refuse_nobody, sent, temporary_rrd
+from apps.captures.info import left_out_notes
 from apps.captures.reader import Capture
 from apps.cli import exits
 from apps.cli.export import progress_bar
@@ -109,6 +110,8 @@ def view_file(file: Path, target: Target, sim: bool = False) -> int:
             _show(capture, target, stage, export)
         for problem in capture.problems:
             print(f"missing: {problem}", file=sys.stderr)
+        for note in left_out_notes(capture):
+            print(f"note: {note}", file=sys.stderr)
         return exits.FAILED if capture.problems else exits.DONE
 
 
@@ -142,7 +145,7 @@ async def view_mesh(choice: RobotChoice, target: Target, sim: bool = False) -> i
     display, MeshError when there is no mesh.
     """
     from apps.captures.export.files import making
-    from apps.captures.export.rerun_scene import APPLICATION, RerunScene, library
+    from apps.captures.export.rerun_scene import APPLICATION, RerunScene, flush, library
 
     rerun = library()
     target.check()
@@ -175,10 +178,11 @@ async def view_mesh(choice: RobotChoice, target: Target, sim: bool = False) -> i
             if viewer is not None and viewer.failed:
                 raise CaptureError(viewer.reason())
             if viewer is None or not viewer.ended:
-                ended = writing.join(FLUSH_S) and Attempt(recording.flush).join(FLUSH_S)
-                if not ended:
+                flushing = Attempt(partial(flush, recording, target.save) if target.save else recording.flush)
+                if not (writing.join(FLUSH_S) and flushing.join(FLUSH_S)):
                     raise CaptureError(f"the viewer took nothing any more; {waiting.dropped} messages were not shown")
                 writing.result()
+                flushing.result()
             return exits.DONE
         finally:
             if viewer is not None:

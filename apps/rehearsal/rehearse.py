@@ -35,6 +35,9 @@ from cocoro.tasks import Task
 from cocoro.vloop import run_virtual
 from deploy.delayed import DelayedNode
 from deploy.processes import named, needs
+from services.executive.tasks.follow import CATCH_UP_S, WITHIN_M
+from services.planning.config import FollowConfig
+from sim.coverage import CoverageJudge
 from sim.judge import Judge, PursuitJudge
 from sim.random_scene import find_scene
 from sim.realism import REALISM, body_of, wheel_scales
@@ -82,6 +85,10 @@ class _Rehearsal:
         self._judge = self._judge_of(self._task)
         self._body = body_of(self._robot, request.body, request.seed).robot
         self._trace = Trace(self._body, self._present(self._task))
+        self._coverage = (
+            CoverageJudge(self._robot, self._scene, request.seen_within_m) if request.seen_within_m else None
+        )
+        self._asked = False
         self._steps: list[dict[str, Any]] = []
         """Results of the tasks that have ended, in order."""
         self._frame: Frame | None = None
@@ -145,11 +152,16 @@ class _Rehearsal:
     def _judge_of(self, task: Task) -> Judge | PursuitJudge:
         present = self._present(task)
         if task.pursuit_phase and present:
-            return PursuitJudge(self._robot, self._scene, present)
+            return PursuitJudge(
+                self._robot, self._scene, present,
+                distance_m=FollowConfig().distance_m, within_m=WITHIN_M, catch_up_s=CATCH_UP_S,
+            )  # fmt: skip
         return Judge(self._scene, present)
 
     def _feed_judge(self, truth: Truth) -> None:
         self._judge.feed(truth)
+        if self._coverage is not None and self._asked:
+            self._coverage.feed(truth)
 
     def _settings(self, name: str) -> dict[str, Any]:
         request = self._request
@@ -188,7 +200,7 @@ class _Rehearsal:
                 task = replace(task, first=self._collector.next, count=max(left, 1))
             question = TaskRequest(task=task, timeout_s=request.timeout_s)
             self._trace.begin(self._present(task))
-            asked_ns = operator.now_ns()
+            asked_ns, self._asked = operator.now_ns(), True
             reply = await self._ask(operator, question)
             while reply.refusal in ("not_alive", "estop") and operator.now_ns() - asked_ns < START_S * NS:
                 await operator.sleep(0.1)
@@ -237,6 +249,7 @@ class _Rehearsal:
                 "outcome": state.outcome,
                 "reason": state.reason,
                 "sim_s": round(state.elapsed_s, 3),
+                "measures": state.measures,
                 "hand_to_target": self._trace.hand_gap(),
                 "target_edge_m": edge_m,
                 "longest_stall_s": round(self._trace.longest_stall_s(), 3),
@@ -296,6 +309,7 @@ class _Rehearsal:
             "reason": state.reason,
             "sim_s": round(state.elapsed_s, 3),
             "wall_s": 0.0,
+            "measures": state.measures,
             "phases": [
                 {"name": phase.name, "sim_s": round(((phase.end_ns or state.stamp_ns) - phase.start_ns) / NS, 3)}
                 for phase in state.phases
@@ -303,5 +317,6 @@ class _Rehearsal:
             "truth": msgspec.to_builtins(self._judge.result()),
             "tasks": self._steps,
             "body": self._true_body(),
+            **({} if self._coverage is None else {"seen_floor": msgspec.to_builtins(self._coverage.result())}),
             **({"trace": self._trace.data()} if request.trace else {}),
         }

@@ -55,6 +55,8 @@ class RehearsalRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
     """File for the last picture of the task's snapshot phase (PNG)."""
     objects: str | None = None
     """File of known objects in place of the project's own."""
+    seen_within_m: Annotated[float, Meta(gt=0, le=3)] | None = None
+    """Judge by the truth which floor the camera saw within this distance of where the tasks began."""
     trace: bool = False
     """Add to the result how everything moved, by the truth and by the robot's own estimate."""
     record: str | None = None

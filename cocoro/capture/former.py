@@ -23,15 +23,8 @@ RENAMED = {"Clock": "ClockTick"}
 
 _INTENT_FIELDS = ("stamp_ns", "seq", "incarnation", "task_id", "step")
 _ACTION_FIELDS: Mapping[str, Mapping[str, Any]] = {
-    "search": {"label": ""},
-    "explore": {"label": ""},
-    "approach": {"label": ""},
-    "reach": {"label": ""},
-    "grasp": {"label": ""},
-    "lift": {"label": ""},
+    **{key: {"label": ""} for key in ("search", "explore", "approach", "reach", "grasp", "lift", "follow", "touch")},
     "carry": {"label": "", "place_m": [0.0, 0.0]},
-    "follow": {"label": ""},
-    "touch": {"label": ""},
     "go-to": {"label": "", "distance_m": 0.0},
     "babble-arm": {"first": 0, "count": 0},
     "babble-wheels": {"label": "", "first": 0, "count": 0},

@@ -36,6 +36,8 @@ class TaskState(Message):
     """For failed and cancelled tasks: a word (not_found, lost, slipped, unreachable, timed_out, ...), a colon, and a
     sentence."""
     elapsed_s: Finite = 0.0
+    measures: dict[str, Finite] = {}
+    """The task's own figures on how well it goes, by name; which ones is said where the task is described."""
 
 
 class TaskRequest(msgspec.Struct, kw_only=True):

@@ -17,11 +17,14 @@ class TopicHealth(msgspec.Struct, kw_only=True):
     age_s: Finite | None = None
     """Age of the newest message by its stamp at the time of this report; None without a message."""
     skipped: Count = 0
-    """State messages that a newer one replaced before they were read."""
+    """Messages that a newer one replaced because the reader was too slow for them. One that a newer one replaced for a
+    reader that looks at its own times is not counted."""
     lost: Count = 0
     """Messages missing from the sequence."""
     rejected: Count = 0
     """Messages that were dropped as malformed, of a wrong type, oversized, out of order or untimely."""
+    expired: Count = 0
+    """Of the rejected: commands that were good but older than a command may be, because somebody was late."""
     last_error: str = ""
     """The reason of the last rejection."""
     fault: str = ""

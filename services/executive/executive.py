@@ -108,6 +108,7 @@ class Executive:
         now_ns = self._node.now_ns()
         task_id = f"{task.name}-{now_ns}-{self._count}"
         self.state = TaskState(task_id=task_id, task=task.name, label=task.target, phase="start", started_ns=now_ns)
+        self._skills.measures = self.state.measures
         self._asker = request.asker
         self._ended = asyncio.get_running_loop().create_future()
         timeout_s = request.timeout_s or task.limit_s(self._config)

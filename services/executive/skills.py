@@ -41,6 +41,8 @@ class PlannerSkills:
         self.waits = ""
         """Why a task waits for the planner; empty when it does not."""
         self.intent = Intent(action=Idle())
+        self.measures: dict[str, float] = {}
+        """The running task's."""
         node.spawn(self._repeat(config.intent_hz))
 
     @property
@@ -95,20 +97,28 @@ class PlannerSkills:
             raise TaskFailedError("timed_out", f"{action.name} took over {timeout_s:g} s: {why}")
         return ended
 
-    async def keep_doing(self, action: Action, *, until_s: float) -> None:
+    async def keep_doing(
+        self, action: Action, *, until_s: float, watch: Callable[[PlannerStatus], None] = lambda status: None
+    ) -> None:
         self._begin(action)
-        await self._watch(until_s)
+        await self._watch(until_s, watch)
+
+    def measure(self, name: str, value: float) -> None:
+        self.measures[name] = round(value, 3)
 
     def _begin(self, action: Action) -> None:
         self._phase(action.name)
         self.want(action, self.intent.task_id)
 
-    async def _watch(self, until_s: float) -> PlannerStatus | None:
-        """Wait until the planner reports the wanted action as done; None when it is not by `until_s`. Raises
-        TaskFailedError when it reports a failure."""
+    async def _watch(
+        self, until_s: float, watch: Callable[[PlannerStatus], None] = lambda status: None
+    ) -> PlannerStatus | None:
+        """Wait until the planner reports the wanted action as done; None when it is not by `until_s`. `watch` gets each
+        status of the action. Raises TaskFailedError when it reports a failure."""
         while True:
             status = await self._next_status()
             if self._answers(status):
+                watch(status)
                 if status.state == "done":
                     return status
                 if status.state == "failed":

@@ -154,8 +154,10 @@ class FollowConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_speed_mps: Positive = 0.48
     gain_per_s: Positive = 1.2
     turn_gain_per_s: Positive = 2.4
+    round_speed_mps: Positive = 0.40
+    """Speed on the way round what stands between."""
     lost_s: Positive = 1.0
-    """After this time unseen the target is searched in its last direction of motion."""
+    """After this time unseen the target is looked for where it was last going."""
     give_up_s: Positive = 25.0
 
 

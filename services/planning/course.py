@@ -7,6 +7,7 @@ reaches an obstacle.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from math import atan2, cos, hypot, pi, sin
 from typing import Literal, NamedTuple
 
@@ -60,14 +61,16 @@ class Course:
         arm: Literal["last", "out", "folded"],
         arrive_m: float | None = None,
         swing_m: FloatArray | None = None,
+        serves: Callable[[Pose2], bool] | None = None,
     ) -> None:
         """`arm`: where the arm is extended: on the `last` stretch, all the way (`out`), or nowhere (`folded`).
 
         `arrive_m`: distance from the aim that counts as arrived; None: the driver's tolerances. `swing_m`: floor
         positions (n, 2), body frame, metres, that the arm sweeps while it unfolds; they must be free before the last
-        stretch.
+        stretch. `serves`: which poses before the target are good for what comes then; None: all.
         """
         self._swing = swing_m
+        self._serves = serves or (lambda pose: True)
         self._config = config.navigation
         self._aim_m = aim_m
         self._arm_out = arm == "out"
@@ -100,7 +103,7 @@ class Course:
         x, y, _ = body.inverse().apply((*target_m, 0.0))
         offset = offset_to((x, y), self._aim_m)
         near_enough = self._arrive_m is not None and hypot(x - self._aim_m[0], y - self._aim_m[1]) < self._arrive_m
-        if near_enough or driver.arrived(offset):
+        if (near_enough or driver.arrived(offset)) and self._serves(body):
             return Move(0.0, 0.0, abs(offset.ahead_m), "there", True, arrived=True)
         if self._planned_ns is None or now_ns - self._planned_ns >= _REPLAN_NS:
             self._planned_ns = now_ns
@@ -129,7 +132,8 @@ class Course:
         preview = [body.compose(pose) for pose in driver.preview((x, y), self._aim_m)]
         # Hysteresis: on the last stretch, with the hand extended, smaller margins do.
         share = 0.5 if self._last_stretch else 1.0
-        if self._free(preview, fields, share, arm_from_m=self._stretch_m) and self._unfolds_on(preview, fields):
+        free = self._free(preview, fields, share, arm_from_m=self._stretch_m) and self._unfolds_on(preview, fields)
+        if free and self._serves(preview[-1]):
             self._detour = None
             self._last_stretch = True
             return
@@ -189,7 +193,7 @@ class Course:
             cost = routes.cost(stretch[0].x_m, stretch[0].y_m)
             if not np.isfinite(cost) or not self._free_stretch(stretch, fields):
                 continue
-            if not self.roomy(stretch[0], fields):
+            if not self.roomy(stretch[0], fields) or not self._serves(end):
                 continue
             bearing = atan2(stretch[0].y_m - body.y_m, stretch[0].x_m - body.x_m)
             cost += 0.25 * abs(wrap_rad(yaw - bearing))

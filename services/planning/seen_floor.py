@@ -23,6 +23,8 @@ from services.planning.floor_map import CELL_M, SIZE, FloorMap, overlap
 from services.planning.head import PAN, TILT
 
 _STRETCH_BYTES = 6
+_DOUBT = np.ones((3, 3), dtype=np.uint8)
+"""A cell at the edge of what a scan shows does not count: the odometry is off by a few centimetres."""
 _SPREAD_DEG = (0.25, 0.75)
 """A stretch is a degree wide."""
 _ENOUGH = 2
@@ -38,6 +40,8 @@ _CORNER_CELLS = 4
 _OPAQUE_CELLS = 1
 _APART_M = 0.18
 """Places to look from are further than this from those that were looked from."""
+_NEAREST_M = 0.30
+"""Nearer floor is not visible from a place: the body hides it."""
 _NEAR_M, _NEAR_SHARE = 1.0, 0.5
 """Floor nearer than this to a place to look from counts by this share."""
 _MOUNT_M = 0.01
@@ -121,9 +125,10 @@ class SeenFloor:
         flat = self._flat(
             x + (np.cos(bearings)[:, None] * steps)[inside], y + (np.sin(bearings)[:, None] * steps)[inside]
         )
-        cells = self._count.reshape(-1)
-        numbers = np.unique(flat[flat >= 0])
-        cells[numbers] = np.minimum(cells[numbers] + 1, _ENOUGH)
+        cells = np.zeros(SIZE * SIZE, dtype=np.uint8)
+        cells[flat[flat >= 0]] = 1
+        sure = cv2.erode(cells.reshape(SIZE, SIZE), _DOUBT).astype(bool)
+        self._count[sure] = np.minimum(self._count[sure] + 1, _ENOUGH)
 
     def stand_at(self, body: Pose2) -> None:
         """Count the floor under the body as seen."""
@@ -256,7 +261,10 @@ class SeenFloor:
 
     def _hidden(self, around: FloorMap, known: Sequence[tuple[float, ...]]) -> BoolArray:
         wide = np.ones((2 * _BESIDE_CELLS + 1,) * 2, dtype=np.uint8)
-        beside = cv2.dilate(self._things(around, known).astype(np.uint8), wide).astype(bool)
+        occupied = self._aligned(around, around.occupied(), beyond=False)
+        beside = cv2.dilate(occupied.astype(np.uint8), wide).astype(bool)
+        for x, y, radius in known:
+            beside |= self._disc(x, y, radius + CELL_M / 2)
         hidden = (self._count < _ENOUGH) & ~beside & ~self._beyond()
         # What is narrower than two cells hides no object.
         block = hidden[:-1, :-1] & hidden[1:, :-1] & hidden[:-1, 1:] & hidden[1:, 1:]
@@ -287,7 +295,7 @@ class SeenFloor:
         opaque = cv2.dilate(things.astype(np.uint8), np.ones((2 * _OPAQUE_CELLS + 1,) * 2, np.uint8)).reshape(-1) > 0
         stopped = np.logical_or.accumulate(opaque[flat] | (flat < 0), axis=-1)
         unknown = np.cumsum((self._count.reshape(-1) < _ENOUGH)[flat], axis=-1) * float(steps_m[1] - steps_m[0])
-        return flat, ~stopped & (unknown <= self._config.margin_m)
+        return flat, ~stopped & (unknown <= self._config.margin_m) & (steps_m >= _NEAREST_M)
 
     def _flat(self, x_m: FloatArray, y_m: FloatArray) -> IntArray:
         rows = np.floor(x_m / CELL_M).astype(np.int64) - self._corner[0]

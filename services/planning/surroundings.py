@@ -11,6 +11,7 @@ from cocoro.arrays import FloatArray
 from cocoro.clock import NS
 from cocoro.frames import Pose2
 from cocoro.messages import TargetEstimate
+from cocoro.units import Vec3
 from services.planning.floor_map import ClearanceField, FloorMap
 from services.planning.routes import Routes
 
@@ -88,6 +89,14 @@ class Surroundings:
             cell = self.floor.cell(float(x), float(y))
             hidden.append(cell is not None and not looked[cell])
         return np.array(hidden, dtype=bool)
+
+    def sees(self, from_m: Vec3, to_m: Vec3) -> bool:
+        """Whether nothing on the map hides a place from another, both odometry frame, m. What stands within 0.2 m of
+        the first or 0.1 m of the second does not count."""
+        start, end = np.array(from_m), np.array(to_m)
+        away_m = float(np.hypot(*(end - start)[:2]))
+        shares = np.arange(0.2, away_m - 0.1, 0.02) / max(away_m, 1e-6)
+        return not self.floor.taller(start + shares[:, None] * (end - start)).any()
 
     def routes(self, field: ClearanceField, body: Pose2, radius_m: float, comfort_m: float) -> Routes:
         return Routes(self.floor, field, (body.x_m, body.y_m), radius_m, comfort_m)

@@ -16,7 +16,16 @@ import msgspec
 import numpy as np
 
 from apps.captures.export.files import making
-from apps.captures.export.geometry import CAMERA, Posture, about_z, conjugate, points, quaternion, rotated
+from apps.captures.export.geometry import (
+    CAMERA,
+    POINTS_PERIOD_NS,
+    Posture,
+    about_z,
+    conjugate,
+    points,
+    quaternion,
+    rotated,
+)
 from apps.captures.export.story import catalogue_of, robot_of
 from apps.captures.reader import Capture, Record
 from apps.captures.rewrite import info_in
@@ -38,8 +47,8 @@ from cocoro.messages import (
 )
 from cocoro.objects import ObjectSpec
 from cocoro.units import Vec3
-from services.capture.file import Packer
 from services.capture.keys import KeyInfo, QueuedMessage
+from services.capture.packing import Packer
 from services.capture.writer import CaptureWriter, FileLimits
 
 try:
@@ -51,8 +60,6 @@ ODOMETRY, BODY = "odometry", "body"
 """Names of coordinate frames; each link's frame has the link's name."""
 DEPTH_STEP = 4
 """Every so many rows and columns of the depth image become points."""
-POINTS_PERIOD_NS = NS // 10
-"""Least time between two clouds of points. With all of them they would be nine tenths of the file."""
 POINT_STEP_M = 2.0**-10
 """Points are rounded to this, a fifth of the sensor's step at 1.5 m: then the compression finds what is equal."""
 LATE_NS = 2 * NS

@@ -8,6 +8,7 @@ from math import cos, sin
 import numpy as np
 
 from cocoro.arrays import Float32Array, FloatArray, ImageArray
+from cocoro.clock import NS
 from cocoro.frames import Pose2
 from cocoro.kinematics import Tree
 from cocoro.messages import BaseState, Frame, ServoState
@@ -15,6 +16,8 @@ from cocoro.robot import Robot
 from cocoro.units import Quaternion, Vec3
 
 CAMERA = "camera"
+POINTS_PERIOD_NS = NS // 10
+"""Least time between two clouds of points. With one for each frame they would be nine tenths of a viewer's file."""
 
 
 def quaternion(turn: FloatArray) -> Quaternion:

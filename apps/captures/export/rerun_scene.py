@@ -6,6 +6,7 @@ stage the simulated robot and its scene are there too, seen from outside. Needs 
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,7 +14,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from apps.captures.export.files import making
-from apps.captures.export.geometry import CAMERA, Posture, about_z, conjugate, points, quaternion, rotated
+from apps.captures.export.geometry import (
+    CAMERA,
+    POINTS_PERIOD_NS,
+    Posture,
+    about_z,
+    conjugate,
+    points,
+    quaternion,
+    rotated,
+)
 from apps.captures.export.story import catalogue_of, robot_of
 from apps.captures.reader import Capture
 from apps.pictures import describe
@@ -48,10 +58,12 @@ BONE, UNKNOWN, TRUE = (217, 217, 230), (255, 255, 255), (50, 230, 80)
 
 def library() -> Any:
     """The rerun package. Raises CaptureError with the command that installs it."""
+    os.environ.setdefault("RUST_LOG", "off")  # its errors are raised as well, and told once
     try:
         import rerun
     except ModuleNotFoundError as error:
         raise CaptureError("this needs Rerun: pip install 'cocoro-mesh[view]'") from error
+    rerun.unregister_shutdown()  # at the process's end it would wait for ever for a viewer that takes nothing
     return rerun
 
 
@@ -68,8 +80,16 @@ def export(
         recording = rr.RecordingStream(APPLICATION)
         recording.save(str(out))
         count = log_capture(capture, recording, progress, stage)
-        recording.flush()
+        flush(recording, out)
         return count
+
+
+def flush(recording: Any, out: Path) -> None:
+    """Wait until everything is in the file. Raises CaptureError when it is not."""
+    try:
+        recording.flush()
+    except RuntimeError as error:
+        raise CaptureError(f"{out}: it could not be written to its end ({error}); make room there") from error
 
 
 def log_capture(
@@ -104,6 +124,8 @@ class RerunScene:
         self._posture = Posture(robot)
         self._phase = ""
         self._why = ""
+        self._cloud_ns = -POINTS_PERIOD_NS
+        """Stamp of the newest cloud of points."""
         self._stage: StageLogger | None = None
         self._log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         if stage is not None:
@@ -146,6 +168,9 @@ class RerunScene:
         )  # fmt: skip
         pixels = np.frombuffer(frame.colour, dtype=np.uint8).reshape(frame.height, frame.width, 3)
         self._log("world/body/camera/colour", rr.Image(pixels).compress(jpeg_quality=JPEG_QUALITY))
+        if 0 <= frame.stamp_ns - self._cloud_ns < POINTS_PERIOD_NS:
+            return
+        self._cloud_ns = frame.stamp_ns
         places, colours = points(frame, self._robot, DEPTH_STEP)
         links = self._posture.links()
         if links:  # below the body, because entities below a camera are drawn into its picture

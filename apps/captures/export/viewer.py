@@ -110,6 +110,7 @@ class ViewerProcess:
         elif file is None:
             options.append("--expect-data-soon")
         self._port = data_port
+        self._was_ready = False
         self._bind = target.bind
         self._said = tempfile.TemporaryFile()  # noqa: SIM115 # closed by `close`
         command = [_program(), *([str(file)] if file is not None else []), *options]
@@ -129,6 +130,7 @@ class ViewerProcess:
                 raise CaptureError(self.reason())
             with suppress(OSError):
                 socket.create_connection((_reached(self._bind), self._port), 1.0).close()
+                self._was_ready = True
                 return
             time.sleep(0.05)
         raise CaptureError(f"Rerun's viewer takes no data within {START_S:.0f} s; {INSTEAD}")
@@ -148,6 +150,8 @@ class ViewerProcess:
         lines = self._said.read().decode(errors="replace").splitlines()
         errors = [line.removeprefix("Error: ") for line in lines if line.startswith("Error: ")]
         why = f": {errors[-1].rpartition('.rs:')[2].partition(': ')[2] or errors[-1]}" if errors else ""
+        if self._was_ready:
+            return f"Rerun's viewer has ended{why or f' with exit code {self._process.returncode}'}"
         return f"Rerun's viewer could not be opened{why}; {INSTEAD}"
 
     def wait(self) -> None:
@@ -224,7 +228,7 @@ class Attempt(Generic[R]):
     def result(self) -> R:
         """Its result, once it has ended. Raises its error, and CaptureError for one of Rerun's."""
         if isinstance(self._error, RuntimeError | OSError):
-            raise CaptureError(f"Rerun's viewer has gone: {self._error}") from self._error
+            raise CaptureError(f"not all was taken: {self._error}") from self._error
         if self._error is not None:
             raise self._error
         return self._result[0]

@@ -10,7 +10,8 @@ from cocoro.messages import actions
 from cocoro.messages.actions import Action
 from services.planning.behaviours.babbling import ArmBabbling, WheelBabbling
 from services.planning.behaviours.base import Actuators, Behaviour, Plan, Snapshot
-from services.planning.behaviours.driving import Approaching, Carrying, Following
+from services.planning.behaviours.driving import Approaching, Carrying
+from services.planning.behaviours.following import Following
 from services.planning.behaviours.going import Going
 from services.planning.behaviours.handling import Closing, Lifting, PuttingDown, Reaching
 from services.planning.behaviours.looking import Exploring, Idling, Parking, Searching

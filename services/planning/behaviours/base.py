@@ -44,6 +44,8 @@ class Actuators:
     unfolding: FloatArray = field(init=False)
     """Places on the floor, (n, 2), body frame, m, over which the arm swings when it unfolds."""
     camera_tilt: CameraTilt = field(init=False)
+    camera_m: float = field(init=False)
+    """Height of the camera above the floor."""
     ready_on_the_way: bool = True
     """The hand gets ready for a target while the base drives. Otherwise it stays parked until the base stands."""
     grasp_height_m: float = 0.065
@@ -59,6 +61,7 @@ class Actuators:
         self.reachability = Reachability(config.arm, self.reacher)
         self.unfolding = self._unfolding()
         self.camera_tilt = CameraTilt(robot)
+        self.camera_m = float(robot.chain("camera").pose(dict.fromkeys(robot.joints, 0.0))[2, 3])
 
     def _unfolding(self) -> FloatArray:
         arm = ArmController(self.robot, self.config.arm, self.reacher)

@@ -1,18 +1,16 @@
-"""Driving behaviours: to a target, with something in the hand to a place, and after a moving target."""
+"""Driving behaviours: to a target, and with something in the hand to a place."""
 
 from __future__ import annotations
 
-from collections import deque
-from math import atan2, cos, hypot, sin
+from math import cos, sin
 
 from cocoro.clock import NS
 from cocoro.frames import Pose2
 from cocoro.messages import BaseState, TargetEstimate
-from cocoro.messages.actions import Approach, Carry, Follow
+from cocoro.messages.actions import Approach, Carry
 from services.planning.arm import ArmStep
-from services.planning.behaviours.base import Actuators, Plan, Snapshot, hand_place, planar_m
+from services.planning.behaviours.base import Actuators, Plan, Snapshot, hand_place
 from services.planning.course import Course, Move
-from services.planning.head import PAN, TILT, Sweep
 from services.planning.reach import HandPose
 from services.planning.surroundings import Fields
 
@@ -122,8 +120,8 @@ class Approaching:
     def _touched(self, snapshot: Snapshot) -> None:
         """Enter an unseen obstacle, which holds up the arm, in the map at the hand's place."""
         self._stalls += 1
-        x, y, _ = snapshot.body.apply(hand_place(snapshot))
-        snapshot.estimator.around.floor.bump([(x, y)])
+        x, y, z = snapshot.body.apply(hand_place(snapshot))
+        snapshot.estimator.around.floor.bump([(x, y)], z)
         snapshot.actuators.arm.resync()
 
     def _room_here(self, snapshot: Snapshot, fields: Fields) -> bool:
@@ -238,69 +236,6 @@ class Carrying:
         if move.arrived and snapshot.standing:
             plan.state, plan.why = "done", "at the place to put it down"
         return plan
-
-
-class Following:
-    """Keeps a set distance to a moving target with head and base. The target's velocity is fed forward, so that the
-    distance does not lag. When the target is lost the head looks where it was going before it searches."""
-
-    needs_sight = True
-
-    def __init__(self, action: Follow) -> None:
-        self._label = action.label
-        self._trail: deque[tuple[int, tuple[float, float]]] = deque(maxlen=400)
-        self._sweep: Sweep | None = None
-
-    def step(self, snapshot: Snapshot) -> Plan:
-        actuators, config = snapshot.actuators, snapshot.actuators.config.follow
-        target = snapshot.target(self._label)
-        if target is None:
-            return Plan(snapshot.stand(), snapshot.still(), f"{self._label} is unknown", None, "failed", "lost")
-        if target.age_s > config.give_up_s:
-            why = f"{self._label} has not been seen for {target.age_s:.0f} s"
-            return Plan(snapshot.stand(), snapshot.still(), why, None, "failed", "lost")
-        arm = actuators.arm.park(snapshot.angles, snapshot.dt_s)
-        if target.age_s > config.lost_s + snapshot.estimator.sight_lag_s:
-            return self._look_for(snapshot, target, arm)
-        self._sweep = None
-        self._trail.append((snapshot.now_ns, target.odometry_position_m[:2]))
-        x, y, _ = target.position_m
-        distance, bearing = hypot(x, y), atan2(y, x)
-        vx, vy, _ = snapshot.body.inverse().rotate(target.velocity_mps)
-        # Velocity along and across the line of sight.
-        along = (vx * x + vy * y) / max(distance, 0.2)
-        across = (x * vy - y * vx) / max(distance, 0.2)
-        gap = distance - config.distance_m
-        speed = (along + config.gain_per_s * gap) * max(cos(bearing), 0.0)
-        speed = min(max(speed, -0.25), config.max_speed_mps)
-        turn = config.turn_gain_per_s * bearing + across / max(distance, 0.3)
-        move = Move(speed, turn, abs(gap), f"{distance:.2f} m behind it, {gap:+.2f} m to make up", False)
-        fields = snapshot.fields(self._label, self._ignored(snapshot.now_ns))
-        watcher = Course(actuators.robot, actuators.config, (0.0, 0.0), arm="folded")
-        if watcher.guarded(move, snapshot.body, fields, actuators.driver):
-            move = move._replace(speed_mps=0.0, why="something is between us")
-        base = actuators.driver.command(move.speed_mps, move.turn_radps, snapshot.dt_s, brisk=True)
-        return Plan(base, arm, move.why, snapshot.look_at(target.position_m), distance_m=distance)
-
-    def _look_for(self, snapshot: Snapshot, target: TargetEstimate, arm: ArmStep) -> Plan:
-        pan, tilt = snapshot.angles[PAN], snapshot.angles[TILT]
-        if target.age_s < 3.0:
-            head = snapshot.look_at(target.position_m)
-            turn = 1.5 * atan2(target.position_m[1], target.position_m[0])
-            base = snapshot.actuators.driver.command(0.0, turn, snapshot.dt_s)
-            return Plan(base, arm, "lost it: looking where it was going", head, distance_m=planar_m(target))
-        if self._sweep is None or self._sweep.done:
-            self._sweep = Sweep(snapshot.actuators.config.head, pan)
-        head = (*self._sweep.next(pan, tilt), snapshot.actuators.config.head.sweep_speed_radps)
-        return Plan(snapshot.stand(), arm, "lost it: searching", head, distance_m=planar_m(target))
-
-    def _ignored(self, now_ns: int) -> tuple[tuple[float, float, float], ...]:
-        """Circles (x, y, radius), odometry frame, m, around recent places of the target: the map may still show it."""
-        while self._trail and now_ns - self._trail[0][0] > 8 * NS:
-            self._trail.popleft()
-        return tuple((x, y, 0.15) for _, (x, y) in list(self._trail)[::10]) + tuple(
-            (x, y, 0.15) for _, (x, y) in list(self._trail)[-1:]
-        )
 
 
 def _waiting(move: Move, why: str) -> Move:
