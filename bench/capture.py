@@ -45,7 +45,7 @@ from cocoro.messages import BaseState, Frame
 from cocoro.node import Node
 from cocoro.robot import Robot
 from deploy.rundir import RunDir
-from services.capture.file import Packer
+from services.capture.packing import Packer
 from services.executive.tasks import FetchTask
 
 COCORO = [sys.executable, "-m", "apps.cli.main"]

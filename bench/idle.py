@@ -23,13 +23,14 @@ from apps.captures.reader import Capture
 from bench.ended import cocoro, leave_when_ended
 from cocoro.clock import NS
 from deploy.rundir import RunDir
-from services.capture.file import LARGE_BYTES, Packer
+from services.capture.file import LARGE_BYTES
 from services.capture.folder import captures
+from services.capture.packing import Packer
 
 ROBOT = "bench-idle"
 START_S = 5.0
 """The robot's start is not idling."""
-PIECE_S = 0.5
+PIECE_S = 0.1
 """Messages of about this time share a chunk."""
 
 
@@ -81,15 +82,19 @@ def _kinds(paths: list[Path]) -> None:
                 for record in capture.messages(key):
                     messages[key] += 1
                     if record.log_ns > until_ns or len(record.payload) >= LARGE_BYTES:
-                        packed[key] += len(packer.pack(piece)[1])
+                        packed[key] += len(_pack(packer, piece))
                         piece, until_ns = b"", record.log_ns + round(PIECE_S * NS)
                     piece += record.payload
-                packed[key] += len(packer.pack(piece)[1])
+                packed[key] += len(_pack(packer, piece))
         print(f"{path.name}: {path.stat().st_size / 1e6:.1f} MB")
     for key, size in packed.most_common(14):
         out = f", {left_out[key]} left out" if left_out[key] else ""
         rate = messages[key] / seconds
         print(f"  {key.partition('/')[2]:<24} {rate:6.1f} Hz {3600 * size / seconds / 1e6:8.1f} MB an hour{out}")
+
+
+def _pack(packer: Packer, piece: bytes) -> bytes:
+    return (packer.pack if len(piece) >= LARGE_BYTES else packer.pack_small)(piece)[1]
 
 
 if __name__ == "__main__":
