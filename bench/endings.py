@@ -32,6 +32,7 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 
+from bench.ended import leave_when_ended
 from bench.live import Operator, operator
 from cocoro import topics
 from cocoro.bus.zenoh import ZenohBus
@@ -392,6 +393,7 @@ def main() -> int:
     parser.add_argument("--only", default="", metavar="KIND", help=f"one of: {', '.join(KINDS)}")
     parser.add_argument("--phase", default="", metavar="PHASE", help=f"one of: {', '.join(PHASES)}")
     arguments = parser.parse_args()
+    leave_when_ended()
     well = asyncio.run(bench(arguments.first, arguments.count, arguments.seed, arguments.only, arguments.phase))
     return 0 if well else 1
 
