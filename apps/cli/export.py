@@ -1,4 +1,4 @@
-"""`cocoro export` and `cocoro view`: captures as film, table, or scene of another viewer."""
+"""`cocoro export`: captures as film, table, or scene of another viewer."""
 
 from __future__ import annotations
 
@@ -18,6 +18,8 @@ from apps.cli.options import CameraOption, CaptureArgument, JsonOption
 from apps.cli.output import print_json
 from cocoro.clock import NS
 from cocoro.errors import ConfigError
+
+NO_ATTACHMENTS = "recorders attach no files: the run's profile, description and model are in `cocoro capture info FILE`"
 
 app = typer.Typer()
 
@@ -108,7 +110,8 @@ def export_capture(
         if attachments is not None:
             from apps.captures.export.files import export_attachments
 
-            wrote(attachments, export_attachments(capture, attachments), "attachments")
+            count = export_attachments(capture, attachments)
+            wrote(attachments, count, "attachments", "" if count else NO_ATTACHMENTS)
         for problem in capture.problems:
             print(f"missing: {problem}", file=sys.stderr)
         if capture.ending:
