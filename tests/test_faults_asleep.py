@@ -58,14 +58,15 @@ def test_when_all_sleep_for_longer_than_the_lease_the_robot_stands_and_nobody_is
                 assert float(awake.partition(SAID)[2].split()[0]) >= ASLEEP_S - 1.0
                 code = await asyncio.to_thread(fetch.end)
                 if code != 0:  # a connection broke: the task has ended, and the robot stands
-                    assert code == 1
+                    assert code in (1, 3)
                     ended_s = robot.now_s
                     await robot.passes(0.5)
                     assert robot.stood_since(ended_s)
-                    assert SAID in fetch.lines[-1] or "nothing from the planner" in fetch.lines[-1], fetch.lines
+                    whys = (SAID, "nothing from the planner", "asker_gone", "looking again")
+                    assert any(why in line for why in whys for line in fetch.lines), fetch.lines
                 said = said_by_all(robot, fetch)
                 assert " died" not in said
-                assert said.count("lost contact") == said.count("is back") == 0, said
+                assert said.count("no sign of it") == said.count("is back") == 0, said
                 code, answer = await robot.command("park")
                 assert code == 0, answer
                 assert {service: by.pid for service, by in robot.run_dir.claims().items()} == pids

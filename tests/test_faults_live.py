@@ -99,6 +99,7 @@ def test_who_is_stopped_for_longer_than_the_lease_ends_the_task_and_is_back_when
             robot.signal("perception", signal.SIGCONT)
             await robot.told("perception is back")
             assert robot.pid("perception") == pid, "who is stopped is not killed"
+            await robot.passes(1.0)  # until it has told what it sees: a task is not begun blindly
             await robot.driving()
 
     asyncio.run(scenario())

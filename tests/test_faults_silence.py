@@ -15,6 +15,7 @@ from robot_rig import HALTED_MPS, SMALL_FRAMES, RobotRig
 from cocoro import topics
 from cocoro.bus.base import Payload
 from cocoro.testing import in_virtual_time
+from services.planning.floor_map import FloorMap
 
 pytestmark = pytest.mark.sim
 
@@ -153,6 +154,23 @@ async def test_when_the_planner_stays_silent_the_task_fails_and_says_so() -> Non
             assert (refused.refusal, refused.text) == ("not_alive", "the planner says nothing; see cocoro status")
         await rig.advance(0.2)
         assert (await rig.run("fetch", "red_can")).outcome == "done"
+
+
+def test_an_arm_that_no_command_reaches_is_not_held_up_by_anything(monkeypatch: pytest.MonkeyPatch) -> None:
+    touched: list[object] = []
+    monkeypatch.setattr(FloorMap, "bump", lambda _, places, height_m=None: touched.append(places))
+
+    @in_virtual_time
+    async def scenario() -> None:
+        async with RobotRig() as rig:
+            await rig.driving(0.1)
+            with silent(rig, "planning"):  # which begins to unfold the arm meanwhile
+                await rig.advance(2.5)
+            await rig.advance(0.5)
+            assert rig.speed_mps > 0.1
+
+    scenario()
+    assert touched == []
 
 
 @in_virtual_time

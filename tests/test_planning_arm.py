@@ -252,3 +252,16 @@ def test_a_grasp_is_level_with_the_claws_beside_the_target() -> None:
     left, right = (ROBOT.chain(claw).position(arm.angles) for claw in ("claw_left", "claw_right"))
     assert left[2] == pytest.approx(right[2], abs=0.005)
     assert abs(left[1] - right[1]) == pytest.approx(2 * 0.01725, abs=0.001)
+
+
+@pytest.mark.parametrize("arrive", [True, False])
+def test_an_arm_that_stays_behind_is_held_up_unless_its_commands_do_not_arrive(arrive: bool) -> None:
+    controller = ArmController(ROBOT, CONFIG.arm, REACHER)
+    held_up = []
+    for _ in range(round(3.0 / TICK_S)):
+        if not arrive:
+            controller.undelivered()
+        controller.park(READY, TICK_S)
+        held_up.append(controller.stalled)
+    assert held_up[-1] == arrive
+    assert not any(held_up[: round(CONFIG.arm.stall_s / TICK_S)])

@@ -109,3 +109,31 @@ def test_a_wall_behind_a_known_object_is_no_part_of_it() -> None:
     room = Room([can, box(1.5, 0.0, 2.0, 0.0, 0.5)])
     room.look(2.0, known=[Solid((1.433, 0.0, 0.06), 0.033, 0.12)])
     assert room.occupied((1.5, 0.0), within_m=0.06) >= 1
+
+
+def test_what_the_bumper_touched_stays_for_20_s_where_the_camera_sees_nothing_but_floor() -> None:
+    room = Room([WALL])
+    room.look(0.2, tilt=-0.6)
+    room.floor.bump([(1.02, 0.02)])
+    room.look(19.0, tilt=-0.6)
+    assert room.occupied((1.02, 0.02), within_m=0.1) == 1
+    room.look(3.0, tilt=-0.6)
+    assert room.occupied((1.02, 0.02), within_m=0.1) == 0
+
+
+@pytest.mark.parametrize("height_m", [0.05, 0.35])
+def test_what_held_up_the_hand_is_dropped_where_the_camera_looks_through_it(height_m: float) -> None:
+    room = Room([WALL])
+    room.look(0.2, tilt=-0.4)
+    room.floor.bump([(1.32, 0.02)], height_m)
+    room.look(1.0, pan=1.5)
+    assert room.occupied((1.32, 0.02), within_m=0.1) == 1, "out of the picture"
+    room.look(1.0, tilt=-0.4)
+    assert room.occupied((1.32, 0.02), within_m=0.1) == 0
+
+
+def test_what_held_up_the_hand_stays_where_something_is_seen_at_its_height() -> None:
+    room = Room([box(1.3, 0.0, 0.4, 0.30, 0.40)])
+    room.floor.bump([(1.32, 0.02)], 0.35)
+    room.look(5.0, tilt=-0.4)
+    assert room.occupied((1.32, 0.02), within_m=0.1) >= 1

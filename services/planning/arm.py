@@ -67,6 +67,10 @@ class ArmController:
         self._stalled_s = 0.0
         self._clearance_m = None
 
+    def undelivered(self) -> None:
+        """The commands do not arrive: the arm lags behind its goal, and nothing holds it up."""
+        self._stalled_s = 0.0
+
     def folded(self, angles: Mapping[str, float]) -> bool:
         """Whether the arm is in or near the plane that it parks in."""
         return angles["arm_base"] > _SIDE_RAD
@@ -141,7 +145,7 @@ class ArmController:
 
     @property
     def stalled(self) -> bool:
-        """Whether a joint has lagged behind its goal for `stall_s`."""
+        """Whether a joint has lagged behind its goal for `stall_s` while commands arrived."""
         return self._stalled_s > self._config.stall_s
 
     def _sync(self, measured: Mapping[str, float], dt_s: float) -> dict[str, float]:

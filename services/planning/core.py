@@ -25,6 +25,9 @@ from services.planning.learned import Learned
 from services.planning.reach import ARM
 from services.planning.state_estimator import StateEstimator
 
+NO_COMMAND = "no command"
+"""`BaseState.stopped_by` while the planner's commands do not arrive."""
+
 
 class PlanningCore:
     """The planner as a `cocoro.core.Core`. Without a fresh state of the robot it stands still and reports why."""
@@ -96,6 +99,8 @@ class PlanningCore:
             self.actuators.grip.keep()
             return self._halt(latched, now_ns)
         self._missing_since_ns = None
+        if self._estimator.base is not None and self._estimator.base.stopped_by == NO_COMMAND:
+            self.actuators.arm.undelivered()
         self._estimator.look_around(now_ns, self._own_hull)
         snapshot = Snapshot(now_ns, dt_s, self._estimator, body, self._estimator.angles(), self.actuators)
         plan = self._plan(snapshot)

@@ -35,6 +35,8 @@ _EMPTY_NS = NS // 2
 """Where the depth image has no data in place of what stood there, evidence decreases once in this time."""
 _OLD_NS = 120 * NS
 """Evidence that nothing has confirmed for so long is dropped, and its cell counts as not seen."""
+_TOUCHED_NS = 20 * NS
+"""What the bumper touched stays for so long whatever is seen there: the camera may not see it."""
 _MARGIN_M = 0.06
 """Margin about a known object for the cells' size, the depth's noise, and the error of its place."""
 
@@ -71,6 +73,7 @@ class FloorMap:
     def clear(self) -> None:
         self._evidence[:] = 0
         self._looked[:] = False
+        self._confirmed_ns[:] = 0
         self.changes += 1
 
     # --- updates ----------------------------------------------------------------------------------
@@ -120,7 +123,7 @@ class FloorMap:
         self._lowest[rows[fresh], columns[fresh]], self._highest[rows[fresh], columns[fresh]] = np.inf, -np.inf
         np.minimum.at(self._lowest, (rows, columns), lowest_m[inside])
         np.maximum.at(self._highest, (rows, columns), highest_m[inside])
-        self._confirmed_ns[rows, columns] = self._now_ns
+        self._confirmed_ns[rows, columns] = np.maximum(self._confirmed_ns[rows, columns], self._now_ns)
         self._add(places_m, _HIT)
 
     def _free(self, places_m: FloatArray, up_to_m: float) -> None:
@@ -130,6 +133,7 @@ class FloorMap:
         inside = ((index >= 0) & (index < SIZE)).all(axis=1)
         rows, columns = index[inside].T
         above = (self._lowest[rows, columns] > NEAR_FLOOR_M) | (self._highest[rows, columns] > up_to_m)
+        above |= self._confirmed_ns[rows, columns] > self._now_ns
         above &= self._evidence[rows, columns] > 0
         self._add(places_m[inside][~above], -_FREE)
         self._looked[rows, columns] = True
@@ -142,6 +146,7 @@ class FloorMap:
         for solid in known:
             theirs = solid.holds(places, lowest, highest)
             self._evidence[rows[theirs], columns[theirs]] = 0
+            self._confirmed_ns[rows[theirs], columns[theirs]] = 0
         age_ns = self._now_ns - self._confirmed_ns[rows, columns]
         old = age_ns > _OLD_NS
         self._evidence[rows[old], columns[old]] = 0
@@ -154,11 +159,19 @@ class FloorMap:
         less = (through.gone | (through.empty & empty_due)) & (age_ns > 0)
         self._evidence[rows[less], columns[less]] = np.maximum(self._evidence[rows[less], columns[less]] - _FREE, 0)
 
-    def bump(self, places_m: Sequence[tuple[float, float]]) -> None:
-        """Mark places (odometry frame) as occupied because the robot touched something there."""
-        places, floor = np.array(places_m), np.zeros(len(places_m))
+    def bump(self, places_m: Sequence[tuple[float, float]], height_m: float | None = None) -> None:
+        """Mark places (odometry frame) as occupied because the robot touched something there.
+
+        `height_m`: of the touch, where it is only concluded, as that of a held-up arm is; what is seen there may
+        contradict it at once. None: of the bumper.
+        """
+        places, height = np.array(places_m), np.full(len(places_m), height_m or 0.0)
         for _ in range(3):
-            self._hit(places, floor, floor)
+            self._hit(places, height, height)
+        if height_m is None:
+            index = self._index(places)
+            rows, columns = index[((index >= 0) & (index < SIZE)).all(axis=1)].T
+            self._confirmed_ns[rows, columns] = self._now_ns + _TOUCHED_NS
         self.changes += 1
 
     def pass_over(self, place_m: tuple[float, float]) -> None:

@@ -120,8 +120,8 @@ class Approaching:
     def _touched(self, snapshot: Snapshot) -> None:
         """Enter an unseen obstacle, which holds up the arm, in the map at the hand's place."""
         self._stalls += 1
-        x, y, _ = snapshot.body.apply(hand_place(snapshot))
-        snapshot.estimator.around.floor.bump([(x, y)])
+        x, y, z = snapshot.body.apply(hand_place(snapshot))
+        snapshot.estimator.around.floor.bump([(x, y)], z)
         snapshot.actuators.arm.resync()
 
     def _room_here(self, snapshot: Snapshot, fields: Fields) -> bool:
