@@ -131,7 +131,8 @@ def test_a_robot_that_did_not_know_its_place_does_not_say_that_it_saw_the_whole(
     room = Room([])
     room.seen.begin(Pose2())
     look_around(room, Pose2())
-    look_around(room, Pose2(1.0, 0.0, 3.1))
+    for body in (Pose2(1.0, 0.0, 3.1), Pose2(-1.0, 0.0, 0.0)):
+        look_around(room, body)
     snapshot: Any = SimpleNamespace(
         estimator=SimpleNamespace(seen=room.seen),
         actuators=SimpleNamespace(config=PlanningConfig()),
