@@ -35,6 +35,7 @@ from apps.captures.reader import Capture
 from apps.captures.reexecute import describe_result, reexecute
 from apps.rehearsal.rehearse import rehearse
 from apps.rehearsal.request import RehearsalRequest
+from bench.ended import cocoro, leave_when_ended
 from cocoro import topics
 from cocoro.bus.endpoints import default
 from cocoro.bus.zenoh import ZenohBus
@@ -44,7 +45,7 @@ from cocoro.messages import BaseState, Frame
 from cocoro.node import Node
 from cocoro.robot import Robot
 from deploy.rundir import RunDir
-from services.capture.file import Packer
+from services.capture.packing import Packer
 from services.executive.tasks import FetchTask
 
 COCORO = [sys.executable, "-m", "apps.cli.main"]
@@ -74,8 +75,8 @@ def traffic(folder: Path, seconds: float, sensors: str, compression: str, per_oc
     profile.write_text(
         PROFILE.format(folder=folder, sensors=sensors, compression=compression, per_occasion=json.dumps(per_occasion))
     )
-    subprocess.run([*COCORO, "up", str(profile), "--detach"], check=True, stdout=subprocess.DEVNULL)
     try:
+        cocoro("up", str(profile), "--detach")
         recorder = psutil.Process(RunDir("calliope").claims()["capture"].pid)
         before, started = recorder.cpu_times(), time.monotonic()
         written = recorder.io_counters().write_bytes
@@ -86,7 +87,7 @@ def traffic(folder: Path, seconds: float, sensors: str, compression: str, per_oc
         cpu_s = after.user + after.system - before.user - before.system
         rss_mb = recorder.memory_info().rss / 1e6
     finally:
-        subprocess.run([*COCORO, "down"], check=True, stdout=subprocess.DEVNULL)
+        cocoro("down")
     print("\n".join(done.stdout.strip().splitlines()[-2:]) if done.stdout else done.stderr)
     print(f"recorder: {100 * cpu_s / lasted_s:.1f}% of one core over {lasted_s:.0f} s, {rss_mb:.0f} MB resident")
     for path in sorted(folder.glob("*.mcap")):
@@ -174,15 +175,15 @@ def again(folder: Path) -> None:
     listener.write_text(
         f'robot = "calliope"\nclock = "sim"\nprocesses = ["capture"]\n[service.capture]\nfolder = "{folder}/again"\n'
     )
-    subprocess.run([*COCORO, "up", str(listener), "--detach"], check=True, stdout=subprocess.DEVNULL)
     try:
+        cocoro("up", str(listener), "--detach")
         subprocess.run([*COCORO, "replay", str(first)], check=True)
         (second,) = (folder / "again").glob("*.mcap")
         played, give_up_s = _published(first), time.monotonic() + HEARD_S
         while _count(_published(second)) < _count(played) and time.monotonic() < give_up_s:
             time.sleep(LOOK_S)  # the last messages may be on their way, or wait to be written
     finally:
-        subprocess.run([*COCORO, "down"], check=True, stdout=subprocess.DEVNULL)
+        cocoro("down")
     payloads = [played, _published(second)]
     different = sorted(key for key in payloads[0].keys() | payloads[1].keys() if payloads[0][key] != payloads[1][key])
     count = _count(played)
@@ -230,6 +231,7 @@ def main() -> None:
     parser.add_argument("--compression", default="zstd")
     parser.add_argument("--times", type=int, default=20)
     options = parser.parse_args()
+    leave_when_ended()
     with tempfile.TemporaryDirectory(prefix="cocoro-") as name:
         folder = Path(name)
         os.environ["COCORO_RUN_DIR"] = str(folder / "run")

@@ -24,7 +24,7 @@ from apps.rehearsal.rehearse import rehearse
 from apps.rehearsal.request import RehearsalRequest
 from cocoro.capture.conventions import CaptureError
 from cocoro.clock import NS
-from services.capture.file import Packer
+from services.capture.packing import Packer
 from services.executive.tasks import FetchTask
 
 

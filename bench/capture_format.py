@@ -36,9 +36,9 @@ from apps.rehearsal.rehearse import rehearse
 from apps.rehearsal.request import RehearsalRequest
 from cocoro.capture import mcap
 from cocoro.clock import NS
-from services.capture import file
-from services.capture.file import QUICK, Packer
+from services.capture import file, packing
 from services.capture.keys import QueuedMessage, info_of
+from services.capture.packing import QUICK, Packer
 from services.capture.writer import CaptureWriter, FileLimits
 from services.executive.tasks import FetchTask
 from sim.realism import Sensors
@@ -170,7 +170,8 @@ def records(folder: Path, times: int) -> None:
     payload, count, places = bytes(220), 1000, list(range(40))
 
     def write_messages() -> bytes:
-        return b"".join(part for n in range(count) for part in (file.message_head(3, n, n, n, len(payload)), payload))
+        head = packing.message_head
+        return b"".join(part for n in range(count) for part in (head(3, n, n, n, len(payload)), payload))
 
     def write_messages_by_package() -> bytes:
         return file.packed(*(Message(3, n, payload, n, n) for n in range(count)))

@@ -32,6 +32,7 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 
+from bench.ended import leave_when_ended
 from bench.live import Operator, operator
 from cocoro import topics
 from cocoro.bus.zenoh import ZenohBus
@@ -197,19 +198,25 @@ class Watched:
             await self.until(lambda: self.state.task_id == reply.task_id and self.state.outcome is not None)
         return reply
 
+    def claws_touch(self) -> bool:
+        """Whether a claw touches an object, by the newest truth."""
+        return any(set(CLAWS) & set(item.touching) for item in self.truths[-1].objects)
+
     def body_rest_s(self, since_ns: int) -> float:
         moving = [row.sim_ns for row in self.rows if row.sim_ns > since_ns and row.moves_mps >= STANDING_MPS]
         return (max(moving, default=since_ns) - since_ns) / NS
 
-    def joints_rest_s(self, since_ns: int) -> tuple[float, float]:
-        """When the last joint came to rest, without the claws and of the claws."""
-        last = {False: since_ns, True: since_ns}
+    def joints_rest_s(self, since_ns: int) -> tuple[float, float, str]:
+        """When the last joint came to rest, without the claws and of the claws; and which joint, how fast, was last."""
+        last, which = {False: since_ns, True: since_ns}, ""
         for before, after in pairwise([truth for truth in self.truths if truth.stamp_ns > since_ns]):
             dt_s = (after.stamp_ns - before.stamp_ns) / NS
             for joint, angle in after.joints_rad.items():
-                if abs(angle - before.joints_rad[joint]) / dt_s > STANDING_RADPS:
+                speed_radps = abs(angle - before.joints_rad[joint]) / dt_s
+                if speed_radps > STANDING_RADPS:
                     last[joint in CLAWS] = after.stamp_ns
-        return (last[False] - since_ns) / NS, (last[True] - since_ns) / NS
+                    which = f"{joint} at {speed_radps:.2f} rad/s"
+        return (last[False] - since_ns) / NS, (last[True] - since_ns) / NS, which
 
 
 @asynccontextmanager
@@ -259,6 +266,8 @@ def case(number: int, seed: int) -> Case:
     kinds = list(KINDS)
     turn, place = divmod(number, len(kinds))
     phase = PHASES[(place + 3 * turn) % len(PHASES)]
+    if (kinds[place], phase) == ("Ctrl-Z", "start"):  # suspended before it asks, as every command is
+        phase = "search"
     label = ABSENT if phase == "search" else CANS[number % len(CANS)]
     wait_s = rng.uniform(0.1, 0.9) if phase == "start" else rng.uniform(0.0, 0.6)
     return Case(number, kinds[place], phase, label, wait_s)
@@ -270,8 +279,10 @@ class Verdict:
     body_s: float = 0.0
     joints_s: float = 0.0
     claws_s: float = 0.0
+    last: str = ""
+    """The joint that moved last, and its speed."""
     held: bool = False
-    """Claws that hold something swing with it until their torques balance; they are reported, not judged."""
+    """Claws that touch an object swing with it until their torques balance; they are reported, not judged."""
     real_s: float = 0.0
     code: int | None = None
     faults: list[str] = field(default_factory=list)
@@ -300,15 +311,12 @@ async def judge(robot: Watched, one: Case, folder: Path) -> Verdict | None:
         since_ns = robot.node.now_ns()
         await robot.until(lambda: robot.node.now_ns() > since_ns + WATCH_S * NS)
     finally:
-        if one.kind == "Ctrl-Z" and one.phase == "start":  # nothing handles it yet: the command is suspended
-            command.process.send_signal(signal.SIGCONT)
-            command.process.send_signal(signal.SIGTERM)
         code = await asyncio.to_thread(command.finish)
     robot.read()
     last_ns = max(row.sim_ns for row in robot.rows if row.real_ns <= ended_ns)
     verdict.body_s = robot.body_rest_s(last_ns)
-    verdict.joints_s, verdict.claws_s = robot.joints_rest_s(last_ns)
-    verdict.held = robot.holding
+    verdict.joints_s, verdict.claws_s, verdict.last = robot.joints_rest_s(last_ns)
+    verdict.held = robot.claws_touch()
     moved_ns = [row.real_ns for row in robot.rows if row.sim_ns > last_ns and row.moves_mps >= STANDING_MPS]
     verdict.real_s = (max(moved_ns, default=ended_ns) - ended_ns) / NS
     verdict.code = code
@@ -328,7 +336,7 @@ async def _judge_task(robot: Watched, verdict: Verdict, before: str, command: Co
     if verdict.body_s > BOUND_S:
         verdict.faults.append(f"the body moved for {verdict.body_s:.3f} s")
     if verdict.joints_s > BOUND_S or (verdict.claws_s > BOUND_S and not verdict.held):
-        verdict.faults.append(f"joints moved for {verdict.joints_s:.3f} s, claws for {verdict.claws_s:.3f} s")
+        verdict.faults.append(f"the joints moved for too long, last {verdict.last}")
     following = await robot.do(PutDownTask() if robot.holding else ParkTask())
     if not following.accepted:
         verdict.faults.append(f"the next task is refused: {following.text}")
@@ -385,6 +393,7 @@ def main() -> int:
     parser.add_argument("--only", default="", metavar="KIND", help=f"one of: {', '.join(KINDS)}")
     parser.add_argument("--phase", default="", metavar="PHASE", help=f"one of: {', '.join(PHASES)}")
     arguments = parser.parse_args()
+    leave_when_ended()
     well = asyncio.run(bench(arguments.first, arguments.count, arguments.seed, arguments.only, arguments.phase))
     return 0 if well else 1
 

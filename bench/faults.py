@@ -28,6 +28,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import get_args
 
+from bench.ended import leave_when_ended
 from bench.fault_bus import Way
 from bench.fault_robot import FaultRobot, Happening, NotFastError
 from bench.fault_scenes import DRIVES, Drive, draw_errand
@@ -155,6 +156,7 @@ def main() -> int:
     parser.add_argument("--others", type=int, default=0, help="alarms: so many processes that keep the cores busy")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="alarms: of the profile")
     asked = parser.parse_args()
+    leave_when_ended()
     if asked.what == "live":
         return 0 if live(asked.count, asked.seed, asked.profile, STAND_S) else 1
     if asked.what == "alarms":

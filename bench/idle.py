@@ -11,8 +11,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import subprocess
-import sys
 import tempfile
 import time
 from collections import Counter
@@ -22,16 +20,17 @@ import psutil
 
 from apps.captures.info import missing_of
 from apps.captures.reader import Capture
+from bench.ended import cocoro, leave_when_ended
 from cocoro.clock import NS
 from deploy.rundir import RunDir
-from services.capture.file import LARGE_BYTES, Packer
+from services.capture.file import LARGE_BYTES
 from services.capture.folder import captures
+from services.capture.packing import Packer
 
-COCORO = [sys.executable, "-m", "apps.cli.main"]
 ROBOT = "bench-idle"
 START_S = 5.0
 """The robot's start is not idling."""
-PIECE_S = 0.5
+PIECE_S = 0.1
 """Messages of about this time share a chunk."""
 
 
@@ -42,13 +41,14 @@ def main() -> None:
     parser.add_argument("--frames", default="640x480@30")
     parser.add_argument("--whole", action="store_true")
     options = parser.parse_args()
+    leave_when_ended()
     with tempfile.TemporaryDirectory(prefix="cocoro-") as name:
         folder = Path(name)
         os.environ |= {"COCORO_RUN_DIR": str(folder / "run"), "COCORO_CAPTURE_DIR": str(folder / "captures")}
         settings = ["--sensors", options.sensors, "--frames", options.frames, "--set", f'robot="{ROBOT}"']
         settings += ["--set", "service.capture.idle_period_s=0.0"] if options.whole else []
-        subprocess.run([*COCORO, "up", "sim", *settings, "--detach"], check=True, stdout=subprocess.DEVNULL)
         try:
+            cocoro("up", "sim", *settings, "--detach")
             time.sleep(START_S)
             recorder = psutil.Process(RunDir(ROBOT).claims()["capture"].pid)
             before, began_s, size = recorder.cpu_times(), time.monotonic(), _size(folder / "captures")
@@ -56,7 +56,7 @@ def main() -> None:
             after, lasted_s = recorder.cpu_times(), time.monotonic() - began_s
             grown, rss_mb = _size(folder / "captures") - size, recorder.memory_info().rss / 1e6
         finally:
-            subprocess.run([*COCORO, "down", "--robot", ROBOT], check=True, stdout=subprocess.DEVNULL)
+            cocoro("down", "--robot", ROBOT)
         cpu = (after.user + after.system - before.user - before.system) / lasted_s
         print(f"{options.sensors} sensors, {options.frames}: {grown / lasted_s * 3600 / 1e6:.0f} MB an hour on disk")
         print(f"recorder: {100 * cpu:.1f}% of one core, {rss_mb:.0f} MB resident, over {lasted_s:.0f} s")
@@ -82,15 +82,19 @@ def _kinds(paths: list[Path]) -> None:
                 for record in capture.messages(key):
                     messages[key] += 1
                     if record.log_ns > until_ns or len(record.payload) >= LARGE_BYTES:
-                        packed[key] += len(packer.pack(piece)[1])
+                        packed[key] += len(_pack(packer, piece))
                         piece, until_ns = b"", record.log_ns + round(PIECE_S * NS)
                     piece += record.payload
-                packed[key] += len(packer.pack(piece)[1])
+                packed[key] += len(_pack(packer, piece))
         print(f"{path.name}: {path.stat().st_size / 1e6:.1f} MB")
     for key, size in packed.most_common(14):
         out = f", {left_out[key]} left out" if left_out[key] else ""
         rate = messages[key] / seconds
         print(f"  {key.partition('/')[2]:<24} {rate:6.1f} Hz {3600 * size / seconds / 1e6:8.1f} MB an hour{out}")
+
+
+def _pack(packer: Packer, piece: bytes) -> bytes:
+    return (packer.pack if len(piece) >= LARGE_BYTES else packer.pack_small)(piece)[1]
 
 
 if __name__ == "__main__":

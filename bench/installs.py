@@ -11,7 +11,10 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
+
+from bench.ended import leave_when_ended
 
 ROOT = Path(__file__).parent.parent
 EXTRAS = ("", "operator", "robot", "sim")
@@ -41,10 +44,12 @@ PROBES = (
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("extras", nargs="*", default=EXTRAS, metavar="EXTRA")
+    asked = parser.parse_args()
+    leave_when_ended()
     with tempfile.TemporaryDirectory() as folder:
         _run([sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", folder, str(ROOT)])
         (wheel,) = Path(folder).glob("*.whl")
-        for extra in parser.parse_args().extras:
+        for extra in asked.extras:
             measure(extra, wheel, Path(folder) / f"venv-{extra}")
 
 
@@ -58,15 +63,22 @@ def measure(extra: str, wheel: Path, venv: Path) -> None:
     print(f"\n== {what}: installed in {time.monotonic() - begun_s:.0f} s", flush=True)
     _run([str(venv / "bin" / "python"), str(ROOT / "deploy" / "install_progress.py"), "sizes"])
     environment = {"PATH": "/usr/bin:/bin", "HOME": str(venv), "COCORO_RUN_DIR": str(venv / "run")}
-    for words in PROBES:
-        done = subprocess.run(
-            [str(venv / "bin" / "cocoro"), *words],
-            cwd=venv,
-            env=environment,
-            capture_output=True,
-            text=True,
-            timeout=300,
+
+    def cocoro(*words: str) -> subprocess.CompletedProcess[str]:
+        command = [str(venv / "bin" / "cocoro"), *words]
+        return subprocess.run(
+            command, cwd=venv, env=environment, capture_output=True, text=True, timeout=300, check=False
         )
+
+    try:
+        _probe(cocoro)
+    finally:
+        cocoro("down")
+
+
+def _probe(cocoro: Callable[..., subprocess.CompletedProcess[str]]) -> None:
+    for words in PROBES:
+        done = cocoro(*words)
         said = ((done.stderr or done.stdout).strip().splitlines() or [""])[-1]
         print(f"  {done.returncode}  cocoro {' '.join(words).replace(GOLDEN, 'FILE'):<42} {said[:110]}")
 

@@ -26,6 +26,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from bench.ended import leave_when_ended
 from cocoro import topics
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.clock import NS, FollowedClock
@@ -181,6 +182,7 @@ def main() -> int:
     parser.add_argument("--profile", choices=["sim", "sim-wire"], default="sim", help="of the fetches")
     parser.add_argument("--sensors", choices=["ideal", "real"], default="ideal")
     arguments = parser.parse_args()
+    leave_when_ended()
     if arguments.what == "fetches":
         well = fetches(arguments.count, arguments.profile, arguments.sensors)
     else:

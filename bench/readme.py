@@ -22,6 +22,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from bench.ended import leave_when_ended
+
 ROOT = Path(__file__).parent.parent
 PAGE = ROOT / "README.md"
 NOT_RUN = {
@@ -181,6 +183,7 @@ def main() -> int:
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--frames", metavar="WxH@HZ")
     options = parser.parse_args()
+    leave_when_ended()
     chosen = [block for block in blocks() if block.section.startswith(tuple(options.sections) or "")]
     wrong, total_s = 0, 0.0
     with tempfile.TemporaryDirectory(prefix="readme-") as folder:

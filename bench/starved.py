@@ -23,6 +23,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from bench.ended import leave_when_ended
 from bench.faults_live import busy
 from bench.live import Operator
 from cocoro import topics
@@ -148,6 +149,7 @@ def main() -> int:
     parser.add_argument("--sensors", choices=["ideal", "real"], default="real")
     parser.add_argument("--frames", default="640x480@30")
     asked = parser.parse_args()
+    leave_when_ended()
     options = ["--sensors", asked.sensors, "--frames", asked.frames]
     try:
         good = sum(trial(number + 1, asked.busy, options) for number in range(asked.count))

@@ -30,6 +30,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 
+from bench.ended import leave_when_ended
 from bench.stop_rig import NAME, PATIENCE_S, Driver, Place, driving, place
 from cocoro import topics
 from cocoro.bus.zenoh import ZenohBus
@@ -311,6 +312,7 @@ def main() -> int:
     parser.add_argument("--any-time", action="store_true", help="judge the effect and the report, not the time")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
+    leave_when_ended()
     wanted = options.situations or list(SITUATIONS)
     if unknown := set(wanted) - {*SITUATIONS, "restarts"}:
         parser.error(f"there is no situation {unknown.pop()!r}")

@@ -13,6 +13,7 @@ record_steps = false              #   publish the inputs and outputs of each ste
 
 from __future__ import annotations
 
+import re
 import tomllib
 from collections.abc import Iterable
 from importlib import resources
@@ -31,6 +32,7 @@ from deploy.rundir import Mesh
 C = TypeVar("C")
 Name = Annotated[str, Meta(pattern=r"\A[a-z0-9][a-z0-9_-]{0,31}\Z")]
 """A chunk of a key, and the name of a directory."""
+A_NAME = "a name has 1 to 32 small letters, digits, '-' and '_', and begins with a letter or a digit"
 
 PACKAGE = "deploy"
 """The package whose resources contain the project's profiles."""
@@ -144,7 +146,9 @@ def from_data(data: dict[str, Any], name: str) -> Profile:
     try:
         profile = msgspec.structs.replace(msgspec.convert(data, Profile), name=name)
     except msgspec.ValidationError as error:
-        raise ConfigError(f"profile {name}: {field_text(error, Profile)}") from error
+        text = re.sub(r"Expected `str` matching regex '.*?'(?=$| - at|:)", A_NAME, field_text(error, Profile))
+        text = re.sub(r"(.*) - at `key` in `\$\.(\w+)`", r"\2: \1", text)
+        raise ConfigError(f"profile {name}: {text}") from error
     if len(set(profile.processes)) < len(profile.processes):
         raise ConfigError(f"profile {name}: processes names a process twice")
     try:

@@ -19,8 +19,8 @@ from cocoro.robot import Robot
 from cocoro.vloop import run_virtual
 from deploy.delayed import DelayedNode
 from deploy.processes import named
-from services.capture.file import Compression, Packer
 from services.capture.keys import KeyInfo, QueuedMessage, info_of
+from services.capture.packing import Compression, Packer
 from services.capture.writer import CaptureWriter, FileLimits
 
 ROBOT = Robot.load()

@@ -21,7 +21,7 @@ from apps.captures.reader import Capture
 from apps.captures.rewrite import rewrite
 from apps.cli.main import main
 from cocoro.capture.conventions import checksum
-from services.capture.file import Packer
+from services.capture.packing import Packer
 
 FILES = dict(variants())
 

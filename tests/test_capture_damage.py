@@ -16,7 +16,7 @@ from apps.captures.reader import Capture, Record
 from apps.captures.rewrite import rewrite
 from apps.cli.main import main
 from cocoro.capture.conventions import CaptureError
-from services.capture.file import Packer
+from services.capture.packing import Packer
 
 pytestmark = pytest.mark.sweep
 

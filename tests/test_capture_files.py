@@ -28,9 +28,9 @@ from cocoro.capture.types import Alive, LossyFrame, NotReadableError, schema_of
 from cocoro.errors import ConfigError
 from cocoro.messages import BaseState, Detections, Frame, Message, PlannerStatus
 from cocoro.topics import TOPICS
-from services.capture.file import COMPRESSIONS, Compression, Packer
 from services.capture.folder import captures, make_room
 from services.capture.keys import KeyFilter, lossy
+from services.capture.packing import COMPRESSIONS, Compression, Packer
 from services.capture.writer import FileLimits, Missing
 
 BIG = msgspec.msgpack.encode(frame(7, 320, 240))

@@ -33,8 +33,8 @@ from cocoro.node import Node
 from cocoro.robot import Robot
 from deploy.rundir import RunDir
 from services.capture.config import CaptureConfig
-from services.capture.file import Packer
 from services.capture.log_clock import WALL_CLOCK, LogClock
+from services.capture.packing import Packer
 from services.capture.service import run
 
 pytestmark = pytest.mark.zenoh

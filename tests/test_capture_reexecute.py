@@ -26,8 +26,8 @@ from cocoro.capture.conventions import CaptureError
 from cocoro.clock import NS
 from cocoro.core import Core, Output, Sample, Schedule, Take
 from cocoro.messages import Detections, PlannerStatus
-from services.capture.file import Packer
 from services.capture.keys import QueuedMessage, lossy
+from services.capture.packing import Packer
 from services.capture.writer import CaptureWriter, FileLimits
 from services.perception import service as perception
 from services.planning import service as planning

@@ -17,17 +17,18 @@ from apps.cli.status import space
 from cocoro.clock import NS
 from cocoro.messages import Recording
 from deploy.rundir import RunDir
-from services.capture.file import CaptureFile, Packer
+from services.capture.file import CaptureFile
 from services.capture.folder import is_pinned
 from services.capture.occasions import OCCASION, Occasion
+from services.capture.packing import Packer
 from services.capture.writer import sync_and_close
 
 RUN = "calliope-20260101T000000Z"
 
 
 def make(folder: Path, number: int, what: str = "", outcome: str = "", close: bool = True) -> Path:
-    label = what.replace(" ", "-")
-    path = folder / f"{RUN}-{number:03}{f'-{label}' if label else ''}.mcap"
+    label = what.replace(" ", "-") or "idle"
+    path = folder / f"{RUN}-{number:03}-{label}.mcap"
     file = CaptureFile(path, Packer("zstd"))
     if what:
         kind = "task" if outcome else what
@@ -61,7 +62,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     ("name", "number"),
     [
         ("latest", 5), ("latest-1", 4), ("latest-2", 2), ("idle", 6), ("idle-2", 1), ("fetch", 5), ("fetch-1", 2),
-        ("fetch red_can", 2), ("fetch-red_can", 2), ("stop", 4), ("fetch-2", 2), (f"{RUN}-003.mcap", 3),
+        ("fetch red_can", 2), ("fetch-red_can", 2), ("stop", 4), ("fetch-2", 2), (f"{RUN}-003-idle.mcap", 3),
     ],
 )  # fmt: skip
 def test_a_name_stands_for_a_file(folder: Path, name: str, number: int) -> None:
@@ -74,8 +75,13 @@ def test_a_shell_completes_names(folder: Path) -> None:
 
 
 def test_a_path_is_a_path(folder: Path) -> None:
-    (folder.parent / "fetch").touch()
-    assert shelf.find("fetch") == Path("fetch")
+    (folder.parent / "fetch").write_text("a list of what to fetch")
+    assert shelf.find("fetch").name == f"{RUN}-005-fetch-blue_can.mcap"
+    assert shelf.find("./fetch") == Path("fetch")
+    make(folder.parent, 9).rename(folder.parent / "latest")
+    (folder.parent / "fetch.mcap").touch()
+    for path in ("latest", "fetch.mcap"):
+        assert shelf.find(path) == Path(path)
     for path in ("no/such/thing", "nothing.mcap", "/dev/null", str(folder)):
         assert shelf.find(path) == Path(path)
     (folder.parent / "stop").mkdir()
@@ -135,7 +141,11 @@ def test_commands_take_names(folder: Path, capsys: pytest.CaptureFixture[str]) -
 
 
 def test_a_run_up_to_a_file(folder: Path, tmp_path: Path) -> None:
-    assert [path.name[-8:-5] for path in shelf.run_until(folder / f"{RUN}-003.mcap")] == ["001", "can", "003"]
+    assert [path.name.removeprefix(RUN)[1:4] for path in shelf.run_until(folder / f"{RUN}-003-idle.mcap")] == [
+        "001",
+        "002",
+        "003",
+    ]
     assert shelf.run_until(tmp_path / "mine.mcap") == [tmp_path / "mine.mcap"]
 
 
@@ -151,7 +161,25 @@ def test_the_file_of_a_recorder_that_is_up_is_found_by_its_process(short_path: P
     (claim,) = run_dir.claim("capture", ["capture"])
     try:
         with (tmp_path / "open.mcap").open("wb"):
-            assert open_captures(run_dir) == [tmp_path / "open.mcap"]
-        assert open_captures(run_dir) == []
+            assert tmp_path / "open.mcap" in open_captures(run_dir)
+        assert tmp_path / "open.mcap" not in open_captures(run_dir)
     finally:
         claim.release()
+
+
+def test_what_is_being_written_stays_whatever_its_path_is_called(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr("apps.cli.shelf.robots", lambda: [RunDir("robbie", folder)])
+    monkeypatch.setattr("apps.cli.shelf.open_captures", lambda _: [folder / f"{RUN}-006-idle.mcap"])
+    assert main(["capture", "remove", f"{RUN}-006-idle.mcap", "--yes"]) == exits.REFUSED
+    assert "is being written" in capsys.readouterr().err
+    assert main(["capture", "remove", f"{RUN}-001-idle.mcap", f"./{RUN}-001-idle.mcap", "--yes"]) == exits.DONE
+    assert sorted(path.name[len(RUN) + 1 :][:3] for path in folder.glob("*.mcap")) == [
+        "002",
+        "003",
+        "004",
+        "005",
+        "006",
+    ]

@@ -21,7 +21,8 @@ from apps.captures.info import report
 from apps.captures.reader import Capture
 from apps.captures.rewrite import rewrite
 from cocoro.capture.mcap import MAGIC, PREFIX
-from services.capture.file import CaptureFile, Packer
+from services.capture.file import CaptureFile
+from services.capture.packing import Packer
 from services.capture.writer import FileLimits, sync_and_close
 
 pytestmark = pytest.mark.sweep

@@ -111,6 +111,24 @@ def test_the_options_of_up_are_settings_of_the_simulator(tmp_path: Path, monkeyp
     assert overrides("paper", None, None, None, None, [], []) == ['service.sim.scene="paper"']
 
 
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--scene", "papr"], "did you mean paper?"),
+        (["--sensors", "idael"], "known are ideal, real; did you mean ideal?"),
+        (["--body", "wron"], "known are nominal, worn; did you mean worn?"),
+        (["--reach", "lerned"], "known are learned, rigid; did you mean learned?"),
+        (["--set", "robot=Upper"], "robot: a name has 1 to 32 small letters, digits, '-' and '_'"),
+    ],
+)
+def test_up_refuses_a_value_that_is_none_before_it_starts_anything(
+    arguments: list[str], said: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("apps.cli.running.supervise", lambda *_: pytest.fail("it was started"))
+    assert main(["up", *arguments]) == 2
+    assert said in capsys.readouterr().err
+
+
 def test_frames_may_leave_the_rate_out() -> None:
     assert frames_of("640x480") == {"width": 640, "height": 480}
 

@@ -105,10 +105,10 @@ def report() -> dict[str, Any]:
     }  # fmt: skip
 
 
-def drawn(width: int, height: int | None = None) -> str:
+def drawn(width: int, height: int | None = None, told: dict[str, Any] | None = None) -> str:
     out = StringIO()
     screen = Console(file=out, width=width, height=height, color_system=None)
-    screen.print(top_view.render(report(), None if height is None else screen))
+    screen.print(top_view.render(told or report(), None if height is None else screen))
     return out.getvalue()
 
 
@@ -129,6 +129,45 @@ def test_top_on_a_low_terminal_shows_the_topics_with_a_problem_and_counts_the_re
     assert sum("/detections" in line for line in text.splitlines()) >= 4
     assert "perception/detections" in text
     assert "more; so does --once" in text
+
+
+STARVED = (
+    "this machine is short of processor time: of 10 s waited planning 40%, perception 31%, executive 22%; of its 2 "
+    "cores took python -c while True: pass (pid 4711) 98%, sim (pid 4712) 61%"
+)
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+def test_top_says_all_of_who_takes_the_processor_below_the_emergency_stop(width: int) -> None:
+    told = report() | {"latch": {"state": "latched", "by": "operator"}}
+    told["machine"] |= {"starved": STARVED}
+    text = drawn(width, 24, told)
+    assert len(text.splitlines()) <= 24
+    assert "".join(STARVED.split()) in "".join(text.split())
+    assert text.index("EMERGENCY STOP latched") < text.index("short of processor time")
+
+
+def test_services_of_one_process_say_the_same_once(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    told = report()
+    for service in told["services"]:
+        service["health"]["text"] = SENTENCE if service["service"] in ("sim", "kinect", "base") else ""
+    at(monkeypatch, 200)
+    status._print(told)
+    lines = {line.split()[0]: line for line in capsys.readouterr().out.splitlines() if line.strip()}
+    assert (lines["sim"].endswith(SENTENCE), lines["kinect"][-6:], lines["base"][-6:]) == (True, "as sim", "as sim")
+    assert drawn(200, told=told).count(SENTENCE) == 2  # the task's, too
+
+
+def test_a_replayed_service_is_neither_missing_nor_dead() -> None:
+    told = report()
+    told["services"][1] |= {"alive": False, "state": "replayed"}
+    assert not status.missing(told)
+    (line,) = (line for line in drawn(200, told=told).splitlines() if line.startswith("sim "))
+    assert line.split() == ["sim", "replayed"]
+    told["services"][1]["state"] = "not alive"
+    assert status.missing(told)
 
 
 @pytest.mark.parametrize("width", WIDTHS)

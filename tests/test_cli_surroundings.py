@@ -29,7 +29,7 @@ from apps.captures.rewrite import rewrite
 from apps.cli import exits
 from apps.cli.main import failed
 from cocoro.clock import NS
-from services.capture.file import Packer
+from services.capture.packing import Packer
 
 
 @pytest.fixture(scope="module")

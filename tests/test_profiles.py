@@ -90,7 +90,8 @@ def test_a_mistake_in_a_services_table_names_profile_table_and_field(tmp_path: P
     [
         ("robot = ", r"mine.toml: Invalid value"),
         ('processes = ["planning"]', r"missing required field `robot`"),
-        ('robot = "R 2"\nprocesses = ["planning"]', r"robot: Expected `str` matching regex"),
+        ('robot = "R 2"\nprocesses = ["planning"]', r"robot: a name has 1 to 32 small letters, digits, '-' and '_'"),
+        ('robot = "r"\nprocesses = ["sim"]\n[service.Sim]', r"service: a name has 1 to 32 small letters"),
         ('robot = "r"\nprocesses = []', r"processes: Expected `array` of length >= 1"),
         ('robot = "r"\nprocesses = ["plannning"]', r"no process 'plannning'; known are"),
         ('robot = "r"\nprocesses = ["planning", "planning"]', r"names a process twice"),

@@ -8,9 +8,9 @@ from pathlib import Path
 
 from cocoro.errors import CocoroError
 from deploy.rundir import RunDir, robots
-from services.capture.folder import default_folder, parsed_name
+from services.capture.folder import IDLE, default_folder, parsed_name
 
-LATEST, IDLE = "latest", "idle"
+LATEST = "latest"
 
 
 def folders() -> list[Path]:
@@ -45,16 +45,16 @@ def shelf(robot: str | None = None) -> list[tuple[str, Path]]:
             name = parsed_name(path)
             if name is not None and robot in (None, name.robot):
                 with suppress(OSError):
-                    found.append((path.stat().st_mtime_ns, name.number, bool(name.label), path))
-    return _named([(labelled, path) for _, _, labelled, path in sorted(found, reverse=True)])
+                    found.append((path.stat().st_mtime_ns, name.number, name.label != IDLE, path))
+    return _named([(eventful, path) for _, _, eventful, path in sorted(found, reverse=True)])
 
 
 def _named(newest_first: Sequence[tuple[bool, Path]]) -> list[tuple[str, Path]]:
-    """`latest` counts those in which something happened, `idle` the others."""
+    """`idle` counts those in which nothing happened, `latest` the others."""
     counts = {True: 0, False: 0}
     named = []
-    for labelled, path in newest_first:
-        name, back = LATEST if labelled else IDLE, counts[labelled]
+    for eventful, path in newest_first:
+        name, back = LATEST if eventful else IDLE, counts[eventful]
         named.append((f"{name}-{back}" if back else name, path))
-        counts[labelled] += 1
+        counts[eventful] += 1
     return named

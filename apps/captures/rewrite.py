@@ -16,8 +16,9 @@ from apps.captures.reader import Capture, Record
 from cocoro.capture.conventions import CaptureError
 from cocoro.capture.mcap import DamageError
 from cocoro.capture.types import TypeSchema
-from services.capture.file import CaptureFile, Packer
+from services.capture.file import CaptureFile
 from services.capture.keys import KeyInfo
+from services.capture.packing import Packer
 from services.capture.writer import sync_and_close
 
 REPAIRED = "repaired"

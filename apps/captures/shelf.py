@@ -20,7 +20,7 @@ from apps.captures.names import LATEST, shelf
 from cocoro.capture import mcap
 from cocoro.capture.mcap import MAGIC, PREFIX, DamageError
 from cocoro.clock import NS
-from services.capture.folder import captures, is_pinned, parsed_name
+from services.capture.folder import IDLE, captures, is_pinned, parsed_name
 from services.capture.occasions import OCCASION, Note, Occasion, occasion_of
 
 _COUNTED = re.compile(r"(?P<name>.+)-(?P<back>\d{1,4})")
@@ -44,7 +44,7 @@ class ListedCapture(msgspec.Struct, kw_only=True):
     duration_s: float = 0.0
     messages: int = 0
     what: str = ""
-    """The task with its target, or another occasion; '' when nothing happened."""
+    """The task with its target, or another occasion; '' when nothing happened, or the recorder did not tell."""
     task_id: str = ""
     outcome: str = ""
     reason: str = ""
@@ -132,7 +132,7 @@ def listed(robot: str | None = None) -> Iterator[ListedCapture]:
         if (occasion := ends.occasion) is not None:
             capture.what, capture.task_id, capture.outcome = occasion.what, occasion.task_id, occasion.outcome
             capture.reason, capture.notes = occasion.reason, occasion.notes
-        capture.what = capture.what or parsed.label
+        capture.what = capture.what or ("" if parsed.label == IDLE else parsed.label)
         yield capture
 
 
@@ -159,11 +159,12 @@ def find(text: str) -> Path:
     """The file of a name: a path, a file's name in the folder of captures, `latest` or `idle`, a task (`fetch`,
     `fetch red_can`), `stop`, `fault` or `motion`, each with `-N` for the Nth before it, or a task's id.
 
-    A text that is none of them is returned as a path, so that reading it fails.
+    A path comes first: a text with a folder, with the ending .mcap, or of an MCAP file in the current directory. A text
+    that is none of these is returned as a path, so that reading it fails.
     """
     path = Path(text)
     with suppress(OSError, ValueError):
-        if path.exists() and not path.is_dir():
+        if path.exists() and not path.is_dir() and (path.parts[:-1] or path.suffix == ".mcap" or _is_mcap(path)):
             return path
     there = shelf()
     for name, found in there:
@@ -174,9 +175,18 @@ def find(text: str) -> Path:
     if (found_by := _by_label(text, there)) is not None:
         return found_by
     for _, found in there:
-        if _label(found) and (occasion := Ends(found).occasion) is not None and text == occasion.task_id:
+        if _label(found) in ("", IDLE):
+            continue
+        if (occasion := Ends(found).occasion) is not None and text == occasion.task_id:
             return found
     return path
+
+
+def _is_mcap(path: Path) -> bool:
+    if not path.is_file():
+        return False
+    with path.open("rb") as stream:
+        return stream.read(len(MAGIC)) == MAGIC
 
 
 def _by_label(text: str, there: Sequence[tuple[str, Path]]) -> Path | None:

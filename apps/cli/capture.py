@@ -25,10 +25,10 @@ from apps.cli.terminal import Column, fields, table
 from cocoro.capture.conventions import CaptureError
 from cocoro.clock import NS
 from cocoro.errors import ConfigError, choice_of
-from services.capture.file import COMPRESSIONS, Compression, Packer
 from services.capture.keys import KeyFilter
 from services.capture.log_clock import WALL_CLOCK, WallClockStep, describe_step
 from services.capture.occasions import OCCASION, Occasion
+from services.capture.packing import COMPRESSIONS, Compression, Packer
 
 MB = 1e6
 COLUMNS = (

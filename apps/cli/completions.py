@@ -96,8 +96,8 @@ def of(*names: str) -> Callable[[str], list[str]]:
 def captures() -> Iterable[str]:
     """Names of captures, and of the tasks in them."""
     from apps.captures.names import shelf
-    from services.capture.folder import parsed_name
+    from services.capture.folder import IDLE, parsed_name
 
     there = shelf()
-    labels = (name.label for _, path in there if (name := parsed_name(path)) and name.label)
+    labels = (name.label for _, path in there if (name := parsed_name(path)) and name.label not in ("", IDLE))
     return dict.fromkeys([*(name for name, _ in there), *labels])

@@ -1,4 +1,4 @@
-"""`cocoro export` and `cocoro view`: captures as film, table, or scene of another viewer."""
+"""`cocoro export`: captures as film, table, or scene of another viewer."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -19,12 +19,7 @@ from apps.cli.output import print_json
 from cocoro.clock import NS
 from cocoro.errors import ConfigError
 
-if TYPE_CHECKING:
-    pass
-
-PER_SERVICE = "{service}"
-DEPTH = 4
-"""Messages of one key that may wait; a viewer that is late shows the newest."""
+NO_ATTACHMENTS = "recorders attach no files: the run's profile, description and model are in `cocoro capture info FILE`"
 
 app = typer.Typer()
 
@@ -115,7 +110,8 @@ def export_capture(
         if attachments is not None:
             from apps.captures.export.files import export_attachments
 
-            wrote(attachments, export_attachments(capture, attachments), "attachments")
+            count = export_attachments(capture, attachments)
+            wrote(attachments, count, "attachments", "" if count else NO_ATTACHMENTS)
         for problem in capture.problems:
             print(f"missing: {problem}", file=sys.stderr)
         if capture.ending:

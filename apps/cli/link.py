@@ -27,6 +27,8 @@ __all__ = ["Answer", "MeshLink", "find", "joined", "within"]
 PERCEPTION = "perception"
 """The component that detects the known objects."""
 ROBOT_FILES = ("description", "measured")
+REPLAY, REPLAYED = "replay", "replayed"
+"""Process that publishes a capture's messages, and the state of a service that it stands for."""
 START = "start one with `cocoro up sim`"
 
 
@@ -72,9 +74,16 @@ class MeshLink(Participant):
         return f"{answer.service}: {answer.error}"
 
     def unheard(self, service: str) -> str:
-        """The state of a service without a liveliness token: `not alive` when no process of this machine is it, else
-        `no contact`, which a living process may be without."""
-        return "not alive" if self._private and self.run_dir.claimant(service) is None else "no contact"
+        """The state of a service without a liveliness token: `replayed` when a replay publishes its messages, `not
+        alive` when no process of this machine is it, else `no contact`, which a living process may be without."""
+        by = self.run_dir.claimant(service)
+        if by is not None and by.name == REPLAY:
+            return REPLAYED
+        return "not alive" if self._private and by is None else "no contact"
+
+    def replayed(self) -> set[str]:
+        """The services whose messages a replay of this machine publishes."""
+        return {service for service, by in self.run_dir.claims().items() if by.name == REPLAY}
 
 
 def find(choice: RobotChoice) -> RunDir:

@@ -22,6 +22,7 @@ from apps.captures.reader import Capture
 from apps.captures.replay import SIMULATOR, Replay, heard_as, played_keys, refuse_if_alive, services_of
 from apps.cli import exits
 from apps.cli.capture import check_span
+from apps.cli.link import REPLAY
 from apps.cli.options import CaptureArgument, FromOption, OnlyOption, ToOption
 from apps.cli.terminal import StatusLine
 from cocoro.bus.zenoh import ZenohBus
@@ -95,7 +96,7 @@ async def replay_file(
         name = _named(robot) if robot is not None else _name(capture.robot, hardware)
         run_dir = RunDir(name)
         run_dir.make()
-        claims = run_dir.claim("replay", services)
+        claims = run_dir.claim(REPLAY, services)
         try:
             async with await ZenohBus.open(run_dir.join_as("replay", frames=True)) as bus:
                 await refuse_if_alive(bus, name, services)
@@ -117,7 +118,7 @@ def _named(robot: str) -> str:
     try:
         return msgspec.convert(robot, profiles.Name)
     except msgspec.ValidationError as error:
-        raise ConfigError(f"--robot {robot}: a robot's name has 1 to 32 small letters, digits, '-' and '_'") from error
+        raise ConfigError(f"--robot {robot}: {profiles.A_NAME}") from error
 
 
 def _name(recorded: str, hardware: bool) -> str:

@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Iterable
 from contextlib import closing
 from pathlib import Path
 from typing import IO, Annotated, Any, TextIO
@@ -34,11 +35,12 @@ from apps.cli.options import (
 from apps.cli.output import going_on, print_json
 from cocoro import private
 from cocoro.bus import shared
-from cocoro.errors import CocoroError, ConfigError
+from cocoro.errors import CocoroError, ConfigError, choice_of
 from deploy import extras, launch, profiles
 from deploy.profiles import Profile
 from deploy.rundir import RunDir, Target, robots, targets
 
+SENSORS, BODIES, REACHES = ("ideal", "real"), ("nominal", "worn"), ("learned", "rigid")
 ERRORS = "supervisor.err"
 ERRORS_BYTES = 64 * 1024
 STOP_S = 60.0
@@ -57,16 +59,16 @@ def up(
     sensors: Annotated[
         str | None,
         typer.Option(
-            metavar="ideal|real",
-            autocompletion=completions.of("ideal", "real"),
+            metavar="|".join(SENSORS),
+            autocompletion=completions.of(*SENSORS),
             help="Simulator: sensors without or with errors.",
         ),
     ] = None,
     body: Annotated[
         str | None,
         typer.Option(
-            metavar="nominal|worn",
-            autocompletion=completions.of("nominal", "worn"),
+            metavar="|".join(BODIES),
+            autocompletion=completions.of(*BODIES),
             help="Simulator: a body that equals the nominal model, or differs.",
         ),
     ] = None,
@@ -147,9 +149,9 @@ def overrides(
     if seed is not None:
         sim["seed"] = seed
     if sensors is not None:
-        sim["sensors"] = sensors
+        sim["sensors"] = one_of("--sensors", sensors, SENSORS)
     if body is not None:
-        sim["body"] = body
+        sim["body"] = one_of("--body", body, BODIES)
     if frames is not None:
         sim.update(frames_of(frames))
     # These JSON values are TOML values, too.
@@ -171,17 +173,28 @@ def model_of(file: Path | None, reach: str | None, adapt: bool = False) -> list[
     if file is not None and not file.is_file():
         raise ConfigError(f"--model {file}: no such file; `cocoro learn` writes one")
     found = [] if file is None else [f"service.planning.model={json.dumps(str(file.resolve()))}"]
-    found += [] if reach is None else [f"service.planning.reach={json.dumps(reach)}"]
+    found += [] if reach is None else [f"service.planning.reach={json.dumps(one_of('--reach', reach, REACHES))}"]
     return found + (["service.planning.adapt=true"] if adapt else [])
 
 
 def scene_of(scene: str) -> str:
-    """A scene's name unchanged; the path of a scene file made absolute. Raises ConfigError for a missing file."""
+    """A scene's name unchanged; the path of a scene file made absolute. Raises ConfigError for an unknown name and a
+    missing file."""
     if not scene.endswith(".toml") and os.sep not in scene:
-        return scene
+        from sim.scene_names import GENERATED, scene_names
+
+        return one_of("--scene", scene, (*scene_names(), *GENERATED))
     if not Path(scene).is_file():
         raise ConfigError(f"--scene {scene}: no such file; give a .toml file, or the name of a scene")
     return str(Path(scene).resolve())
+
+
+def one_of(option: str, given: str, known: Iterable[str]) -> str:
+    """A value that is allowed, unchanged. Raises ConfigError for another."""
+    names = [*known]
+    if given not in names:
+        raise ConfigError(f"{option} {given}: {choice_of(given, names)}")
+    return given
 
 
 # --- up -------------------------------------------------------------------------------------------

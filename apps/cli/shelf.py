@@ -20,7 +20,7 @@ from cocoro.capture.conventions import CaptureError
 from cocoro.clock import NS
 from cocoro.errors import RefusedError
 from deploy.rundir import robots
-from services.capture.folder import delete, is_pinned, pin_of
+from services.capture.folder import IDLE, delete, is_pinned, pin_of
 
 MB = 1e6
 COLUMNS = (
@@ -52,7 +52,7 @@ def list_captures(
         places = ", ".join(map(str, folders()))
         print(f"no captures{f' of {robot}' if robot else ''} in {places}")
         return
-    shown = found if everything else [each for each in found if each.what][:count]
+    shown = found if everything else [each for each in found if each.name.partition("-")[0] != IDLE][:count]
     if shown:
         print_table(COLUMNS, [_row(each) for each in reversed(shown)])
         print()
@@ -107,17 +107,18 @@ def remove(
     as_json: JsonOption = False,
 ) -> None:
     """Delete captures, after asking."""
-    sys.exit(remove_captures(list(dict.fromkeys(files)), yes, as_json))
+    sys.exit(remove_captures(list(dict.fromkeys(file.absolute() for file in files)), yes, as_json))
 
 
 def remove_captures(files: list[Path], yes: bool, as_json: bool) -> int:
     """Deletes captures; returns the exit code. Nothing is deleted when one of them must stay. Raises RefusedError for
     one that is pinned or is being written, CaptureError for what is no capture."""
+    written = {path.resolve() for run_dir in robots() for path in open_captures(run_dir)}
     for path in files:
         _must_exist(path)
         if is_pinned(path):
             raise RefusedError(f"{path} is pinned; `cocoro capture unpin` comes first; nothing was removed")
-        if path in _written():
+        if path.resolve() in written:
             raise RefusedError(f"{path} is being written; `cocoro down` ends that; nothing was removed")
     size = _size(sum(path.stat().st_size for path in files))
     if not yes:
@@ -130,11 +131,6 @@ def remove_captures(files: list[Path], yes: bool, as_json: bool) -> int:
             complain("nothing was removed, as you answered")
             return exits.REFUSED
     return _each(files, as_json, "removed", delete)
-
-
-def _written() -> set[Path]:
-    """Captures that recorders of this machine have open now."""
-    return {path for run_dir in robots() for path in open_captures(run_dir)}
 
 
 def _each(files: list[Path], as_json: bool, word: str, work: Any) -> int:

@@ -12,7 +12,7 @@ import msgspec
 import typer
 
 from apps.cli import exits
-from apps.cli.link import MeshLink, joined, within
+from apps.cli.link import REPLAYED, MeshLink, joined, within
 from apps.cli.options import JsonOption, MeshOption, RobotChoice, RobotOption
 from apps.cli.output import print_json
 from apps.cli.terminal import Column, fields, print_table
@@ -48,7 +48,7 @@ async def show_status(choice: RobotChoice, as_json: bool) -> int:
         print_json(report)
     else:
         _print(report)
-    return exits.DONE if all(service["alive"] for service in report["services"]) else exits.FAILED
+    return exits.FAILED if missing(report) else exits.DONE
 
 
 class Survey:
@@ -65,9 +65,10 @@ class Survey:
         for topic in NEWS:
             self._link.inbox(topic).add(partial(self._on_news, topic.name))
         alive = set(await self._link.alive())
-        wanted_news = {topic.name for topic in NEWS if topic.service in alive}
-        await within(HEALTH_S, lambda: alive <= set(self._health) and wanted_news <= set(self._newest), self._changed)
-        return self._report(alive)
+        there = alive | self._link.replayed()
+        wanted_news = {topic.name for topic in NEWS if topic.service in there}
+        await within(HEALTH_S, lambda: there <= set(self._health) and wanted_news <= set(self._newest), self._changed)
+        return self._report(alive, there)
 
     def _on_health(self, health: Health) -> None:
         self._health[health.service] = health
@@ -77,9 +78,9 @@ class Survey:
         self._newest[topic] = message
         self._changed.set()
 
-    def _report(self, alive: set[str]) -> dict[str, Any]:
+    def _report(self, alive: set[str], there: set[str]) -> dict[str, Any]:
         resolved = self._link.run_dir.resolved()
-        names = list(dict.fromkeys([*expected(resolved), *sorted(alive)]))
+        names = list(dict.fromkeys([*expected(resolved), *sorted(there)]))
         return {
             "robot": self._link.robot,
             "profile": resolved.get("name", ""),
@@ -98,10 +99,17 @@ class Survey:
     def _state(self, service: str, alive: bool) -> str:
         if not alive:
             return self._link.unheard(service)
-        return self._health[service].state if service in self._health else "no report"
+        if service in self._health:
+            return self._health[service].state
+        return REPLAYED if service in self._link.replayed() else "no report"
 
     def _newest_of(self, topic: str) -> Any:
         return msgspec.to_builtins(self._newest[topic]) if topic in self._newest else None
+
+
+def missing(report: dict[str, Any]) -> bool:
+    """Whether a service of a report is missing: it is not alive, and no replay stands for it."""
+    return not all(service["alive"] or service["state"] == REPLAYED for service in report["services"])
 
 
 def expected(resolved: dict[str, Any]) -> tuple[str, ...]:
@@ -114,12 +122,13 @@ def expected(resolved: dict[str, Any]) -> tuple[str, ...]:
 
 def _print(report: dict[str, Any]) -> None:
     rows = []
+    told: dict[tuple[str, int], str] = {}
     for service in report["services"]:
         health = service.get("health")
         if health is None:
             rows.append((service["service"], service["state"], "", "", "", "", ""))
             continue
-        text = "; ".join(filter(None, (health["text"], *health["faults"])))
+        text = said(health, service["service"], told)
         loop = max(health["loops"], key=lambda loop: loop["rate_hz"], default=None)
         rows.append(
             (
@@ -136,6 +145,13 @@ def _print(report: dict[str, Any]) -> None:
     print_table(COLUMNS, rows)
     print()
     print(fields(_facts(report)), end="")
+
+
+def said(health: dict[str, Any], service: str, told: dict[tuple[str, int], str]) -> str:
+    """What a service says; 'as sim' when another service of its process, in `told`, has said the same."""
+    text = "; ".join(filter(None, (health["text"], *health["faults"])))
+    by = told.setdefault((text, health["pid"]), service)
+    return text if not text or by == service else f"as {by}"
 
 
 def _facts(report: dict[str, Any]) -> Iterator[tuple[str, str]]:

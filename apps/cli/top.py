@@ -16,10 +16,10 @@ import typer
 
 from apps.cli import exits
 from apps.cli.interrupt import elapsed, interrupt_event
-from apps.cli.link import MeshLink, joined, within
+from apps.cli.link import REPLAYED, MeshLink, joined, within
 from apps.cli.options import JsonOption, MeshOption, RobotChoice, RobotOption
 from apps.cli.output import print_json
-from apps.cli.status import expected
+from apps.cli.status import expected, missing
 from apps.cli.top_view import Screen, print_report
 from cocoro.component import Component
 from cocoro.errors import CocoroError
@@ -67,7 +67,7 @@ async def show_top(choice: RobotChoice, once: bool, as_json: bool, every_s: floa
         if once:
             report = watch.report()
             _print(report, as_json)
-            return exits.DONE if all(service["alive"] for service in report["services"]) else exits.FAILED
+            return exits.FAILED if missing(report) else exits.DONE
         with interrupt_event() as end:
             if as_json or not sys.stdout.isatty():
                 while not end.is_set():
@@ -113,7 +113,8 @@ class MeshWatch:
     async def first(self) -> None:
         """Waits for the health of every live service, at most FIRST_S."""
         self._alive |= set(await self._link.alive())
-        await within(FIRST_S, lambda: self._alive <= set(self._health), self._changed)
+        there = self._alive | self._link.replayed()
+        await within(FIRST_S, lambda: there | self._alive <= set(self._health), self._changed)
 
     def _on_alive(self, service: str, alive: bool) -> None:
         (self._alive.add if alive else self._alive.discard)(service)
@@ -164,8 +165,10 @@ class MeshWatch:
         health, heard_s = self._health.get(name), self._heard_s.get(name)
         silent_s = None if heard_s is None else time.monotonic() - heard_s
         alive = name in self._alive
-        unreported = alive and self._clock_goes and (silent_s is None or silent_s * self._clock_rate > UNREPORTED_S)
-        state = "no report" if unreported else "" if health is None else health.state
+        replayed = health is None and self._link.unheard(name) == REPLAYED
+        late = silent_s is None or silent_s * self._clock_rate > UNREPORTED_S
+        unreported = alive and not replayed and self._clock_goes and late
+        state = REPLAYED if replayed else "no report" if unreported else "" if health is None else health.state
         return {
             "service": name,
             "process": row.name if row is not None else name,
@@ -208,7 +211,7 @@ class MeshWatch:
         sent: dict[str, tuple[str, TopicHealth]] = {}
         read: list[tuple[str, TopicHealth]] = []
         for service, health in self._health.items():
-            if service in self._alive:
+            if service in self._alive or self._link.unheard(service) == REPLAYED:
                 for topic in health.topics:
                     if topic.direction == "out":
                         sent[topic.key] = (service, topic)

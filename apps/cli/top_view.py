@@ -8,14 +8,16 @@ from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.text import Text
 
+from apps.cli.link import REPLAYED
+from apps.cli.status import said
 from apps.cli.terminal import PLAIN_WIDTH, Column, FittedTable
 
 SLOW, STALLED = 0.85, 0.4
 """Shares of the nominal rate: one below SLOW, or as far above 1, is yellow, one below STALLED red."""
 LATE, VERY_LATE = 0.01, 0.1
 """Shares of a loop's periods without a step that are yellow and red."""
-OTHER_LINES = 8
-"""Lines of the screen beside services and topics: the headline's three, two blank ones, the topics' head, and two that
+OTHER_LINES = 7
+"""Lines of the screen beside services and topics: the headline's two, two blank ones, the topics' head, and two that
 tell what is left out."""
 BAD, DOUBTFUL, GOOD, FAINT = "bold red", "yellow", "green", "dim"
 COUNTED = ("skipped", "lost", "rejected", "expired")
@@ -61,17 +63,20 @@ def print_report(report: dict[str, Any]) -> None:
 def render(report: dict[str, Any], screen: Console | None = None) -> RenderableType:
     """The whole report; for a `screen` only topics that have a rate or a problem, as many as have room on it."""
     topics, hidden = report["topics"], list[Text]()
+    words = report["machine"].get("starved", "")
+    starved = [Text(words, BAD)] if words else []  # folded: the end of the sentence says who takes the processor
     needed = len(report["services"]) + len(topics) + 2 * OTHER_LINES
     services = _services(report["services"], fold=screen is None or screen.height > needed)
     if screen is None:
         room = len(topics)
     else:
-        room = max(screen.height - len(screen.render_lines(services, pad=False)) - OTHER_LINES, 1)
+        fixed = Group(*starved, services)
+        room = max(screen.height - len(screen.render_lines(fixed, pad=False)) - OTHER_LINES, 1)
     if room < len(topics):
         topics = sorted(filter(_is_busy, topics), key=lambda topic: not _is_troubled(topic))[:room]
         more = len(report["topics"]) - len(topics)
         hidden = [Text(f"(a higher terminal shows {more} more; so does --once)", FAINT)]
-    return Group(_headline(report), Text(), services, Text(), _topics(topics), *hidden)
+    return Group(_headline(report), *starved, Text(), services, Text(), _topics(topics), *hidden)
 
 
 def _is_busy(topic: dict[str, Any]) -> bool:
@@ -102,8 +107,6 @@ def _headline(report: dict[str, Any]) -> Text:
     if (base := report["base"]) is not None:
         text.append(f"  battery {100 * base['battery_fraction']:.0f}%")
     text.append("\n")
-    if machine.get("starved"):
-        text.append(f"{machine['starved']}\n", BAD)
     task, plan = report["task"], report["plan"]
     if task is not None and task["task_id"]:
         name = f"{task['task']} {task['label']}".strip()
@@ -123,17 +126,18 @@ BAD_STATES = ("not alive", "no contact", "no report")
 
 def _services(services: list[dict[str, Any]], fold: bool) -> FittedTable:
     shown: dict[int, str] = {}
-    return FittedTable(SERVICES, [_service(service, shown) for service in services], fold=fold)
+    told: dict[tuple[str, int], str] = {}
+    return FittedTable(SERVICES, [_service(service, shown, told) for service in services], fold=fold)
 
 
-def _service(service: dict[str, Any], shown: dict[int, str]) -> list[str | Text]:
+def _service(service: dict[str, Any], shown: dict[int, str], told: dict[tuple[str, int], str]) -> list[str | Text]:
     health = service["health"]
     style = BAD if service["state"] in BAD_STATES else GOOD if service["state"] == "ready" else DOUBTFUL
     state = Text(service["state"] or "?", style)
     if health is None:
         return [service["service"], state, *[""] * 9]
     loop = max(health["loops"], key=lambda loop: loop["rate_hz"], default=None)
-    text = "; ".join(filter(None, (health["text"], *health["faults"])))
+    text = said(health, service["service"], told)
     if service["state"] == "no report" and service["silent_s"] is not None:
         text = f"no report of its health for {service['silent_s']:.0f} s"
     pid = health["pid"]
@@ -147,7 +151,7 @@ def _service(service: dict[str, Any], shown: dict[int, str]) -> list[str | Text]
             _cost(100 * health["cpu_share"], 100 * (service["cpu_budget"] or 0), "%"),
             _cost(health["rss_mb"], service["rss_budget_mb"] or 0, " MB"),
         ]
-    dead = service["state"] == "not alive"
+    was = {"not alive": f"was {pid}", REPLAYED: ""}.get(service["state"], f"pid {pid}")
     row = [
         service["service"], state, *costs,
         "" if loop is None else f"{loop['rate_hz']:.1f} Hz",
@@ -156,9 +160,7 @@ def _service(service: dict[str, Any], shown: dict[int, str]) -> list[str | Text]
         _late(service.get("late_share")),
         _duration(health["uptime_s"]), text,
     ]  # fmt: skip
-    return (
-        [row[0], row[1], *[""] * 8, Text(f"{'was' if dead else 'pid'} {pid}", FAINT)] if not service["alive"] else row
-    )
+    return row if service["alive"] else [row[0], row[1], *[""] * 8, Text(was, FAINT)]
 
 
 def _late(share: float | None) -> Text:

@@ -13,6 +13,6 @@ CAPTURE = Component(
     frames="reads",
     nice=10,
     cpu_share=0.3,
-    rss_mb=400.0,
+    rss_mb=300.0,
     libraries=("opencv-python-headless",),
 )

@@ -9,8 +9,8 @@ import msgspec
 from msgspec import Meta
 
 from cocoro.units import Positive
-from services.capture.file import Compression
 from services.capture.folder import default_folder
+from services.capture.packing import Compression
 
 
 class CaptureConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -27,7 +27,7 @@ class CaptureConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     compression: Compression = "zstd"
     """Lossless compression of chunks. A chunk that does not shrink is stored uncompressed."""
     level: Annotated[int, Meta(ge=1, le=19)] = 1
-    """zstd level: 1 is fast, 19 thorough and slow."""
+    """zstd level: 1 is fast, 19 thorough and slow. Small messages have at least 3."""
     jpeg_quality: Annotated[int, Meta(ge=1, le=100)] | None = None
     """Store the frames' colour as JPEG of this quality: far smaller, but perception cannot be re-executed from it."""
 
@@ -39,8 +39,8 @@ class CaptureConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     Has no effect without `per_occasion`."""
     before_s: Annotated[float, Meta(ge=0, le=3)] = 3.0
     """Seconds of everything that are kept in memory, for the file of the next occasion."""
-    before_mb: Positive = 140.0
-    """Limit of that memory. 3 s of 30 frames of 640 x 480 take 138 MB."""
+    before_mb: Positive = 100.0
+    """Limit of that memory. 3 s of 30 frames of 640 x 480 take 58 to 73 MB with noisy sensors: they wait packed."""
 
     rotate_mb: Positive = 2000.0
     rotate_s: Positive = 600.0

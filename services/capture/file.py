@@ -3,15 +3,6 @@
 The file is encoded here because the `mcap` package's writer takes 1.2 times (ideal sensors) to 1.8 times (real
 sensors) the processor time, 1.2 to 1.4 times without frames (`python bench/capture_format.py files`). It also has
 one zstd level and mixes frames with small messages in one chunk.
-
-A frame is copied once, behind its message's head, so writing 1.54 MB needs up to 3.08 MB more memory at the peak,
-packed bytes included. In return a frame that is joined and packed as one piece takes 1.74 ms (3.26 ms with noisy
-sensors), against 1.99 ms (3.71 ms) when zstd gets head and payload one after the other (`python
-bench/capture_format.py records`).
-
-Compression is measured on frames of the simulated Kinect, 1.5 MB each, on one core (`python bench/capture.py
-frames`): zstd at level 1 makes ideal frames 25 times smaller in 1.0 ms and noisy ones 2.1 times in 2.1 ms; lz4 11
-times in 0.6 ms and 1.3 times in 0.9 ms. Both cost less than writing the bytes that they save.
 """
 
 from __future__ import annotations
@@ -21,13 +12,10 @@ import os
 import struct
 import zlib
 from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Literal, get_args
 
-import lz4.frame
 import msgspec
-import zstandard
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.records import (
@@ -49,37 +37,7 @@ from mcap.records import (
 from cocoro.about import versions
 from cocoro.capture import mcap
 from cocoro.capture.conventions import CHECKSUM, MAKER, PROFILE, TALLY, KeyTally, checksum, tally_names
-
-Compression = Literal["zstd", "lz4", "none"]
-COMPRESSIONS: tuple[Compression, ...] = get_args(Compression)
-WORTH = 0.95
-"""A chunk that does not shrink to this share of its size is stored uncompressed, so that reading it is free."""
-QUICK = zstandard.ZstdCompressionParameters.from_level(1, window_log=17, hash_log=12, chain_log=12, min_match=7)
-"""zstd level 1 with a table that fits the level 1 cache, and without short matches: 6% less time for frames at the
-same size."""
-
-
-class Packer:
-    """Compresses chunks. Not thread-safe."""
-
-    def __init__(self, compression: Compression, level: int = 1) -> None:
-        """`level` is the zstd level: 1 is fast, 19 thorough."""
-        self._name = "" if compression == "none" else compression
-        self._pack: Callable[[bytes | memoryview], bytes] | None = None
-        if compression == "zstd" and level == 1:
-            self._pack = zstandard.ZstdCompressor(compression_params=QUICK).compress
-        elif compression == "zstd":
-            self._pack = zstandard.ZstdCompressor(level=level).compress
-        elif compression == "lz4":
-            self._pack = lz4.frame.compress
-
-    def pack(self, raw: bytes) -> tuple[str, bytes]:
-        """Returns the compression's name in MCAP ('' for none) and the compressed bytes."""
-        if self._pack is None:
-            return "", raw
-        packed = self._pack(raw)
-        return (self._name, packed) if len(packed) < WORTH * len(raw) else ("", raw)
-
+from services.capture.packing import PackedMessage, Packer, message_head
 
 LIBRARY = f"{MAKER} {versions().get('cocoro-mesh', '')}".strip()
 LARGE_BYTES = 64 * 1024
@@ -98,6 +56,8 @@ class _Chunk:
         self.size_bytes = 0
         self.start_ns = 0
         self.end_ns = 0
+        self.declares = False
+        """It has schemas or channels."""
 
 
 class CaptureFile:
@@ -153,32 +113,58 @@ class CaptureFile:
 
     def add(self, channel_id: int, sequence: int, log_ns: int, publish_ns: int, payload: bytes) -> None:
         """Add a message of a declared channel. Log times must not decrease."""
-        head = message_head(channel_id, sequence & 0xFFFFFFFF, log_ns, max(publish_ns, 0) & (1 << 64) - 1, len(payload))
-        self.tallies[channel_id].add(log_ns, len(payload))
         if len(payload) >= LARGE_BYTES:
-            raw = b"".join((*self._pending, head, payload))
-            at = len(raw) - len(head) - len(payload)
-            self._pending.clear()
-            self._write_chunk(raw, {channel_id: [log_ns, at]}, log_ns, log_ns)
+            self._flush_declarations()
+            self._add_packed(self._packer.message(channel_id, sequence, log_ns, publish_ns, payload, self._pending))
             return
+        head = message_head(channel_id, sequence, log_ns, publish_ns, len(payload))
+        self.tallies[channel_id].add(log_ns, len(payload))
         chunk = self._chunk
         if not chunk.parts:
             chunk.start_ns = log_ns
         chunk.end_ns = log_ns
-        chunk.parts += self._pending
-        chunk.size_bytes += sum(map(len, self._pending))
-        self._pending.clear()
+        self._declare_in(chunk)
         chunk.places[channel_id] += (log_ns, chunk.size_bytes)
         chunk.parts += (head, payload)
         chunk.size_bytes += len(head) + len(payload)
         if chunk.size_bytes >= FULL_BYTES:
             self.flush()
 
+    def add_packed(self, packed: PackedMessage) -> None:
+        """As `add`, of a message that the packer has packed already."""
+        self._flush_declarations()
+        self._add_packed(self._packer.behind(self._pending, packed) if self._pending else packed)
+
+    def _add_packed(self, packed: PackedMessage) -> None:
+        """Write a chunk with one message, and before it what was pending."""
+        self._pending.clear()
+        self.tallies[packed.channel_id].add(packed.log_ns, packed.payload_bytes)
+        head = mcap.ChunkHead(
+            packed.log_ns, packed.log_ns, packed.raw_bytes, packed.crc, packed.compression, len(packed.data)
+        )
+        self._write_chunk(head, packed.data, {packed.channel_id: [packed.log_ns, packed.message_at]})
+
+    def _flush_declarations(self) -> None:
+        """A message must not come before its channel, which may be in the chunk of small messages."""
+        if self._chunk.parts and (self._pending or self._chunk.declares):
+            self._declare_in(self._chunk)
+            self.flush()
+
+    def _declare_in(self, chunk: _Chunk) -> None:
+        if self._pending:
+            chunk.parts += self._pending
+            chunk.size_bytes += sum(map(len, self._pending))
+            chunk.declares = True
+            self._pending.clear()
+
     def flush(self) -> None:
         """Hand everything to the operating system, so that the death of this process loses nothing of it."""
         chunk, self._chunk = self._chunk, _Chunk()
         if chunk.parts:
-            self._write_chunk(b"".join(chunk.parts), chunk.places, chunk.start_ns, chunk.end_ns)
+            raw = b"".join(chunk.parts)
+            name, packed = self._packer.pack_small(raw)
+            head = mcap.ChunkHead(chunk.start_ns, chunk.end_ns, len(raw), zlib.crc32(raw), name, len(packed))
+            self._write_chunk(head, packed, chunk.places)
 
     def metadata(self, name: str, entries: Mapping[str, str]) -> None:
         """Write a metadata record, with a checksum where the file has this project's profile; MCAP itself has none for
@@ -224,9 +210,8 @@ class CaptureFile:
 
     # --- writing ----------------------------------------------------------------------------------
 
-    def _write_chunk(self, raw: bytes, index: Mapping[int, list[int]], start_ns: int, end_ns: int) -> None:
-        name, packed = self._packer.pack(raw)
-        head = chunk_head(mcap.ChunkHead(start_ns, end_ns, len(raw), zlib.crc32(raw), name, len(packed)))
+    def _write_chunk(self, chunk: mcap.ChunkHead, packed: bytes, index: Mapping[int, list[int]]) -> None:
+        head = chunk_head(chunk)
         length = len(head) + len(packed)
         offsets, entries, at = {}, [], self.size_bytes + length
         for channel_id, places in index.items():
@@ -239,16 +224,16 @@ class CaptureFile:
             ChunkIndex(
                 chunk_length=length,
                 chunk_start_offset=offset,
-                compression=name,
+                compression=chunk.compression,
                 compressed_size=len(packed),
-                message_end_time=end_ns,
+                message_end_time=chunk.end_ns,
                 message_index_length=at - offset - length,
                 message_index_offsets=offsets,
-                message_start_time=start_ns,
-                uncompressed_size=len(raw),
+                message_start_time=chunk.start_ns,
+                uncompressed_size=chunk.raw_bytes,
             )
         )
-        self.raw_bytes += len(raw)
+        self.raw_bytes += chunk.raw_bytes
 
     def _ending(self) -> list[bytes]:
         end = packed(DataEnd(0))  # no checksum over all data: each chunk has its own
@@ -320,13 +305,6 @@ def ended(builder: RecordBuilder) -> bytes:
 def footer(summary: bytes, summary_start: int, offsets_start: int) -> bytes:
     """Encode the footer with the checksum of the whole summary section."""
     return packed(Footer(summary_start, offsets_start, mcap.footer_crc(summary, summary_start, offsets_start)))
-
-
-def message_head(channel_id: int, sequence: int, log_ns: int, publish_ns: int, payload_bytes: int) -> bytes:
-    """Encode a message's prefix and fields; the payload follows. About 4 times as fast as the package on messages of
-    220 bytes."""
-    length = mcap.MESSAGE_FIELDS.size + payload_bytes
-    return mcap.MESSAGE_HEAD.pack(Opcode.MESSAGE, length, channel_id, sequence, log_ns, publish_ns)
 
 
 def message_index(channel_id: int, entries: Sequence[int]) -> bytes:

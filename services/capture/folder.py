@@ -17,7 +17,7 @@ PIN = ".pin"
 """A file with this ending beside a capture pins it: the recorder never deletes it."""
 NEWEST_IDLE = 2
 """Captures in which nothing happened and that stay as long as others can go: about the last hour."""
-MOTION = "motion"
+IDLE, MOTION = "idle", "motion"
 _NAME = re.compile(r"(?P<run>(?P<robot>.+)-\d{8}T\d{6}Z)-(?P<number>\d{3,})(?:-(?P<label>[A-Za-z0-9_.+-]+))?\.mcap")
 _UNFIT = re.compile(r"[^A-Za-z0-9_.+-]+")
 LONGEST_LABEL = 60
@@ -31,12 +31,13 @@ class CaptureName(NamedTuple):
     """The robot's name and the start of the recorder; equal for all files of one run."""
     number: int
     label: str
-    """What happened in it: a task with its target (`fetch-red_can`), `stop`, `fault` or `motion`; '' for nothing."""
+    """What happened in it: a task with its target (`fetch-red_can`), `stop`, `fault`, `motion`, or `idle` for nothing;
+    '' where the recorder did not tell these apart."""
 
     @property
     def rank(self) -> int:
         """The lower, the earlier it makes room."""
-        return 0 if not self.label else 1 if self.label == MOTION else 2
+        return {IDLE: 0, MOTION: 1}.get(self.label, 2)
 
 
 def default_folder() -> Path:
@@ -95,8 +96,8 @@ def make_room(folder: Path, robot: str, keep_bytes: int, started: datetime | Non
     """Delete captures of a robot until the others take at most `keep_bytes`.
 
     Captures in which nothing happened go first, except the newest two, then those in which the robot only moved, then
-    those with a task, a stop or a fault; each kind oldest first. Pinned ones neither go nor count. The newest capture
-    never goes, nor does the newest one with a task, a stop or a fault.
+    the others: with a task, a stop or a fault, or of a recorder that did not tell these apart. Each kind goes oldest
+    first. Pinned ones neither go nor count. The newest capture never goes, nor does the newest of the last kind.
 
     The current run's files, which began at `started`, count as the newest, in the order of their numbers, whatever
     the wall clock said when others were begun.

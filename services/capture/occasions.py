@@ -16,7 +16,7 @@ from cocoro.clock import NS
 from cocoro.keys import service_of
 from cocoro.messages import BaseState, Health, Latch, ServoState, TaskState
 from cocoro.topics import ARM_STATE, BASE_STATE, HAND_STATE, HEALTH, LATCH, TASK
-from services.capture.folder import MOTION, label_of
+from services.capture.folder import IDLE, MOTION, label_of
 
 AFTER_S = 5.0
 """An occasion lasts for this time after its last cause."""
@@ -159,14 +159,16 @@ class Watch:
     # --- causes -----------------------------------------------------------------------------------
 
     def _on_task(self, _key: str, state: TaskState, log_ns: int) -> None:
+        if self._task_id and (state.task_id != self._task_id or state.outcome is not None):
+            heard = state.task_id == self._task_id  # else a new executive or task has come since
+            self._end_task(state if heard else TaskState(task_id=self._task_id), log_ns)
         if state.outcome is not None:
-            if state.task_id == self._task_id:
-                self._end_task(state, log_ns)
             self._ended_task = state.task_id
         elif state.task_id not in ("", self._task_id, self._ended_task):
             self._task_id = state.task_id
             what = f"{state.task} {state.label}".strip()
             label = label_of(state.task, state.label)
+            label = f"task-{label}" if label in (IDLE, MOTION) else label
             self._begin(Occasion(kind="task", what=what, label=label, began_ns=log_ns, task_id=state.task_id))
 
     def _end_task(self, state: TaskState, log_ns: int) -> None:

@@ -13,10 +13,10 @@ from cocoro.clock import NS
 from cocoro.component import Implementation
 from cocoro.node import Node
 from services.capture.config import CaptureConfig, folder_of
-from services.capture.file import Packer
 from services.capture.folder import RecordingFolder
 from services.capture.keys import KeyFilter, KeyInfo, info_of, lossy
 from services.capture.log_clock import LogClock
+from services.capture.packing import Packer
 from services.capture.recorder import Ledger, Recorder
 from services.capture.sink import DirectSink, ThreadedSink
 from services.capture.thinning import ThinningLimits, ThinningWriter

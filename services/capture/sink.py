@@ -16,14 +16,12 @@ from cocoro.messages import DisturbedFile
 from services.capture.file import LARGE_BYTES
 from services.capture.keys import QueuedMessage
 from services.capture.occasions import Occasion, OccasionNews
-from services.capture.writer import CaptureWriter
+from services.capture.writer import CaptureWriter, sync
 
 log = logging.getLogger(__name__)
 
 POLL_S = 0.02
 """Period at which the thread takes all queued messages, so that the loop never has to wake it."""
-IDLE_FLUSH_S = 0.5
-"""Time between two flushes while nothing happens. Small messages of 0.1 s take 1.5 times the room of those of 0.5 s."""
 RESERVE_BYTES = 16 * 1024 * 1024
 """Room for small messages when large ones have filled the queue."""
 
@@ -68,7 +66,8 @@ class RecordingSink(Protocol):
 
 
 class DirectSink:
-    """Writes each message directly, for virtual time."""
+    """Writes each message directly, for virtual time. Its progress does not tell the room on the disk, so that equal
+    runs make equal captures."""
 
     def __init__(self, make: Callable[[Callable[[int], None] | None], CaptureWriter], flush_s: float) -> None:
         self._writer: CaptureWriter | None = None
@@ -98,7 +97,7 @@ class DirectSink:
                 self._writer.tell(what, occasion)
 
     def progress(self) -> RecordingProgress:
-        return _progress(self._writer, 0, 0.0, self._fault)
+        return _progress(self._writer, 0, 0.0, self._fault)._replace(free_bytes=0)
 
     def deleted(self) -> tuple[str, ...]:
         return () if self._writer is None else self._writer.deleted
@@ -151,10 +150,14 @@ class ThreadedSink:
         return True
 
     def remember(self, name: str, entries: Mapping[str, str]) -> None:
-        self._waiting.append(lambda writer: writer.remember(name, entries))
+        self._ask(lambda writer: writer.remember(name, entries))
 
     def tell(self, what: OccasionNews, occasion: Occasion) -> None:
-        self._waiting.append(lambda writer: writer.tell(what, occasion))
+        self._ask(lambda writer: writer.tell(what, occasion))
+
+    def _ask(self, work: Callable[[CaptureWriter], None]) -> None:
+        if not self._fault:  # nobody takes it any more
+            self._waiting.append(work)
 
     def progress(self) -> RecordingProgress:
         waiting_bytes = self._taken_bytes - self._done_bytes
@@ -181,14 +184,14 @@ class ThreadedSink:
                 self._write(writer)
                 if time.monotonic() >= flush_at_s:
                     writer.flush()
-                    flush_at_s = time.monotonic() + self._period_s(writer)
+                    flush_at_s = time.monotonic() + self._flush_s
                 if last:
                     writer.close()
                     return
 
     def _write(self, writer: CaptureWriter) -> None:
         """Write the queued messages, with a flush whenever `flush_s` has passed."""
-        flush_at_s = time.monotonic() + self._period_s(writer)
+        flush_at_s = time.monotonic() + self._flush_s
         for _ in range(len(self._waiting)):
             item = self._waiting.popleft()
             if isinstance(item, QueuedMessage):
@@ -198,11 +201,7 @@ class ThreadedSink:
                 item(writer)
             if time.monotonic() >= flush_at_s:
                 writer.flush()
-                flush_at_s = time.monotonic() + self._period_s(writer)
-
-    def _period_s(self, writer: CaptureWriter) -> float:
-        """Larger chunks while nothing happens: they shrink further."""
-        return max(self._flush_s, IDLE_FLUSH_S) if writer.thins else self._flush_s
+                flush_at_s = time.monotonic() + self._flush_s
 
     def _failed(self, fault: str) -> None:
         self._fault = fault
@@ -217,7 +216,7 @@ class Syncer:
         self,
         period_s: float,
         current: Callable[[], int | None],
-        sync: Callable[[int], None] = os.fdatasync,
+        sync: Callable[[int], None] = sync,
         wait: Callable[[threading.Event, float], bool] = threading.Event.wait,
     ) -> None:
         """`current` returns the descriptor of the open file."""
@@ -235,7 +234,7 @@ class Syncer:
         self._thread.start()
 
     def release(self, fd: int) -> None:
-        """Take over a completed file: sync and close it soon."""
+        """Take over a completed file or a folder: sync and close it soon."""
         self._whole.append(fd)
 
     def run(self) -> None:

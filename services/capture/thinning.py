@@ -16,10 +16,11 @@ from cocoro.bus.base import Qos
 from cocoro.capture.conventions import LEFT_OUT
 from cocoro.clock import NS
 from cocoro.installed import topic_named
-from services.capture.file import LARGE_BYTES, Packer
-from services.capture.folder import RecordingFolder
+from services.capture.file import LARGE_BYTES
+from services.capture.folder import IDLE, RecordingFolder
 from services.capture.keys import KeyInfo, PreparedMessage, QueuedMessage
 from services.capture.occasions import OCCASION, Occasion, OccasionNews
+from services.capture.packing import PackedMessage, Packer
 from services.capture.writer import CaptureWriter, FileLimits, Missing, sync_and_close
 
 KEPT_STRETCHES = 100
@@ -40,12 +41,18 @@ class ThinningLimits:
 class _Held:
     """A message that waits."""
 
-    __slots__ = ("message", "written")
+    __slots__ = ("key", "log_ns", "message", "written")
 
-    def __init__(self, message: QueuedMessage, written: bool) -> None:
+    def __init__(self, key: str, log_ns: int, message: QueuedMessage | PackedMessage, written: bool) -> None:
+        self.key = key
+        self.log_ns = log_ns
         self.message = message
         self.written = written
         """It is in the current file or the one before."""
+
+    @property
+    def size_bytes(self) -> int:
+        return len(self.message.data if isinstance(self.message, PackedMessage) else self.message.payload)
 
 
 class ThinningWriter(CaptureWriter):
@@ -63,6 +70,7 @@ class ThinningWriter(CaptureWriter):
         release: Callable[[int], None] = sync_and_close,
         prepare: Callable[[QueuedMessage], PreparedMessage] | None = None,
     ) -> None:
+        folder.label = IDLE
         super().__init__(folder.place, packer, limits, info, self._with_left_out, release, prepare)
         self.folder = folder
         self._known_missing = missing
@@ -95,7 +103,8 @@ class ThinningWriter(CaptureWriter):
         return self.folder.deleted
 
     @property
-    def thins(self) -> bool:
+    def _thins(self) -> bool:
+        """Whether large messages are left out now."""
         return self.occasion is None and self._thinning.period_s > 0
 
     @property
@@ -105,13 +114,17 @@ class ThinningWriter(CaptureWriter):
 
     def put(self, message: QueuedMessage) -> None:
         self._newest_ns = max(self._newest_ns, message.log_ns)
-        waits = self.thins and len(message.payload) >= LARGE_BYTES and self._may_be_left_out(message.key)
-        if not waits:
+        if not self._holds:
             super().put(message)
-        if self._holds:
-            self._held.append(_Held(message, written=not waits))
-            self._held_bytes += len(message.payload)
-            self._let_go_of_old()
+        elif len(message.payload) >= LARGE_BYTES:
+            packed = self.pack(message)
+            waits = self._thins and self._may_be_left_out(message.key)
+            if not waits:
+                self.put_packed(packed)
+            self._hold(_Held(message.key, message.log_ns, packed, written=not waits))
+        else:
+            super().put(message)
+            self._hold(_Held(message.key, message.log_ns, message, written=True))
 
     def tell(self, what: OccasionNews, occasion: Occasion) -> None:
         if what == "begin":
@@ -145,8 +158,7 @@ class ThinningWriter(CaptureWriter):
         self._next_file(occasion)
         self._write_occasion(occasion)
         for held in self._held:
-            super().put(held.message)
-            held.written = True
+            self._put_held(held)
         if not self._holds:
             self._held.clear()
             self._held_bytes = 0
@@ -155,7 +167,7 @@ class ThinningWriter(CaptureWriter):
         self._end_stretch()
         self.forget(OCCASION)
         self.occasion = occasion
-        self.folder.label = "" if occasion is None else occasion.label
+        self.folder.label = IDLE if occasion is None else occasion.label
         self.rotate()
         self._set_limits()
 
@@ -168,36 +180,42 @@ class ThinningWriter(CaptureWriter):
 
     # --- what waits -------------------------------------------------------------------------------
 
-    def _let_go_of_old(self) -> None:
-        """Release what has waited for long enough."""
+    def _hold(self, held: _Held) -> None:
+        """Keep a message, and release what has waited for long enough."""
+        self._held.append(held)
+        self._held_bytes += held.size_bytes
         oldest_ns = self._newest_ns - round(self._thinning.before_s * NS)
-        while self._held and (
-            self._held[0].message.log_ns < oldest_ns or self._held_bytes > self._thinning.before_bytes
-        ):
+        while self._held and (self._held[0].log_ns < oldest_ns or self._held_bytes > self._thinning.before_bytes):
             held = self._held.popleft()
-            self._held_bytes -= len(held.message.payload)
+            self._held_bytes -= held.size_bytes
             self._let_go_of(held, keep=True)
 
+    def _put_held(self, held: _Held) -> None:
+        if isinstance(held.message, PackedMessage):
+            self.put_packed(held.message)
+        else:
+            super().put(held.message)
+        held.written = True
+
     def _let_go_of(self, held: _Held, keep: bool) -> None:
-        message = held.message
         if held.written:
-            if len(message.payload) >= LARGE_BYTES:
-                self._kept_ns[message.key] = message.log_ns
+            if isinstance(held.message, PackedMessage):
+                self._kept_ns[held.key] = held.log_ns
             return
-        kept_ns = self._kept_ns.get(message.key)
-        if keep and (kept_ns is None or message.log_ns - kept_ns >= self._thinning.period_s * NS):
-            self._kept_ns[message.key] = message.log_ns
-            super().put(message)
+        kept_ns = self._kept_ns.get(held.key)
+        if keep and (kept_ns is None or held.log_ns - kept_ns >= self._thinning.period_s * NS):
+            self._kept_ns[held.key] = held.log_ns
+            self._put_held(held)
             return
-        self.left_out[message.key] += 1
+        self.left_out[held.key] += 1
         if not self._stretches or self._stretches[-1][1] is not None:
-            self._stretches.append([message.log_ns, None])
+            self._stretches.append([held.log_ns, None])
             self._write_stretches()
 
     def _end_stretch(self) -> None:
         """Large messages are written again from those that wait on."""
         if self._stretches and self._stretches[-1][1] is None:
-            first_ns = next((held.message.log_ns for held in self._held if not held.written), self._newest_ns)
+            first_ns = next((held.log_ns for held in self._held if not held.written), self._newest_ns)
             self._stretches[-1][1] = first_ns
             self._write_stretches()
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import stat
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
@@ -16,9 +17,10 @@ from cocoro.capture.conventions import CaptureError
 from cocoro.capture.types import TypeSchema
 from cocoro.clock import NS
 from cocoro.messages import DisturbedFile
-from services.capture.file import CaptureFile, Packer
+from services.capture.file import CaptureFile
 from services.capture.keys import KeyInfo, PreparedMessage, QueuedMessage
 from services.capture.occasions import Occasion, OccasionNews
+from services.capture.packing import PackedMessage, Packer
 
 MB = 1_000_000
 LOOK_S = 1.0
@@ -40,9 +42,17 @@ class FileLimits:
     """Recording stops when the disk has less room left, to leave some for the robot."""
 
 
+def sync(fd: int) -> None:
+    """Sync a file's content, or the entries of a folder."""
+    if stat.S_ISDIR(os.fstat(fd).st_mode):
+        os.fsync(fd)
+    else:
+        os.fdatasync(fd)
+
+
 def sync_and_close(fd: int) -> None:
     try:
-        os.fdatasync(fd)
+        sync(fd)
     finally:
         os.close(fd)
 
@@ -72,7 +82,8 @@ class CaptureWriter:
         monotonic_s: Callable[[], float] = time.monotonic,
     ) -> None:
         """`place(n)` is the path of the nth file, from 1 on. `info(key, payload)` gives a new channel's information.
-        `release` takes the descriptor of a completed file. `prepare` may replace each message."""
+        `release` takes the descriptor of a completed file, or of the folder of a new one, to sync and close it.
+        `prepare` may replace each message."""
         self._place = place
         self._packer = packer
         self.limits = limits
@@ -83,10 +94,12 @@ class CaptureWriter:
         self._monotonic_s = monotonic_s
         self._look_at_s = 0.0
         self._metadata: dict[str, dict[str, str]] = {}
-        self._infos: dict[ChannelName, KeyInfo] = {}
-        self._channels: dict[ChannelName, int] = {}
+        self._numbers: dict[ChannelName, int] = {}
+        """Numbers of the channels, the same in all files."""
+        self._channels: dict[int, tuple[Channel, Schema | None]] = {}
         self._schemas: dict[TypeSchema, int] = {}
-        """Numbers of channels and schemas in the current file."""
+        self._declared: set[int] = set()
+        """Channels in the current file."""
         self._number = 0
         self._first_ns: int | None = None
         self._closed_bytes = 0
@@ -118,37 +131,72 @@ class CaptureWriter:
         return self._closed_raw_bytes + (0 if self._ended is self.file else self.file.raw_bytes)
 
     def put(self, message: QueuedMessage) -> None:
-        if self._first_ns is None:
-            self._first_ns = message.log_ns
-        elif (
-            self.file.size_bytes >= self.limits.file_bytes or message.log_ns - self._first_ns >= self.limits.file_s * NS
-        ):
-            self._rotate()
-            self._first_ns = message.log_ns
-        schema = None
-        if self._prepare is not None:
-            message, schema = self._prepare(message)
+        self._turn(message.log_ns)
+        message, number = self._numbered(message)
         try:
-            name: ChannelName = message.key if message.channel is None else (message.key, message.channel)
-            channel = self._channels.get(name) or self._channel(name, message, schema)
-            self.file.add(channel, message.sequence, message.log_ns, message.publish_ns, message.payload)
+            self._declare(number)
+            self.file.add(number, message.sequence, message.log_ns, message.publish_ns, message.payload)
         except OSError as error:
             raise self._failed(error) from error
         self.messages += 1
 
-    def _channel(self, name: ChannelName, message: QueuedMessage, schema: TypeSchema | None) -> int:
-        """Declare a channel in the current file."""
-        info = self._infos.get(name)
-        if info is None:
+    def pack(self, message: QueuedMessage) -> PackedMessage:
+        """The same message for `put_packed`, into this file or a later one.
+
+        Its bytes are a copy. The packer makes room for a message that does not shrink and gives the rest back, and many
+        such rests, none of which fits the next message, take as much memory as if nothing had been packed.
+        """
+        message, number = self._numbered(message)
+        packed = self._packer.message(number, message.sequence, message.log_ns, message.publish_ns, message.payload)
+        return packed._replace(data=bytes(memoryview(packed.data)))
+
+    def put_packed(self, packed: PackedMessage) -> None:
+        self._turn(packed.log_ns)
+        try:
+            self._declare(packed.channel_id)
+            self.file.add_packed(packed)
+        except OSError as error:
+            raise self._failed(error) from error
+        self.messages += 1
+
+    def _turn(self, log_ns: int) -> None:
+        """Begin a new file where the current one is large or long enough."""
+        if self._first_ns is None:
+            self._first_ns = log_ns
+        elif self.file.size_bytes >= self.limits.file_bytes or log_ns - self._first_ns >= self.limits.file_s * NS:
+            self._rotate()
+            self._first_ns = log_ns
+
+    def _numbered(self, message: QueuedMessage) -> tuple[QueuedMessage, int]:
+        """The message as it is to be written, and its channel's number."""
+        schema = None
+        if self._prepare is not None:
+            message, schema = self._prepare(message)
+        name: ChannelName = message.key if message.channel is None else (message.key, message.channel)
+        number = self._numbers.get(name)
+        if number is None:
+            number = self._numbers[name] = len(self._numbers) + 1
             info = message.info or self._info(message.key, message.payload)
-            info = self._infos[name] = info if schema is None else info._replace(schema=schema)
-        schema_id = 0
-        if info.schema is not None:
-            schema_id = self._schemas.setdefault(info.schema, len(self._schemas) + 1)
-            self.file.schema(Schema(schema_id, info.schema.data, info.schema.encoding, info.schema.name))
-        channel = self._channels[name] = len(self._channels) + 1
-        self.file.channel(Channel(channel, message.key, info.encoding, info.metadata, schema_id))
-        return channel
+            self._channels[number] = self._channel(number, message.key, info, schema or info.schema)
+        return message, number
+
+    def _channel(
+        self, number: int, key: str, info: KeyInfo, schema: TypeSchema | None
+    ) -> tuple[Channel, Schema | None]:
+        if schema is None:
+            return Channel(number, key, info.encoding, info.metadata, 0), None
+        schema_id = self._schemas.setdefault(schema, len(self._schemas) + 1)
+        declared = Schema(schema_id, schema.data, schema.encoding, schema.name)
+        return Channel(number, key, info.encoding, info.metadata, schema_id), declared
+
+    def _declare(self, number: int) -> None:
+        """Declare a channel in the current file."""
+        if number not in self._declared:
+            self._declared.add(number)
+            channel, schema = self._channels[number]
+            if schema is not None:
+                self.file.schema(schema)
+            self.file.channel(channel)
 
     def flush(self) -> None:
         """Hand everything to the operating system; check that the file is at its path and the disk has room."""
@@ -190,11 +238,6 @@ class CaptureWriter:
     def deleted(self) -> tuple[str, ...]:
         """Names of the captures that made room."""
         return ()
-
-    @property
-    def thins(self) -> bool:
-        """Whether large messages are left out now."""
-        return False
 
     def forget(self, name: str) -> None:
         """Later files have no metadata of this name."""
@@ -239,7 +282,8 @@ class CaptureWriter:
             try:
                 for name, entries in self._metadata.items():
                     file.metadata(name, entries)
-                _sync_folder(path.parent)
+                # Syncs the folder, so that the new file's entry survives a loss of power.
+                self._release(os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC))
             except OSError:
                 file.abandon()
                 raise
@@ -255,7 +299,7 @@ class CaptureWriter:
         except CaptureError:
             self.close()
             raise
-        self.file, self._channels, self._schemas = after, {}, {}
+        self.file, self._declared = after, set()
         try:
             self._finish(before)
         except OSError as error:
@@ -303,15 +347,6 @@ class CaptureWriter:
 
 def _error(error: OSError, path: Path) -> CaptureError:
     return CaptureError(f"{path}: {error.strerror or error}")
-
-
-def _sync_folder(folder: Path) -> None:
-    """Makes the new file's directory entry survive a loss of power."""
-    fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(fd)
-    finally:
-        os.close(fd)
 
 
 class FileLocation(NamedTuple):

@@ -15,8 +15,8 @@ from apps.captures.rewrite import rewrite
 from apps.rehearsal.rehearse import rehearse
 from apps.rehearsal.request import RehearsalRequest
 from cocoro.clock import NS
-from services.capture.file import Packer
 from services.capture.keys import KeyFilter
+from services.capture.packing import Packer
 from services.executive.tasks import FetchTask
 
 GOLDEN = Path(__file__).with_name("fetch.mcap")

@@ -47,8 +47,8 @@ from cocoro.messages import (
 )
 from cocoro.objects import ObjectSpec
 from cocoro.units import Vec3
-from services.capture.file import Packer
 from services.capture.keys import KeyInfo, QueuedMessage
+from services.capture.packing import Packer
 from services.capture.writer import CaptureWriter, FileLimits
 
 try:

@@ -1,0 +1,42 @@
+"""A bench that is ended leaves no robot behind: what it started is stopped on every way out.
+
+Ctrl-C raises KeyboardInterrupt, so that contexts are left and robots are stopped; SIGTERM and the closing of the
+terminal would end the process at once instead.
+"""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+from contextlib import suppress
+from types import FrameType
+
+import psutil
+
+SIGNALS = (signal.SIGTERM, signal.SIGHUP)
+
+
+def leave_when_ended() -> None:
+    """Make the signals of `SIGNALS` leave all contexts. Call it at the begin of a bench, in its main thread."""
+    for number in SIGNALS:
+        signal.signal(number, _leave)
+
+
+def _leave(number: int, _frame: FrameType | None) -> None:
+    for each in SIGNALS:
+        signal.signal(each, lambda *_: None)  # a second one must not interrupt the stopping
+    for child in psutil.Process().children():
+        with suppress(psutil.Error):
+            child.send_signal(signal.SIGINT)  # somebody may wait for it
+    raise SystemExit(128 + number)
+
+
+def cocoro(*words: str) -> None:
+    """Run a command of the command line. Raises CalledProcessError for one that fails. Unlike `subprocess.run` it never
+    kills the command, which may be about to start a robot."""
+    command = [sys.executable, "-m", "apps.cli.main", *words]
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
+        code = process.wait()
+    if code:
+        raise subprocess.CalledProcessError(code, command)
