@@ -191,6 +191,17 @@ async def test_another_tasks_outcome_is_not_taken_for_this_ones(scene: Scene) ->
 
 
 @in_virtual_time
+async def test_an_outcome_that_was_not_heard_is_asked_for_when_the_next_task_runs(scene: Scene) -> None:
+    executive = Executive(scene.node)
+    running = await following(scene.follower())
+    executive.tell("search", 1.0)
+    executive.knows("end", 4.0, outcome="done")
+    for elapsed_s in (0.0, 0.2):
+        executive.tell("search", elapsed_s, task_id="fetch-2")
+    assert (await asyncio.wait_for(running, 1.0))[0] == exits.DONE
+
+
+@in_virtual_time
 async def test_an_outcome_that_comes_with_the_reply_is_not_missed(scene: Scene) -> None:
     executive = Executive(scene.node)
     executive.on_run = lambda: executive.tell("end", 0.0, outcome="failed", reason="unreachable")
@@ -451,6 +462,20 @@ async def test_a_detached_task_names_nobody_and_its_id_is_the_result(scene: Scen
     code, result = await Follower(scene.link, REQUEST, LineDisplay(scene.out), None, watched=False).ask()
     assert (code, result["task_id"], result["outcome"]) == (exits.DONE, ID, None)
     assert executive.asked[0].asker == ""
+
+
+@in_virtual_time
+async def test_a_detached_task_that_is_let_go_of_before_the_answer_is_cancelled_however_often(scene: Scene) -> None:
+    executive = Executive(scene.node)
+    follower = Follower(scene.link, REQUEST, LineDisplay(scene.out), None, watched=False)
+
+    def three_times() -> None:
+        for _ in range(3):
+            follower.signalled(signal.SIGINT)
+
+    executive.on_run = three_times
+    code, result = await follower.ask()
+    assert (code, result["outcome"], executive.cancelled) == (exits.REFUSED, "cancelled", [ID])
 
 
 @in_virtual_time

@@ -107,7 +107,7 @@ def remove(
     as_json: JsonOption = False,
 ) -> None:
     """Delete captures, after asking."""
-    sys.exit(remove_captures(list(dict.fromkeys(file.absolute() for file in files)), yes, as_json))
+    sys.exit(remove_captures(list({file.absolute(): file for file in files}.values()), yes, as_json))
 
 
 def remove_captures(files: list[Path], yes: bool, as_json: bool) -> int:

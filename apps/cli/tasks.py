@@ -29,9 +29,10 @@ from services.executive.askers import asker_key
 
 USAGE_REFUSALS = ("unknown_label", "not_graspable", "bad_request")
 """Refusals that are the operator's mistake, not the robot's state."""
-UNSETTLED_S = {"not_alive": 3.0, "estop": 10.0}
+UNSETTLED_S = {"not_alive": 3.0, "estop": 10.0, "asker_gone": 3.0}
 """Longest time for which such a refusal is answered by another request: an executive that has just started may not have
-received every service's state. A stop that is known to be latched is not asked about again."""
+received every service's state, and a late one not this command's token. A stop that is known to be latched is not asked
+about again."""
 ASK_AGAIN_S = 0.1
 """Time between two of these requests."""
 CANCEL_S = 10.0
@@ -71,6 +72,8 @@ class Follower:
         self._label = "" if task is None else task.target
         self._snapshot_phase = "" if task is None else task.snapshot_phase
         self._task_id = ""
+        self._begun = False
+        """Whether any state of the task was heard."""
         self._token: Handle | None = None
         self._news: asyncio.Queue[TaskState | bool] = asyncio.Queue()
         """States of the task, and whether the executive's liveliness token is present, at each change."""
@@ -103,8 +106,9 @@ class Follower:
         return await self._unless_left(self._run())
 
     async def ask(self) -> Result:
-        """Requests the task without following it; returns the exit code and the result as data."""
-        return await self._unless_left(self._begin())
+        """Requests the task without following it; returns the exit code and the result as data. Cannot be left: nobody
+        watches the task, and whoever lets go of it before the answer must not find it running."""
+        return await self._begin()
 
     def listen(self) -> None:
         """Keeps the states of tasks from now on."""
@@ -115,7 +119,7 @@ class Follower:
 
     async def attend(self, state: TaskState) -> Result:
         """Follows a task that runs already, or has ended; returns the exit code and the result as data."""
-        self._task, self._label, self._task_id = state.task, state.label, state.task_id
+        self._task, self._label, self._task_id, self._begun = state.task, state.label, state.task_id, True
         if state.outcome is not None:
             return self._outcome(state)
         return await self._unless_left(self._follow())
@@ -220,8 +224,15 @@ class Follower:
         while True:
             news = await self._next_news()
             state = await self._looked_for() if news is False else news
-            if isinstance(state, bool) or state.task_id != self._task_id:
+            if isinstance(state, bool):
                 continue
+            if state.task_id != self._task_id:
+                # One task runs at a time: once this one has begun, news of another means that its end was not heard.
+                over = await self._looking.ask(self._task_id) if self._begun else None
+                if over is None:
+                    continue
+                state = over
+            self._begun = True
             if self._picture is not None:
                 if state.phase == self._snapshot_phase and camera is None:
                     camera = SnapshotTaker(self._link)

@@ -103,7 +103,7 @@ class FloorMap:
             points = np.array(seen.points_m)
             lowest = np.array(seen.lowest_m) if len(seen.lowest_m) == len(points) else points[:, 2]
             if own is not None:
-                others = ~_inside(points, *own)
+                others = ~inside(points, *own)
                 points, lowest = points[others], lowest[others]
             c, s = cos(body.yaw_rad), sin(body.yaw_rad)
             places = points[:, :2] @ np.array([[c, s], [-s, c]]) + np.array([body.x_m, body.y_m])
@@ -293,7 +293,7 @@ class ClearanceField:
         return clearance
 
 
-def _inside(points: FloatArray, centres: FloatArray, radii: FloatArray) -> BoolArray:
+def inside(points: FloatArray, centres: FloatArray, radii: FloatArray) -> BoolArray:
     """Which points (n, 3) lie within any of the balls (m, 3), (m,) seen from above, shape (n,)."""
     gaps = np.linalg.norm(points[:, None, :2] - centres[None, :, :2], axis=2) - radii[None, :]
     inside: BoolArray = (gaps < 0.0).any(axis=1)
