@@ -38,6 +38,8 @@ class Coverage(msgspec.Struct, frozen=True, kw_only=True):
     """Not seen, and not visible from any pose that the robot could have reached."""
     missed: int
     """Not seen, though a pose would have shown it."""
+    hiding: int
+    """Of the missed cells those in a square of two by two that were all missed: an object can stand there unseen."""
     missed_at_m: tuple[tuple[float, float], ...]
     """Some of the missed cells, in the robot's frame at the start."""
 
@@ -139,6 +141,7 @@ class CoverageJudge:
             seen=int(self._seen.sum()),
             unseeable=int((~seeable).sum()),
             missed=int(seeable.sum()),
+            hiding=_in_squares(left[seeable] - self._start[:2]),
             missed_at_m=tuple((round(x, 2), round(y, 2)) for x, y in missed[:: max(len(missed) // 12, 1)].tolist()),
         )
 
@@ -168,6 +171,13 @@ class CoverageJudge:
             points = np.column_stack([cells_m[left], np.zeros(len(left))])
             seeable[left] = ~self._hidden(self._newest, np.array([*place, EYE_M]), points)
         return seeable
+
+
+def _in_squares(cells_m: FloatArray) -> int:
+    """How many of the cells (n, 2) belong to a square of two by two."""
+    cells = {(x, y) for x, y in np.rint(cells_m / CELL_M).astype(np.int64).tolist()}
+    squares = [{(x, y), (x + 1, y), (x, y + 1), (x + 1, y + 1)} for x, y in cells]
+    return len(set().union(*(square for square in squares if square <= cells)))
 
 
 def _yaw(truth: Truth) -> float:

@@ -42,6 +42,7 @@ class Room:
 
     def __post_init__(self) -> None:
         self.floor = FloorMap()
+        self.doubt_m = 0.0
         self.seen = SeenFloor(SearchConfig(), ROBOT)
         self.now_ns = NS
         self._scanner = FloorScanner(ROBOT, PerceptionConfig())
@@ -66,7 +67,7 @@ class Room:
             self.now_ns += NS // RATE_HZ
             seen = self._obstacles(depth, pose)
             self.floor.enter(seen, body, None, known, DepthView(ROBOT, seen.nearest, angles))
-            self.seen.enter(seen, body, turning_radps)
+            self.seen.enter(seen, body, turning_radps, self.doubt_m)
 
     def occupied(self, near: tuple[float, float], within_m: float = 0.25) -> int:
         """How many cells are occupied near a place."""

@@ -60,6 +60,7 @@ def test_an_empty_room_is_seen_from_where_the_robot_stands_when_it_turns_round()
 def test_floor_behind_a_wall_is_missed_until_it_is_looked_at_from_there() -> None:
     hidden = judged(wall(0.8, 0.0, (0.1, 0.8, 0.8)))
     assert hidden.missed > 50
+    assert 50 < hidden.hiding <= hidden.missed
     assert all(x > 0.7 for x, _ in hidden.missed_at_m)
     assert judged(wall(0.8, 0.0, (0.1, 0.8, 0.8)), places=((0.0, 0.0), (1.2, 0.9), (1.2, -0.9))).missed == 0
 

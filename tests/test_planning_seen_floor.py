@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 from math import hypot
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 from depth_room import Box, Room, box
 
 from cocoro.arrays import FloatArray
 from cocoro.frames import Pose2
+from cocoro.messages.actions import Explore
+from services.planning.behaviours.looking import Exploring
+from services.planning.config import PlanningConfig
 from services.planning.seen_floor import describe
 from services.planning.surroundings import Surroundings
 
@@ -120,3 +125,36 @@ def test_a_second_search_of_a_task_begins_anew_about_the_same_place() -> None:
     room.seen.begin(Pose2(1.0, 0.0))
     assert not counted(room, (1.2, 0.0))
     assert counted(room, (2.5, 0.0)), "the radius counts from where the task began"
+
+
+def test_a_robot_that_did_not_know_its_place_does_not_say_that_it_saw_the_whole() -> None:
+    room = Room([])
+    room.seen.begin(Pose2())
+    look_around(room, Pose2())
+    for body in (Pose2(1.0, 0.0, 3.1), Pose2(-1.0, 0.0, 0.0)):
+        look_around(room, body)
+    snapshot: Any = SimpleNamespace(
+        estimator=SimpleNamespace(seen=room.seen),
+        actuators=SimpleNamespace(config=PlanningConfig()),
+        stands_around=(room.floor, ()),
+        body=Pose2(),
+    )
+    exploring = Exploring(Explore(label="red_can"))
+    assert exploring._nothing_left(snapshot).startswith("the whole surroundings were searched, 2.0 m wide; red_can")
+    room.seen.doubt_m = 0.3
+    said = exploring._nothing_left(snapshot)
+    assert "knew its place only to 0.6 m" in said
+    assert "whole" not in said
+
+
+def test_the_doubt_is_that_of_the_newly_seen_floor_alone() -> None:
+    room = Room([])
+    room.seen.begin(Pose2())
+    room.doubt_m = 0.1
+    room.look(0.3, 0.0, -0.6)
+    assert room.seen.doubt_m == 0.1
+    room.doubt_m = 0.5
+    room.look(0.3, 0.0, -0.6)
+    assert room.seen.doubt_m == 0.1
+    room.look(0.3, 1.5, -0.6)
+    assert room.seen.doubt_m == 0.5

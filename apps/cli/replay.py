@@ -96,6 +96,8 @@ async def replay_file(
         name = _named(robot) if robot is not None else _name(capture.robot, hardware)
         run_dir = RunDir(name)
         run_dir.make()
+        for note in left_out_notes(capture):
+            print(f"note: {note}", file=sys.stderr)
         claims = run_dir.claim(REPLAY, services)
         try:
             async with await ZenohBus.open(run_dir.join_as("replay", frames=True)) as bus:
@@ -108,8 +110,6 @@ async def replay_file(
             print(f"not played: {problem}", file=sys.stderr)
         if capture.ending:
             print(f"note: {file} was {capture.ending}", file=sys.stderr)
-        for note in left_out_notes(capture):
-            print(f"note: {note}", file=sys.stderr)
         return exits.FAILED if capture.problems else exits.DONE
 
 

@@ -24,7 +24,7 @@ from services.planning.head import PAN, TILT
 
 _STRETCH_BYTES = 6
 _DOUBT = np.ones((3, 3), dtype=np.uint8)
-"""A cell at the edge of what a scan shows does not count: the odometry is off by a few centimetres."""
+"""A cell at the edge of what a scan shows does not count: the body's pose is off by a few centimetres."""
 _SPREAD_DEG = (0.25, 0.75)
 """A stretch is a degree wide."""
 _ENOUGH = 2
@@ -84,17 +84,19 @@ class SeenFloor:
         self._corner: IntArray = np.zeros(2, dtype=np.int64)
         self._centre_m: tuple[float, float] | None = None
         self._avoided: list[tuple[float, float]] = []
-        self._task_id = ""
+        self.task_id = ""
         self.running = False
         """Whether a search goes on."""
+        self.doubt_m = 0.0
+        """By how much the place of some floor was in doubt when it was seen."""
 
     # --- updates ----------------------------------------------------------------------------------
 
     def end(self, task_id: str) -> None:
         """End the search; `task_id`: the task that goes on or begins."""
         self.running = False
-        if task_id != self._task_id:
-            self._task_id, self._centre_m = task_id, None
+        if task_id != self.task_id:
+            self.task_id, self._centre_m = task_id, None
 
     def begin(self, body: Pose2) -> None:
         """Begin a search. It goes about the place where the task's first search began."""
@@ -104,14 +106,16 @@ class SeenFloor:
         self._corner = np.floor(np.array(self._centre_m) / CELL_M).astype(np.int64) - SIZE // 2
         self._count[:] = 0
         self._missed[:] = 0
+        self.doubt_m = 0.0
         self._avoided.clear()
 
     def clear(self) -> None:
         """Forget everything: the odometry frame is a new one."""
         self.running, self._centre_m = False, None
 
-    def enter(self, seen: Obstacles, body: Pose2, turning_radps: float) -> None:
-        """Enter the floor of one depth image, taken from the body's pose while the camera turned at a rate."""
+    def enter(self, seen: Obstacles, body: Pose2, turning_radps: float, doubt_m: float = 0.0) -> None:
+        """Enter the floor of one depth image, taken from the body's pose while the camera turned at a rate. `doubt_m`:
+        how far that floor may be from where it seems to be."""
         if not self.running or not seen.shown or turning_radps > self._config.turning_radps:
             return
         whole = len(seen.shown) // _STRETCH_BYTES * _STRETCH_BYTES
@@ -128,6 +132,8 @@ class SeenFloor:
         cells = np.zeros(SIZE * SIZE, dtype=np.uint8)
         cells[flat[flat >= 0]] = 1
         sure = cv2.erode(cells.reshape(SIZE, SIZE), _DOUBT).astype(bool)
+        if (sure & (self._count < _ENOUGH)).any():
+            self.doubt_m = max(self.doubt_m, doubt_m)
         self._count[sure] = np.minimum(self._count[sure] + 1, _ENOUGH)
 
     def stand_at(self, body: Pose2) -> None:

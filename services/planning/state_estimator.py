@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Mapping
 from itertools import compress
-from math import cos, hypot, inf, sin
+from math import hypot, inf
 from typing import Any, NamedTuple
 
 import msgspec
@@ -22,16 +22,20 @@ from cocoro.robot import Robot
 from cocoro.topics import Topic
 from cocoro.units import Vec3
 from services.planning.config import PlanningConfig
-from services.planning.floor_map import Solid
+from services.planning.floor_map import Solid, inside
 from services.planning.head import PAN, TILT, CameraTilt
 from services.planning.memory import TargetMemory
+from services.planning.pose_matching import PoseMatching
 from services.planning.seen_floor import SeenFloor
 from services.planning.seen_through import VIEW_BYTES, DepthView
 from services.planning.surroundings import Surroundings
+from services.planning.turning import Turning
 
 _WAIT_FOR_ODOMETRY_NS = NS // 5
 _JUST_SEEN_S = 0.5
 """An object that a frame does not show, but which was seen so shortly before it, is still in it."""
+_STEADY_RADPS = 1.0
+"""A camera that turns faster does not correct the body's pose."""
 _GLIMPSE_NS = NS // 20
 """Time over which the camera's turn is measured."""
 FLOOR_M, FLOOR_PER_M = 0.040, 0.012
@@ -93,40 +97,6 @@ class PostureSighting(NamedTuple):
     """By joint, all of them."""
 
 
-class Turning:
-    """The base's odometry with a learned wheel distance in place of the nominal one.
-
-    The base computes its heading from the wheels' travel and the nominal distance; here it is scaled, and with it the
-    direction of each stretch of its path. Path length and speed do not depend on the distance.
-    """
-
-    def __init__(self) -> None:
-        self.ratio = 1.0
-        """Nominal over learned wheel distance; 1 while nothing is learned."""
-        self._before: BaseState | None = None
-        self._pose = Pose2()
-
-    def pose(self, state: BaseState) -> Pose2:
-        """The body's pose in the odometry frame. Call it once for each state, in order."""
-        raw = Pose2(*state.odometry_m, state.odometry_yaw_rad)
-        before, self._before = self._before, state
-        anew = before is None or before.incarnation != state.incarnation or state.stamp_ns < before.stamp_ns
-        if anew or before is None:
-            self._pose = raw
-            return raw
-        then = Pose2(*before.odometry_m, before.odometry_yaw_rad)
-        if self.ratio == 1.0 and self._pose == then:
-            self._pose = raw
-            return raw
-        step = then.inverse().compose(raw)
-        # The chord is half the turn off the heading at its start, so another turn changes its direction.
-        extra_rad = (self.ratio - 1.0) * step.yaw_rad
-        c, s = cos(extra_rad / 2), sin(extra_rad / 2)
-        bent = Pose2(c * step.x_m - s * step.y_m, s * step.x_m + c * step.y_m, step.yaw_rad + extra_rad)
-        self._pose = self._pose.compose(bent)
-        return self._pose
-
-
 class StateEstimator:
     """Takes every input of the planner and answers queries by time."""
 
@@ -160,6 +130,7 @@ class StateEstimator:
         """By topic, when its newest message was published."""
         self._sight = PerceptionWatch(robot.base.command_timeout_s, config.blind_periods)
         self.turning = Turning()
+        self.matching = PoseMatching()
         self.camera_tilt: CameraTilt | None = None
         """The camera's learned tilt: points that a tilted camera sees above the floor may be floor."""
         self._watched = {config.marker}
@@ -169,8 +140,9 @@ class StateEstimator:
         self._published_ns[topic.name] = min(message.stamp_ns, now_ns)
         if isinstance(message, BaseState):
             self.base = message
-            resets = self._odometry.resets
+            resets, before = self._odometry.resets, self._odometry.newest
             self._odometry.add(message.stamp_ns, self.turning.pose(message), message.incarnation)
+            newest = self._odometry.newest
             if self._odometry.resets != resets:
                 # The base restarted with a new odometry frame; positions in the old frame are void.
                 self.memory.clear()
@@ -179,6 +151,10 @@ class StateEstimator:
                 self._floors.clear()
                 self._waiting.clear()
                 self._localised_ns = 0
+                self.matching.clear()
+                self.turning.constants = self.matching.constants
+            elif before is not None and newest is not None:
+                self.matching.moved(Pose2(*before[1].tolist()), Pose2(*newest[1].tolist()))
         elif isinstance(message, ServoState):
             self._keep_posture(topic.name, message)
             if topic.name == topics.ARM_STATE.name:
@@ -220,12 +196,17 @@ class StateEstimator:
             detections = self._waiting.popleft()
             pose = self._odometry.at(detections.stamp_ns, self._gap_ns)
             if pose is not None:
-                self._remember(detections, Pose2(*pose.tolist()))
+                self._remember(detections, self.matching.place(Pose2(*pose.tolist())))
+                if self.seen.running and self._turning_radps(detections.stamp_ns) < _STEADY_RADPS:
+                    self._compare(detections, Pose2(*pose.tolist()))
             elif now_ns - detections.stamp_ns < _WAIT_FOR_ODOMETRY_NS:
                 self._waiting.append(detections)
 
-    def look_around(self, now_ns: int, own: Callable[[Mapping[str, float]], tuple[FloatArray, FloatArray]]) -> None:
-        """Enter floor observations whose odometry is known. `own`: the robot's hull by joint angles."""
+    def look_around(
+        self, now_ns: int, own: Callable[[Mapping[str, float]], tuple[FloatArray, FloatArray]], *, on_way: bool = False
+    ) -> None:
+        """Enter floor observations whose odometry is known. `own`: the robot's hull by joint angles. `on_way`: a pose
+        that a search has corrected is corrected further."""
         while self._floors:
             seen = self._floors[0]
             pose = self._odometry.at(seen.stamp_ns, self._gap_ns)
@@ -238,8 +219,31 @@ class StateEstimator:
                 angles = self.posture(seen.stamp_ns)
                 view = DepthView(self._robot, seen.nearest, angles) if len(seen.nearest) == VIEW_BYTES else None
                 known = self._solids(seen.stamp_ns)
-                self.around.floor.enter(seen, Pose2(*pose.tolist()), own(angles), known, view)
-                self.seen.enter(seen, Pose2(*pose.tolist()), self._turning_radps(seen.stamp_ns))
+                hull, odometry = own(angles), Pose2(*pose.tolist())
+                turning_radps = self._turning_radps(seen.stamp_ns)
+                correct = self.seen.running or (on_way and self.matching.shift is not None)
+                if correct and turning_radps < _STEADY_RADPS:
+                    self._match(seen, odometry, hull, angles[PAN])
+                body = self.matching.place(odometry)
+                self.around.floor.enter(seen, body, hull, known, view)
+                self.seen.enter(seen, body, turning_radps, self.matching.doubt_m)
+
+    def _compare(self, detections: Detections, odometry: Pose2) -> None:
+        """Correct the body's pose by the known objects that a search sees."""
+        self.matching.follow(self.seen.task_id)
+        for detection in detections.detections:
+            label, place = detection.label, detection.position_m
+            if place is not None and not detection.note and label in self._known and self.memory.sure(label):
+                self.matching.sight(label, place[:2], odometry)
+        self.turning.constants = self.matching.constants
+
+    def _match(self, seen: Obstacles, odometry: Pose2, hull: tuple[FloatArray, FloatArray], pan_rad: float) -> None:
+        """Correct the body's pose by what a search's scan shows."""
+        self.matching.follow(self.seen.task_id)
+        points = np.array(seen.points_m).reshape(-1, 3)
+        others = points[~inside(points, *hull)]
+        if self.matching.scan(others[:, :2], seen.origin_m, odometry, pan_rad):
+            self.turning.constants = self.matching.constants
 
     def _turning_radps(self, stamp_ns: int) -> float:
         """The rate at which the camera turned before a time; infinite where that is not known."""
@@ -316,7 +320,7 @@ class StateEstimator:
     def body(self) -> Pose2 | None:
         """The body's newest pose in the odometry frame."""
         newest = self._odometry.newest
-        return Pose2(*newest[1].tolist()) if newest else None
+        return self.matching.place(Pose2(*newest[1].tolist())) if newest else None
 
     def missing(self, now_ns: int) -> str:
         """Which state is missing or too old to move; '' when all are fresh."""

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from math import atan2, hypot
 
+import numpy as np
+
 from cocoro.clock import NS
 from cocoro.frames import Pose2
 from cocoro.messages.actions import Explore, Idle, Park, Search
@@ -185,6 +187,8 @@ class Exploring:
     """Period at which it checks whether the place is still worth the way."""
     HERE_M = 0.05
     AHEAD_RAD = 0.3
+    DOUBT_M = 0.5
+    """Doubt of the seen floor's place from which it does not say that it has seen the whole."""
     WORTH = 0.3
     """Share of the place's unseen floor that must be left."""
 
@@ -213,7 +217,9 @@ class Exploring:
             radius = actuators.robot.base.chassis_diameter_m / 2 + navigation.clearance_m
             around = snapshot.estimator.around
             routes = around.routes(fields.body, snapshot.body, radius, navigation.comfort_m)
-            self._view = seen.viewpoint(snapshot.body, routes.costs(), *snapshot.stands_around)
+            # The routes' way out of a narrow place is no place to stay: the course would find no pose there.
+            costs = np.where(fields.body.metres >= radius, routes.costs(), np.inf)
+            self._view = seen.viewpoint(snapshot.body, costs, *snapshot.stands_around)
             self._checked_ns = snapshot.now_ns
             if self._view is None:
                 return Plan(
@@ -276,6 +282,12 @@ class Exploring:
             return f"{self._label} was not found; nowhere else to look from{_not_seen(rest, snapshot.body)}"
         radius_m = snapshot.actuators.config.search.radius_m
         enclosed = f", except {rest.enclosed_m2:.2f} m2 that obstacles enclose" if rest.enclosed_m2 >= 0.01 else ""
+        doubt_m = 2 * snapshot.estimator.seen.doubt_m
+        if doubt_m > self.DOUBT_M:
+            return (
+                f"{self._label} was not found; the surroundings were searched, {radius_m:.1f} m wide{enclosed}, but the"
+                f" robot knew its place only to {doubt_m:.1f} m, so some floor may have been missed"
+            )
         return f"the whole surroundings were searched, {radius_m:.1f} m wide{enclosed}; {self._label} is not there"
 
 
