@@ -33,7 +33,7 @@ NOT_RUN = {
     "cocoro base": "needs the robot's hardware",
     "cocoro servos scan": "needs the robot's hardware",
     "cocoro kinect calibrate": "needs a Kinect",
-    "cocoro view": "opens a window",
+    "cocoro view": "opens a window or a browser",
 }
 """Commands that nobody can run everywhere, and why."""
 SLOW = {

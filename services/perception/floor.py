@@ -30,6 +30,8 @@ _ROW_RAD, _CAMERA_M = 0.0125, 0.73
 """Angle between two rows of the grid, and the camera's height."""
 _NEAR_M = 1.0
 """Nearer, neighbouring pixels may be more than a degree apart."""
+_BEYOND_M = 100.0
+"""More than any distance."""
 _GAP = 2.2
 """Floor is shown without a gap where two pixels are less than so many rows apart."""
 
@@ -52,7 +54,12 @@ class FloorScanner:
             np.arange(blocks) * size // blocks for blocks, size in zip(BLOCKS, image.raw_depth.shape, strict=True)
         )
         # Codes rise with the depth, and that of no data is the highest.
-        codes = np.minimum.reduceat(np.minimum.reduceat(image.raw_depth, rows, axis=0), columns, axis=1)
+        height, width = image.raw_depth.shape
+        if height % BLOCKS[0] == 0:  # several times as fast
+            strips = image.raw_depth.reshape(BLOCKS[0], -1, width).min(axis=1)
+        else:
+            strips = np.minimum.reduceat(image.raw_depth, rows, axis=0)
+        codes = np.minimum.reduceat(strips, columns, axis=1)
         steps = np.clip(self._robot.depth_m(codes) / STEP_M, 1.0, 255.0)
         nearest: bytes = np.nan_to_num(steps, nan=0.0).astype(np.uint8).tobytes()
         return nearest
@@ -139,7 +146,8 @@ def _shown(bearing_rad: FloatArray, distance_m: FloatArray, floor: BoolArray) ->
     runs: list[FloatArray] = []
     for part, width_deg in ((distance_m < _NEAR_M, 2), (distance_m >= _NEAR_M, 1)):
         degree = np.floor(np.degrees(bearing_rad[part]) / width_deg).astype(np.int64) * width_deg % 360
-        order = np.lexsort((distance_m[part], degree))
+        # By degree, then by distance: one sort is cheaper than two.
+        order = np.argsort(degree * _BEYOND_M + distance_m[part], kind="stable")
         degree, away, flat = degree[order], distance_m[part][order], floor[part][order]
         if not flat.any():
             continue

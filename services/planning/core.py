@@ -13,7 +13,7 @@ from cocoro.arrays import FloatArray
 from cocoro.clock import NS
 from cocoro.core import Output, Sample, Schedule, Take
 from cocoro.messages import BaseCommand, Intent, LearnedModel, PlannerStatus, ServoCommand
-from cocoro.messages.actions import Explore, Idle, Search
+from cocoro.messages.actions import Approach, Explore, Idle, Search
 from cocoro.objects import Catalogue
 from cocoro.robot import Robot
 from cocoro.topics import Topic
@@ -101,7 +101,9 @@ class PlanningCore:
         self._missing_since_ns = None
         if self._estimator.base is not None and self._estimator.base.stopped_by == NO_COMMAND:
             self.actuators.arm.undelivered()
-        self._estimator.look_around(now_ns, self._own_hull)
+        # On a way with the arm folded; a pose that changes under a hand at its target would move the hand.
+        on_way = isinstance(self._intent.action, Approach) and self.actuators.arm.parked(self._estimator.angles())
+        self._estimator.look_around(now_ns, self._own_hull, on_way=on_way)
         snapshot = Snapshot(now_ns, dt_s, self._estimator, body, self._estimator.angles(), self.actuators)
         plan = self._plan(snapshot)
         if isinstance(self._behaviour, Idling):

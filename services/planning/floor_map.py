@@ -98,7 +98,7 @@ class FloorMap:
         if seen.free:
             # Thin things are seen by the image itself; without it they must do with the floor around them.
             up_to_m = NEAR_FLOOR_M if view is not None else np.inf
-            self._free(self._along(np.array(seen.free), origin, body.yaw_rad), up_to_m)
+            self._free(self._crossed(np.array(seen.free), origin, body.yaw_rad), up_to_m)
         if seen.points_m:
             points = np.array(seen.points_m)
             lowest = np.array(seen.lowest_m) if len(seen.lowest_m) == len(points) else points[:, 2]
@@ -126,17 +126,16 @@ class FloorMap:
         self._confirmed_ns[rows, columns] = np.maximum(self._confirmed_ns[rows, columns], self._now_ns)
         self._add(places_m, _HIT)
 
-    def _free(self, places_m: FloatArray, up_to_m: float) -> None:
-        """Decrease the evidence of cells in which floor is seen (n, 2), unless it begins above the floor or reaches
-        higher than `up_to_m`."""
-        index = self._index(places_m)
-        inside = ((index >= 0) & (index < SIZE)).all(axis=1)
-        rows, columns = index[inside].T
-        above = (self._lowest[rows, columns] > NEAR_FLOOR_M) | (self._highest[rows, columns] > up_to_m)
-        above |= self._confirmed_ns[rows, columns] > self._now_ns
-        above &= self._evidence[rows, columns] > 0
-        self._add(places_m[inside][~above], -_FREE)
-        self._looked[rows, columns] = True
+    def _free(self, cells: IntArray, up_to_m: float) -> None:
+        """Decrease the evidence of cells in which floor is seen (flat numbers, each once), unless it begins above the
+        floor or reaches higher than `up_to_m`."""
+        evidence, lowest, highest = (array.reshape(-1) for array in (self._evidence, self._lowest, self._highest))
+        above = (lowest[cells] > NEAR_FLOOR_M) | (highest[cells] > up_to_m)
+        above |= self._confirmed_ns.reshape(-1)[cells] > self._now_ns
+        above &= evidence[cells] > 0
+        flat = cells[~above]
+        evidence[flat] = np.maximum(evidence[flat] - _FREE, _LEAST)
+        self._looked.reshape(-1)[cells] = True
 
     def _doubt(self, body: Pose2, known: Sequence[Solid], view: DepthView | None, *, empty_due: bool) -> None:
         """Decrease evidence that this image contradicts, and drop that of known objects and what is old."""
@@ -178,17 +177,22 @@ class FloorMap:
         """Count the floor within 10 cm of a place (odometry frame) as seen."""
         self._looked |= self._disc(*place_m, 0.10)
 
-    @staticmethod
-    def _along(rays: FloatArray, origin: FloatArray, yaw_rad: float) -> FloatArray:
-        """Points (n, 2), odometry frame, every cell along the rays (m, 3): bearing rad, near m, far m. A ray stands for
-        2 degrees, so it is spread, or cells between two rays would be left out."""
+    def _crossed(self, rays: FloatArray, origin: FloatArray, yaw_rad: float) -> IntArray:
+        """The map's cells along the rays (m, 3): bearing rad, near m, far m, from a place in the odometry frame; flat
+        numbers. A ray stands for 2 degrees, so it is spread, or cells between two rays would be left out."""
         rays = np.repeat(rays, len(_SPREAD_RAD), axis=0)
         rays[:, 0] += np.tile(_SPREAD_RAD, len(rays) // len(_SPREAD_RAD))
         steps = np.arange(0.0, float(rays[:, 2].max()), CELL_M)
-        inside = (steps[None, :] >= rays[:, 1:2]) & (steps[None, :] <= rays[:, 2:3])
-        directions = np.stack([np.cos(rays[:, 0] + yaw_rad), np.sin(rays[:, 0] + yaw_rad)], axis=1)
-        points: FloatArray = (origin + directions[:, None, :] * steps[None, :, None])[inside]
-        return points
+        ray, step = np.nonzero((steps >= rays[:, 1:2]) & (steps <= rays[:, 2:3]))
+        bearing, away = rays[:, 0] + yaw_rad, steps[step]
+        row, column = (
+            np.floor((start + direction[ray] * away) / CELL_M).astype(np.int64) - first
+            for start, direction, first in zip(origin, (np.cos(bearing), np.sin(bearing)), self._corner, strict=True)
+        )
+        inside = (row >= 0) & (row < SIZE) & (column >= 0) & (column < SIZE)
+        crossed = np.zeros(SIZE * SIZE, dtype=bool)
+        crossed[row[inside] * SIZE + column[inside]] = True
+        return np.flatnonzero(crossed)
 
     def _add(self, points_m: FloatArray, evidence: int) -> None:
         """Add evidence to the cells of points (n, 2), once per cell."""

@@ -70,9 +70,10 @@ class DepthView:
         # A comparison with NaN, which is no data, is false.
         at_or_before = (seen < (depth + margin)[:, :, None]).any(axis=2)
         behind = seen[:, :, _SIDE] >= depth + margin
-        shadowed = (self._around(row, column, _SHADOW) < (depth - margin)[:, :, None]).any(axis=2)
         through = visible & ~at_or_before & behind
-        dark = visible & ~at_or_before & np.isnan(seen[:, :, _SIDE]) & ~shadowed
+        dark = visible & ~at_or_before & np.isnan(seen[:, :, _SIDE])
+        if dark.any():
+            dark &= ~(self._around(row, column, _SHADOW) < (depth - margin)[:, :, None]).any(axis=2)
         count = visible.sum(axis=1)
         gone = (count >= 2) & (through.sum(axis=1) == count)
         empty = (count >= 2) & ~gone & ((through | dark).sum(axis=1) == count)

@@ -202,8 +202,11 @@ class StateEstimator:
             elif now_ns - detections.stamp_ns < _WAIT_FOR_ODOMETRY_NS:
                 self._waiting.append(detections)
 
-    def look_around(self, now_ns: int, own: Callable[[Mapping[str, float]], tuple[FloatArray, FloatArray]]) -> None:
-        """Enter floor observations whose odometry is known. `own`: the robot's hull by joint angles."""
+    def look_around(
+        self, now_ns: int, own: Callable[[Mapping[str, float]], tuple[FloatArray, FloatArray]], *, on_way: bool = False
+    ) -> None:
+        """Enter floor observations whose odometry is known. `own`: the robot's hull by joint angles. `on_way`: a pose
+        that a search has corrected is corrected further."""
         while self._floors:
             seen = self._floors[0]
             pose = self._odometry.at(seen.stamp_ns, self._gap_ns)
@@ -218,7 +221,8 @@ class StateEstimator:
                 known = self._solids(seen.stamp_ns)
                 hull, odometry = own(angles), Pose2(*pose.tolist())
                 turning_radps = self._turning_radps(seen.stamp_ns)
-                if self.seen.running and turning_radps < _STEADY_RADPS:
+                correct = self.seen.running or (on_way and self.matching.shift is not None)
+                if correct and turning_radps < _STEADY_RADPS:
                     self._match(seen, odometry, hull, angles[PAN])
                 body = self.matching.place(odometry)
                 self.around.floor.enter(seen, body, hull, known, view)
