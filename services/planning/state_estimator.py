@@ -272,10 +272,9 @@ class StateEstimator:
         distance = np.hypot(points[:, 0] - seen.origin_m[0], points[:, 1] - seen.origin_m[1])
         stands = self.camera_tilt.heights(points) > FLOOR_M + FLOOR_PER_M * distance
         stand = stands.tolist()
-        kept = {"points_m": tuple(compress(seen.points_m, stand))}
-        if len(seen.lowest_m) == len(stand):  # captures of former versions have none
-            kept["lowest_m"] = tuple(compress(seen.lowest_m, stand))
-        return msgspec.structs.replace(seen, **kept)
+        return msgspec.structs.replace(
+            seen, points_m=tuple(compress(seen.points_m, stand)), lowest_m=tuple(compress(seen.lowest_m, stand))
+        )
 
     def _remember(self, detections: Detections, body: Pose2) -> None:
         self._localised_ns = detections.stamp_ns
