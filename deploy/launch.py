@@ -54,14 +54,14 @@ def set_up_logging(process: str) -> logging.Logger:
 
 def changed(config: Any, path: str = "") -> list[str]:
     """The settings that differ from their defaults, as `head.sweep_speed_radps = 0.5`; all of them would be 2 KB."""
-    defaults = type(config)()
     found = []
-    for name in config.__struct_fields__:
-        value, default = getattr(config, name), getattr(defaults, name)
+    for field in msgspec.structs.fields(config):
+        value = getattr(config, field.name)
+        default = field.default_factory() if field.default_factory is not msgspec.NODEFAULT else field.default
         if isinstance(value, msgspec.Struct) and type(value) is type(default):
-            found += changed(value, f"{path}{name}.")
+            found += changed(value, f"{path}{field.name}.")
         elif value != default:
-            found.append(f"{path}{name} = {json.dumps(value, default=str)}")
+            found.append(f"{path}{field.name} = {json.dumps(value, default=str)}")
     return found
 
 

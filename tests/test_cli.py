@@ -129,6 +129,14 @@ def test_up_refuses_a_value_that_is_none_before_it_starts_anything(
     assert said in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("arguments", [["--sensors", "idael"], ["--body", "nominl"], ["--reach", "learnd"]])
+def test_rehearse_lists_the_values_that_there_are(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["rehearse", "fetch", "red_can", *arguments]) == 2
+    said = capsys.readouterr().err
+    assert f"{arguments[0][2:]}: unknown value" in said
+    assert "did you mean" in said
+
+
 def test_frames_may_leave_the_rate_out() -> None:
     assert frames_of("640x480") == {"width": 640, "height": 480}
 

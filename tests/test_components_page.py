@@ -39,7 +39,7 @@ def test_the_tutorial_works_word_for_word(tmp_path: Path) -> None:
     assert re.search(r"^nearest/object +Nearest +2 Hz +2 s +state +nearest +yes", operated, re.MULTILINE)
     assert "calliope/nearest/object  Nearest  #" in operated
     assert re.search(r"^nearest +ready", operated, re.MULTILINE)
-    assert re.search(r"^calliope/nearest/object +\d\.\d Hz +2\.0 Hz", operated, re.MULTILINE)
-    assert "nearest: nearest.service with NearestConfig(rate_hz=5.0, within_m=3.0)" in operated
+    assert re.search(r"^nearest/object +\d\.\d Hz +2\.0 Hz", operated, re.MULTILINE)
+    assert "nearest: nearest.service with rate_hz = 5.0" in operated
     assert re.search(r"^nearest: \d+ steps, \d+ outputs compared: every one equal", operated, re.MULTILINE)
     assert sys.prefix not in operated

@@ -19,7 +19,7 @@ from learning_arm import sightings
 from apps.cli import experiment as experimenting
 from apps.cli.experiment_progress import RunProgress, TimeLeft
 from apps.cli.main import main
-from apps.experiments import lessons, plan, report
+from apps.experiments import lessons, plan, report, workers
 from apps.experiments.carry_out import LESSONS, RunResult
 from apps.experiments.experiments import EXPERIMENTS
 from apps.experiments.plan import ExperimentSettings
@@ -52,6 +52,35 @@ def test_one_value_has_no_interval_and_none_has_no_mean() -> None:
 
 
 # --- runs ---------------------------------------------------------------------------------------------
+
+
+class Killed:
+    """A worker that was killed while it had nothing to do."""
+
+    def __init__(self) -> None:
+        self.run: str | None = None
+        self.process = self
+
+    def begin(self, run: str, kind: str, fields: dict[str, Any]) -> None:
+        raise BrokenPipeError
+
+    def join(self, _timeout_s: float) -> None:
+        pass
+
+
+def test_a_run_begins_in_a_new_worker_where_an_idle_one_was_killed(monkeypatch: pytest.MonkeyPatch) -> None:
+    begun: list[str] = []
+
+    class Fresh(Killed):
+        def begin(self, run: str, kind: str, fields: dict[str, Any]) -> None:
+            begun.append(run)
+
+    monkeypatch.setattr(workers, "_Worker", Fresh)
+    pool = workers.Workers(1)
+    pool._workers = [Killed()]  # type: ignore[list-item]
+    pool.begin("reach", "rehearse", {})
+    assert begun == ["reach"]
+    assert len(pool._workers) == 1
 
 
 class Quiet:

@@ -148,3 +148,17 @@ def first_to_end(processes: list[subprocess.Popen[str]]) -> subprocess.Popen[str
         thread.start()
     assert ended.wait(operator_shell.PATIENCE_S)
     return next(process for process in processes if process.poll() is not None)
+
+
+class Inner(msgspec.Struct, frozen=True):
+    speed_mps: float = 1.0
+
+
+class Settings(msgspec.Struct, frozen=True, kw_only=True):
+    port: str
+    rate_hz: float = 2.0
+    inner: Inner = Inner()
+
+
+def test_a_start_logs_the_settings_that_differ_and_those_without_a_default() -> None:
+    assert launch.changed(Settings(port="a", inner=Inner(speed_mps=0.5))) == ['port = "a"', "inner.speed_mps = 0.5"]

@@ -58,7 +58,8 @@ def test_the_floor_that_a_tilted_camera_lifts_is_no_obstacle(robot: Robot) -> No
     floor, box = seen(robot, (1.9, 0.2, 0.0), 0.03), seen(robot, (1.9, -0.2, 0.2), 0.03)
     assert floor[2] > 0.05  # higher than what counts as floor so far off
     estimator = StateEstimator(PlanningConfig(), robot)
-    obstacles = Obstacles(points_m=(floor, box), origin_m=(0.06, 0.0))
+    obstacles = Obstacles(points_m=(floor, box), lowest_m=(0.04, 0.15), origin_m=(0.06, 0.0))
     assert estimator._standing(obstacles).points_m == (floor, box)
     estimator.camera_tilt = CameraTilt(robot, 0.03)
-    assert estimator._standing(obstacles).points_m == (box,)
+    standing = estimator._standing(obstacles)
+    assert (standing.points_m, standing.lowest_m) == ((box,), (0.15,))

@@ -65,7 +65,7 @@ def test_a_mistake_in_the_profile_is_one_line_that_names_table_and_field(shell: 
     assert "Traceback" not in up.stdout + up.stderr
     unknown = shell("up", shell.profile("good"), "--set", "service.good.pase_hz=2")
     assert unknown.returncode == 2
-    assert "[service.good]: Object contains unknown field `pase_hz`" in unknown.stdout
+    assert "[service.good]: unknown field 'pase_hz'; known are pace_hz; did you mean pace_hz?" in unknown.stdout
 
 
 def test_one_that_does_not_get_ready_in_time_is_named_with_what_is_missing(shell: Shell) -> None:

@@ -24,7 +24,7 @@ from cocoro.clock import NS
 from cocoro.component import Implementation
 from cocoro.component import load as load_component
 from cocoro.core import Core
-from cocoro.errors import ConfigError
+from cocoro.errors import ConfigError, field_text
 from cocoro.messages import StepRecord
 from cocoro.robot import Robot
 from cocoro.topics import STEPS
@@ -208,7 +208,9 @@ def _origin(service: str, entries: Mapping[str, str], folder: Path) -> Origin:
     try:
         config = msgspec.convert(settings, implementation.config)
     except msgspec.ValidationError as error:
-        raise ConfigError(f"its configuration does not fit today's component: {error}") from error
+        raise ConfigError(
+            f"its configuration does not fit today's component: {field_text(error, implementation.config)}"
+        ) from error
     robot = Robot.from_data(json.loads(entries["description"]), "the recorded robot description")
     return Origin(service, implementation, robot, config, float(entries["latency_s"]))
 

@@ -85,7 +85,8 @@ class BabbleDisplay:
         self._view.say(text)
 
     def result(self, text: str) -> None:
-        self._view.result(f"{text}; {self._kept.summary}")
+        first, line_end, rest = text.partition("\n")
+        self._view.result(f"{first}; {self._kept.summary}{line_end}{rest}")
 
     def close(self) -> None:
         self._view.close()

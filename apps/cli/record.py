@@ -20,7 +20,7 @@ from apps.cli.output import complain, going_on, tell
 from apps.cli.terminal import StatusLine
 from cocoro.clock import FollowedClock
 from cocoro.component import load as load_component
-from cocoro.errors import ConfigError
+from cocoro.errors import ConfigError, field_text
 from cocoro.installed import unrecorded
 from cocoro.messages import Recording
 from cocoro.node import Node
@@ -75,7 +75,7 @@ async def record_mesh(
     try:
         config = msgspec.convert(settings, component.config)
     except msgspec.ValidationError as error:
-        raise ConfigError(f"record: {error}") from error
+        raise ConfigError(f"record: {field_text(error, component.config)}") from error
     if left_out := unrecorded():
         print(f"not recorded, as declared: {', '.join(left_out)}", file=sys.stderr)
     async with joined(choice, frames=True) as link:

@@ -23,7 +23,7 @@ from apps.cli.tasks import USAGE_REFUSALS
 from apps.cli.terminal import StatusLine
 from apps.rehearsal.progress import Tell, ignored
 from apps.rehearsal.request import RehearsalRequest
-from cocoro.errors import CocoroError, ConfigError
+from cocoro.errors import CocoroError, ConfigError, field_text
 
 
 def rehearse(
@@ -105,8 +105,7 @@ def request_of(options: dict[str, Any], latency: list[str], frames: str | None) 
     try:
         return msgspec.convert(fields, RehearsalRequest)
     except msgspec.ValidationError as error:
-        text, _, path = str(error).partition(" - at `$.")
-        raise ConfigError(f"{path.rstrip('`') or 'rehearse'}: {text}") from error
+        raise ConfigError(f"rehearse: {field_text(error, RehearsalRequest)}") from error
 
 
 def summary(result: dict[str, Any]) -> str:

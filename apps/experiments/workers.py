@@ -83,10 +83,15 @@ class Workers:
 
     def begin(self, run: str, kind: str, fields: dict[str, Any]) -> None:
         """Begins a run in a worker that is free."""
-        worker = next((worker for worker in self._workers if worker.run is None), None)
-        if worker is None:
-            worker = _Worker()
-            self._workers.append(worker)
+        for worker in [worker for worker in self._workers if worker.run is None]:
+            try:
+                worker.begin(run, kind, fields)
+                return
+            except OSError:  # it was killed since its last run
+                worker.process.join(END_S)
+                self._workers.remove(worker)
+        worker = _Worker()
+        self._workers.append(worker)
         worker.begin(run, kind, fields)
 
     def reports(self, within_s: float) -> Iterator[Report]:

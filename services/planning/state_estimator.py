@@ -271,7 +271,10 @@ class StateEstimator:
         points = np.array(seen.points_m)
         distance = np.hypot(points[:, 0] - seen.origin_m[0], points[:, 1] - seen.origin_m[1])
         stands = self.camera_tilt.heights(points) > FLOOR_M + FLOOR_PER_M * distance
-        return msgspec.structs.replace(seen, points_m=tuple(compress(seen.points_m, stands.tolist())))
+        stand = stands.tolist()
+        return msgspec.structs.replace(
+            seen, points_m=tuple(compress(seen.points_m, stand)), lowest_m=tuple(compress(seen.lowest_m, stand))
+        )
 
     def _remember(self, detections: Detections, body: Pose2) -> None:
         self._localised_ns = detections.stamp_ns
