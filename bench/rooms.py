@@ -45,11 +45,10 @@ def _searched(result: Result) -> bool:
 
 
 def _said(result: Result) -> str:
-    """Whether it said that it saw the whole, and whether that was true."""
-    if not result["reason"].startswith("not_found: the whole"):
-        return "part"
-    missed, hiding = (result["seen_floor"][name] for name in ("missed", "hiding"))
-    return "whole, rightly" if not missed else "whole, but slivers" if not hiding else "whole, wrongly"
+    """Whether it said that it saw every place where the object could stand, and whether that was true."""
+    if not result["reason"].startswith("not_found: every place"):
+        return "a part"
+    return "all, wrongly" if result["seen_floor"]["hiding"] else "all, rightly"
 
 
 def main() -> int:

@@ -127,7 +127,7 @@ def test_a_second_search_of_a_task_begins_anew_about_the_same_place() -> None:
     assert counted(room, (2.5, 0.0)), "the radius counts from where the task began"
 
 
-def test_a_robot_that_did_not_know_its_place_does_not_say_that_it_saw_the_whole() -> None:
+def test_a_robot_that_did_not_know_its_place_does_not_say_that_it_saw_every_place() -> None:
     room = Room([])
     room.seen.begin(Pose2())
     look_around(room, Pose2())
@@ -140,11 +140,11 @@ def test_a_robot_that_did_not_know_its_place_does_not_say_that_it_saw_the_whole(
         body=Pose2(),
     )
     exploring = Exploring(Explore(label="red_can"))
-    assert exploring._nothing_left(snapshot).startswith("the whole surroundings were searched, 2.0 m wide; red_can")
+    assert exploring._nothing_left(snapshot).startswith("every place within 2.0 m where red_can could stand was seen")
     room.seen.doubt_m = 0.3
     said = exploring._nothing_left(snapshot)
     assert "knew its place only to 0.6 m" in said
-    assert "whole" not in said
+    assert "every place" not in said
 
 
 def test_the_doubt_is_that_of_the_newly_seen_floor_alone() -> None:

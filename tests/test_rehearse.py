@@ -81,7 +81,7 @@ def test_what_is_not_there_is_not_found_and_the_robot_stands(tmp_path: Path) -> 
     scene.write_text(ONLY_GREEN)
     result = rehearse(small(scene=str(scene), seen_within_m=2.0))
     assert result["outcome"] == "failed"
-    assert result["reason"].startswith("not_found: the whole surroundings were searched")
+    assert result["reason"].startswith("not_found: every place within 2.0 m where red_can could stand was seen")
     floor = result["seen_floor"]
     assert floor["missed"] <= 3, "of 5,000 cells: the rim of the can and a strip of its shadow"
     assert floor["hiding"] == 0

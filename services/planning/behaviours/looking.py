@@ -188,7 +188,7 @@ class Exploring:
     HERE_M = 0.05
     AHEAD_RAD = 0.3
     DOUBT_M = 0.5
-    """Doubt of the seen floor's place from which it does not say that it has seen the whole."""
+    """Doubt of the seen floor's place from which it does not say that it has seen every place."""
     WORTH = 0.3
     """Share of the place's unseen floor that must be left."""
 
@@ -285,10 +285,12 @@ class Exploring:
         doubt_m = 2 * snapshot.estimator.seen.doubt_m
         if doubt_m > self.DOUBT_M:
             return (
-                f"{self._label} was not found; the surroundings were searched, {radius_m:.1f} m wide{enclosed}, but the"
-                f" robot knew its place only to {doubt_m:.1f} m, so some floor may have been missed"
+                f"{self._label} was not found within {radius_m:.1f} m{enclosed}, but the robot knew its place only to"
+                f" {doubt_m:.1f} m, so some floor may have been missed"
             )
-        return f"the whole surroundings were searched, {radius_m:.1f} m wide{enclosed}; {self._label} is not there"
+        return (
+            f"every place within {radius_m:.1f} m where {self._label} could stand was seen{enclosed}; it is not there"
+        )
 
 
 def _not_seen(rest: Rest, body: Pose2) -> str:
