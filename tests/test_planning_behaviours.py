@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any, cast
+
 import pytest
 from planner_rig import ROBOT, Planner, standing, started
 
 from apps.rehearsal.lockstep import LockstepPlanner
 from cocoro import topics
+from cocoro.frames import Pose2
+from cocoro.messages.actions import Approach
+from services.planning.behaviours.driving import Approaching
 from services.planning.config import PlanningConfig
 
 
@@ -56,6 +62,15 @@ def test_approach_to_what_was_never_seen_is_lost(planner: Planner) -> None:
     planner.want("approach", "blue_can")
     assert planner.tick().reason == "lost"
     assert standing(planner)
+
+
+def test_the_arm_unfolds_before_the_robot_turns_to_where_there_is_no_room_for_it(planner: Planner) -> None:
+    core = planner.under_test.core
+    approaching = Approaching(Approach(label="red_can"))
+    approaching._course = cast(Any, SimpleNamespace(roomy=lambda pose, _: abs(pose.yaw_rad) < 0.3))
+    snapshot = cast(Any, SimpleNamespace(actuators=core.actuators, body=Pose2()))
+    for place, room in (((1.5, -0.1, 0.06), True), ((0.2, 0.5, 0.06), False)):
+        assert approaching._room_ahead(snapshot, cast(Any, SimpleNamespace(position_m=place)), cast(Any, None)) is room
 
 
 def test_reaching_for_what_is_too_far_is_unreachable(planner: Planner) -> None:

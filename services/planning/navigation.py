@@ -16,6 +16,9 @@ from cocoro.messages import BaseCommand
 from cocoro.robot import Base
 from services.planning.config import NavigationConfig
 
+PREVIEW_S = 0.1
+"""Time between two poses of a previewed drive, s."""
+
 
 @dataclass(frozen=True)
 class Offset:
@@ -83,15 +86,15 @@ class Driver:
         return speed, min(max(turn, -config.max_turn_radps), config.max_turn_radps)
 
     def preview(self, target_m: tuple[float, float], aim_m: tuple[float, float]) -> list[Pose2]:
-        """The poses along the arc in the present body frame, every 0.1 s for at most 20 s."""
+        """The poses along the arc in the present body frame, every `PREVIEW_S` for at most 20 s."""
         poses = [Pose2()]
-        for _ in range(200):
+        for _ in range(round(20.0 / PREVIEW_S)):
             x, y, _z = poses[-1].inverse().apply((*target_m, 0.0))
             offset = offset_to((x, y), aim_m)
             if self.arrived(offset):
                 break
             speed, turn = self.law(offset)
-            poses.append(poses[-1].compose(Pose2(speed * 0.1, 0.0, turn * 0.1)))
+            poses.append(poses[-1].compose(Pose2(speed * PREVIEW_S, 0.0, turn * PREVIEW_S)))
         return poses
 
     def stopping_poses(self, speed_mps: float, turn_radps: float) -> list[Pose2]:

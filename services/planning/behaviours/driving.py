@@ -11,6 +11,7 @@ from cocoro.messages.actions import Approach, Carry
 from services.planning.arm import ArmStep
 from services.planning.behaviours.base import Actuators, Plan, Snapshot, hand_place
 from services.planning.course import Course, Move
+from services.planning.navigation import PREVIEW_S
 from services.planning.reach import HandPose
 from services.planning.surroundings import Fields
 
@@ -128,10 +129,16 @@ class Approaching:
         assert self._course is not None
         return self._course.roomy(snapshot.body, fields)
 
-    def _room_ahead(self, snapshot: Snapshot, fields: Fields) -> bool:
-        """Whether there is room for the arm to unfold while the robot drives on."""
+    UNFOLD_S = 2.0
+    """Time in which the arm unfolds, s."""
+
+    def _room_ahead(self, snapshot: Snapshot, target: TargetEstimate, fields: Fields) -> bool:
+        """Whether there is room for the arm to unfold while the robot turns and drives on."""
         assert self._course is not None
-        return all(self._course.roomy(snapshot.body.compose(Pose2(ahead)), fields) for ahead in (0.25, 0.5))
+        x, y, _ = target.position_m
+        on_the_way = snapshot.actuators.driver.preview((x, y), grasp_aim(snapshot.actuators))
+        ahead = [Pose2(0.25), Pose2(0.5), *on_the_way[: round(self.UNFOLD_S / PREVIEW_S) : 4]]
+        return all(self._course.roomy(snapshot.body.compose(pose), fields) for pose in ahead)
 
     def _unseen_swing(self, snapshot: Snapshot) -> tuple[float, float] | None:
         """A place to look at before the arm unfolds, odometry frame, m; for the time of one glance."""
@@ -175,7 +182,7 @@ class Approaching:
             # The robot drives on meanwhile, but not up to the target.
             held = _waiting(move, why) if move.left_m < 0.35 else move._replace(why=f"{why}; {move.why}")
             return arm.park(angles, dt_s)._replace(arrived=False), held._replace(look_at=place)
-        if arm.folded(reference) and not self._room_ahead(snapshot, fields):
+        if arm.folded(reference) and not self._room_ahead(snapshot, target, fields):
             move = _waiting(move, "unfolding the arm here, where there is room")
         actuators.grip.open()
         if move.left_m < config.descend_at_m and abs(move.turn_radps) < 0.4:
