@@ -26,7 +26,7 @@ TICK_HZ = os.sysconf("SC_CLK_TCK")
 class Taker(NamedTuple):
     pid: int
     what: str
-    """The robot's name of it, or its command line."""
+    """The robot's name of it, or its command line, without the program's folder."""
     share: float
     """Of one core."""
 
@@ -140,6 +140,7 @@ def _command(proc: Path, pid: int) -> str:
         words = (proc / str(pid) / "cmdline").read_bytes().split(b"\0")
     except OSError:
         return "?"
-    line = " ".join(word.decode(errors="replace") for word in words if word)
+    program, *arguments = (word.decode(errors="replace") for word in words)
+    line = " ".join(filter(None, (program.rpartition("/")[2], *arguments)))
     printable = "".join(c if c.isprintable() else " " for c in line)
     return printable if len(printable) <= WORDS else f"{printable[: WORDS - 1]}…"

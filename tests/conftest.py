@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import logging
 import os
 import signal
 from collections.abc import Iterator
@@ -78,6 +79,15 @@ def latches_of_this_test(states: Iterator[Path], monkeypatch: pytest.MonkeyPatch
     state = next(states)
     state.mkdir(mode=0o700)
     monkeypatch.setenv("COCORO_STATE_DIR", str(state))
+
+
+@pytest.fixture(autouse=True)
+def log_of_this_test() -> Iterator[None]:
+    """Remove what a command has added to the log: it writes to the standard error of this test, which ends with it."""
+    yield
+    root = logging.getLogger()
+    for handler in [handler for handler in root.handlers if type(handler) is logging.StreamHandler]:
+        root.removeHandler(handler)
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -44,6 +44,7 @@ def test_no_message_names_a_file_that_an_installation_by_pip_lacks() -> None:
     assert not wrong, "\n".join(wrong)
 
 
+@pytest.mark.process
 def test_the_files_that_doctor_tells_to_install_are_there(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

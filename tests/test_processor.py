@@ -29,7 +29,7 @@ class Proc:
         zeros = " ".join(["0"] * 10)
         (folder / "stat").write_text(f"{pid} (a ) b) {state} {zeros} {ticks} 0 0 0 0 0 0 0 {start} 0 0")
         (folder / "schedstat").write_text(f"0 {round(waited_s * 1e9)} 3")
-        (folder / "cmdline").write_bytes(name.replace(" ", "\0").encode())
+        (folder / "cmdline").write_bytes(f"/somewhere/bin/{name}".replace(" ", "\0").encode())
 
 
 @pytest.fixture
