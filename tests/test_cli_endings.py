@@ -33,13 +33,14 @@ class Executive:
         """Task by asker."""
         self.ended: dict[str, str] = {}
         self.changed = asyncio.Event()
-        Askers(node, lambda asker: self._end(self._asked[asker], "gone"))
+        self._askers = Askers(node, lambda asker: self._end(self._asked[asker], "gone"))
         node.serve(RUN, self._run)
         node.serve(CANCEL, self._cancel)
         node.ready()
 
     async def _run(self, request: TaskRequest) -> TaskReply:
         task_id = f"{request.timeout_s:g}"
+        assert await self._askers.present(request.asker), "its token is there before its task begins"
         self._asked[request.asker] = task_id
         self.changed.set()
         return TaskReply(accepted=True, task_id=task_id)
