@@ -14,6 +14,7 @@ from cocoro.frames import Pose2
 from cocoro.messages.actions import Approach
 from services.planning.behaviours.driving import Approaching
 from services.planning.config import PlanningConfig
+from services.planning.core import PlanningCore
 
 
 @pytest.fixture
@@ -66,6 +67,7 @@ def test_approach_to_what_was_never_seen_is_lost(planner: Planner) -> None:
 
 def test_the_arm_unfolds_before_the_robot_turns_to_where_there_is_no_room_for_it(planner: Planner) -> None:
     core = planner.under_test.core
+    assert isinstance(core, PlanningCore)
     approaching = Approaching(Approach(label="red_can"))
     approaching._course = cast(Any, SimpleNamespace(roomy=lambda pose, _: abs(pose.yaw_rad) < 0.3))
     snapshot = cast(Any, SimpleNamespace(actuators=core.actuators, body=Pose2()))
