@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from faults_live import PROCESSES, LiveRobot, live
 from operator_shell import Running
-from test_faults_live import FAR, fault, stands_in_time
+from test_faults_live import FAR
 
 pytestmark = [pytest.mark.zenoh, pytest.mark.sim, pytest.mark.process]
 
@@ -73,26 +73,5 @@ def test_when_all_sleep_for_longer_than_the_lease_the_robot_stands_and_nobody_is
             finally:
                 fetch.process.kill()
                 fetch.process.wait()
-
-    asyncio.run(scenario())
-
-
-def test_of_one_that_alone_is_stopped_for_longer_than_the_lease_contact_is_lost(tmp_path: Path, far: Path) -> None:
-    async def scenario() -> None:
-        async with live(tmp_path, scene=far, mesh=MESH) as robot:
-            task_id = await robot.driving()
-            stopped_s = await fault(robot, "planning", signal.SIGSTOP)
-            state = await robot.outcome(task_id)
-            late = "not_alive: nothing from the planner for 10 s"
-            assert state.reason in ("not_alive: lost contact with planning", late)
-            await stands_in_time(robot, stopped_s)
-            await robot.told("lost contact with planning: no sign of it")
-            code, said = await robot.command("status")
-            assert code == 1
-            assert "no contact" in next(line for line in said.splitlines() if line.startswith("planning "))
-            robot.signal("planning", signal.SIGCONT)
-            await robot.told("planning is back")
-            await robot.driving()
-            assert " died" not in said_by_all(robot)
 
     asyncio.run(scenario())

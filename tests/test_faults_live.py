@@ -95,6 +95,9 @@ def test_who_is_stopped_for_longer_than_the_lease_ends_the_task_and_is_back_when
             )
             await stands_in_time(robot, stopped_s)
             await robot.told("lost contact with perception: no sign of it")
+            code, said = await robot.command("status")
+            assert code == 1
+            assert "no contact" in next(line for line in said.splitlines() if line.startswith("perception "))
             assert (await robot.ask(asked("park"))).refusal == "not_alive"
             robot.signal("perception", signal.SIGCONT)
             await robot.told("perception is back")
