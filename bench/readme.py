@@ -71,7 +71,7 @@ class Block:
 
 @dataclass(frozen=True)
 class Ran:
-    """How a command ended."""
+    """The end of a command."""
 
     command: str
     code: int

@@ -15,7 +15,7 @@ PROC = Path("/proc")
 STARVED_SHARE = 0.2
 """A process that waits for a processor for this share of a time is starved in it."""
 TAKERS = 3
-"""So many of the processes that take most are named."""
+"""Number of processes that are named, those that take most."""
 TAKES_SHARE = 0.1
 """A process is named as one that takes the processor from this share of one core on."""
 WORDS = 40

@@ -174,7 +174,7 @@ class CoverageJudge:
 
 
 def _in_squares(cells_m: FloatArray) -> int:
-    """How many of the cells (n, 2) belong to a square of two by two."""
+    """The number of cells of (n, 2) that belong to a square of two by two."""
     cells = {(x, y) for x, y in np.rint(cells_m / CELL_M).astype(np.int64).tolist()}
     squares = [{(x, y), (x + 1, y), (x, y + 1), (x + 1, y + 1)} for x, y in cells]
     return len(set().union(*(square for square in squares if square <= cells)))

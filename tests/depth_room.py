@@ -70,7 +70,7 @@ class Room:
             self.seen.enter(seen, body, turning_radps, self.doubt_m)
 
     def occupied(self, near: tuple[float, float], within_m: float = 0.25) -> int:
-        """How many cells are occupied near a place."""
+        """The number of occupied cells near a place."""
         cells = np.argwhere(self.floor.occupied())
         centres = np.array([self.floor.centre(row, column) for row, column in cells]).reshape(-1, 2)
         return int((np.hypot(centres[:, 0] - near[0], centres[:, 1] - near[1]) <= within_m).sum())

@@ -1,4 +1,4 @@
-"""How the sight of walls corrects the body's pose, and where it must not."""
+"""The sight of walls corrects the body's pose, except where it must not."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a search counts as seen, where it goes to see the rest, and what it says of it."""
+"""A search: the floor that counts as seen, the places from which it sees the rest, and its report."""
 
 from __future__ import annotations
 

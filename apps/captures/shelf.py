@@ -53,7 +53,7 @@ class ListedCapture(msgspec.Struct, kw_only=True):
 
 
 class Ends:
-    """What a capture's beginning and end say, without its messages."""
+    """The facts in a capture's beginning and end, without its messages."""
 
     def __init__(self, path: Path) -> None:
         self.statistics: Statistics | None = None

@@ -171,7 +171,7 @@ def _facts(report: dict[str, Any]) -> Iterator[tuple[str, str]]:
 
 
 def space(recording: Recording) -> str:
-    """How much room the captures have, and how long it lasts."""
+    """Room left for captures, and the time for which it lasts."""
     if recording.fault:
         return ""
     rate = recording.rate_bytes_per_s

@@ -27,7 +27,7 @@ TEXT_WIDTH = 24
 
 
 class Column(NamedTuple):
-    """How a table shows a column."""
+    """The form of a table's column."""
 
     head: str
     rank: int = 0

@@ -29,7 +29,7 @@ END_S = 5.0
 
 
 class Report(NamedTuple):
-    """What a worker says of its run: how far it is, or its result."""
+    """A worker's report of its run: its progress, or its result."""
 
     run: str
     progress: RehearsalProgress | None = None

@@ -1,4 +1,4 @@
-"""How far a rehearsal is."""
+"""Progress of a rehearsal."""
 
 from __future__ import annotations
 

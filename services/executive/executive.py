@@ -43,7 +43,7 @@ LOOK_S = 0.02
 """Time between two looks whether a service that is not heard has died."""
 GONE = "the command or program that asked for it has ended, or is not heard any more"
 REMEMBERED = 64
-"""How many ended tasks the executive knows."""
+"""Number of ended tasks that the executive remembers."""
 _CLOCK_STANDS_S = 1.0
 """A clock that takes longer than this for 20 ms stands still."""
 

@@ -18,7 +18,7 @@ ROOT = "sim"
 FLOOR_M = 4.0
 """Half width of the drawn floor."""
 EYE_M: Vec3 = (-1.5, -1.9, 1.5)
-"""Where the eye is at the start, from the robot's starting place."""
+"""The eye's place at the start, from the robot's starting place."""
 LOOK_M: Vec3 = (0.5, 0.0, 0.25)
 BACKGROUND = (206, 212, 218)
 

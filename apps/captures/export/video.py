@@ -136,7 +136,7 @@ def _put_inset(picture: ImageArray, inset: ImageArray) -> None:
 
 
 class _Pictures(Protocol):
-    """What takes the pictures of a film."""
+    """Takes the pictures of a film."""
 
     def show(self, at_s: float, picture: ImageArray) -> None: ...
 

@@ -184,7 +184,7 @@ def free_port(wanted: int, bind: str) -> int:
 
 
 def _reached(bind: str) -> str:
-    """Where this machine reaches what is bound to an address."""
+    """The address by which this machine reaches a server that is bound to an address."""
     return LOOPBACK if bind == "0.0.0.0" else "[::1]" if bind == "::" else bind
 
 
