@@ -1,10 +1,9 @@
 """What a search has seen of the floor, and from where the rest can be seen.
 
 A cell counts as seen when floor was measured in it from near enough, twice, while the head hardly turned: then an
-object there would have been found. In the last centimetres before a wall no object can stand, and no cell is sure: when
-all else was seen, the search looks at each wall's foot from its own side. Places to look from are rated by casting rays
-through the floor map (next best view, Connolly 1985; derived): things are opaque, and so is unseen floor beyond a
-margin.
+object there would have been found. Beside a wall no cell is sure: when all else was seen, the search looks at each
+wall's foot from its own side. Places to look from are rated by casting rays through the floor map (next best view,
+Connolly 1985; derived): things are opaque, and so is unseen floor beyond a margin.
 """
 
 from __future__ import annotations
@@ -44,8 +43,6 @@ _ROW_RAD, _CAMERA_M = 0.0125, 0.73
 ends."""
 _SECTORS = 60
 """Directions from which a cell is seen are told apart by so many sectors."""
-_OWN_SIDE = 0.05
-"""Least cosine between the direction from which an obstacle's foot is seen and that away from the obstacle."""
 _ANYWHERE = (1 << _SECTORS) - 1
 _RAYS, _STEP_M = 120, 0.075
 _FINE_RAYS = 540
@@ -78,7 +75,7 @@ def _away_kernels() -> tuple[FloatArray, FloatArray]:
 def _own_sides() -> IntArray:
     """For each direction away from an obstacle (sectors) the sectors (bits) from which its foot is seen."""
     sectors = (np.arange(_SECTORS) + 0.5) * (2 * np.pi / _SECTORS)
-    own = np.cos(sectors[:, None] - sectors) >= _OWN_SIDE
+    own = np.cos(sectors[:, None] - sectors) > -1e-9
     sides: IntArray = (own.astype(np.int64) << np.arange(_SECTORS)).sum(axis=1)
     return sides
 
@@ -119,6 +116,8 @@ class SeenFloor:
         """The sectors (bits) from which a cell was seen."""
         self._feet = False
         """Whether the feet of obstacles are looked at, too: all other floor was seen."""
+        self._claimed = np.ones((SIZE, SIZE), dtype=bool)
+        """Cells whose place must not be in doubt when they are seen."""
         self._corner: IntArray = np.zeros(2, dtype=np.int64)
         self._centre_m: tuple[float, float] | None = None
         self._avoided: list[tuple[float, float]] = []
@@ -148,6 +147,7 @@ class SeenFloor:
         self._missed[:] = 0
         self._from[:] = 0
         self._feet = False
+        self._claimed = ~self._beyond()
         self.scans = 0
         self.doubt_m = 0.0
         self._avoided.clear()
@@ -169,7 +169,7 @@ class SeenFloor:
         x, y = body.apply((*seen.origin_m, 0.0))[:2]
         cells = self._crossed(x, y, rays, self._config.sight_m)
         sure = cv2.erode(cells.astype(np.uint8), _DOUBT).astype(bool)
-        if (sure & (self._count < _ENOUGH)).any():
+        if (sure & (self._count < _ENOUGH) & self._claimed).any():
             self.doubt_m = max(self.doubt_m, doubt_m)
         self._count[sure] = np.minimum(self._count[sure] + 1, _ENOUGH)
         rays[:, 2] += _ROW_RAD * (rays[:, 2] ** 2 / _CAMERA_M + _CAMERA_M)
@@ -255,7 +255,7 @@ class SeenFloor:
         stands is such a place, too, if something can be seen when it turns round."""
         view = self._best_view(body, costs_m, around, known)
         if view is None and not self._feet:
-            self._feet = True
+            self._feet, self._claimed = True, self._hidden(around, known)
             view = self._best_view(body, costs_m, around, known)
         return view
 
@@ -307,6 +307,8 @@ class SeenFloor:
     def rest(self, around: FloorMap, known: Sequence[tuple[float, ...]]) -> Rest:
         """What was not seen, given up or not."""
         hidden = self._hidden(around, known)
+        if self._feet:
+            hidden |= _large(self._unseen_feet(around) > 0, self.least_m2)
         _, patches, stats, middles = cv2.connectedComponentsWithStats(hidden.astype(np.uint8), connectivity=8)
         seen = np.asarray(self._count >= _ENOUGH)
         found, enclosed = [], 0.0
@@ -351,7 +353,7 @@ class SeenFloor:
         """The sectors (bits) from which each cell is still to be seen."""
         wanted = np.where(self.unseen(around, known), _ANYWHERE, 0)
         if self._feet:
-            wanted |= self._unseen_feet(around)
+            wanted |= np.where(self._missed < _PATIENCE, self._unseen_feet(around), 0)
         return wanted
 
     def _unseen_feet(self, around: FloorMap) -> IntArray:
@@ -362,7 +364,7 @@ class SeenFloor:
             cv2.dilate(things, np.ones((2 * reach + 1,) * 2, np.uint8)).astype(bool)
             for reach in (_OPAQUE_CELLS, _OPAQUE_CELLS + 1)
         )
-        here = outer & ~inner & ~self._beyond() & (self._missed < _PATIENCE)
+        here = outer & ~inner & ~self._beyond()
         x, y = (cv2.filter2D(things.astype(np.float64), -1, kernel) for kernel in (_AWAY_X, _AWAY_Y))
         own = _OWN[_sector(np.arctan2(y, x))]
         return np.where(here & (self._from & own == 0), own, 0)
@@ -413,6 +415,14 @@ class SeenFloor:
 def _sector(bearing_rad: FloatArray) -> IntArray:
     sector: IntArray = np.floor(bearing_rad / (2 * np.pi / _SECTORS)).astype(np.int64) % _SECTORS
     return sector
+
+
+def _large(cells: BoolArray, least_m2: float) -> BoolArray:
+    """The cells that belong to a patch of at least a size."""
+    _, patches, stats, _ = cv2.connectedComponentsWithStats(cells.astype(np.uint8), connectivity=8)
+    large = stats[:, cv2.CC_STAT_AREA] * _AREA_M2 > least_m2 - _AREA_M2 / 2
+    large[0] = False
+    return np.asarray(large[patches])
 
 
 def describe(rest: Rest, body: Pose2) -> str:
