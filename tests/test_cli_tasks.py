@@ -1,4 +1,4 @@
-"""How a task is asked for and followed, against a scripted executive on the local bus in virtual time."""
+"""Commands that ask for a task and follow it, against a scripted executive on the local bus in virtual time."""
 
 from __future__ import annotations
 
@@ -357,7 +357,7 @@ async def test_the_first_interrupt_cancels_on_the_robot_and_waits_for_the_outcom
 
 @in_virtual_time
 async def test_babbling_that_cannot_be_kept_is_cancelled_on_the_robot(scene: Scene) -> None:
-    """It would move for nothing."""
+    """The robot would move for nothing."""
 
     class Full:
         taken = 0

@@ -48,7 +48,7 @@ def moving(robot: str, *services: str, keep: Callable[[str], Future[str]] = kept
 
 
 def reached(asking: Asking) -> list[bool]:
-    """For each stop point of the robot, whether the request has been delivered to it."""
+    """Flags of the robot's stop points to which the request has been delivered."""
     return [point.sent_s is not None for point in asking.points.values()]
 
 
@@ -301,7 +301,7 @@ def test_nobody_else_reaches_the_line_on_which_a_point_answers(robot: str) -> No
 @pytest.mark.process
 @pytest.mark.parametrize("free", [1, 2, 3, 1500], ids=lambda free: f"{free}-files-left")
 def test_a_caller_that_has_nearly_all_its_files_open_stops_the_robot(robot: str, free: int) -> None:
-    """Also one whose next file has a number that select(2) cannot take."""
+    """The case includes a next file with a number that select(2) cannot take."""
     code = (
         "import resource, time; hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1];"
         "resource.setrlimit(resource.RLIMIT_NOFILE, (min(3000, hard), hard));"
@@ -338,7 +338,7 @@ def test_another_user_without_any_variable_can_stop_the_robot(robot: str) -> Non
 @pytest.mark.process
 @needs_root
 def test_an_address_that_names_another_user_is_that_of_who_made_it(robot: str) -> None:
-    """Its answers, or their absence, are attributed to that user's robot."""
+    """Answers of such an address, or their absence, are attributed to that user's robot."""
     with a_liar(robot), moving(robot, "arm"):
         asking = stop(robot, within_s=1.0)  # the liar never says whether its latch is on the disk
     assert {point.service: point.uid for point in asking.points.values()} == {"base": 65534, "arm": 0}

@@ -39,7 +39,7 @@ MeshOption = Annotated[
 
 @dataclass(frozen=True)
 class RobotChoice:
-    """Which robot a command is for, from `--robot` and `--profile`; neither is needed when one robot is up here."""
+    """The robot that a command is for, from `--robot` and `--profile`; neither is needed when one robot is up here."""
 
     robot: str | None = None
     profile: str | None = None

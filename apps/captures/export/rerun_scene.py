@@ -248,7 +248,7 @@ class RerunScene:
         self._phase = phase
 
     def _truth(self, truth: Truth) -> None:
-        """In the body frame, as the believed objects; with a stage also in the world's."""
+        """Log the true objects in the body frame, as the believed ones are; with a stage also in the world frame."""
         if self._stage is not None:
             self._stage.log(truth)
         there = [item for item in truth.objects if item.kind == "object"]
