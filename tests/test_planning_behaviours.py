@@ -54,9 +54,28 @@ def test_a_search_whose_time_is_up_says_what_it_has_not_seen(planner: Planner) -
     assert standing(planner)
 
 
-def test_exploring_without_a_search_before_finds_nothing(planner: Planner) -> None:
+def test_a_base_that_restarts_begins_the_search_anew(planner: Planner) -> None:
+    planner.sees = None
+    planner.want("search", "blue_can")
+    planner.run(0.1)
+    planner.incarnation += 1
+    status = planner.run(0.1)
+    assert status.state == "running"
+    assert status.why.startswith("sweeping for blue_can")
+
+
+def test_a_restart_while_exploring_lets_the_search_begin_anew_and_claims_nothing(planner: Planner) -> None:
+    planner.sees = None
+    planner.want("search", "blue_can")
+    planner.run(0.2)
     planner.want("explore", "blue_can")
-    assert planner.tick().reason == "not_found"
+    planner.incarnation += 1
+    status = planner.tick()
+    assert (status.state, status.why) == ("done", "the search begins anew")
+    planner.want("explore", "blue_can", time_is_up=True)
+    status = planner.tick()
+    assert (status.state, status.reason) == ("failed", "not_found")
+    assert "which floor was seen is not known" in status.why
 
 
 def test_approach_to_what_was_never_seen_is_lost(planner: Planner) -> None:

@@ -127,7 +127,10 @@ class NominalModel:
 
 
 class HandMap:
-    """The map from joint angles, rad, in the order of `joints`, to the positions where the marker is seen, body frame, m."""
+    """The map from joint angles, rad, in the order of `joints`, to the position at which the marker is seen.
+
+    Positions are in the body frame, m.
+    """
 
     def __init__(
         self,

@@ -109,7 +109,7 @@ class ThinningWriter(CaptureWriter):
 
     @property
     def _holds(self) -> bool:
-        """Whether messages are held for the next file: not while a task runs, since the file of the next task has them whole."""
+        """Whether messages are held for the next file: not while a task runs."""
         return self.occasion is None or not self.occasion.task_id or self.occasion.ended_ns is not None
 
     def put(self, message: QueuedMessage) -> None:

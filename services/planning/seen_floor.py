@@ -87,6 +87,8 @@ class SeenFloor:
         self.task_id = ""
         self.running = False
         """Whether a search goes on."""
+        self.scans = 0
+        """Depth images that this search has entered."""
         self.doubt_m = 0.0
         """By how much the place of some floor was in doubt when it was seen."""
 
@@ -106,6 +108,7 @@ class SeenFloor:
         self._corner = np.floor(np.array(self._centre_m) / CELL_M).astype(np.int64) - SIZE // 2
         self._count[:] = 0
         self._missed[:] = 0
+        self.scans = 0
         self.doubt_m = 0.0
         self._avoided.clear()
 
@@ -135,6 +138,7 @@ class SeenFloor:
         if (sure & (self._count < _ENOUGH)).any():
             self.doubt_m = max(self.doubt_m, doubt_m)
         self._count[sure] = np.minimum(self._count[sure] + 1, _ENOUGH)
+        self.scans += 1
 
     def stand_at(self, body: Pose2) -> None:
         """Count the floor under the body as seen."""

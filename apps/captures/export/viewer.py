@@ -40,7 +40,7 @@ INSTEAD = "--web shows it in a browser, --save OUT.rrd writes a file, --connect 
 
 
 class Target(msgspec.Struct, frozen=True, kw_only=True):
-    """The viewer or file that takes a scene: at most one of `save`, `web` and `connect`; a window when none is given."""
+    """The viewer or file that gets a scene: at most one of `save`, `web` and `connect`; without them a window."""
 
     save: Path | None = None
     web: bool = False

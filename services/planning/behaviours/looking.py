@@ -112,9 +112,9 @@ class Searching:
         config, seen = snapshot.actuators.config, snapshot.estimator.seen
         pan, tilt = snapshot.angles[PAN], snapshot.angles[TILT]
         lag_s = snapshot.estimator.sight_lag_s
-        if self._checked_ns is None and not seen.running:
+        if not seen.running:  # the first look, or the base restarted with a new odometry frame
             seen.begin(snapshot.body)
-            self._sweep = Sweep(config.head, pan)
+            self._sweep, self._glances, self._checked_ns = Sweep(config.head, pan), None, None
         seen.stand_at(snapshot.body)
         if self._checked_ns is None or snapshot.now_ns - self._checked_ns >= self.CHECK_NS:
             first = self._checked_ns is None
@@ -123,7 +123,7 @@ class Searching:
             self._left_m2 = float(cells.sum()) * CELL_M**2
             if first and self._sweep is None:
                 self._glances = glances(config.head, pan, seen.bearings(cells, snapshot.body))
-        if self._left_m2 < config.search.least_m2:
+        if self._left_m2 < config.search.least_m2 and seen.scans:  # without a scan the floor map may be empty
             self._sweep, self._glances = None, []
         # Even slow perception must see every direction twice while the view passes over it.
         slow = 0.4 / max(lag_s, 1e-3)
@@ -202,8 +202,8 @@ class Exploring:
 
     def step(self, snapshot: Snapshot) -> Plan:
         actuators, seen = snapshot.actuators, snapshot.estimator.seen
-        if not seen.running:  # a planner that restarted knows nothing of the search
-            return Plan(snapshot.stand(), snapshot.still(), "there is no search", None, "failed", "not_found")
+        if not seen.running:
+            return self._without_search(snapshot)
         if self._time_is_up:
             rest = seen.rest(*snapshot.stands_around)
             why = f"time is up; {self._label} was not found{_not_seen(rest, snapshot.body)}"
@@ -250,6 +250,13 @@ class Exploring:
         if move.blocked or move.arrived or not self._worth_it(snapshot):
             plan.state = "done"
         return plan
+
+    def _without_search(self, snapshot: Snapshot) -> Plan:
+        """Let the search begin anew: the planner or the base restarted, so what was seen before is not known."""
+        if self._time_is_up:
+            why = f"time is up; {self._label} was not found; which floor was seen is not known after a restart"
+            return Plan(snapshot.stand(), snapshot.still(), why, None, "failed", "not_found")
+        return Plan(snapshot.stand(), snapshot.still(), "the search begins anew", state="done")
 
     def _turn(self, snapshot: Snapshot, bearing_rad: float, head: tuple[float, float, float]) -> Plan:
         arm = snapshot.actuators.arm.park(snapshot.angles, snapshot.dt_s)
