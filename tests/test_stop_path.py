@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -29,9 +30,10 @@ def robot() -> str:
     return new_robot()
 
 
-def kept(_by: str) -> Future[str]:
+def kept(_by: str, why_not: str = "") -> Future[str]:
+    """The disk's answer to a latch that is to be kept, given at once."""
     done: Future[str] = Future()
-    done.set_result("")
+    done.set_result(why_not)
     return done
 
 
@@ -112,12 +114,7 @@ def test_who_has_ended_is_not_waited_for(robot: str) -> None:
 
 
 def test_a_latch_that_the_disk_did_not_take_is_told(robot: str) -> None:
-    def full(_by: str) -> Future[str]:
-        done: Future[str] = Future()
-        done.set_result("the disk is full")
-        return done
-
-    with moving(robot, "base", keep=full) as halted:
+    with moving(robot, "base", keep=partial(kept, why_not="the disk is full")) as halted:
         (point,) = stop(robot).points.values()
         assert (point.kept, point.why_not_kept) == (False, "the disk is full")
         assert halted["base"]
