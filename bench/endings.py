@@ -132,7 +132,7 @@ class Command:
 
 
 def _own(terminal: int, kind: str) -> None:
-    """In the child: its controlling terminal, as a shell gives it; a hang-up that is ignored."""
+    """Prepare the child as a shell does, with a controlling terminal; where `kind` says so it ignores a hang-up."""
     if "pipe" not in kind:
         fcntl.ioctl(terminal, termios.TIOCSCTTY, 0)
     if "unheard" in kind:
@@ -207,7 +207,7 @@ class Watched:
         return (max(moving, default=since_ns) - since_ns) / NS
 
     def joints_rest_s(self, since_ns: int) -> tuple[float, float, str]:
-        """When the last joint came to rest, without the claws and of the claws; and which joint, how fast, was last."""
+        """Times, s, at which the last joint and the last claw came to rest; and the last of them with its speed."""
         last, which = {False: since_ns, True: since_ns}, ""
         for before, after in pairwise([truth for truth in self.truths if truth.stamp_ns > since_ns]):
             dt_s = (after.stamp_ns - before.stamp_ns) / NS

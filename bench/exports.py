@@ -69,7 +69,7 @@ def rehearsed(options: list[str], out: Path) -> Path:
 
 
 def ended(words: list[str], env: dict[str, str] | None = None, interrupt_at: str = "") -> str:
-    """How `cocoro view` ended. With `interrupt_at` Ctrl-C follows these words of it."""
+    """Run `cocoro view` and describe its end. With `interrupt_at` Ctrl-C follows these words of it."""
     started_s = time.monotonic()
     process = subprocess.Popen(
         [*COCORO, "view", *words], env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True

@@ -54,7 +54,7 @@ class FaultyBus:
             self._tokens[service].close()
 
     def way(self, service: str) -> Way | None:
-        """How a service fails; None when it does not fail."""
+        """The way in which a service fails; None when it does not fail."""
         return self._ways.get(service)
 
     def owner(self, key: str) -> str:

@@ -190,7 +190,7 @@ def live(count: int, seed: int, profile: str, bound_s: float) -> bool:
 
 @dataclass
 class Alarms:
-    """How often a service's patience ended although all services lived."""
+    """The number of times that a service's patience ended although all services lived."""
 
     task: str
     seconds: float

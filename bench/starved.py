@@ -57,7 +57,7 @@ class Trial(NamedTuple):
 
     @property
     def wrong(self) -> list[str]:
-        """What of the command's result is not true."""
+        """The statements of the command's result that are not true."""
         outcome = str(self.result.get("outcome"))
         found = []
         if self.code != CODES.get(outcome, 2):

@@ -268,7 +268,7 @@ def _kill(here: Place, who: str) -> None:
 
 
 def restarts(count: int, seed: int) -> list[str]:
-    """For each time that the latch was lost, the processes that were killed, in order."""
+    """Kill processes of a stopped robot, `count` times; lists the cases in which the latch was lost, in words."""
     draws = random.Random(seed)
     forgotten = []
     for number in range(count):

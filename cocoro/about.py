@@ -29,7 +29,8 @@ DISTRIBUTIONS = ("cocoro-mesh", "eclipse-zenoh", "msgspec", "numpy", "scipy", "o
 def about(
     service: str, robot_name: str, robot: Robot, *, module: str, config: Any, record_steps: bool, virtual: bool
 ) -> AboutReply:
-    """With `virtual` time, process and host are left out: then two equal runs give equal replies."""
+    """Make a service's reply about itself. With `virtual` time, process and host are left out, so that two equal runs
+    give equal replies."""
     return AboutReply(
         service=service,
         robot=robot_name,

@@ -11,6 +11,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
+from math import exp
 from typing import NamedTuple, Protocol
 
 NS = 1_000_000_000
@@ -168,8 +169,9 @@ class FollowedClock:
     """Follows ticks of simulated time. Between ticks it runs on at the simulator's rate, for at most `run_on_s`: when
     the simulator stands still, time stands still.
 
-    A single wrong tick moves nothing. Wrong is a tick before the last one, or further ahead than CLOCKS_APART_NS plus
-    twice what the last tick's rate gives in the real time that has passed. After `FOLLOWED_AFTER` wrong ticks in a row
+    A single wrong tick moves nothing. Wrong is a tick before the last one, or further ahead than `LEAP_NS` plus twice
+    what the last tick's rate gives in the real time that has passed, plus what ticks before it came too late for: a
+    process that did not run receives them in a burst. After `FOLLOWED_AFTER` wrong ticks in a row
     that agree with one another, the clock follows them. Ahead, that is only later (a replay was moved forward). Back
     by more than CLOCKS_APART_NS, it is a new epoch: the tick before them was the wrong one. Back by less than that,
     the clock waits until the ticks have caught up.
@@ -178,6 +180,10 @@ class FollowedClock:
     virtual = False
     STANDS_NS = NS
     """Without a tick for this much real time the clock stands: the slowest simulator ticks more often."""
+    LEAP_NS = NS // 10
+    """A wrong tick that is ahead by less than this is taken; time then stands until the others have caught up."""
+    BEHIND_NS = NS // 2
+    """Ticks' delay is forgotten with this time constant: a simulator that did not get its time never makes it up."""
     FOLLOWED_AFTER = 3
     FASTEST = 100.0
     """Highest rate of a replay, simulated seconds per real second."""
@@ -190,6 +196,7 @@ class FollowedClock:
         self._tick_ns = 0
         self._tick_real_ns = 0
         self._newest_ns = 0
+        self._behind_ns = 0.0
         self._rate = 1.0
         self._pace = 1.0
         self._doubted: Ticks | None = None
@@ -215,16 +222,19 @@ class FollowedClock:
         real_ns = steady_ns()
         anew = incarnation != self._incarnation
         if not anew:
-            ahead_ns = stamp_ns - self._tick_ns
-            if not 0 <= ahead_ns <= self._credible_ns(real_ns - self._tick_real_ns):
+            ahead_ns, passed_ns = stamp_ns - self._tick_ns, real_ns - self._tick_real_ns
+            if not 0 <= ahead_ns <= self._credible_ns(passed_ns) + self._behind_ns:
                 if not self._insists(stamp_ns, real_ns):
-                    return _rejection(ahead_ns, real_ns - self._tick_real_ns)
+                    return _rejection(ahead_ns, passed_ns)
                 anew = ahead_ns < 0
+            kept = exp(-passed_ns / self.BEHIND_NS)
+            self._behind_ns = max(self._behind_ns * kept + self._pace * passed_ns - ahead_ns, 0.0)
         if anew:
             if self._incarnation is not None:
                 self._epoch += 1
             self._incarnation = incarnation
             self._newest_ns = 0
+            self._behind_ns = 0.0
         self._doubted = None
         self._tick_ns = stamp_ns
         self._tick_real_ns = real_ns
@@ -238,7 +248,7 @@ class FollowedClock:
 
     def _credible_ns(self, passed_ns: int) -> int:
         """How far ticks can have advanced in some real time."""
-        return CLOCKS_APART_NS + round(2 * self._pace * passed_ns)
+        return self.LEAP_NS + round(2 * self._pace * passed_ns)
 
     def _insists(self, stamp_ns: int, real_ns: int) -> bool:
         """Whether a rejected tick is the `FOLLOWED_AFTER`th in a row that agree, so that the clock follows it."""
@@ -260,7 +270,7 @@ class FollowedClock:
     def latest_ns(self) -> int | None:
         if self._incarnation is None:
             return None
-        return self._tick_ns + self._credible_ns(steady_ns() - self._tick_real_ns) - CLOCKS_APART_NS
+        return self._tick_ns + self._credible_ns(steady_ns() - self._tick_real_ns) - self.LEAP_NS
 
     async def wait_started(self) -> None:
         while self._incarnation is None:

@@ -34,7 +34,7 @@ class Output(NamedTuple):
 
 @dataclass(frozen=True)
 class Schedule:
-    """When a core is stepped: at a fixed rate, when a message of a triggering topic arrives, or both."""
+    """The times at which a core is stepped: at a fixed rate, when a message of a triggering topic arrives, or both."""
 
     rate_hz: float | None
     triggers: tuple[Topic[Any], ...] = ()

@@ -55,7 +55,7 @@ class MeshError(CocoroError):
 
 
 class CallTimeoutError(MeshError):
-    """No service answered a request in time."""
+    """A request that no service answered in time."""
 
 
 class RemoteError(CocoroError):

@@ -111,7 +111,7 @@ class Inbox(Generic[M]):
             reader(key, message)
 
     def _ahead_ns(self, stamp_ns: int) -> int:
-        """How far a stamp is ahead of the clock, ns; 0 when the clock has not started."""
+        """The time by which a stamp is ahead of the clock, ns; 0 when the clock has not started."""
         now_ns = self._clock.latest_ns()
         if now_ns is None:
             return 0

@@ -120,7 +120,7 @@ class ServiceLatch:
         return EstopReply(service=self._node.name, latch=self.state, text=not_kept)
 
     async def _not_kept(self, within_s: float) -> str:
-        """Why the last state is not on the disk; '' when it is."""
+        """The reason for which the last state is not on the disk; '' when it is."""
         if self._record is None:
             return ""
         try:

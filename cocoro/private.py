@@ -179,7 +179,7 @@ def _writable(found: os.stat_result) -> bool:
 
 
 def _distrust(found: os.stat_result, last: bool) -> str | None:
-    """Why a directory is not safe, None when it is; the last one of a path must be this user's alone."""
+    """The reason for which a directory is not safe, or None; the last one of a path must be this user's alone."""
     if found.st_uid not in ((os.geteuid(),) if last else _trusted()):
         return _belongs(found.st_uid)
     if last and found.st_mode & 0o022:

@@ -49,7 +49,7 @@ class Publisher(Generic[M]):
 
     @property
     def trouble(self) -> str:
-        """Why its messages cost more than they should; empty when they do not."""
+        """The reason for which its messages cost more than they should; '' when they do not."""
         return f"{self.topic.name}: {self._raw.trouble}" if self._raw.trouble else ""
 
     def health(self, now_ns: int) -> TopicHealth:

@@ -245,7 +245,7 @@ class Camera:
         return np.array([(u_px - self.cx) / self.fx, (v_px - self.cy) / self.fy, 1.0])
 
     def scaled(self, width: int, height: int) -> Camera:
-        """This camera at another resolution."""
+        """A camera like this one at another resolution."""
         sx, sy = width / self.width, height / self.height
         cx = (self.cx + 0.5) * sx - 0.5  # distances scale from the image's edge, which is at -0.5
         cy = (self.cy + 0.5) * sy - 0.5
@@ -317,11 +317,11 @@ class Robot:
         return data
 
     def with_base(self, **changes: float) -> Robot:
-        """This robot with other values in its `[base]` table."""
+        """A robot like this one with other values in its `[base]` table."""
         return Robot(msgspec.structs.replace(self._spec, base=msgspec.structs.replace(self.base, **changes)))
 
     def with_networks(self, **changes: float) -> Robot:
-        """This robot with other values in both of its `[network]` tables."""
+        """A robot like this one with other values in both of its `[network]` tables."""
         networks = {name: msgspec.structs.replace(row, **changes) for name, row in self._spec.network.items()}
         return Robot(msgspec.structs.replace(self._spec, network=networks))
 

@@ -121,7 +121,7 @@ class SequenceTracker:
         return _Run(1, seq, seq, stamp_ns)
 
     def why(self, seq: int) -> str:
-        """Why a number was rejected."""
+        """The reason for which a sequence number was rejected."""
         wrong = "cannot be traffic" if seq > self.seq else "was there before"
         return f"sequence number {seq} after {self.seq} {wrong}"
 

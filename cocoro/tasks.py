@@ -87,7 +87,7 @@ class Skills(Protocol):
         """Hold still for a time; raises TaskFailedError('slipped') when the hand loses what it holds."""
 
     def place(self) -> Vec2:
-        """Where the body stands, odometry frame, m."""
+        """The position of the body, odometry frame, m."""
 
     def size_m(self, label: str) -> Vec3:
         """Extents of a known object: over the floor, over the floor, height. Raises KeyError for an unknown one."""

@@ -89,6 +89,6 @@ class VirtualTimeLoop(asyncio.SelectorEventLoop):
 
 
 def run_virtual(main: Coroutine[Any, Any, T]) -> T:
-    """Like `asyncio.run`, in virtual time. Raises NothingScheduledError when the run is stuck for ever."""
+    """Run a coroutine as `asyncio.run` does, in virtual time. Raises NothingScheduledError when it is stuck."""
     with asyncio.Runner(loop_factory=VirtualTimeLoop) as runner:
         return runner.run(main)

@@ -121,7 +121,7 @@ class ProcessContact(Contact):
         return service in self._met and not self.dead(service)
 
     async def lost(self, service: str) -> str:
-        """As the base class; returns within `CLAIM_S`."""
+        """The reason for which the contact was lost, as the base class says it; returns within `CLAIM_S`."""
         asleep = "" if self._sleep_detector is None else self._sleep_detector.look()
         if service in self._met:
             for _ in range(round(CLAIM_S / LOOK_S)):

@@ -41,7 +41,8 @@ def require(what: str, components: Iterable[Component]) -> None:
 
 
 def advice(*libraries: str) -> str:
-    """How to install distributions: `pip install 'cocoro-mesh[sim]'`, or by their own names when no extra has all."""
+    """The command that installs distributions: `pip install 'cocoro-mesh[sim]'`, or by their own names when no extra
+    has all."""
     found = [extra for extra in EXTRAS if set(libraries) <= _libraries_of(extra)]
     return f"pip install '{PROJECT}[{found[0]}]'" if found else f"pip install {' '.join(libraries)}"
 

@@ -1,4 +1,4 @@
-"""Who uses the processors of this machine, and who waits for one: read from /proc, over a time.
+"""Use of this machine's processors, and the processes that wait for one: read from /proc, over a time.
 
 The figures are of this machine and its other users, so they are not part of the robot's messages.
 """

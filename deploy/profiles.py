@@ -70,7 +70,7 @@ class Profile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
         return description, measured
 
     def with_robot(self, description: Path | None, measured: Path | None) -> Profile:
-        """This profile with another description or measured file; None keeps its own."""
+        """A profile like this one with another description or measured file; None keeps its own."""
         files = {"description": description, "measured": measured}
         given = {name: str(file.resolve()) for name, file in files.items() if file is not None}
         return msgspec.structs.replace(self, **given)

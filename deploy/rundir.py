@@ -42,8 +42,8 @@ KEPT_LOGS = 5
 
 
 class Mesh(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Where a robot's processes meet: a profile's `[mesh]` table. Without endpoints it is the run directory. The
-    fields are those of `cocoro.bus.endpoints.ZenohConfig`."""
+    """The place where a robot's processes meet: a profile's `[mesh]` table. Without endpoints it is the run directory.
+    The fields are those of `cocoro.bus.endpoints.ZenohConfig`."""
 
     mode: Literal["peer", "client", "router"] = "peer"
     listen: tuple[str, ...] = ()
@@ -135,8 +135,8 @@ class RunDir:
     # --- the mesh ---------------------------------------------------------------------------------
 
     def join_as(self, name: str, mesh: Mesh | None = None, *, frames: bool = False) -> ZenohConfig:
-        """How a process called `name` joins the mesh of a profile (by default the last start's). `frames`: it publishes
-        or reads frames, so it asks for shared memory."""
+        """Configure a process called `name` to join the mesh of a profile (by default the last start's). `frames`: it
+        publishes or reads frames, so it asks for shared memory."""
         if mesh is None:
             mesh = msgspec.convert(self.resolved().get("mesh", {}), Mesh)
         if not mesh.listen and not mesh.connect:
@@ -195,13 +195,13 @@ class RunDir:
 
 
 def robots(root: Path | None = None) -> list[RunDir]:
-    """This user's robots that have a process on this machine. Raises ConfigError for a run directory that is not to be
-    trusted."""
+    """List this user's robots that have a process on this machine. Raises ConfigError for a run directory that is not
+    to be trusted."""
     return [run_dir for run_dir in folders(root) if run_dir.populated]
 
 
 def folders(root: Path | None = None) -> list[RunDir]:
-    """This user's robots that have a folder, running or not. Raises ConfigError as `robots` does."""
+    """List this user's robots that have a folder, running or not. Raises ConfigError as `robots` does."""
     root = root or default_run_dir()
     try:
         with private.directory(root, own=False) as fd, os.scandir(fd) as entries:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from math import degrees
 
 from cocoro.messages import BaseCommand, BaseState, LatchState
+from cocoro.messages.hardware import STOPPED_BY
 from cocoro.odometry import REPORT_PERIOD_S, Odometry, WheelRamp
 from cocoro.robot import Base
 
@@ -68,7 +69,7 @@ class MobileBase:
         """Accept wheel speeds. They expire `Base.patience_s` after the command's stamp (without a stamp: after now).
         Returns '' when accepted, otherwise the reason for refusing."""
         if self.latch != "released":
-            return _latch_text(self.latch)
+            return STOPPED_BY[self.latch]
         self._wanted = command.left_mps, command.right_mps
         sent_ns = min(command.stamp_ns or now_ns, now_ns)
         self._valid_until_ns = sent_ns + round(self._base.patience_s(self._faster_mps()) * 1e9)
@@ -118,7 +119,7 @@ class MobileBase:
         """The part of the commanded speeds that deadman, emergency stop and bump reflex allow; left, right."""
         self.stopped_by = ""
         if self.latch != "released":
-            self.stopped_by = _latch_text(self.latch)
+            self.stopped_by = STOPPED_BY[self.latch]
             return 0.0, 0.0
         if now_ns > self._valid_until_ns:
             self.stopped_by = "no command"
@@ -130,7 +131,3 @@ class MobileBase:
             forward = (left + right) / 2
             return left - forward, right - forward
         return left, right
-
-
-def _latch_text(latch: LatchState) -> str:
-    return {"released": "", "latched": "estop", "unknown": "latch unknown"}[latch]

@@ -1,4 +1,4 @@
-"""Which floor the camera saw, by the simulator's truth: what a search may say of it is judged by this."""
+"""The floor that the camera saw, by the simulator's truth. A search's statements about the floor are judged by it."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ class CoverageJudge:
         return self._scene.obstacles[int(item.label.removeprefix("obstacle_")) - 1]
 
     def _sees(self, truth: Truth, cells_m: FloatArray) -> BoolArray:
-        """Which places on the floor (n, 2), world frame, are seen now."""
+        """Mark the places on the floor (n, 2), world frame, m, that are seen now; returns shape (n,)."""
         body = np.eye(4)
         body[:3, :3] = rotation(truth.body_orientation)
         body[:3, 3] = truth.body_m
@@ -112,7 +112,7 @@ class CoverageJudge:
         return seen | under
 
     def _hidden(self, truth: Truth, eye: FloatArray, points: FloatArray) -> BoolArray:
-        """Which points (n, 3), world frame, something hides from a place (3,)."""
+        """Mark the points (n, 3), world frame, m, that something hides from a place (3,); returns shape (n,)."""
         hidden = np.zeros(len(points), dtype=bool)
         for item in truth.objects:
             solid = self._solid(item)
@@ -146,7 +146,7 @@ class CoverageJudge:
         )
 
     def _seeable(self, cells_m: FloatArray) -> BoolArray:
-        """Which cells (n, 2), world frame, a pose that the robot can reach would show."""
+        """Mark the cells (n, 2), world frame, m, that a pose within the robot's reach would show; shape (n,)."""
         assert self._newest is not None
         assert self._start is not None
         seeable = np.zeros(len(cells_m), dtype=bool)
@@ -186,7 +186,7 @@ def _yaw(truth: Truth) -> float:
 
 
 def _stands_on(solid: SceneObject | Obstacle, item: TrueObject, places_m: FloatArray, room_m: float) -> BoolArray:
-    """Which places (n, 2), world frame, are nearer than `room_m` to the floor under a thing."""
+    """Mark the places (n, 2), world frame, m, that are nearer than `room_m` to the floor under a thing; (n,)."""
     x, y, z = item.position_m
     sizes = solid.dimensions_m
     if z > solid.standing_height_m + 0.3:  # it hangs in the air

@@ -152,7 +152,7 @@ def _bottom_depth_m(known: SceneObject, item: TrueObject) -> float:
 
 
 class Pursuit(msgspec.Struct, frozen=True, kw_only=True):
-    """How a follow task went, from the moment at which following began."""
+    """The figures of a follow task, from the moment at which following began."""
 
     mean_gap_m: float
     """Horizontal distance from the robot's centre to the target's nearest edge."""

@@ -59,7 +59,7 @@ class RobotModel:
                     yield one, other
 
     def visuals(self) -> list[tuple[str, FloatArray, Visual]]:
-        """For each part: the URDF link that carries it, its pose (4, 4) in that link, and its visual."""
+        """List for each part the URDF link that carries it, its pose (4, 4) in that link, and its visual."""
         found = []
         for link, parts in self.body.parts.items():
             carrier, offset = self.carried.get(link, (link, np.eye(4)))

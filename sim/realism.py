@@ -1,4 +1,4 @@
-"""How the simulated body differs from a perfect one: errors of servos and wheels, and errors of making and wear.
+"""The simulated body's differences from a perfect one: errors of servos and wheels, and errors of making and wear.
 
 The camera's errors are in `sim.camera`, the latencies in `sim.service`. Everything is drawn from the run's seed, so the
 same seed gives the same body.
@@ -107,7 +107,7 @@ class Wear:
     """Time at which the forearm is bent; None is never."""
 
     def slip_rad(self, joint: str, time_s: float) -> float:
-        """How far a joint's angle exceeds that of its servo's shaft."""
+        """The angle, rad, by which a joint exceeds its servo's shaft."""
         bent = self.bend_s is not None and time_s >= self.bend_s and joint == "elbow"
         return self.slip_radps.get(joint, 0.0) * time_s + (BEND_RAD if bent else 0.0)
 

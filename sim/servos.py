@@ -11,6 +11,7 @@ from math import degrees, radians
 from typing import NamedTuple
 
 from cocoro.messages import LatchState, ServoCommand, ServoState
+from cocoro.messages.hardware import STOPPED_BY
 from cocoro.robot import Joint
 
 SPEED_COUNT_RADPS = 0.111 * 2 * 3.141592653589793 / 60
@@ -172,7 +173,7 @@ class SimServoNetwork:
 
     @property
     def stopped_by(self) -> str:
-        return {"released": "", "latched": "estop", "unknown": "latch unknown"}[self.latch]
+        return STOPPED_BY[self.latch]
 
     def command(self, command: ServoCommand, now_ns: int) -> str:
         """Accept all goals or none. Returns '' when accepted, otherwise the reason for refusing."""

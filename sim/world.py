@@ -35,7 +35,7 @@ NETWORKS = ("arm", "hand")
 
 
 class WheelMotion(NamedTuple):
-    """How the base drives its wheels now."""
+    """The base's present drive of its wheels."""
 
     speed_mps: float
     """Speed of the faster wheel by the base's ramp."""
@@ -246,7 +246,7 @@ class World:
         return self._mechanism.root_pose()
 
     def wheels(self) -> WheelMotion:
-        """How the wheels are driven, independent of what the base reports."""
+        """The present drive of the wheels, independent of what the base reports."""
         ramp = self._base.ramp
         return WheelMotion(max(abs(ramp.left_mps), abs(ramp.right_mps)), self._base.stopped_by == "no command")
 

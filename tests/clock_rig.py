@@ -1,4 +1,4 @@
-"""For tests of clocks: the system's clocks follow the time of the virtual loop.
+"""A set-up for tests of clocks: the system's clocks follow the time of the virtual loop.
 
 `pytest_plugins` in conftest.py registers the fixture.
 """

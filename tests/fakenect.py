@@ -42,7 +42,7 @@ def player(folder: Path) -> str:
 
 
 def _download(folder: Path) -> str:
-    """Why the library is not available; '' when it is."""
+    """Download the library. Returns the reason for which it is not available; '' when it is."""
     return _run([*APT, "download", PACKAGE], folder, DOWNLOAD_S)
 
 

@@ -1,4 +1,4 @@
-"""How long a base turns its wheels on one command, by speed: the driver, and the simulator's base."""
+"""The time for which a base turns its wheels on one command, by speed: the driver, and the simulator's base."""
 
 from __future__ import annotations
 

@@ -84,7 +84,7 @@ class Line:
 
 
 def one(seed: int, kind: FaultKind) -> int | None:
-    """How long the wheels turned after the service's death; None when nothing could have stopped them."""
+    """The time, ns, for which the wheels turned after the service died; None when nothing could have stopped them."""
     line = Line(seed)
     assert line.drives()
     line.garble(kind, line.draws.uniform(0.003, 0.1), round(line.draws.uniform(100, 1500)) * MS)

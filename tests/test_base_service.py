@@ -40,6 +40,7 @@ class Driven:
     def __init__(self, bench: Bench, service: ServiceUnderTest) -> None:
         self.bench = bench
         self.service = service
+        self.name = service.robot.name
         self.commanded_ns = 0
         """CLOCK_MONOTONIC of the last command."""
         self._driving: asyncio.Task[None] | None = None

@@ -6,8 +6,7 @@ import asyncio
 import os
 import signal
 import time
-from collections.abc import AsyncIterator, Iterator
-from contextlib import asynccontextmanager
+from collections.abc import Awaitable, Callable, Iterator
 from copy import copy
 from pathlib import Path
 
@@ -96,70 +95,68 @@ def latches(tmp_path: Path) -> Path:
     return folder
 
 
-@asynccontextmanager
-async def rolling(bench: Bench, name: str, latches: Path) -> AsyncIterator[Driven]:
-    """The base service and its guard, driving straight."""
-    robot = copy(Robot.load())
-    robot.name = name
-    config = {"port": bench.port}
-    async with ServiceUnderTest(
-        "services.base.service", config, robot=robot, clock=RealClock(), latches=latches
-    ) as service:
-        base = Driven(bench, service)
-        await base.state(lambda state: state.mode == "safe")
-        await base.roll()
-        yield base
-        base.silence()
+def while_rolling(scenario: Callable[[Driven, Path], Awaitable[None]]) -> Callable[[Bench, str, Path], None]:
+    """A scenario with the base service and its guard, which drive straight when it begins."""
+
+    async def run(bench: Bench, name: str, latches: Path) -> None:
+        robot = copy(Robot.load())
+        robot.name = name
+        config = {"port": bench.port}
+        async with ServiceUnderTest(
+            "services.base.service", config, robot=robot, clock=RealClock(), latches=latches
+        ) as service:
+            base = Driven(bench, service)
+            await base.state(lambda state: state.mode == "safe")
+            await base.roll()
+            await scenario(base, latches)
+            base.silence()
+
+    def test(bench: Bench, name: str, latches: Path) -> None:
+        asyncio.run(asyncio.wait_for(run(bench, name, latches), PATIENCE_S))
+
+    test.__name__ = scenario.__name__
+    return test
 
 
-def test_service_and_guard_are_both_told_and_a_reset_releases_both(bench: Bench, name: str, latches: Path) -> None:
-    async def scenario() -> None:
-        async with rolling(bench, name, latches) as base:
-            asked_ns = time.monotonic_ns()
-            answers = await asyncio.to_thread(stopped_ns, name)
-            assert set(answers) == {"base", "wheels"}
-            assert None not in answers.values()
-            assert await base.wheels(0, 0) - asked_ns < PATIENCE_NS
-            state = await base.state(lambda state: state.stopped_by == "estop")
-            assert state.latch == "latched"
-            assert read(latches / "base").latched
-            await asyncio.to_thread(stopped_ns, name)
-            base.release()  # the executive's word releases nothing
-            await base.state(lambda state: state.latch == "latched")
-            reply = await base.service.ask(topics.ESTOP.of("base"), EstopRequest(latched=False, by="test"))
-            assert reply.latch == "released"
-            await base.wheels(200, 200)
-            assert not read(latches / "base").latched
-
-    asyncio.run(asyncio.wait_for(scenario(), PATIENCE_S))
+@while_rolling
+async def test_service_and_guard_are_both_told_and_a_reset_releases_both(base: Driven, latches: Path) -> None:
+    asked_ns = time.monotonic_ns()
+    answers = await asyncio.to_thread(stopped_ns, base.name)
+    assert set(answers) == {"base", "wheels"}
+    assert None not in answers.values()
+    assert await base.wheels(0, 0) - asked_ns < PATIENCE_NS
+    state = await base.state(lambda state: state.stopped_by == "estop")
+    assert state.latch == "latched"
+    assert read(latches / "base").latched
+    await asyncio.to_thread(stopped_ns, base.name)
+    base.release()  # the executive's word releases nothing
+    await base.state(lambda state: state.latch == "latched")
+    reply = await base.service.ask(topics.ESTOP.of("base"), EstopRequest(latched=False, by="test"))
+    assert reply.latch == "released"
+    await base.wheels(200, 200)
+    assert not read(latches / "base").latched
 
 
-def test_a_loop_that_hangs_keeps_the_wheels_from_nothing(bench: Bench, name: str, latches: Path) -> None:
-    async def scenario() -> None:
-        async with rolling(bench, name, latches) as base:
-            asked_ns = time.monotonic_ns()
-            answers = stopped_ns(name)  # in the loop, which hangs meanwhile
-            assert None not in answers.values()
-            assert bench.until_wheels(0, 0) - asked_ns < PATIENCE_NS
-            await base.state(lambda state: state.latch == "latched")
-
-    asyncio.run(asyncio.wait_for(scenario(), PATIENCE_S))
+@while_rolling
+async def test_a_loop_that_hangs_keeps_the_wheels_from_nothing(base: Driven, latches: Path) -> None:
+    asked_ns = time.monotonic_ns()
+    answers = stopped_ns(base.name)  # in the loop, which hangs meanwhile
+    assert None not in answers.values()
+    assert base.bench.until_wheels(0, 0) - asked_ns < PATIENCE_NS
+    await base.state(lambda state: state.latch == "latched")
 
 
-def test_a_guard_that_comes_after_a_stop_knows_of_it_from_the_service(bench: Bench, name: str, latches: Path) -> None:
-    async def scenario() -> None:
-        async with rolling(bench, name, latches) as base:
-            await asyncio.to_thread(stopped_ns, name)
-            await base.state(lambda state: state.latch == "latched")
-            before = guards(name)
-            for pid in before:
-                os.kill(pid, signal.SIGKILL)
-            bench.forget()
-            state = await base.state(lambda state: state.stopped_by == "estop" and not before & guards(name))
-            assert state.latch == "latched"
-            assert all(wheels == (0, 0) for _, wheels in bench.emulator.call(bench.create.acted.copy))
-
-    asyncio.run(asyncio.wait_for(scenario(), PATIENCE_S))
+@while_rolling
+async def test_a_guard_that_comes_after_a_stop_knows_of_it_from_the_service(base: Driven, latches: Path) -> None:
+    await asyncio.to_thread(stopped_ns, base.name)
+    await base.state(lambda state: state.latch == "latched")
+    before = guards(base.name)
+    for pid in before:
+        os.kill(pid, signal.SIGKILL)
+    base.bench.forget()
+    state = await base.state(lambda state: state.stopped_by == "estop" and not before & guards(base.name))
+    assert state.latch == "latched"
+    assert all(wheels == (0, 0) for _, wheels in base.bench.emulator.call(base.bench.create.acted.copy))
 
 
 def guards(name: str) -> set[int]:

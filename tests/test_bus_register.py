@@ -151,7 +151,7 @@ async def answer(_key: str, _payload: bytes | memoryview) -> bytes:
 
 @pytest.fixture
 def takes_no_entries(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As a place without inodes, or one that was mounted for reading alone."""
+    """Let no entry be made, as in a place without inodes, or in one that was mounted for reading alone."""
     really = os.open
 
     def open_(path: str, flags: int, mode: int = 0o777, *, dir_fd: int | None = None) -> int:
@@ -220,7 +220,7 @@ def crowd(directory: Path, count: int) -> Iterator[None]:
 
 
 async def joining_s(config: ZenohConfig) -> float:
-    """How long it takes to join and to be answered."""
+    """Join and be answered; returns the time that it takes, s."""
     started_s = time.monotonic()
     async with await ZenohBus.open(config, expect_mesh=True) as late:
         assert await who(late) == ["server"]
@@ -230,7 +230,7 @@ async def joining_s(config: ZenohConfig) -> float:
 @pytest.mark.process
 @scenario
 async def test_a_crowd_of_idle_connections_keeps_nobody_out(directory: Path) -> None:
-    """They need not speak zenoh; the directory is private, so that only this user's processes can be such."""
+    """The connections do not speak zenoh. The directory is private, so only this user's processes can make such."""
     assert CROWD < ACCEPT_PENDING
     async with child(directory, "server") as server:
         await server.says("ready")

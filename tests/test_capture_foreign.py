@@ -58,7 +58,7 @@ def test_the_mcap_and_msgpack_libraries_read_everything_by_the_page(expected: di
 
 
 def _crc(entries: dict[str, str]) -> str:
-    """As docs/captures.md defines it."""
+    """The checksum of metadata, as docs/captures.md defines it."""
     crc = 0
     for name in sorted(entries):
         if name != "crc32":

@@ -1,4 +1,4 @@
-"""What happens is recorded whole and in a file of its own; of the rest, what is large is recorded now and then."""
+"""Occasions are recorded whole and in a file of their own; of the rest, large messages are recorded now and then."""
 
 from __future__ import annotations
 

@@ -56,7 +56,7 @@ def use_core(monkeypatch: pytest.MonkeyPatch, service: ModuleType, make: Callabl
 
 @pytest.mark.parametrize("service", ["perception", "planning"])
 def test_the_golden_capture_is_executed_again_with_equal_outputs(service: str) -> None:
-    """When outputs are meant to change, make the capture anew: tests/golden/make.py."""
+    """Where outputs are meant to change, tests/golden/make.py makes the capture anew."""
     result = again(GOLDEN, service, TOLERANCE)
     assert result.first is None, result.first
     assert result.not_executable == 0

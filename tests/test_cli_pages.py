@@ -36,7 +36,7 @@ def shown(page: Path) -> Iterator[tuple[str, bool]]:
 
 
 def arguments(line: str) -> list[str]:
-    """Its words without comment, redirection and brackets; a capital letter stands for a number."""
+    """The words of a command line without comment, redirection and brackets; a capital letter stands for a number."""
     words = shlex.split(line, comments=True)[1:]
     end = next((number for number, word in enumerate(words) if word in ENDS), len(words))
     return [re.sub(r"^[A-Z]$", "1", word.strip("[]")) for word in words[:end] if word not in ("...", "…")]

@@ -1,4 +1,4 @@
-"""How the progress of a task is shown on a terminal: one line rewritten in place, the finished phases above it."""
+"""Display of a task's progress on a terminal: one line rewritten in place, the finished phases above it."""
 
 from __future__ import annotations
 

@@ -86,7 +86,7 @@ def test_every_command_ends_in_words_and_with_its_exit_code(name: str, table: Ta
 
 @pytest.mark.process
 def test_so_it_does_in_the_locale_of_c(table: Table, root: Path) -> None:
-    """Where Python takes every file name for ASCII, and prints nothing else."""
+    """In this locale Python takes every file name for ASCII, and prints nothing else."""
     surroundings = Surroundings({"encoding": "ascii"}, odd="für")
     with Forks(LC_ALL="C", PYTHONUTF8="0", PYTHONCOERCECLOCALE="0") as forks:
         in_c = Table(forks, root)
@@ -98,7 +98,7 @@ def test_so_it_does_in_the_locale_of_c(table: Table, root: Path) -> None:
 
 @pytest.mark.process
 def test_all_is_well_where_nothing_is_wrong(table: Table) -> None:
-    """So that the table is not one of commands that all fail alike."""
+    """The table is not one of commands that all fail alike."""
     well = {command for command in COMMANDS if table.usual(command).code == exits.DONE}
     writers = {"export", "capture info", "capture repair", "new service", "topics", "down"}
     assert well >= writers, [table.usual(command) for command in writers - well]
@@ -150,7 +150,7 @@ def test_a_signal_while_it_imports_ends_it_in_silence(command: str, table: Table
 
 @pytest.mark.process
 def test_being_told_to_end_does_so_where_ctrl_c_is_ignored(table: Table) -> None:
-    """As in the background of a script."""
+    """Ctrl-C is ignored in the background of a script."""
     ending = table.play("topics", Surroundings({"at_call": 100, "number": signal.SIGTERM, "deaf": True}))
     assert (ending.code, ending.err) == (exits.REFUSED, "")
 

@@ -52,7 +52,7 @@ def test_without_proc_a_robot_comes_up_and_top_says_what_it_cannot_measure(shell
 
 
 def test_who_listens_for_ever_ends_when_nobody_reads_it_any_more(shell: Shell) -> None:
-    """In the background of a script, where Ctrl-C is ignored, nothing else would end it."""
+    """Nothing else ends such a command in the background of a script, where Ctrl-C is ignored."""
     assert shell("up", shell.profile("good"), "--detach").returncode == exits.DONE
     listening = subprocess.Popen(
         command("echo", "*/health"),

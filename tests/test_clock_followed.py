@@ -70,7 +70,7 @@ TICK_NS = NS // 120
 
 
 @pytest.mark.usefixtures("real_time")
-@pytest.mark.parametrize("ahead_s", [0.3, 1.0, 3600.0, 2.0**62 / NS])
+@pytest.mark.parametrize("ahead_s", [0.13, 0.25, 1.0, 3600.0, 2.0**62 / NS])
 def test_one_tick_from_far_ahead_moves_nothing(ahead_s: float) -> None:
     async def main() -> None:
         clock = FollowedClock()
@@ -94,14 +94,14 @@ def test_a_tick_that_is_a_little_ahead_holds_time_still_until_the_others_have_ca
         stood_s = 0.0
         for tick in range(240):
             if tick == 100:
-                assert clock.tick(tick * TICK_NS + NS // 4, 1) == ""
+                assert clock.tick(tick * TICK_NS + NS // 10, 1) == ""
             clock.tick(tick * TICK_NS, 1)
             before_ns = clock.now_ns()
             await asyncio.sleep(1 / 120)
             stood_s += (1 / 120) * (clock.now_ns() == before_ns)
         assert clock.epoch == 0
         assert clock.now_ns() == 240 * TICK_NS
-        assert 0.15 < stood_s < 0.26
+        assert 0.05 < stood_s < 0.11
 
     run_virtual(main())
 
@@ -155,6 +155,21 @@ def test_who_was_stopped_for_a_while_takes_the_next_tick() -> None:
         assert clock.latest_ns() == NS + 2 * 10 * NS, "it may have gone twice as fast as it seemed"
         assert clock.tick(11 * NS, 1) == ""
         assert clock.now_ns() == 11 * NS
+
+    run_virtual(main())
+
+
+@pytest.mark.usefixtures("real_time")
+def test_ticks_that_come_in_a_burst_may_lack_some_in_the_middle() -> None:
+    async def main() -> None:
+        clock = FollowedClock()
+        for tick in range(120):
+            clock.tick(tick * TICK_NS, 1)
+            await asyncio.sleep(1 / 120)
+        await asyncio.sleep(1.0)
+        for tick in (120, 121, 180, 239):
+            assert clock.tick(tick * TICK_NS, 1) == ""
+        assert clock.tick(263 * TICK_NS, 1), "all that were late have come"
 
     run_virtual(main())
 

@@ -1,4 +1,4 @@
-"""Which floor was seen by the truth, and the random rooms that hide their object."""
+"""The floor that was seen by the truth, and the random rooms that hide their object."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ TURNS = tuple((0.0, 0.0, sin(turn / 2), cos(turn / 2)) for turn in (0.0, pi / 2,
 
 
 def judged(*walls: Obstacle, places: tuple[tuple[float, float], ...] = ((0.0, 0.0),)) -> Coverage:
-    """What is seen of a room from some places, at each with the head all around and the body in four directions."""
+    """Coverage of a room seen from some places, at each with the head all around and the body in four directions."""
     judge = CoverageJudge(ROBOT, Scene(name="room", obstacles=walls), 1.5)
     objects = tuple(
         TrueObject(label=f"obstacle_{n}", kind="obstacle", position_m=wall.centre_m, orientation=UPRIGHT, touching=())

@@ -51,7 +51,7 @@ SIMULATED = ("capture", "sim", "perception", "planning", "executive")
 @pytest.mark.sim
 @in_virtual_time
 async def test_the_simulated_robot_speaks_as_it_declares(tmp_path: Path) -> None:
-    """Over all that makes a component say something: recording, both kinds of babbling, a learned model."""
+    """The runs include all that makes a component say something: recording, both kinds of babbling, a learned model."""
     settings: dict[str, dict[str, Any]] = {
         "capture": {"file": str(tmp_path / "all.mcap")}, "sim": SMALL_FRAMES | {"scene": "wheels"},
     }  # fmt: skip

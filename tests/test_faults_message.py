@@ -28,9 +28,6 @@ FAR = 2**62
 STANDS_S = 0.45
 """For so long at most one bad message makes the robot less than half as fast: 0.25 s until the true stamps have passed
 the wrong one, three messages at 50 Hz, and the ramps down and up, less the patience that there is at full speed."""
-RESTARTS_S = 0.6
-"""The same after a tick that was 0.25 s ahead: the planner has no step until then, so the base comes to rest by itself
-and the ramp up begins from there."""
 KEYS: tuple[Topic[Any], ...] = (topics.BASE_COMMAND, topics.BASE_STATE, topics.LATCH)
 
 
@@ -250,7 +247,7 @@ def ahead(seconds: float) -> Spoil:
 
 
 @pytest.mark.usefixtures("loop_time")
-@pytest.mark.parametrize("spoil", [ahead(0.3), ahead(1.0), ahead(3600.0), ahead(FAR / NS), at_once])
+@pytest.mark.parametrize("spoil", [ahead(0.25), ahead(1.0), ahead(3600.0), ahead(FAR / NS), at_once])
 def test_one_tick_that_cannot_be_right_changes_nothing(spoil: Spoil) -> None:
     right, bad = undisturbed(followed), drive(topics.CLOCK, spoil, followed)
     assert bad.speeds_mps == right.speeds_mps
@@ -260,6 +257,6 @@ def test_one_tick_that_cannot_be_right_changes_nothing(spoil: Spoil) -> None:
 
 @pytest.mark.usefixtures("loop_time")
 def test_one_tick_that_is_a_little_ahead_stops_nothing_for_long() -> None:
-    bad = drive(topics.CLOCK, ahead(0.25), followed)
-    assert stood_s(bad, undisturbed(followed)) <= RESTARTS_S
+    bad = drive(topics.CLOCK, ahead(0.1), followed)
+    assert stood_s(bad, undisturbed(followed)) <= STANDS_S
     assert bad.outcome.outcome == "done"

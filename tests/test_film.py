@@ -48,7 +48,7 @@ def way(count: int = 150) -> list[Truth]:
 
 
 def in_picture(pose: FloatArray, place: tuple[float, float, float]) -> tuple[float, float]:
-    """Where a point is in a picture of 16 to 9, as shares of its half width and height from the middle."""
+    """Position of a point in a picture of 16 to 9, as shares of its half width and height from the middle."""
     x, y, z = pose[:3, :3].T @ (np.array(place) - pose[:3, 3])
     assert z > 0
     tangent = np.tan(VIEW_RAD / 2)

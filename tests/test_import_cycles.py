@@ -1,5 +1,5 @@
-"""No two modules import each other, directly or over others; imports for types alone and within functions count. No
-import is hidden from this and from the linter."""
+"""Import cycles: no two modules import each other, directly or over others. Imports for types alone and within
+functions count, and no import is hidden from these tests and from the linter."""
 
 from __future__ import annotations
 

@@ -155,7 +155,7 @@ def test_a_stale_command_as_if_of_another_publisher_does_not_change_who_is_follo
 def test_whatever_bad_message_comes_between_good_ones_soon_all_good_ones_are_taken(
     events: list[tuple[str, int]],
 ) -> None:
-    """And the losses are those that there were, unless a wrong number passed for traffic."""
+    """The counted losses are the true ones, unless a wrong number passed for traffic."""
     talk = Talk()
     lost, passed = 0, False
     talk.say()

@@ -47,7 +47,7 @@ class Base:
         self.halts += 1
 
     def stop(self, within_s: float = PATIENCE_S) -> Asking:
-        """By the stop path; blocks, as if this were another process."""
+        """Stop by the stop path. It blocks, as if this were another process."""
         with Asking(self.node.robot_name) as asking:
             asking.go_on(time.monotonic() + within_s)
             asking.hear_of_the_disk(time.monotonic() + within_s)

@@ -166,7 +166,7 @@ def test_where_there_is_no_thing_it_is_said_what_to_do(find: Callable[[], object
 
 
 def patch_of(rgb: tuple[float, float, float]) -> np.ndarray:
-    """As a camera has it in one light: shaded from 55 to 100%."""
+    """Pixels (n, 3) of a colour as a camera sees it in one light: shaded from 55 to 100%."""
     draws = np.random.default_rng(2)
     values = 255 * np.array(rgb) * draws.uniform(0.55, 1.0, (900, 1)) + draws.normal(0, 1.3, (900, 3))
     return np.clip(np.rint(values), 0, 255).astype(np.uint8)

@@ -15,7 +15,7 @@ from sim.realism import BEND_RAD
 
 @pytest.fixture(scope="module")
 def parts(robot: Robot) -> tuple[Sightings, Sightings, Sightings]:
-    """To learn at first, to meet at work, held out."""
+    """Split sightings into those to learn at first, to meet at work, and to hold out."""
     seen = sightings(robot, draws=300)
     learn, held = split(seen)
     return learn.pick(learn.draws < 160), learn.pick(learn.draws >= 160), held

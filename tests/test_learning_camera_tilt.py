@@ -16,7 +16,7 @@ from services.planning.state_estimator import StateEstimator
 
 
 def seen(robot: Robot, true_m: Vec3, tilt_rad: float) -> Vec3:
-    """Where a camera on a neck whose tilt is off by `tilt_rad` sees a true position, by the nominal model."""
+    """The nominal model's position, m, of a true one that a camera sees on a neck whose tilt is off by `tilt_rad`."""
     neck = robot.chain("camera")
     angles = {"neck_pan": float(np.arctan2(true_m[1], true_m[0] - 0.032685)), "neck_tilt": -0.4}
     really = neck.pose(angles | {"neck_tilt": -0.4 - tilt_rad})

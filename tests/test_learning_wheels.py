@@ -19,7 +19,7 @@ TARGET_M = (1.5, 0.0)
 
 
 def drive(left_m: float, right_m: float, separation_m: float = TRUE_M) -> Pose2:
-    """Where a body is after its wheels have rolled so far."""
+    """The pose of a body after its wheels have rolled so far."""
     turn = (right_m - left_m) / separation_m
     way = (left_m + right_m) / 2
     chord = way * (sin(turn / 2) / (turn / 2) if turn else 1.0)

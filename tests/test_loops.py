@@ -14,7 +14,7 @@ from cocoro.vloop import run_virtual
 
 
 async def times_of(clock: Clock, rate_hz: float, count: int, meter: LoopMeter, work_s: dict[int, float]) -> list[float]:
-    """When a loop's turns begin; `work_s` is how long some of them take."""
+    """The times at which a loop's turns begin; `work_s` has the durations of some of them."""
     begun: list[float] = []
     async for now_ns in every(clock, rate_hz, meter):
         begun.append(now_ns / NS)

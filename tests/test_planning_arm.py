@@ -62,7 +62,7 @@ class Arm:
         self.steps: list[ArmStep] = []
 
     def go(self, command: Callable[[], ArmStep], most_s: float = 12.0) -> ArmStep:
-        """Until it says that it has arrived or is blocked."""
+        """Repeat a command until the arm has arrived or is blocked."""
         for _ in range(round(most_s / TICK_S)):
             step = command()
             self.angles = self.angles | dict(zip(ARM, step.goal_rad.tolist(), strict=True)) | {ROLL: step.roll_rad}

@@ -147,7 +147,7 @@ class Body:
         self._wheels = (0.0, 0.0)
 
     def run(self, intent: Intent, *, ticks: int) -> PlannerStatus:
-        """Until it ends, or for so many ticks."""
+        """Follow an intent until it ends, or for so many ticks."""
         for tick in range(ticks):
             self.now_ns += TICK_NS
             self._move(TICK_NS / NS)

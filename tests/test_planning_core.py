@@ -28,7 +28,7 @@ def planner() -> Planner:
 
 
 def approaching(planner: Planner) -> None:
-    """On the way to the can."""
+    """Bring the robot on its way to the can."""
     planner.want("approach", "red_can")
     planner.run(2.0)
     assert planner.wheels.left_mps > 0.1

@@ -20,7 +20,7 @@ CAMERA = ROBOT.chain("camera")
 
 
 def off_centre_px(point_m: tuple[float, float, float], pan: float, tilt: float) -> float:
-    """How far from the middle of the image a point of the body frame is seen; infinity behind the camera."""
+    """Distance, pixels, between the middle of the image and a point of the body frame; infinity behind the camera."""
     pose = CAMERA.pose({PAN: pan, TILT: tilt})
     x, y, z = pose[:3, :3].T @ (np.array(point_m) - pose[:3, 3])
     return float(np.hypot(ROBOT.camera.fx * x / z, ROBOT.camera.fy * y / z)) if z > 0 else float("inf")
@@ -61,7 +61,7 @@ def test_it_never_looks_further_than_the_neck_turns(point: tuple[float, float, f
 
 
 def swept(pan: float) -> list[tuple[float, float]]:
-    """Where a head that goes 2 degrees a step looks during a sweep."""
+    """The directions of a head that goes 2 degrees a step during a sweep."""
     sweep, tilt, looked = Sweep(CONFIG, pan), 0.0, [(pan, 0.0)]
     for _ in range(2000):
         goal_pan, goal_tilt = sweep.next(pan, tilt)

@@ -240,7 +240,7 @@ def test_what_is_no_regular_file_is_refused_and_waits_for_nobody(tmp_path: Path,
 
 
 def test_what_is_made_is_for_this_user_alone(shared: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As where neither COCORO_RUN_DIR nor XDG_RUNTIME_DIR is set: below the place for temporary files."""
+    """Without COCORO_RUN_DIR and XDG_RUNTIME_DIR the folders lie below the place for temporary files."""
     for variable in ("COCORO_RUN_DIR", "XDG_RUNTIME_DIR"):
         monkeypatch.delenv(variable, raising=False)
     monkeypatch.setattr(tempfile, "tempdir", str(shared))

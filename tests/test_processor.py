@@ -1,4 +1,4 @@
-"""Who waits for a processor and who takes it, by a /proc of the test's own; and the rates that are meant."""
+"""Processes that wait for a processor and that use it, by a /proc of the test's own; and the rates that are meant."""
 
 from __future__ import annotations
 

@@ -36,7 +36,7 @@ position_m = [1.2, -0.4]
 
 
 def small(task: str = "fetch", label: str = "red_can", **more: Any) -> RehearsalRequest:
-    """With small frames, at half their rate."""
+    """A request for a rehearsal with small frames, at half their rate."""
     return RehearsalRequest(task=asked(task, label).task, width=320, height=240, frame_rate_hz=15.0, **more)
 
 

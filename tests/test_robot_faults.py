@@ -28,7 +28,7 @@ def stands_since(rig: RobotRig, when_s: float) -> bool:
 
 
 def zero_commanded_since(rig: RobotRig, when_s: float) -> bool:
-    """By the planner's commands, or by the base that hears none."""
+    """Whether the wheels were commanded to stand, by the planner's commands or by the base that hears none."""
     return not any(left or right for left, right in rig.commanded_since(when_s)) and (
         bool(rig.commanded_since(when_s)) or not rig.base_obeys_since(when_s)
     )

@@ -153,7 +153,7 @@ def test_the_unit_lets_the_robot_do_its_work(unit: dict[str, list[str]]) -> None
 
 @pytest.mark.process
 def test_the_unit_lets_processes_end_by_themselves_when_their_supervisor_has_died(unit: dict[str, list[str]]) -> None:
-    """If base service and guard were killed together, a Create would drive on."""
+    """A Create would drive on if base service and guard were killed together."""
     assert unit["KillMode"] == ["mixed"]
     (after,) = unit["ExecStopPost"]
     command = shlex.split(after)[-1].replace("$$", "$").replace("sleep", "echo waits")

@@ -195,7 +195,7 @@ def test_the_doctor_names_a_run_directory_that_is_another_user_s(root: Path) -> 
 
 @scenario
 async def test_frames_reach_a_receiver_without_shared_memory(directory: Path, needs_pool: None) -> None:
-    """Beside one with it, from a publisher with it, whole and in order."""
+    """Frames arrive whole and in order beside a receiver with shared memory, from a publisher with it."""
     async with (
         await ZenohBus.open(local(directory, "publisher")) as publisher,
         await ZenohBus.open(local(directory, "plain", shared_memory=False)) as plain,

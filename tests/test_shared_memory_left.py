@@ -1,4 +1,4 @@
-"""No shared memory is left behind, and none that a process holds is removed."""
+"""Removal of shared memory: none is left behind, and none that a process holds is removed."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from cocoro.bus.declared import SharedPool
 
 @pytest.fixture
 def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """In /dev/shm's place."""
+    """A folder in /dev/shm's place."""
     monkeypatch.setattr(shared, "PLACE", tmp_path)
     return tmp_path
 

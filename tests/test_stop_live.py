@@ -26,7 +26,7 @@ SMALL = ("--frames", "160x120@10")
 
 
 def no_namespaces() -> str:
-    """Why there are none to be had, or ''."""
+    """The reason for which there are no namespaces to be had, or ''."""
     if shutil.which("unshare") is None:
         return "there is no unshare"
     command = ["unshare", "--mount", "--net", "mount", "--make-rprivate", "/"]

@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -29,9 +30,10 @@ def robot() -> str:
     return new_robot()
 
 
-def kept(_by: str) -> Future[str]:
+def kept(_by: str, why_not: str = "") -> Future[str]:
+    """The disk's answer to a latch that is to be kept, given at once."""
     done: Future[str] = Future()
-    done.set_result("")
+    done.set_result(why_not)
     return done
 
 
@@ -48,7 +50,7 @@ def moving(robot: str, *services: str, keep: Callable[[str], Future[str]] = kept
 
 
 def reached(asking: Asking) -> list[bool]:
-    """For each stop point of the robot, whether the request has been delivered to it."""
+    """Flags of the robot's stop points to which the request has been delivered."""
     return [point.sent_s is not None for point in asking.points.values()]
 
 
@@ -112,12 +114,7 @@ def test_who_has_ended_is_not_waited_for(robot: str) -> None:
 
 
 def test_a_latch_that_the_disk_did_not_take_is_told(robot: str) -> None:
-    def full(_by: str) -> Future[str]:
-        done: Future[str] = Future()
-        done.set_result("the disk is full")
-        return done
-
-    with moving(robot, "base", keep=full) as halted:
+    with moving(robot, "base", keep=partial(kept, why_not="the disk is full")) as halted:
         (point,) = stop(robot).points.values()
         assert (point.kept, point.why_not_kept) == (False, "the disk is full")
         assert halted["base"]
@@ -301,7 +298,7 @@ def test_nobody_else_reaches_the_line_on_which_a_point_answers(robot: str) -> No
 @pytest.mark.process
 @pytest.mark.parametrize("free", [1, 2, 3, 1500], ids=lambda free: f"{free}-files-left")
 def test_a_caller_that_has_nearly_all_its_files_open_stops_the_robot(robot: str, free: int) -> None:
-    """Also one whose next file has a number that select(2) cannot take."""
+    """The case includes a next file with a number that select(2) cannot take."""
     code = (
         "import resource, time; hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1];"
         "resource.setrlimit(resource.RLIMIT_NOFILE, (min(3000, hard), hard));"
@@ -338,7 +335,7 @@ def test_another_user_without_any_variable_can_stop_the_robot(robot: str) -> Non
 @pytest.mark.process
 @needs_root
 def test_an_address_that_names_another_user_is_that_of_who_made_it(robot: str) -> None:
-    """Its answers, or their absence, are attributed to that user's robot."""
+    """Answers of such an address, or their absence, are attributed to that user's robot."""
     with a_liar(robot), moving(robot, "arm"):
         asking = stop(robot, within_s=1.0)  # the liar never says whether its latch is on the disk
     assert {point.service: point.uid for point in asking.points.values()} == {"base": 65534, "arm": 0}

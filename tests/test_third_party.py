@@ -49,7 +49,7 @@ def odometer(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Component]:
 
 @pytest.fixture(scope="module")
 def rejected(odometer: Component, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """By "path" a capture of two seconds with a message that is not valid, and by "health" what a reader made of it."""
+    """Record two seconds with an invalid message: "path" is the capture, "health" what a reader made of it."""
     implementation, found = load(odometer), {}
 
     async def scenario(room: Room) -> None:

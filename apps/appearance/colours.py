@@ -105,7 +105,7 @@ def overlaps(found: ColourRange, known: Iterable[ObjectSpec]) -> list[ColourOver
 
 
 def _typical(pixels: ImageArray) -> ImageArray:
-    """At most about MOST_PIXELS of the pixels, without those of another colour."""
+    """The pixels (n, 3) without those of another colour, thinned to about MOST_PIXELS."""
     chromaticity = _chromaticity(lab_of(pixels[None])[0])
     off = np.linalg.norm(chromaticity - np.median(chromaticity, axis=0), axis=-1)
     spread = max(1.4826 * float(np.median(off)), LEAST_SPREAD)

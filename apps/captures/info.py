@@ -203,8 +203,8 @@ def missing_of(capture: Capture) -> Missing:
 
 
 def left_out_notes(capture: Capture, missing: Missing | None = None) -> list[str]:
-    """What was left out by intention, in words: one line, or none. `missing` is what the capture says, where it was
-    read already."""
+    """Describe in one line, or none, the messages that were left out by intention. `missing` is the capture's own
+    account of them, where it was read already."""
     missing = missing or (missing_of(capture) if capture.left_out else Missing({}, {}))
     if not missing.left_out:
         return []

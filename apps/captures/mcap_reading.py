@@ -66,7 +66,7 @@ def check_message_index(content: Bytes) -> int:
 
 
 def index_entries(content: Bytes) -> tuple[int, list[tuple[int, int]]]:
-    """From a checked message index: the channel, and log time and offset of each message."""
+    """Parse a checked message index: the channel's number, and log time, ns, and offset of each message."""
     channel, length = struct.unpack_from("<HI", content)
     return channel, list(struct.iter_unpack("<QQ", content[6 : 6 + length]))
 

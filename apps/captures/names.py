@@ -14,7 +14,7 @@ LATEST = "latest"
 
 
 def folders() -> list[Path]:
-    """Where the recorders of this user write: the default, and where robots that are up here do."""
+    """The folders into which this user's recorders write: the default one, and those of robots that are up here."""
     found = [default_folder()]
     with suppress(CocoroError, OSError):
         for run_dir in robots():

@@ -70,7 +70,7 @@ class Player:
         return (min(self._now_ns(now_s), self._end_ns) - self._capture.start_ns) / NS
 
     def position_ns(self, now_s: float) -> int:
-        """As a log time."""
+        """The position in the capture, as a log time, ns."""
         return min(self._now_ns(now_s), self._end_ns)
 
     # --- what is due ------------------------------------------------------------------------------

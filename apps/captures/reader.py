@@ -116,7 +116,7 @@ class Capture:
 
     @property
     def ending(self) -> str:
-        """Why the capture may be shorter than the run, in words; '' for a closed file."""
+        """The reason, in words, for which the capture may be shorter than the run; '' for a closed file."""
         if self.closed:
             return ""
         cut = f" (the last record is cut off after {self.cut_bytes} bytes)" if self.cut_bytes else ""
@@ -173,7 +173,7 @@ class Capture:
 
     @cached_property
     def channels(self) -> dict[int, Channel]:
-        """By number, including those without messages."""
+        """All channels by their number, including those without messages."""
         return dict(sorted(self._contents.channels.items()))
 
     @cached_property

@@ -70,7 +70,7 @@ class ReexecutionResult(msgspec.Struct, kw_only=True):
 
     @property
     def speed(self) -> float:
-        """As a multiple of real time."""
+        """The speed of the execution, as a multiple of real time; 0 when nothing was executed."""
         return self.recorded_s / self.wall_s if self.wall_s else 0.0
 
 
@@ -191,7 +191,8 @@ class _Reexecution:
         return samples, missing
 
     def _compare(self, step: RecordedStep, outputs: Sequence[Output]) -> tuple[str, str]:
-        """Why the outputs cannot be compared, and the first difference; '' for none."""
+        """Compare a step's outputs with the recorded ones: the reason for which they cannot be compared, and the first
+        difference; each is '' when there is none."""
         produced = step.record.produced
         given, now = [name[0] for name in produced], [output.topic.name for output in outputs]
         if given != now:

@@ -102,8 +102,8 @@ class Replay:
     def __init__(
         self, bus: Bus, capture: Capture, player: Player, *, hardware: bool = False, robot: str | None = None
     ) -> None:
-        """With `hardware` the hardware's services are declared alive, and there is always a clock. `robot` is the name
-        that the messages are published under; None: the recorded one."""
+        """Publish what `player` plays of a capture. With `hardware` the hardware's services are declared alive, and
+        there is always a clock. `robot` is the name under which messages are published; None: the recorded one."""
         self.sent = 0
         self._bus = bus
         self._capture = capture

@@ -43,8 +43,8 @@ class Walk:
     """Adds records to `found`. `step` raises DamageError for a damaged record; what was read before stays."""
 
     def __init__(self, disk: Disk, found: Contents, check: bool, sure: bool = True) -> None:
-        """With `check`, attachments are read and their checksums verified. Unless the caller is `sure` that the summary
-        is undamaged, nothing is taken from it."""
+        """Walk over a file's records and note them in `found`. With `check`, attachments are read and their checksums
+        verified. Unless the caller is `sure` that the summary is undamaged, nothing is taken from it."""
         self.suspect: int | None = None
         """Offset of the first of the records just before this one that no checksum covers: of an unknown kind, or
         longer than its known fields. One of them may have a damaged length. None: no such record."""
@@ -230,7 +230,7 @@ class Walk:
         return taken
 
     def _footer(self, start: int, end: int) -> int:
-        """Only the magic bytes follow it."""
+        """Read the footer, which only the magic bytes may follow."""
         mcap.parsed(Footer, self._disk.read_cached(start, min(end - start, HEAD_BYTES)))
         if self._disk.read(end, len(MAGIC)) != MAGIC:
             raise DamageError("the file does not end after its footer")

@@ -19,7 +19,16 @@ from apps.captures.info import AttachmentReport, CaptureReport, report
 from apps.captures.reader import Capture
 from apps.captures.rewrite import REPAIRED, rewrite
 from apps.cli import completions, exits, shelf
-from apps.cli.options import CaptureArgument, FromOption, JsonOption, OnlyOption, ToOption, WithoutOption, capture_file
+from apps.cli.options import (
+    CaptureArgument,
+    FromOption,
+    JsonOption,
+    OnlyOption,
+    ToOption,
+    WithoutOption,
+    capture_file,
+    name_option,
+)
 from apps.cli.output import print_json
 from apps.cli.terminal import Column, fields, table
 from cocoro.capture.conventions import CaptureError
@@ -189,11 +198,7 @@ def repair(
     ] = None,
     compression: Annotated[
         str,
-        typer.Option(
-            metavar="zstd|lz4|none",
-            autocompletion=completions.of("zstd", "lz4", "none"),
-            help="Compression of the new file.",
-        ),
+        name_option("zstd", "lz4", "none", help="Compression of the new file."),
     ] = "zstd",
     level: Annotated[int, typer.Option(min=1, max=19, help="Level for zstd; 19 is small and slow.")] = 1,
     only: OnlyOption = None,
@@ -294,11 +299,7 @@ def reexecute(
     ],
     against: Annotated[
         str,
-        typer.Option(
-            metavar="recorded|nothing",
-            autocompletion=completions.of("recorded", "nothing"),
-            help="What to compare the outputs with.",
-        ),
+        name_option("recorded", "nothing", help="What to compare the outputs with."),
     ] = "recorded",
     tolerance: Annotated[
         float,

@@ -47,7 +47,7 @@ def echo(
     profile: MeshOption = None,
     json: JsonOption = False,
 ) -> None:
-    """The messages of a key, decoded, of any type; a message that a reader would reject is marked with the reason."""
+    """Messages of a key, decoded, of any type; one that a reader would reject is marked with the reason."""
     sys.exit(asyncio.run(print_messages(RobotChoice(robot, profile), key, count, seconds, json, full)))
 
 

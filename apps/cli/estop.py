@@ -91,7 +91,7 @@ def by_path(robot: str | None) -> tuple[list[StopResult], list[str]]:
 
 
 def _left_open(robot: str | None, stops: list[StopResult]) -> set[str]:
-    """This user's robots that have a running service which the stop path did not stop."""
+    """Names of this user's robots that have a running service which the stop path did not stop."""
     own = {stop.robot: stop for stop in stops if stop.owner is None}
     left_open = {stop.robot for stop in own.values() if stop.missing}
     from deploy.rundir import RunDir, robots  # slow to import; by now every stop has been sent

@@ -59,7 +59,7 @@ def experiment(
     no_plots: Annotated[bool, typer.Option("--no-plots", help="Tables only, without matplotlib.")] = False,
     json: JsonOption = False,
 ) -> None:
-    """Run the paper's experiments in virtual time and report them beside the paper's text and baselines.
+    """Run the paper's experiments in virtual time and report them beside its text and baselines.
 
     E1 hand-eye map, E2 reaching, E3 wheel distance, E4 navigation, E5 following, E6 fetching. Ctrl-C ends it; the same
     command continues.

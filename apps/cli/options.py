@@ -9,12 +9,18 @@ import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from apps.cli import completions
 from cocoro.errors import ConfigError
+
+
+def name_option(*names: str, help: str) -> Any:
+    """An option that takes one of these names."""
+    return typer.Option(metavar="|".join(names), autocompletion=completions.of(*names), help=help)
+
 
 # --- which robot, and how to print ----------------------------------------------------------------
 
@@ -39,7 +45,7 @@ MeshOption = Annotated[
 
 @dataclass(frozen=True)
 class RobotChoice:
-    """Which robot a command is for, from `--robot` and `--profile`; neither is needed when one robot is up here."""
+    """The robot that a command is for, from `--robot` and `--profile`; neither is needed when one robot is up here."""
 
     robot: str | None = None
     profile: str | None = None
@@ -87,12 +93,7 @@ ObjectsOption = Annotated[
 ]
 BodyOption = Annotated[
     str,
-    typer.Option(
-        "--body",
-        metavar="nominal|worn",
-        autocompletion=completions.of("nominal", "worn"),
-        help="A body like the nominal model, or one that differs.",
-    ),
+    name_option("nominal", "worn", help="A body like the nominal model, or one that differs."),
 ]
 DescriptionOption = Annotated[
     Path | None,
@@ -110,12 +111,7 @@ ModelOption = Annotated[
 ]
 ReachOption = Annotated[
     str | None,
-    typer.Option(
-        "--reach",
-        metavar="learned|rigid",
-        autocompletion=completions.of("learned", "rigid"),
-        help="rigid: reach without the learned model of the arm.",
-    ),
+    name_option("learned", "rigid", help="rigid: reach without the learned model of the arm."),
 ]
 AdaptOption = Annotated[
     bool, typer.Option("--adapt", help="Keep training the learned model of the arm with what the camera sees at work.")

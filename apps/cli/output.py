@@ -240,7 +240,7 @@ def print_json_error(code: int, text: str) -> None:
 
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """In this context `give_up_waiting` has an effect."""
+    """Let `give_up_waiting` have an effect in this context."""
     for out in _outs.values():
         out.interruptible = True
     try:

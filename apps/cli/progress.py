@@ -1,4 +1,4 @@
-"""How a command shows the progress of a task: one line rewritten in place on a terminal, lines for each phase
+"""Display of a task's progress by a command: one line rewritten in place on a terminal, lines for each phase
 elsewhere, and nothing with `--json`."""
 
 from __future__ import annotations

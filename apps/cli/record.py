@@ -12,10 +12,10 @@ from typing import Annotated, Any
 import msgspec
 import typer
 
-from apps.cli import completions, exits
+from apps.cli import exits
 from apps.cli.interrupt import interrupt_event
 from apps.cli.link import joined
-from apps.cli.options import JsonOption, MeshOption, OnlyOption, RobotChoice, RobotOption, WithoutOption
+from apps.cli.options import JsonOption, MeshOption, OnlyOption, RobotChoice, RobotOption, WithoutOption, name_option
 from apps.cli.output import complain, going_on, tell
 from apps.cli.terminal import StatusLine
 from cocoro.clock import FollowedClock
@@ -42,9 +42,7 @@ def record(
     without: WithoutOption = None,
     compression: Annotated[
         str,
-        typer.Option(
-            metavar="zstd|lz4|none", autocompletion=completions.of("zstd", "lz4", "none"), help="Lossless compression."
-        ),
+        name_option("zstd", "lz4", "none", help="Lossless compression."),
     ] = "zstd",
     jpeg: Annotated[
         int | None,

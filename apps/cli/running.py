@@ -31,6 +31,7 @@ from apps.cli.options import (
     SetOption,
     frames_of,
     latencies_of,
+    name_option,
 )
 from apps.cli.output import going_on, print_json
 from cocoro import private
@@ -58,19 +59,11 @@ def up(
     seed: Annotated[int | None, typer.Option(min=0, help="Simulator: seed of all random numbers.")] = None,
     sensors: Annotated[
         str | None,
-        typer.Option(
-            metavar="|".join(SENSORS),
-            autocompletion=completions.of(*SENSORS),
-            help="Simulator: sensors without or with errors.",
-        ),
+        name_option(*SENSORS, help="Simulator: sensors without or with errors."),
     ] = None,
     body: Annotated[
         str | None,
-        typer.Option(
-            metavar="|".join(BODIES),
-            autocompletion=completions.of(*BODIES),
-            help="Simulator: a body that equals the nominal model, or differs.",
-        ),
+        name_option(*BODIES, help="Simulator: a body that equals the nominal model, or differs."),
     ] = None,
     model: ModelOption = None,
     reach: ReachOption = None,

@@ -148,7 +148,7 @@ def _print(report: dict[str, Any]) -> None:
 
 
 def said(health: dict[str, Any], service: str, told: dict[tuple[str, int], str]) -> str:
-    """What a service says; 'as sim' when another service of its process, in `told`, has said the same."""
+    """A service's text and faults; 'as sim' when another service of its process, in `told`, has said the same."""
     text = "; ".join(filter(None, (health["text"], *health["faults"])))
     by = told.setdefault((text, health["pid"]), service)
     return text if not text or by == service else f"as {by}"

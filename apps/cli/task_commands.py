@@ -37,6 +37,7 @@ from apps.cli.options import (
     RobotChoice,
     RobotOption,
     TimeoutOption,
+    name_option,
 )
 from cocoro.errors import CocoroError, ConfigError, choice_of
 from cocoro.tasks import Task
@@ -89,11 +90,7 @@ def rehearse(
     seed: Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")] = 0,
     sensors: Annotated[
         str,
-        typer.Option(
-            metavar="ideal|real",
-            autocompletion=completions.of("ideal", "real"),
-            help="Perfect camera and body, or real ones.",
-        ),
+        name_option("ideal", "real", help="Perfect camera and body, or real ones."),
     ] = "ideal",
     body: BodyOption = "nominal",
     description: DescriptionOption = None,

@@ -263,7 +263,7 @@ class Follower:
         return False
 
     async def _next_news(self) -> TaskState | bool:
-        """What arrives next; what the executive answers when nothing arrives for long although it is present."""
+        """The next news to arrive; the executive's answer when none arrives for long although it is present."""
         while True:
             with suppress(TimeoutError):
                 return await asyncio.wait_for(self._news.get(), LATE_S)

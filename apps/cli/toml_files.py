@@ -52,8 +52,9 @@ def with_values(text: str, table: str, values: Mapping[str, Value], name: str = 
 
 
 def write_values(path: Path, table: str, values: Mapping[str, Value], name: str = "") -> None:
-    """As `with_values`, in a file, which is made where there is none and replaced as a whole. Raises ConfigError, with
-    the file as it was and the values in the message, when it is no TOML or cannot be written."""
+    """Set values in a file's table as `with_values` does. The file is made where there is none, and replaced as a
+    whole. Raises ConfigError, with the file as it was and the values in the message, when it is no TOML or cannot be
+    written."""
     try:
         text = path.read_bytes().decode() if path.exists() else ""
         _replace(path, with_values(text, table, values, name))

@@ -49,7 +49,7 @@ def top(
     profile: MeshOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Services and topics, live: cpu, memory, rates against nominal, ages, and what was skipped, lost or rejected.
+    """Services and topics, live: cpu, memory, rates against nominal, ages; what was skipped, lost, rejected.
 
     Ctrl-C ends it. Counts are since the start; a value that is wrong now, or grows and should not, is red. LATE is for
     a service the share of its loop's periods that just passed without a step, for a topic the commands that came too

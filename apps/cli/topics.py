@@ -40,7 +40,7 @@ def topics(
     as_page: Annotated[bool, typer.Option("--markdown", help="The whole page of the documentation.")] = False,
     json: JsonOption = False,
 ) -> None:
-    """List the topics and requests of all installed components: type, rate, age, quality of service, publisher."""
+    """List the topics and requests of all components: type, rate, age, quality of service, publisher."""
     print(markdown() if as_page else as_json() if json else table(), end="")
 
 

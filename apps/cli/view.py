@@ -122,7 +122,8 @@ def _recorded_stage(capture: Capture) -> OutsideStage:
 
 
 def _show(capture: Capture, target: Target, stage: OutsideStage | None, export: Callable[..., int]) -> None:
-    """In a window or a browser: a file is made first, so that nothing waits for a viewer that takes nothing."""
+    """Show a capture in a window or a browser. A file is made first, so that nothing waits for a viewer that takes
+    nothing."""
     with temporary_rrd() as rrd:
         with progress_bar(capture, capture.path) as show:
             count = export(capture, rrd, show, stage)
@@ -209,7 +210,7 @@ class Waiting:
         self._open = True
 
     def put(self, topic: str, message: Message) -> None:
-        """When too many wait, the message is dropped; a frame earlier than others."""
+        """Queue a message to be logged. When too many wait it is dropped, a frame earlier than others."""
         with self._changed:
             frames = sum(name == FRAME.name for name, _ in self._messages) if topic == FRAME.name else 0
             if len(self._messages) >= WAITING or frames >= WAITING_FRAMES:
@@ -219,13 +220,14 @@ class Waiting:
             self._changed.notify()
 
     def close(self) -> None:
-        """What waits is still logged."""
+        """Take no more messages. Those that wait are still logged."""
         with self._changed:
             self._open = False
             self._changed.notify()
 
     def log_to(self, scene: RerunScene) -> None:
-        """Until `close`. Raises ConfigError when the truth is of another scene than the one stated."""
+        """Log the queued messages until `close`. Raises ConfigError when the truth is of another scene than the one
+        stated."""
         while True:
             with self._changed:
                 while self._open and not self._messages:

@@ -53,7 +53,7 @@ class _Worker:
 
 
 class Workers:
-    """At most `count` worker processes. Leaving the context ends them, whatever they are doing."""
+    """A context of at most `count` worker processes. Leaving it ends them, whatever they are doing."""
 
     def __init__(self, count: int) -> None:
         self._count = count

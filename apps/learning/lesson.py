@@ -1,4 +1,4 @@
-"""From samples to a model: every method is measured on held-out samples, and the best one is kept."""
+"""Learning of a model from samples: every method is measured on held-out samples, and the best one is kept."""
 
 from __future__ import annotations
 

@@ -44,7 +44,7 @@ def folds(groups: IntArray, count: int) -> Iterable[tuple[BoolArray, BoolArray]]
 
 
 def inliers(places_m: FloatArray, limit_m: float = NEIGHBOUR_M) -> BoolArray:
-    """Which positions (b, 3), metres, have a neighbour within the limit; shape (b,).
+    """Mark the positions (b, 3), m, that have a neighbour within the limit; returns shape (b,).
 
     The paper's 2.5 cm assume dense sightings. The limit is at least four times the median distance of neighbours (own
     addition), since otherwise most of few sightings would be outliers.
@@ -56,7 +56,7 @@ def inliers(places_m: FloatArray, limit_m: float = NEIGHBOUR_M) -> BoolArray:
 
 
 def plausible(errors_m: FloatArray, limit: float = 6.0) -> BoolArray:
-    """Which errors (b, 3) of a map, metres, are at most `limit` times their median length; shape (b,).
+    """Mark the errors (b, 3) of a map, m, that are at most `limit` times their median length; returns shape (b,).
 
     It finds a wrong sighting among good ones, which has near neighbours.
     """

@@ -229,7 +229,7 @@ class _Rehearsal:
         raise AssertionError("a stream has no end")
 
     def _progress(self, state: TaskState) -> RehearsalProgress:
-        """How far the task is: by the samples that it is to report, or by the time that it is to last."""
+        """The task's progress, by the samples that it is to report or by the time that it is to last."""
         share, said, for_s = None, "", getattr(self._task, "for_s", None)
         if self._collector is not None and self._task is self._request.task:
             share, said = len(self._collector) / self._task.count, self._collector.summary

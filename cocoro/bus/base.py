@@ -70,7 +70,7 @@ class RawPublisher(Handle, Protocol):
 
     @property
     def trouble(self) -> str:
-        """Why samples cost more than they should; empty when they do not."""
+        """The reason for which samples cost more than they should; '' when they do not."""
 
 
 class Subscription(Handle, Protocol):
@@ -90,8 +90,8 @@ class Bus(Protocol):
     def publisher(self, key: str, qos: Qos) -> RawPublisher: ...
 
     def subscribe(self, keyexpr: str, qos: Qos, handler: OnSample, *, depth: int) -> Subscription:
-        """At most `depth` samples per key wait for the loop; beyond it the oldest is dropped and counted. Order per key
-        is kept. With Qos.EVENT nothing is dropped."""
+        """Call `handler` in the loop with each sample, in order per key. At most `depth` samples per key wait for the
+        loop; beyond it the oldest is dropped and counted, but none with Qos.EVENT."""
 
     def listen(self, keyexpr: str, handler: OnBatch, every_s: float) -> Handle:
         """Receives all samples, in batches at most every `every_s`; nothing is dropped. Batches, because waking the

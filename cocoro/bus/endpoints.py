@@ -27,7 +27,7 @@ FORBIDDEN = "#?;"
 
 @dataclass(frozen=True)
 class ZenohConfig:
-    """How one process joins: by a directory, or by endpoints such as 'tcp/127.0.0.1:7447', never both.
+    """One process's way into the mesh: a directory, or endpoints such as 'tcp/127.0.0.1:7447', never both.
 
     Raises ConfigError for a combination or a directory that cannot be used.
     """

@@ -44,7 +44,7 @@ def need_bytes(publishers: int, readers: int) -> int:
 
 
 def obstacle(wanted_bytes: int) -> str:
-    """Why this process cannot have `wanted_bytes` of shared memory, and what to do; empty when it can."""
+    """The reason for which this process cannot have `wanted_bytes` of shared memory, with advice; '' when it can."""
     if wanted_bytes == 0:
         return ""
     try:

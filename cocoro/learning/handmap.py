@@ -1,4 +1,4 @@
-"""Where the hand's marker is for the arm's joint angles: by the nominal model, and by the learned hand-eye map.
+"""The position of the hand's marker for the arm's joint angles: by the nominal model, and by the learned hand-eye map.
 
 The map is a network alone, as in the paper, or a network of what the nominal model leaves unexplained. Its outputs are
 Cartesian or egocentric spherical. All positions are in the body frame as the robot's camera sees it: what the camera
@@ -127,7 +127,10 @@ class NominalModel:
 
 
 class HandMap:
-    """Where the marker is seen. Angles are in radians, in the order of `joints`; positions in metres, body frame."""
+    """The map from joint angles, rad, in the order of `joints`, to the position at which the marker is seen.
+
+    Positions are in the body frame, m.
+    """
 
     def __init__(
         self,

@@ -9,6 +9,9 @@ from msgspec import Meta
 
 from cocoro.messages.common import Finite, FiniteNonNegative, FiniteVec2, LatchState, Message, require_finite
 
+STOPPED_BY: dict[LatchState, str] = {"released": "", "latched": "estop", "unknown": "latch unknown"}
+"""The field `stopped_by` of a hardware's state, as far as the emergency stop determines it."""
+
 
 class Frame(Message):
     """One colour and depth pair of the Kinect. The pixels decode without a copy, as `memoryview`."""

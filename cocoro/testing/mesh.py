@@ -94,8 +94,8 @@ class NotedBus(LocalBus):
 
 
 def misdeclared(component: Component, *buses: NotedBus) -> list[str]:
-    """How a component's declaration and its uses of these buses differ, in words; empty when they agree. A use that
-    these runs did not come to counts as a difference."""
+    """The differences, in words, between a component's declaration and its uses of these buses; empty when they agree.
+    A use that these runs did not come to counts as a difference."""
     found = [*_differences("publishes", component.all_publishes(), {name for bus in buses for name in bus.publishes})]
     found += _differences("reads", component.reads, {name for bus in buses for name in bus.reads})
     found += _differences("serves", component.all_serves(), {name for bus in buses for name in bus.serves})

@@ -7,6 +7,7 @@ import msgspec
 from cocoro.clock import NS, is_fresh
 from cocoro.health import WINDOW_S, Recent
 from cocoro.messages import BaseCommand, BaseState, LatchState
+from cocoro.messages.hardware import STOPPED_BY
 from cocoro.odometry import Odometry, WheelRamp
 from cocoro.robot import Base
 from cocoro.topics import BASE_COMMAND
@@ -163,7 +164,7 @@ class BaseDriver:
 
     def stopped_by(self, now_ns: int) -> str:
         if self.latch != "released":
-            return "estop" if self.latch == "latched" else "latch unknown"
+            return STOPPED_BY[self.latch]
         if self.link != "up":
             return "mode" if self.link == "fallen" else "link"
         if now_ns > self._until_ns:

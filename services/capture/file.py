@@ -131,7 +131,7 @@ class CaptureFile:
             self.flush()
 
     def add_packed(self, packed: PackedMessage) -> None:
-        """As `add`, of a message that the packer has packed already."""
+        """Append a message, as `add` does, that the packer has packed already."""
         self._flush_declarations()
         self._add_packed(self._packer.behind(self._pending, packed) if self._pending else packed)
 

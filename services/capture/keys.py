@@ -1,4 +1,4 @@
-"""Which keys are recorded, and as what: key filter, channel information, lossy frames."""
+"""Selection of the keys to record, and their form in the file: key filter, channel information, lossy frames."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""When something happens that is worth recording whole: a task runs, the emergency stop changes, a fault appears, or
+"""Detection of occasions that are worth recording whole: a task runs, the emergency stop changes, a fault appears, or
 the robot moves. Pure: messages in, occasions out."""
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class Occasion(msgspec.Struct, kw_only=True):
     """Faults, stops and motion during the occasion, its cause first."""
 
     def entries(self) -> dict[str, str]:
-        """As metadata: text as it is, everything else as JSON."""
+        """Encode the fields as metadata: text as it is, everything else as JSON."""
         plain: dict[str, Any] = msgspec.to_builtins(self)
         return {name: value if isinstance(value, str) else json.dumps(value) for name, value in plain.items()}
 

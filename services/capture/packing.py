@@ -56,7 +56,7 @@ class Packer:
         return self._by(self._pack, raw)
 
     def pack_small(self, raw: bytes) -> tuple[str, bytes]:
-        """The same, for small messages."""
+        """Compress small messages as `pack` does others."""
         return self._by(self._pack_small, raw)
 
     def _by(self, pack: _Pack | None, raw: bytes) -> tuple[str, bytes]:
@@ -74,7 +74,7 @@ class Packer:
         return PackedMessage(channel_id, log_ns, len(payload), len(raw), zlib.crc32(raw), *self.pack(raw))
 
     def behind(self, before: Sequence[bytes], packed: PackedMessage) -> PackedMessage:
-        """The same chunk with the records `before` in front of it."""
+        """Pack a chunk again with the records `before` in front of it."""
         raw = b"".join((*before, _unpacked(packed.compression, packed.data)))
         return PackedMessage(*packed[:3], len(raw), zlib.crc32(raw), *self.pack(raw))
 

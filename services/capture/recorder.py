@@ -338,7 +338,7 @@ class Recorder:
 
 
 def _entries(about: AboutReply) -> dict[str, str]:
-    """As metadata: text as it is, everything else as JSON."""
+    """Encode a service's reply as metadata: text as it is, everything else as JSON."""
     entries: dict[str, Any] = msgspec.to_builtins(about, builtin_types=(bytes,))
     for file in entries["files"]:
         file["content"] = base64.b64encode(file["content"]).decode()

@@ -109,7 +109,7 @@ class ThinningWriter(CaptureWriter):
 
     @property
     def _holds(self) -> bool:
-        """Not while a task runs: what comes before the next task is whole in that one's file."""
+        """Whether messages are held for the next file: not while a task runs."""
         return self.occasion is None or not self.occasion.task_id or self.occasion.ended_ns is not None
 
     def put(self, message: QueuedMessage) -> None:
@@ -144,7 +144,7 @@ class ThinningWriter(CaptureWriter):
         super().close()
 
     def _with_left_out(self) -> Missing:
-        """What is missing, with what was left out of the file that is being closed."""
+        """The account of missing messages, with those left out of the file that is being closed."""
         here = self.left_out - self._told
         self._told = self.left_out.copy()
         return self._known_missing()._replace(left_out=dict(here))

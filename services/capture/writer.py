@@ -34,7 +34,7 @@ ChannelName = str | tuple[str, int]
 
 @dataclass(frozen=True)
 class FileLimits:
-    """When the next file is begun, and when recording stops."""
+    """The limits at which the next file is begun, and at which recording stops."""
 
     file_bytes: float = float("inf")
     file_s: float = float("inf")
@@ -141,7 +141,7 @@ class CaptureWriter:
         self.messages += 1
 
     def pack(self, message: QueuedMessage) -> PackedMessage:
-        """The same message for `put_packed`, into this file or a later one.
+        """Pack a message for `put_packed`, into this file or a later one.
 
         Its bytes are a copy. The packer makes room for a message that does not shrink and gives the rest back, and many
         such rests, none of which fits the next message, take as much memory as if nothing had been packed.

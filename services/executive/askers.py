@@ -1,4 +1,4 @@
-"""Who asks for tasks and is still there, by their liveliness tokens.
+"""The clients that ask for tasks and are still there, by their liveliness tokens.
 
 A token drops when its process ends, however that ends, and when the mesh has not heard from the process for the lease.
 """

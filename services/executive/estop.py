@@ -48,7 +48,7 @@ class Estop:
 
     @property
     def refusal(self) -> str:
-        """Why no task may start, and what to do; empty when the stop is released."""
+        """The reason for which no task may start, with advice; '' when the stop is released."""
         if self._state == "released":
             return ""
         if self._state == "latched":

@@ -116,7 +116,7 @@ class Executive:
         return TaskReply(accepted=True, task_id=task_id)
 
     def _refusal(self, task: Task) -> tuple[RefusalCode, str] | None:
-        """Why a task cannot start now: a code, and a sentence that says what to do; None when it can."""
+        """The reason for which a task cannot start now: a code, and a sentence with advice; None when it can."""
         if task.needs_label:
             known = self._catalogue.get(task.target)
             grasping = task.needs_label == "graspable"
@@ -151,7 +151,7 @@ class Executive:
         return None
 
     def _what_of(self, missing: list[str]) -> str:
-        """Which missing services have died, and which are only not heard."""
+        """Tell the missing services that have died from those that are only not heard, in words."""
         dead = [service for service in missing if self._node.contact.dead(service)]
         unheard = [service for service in missing if service not in dead]
         texts = ((f"not alive: {', '.join(dead)}", dead), (f"no contact with {', '.join(unheard)}", unheard))

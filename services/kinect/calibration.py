@@ -66,7 +66,7 @@ class Board:
         return np.column_stack([grid, np.zeros(len(grid))]).astype(np.float32)
 
     def covers(self, points_m: FloatArray) -> BoolArray:
-        """Which points (n, 2), m, of the board's plane are on the board and not near its edge: (n,)."""
+        """Mark the points (n, 2), m, of the board's plane that are on the board and not near its edge; shape (n,)."""
         squares = points_m / self.square_m
         ends = np.array([self.columns - 1 + BORDER, self.rows - 1 + BORDER])
         return np.asarray(((squares > -BORDER) & (squares < ends)).all(axis=1))

@@ -63,7 +63,7 @@ class ColourRegion:
 
     @property
     def cut(self) -> bool:
-        """It touches the image's edge."""
+        """Whether the region touches the image's edge."""
         left, top, right, bottom = self.bounds
         return left <= 1 or top <= 1 or right >= self.image.width - 1 or bottom >= self.image.height - 1
 

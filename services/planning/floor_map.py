@@ -50,7 +50,7 @@ class Solid(NamedTuple):
     height_m: float
 
     def holds(self, places_m: FloatArray, lowest_m: FloatArray, highest_m: FloatArray) -> BoolArray:
-        """Which things at places (n, 2), odometry frame, between two heights (n,), are part of it."""
+        """Mark the things at places (n, 2), odometry frame, m, between two heights (n,) that are part of it; (n,)."""
         x, y, z = self.place_m
         half_m = self.height_m / 2 + _MARGIN_M
         beside: BoolArray = np.hypot(places_m[:, 0] - x, places_m[:, 1] - y) < self.radius_m + _MARGIN_M
@@ -244,7 +244,7 @@ class FloorMap:
         return cells
 
     def taller(self, points_m: FloatArray) -> BoolArray:
-        """In which points (n, 3), odometry frame, metres, something was seen to reach higher; shape (n,)."""
+        """Mark the points (n, 3), odometry frame, m, where something was seen to reach higher; returns shape (n,)."""
         index = self._index(points_m)
         inside = ((index >= 0) & (index < SIZE)).all(axis=1)
         taller = np.zeros(len(index), dtype=bool)
@@ -294,7 +294,7 @@ class ClearanceField:
 
 
 def inside(points: FloatArray, centres: FloatArray, radii: FloatArray) -> BoolArray:
-    """Which points (n, 3) lie within any of the balls (m, 3), (m,) seen from above, shape (n,)."""
+    """Mark the points (n, 3) that lie, seen from above, within any of the balls (m, 3), (m,); returns shape (n,)."""
     gaps = np.linalg.norm(points[:, None, :2] - centres[None, :, :2], axis=2) - radii[None, :]
     inside: BoolArray = (gaps < 0.0).any(axis=1)
     return inside

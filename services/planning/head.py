@@ -81,7 +81,7 @@ class Sweep:
 
 
 class Glance(NamedTuple):
-    """Where the head goes next: pan and tilt, rad, and the speed, rad/s."""
+    """The next aim of the head: pan and tilt, rad, and the speed, rad/s."""
 
     pan_rad: float
     tilt_rad: float

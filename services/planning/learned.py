@@ -135,7 +135,7 @@ class Learned:
 
     @property
     def text(self) -> str:
-        """For the status: the model in use, and the last refusal."""
+        """The text for the status: the model in use, and the last refusal."""
         text = f"{self._text}; {self._teacher.text}" if self._teacher is not None else self._text
         return f"{text} ({self._refusal})" if self._refusal else text
 

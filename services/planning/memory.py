@@ -126,7 +126,7 @@ class TargetMemory:
         return self.sightings(label) >= _SURE
 
     def place(self, label: str, stamp_ns: int, within_s: float) -> Vec3 | None:
-        """Where a sure object was at a time, odometry frame, m; None when its newest sighting is further off than
+        """The position of a sure object at a time, odometry frame, m; None when its newest sighting is further off than
         `within_s`."""
         track = self._tracks.get(label)
         if track is None or not self.sure(label) or abs(stamp_ns - track.stamp_ns) > within_s * NS:

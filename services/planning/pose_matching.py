@@ -68,7 +68,7 @@ class Constants(NamedTuple):
     """Turn on each metre."""
 
     def step(self, step: Pose2) -> Pose2:
-        """What a step of the odometry is in truth."""
+        """Correct a step of the odometry."""
         extra_rad = self.turn * step.yaw_rad + self.veer_radpm * step.x_m
         share, c, s = 1.0 + self.distance, cos(extra_rad / 2), sin(extra_rad / 2)
         x_m, y_m = share * step.x_m, share * step.y_m

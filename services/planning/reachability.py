@@ -175,7 +175,7 @@ class Reachability:
         self._retreat_m: float | None = None
 
     def use(self, learned: HandMap | None, mesh: ReachMesh | None) -> None:
-        """Also judge by the positions where the hand was seen; None: by the kinematics alone."""
+        """Judge also by the positions where the hand was seen; with None by the kinematics alone."""
         self._seen = (learned, mesh) if learned is not None and mesh is not None else None
         self._retreat_m = None  # the kinematics may have changed, too
 
@@ -207,7 +207,7 @@ class Reachability:
         return Grasp(behind, behind._replace(radius_m=radius))
 
     def why_not(self, target_m: Vec3, *, touching: bool = False) -> str:
-        """Why a target cannot be grasped (or `touching`: touched) from here; '' when it can."""
+        """The reason for which a target cannot be grasped (or `touching`: touched) from here; '' when it can."""
         config = self._config
         radius_range_m = config.touch_radius_range_m if touching else config.grasp_radius_range_m
         radius, azimuth, height = self._reacher.seen_from_arm(target_m)

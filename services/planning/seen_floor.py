@@ -1,4 +1,4 @@
-"""What a search has seen of the floor, and from where the rest can be seen.
+"""The floor that a search has seen, and the places from which the rest can be seen.
 
 A cell counts as seen when floor was measured in it from near enough, twice, while the head hardly turned: then an
 object there would have been found. Beside a wall no cell is sure: when all else was seen, the search looks at each
@@ -217,7 +217,7 @@ class SeenFloor:
         return cells
 
     def _behind_mount(self, bearing_rad: FloatArray, distance_m: FloatArray) -> BoolArray:
-        """Which places on the floor (n,), body frame, the camera's mount hides (slabs, Kay and Kajiya 1986)."""
+        """Mark the places on the floor (n,), body frame, that the camera's mount hides (slabs, Kay and Kajiya 1986)."""
         kinect, (low, high) = self._robot.kinect, self._robot.joints[PAN].limits_rad
         pan = np.clip(bearing_rad, low, high)
         neck, camera = (self._robot.chain(link).position({PAN: 0.0, TILT: 0.0}) for link in ("neck_tilt", "camera"))
@@ -305,7 +305,7 @@ class SeenFloor:
         return _pair((np.stack(np.nonzero(cells), axis=1).mean(axis=0) + self._corner + 0.5) * CELL_M)
 
     def rest(self, around: FloorMap, known: Sequence[tuple[float, ...]]) -> Rest:
-        """What was not seen, given up or not."""
+        """The floor that was not seen, given up or not."""
         hidden = self._hidden(around, known)
         if self._feet:
             hidden |= _large(self._unseen_feet(around) > 0, self.least_m2)

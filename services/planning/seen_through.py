@@ -28,7 +28,7 @@ _SAMPLES = 5
 
 
 class SeenThrough(NamedTuple):
-    """What one depth image shows of some places, each an array (n,)."""
+    """The evidence of one depth image about n places, each field an array (n,)."""
 
     gone: BoolArray
     """Surfaces behind the place are seen where it would hide them."""
@@ -50,7 +50,7 @@ class DepthView:
         self._depth = np.where(depth > 0.0, depth, np.nan)
 
     def look(self, places_m: FloatArray, lowest_m: FloatArray, highest_m: FloatArray) -> SeenThrough:
-        """What it shows of things at places (n, 2), body frame, that reach from `lowest_m` to `highest_m` (n,).
+        """Judge things at places (n, 2), body frame, m, that reach from `lowest_m` to `highest_m` (n,).
 
         At least two of five heights of a thing must be in the picture and in the sensor's range. Heights near the
         floor do not count where the thing reaches higher: the floor just behind them is no proof.

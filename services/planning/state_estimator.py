@@ -47,7 +47,7 @@ class PerceptionWatch:
     """Whether perception is late, by the arrival of its messages, however slow it is and even if it sees nothing."""
 
     def __init__(self, least_s: float, periods: float) -> None:
-        """It has `least_s` for a message, or `periods` of its own periods where that is longer."""
+        """Give perception `least_s` for a message, or `periods` of its own periods where that is longer."""
         self._least_ns = round(least_s * NS)
         self._periods = periods
         self._arrived_ns: int | None = None
@@ -62,7 +62,7 @@ class PerceptionWatch:
         self._blind_since_ns = None
 
     def blind_s(self, now_ns: int) -> float | None:
-        """As `StateEstimator.blind_s`; counted from the first call where nothing has arrived yet."""
+        """The time, s, as `StateEstimator.blind_s` gives it; since the first call where nothing has arrived yet."""
         if self._arrived_ns is not None and 0 <= now_ns - self._arrived_ns <= self._patience_ns():
             return None
         if self._blind_since_ns is None or now_ns < self._blind_since_ns:
@@ -303,7 +303,7 @@ class StateEstimator:
             )
 
     def watch(self, label: str) -> None:
-        """Also keep the unfiltered sightings of a label."""
+        """Keep the unfiltered sightings of a label, too."""
         self._watched.add(label)
 
     def sightings_of(self, label: str) -> list[PostureSighting]:
@@ -326,7 +326,7 @@ class StateEstimator:
         return self.matching.place(Pose2(*newest[1].tolist())) if newest else None
 
     def missing(self, now_ns: int) -> str:
-        """Which state is missing or too old to move; '' when all are fresh."""
+        """Name the state that is missing or too old to move; '' when all are fresh."""
         for topic, message in (
             (topics.BASE_STATE, self.base),
             (topics.ARM_STATE, self.arm),
@@ -341,7 +341,7 @@ class StateEstimator:
         return f"no angle of {lacking[0]}" if lacking else ""
 
     def latched(self) -> str:
-        """Which hardware is stopped by the emergency stop; '' when none is."""
+        """Name the hardware that is stopped by the emergency stop; '' when none is."""
         for name, state in (("base", self.base), ("arm", self.arm), ("hand", self.hand)):
             if state is not None and state.latch != "released":
                 return f"{name}: emergency stop {state.latch}"

@@ -82,7 +82,7 @@ class Surroundings:
         )
 
     def unseen(self, places_m: FloatArray) -> FloatArray:
-        """Which places (n, 2), odometry frame, were not seen yet; shape (n,)."""
+        """Mark the places (n, 2), odometry frame, m, that were not seen yet; returns shape (n,)."""
         looked = self.floor.looked_at()
         hidden = []
         for x, y in places_m:

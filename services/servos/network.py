@@ -12,6 +12,7 @@ from typing import Literal
 from cocoro.clock import NS, is_fresh
 from cocoro.health import WINDOW_S, Recent
 from cocoro.messages import LatchState, ServoCommand, ServoState
+from cocoro.messages.hardware import STOPPED_BY
 from cocoro.robot import Joint
 from services.servos import table
 from services.servos.motion import AT_GOAL_COUNTS, JointMotion
@@ -105,7 +106,7 @@ class ServoNetwork:
 
     @property
     def stopped_by(self) -> str:
-        return {"released": "", "latched": "estop", "unknown": "latch unknown"}[self.latch]
+        return STOPPED_BY[self.latch]
 
     def command(self, command: ServoCommand, now_ns: int) -> str:
         """Accept all goals or none. Returns '' when accepted, otherwise the reason for refusing."""

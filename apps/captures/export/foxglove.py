@@ -15,18 +15,9 @@ import cv2
 import msgspec
 import numpy as np
 
+from apps.captures.export import geometry
 from apps.captures.export.files import making
-from apps.captures.export.geometry import (
-    CAMERA,
-    POINTS_PERIOD_NS,
-    Posture,
-    about_z,
-    conjugate,
-    points,
-    quaternion,
-    rotated,
-)
-from apps.captures.export.story import catalogue_of, robot_of
+from apps.captures.export.story import PhaseNews, catalogue_of, robot_of
 from apps.captures.reader import Capture, Record
 from apps.captures.rewrite import info_in
 from apps.pictures import describe
@@ -144,10 +135,10 @@ class Translator:
         self._capture = capture
         self._robot = robot_of(capture)
         self._catalogue = catalogue_of(capture)
-        self._posture = Posture(self._robot)
-        self._phase = ""
+        self._posture = geometry.Posture(self._robot)
+        self._phases = PhaseNews()
         self._has_chassis = False
-        self._cloud_ns = -POINTS_PERIOD_NS
+        self._cloud_ns = -geometry.POINTS_PERIOD_NS
         """Stamp of the newest cloud of points."""
 
     def translate(self, record: Record) -> Iterator[FoxgloveMessage]:
@@ -203,19 +194,19 @@ class Translator:
         _, jpeg = cv2.imencode(
             ".jpg", cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
         )
-        picture = fg.CompressedImage(timestamp=at, frame_id=CAMERA, data=jpeg.tobytes(), format="jpeg")
+        picture = fg.CompressedImage(timestamp=at, frame_id=geometry.CAMERA, data=jpeg.tobytes(), format="jpeg")
         yield FoxgloveMessage("/camera/colour", picture)
         camera = self._robot.camera.scaled(frame.width, frame.height)
         k = [camera.fx, 0.0, camera.cx, 0.0, camera.fy, camera.cy, 0.0, 0.0, 1.0]
         calibration = fg.CameraCalibration(
-            timestamp=at, frame_id=CAMERA, width=frame.width, height=frame.height, K=k,
+            timestamp=at, frame_id=geometry.CAMERA, width=frame.width, height=frame.height, K=k,
             R=[1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0], P=[*k[:3], 0.0, *k[3:6], 0.0, *k[6:], 0.0],
         )  # fmt: skip
         yield FoxgloveMessage("/camera/calibration", calibration)
-        if 0 <= frame.stamp_ns - self._cloud_ns < POINTS_PERIOD_NS:
+        if 0 <= frame.stamp_ns - self._cloud_ns < geometry.POINTS_PERIOD_NS:
             return
         self._cloud_ns = frame.stamp_ns
-        places, colours = points(frame, self._robot, DEPTH_STEP)
+        places, colours = geometry.points(frame, self._robot, DEPTH_STEP)
         packed = np.zeros(len(places), dtype=[("place", "<f4", 3), ("colour", "u1", 3), ("alpha", "u1")])
         packed["place"] = np.rint(places / POINT_STEP_M) * POINT_STEP_M
         packed["colour"], packed["alpha"] = colours, 255
@@ -226,14 +217,14 @@ class Translator:
             for n, name in enumerate(("red", "green", "blue", "alpha"))
         ]
         cloud = fg.PointCloud(
-            timestamp=at, frame_id=CAMERA, pose=_pose((0.0, 0.0, 0.0)), point_stride=16, fields=fields,
+            timestamp=at, frame_id=geometry.CAMERA, pose=_pose((0.0, 0.0, 0.0)), point_stride=16, fields=fields,
             data=packed.tobytes(),
         )  # fmt: skip
         yield FoxgloveMessage("/camera/points", cloud)
 
     def _body(self, at: fg.Timestamp) -> fg.FrameTransform:
         body = self._posture.body
-        return _transform(at, ODOMETRY, BODY, (body.x_m, body.y_m, 0.0), about_z(body.yaw_rad))
+        return _transform(at, ODOMETRY, BODY, (body.x_m, body.y_m, 0.0), geometry.about_z(body.yaw_rad))
 
     def _chassis(self, at: fg.Timestamp) -> fg.SceneEntity:
         base = self._robot.base
@@ -246,7 +237,7 @@ class Translator:
         if not links:
             return
         transforms = [
-            _transform(at, BODY, name, tuple(map(float, pose[:3, 3])), quaternion(pose[:3, :3]))
+            _transform(at, BODY, name, tuple(map(float, pose[:3, 3])), geometry.quaternion(pose[:3, :3]))
             for name, pose in links.items()
         ]
         yield FoxgloveMessage("/tf", fg.FrameTransforms(transforms=transforms))
@@ -287,18 +278,14 @@ class Translator:
         shapes = []
         for item in truth.objects:
             if item.kind == "object":
-                x, y, z = (there - here for there, here in zip(item.position_m, truth.body_m, strict=True))
-                place = rotated(conjugate(truth.body_orientation), (x, y, z))
+                place = geometry.in_body(truth, item.position_m)
                 shapes.append(_shape(self._catalogue.get(item.label), place, TRUE))
         return _entity(at, "true", **_by_kind(shapes))
 
     def _log(self, at: fg.Timestamp, task: TaskState) -> Iterator[FoxgloveMessage]:
-        phase = f"{task.task} {task.label}: {task.outcome or task.phase}".strip()
-        if task.task_id and phase != self._phase:
+        if words := self._phases.told_by(task):
             level = fg.LogLevel.Error if task.outcome == "failed" else fg.LogLevel.Info
-            words = f"{phase} ({task.reason})" if task.reason else phase
             yield FoxgloveMessage("/log", fg.Log(timestamp=at, level=level, message=words, name="executive"))
-        self._phase = phase
 
     def _colour_of(self, label: str) -> fg.Color:
         known = self._catalogue.get(label)

@@ -11,7 +11,7 @@ from cocoro.arrays import Float32Array, FloatArray, ImageArray
 from cocoro.clock import NS
 from cocoro.frames import Pose2
 from cocoro.kinematics import Tree
-from cocoro.messages import BaseState, Frame, ServoState
+from cocoro.messages import BaseState, Frame, ServoState, Truth
 from cocoro.robot import Robot
 from cocoro.units import Quaternion, Vec3
 
@@ -52,6 +52,12 @@ def rotated(by: Quaternion, place: Vec3) -> Vec3:
 
 def conjugate(turn: Quaternion) -> Quaternion:
     return -turn[0], -turn[1], -turn[2], turn[3]
+
+
+def in_body(truth: Truth, place_m: Vec3) -> Vec3:
+    """A place in the world frame, m, by the simulator's true pose of the body in the body frame, m."""
+    x, y, z = (there - here for there, here in zip(place_m, truth.body_m, strict=True))
+    return rotated(conjugate(truth.body_orientation), (x, y, z))
 
 
 class Posture:

@@ -13,18 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from apps.captures.export import geometry
 from apps.captures.export.files import making
-from apps.captures.export.geometry import (
-    CAMERA,
-    POINTS_PERIOD_NS,
-    Posture,
-    about_z,
-    conjugate,
-    points,
-    quaternion,
-    rotated,
-)
-from apps.captures.export.story import catalogue_of, robot_of
+from apps.captures.export.story import PhaseNews, catalogue_of, robot_of
 from apps.captures.reader import Capture
 from apps.pictures import describe
 from cocoro.capture.conventions import CaptureError
@@ -121,10 +112,10 @@ class RerunScene:
         self._to = recording
         self._robot = robot
         self._catalogue = catalogue
-        self._posture = Posture(robot)
-        self._phase = ""
+        self._posture = geometry.Posture(robot)
+        self._phases = PhaseNews()
         self._why = ""
-        self._cloud_ns = -POINTS_PERIOD_NS
+        self._cloud_ns = -geometry.POINTS_PERIOD_NS
         """Stamp of the newest cloud of points."""
         self._stage: StageLogger | None = None
         self._log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
@@ -168,13 +159,13 @@ class RerunScene:
         )  # fmt: skip
         pixels = np.frombuffer(frame.colour, dtype=np.uint8).reshape(frame.height, frame.width, 3)
         self._log("world/body/camera/colour", rr.Image(pixels).compress(jpeg_quality=JPEG_QUALITY))
-        if 0 <= frame.stamp_ns - self._cloud_ns < POINTS_PERIOD_NS:
+        if 0 <= frame.stamp_ns - self._cloud_ns < geometry.POINTS_PERIOD_NS:
             return
         self._cloud_ns = frame.stamp_ns
-        places, colours = points(frame, self._robot, DEPTH_STEP)
+        places, colours = geometry.points(frame, self._robot, DEPTH_STEP)
         links = self._posture.links()
         if links:  # below the body, because entities below a camera are drawn into its picture
-            pose = links[CAMERA]
+            pose = links[geometry.CAMERA]
             self._log(
                 "world/body/points", rr.Points3D(places @ pose[:3, :3].T + pose[:3, 3], colors=colours, radii=0.004)
             )
@@ -197,7 +188,9 @@ class RerunScene:
         body, rr = self._posture.body, self._rr
         self._log(
             "world/body",
-            rr.Transform3D(translation=(body.x_m, body.y_m, 0.0), rotation=rr.Quaternion(xyzw=about_z(body.yaw_rad))),
+            rr.Transform3D(
+                translation=(body.x_m, body.y_m, 0.0), rotation=rr.Quaternion(xyzw=geometry.about_z(body.yaw_rad))
+            ),
         )
         radius, height = self._robot.base.chassis_diameter_m / 2, self._robot.base.chassis_height_m
         self._log(
@@ -216,8 +209,8 @@ class RerunScene:
             return
         rr = self._rr
         self._log("world/body/links", rr.LineStrips3D(self._posture.bones(links), radii=0.01, colors=[BONE]))
-        pose = links[CAMERA]
-        turn = rr.Quaternion(xyzw=quaternion(pose[:3, :3]))
+        pose = links[geometry.CAMERA]
+        turn = rr.Quaternion(xyzw=geometry.quaternion(pose[:3, :3]))
         self._log("world/body/camera", rr.Transform3D(translation=pose[:3, 3], rotation=turn))
 
     # --- what it believes, and does ---------------------------------------------------------------
@@ -241,22 +234,15 @@ class RerunScene:
             self._log("log", self._rr.TextLog(f"{plan.behaviour}: {plan.why}", level="DEBUG"))
 
     def _task(self, task: TaskState) -> None:
-        phase = f"{task.task} {task.label}: {task.outcome or task.phase}".strip()
-        if task.task_id and phase != self._phase:
-            words = f"{phase} ({task.reason})" if task.reason else phase
+        if words := self._phases.told_by(task):
             self._log("log", self._rr.TextLog(words, level="ERROR" if task.outcome == "failed" else "INFO"))
-        self._phase = phase
 
     def _truth(self, truth: Truth) -> None:
-        """In the body frame, as the believed objects; with a stage also in the world's."""
+        """Log the true objects in the body frame, as the believed ones are; with a stage also in the world frame."""
         if self._stage is not None:
             self._stage.log(truth)
         there = [item for item in truth.objects if item.kind == "object"]
-        back = conjugate(truth.body_orientation)
-        places = []
-        for item in there:
-            x, y, z = (one - other for one, other in zip(item.position_m, truth.body_m, strict=True))
-            places.append(rotated(back, (x, y, z)))
+        places = [geometry.in_body(truth, item.position_m) for item in there]
         self._log(
             "world/body/true",
             self._rr.Points3D(

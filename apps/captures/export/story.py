@@ -12,7 +12,7 @@ from typing import Any, Generic, TypeVar
 
 import msgspec
 
-from apps.captures.export.geometry import conjugate, rotated
+from apps.captures.export.geometry import in_body
 from apps.captures.reader import Capture, Record
 from cocoro.capture.types import NotReadableError
 from cocoro.clock import NS
@@ -55,6 +55,22 @@ class Story:
     def seen_in(self, incarnation: int, seq: int) -> Detections | None:
         """The detections of a frame."""
         return self._seen.get((incarnation, seq))
+
+
+class PhaseNews:
+    """The phases and outcomes of tasks, in words, each told once."""
+
+    def __init__(self) -> None:
+        self._phase = ""
+
+    def told_by(self, task: TaskState) -> str:
+        """The words for a new phase, with the reason where there is one; '' for a phase that was told already."""
+        phase = f"{task.task} {task.label}: {task.outcome or task.phase}".strip()
+        is_new = task.task_id and phase != self._phase
+        self._phase = phase
+        if not is_new:
+            return ""
+        return f"{phase} ({task.reason})" if task.reason else phase
 
 
 def read(capture: Capture, topic: Topic[M]) -> Iterator[tuple[Record, M]]:
@@ -131,10 +147,7 @@ class Truths:
 
 def _in_body(truth: Truth, label: str) -> Vec3 | None:
     found: TrueObject | None = next((item for item in truth.objects if item.label == label), None)
-    if found is None:
-        return None
-    x, y, z = (there - here for there, here in zip(found.position_m, truth.body_m, strict=True))
-    return rotated(conjugate(truth.body_orientation), (x, y, z))
+    return None if found is None else in_body(truth, found.position_m)
 
 
 def beliefs(capture: Capture) -> Iterator[dict[str, Any]]:

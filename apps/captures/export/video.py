@@ -307,7 +307,7 @@ class Complaints:
 
 
 def why_not_more(path: Path) -> str:
-    """Why a file cannot grow, in the system's words; '' when it can."""
+    """The reason, in the system's words, for which a file cannot grow; '' when it can."""
     try:
         with tempfile.TemporaryFile(dir=path.parent, buffering=0) as probe:
             probe.seek(path.stat().st_size)

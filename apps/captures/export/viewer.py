@@ -40,7 +40,7 @@ INSTEAD = "--web shows it in a browser, --save OUT.rrd writes a file, --connect 
 
 
 class Target(msgspec.Struct, frozen=True, kw_only=True):
-    """Where a scene is shown. At most one of `save`, `web` and `connect`; none of them means a window."""
+    """The viewer or file that gets a scene: at most one of `save`, `web` and `connect`; without them a window."""
 
     save: Path | None = None
     web: bool = False
@@ -141,11 +141,11 @@ class ViewerProcess:
 
     @property
     def failed(self) -> bool:
-        """It ended by an error, not because its window was closed."""
+        """Whether it ended by an error, not because its window was closed."""
         return self._process.poll() not in (None, 0)
 
     def reason(self) -> str:
-        """Why it ended, by its last words."""
+        """The viewer's last words, which say why it ended."""
         self._said.seek(0)
         lines = self._said.read().decode(errors="replace").splitlines()
         errors = [line.removeprefix("Error: ") for line in lines if line.startswith("Error: ")]
@@ -155,7 +155,7 @@ class ViewerProcess:
         return f"Rerun's viewer could not be opened{why}; {INSTEAD}"
 
     def wait(self) -> None:
-        """Until it ends. Raises CaptureError when it ended by an error."""
+        """Wait until the viewer ends. Raises CaptureError when it ended by an error."""
         self._process.wait()
         if self.failed:
             raise CaptureError(self.reason())
@@ -226,7 +226,7 @@ class Attempt(Generic[R]):
         return not self._thread.is_alive()
 
     def result(self) -> R:
-        """Its result, once it has ended. Raises its error, and CaptureError for one of Rerun's."""
+        """The result of the work, once it has ended. Raises the work's error, and CaptureError for one of Rerun's."""
         if isinstance(self._error, RuntimeError | OSError):
             raise CaptureError(f"not all was taken: {self._error}") from self._error
         if self._error is not None:
@@ -235,7 +235,7 @@ class Attempt(Generic[R]):
 
 
 class Pulse:
-    """When something was last done, for a judge of whether it goes on."""
+    """The time of the last sign of progress of something that another thread watches."""
 
     def __init__(self) -> None:
         self._newest_s = time.monotonic()

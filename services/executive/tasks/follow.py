@@ -51,7 +51,7 @@ class Company:
         return min(self.with_s / (now_s - self._from_s), 1.0) if now_s > self._from_s else 1.0
 
     def verdict(self, now_s: float) -> str:
-        """Why the pursuit has failed; '' when it has succeeded."""
+        """The reason for which the pursuit has failed; '' when it has succeeded."""
         if self._from_s is None:
             return f"it did not come within {WITHIN_M:g} m of the wanted distance"
         if (share := self.share(now_s)) >= SHARE:
