@@ -101,6 +101,23 @@ def test_going_from_place_to_place_all_floor_is_seen_in_the_end() -> None:
     assert (rest.patches, rest.enclosed_m2) == ((), 0.0)
 
 
+def test_each_side_of_a_wall_is_looked_at_from_that_side() -> None:
+    room, body = searching([box(0.7, 0.0, 0.5, 0.0, 0.10, 0.05)]), Pose2()
+    behind = [(0.875, y) for y in np.arange(-0.2, 0.21, 0.05)]
+    assert all(counted(room, place) for place in behind), "over the wall the floor was seen"
+    places = []
+    for _looks in range(6):
+        view = room.seen.viewpoint(body, costs(room, body), room.floor, ())
+        if view is None:
+            break
+        x, y = view.place_m
+        places.append(view.place_m)
+        body = Pose2(x, y, float(np.arctan2(view.middle_m[1] - y, view.middle_m[0] - x)))
+        look_around(room, body)
+    assert view is None
+    assert any(x > 0.75 for x, _ in places)
+
+
 def test_floor_that_walls_enclose_is_told_apart() -> None:
     tall = 0.85
     walls = [

@@ -65,6 +65,8 @@ class SearchConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How far outside of the radius the robot goes to look into it."""
     least_m2: Positive = 0.01
     """Least unseen floor for which the robot goes to another place."""
+    least_foot_m2: Positive = 0.0075
+    """The same where only the floor at the feet of walls is left."""
     drive_mps: Positive = 0.2
     turn_radps: Positive = 0.7
     look_s: Positive = 5.0

@@ -1,7 +1,8 @@
 """The floor that a search has seen, and the places from which the rest can be seen.
 
 A cell counts as seen when floor was measured in it from near enough, twice, while the head hardly turned: then an
-object there would have been found. Places to look from are rated by casting rays through the floor map (next best view,
+object there would have been found. Beside a wall no cell is sure: when all else was seen, the search looks at each
+wall's foot from its own side. Places to look from are rated by casting rays through the floor map (next best view,
 Connolly 1985; derived): things are opaque, and so is unseen floor beyond a margin.
 """
 
@@ -33,6 +34,16 @@ _PATIENCE = 2
 """Looks that should have shown a cell and did not, after which it is given up."""
 _BESIDE_CELLS = 2
 """Cells about an obstacle that belong to it: the map shows only what faces the robot."""
+_AWAY_CELLS = 4
+"""Cells within which an obstacle's parts tell to which of its sides floor belongs."""
+_FOOT_M = 3.0
+"""Distance up to which the foot of a wall counts as seen."""
+_ROW_RAD, _CAMERA_M = 0.0125, 0.73
+"""Angle between two rows of a depth image's points, and the camera's height: shown floor ends up to a row before it
+ends."""
+_SECTORS = 60
+"""Directions from which a cell is seen are told apart by so many sectors."""
+_ANYWHERE = (1 << _SECTORS) - 1
 _RAYS, _STEP_M = 120, 0.075
 _FINE_RAYS = 540
 _CORNER_CELLS = 4
@@ -51,6 +62,26 @@ _AREA_M2 = CELL_M**2
 
 
 _Cells = TypeVar("_Cells", FloatArray, BoolArray)
+
+
+def _away_kernels() -> tuple[FloatArray, FloatArray]:
+    """Kernels that add up, for a cell, the directions from the obstacles' cells near it, along x and along y."""
+    reach = np.arange(-_AWAY_CELLS, _AWAY_CELLS + 1, dtype=np.float64)
+    x, y = np.meshgrid(reach, reach, indexing="ij")
+    share = 1.0 / np.maximum(x**2 + y**2, 1.0) ** 1.5
+    return -x * share, -y * share
+
+
+def _own_sides() -> IntArray:
+    """For each direction away from an obstacle (sectors) the sectors (bits) from which its foot is seen."""
+    sectors = (np.arange(_SECTORS) + 0.5) * (2 * np.pi / _SECTORS)
+    own = np.cos(sectors[:, None] - sectors) > -1e-9
+    sides: IntArray = (own.astype(np.int64) << np.arange(_SECTORS)).sum(axis=1)
+    return sides
+
+
+_AWAY_X, _AWAY_Y = _away_kernels()
+_OWN = _own_sides()
 
 
 class Viewpoint(NamedTuple):
@@ -81,6 +112,12 @@ class SeenFloor:
         self._robot = robot
         self._count = np.zeros((SIZE, SIZE), dtype=np.int8)
         self._missed = np.zeros((SIZE, SIZE), dtype=np.int8)
+        self._from = np.zeros((SIZE, SIZE), dtype=np.int64)
+        """The sectors (bits) from which a cell was seen."""
+        self._feet = False
+        """Whether the feet of obstacles are looked at, too: all other floor was seen."""
+        self._claimed = np.ones((SIZE, SIZE), dtype=bool)
+        """Cells whose place must not be in doubt when they are seen."""
         self._corner: IntArray = np.zeros(2, dtype=np.int64)
         self._centre_m: tuple[float, float] | None = None
         self._avoided: list[tuple[float, float]] = []
@@ -108,6 +145,9 @@ class SeenFloor:
         self._corner = np.floor(np.array(self._centre_m) / CELL_M).astype(np.int64) - SIZE // 2
         self._count[:] = 0
         self._missed[:] = 0
+        self._from[:] = 0
+        self._feet = False
+        self._claimed = ~self._beyond()
         self.scans = 0
         self.doubt_m = 0.0
         self._avoided.clear()
@@ -125,20 +165,27 @@ class SeenFloor:
         shown = np.frombuffer(seen.shown[:whole], dtype="<u2").reshape(-1, 3) * (np.pi / 180, 0.001, 0.001)
         rays = np.repeat(shown, len(_SPREAD_DEG), axis=0)
         rays[:, 0] += np.tile(np.radians(_SPREAD_DEG), len(shown))
-        steps = np.arange(0.0, self._config.sight_m, CELL_M / 2)
-        inside = (steps[None, :] >= rays[:, 1:2]) & (steps[None, :] <= rays[:, 2:3])
-        bearings = rays[:, 0] + body.yaw_rad
+        rays[:, 0] += body.yaw_rad
         x, y = body.apply((*seen.origin_m, 0.0))[:2]
-        flat = self._flat(
-            x + (np.cos(bearings)[:, None] * steps)[inside], y + (np.sin(bearings)[:, None] * steps)[inside]
-        )
-        cells = np.zeros(SIZE * SIZE, dtype=np.uint8)
-        cells[flat[flat >= 0]] = 1
-        sure = cv2.erode(cells.reshape(SIZE, SIZE), _DOUBT).astype(bool)
-        if (sure & (self._count < _ENOUGH)).any():
+        cells = self._crossed(x, y, rays, self._config.sight_m)
+        sure = cv2.erode(cells.astype(np.uint8), _DOUBT).astype(bool)
+        if (sure & (self._count < _ENOUGH) & self._claimed).any():
             self.doubt_m = max(self.doubt_m, doubt_m)
         self._count[sure] = np.minimum(self._count[sure] + 1, _ENOUGH)
+        rays[:, 2] += _ROW_RAD * (rays[:, 2] ** 2 / _CAMERA_M + _CAMERA_M)
+        rows, columns = np.nonzero(self._crossed(x, y, rays, _FOOT_M))
+        away_x, away_y = np.array([[x], [y]]) - (np.stack([rows, columns]) + self._corner[:, None] + 0.5) * CELL_M
+        self._from[rows, columns] |= 1 << _sector(np.arctan2(away_y, away_x))
         self.scans += 1
+
+    def _crossed(self, x_m: float, y_m: float, rays: FloatArray, up_to_m: float) -> BoolArray:
+        """The cells along rays (n, 3) from a place: bearing, rad, odometry frame, and begin and end, m."""
+        steps = np.arange(0.0, up_to_m, CELL_M / 2)
+        inside = (steps[None, :] >= rays[:, 1:2]) & (steps[None, :] <= rays[:, 2:3])
+        flat = self._flat(x_m + (np.cos(rays[:, :1]) * steps)[inside], y_m + (np.sin(rays[:, :1]) * steps)[inside])
+        cells = np.zeros(SIZE * SIZE, dtype=bool)
+        cells[flat[flat >= 0]] = True
+        return cells.reshape(SIZE, SIZE)
 
     def stand_at(self, body: Pose2) -> None:
         """Count the floor under the body as seen."""
@@ -190,9 +237,15 @@ class SeenFloor:
         bearings = np.linspace(0.0, 2 * np.pi, _FINE_RAYS, endpoint=False)
         steps = np.arange(CELL_M, self._config.sight_m, CELL_M)
         flat, shown = self._cast(np.array([place_m], dtype=np.float64), bearings, steps, self._things(around, known))
+        wanted = self._wanted(around, known).reshape(-1)[flat] & (1 << _sector(bearings + np.pi))[:, None] > 0
         cells = np.zeros(SIZE * SIZE, dtype=bool)
-        cells[flat[shown & (flat >= 0)]] = True
-        return cells.reshape(SIZE, SIZE) & self.unseen(around, known)
+        cells[flat[shown & wanted & (flat >= 0)]] = True
+        return cells.reshape(SIZE, SIZE)
+
+    @property
+    def least_m2(self) -> float:
+        """Least floor that is worth a look."""
+        return self._config.least_foot_m2 if self._feet else self._config.least_m2
 
     def viewpoint(
         self, body: Pose2, costs_m: FloatArray, around: FloorMap, known: Sequence[tuple[float, ...]]
@@ -200,7 +253,16 @@ class SeenFloor:
         """The place from which the most unseen floor can be seen for the time that it takes to get there; None where
         no reachable place shows any. `costs_m`: length of the way to each cell of the floor map. Where the robot
         stands is such a place, too, if something can be seen when it turns round."""
-        unseen = self.unseen(around, known)
+        view = self._best_view(body, costs_m, around, known)
+        if view is None and not self._feet:
+            self._feet, self._claimed = True, self._hidden(around, known)
+            view = self._best_view(body, costs_m, around, known)
+        return view
+
+    def _best_view(
+        self, body: Pose2, costs_m: FloatArray, around: FloorMap, known: Sequence[tuple[float, ...]]
+    ) -> Viewpoint | None:
+        unseen = self._wanted(around, known)
         if self._centre_m is None or not unseen.any():
             return None
         cost = self._aligned(around, costs_m, beyond=np.inf)
@@ -217,14 +279,15 @@ class SeenFloor:
         flat, shown = self._cast(places, bearings, steps, self._things(around, known))
         # The mount hides what is near, except ahead.
         share = np.where(steps < _NEAR_M, _NEAR_SHARE, 1.0) * steps * (2 * np.pi / _RAYS) * _STEP_M
-        wanted = unseen.reshape(-1)[flat] & (flat >= 0) & shown
+        towards = (1 << _sector(bearings + np.pi))[:, None]
+        wanted = (unseen.reshape(-1)[flat] & towards > 0) & (flat >= 0) & shown
         gains = (wanted * share[None, None, :]).sum(axis=(1, 2))
         seconds = cost[rows, columns] / self._config.drive_mps + self._config.look_s
-        rate = np.where(gains >= self._config.least_m2, gains / seconds, 0.0)
+        rate = np.where(gains >= self.least_m2, gains / seconds, 0.0)
         here = (body.x_m, body.y_m)
         cells = self.visible(here, around, known)
         gain = float(cells.sum()) * _AREA_M2
-        if gain >= self._config.least_m2:
+        if gain >= self.least_m2:
             bearing, _ = self.bearings(cells, body).T
             turn = atan2(float(np.sin(bearing).sum()), float(np.cos(bearing).sum()))
             if gain / (abs(turn) / self._config.turn_radps + self._config.look_s) >= rate.max(initial=0.0):
@@ -234,7 +297,7 @@ class SeenFloor:
                 break
             cells = self.visible(_pair(places[best]), around, known)
             gain = float(cells.sum()) * _AREA_M2
-            if gain >= self._config.least_m2:
+            if gain >= self.least_m2:
                 return Viewpoint(_pair(places[best]), gain, self._middle(cells))
         return None
 
@@ -244,6 +307,8 @@ class SeenFloor:
     def rest(self, around: FloorMap, known: Sequence[tuple[float, ...]]) -> Rest:
         """The floor that was not seen, given up or not."""
         hidden = self._hidden(around, known)
+        if self._feet:
+            hidden |= _large(self._unseen_feet(around) > 0, self.least_m2)
         _, patches, stats, middles = cv2.connectedComponentsWithStats(hidden.astype(np.uint8), connectivity=8)
         seen = np.asarray(self._count >= _ENOUGH)
         found, enclosed = [], 0.0
@@ -283,6 +348,26 @@ class SeenFloor:
             for column in (slice(None, -1), slice(1, None)):
                 wide_enough[row, column] |= block
         return np.asarray(wide_enough)
+
+    def _wanted(self, around: FloorMap, known: Sequence[tuple[float, ...]]) -> IntArray:
+        """The sectors (bits) from which each cell is still to be seen."""
+        wanted = np.where(self.unseen(around, known), _ANYWHERE, 0)
+        if self._feet:
+            wanted |= np.where(self._missed < _PATIENCE, self._unseen_feet(around), 0)
+        return wanted
+
+    def _unseen_feet(self, around: FloorMap) -> IntArray:
+        """The sectors (bits) from which the floor beside obstacles must be seen and was not: those on its side."""
+        cells = self._aligned(around, around.occupied(), beyond=False).astype(np.uint8)
+        things = cv2.morphologyEx(cells, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
+        inner, outer = (
+            cv2.dilate(things, np.ones((2 * reach + 1,) * 2, np.uint8)).astype(bool)
+            for reach in (_OPAQUE_CELLS, _OPAQUE_CELLS + 1)
+        )
+        here = outer & ~inner & ~self._beyond()
+        x, y = (cv2.filter2D(things.astype(np.float64), -1, kernel) for kernel in (_AWAY_X, _AWAY_Y))
+        own = _OWN[_sector(np.arctan2(y, x))]
+        return np.where(here & (self._from & own == 0), own, 0)
 
     def _beyond(self) -> BoolArray:
         assert self._centre_m is not None
@@ -325,6 +410,19 @@ class SeenFloor:
         columns = (np.arange(SIZE) + self._corner[1] + 0.5) * CELL_M - y_m
         disc: BoolArray = rows[:, None] ** 2 + columns[None, :] ** 2 <= radius_m**2
         return disc
+
+
+def _sector(bearing_rad: FloatArray) -> IntArray:
+    sector: IntArray = np.floor(bearing_rad / (2 * np.pi / _SECTORS)).astype(np.int64) % _SECTORS
+    return sector
+
+
+def _large(cells: BoolArray, least_m2: float) -> BoolArray:
+    """The cells that belong to a patch of at least a size."""
+    _, patches, stats, _ = cv2.connectedComponentsWithStats(cells.astype(np.uint8), connectivity=8)
+    large = stats[:, cv2.CC_STAT_AREA] * _AREA_M2 > least_m2 - _AREA_M2 / 2
+    large[0] = False
+    return np.asarray(large[patches])
 
 
 def describe(rest: Rest, body: Pose2) -> str:

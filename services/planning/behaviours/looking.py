@@ -123,7 +123,7 @@ class Searching:
             self._left_m2 = float(cells.sum()) * CELL_M**2
             if first and self._sweep is None:
                 self._glances = glances(config.head, pan, seen.bearings(cells, snapshot.body))
-        if self._left_m2 < config.search.least_m2 and seen.scans:  # without a scan the floor map may be empty
+        if self._left_m2 < seen.least_m2 and seen.scans:  # without a scan the floor map may be empty
             self._sweep, self._glances = None, []
         # Even slow perception must see every direction twice while the view passes over it.
         slow = 0.4 / max(lag_s, 1e-3)
@@ -145,7 +145,7 @@ class Searching:
                 return Plan(snapshot.stand(), snapshot.still(), self._why())
             self._glances.pop(0)
             self._rests_since_ns = None
-        if self._left_m2 >= config.search.least_m2 and not self._rested(snapshot, 2 * lag_s):
+        if self._left_m2 >= seen.least_m2 and not self._rested(snapshot, 2 * lag_s):
             return Plan(snapshot.stand(), snapshot.still(), self._why())
         seen.looked_from(snapshot.body, *snapshot.stands_around)
         why = f"{self._label} is not to be seen from here"
