@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from math import cos, sin
 
-from cocoro.robot import Base
+from cocoro.description import Base
 
 REPORT_PERIOD_S = 0.2
 """Period of requests for path and turn: at 5 Hz the unit of a report is small against its value."""

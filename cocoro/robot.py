@@ -1,228 +1,20 @@
-"""The robot description: one TOML file that the simulator, the models and the drivers all read.
-
-`calliope.toml` describes the Calliope. A robot's own file (`override`) has only the values that were measured on it.
-"""
+"""The robot by its description, ready for computing: what simulator, models and drivers read of it."""
 
 from __future__ import annotations
 
-import tomllib
 from dataclasses import dataclass
 from functools import cached_property
-from importlib import resources
 from math import pi, radians, tan
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import msgspec
 import numpy as np
-from msgspec import Meta
 
 from cocoro.arrays import CodeArray, Float32Array, FloatArray
+from cocoro.description import Description, Network, completed, read
 from cocoro.errors import ConfigError, field_text
 from cocoro.kinematics import Chain, Link, Tree
-from cocoro.units import Positive, Vec3
-
-OWN_FILE = "calliope.toml"
-_MISSING = f"; cocoro/{OWN_FILE} has every field, and a row with a new name needs all fields of its kind"
-
-LensValues = tuple[float, float, float, float, float, float, float, float, float]
-"""fx, fy, cx, cy in pixels, then OpenCV's distortion coefficients k1, k2, p1, p2, k3."""
-
-SERVO_COUNTS = 1024
-SERVO_RANGE_RAD = radians(300.0)
-SERVO_COUNT_RAD = SERVO_RANGE_RAD / (SERVO_COUNTS - 1)
-"""0..1023 stand for 0..300 degrees (ROBOTIS AX-12 manual)."""
-
-
-class Base(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    wheel_separation_m: Positive
-    wheel_radius_m: Positive
-    chassis_diameter_m: Positive
-    chassis_height_m: Positive
-    mass_kg: Positive
-    max_wheel_speed_mps: Positive
-    wheel_acceleration_mps2: Positive
-    command_timeout_s: Positive
-    """A wheel command is valid for at most this time, at any speed."""
-    state_rate_hz: Positive
-    stand_within_s: Positive = 0.3
-    """The wheels stand within this time after the last command, from any speed."""
-    stand_reserve_s: Positive = 0.03
-    """The part of `stand_within_s` reserved for the delivery of a command, one period of the loop that notices the
-    silence, and the body's lag behind the ramp of its wheels."""
-
-    def patience_s(self, speed_mps: float) -> float:
-        """The age up to which a command counts when it turns the faster wheel at this speed; the ramp down to standing
-        takes the rest of `stand_within_s`."""
-        ramp_s = abs(speed_mps) / self.wheel_acceleration_mps2
-        return max(min(self.command_timeout_s, self.stand_within_s - self.stand_reserve_s - ramp_s), 0.0)
-
-    def speed_at_age_mps(self, age_s: float) -> float:
-        """The highest wheel speed from which the base still stands in time when the last command has this age."""
-        ramp_s = self.stand_within_s - self.stand_reserve_s - age_s
-        return max(ramp_s, 0.0) * self.wheel_acceleration_mps2
-
-
-class Kinect(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    width: int
-    height: int
-    rate_hz: Positive
-    horizontal_fov_rad: Positive
-    vertical_fov_rad: Positive
-    depth_offset_m: Vec3
-    projector_offset_m: Vec3
-    min_range_m: Positive
-    max_range_m: Positive
-    depth_curve: Vec3
-    mount_min_m: Vec3
-    mount_max_m: Vec3
-    colour_lens: LensValues | None = None
-    depth_lens: LensValues | None = None
-    """Calibration of both lenses. The driver rectifies its images; readers of frames use the fields of view above."""
-    depth_rotation_rad: Vec3 = (0.0, 0.0, 0.0)
-    """Rotation vector from the depth camera's frame to the colour camera's."""
-
-
-class Marker(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The ball on the hand that babbling looks at; `position_m` is in the link's frame."""
-
-    link: str
-    radius_m: Positive
-    position_m: Vec3
-
-
-class Network(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One bus of servos."""
-
-    baud: int
-    rate_hz: Positive
-    command_timeout_s: Positive
-    """A command to these joints is valid for this time."""
-
-
-class Claw(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    pad_length_m: Positive
-    """Length of a finger and of the pad along it."""
-    open_sign: dict[str, float]
-    """By joint, the sign of the angles towards which it opens."""
-    level_roll_deg: float
-    """The wrist roll at which the claws lie level, for upright targets; the marker then stands above the hand."""
-
-    @property
-    def level_roll_rad(self) -> float:
-        return radians(self.level_roll_deg)
-
-
-class Tube(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A stretch of the arm's hull: balls evenly spaced from one link's origin to another's, both ends included."""
-
-    name: str
-    start: str
-    end: str
-    radius_m: Positive
-    balls: Annotated[int, Meta(ge=2)]
-
-
-class Hull(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The space that arm and hand take up, and the Kinect's housing, for keeping them apart."""
-
-    kinect_min_m: Vec3
-    kinect_max_m: Vec3
-    """A box, body frame, that holds the Kinect's housing at every head angle."""
-    finger_radius_m: Positive
-    finger_turn_deg: dict[str, float]
-    """By claw link, the angle in its x-y plane from its x axis to its finger."""
-    tube: Annotated[list[Tube], Meta(min_length=1)]
-    """From the chassis out. The first one turns on the chassis and is not checked against it."""
-
-
-class Joint(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    name: str
-    network: Literal["arm", "hand"]
-    id: int
-    limits_deg: tuple[float, float]
-    torque_nm: Positive
-    max_speed_radps: Positive
-    compliance_deg: Annotated[float, Meta(ge=0)] = 0.0
-    """Distance from the goal beyond which the servo pushes with all of `torque_nm`; 0: always."""
-    overload_s: Positive = 5.0
-    """A servo that pushes at its limit for this long is overloaded."""
-    direction: Literal[-1, 1] = 1
-    centre_count: float = (SERVO_COUNTS - 1) / 2
-
-    def __post_init__(self) -> None:
-        if not self.limits_deg[0] < self.limits_deg[1]:
-            raise ValueError(f"joint {self.name}: limits_deg must rise, not {self.limits_deg}")
-
-    @property
-    def limits_rad(self) -> tuple[float, float]:
-        return radians(self.limits_deg[0]), radians(self.limits_deg[1])
-
-    def to_count(self, angle_rad: float) -> int:
-        """The servo position nearest to a joint angle (radians), clipped to 0..1023."""
-        count = round(self.centre_count + self.direction * angle_rad / SERVO_COUNT_RAD)
-        return min(max(count, 0), SERVO_COUNTS - 1)
-
-    def to_angle(self, count: float) -> float:
-        """The joint angle, radians, of a servo position."""
-        return self.direction * (count - self.centre_count) * SERVO_COUNT_RAD
-
-
-class _LinkRow(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    name: str
-    parent: str
-    theta_deg: float
-    d_m: float
-    alpha_deg: float
-    r_m: float
-    joint: str | None = None
-    offset_deg: float = 0.0
-
-
-class _DescriptionFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    name: str
-    base: Base
-    kinect: Kinect
-    link: list[_LinkRow]
-    marker: Marker
-    network: dict[Literal["arm", "hand"], Network]
-    joint: list[Joint]
-    claw: Claw
-    hull: Hull
-    pose: dict[str, dict[str, float]]
-
-    def __post_init__(self) -> None:
-        """Refuses references to links and joints that the description does not have, circles of links, and boxes whose
-        corners are swapped."""
-        parents = {row.name: row.parent for row in self.link}
-        joints = {joint.name for joint in self.joint}
-        for row in self.link:
-            above, passed = row.parent, {row.name}
-            while above != "body":
-                if above not in parents:
-                    raise ValueError(f"link {row.name}: its parent {above!r} is not a link")
-                if above in passed:
-                    raise ValueError(f"link {row.name}: its parents go in a circle at {above!r}")
-                passed.add(above)
-                above = parents[above]
-            if row.joint is not None and row.joint not in joints:
-                raise ValueError(f"link {row.name}: there is no joint {row.joint!r}")
-        hull = [("hull.finger_turn_deg", name) for name in self.hull.finger_turn_deg]
-        hull += [(f"hull.tube {tube.name}", name) for tube in self.hull.tube for name in (tube.start, tube.end)]
-        for where, name in [("marker", self.marker.link), *hull]:
-            if name not in parents:
-                raise ValueError(f"{where}: there is no link {name!r}")
-        for where, low_m, high_m in (
-            ("kinect.mount_min_m", self.kinect.mount_min_m, self.kinect.mount_max_m),
-            ("hull.kinect_min_m", self.hull.kinect_min_m, self.hull.kinect_max_m),
-        ):
-            if not all(low < high for low, high in zip(low_m, high_m, strict=True)):
-                raise ValueError(f"{where}: {low_m} must be below {high_m} along each axis")
-        poses = [(f"pose {name}", set(angles)) for name, angles in self.pose.items()]
-        claws = [("claw", set(self.claw.open_sign)), ("hull.finger_turn_deg", set(self.hull.finger_turn_deg))]
-        for where, named in [*poses, *claws]:
-            if unknown := sorted(named - joints):
-                raise ValueError(f"{where}: there is no joint {unknown[0]!r}")
 
 
 @dataclass(frozen=True)
@@ -255,7 +47,7 @@ class Camera:
 class Robot:
     """The description, ready for computing. Make it with `Robot.load()`."""
 
-    def __init__(self, spec: _DescriptionFile) -> None:
+    def __init__(self, spec: Description) -> None:
         self._spec = spec
         self.name = spec.name
         self.base = spec.base
@@ -287,17 +79,7 @@ class Robot:
         `override` has only the values that were measured on one robot: tables are merged, and rows of `[[link]]`,
         `[[joint]]` and `[[hull.tube]]` by their name. Raises ConfigError naming file and field.
         """
-        where = str(path or OWN_FILE)
-        try:
-            data = tomllib.loads(path.read_text(encoding="utf-8") if path else _own_text())
-            if override is not None:
-                where = str(override)
-                _merge(data, tomllib.loads(override.read_text(encoding="utf-8")))
-                where = f"{path} with {override}" if path else where  # either may have the wrong field
-            return cls(msgspec.convert(data, _DescriptionFile))
-        except (ValueError, OSError) as error:  # not UTF-8, not TOML, not a description, not there
-            advice = _MISSING if "missing required field" in str(error) else ""
-            raise ConfigError(f"robot description {where}: {error}{advice}") from error
+        return cls(read(path, override))
 
     @classmethod
     def from_data(cls, data: Any, where: str = "robot description") -> Robot:
@@ -307,9 +89,9 @@ class Robot:
         and the networks' `command_timeout_s` get the Calliope's hull and level roll, and the timeout of their base.
         """
         try:
-            return cls(msgspec.convert(_completed(data), _DescriptionFile))
+            return cls(msgspec.convert(completed(data), Description))
         except msgspec.ValidationError as error:
-            raise ConfigError(f"{where}: {field_text(error, _DescriptionFile)}") from error
+            raise ConfigError(f"{where}: {field_text(error, Description)}") from error
 
     def to_data(self) -> dict[str, Any]:
         """The whole description as plain data."""
@@ -370,39 +152,3 @@ class Robot:
         table[2047] = np.nan
         table[table > 2 * self.kinect.max_range_m] = np.nan
         return table.astype(np.float32)
-
-
-def _own_text() -> str:
-    return resources.files("cocoro").joinpath(OWN_FILE).read_text(encoding="utf-8")
-
-
-def _completed(data: Any) -> Any:
-    """Recorded data with the fields that descriptions did not have yet when it was recorded."""
-    if not isinstance(data, dict):
-        return data
-    claw, base, networks = (data.get(name) for name in ("claw", "base", "network"))
-    if "hull" not in data or (isinstance(claw, dict) and "level_roll_deg" not in claw):
-        own = tomllib.loads(_own_text())
-        data = {"hull": own["hull"], **data}
-        if isinstance(claw, dict):
-            data["claw"] = {"level_roll_deg": own["claw"]["level_roll_deg"], **claw}
-    if isinstance(networks, dict) and isinstance(base, dict) and "command_timeout_s" in base:
-        timeout = {"command_timeout_s": base["command_timeout_s"]}
-        networks = {name: timeout | row if isinstance(row, dict) else row for name, row in networks.items()}
-        data = {**data, "network": networks}
-    return data
-
-
-def _merge(into: dict[str, Any], extra: dict[str, Any]) -> None:
-    for key, value in extra.items():
-        if isinstance(value, dict) and isinstance(into.get(key), dict):
-            _merge(into[key], value)
-        elif isinstance(value, list) and value and isinstance(value[0], dict) and isinstance(into.get(key), list):
-            rows = {row.get("name"): row for row in into[key]}
-            for row in value:
-                if row.get("name") in rows:
-                    _merge(rows[row["name"]], row)
-                else:
-                    into[key].append(row)
-        else:
-            into[key] = value

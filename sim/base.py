@@ -8,10 +8,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import degrees
 
+from cocoro.description import Base
 from cocoro.messages import BaseCommand, BaseState, LatchState
 from cocoro.messages.hardware import STOPPED_BY
 from cocoro.odometry import REPORT_PERIOD_S, Odometry, WheelRamp
-from cocoro.robot import Base
 
 
 class CreateCounters:

@@ -10,9 +10,9 @@ from collections.abc import Mapping
 from math import degrees, radians
 from typing import NamedTuple
 
+from cocoro.description import Joint
 from cocoro.messages import LatchState, ServoCommand, ServoState
 from cocoro.messages.hardware import STOPPED_BY
-from cocoro.robot import Joint
 
 SPEED_COUNT_RADPS = 0.111 * 2 * 3.141592653589793 / 60
 """The unit of speed registers (ROBOTIS AX-12 manual)."""

@@ -12,12 +12,14 @@ from pathlib import Path
 # As the robot's own processes have it, and before numpy is imported: two workers with two threads each spin in vain.
 os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
+import msgspec
 import pytest
 from bus_rig import Local, Mesh, Zenoh
 from hypothesis import HealthCheck, settings
 from pictures import renderer_of
 from places import in_short_folder
 
+from cocoro import publisher
 from cocoro.bus import shared
 from cocoro.robot import Robot
 from sim.render import Renderer
@@ -95,6 +97,18 @@ def captures_of_tests(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None
     """Have robots of tests record into pytest's temporary folder."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("COCORO_CAPTURE_DIR", str(tmp_path_factory.mktemp("captures")))
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def numbers_of_messages() -> Iterator[None]:
+    """Refuse NumPy scalars in messages, so that tests find a core that makes them; a robot converts and sends them."""
+
+    def refuse(value: object) -> object:
+        raise TypeError(f"a {type(value).__name__} is in a message: convert it where it is made")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(publisher, "_ENCODER", msgspec.msgpack.Encoder(enc_hook=refuse))
         yield
 
 

@@ -1,34 +1,27 @@
-"""Exports of captures for viewers, Foxglove and Rerun, and the geometry that they show."""
+"""Rerun's viewer on a capture or live: its window, its page, its address, and what it is given."""
 
 from __future__ import annotations
 
-import json
 import subprocess
 import sys
 import threading
 import types
-from math import pi
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from capture_rig import ROBOT, Room, drive
-from mcap.reader import make_reader
 
 from apps.captures.export import rerun_scene
-from apps.captures.export.geometry import Posture, about_z, conjugate, points, quaternion, rotated
-from apps.captures.export.story import catalogue_of, robot_of
 from apps.captures.export.viewer import Attempt, Pulse, Target, ViewerProcess, address_of, free_port, sent
-from apps.captures.reader import Capture
 from apps.cli.main import main
 from apps.cli.view import WAITING, Waiting, watch
 from cocoro import topics
 from cocoro.bus.base import Qos
 from cocoro.capture.conventions import CaptureError
 from cocoro.errors import ConfigError
-from cocoro.kinematics import turn_z
-from cocoro.messages import BaseCommand, Frame, ServoState
+from cocoro.messages import BaseCommand, Frame
 from cocoro.objects import Catalogue
 from cocoro.vloop import run_virtual
 from sim.outside import OutsideStage
@@ -36,73 +29,6 @@ from sim.scene import load_scene
 from sim.world import World
 
 GOLDEN = Path(__file__).parent / "golden" / "fetch.mcap"
-
-
-# --- Foxglove -------------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def fox(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    pytest.importorskip("foxglove", reason="foxglove-sdk is an extra, and not installed here")
-    out = tmp_path_factory.mktemp("fox") / "fox.mcap"
-    assert main(["export", str(GOLDEN), "--foxglove", str(out)]) == 0
-    return out
-
-
-def test_the_file_for_foxglove_has_its_schemas_in_the_robots_time(fox: Path) -> None:
-    """tests/test_capture_foreign.py decodes and validates each message with npm packages."""
-    from foxglove import messages as sdk
-
-    shown: dict[str, list[bytes]] = {}
-    recorded: dict[str, list[Any]] = {}
-    last = 0
-    with fox.open("rb") as stream:
-        for schema, channel, message in make_reader(stream, validate_crcs=True).iter_messages():
-            assert schema is not None
-            assert last <= message.log_time < 10**10
-            last = message.log_time
-            if schema.name.startswith("foxglove."):
-                assert schema.encoding == channel.message_encoding == "protobuf"
-                assert schema.data == getattr(sdk, schema.name.removeprefix("foxglove.")).get_schema().data
-                shown.setdefault(schema.name, []).append(message.data)
-            else:
-                assert channel.message_encoding == "json"
-                recorded.setdefault(channel.topic, []).append(json.loads(message.data))
-    assert {
-        "foxglove.CompressedImage", "foxglove.CameraCalibration", "foxglove.PointCloud", "foxglove.FrameTransforms",
-        "foxglove.SceneUpdate", "foxglove.ImageAnnotations", "foxglove.Log",
-    } == set(shown)  # fmt: skip
-    assert len(shown["foxglove.CompressedImage"]) == 60
-    assert len(recorded["calliope/base/state"]) == 300
-    transforms = b"".join(shown["foxglove.FrameTransforms"])
-    assert all(frame in transforms for frame in (b"body", b"camera", b"gripper"))
-    assert any(b"approach" in log for log in shown["foxglove.Log"])
-
-
-def test_the_file_for_foxglove_is_no_larger_than_an_ordinary_capture(fox: Path) -> None:
-    """Clouds of points come at 10 Hz at most, whatever the camera's rate is, and the chassis comes once."""
-    stamps: dict[str, list[int]] = {}
-    with fox.open("rb") as stream:
-        for _, channel, message in make_reader(stream).iter_messages():
-            stamps.setdefault(channel.topic, []).append(message.log_time)
-    clouds = stamps["/camera/points"]
-    assert min(np.diff(clouds)) >= 10**8
-    assert len(clouds) > 50
-    assert len(stamps["/robot/chassis"]) == 1
-    assert fox.stat().st_size < 1.2 * GOLDEN.stat().st_size  # its pictures are tiny, of 160 x 120 pixels
-
-
-def test_without_foxglove_one_line_says_how_to_install_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setitem(sys.modules, "foxglove", None)
-    monkeypatch.delitem(sys.modules, "apps.captures.export.foxglove", raising=False)
-    assert main(["export", str(GOLDEN), "--foxglove", str(tmp_path / "fox.mcap")]) == 1
-    assert "pip install 'cocoro-mesh[foxglove]'" in capsys.readouterr().err
-    assert not (tmp_path / "fox.mcap").exists()
-
-
-# --- Rerun ----------------------------------------------------------------------------------------
 
 
 class Made:
@@ -358,45 +284,3 @@ def test_rerun_itself_takes_it(tmp_path: Path) -> None:
     assert main(["view", str(GOLDEN), "--save", str(tmp_path / "out.rrd")]) == 0
     assert (tmp_path / "out.rrd").stat().st_size > 500_000
     subprocess.run([sys.executable, "-m", "rerun", "rrd", "verify", str(tmp_path / "out.rrd")], check=True)
-
-
-# --- geometry -------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("yaw_rad", [0.0, 0.3, pi / 2, 3.0, -2.0])
-def test_quaternions_turn_as_their_matrices_do(yaw_rad: float) -> None:
-    yaw = turn_z(yaw_rad)[:3, :3]
-    tilt = np.array([[1.0, 0, 0], [0, 0.6, -0.8], [0, 0.8, 0.6]])
-    for turn in (yaw, yaw @ tilt, tilt @ yaw):
-        q = quaternion(turn)
-        assert rotated(q, (1.0, 2.0, 3.0)) == pytest.approx(tuple(turn @ (1.0, 2.0, 3.0)))
-        assert rotated(conjugate(q), rotated(q, (1.0, 2.0, 3.0))) == pytest.approx((1.0, 2.0, 3.0))
-    assert rotated(about_z(yaw_rad), (1.0, 0.0, 0.0)) == pytest.approx((np.cos(yaw_rad), np.sin(yaw_rad), 0.0))
-
-
-def test_points_stand_where_the_depth_says() -> None:
-    depth = np.full((12, 16), 2047, dtype="<u2")
-    depth[6, 8] = ROBOT.depth_code(np.array([1.5]))[0]
-    colour = np.full((12, 16, 3), 7, dtype=np.uint8)
-    frame = Frame(width=16, height=12, colour=memoryview(colour.tobytes()), depth=memoryview(depth.tobytes()))
-    places, colours = points(frame, ROBOT, 1)
-    ray = ROBOT.camera.scaled(16, 12).ray(8, 6) * 1.5 + np.array(ROBOT.kinect.depth_offset_m)
-    assert places == pytest.approx(ray.reshape(1, 3), abs=0.01)
-    assert colours.tolist() == [[7, 7, 7]]
-
-
-def test_the_links_are_known_once_every_joint_is() -> None:
-    posture = Posture(ROBOT)
-    assert posture.links() == {}
-    joints = tuple(ROBOT.joints)
-    zero = (0.0,) * len(joints)
-    posture.bend(ServoState(joints=joints, position_rad=zero, speed_radps=zero, load=zero))
-    links = posture.links()
-    assert links["camera"][:3, 3] == pytest.approx((0.0603, 0.0, 0.7331), abs=1e-3)
-    assert len(posture.bones(links)) == len(links) == len(ROBOT.links)
-
-
-def test_robot_and_objects_are_those_that_the_capture_has() -> None:
-    with Capture.open(GOLDEN) as capture:
-        assert "red_can" in catalogue_of(capture)
-        assert robot_of(capture).kinect == ROBOT.kinect

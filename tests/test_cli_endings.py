@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from bench.endings import ENDS, KINDS, Command
+from bench.command_endings import ENDS, KINDS, Command
 from cocoro.bus.endpoints import default
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.clock import RealClock

@@ -7,11 +7,13 @@ from typing import Any
 
 import msgpack
 import msgspec
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from message_samples import MESSAGES, QUESTIONS, data_of, leaves_in, numbers_in, replaced
 
+from cocoro import publisher
 from cocoro.messages import BaseCommand, Frame, Message, ServoCommand, ServoState
 from cocoro.publisher import encode
 
@@ -142,7 +144,9 @@ def test_a_servos_speed_limit_is_not_negative() -> None:
         decoded(ServoCommand, {"joints": ["elbow"], "goal_rad": [0.0], "speed_radps": [-1.0]})
 
 
-def test_numpys_numbers_are_sent_as_numbers() -> None:
-    np = pytest.importorskip("numpy")
-    command = BaseCommand(left_mps=np.float64(0.25), right_mps=np.float32(0.5))
+def test_numpys_numbers_are_sent_as_numbers_and_found_by_tests(monkeypatch: pytest.MonkeyPatch) -> None:
+    command = BaseCommand(left_mps=np.float64(0.25), right_mps=np.float32(0.5))  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match="a float64 is in a message"):
+        encode(command)
+    monkeypatch.setattr(publisher, "_ENCODER", msgspec.msgpack.Encoder(enc_hook=publisher._numpy_scalar))
     assert msgspec.msgpack.decode(encode(command), type=BaseCommand) == BaseCommand(left_mps=0.25, right_mps=0.5)

@@ -98,7 +98,9 @@ def test_in_a_room_the_pose_stays_right_though_the_wheels_differ(
     raw_m, raw_rad = error(drive.raw, drive.true)
     assert raw_m > 0.10
     assert raw_rad > 0.25
-    off_m, off_rad = error(drive.matching.place(drive.odometry), drive.true)
+    place = drive.matching.place(drive.odometry)
+    assert {type(number) for number in place} == {float}, "it goes into messages"
+    off_m, off_rad = error(place, drive.true)
     assert off_m < 0.06
     assert off_rad < 0.04
     assert drive.matching.constants.veer_radpm == pytest.approx(VEER_RADPM, abs=0.02)

@@ -12,8 +12,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from cocoro.description import SERVO_COUNT_RAD
 from cocoro.errors import ConfigError
-from cocoro.robot import SERVO_COUNT_RAD, Camera, Robot
+from cocoro.robot import Camera, Robot
 
 ROBOT = Robot.load()
 TEXT = resources.files("cocoro").joinpath("calliope.toml").read_text()

@@ -10,8 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cocoro.clock import NS
+from cocoro.description import SERVO_COUNT_RAD, Joint
 from cocoro.messages import ServoCommand
-from cocoro.robot import SERVO_COUNT_RAD, Joint, Robot
+from cocoro.robot import Robot
 from services.servos import table
 from services.servos.motion import LEAD_S, REACH_RAD, JointMotion
 from services.servos.network import MISSES, ServoNetwork, ServoStatus, ServoTask

@@ -13,9 +13,10 @@ import pytest
 from wire_servos import LONG_S, MS, REPLY_S, ServoBench, angle, moved
 
 from cocoro import topics
+from cocoro.description import SERVO_COUNT_RAD
 from cocoro.errors import ConfigError, RemoteError
 from cocoro.messages import EstopRequest, ServoRequest
-from cocoro.robot import SERVO_COUNT_RAD, Robot
+from cocoro.robot import Robot
 from cocoro.testing import ServiceUnderTest
 from services.servos.bus import PortError, RefusedWriteError, ServoBus, SilentError
 from services.servos.line import STATE

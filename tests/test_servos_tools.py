@@ -14,8 +14,9 @@ from wire_servos import REPLY_S, ServoBench
 from apps.cli.doctor import _own_checks
 from apps.cli.main import main
 from apps.cli.servos import ServoWorkbench
+from cocoro.description import SERVO_COUNT_RAD
 from cocoro.errors import RefusedError
-from cocoro.robot import SERVO_COUNT_RAD, Robot
+from cocoro.robot import Robot
 from deploy import profiles
 from deploy.processes import named
 from services.base.doctor import check as check_base

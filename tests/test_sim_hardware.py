@@ -9,8 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from cocoro.description import SERVO_COUNT_RAD
 from cocoro.messages import BaseCommand, ServoCommand
-from cocoro.robot import SERVO_COUNT_RAD, Robot
+from cocoro.robot import Robot
 from sim.base import Bumper, MobileBase
 from sim.realism import Wander
 from sim.seeds import stream

@@ -8,7 +8,8 @@ from math import hypot
 
 import pytest
 
-from cocoro.robot import SERVO_COUNT_RAD, Robot
+from cocoro.description import SERVO_COUNT_RAD
+from cocoro.robot import Robot
 from sim.scene import Scene, load_scene
 from sim.service import SimConfig
 from sim.wire.firmware import Channel, LinkedPlant, MotorOrder, MotorOrders, PlantState, ServoSetup, Setup, firmware

@@ -25,7 +25,7 @@ from world_operator import (
     yaw_of,
 )
 
-from cocoro.robot import SERVO_COUNT_RAD
+from cocoro.description import SERVO_COUNT_RAD
 from sim.bullet import Bullet
 from sim.judge import Judge
 from sim.mechanism import Mechanism

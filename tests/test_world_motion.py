@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from world_operator import COMMAND_EVERY, EMPTY, ROBOT, Operator, scene_with, yaw_of
 
+from cocoro.description import SERVO_COUNT_RAD
 from cocoro.messages import BaseCommand, ServoCommand
-from cocoro.robot import SERVO_COUNT_RAD
 from sim.scene import Obstacle, load_scene
 from sim.world import World
 

@@ -10,10 +10,8 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import msgspec
-import numpy as np
 
 from apps.captures.compare import difference, known_to
 from apps.captures.info import changed_since, missing_of
@@ -23,6 +21,7 @@ from cocoro.capture.types import NotReadableError
 from cocoro.clock import NS
 from cocoro.core import Core, Output, Sample
 from cocoro.messages import Message
+from cocoro.publisher import encode
 
 SETTLE_NS = NS
 """After a step whose inputs were left out, a core has its former state again within this time."""
@@ -119,7 +118,6 @@ class _Reexecution:
         self._inputs_missed = False
         self._noted: set[tuple[Path, int]] = set()
         self.changed: dict[str, None] = {}
-        self._encoder = msgspec.msgpack.Encoder(enc_hook=_python_number)
 
     def execute(self, step: RecordedStep) -> None:
         record = step.record
@@ -222,7 +220,7 @@ class _Reexecution:
         if message.stamp_ns == 0:
             message.stamp_ns = now_ns + self._latency_ns
         _, message.incarnation, message.seq = name
-        return self._encoder.encode(message)
+        return encode(message)
 
     def _difference(self, found: FoundMessage, payload: bytes) -> str:
         """The first difference in the fields that both the recorded and today's type have."""
@@ -259,13 +257,6 @@ class _Reexecution:
                 text=text,
                 after_missing=self._inputs_missed,
             )
-
-
-def _python_number(value: object) -> Any:
-    """numpy numbers as Python's, as in the node's publisher."""
-    if isinstance(value, np.generic):
-        return value.item()
-    raise TypeError(f"a {type(value).__name__} cannot be sent")
 
 
 def describe_result(result: ReexecutionResult) -> list[str]:

@@ -28,10 +28,11 @@ from apps.cli.output import complain, print_json, tell
 from apps.cli.terminal import StatusLine, print_table
 from apps.cli.toml_files import write_values
 from cocoro.component import load
+from cocoro.description import Joint
 from cocoro.errors import CocoroError, ConfigError, MeshError, RefusedError, choice_of
 from cocoro.messages import ServoReply, ServoRequest
 from cocoro.ports import port_path
-from cocoro.robot import Joint, Robot
+from cocoro.robot import Robot
 from cocoro.topics import SERVOS
 from deploy import profiles
 from deploy.processes import named

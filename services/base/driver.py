@@ -5,11 +5,11 @@ from __future__ import annotations
 import msgspec
 
 from cocoro.clock import NS, is_fresh
+from cocoro.description import Base
 from cocoro.health import WINDOW_S, Recent
 from cocoro.messages import BaseCommand, BaseState, LatchState
 from cocoro.messages.hardware import STOPPED_BY
 from cocoro.odometry import Odometry, WheelRamp
-from cocoro.robot import Base
 from cocoro.topics import BASE_COMMAND
 from services.base import oi
 from services.base.guard_logic import LinkState

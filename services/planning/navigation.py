@@ -11,9 +11,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import asin, atan2, copysign, hypot, sin, sqrt
 
+from cocoro.description import Base
 from cocoro.frames import Pose2, wrap_rad
 from cocoro.messages import BaseCommand
-from cocoro.robot import Base
 from services.planning.config import NavigationConfig
 
 PREVIEW_S = 0.1

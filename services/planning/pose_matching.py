@@ -325,7 +325,8 @@ class PoseMatching:
         """Change the pose (x, y, yaw) and the constants (3,)."""
         self._covariance = (self._covariance + self._covariance.T) / 2
         pose = self.place(odometry)
-        better = Pose2(pose.x_m + change[0], pose.y_m + change[1], pose.yaw_rad + change[2])
+        x_m, y_m, yaw_rad = change[:3].tolist()
+        better = Pose2(pose.x_m + x_m, pose.y_m + y_m, pose.yaw_rad + yaw_rad)
         self.shift = better.compose(odometry.inverse())
         self.constants = Constants(*(np.array(self.constants) + change[3:]).tolist())
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from cocoro.checks import Check, bad, note, ok
+from cocoro.description import Joint
 from cocoro.ports import check_port, port_path
-from cocoro.robot import Joint, Robot
+from cocoro.robot import Robot
 from services.servos import tools
 from services.servos.bus import PortError, ServoBus, SilentError
 from services.servos.network import HIGH_V, HOT_C, LOW_V

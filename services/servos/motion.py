@@ -7,7 +7,7 @@ commanded speed. So it moves as if it had the final goal, and stops by itself wh
 from __future__ import annotations
 
 from cocoro.clock import NS
-from cocoro.robot import SERVO_COUNT_RAD, Joint
+from cocoro.description import SERVO_COUNT_RAD, Joint
 from services.servos import table
 
 LEAD_S = 0.2

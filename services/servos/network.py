@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from typing import Literal
 
 from cocoro.clock import NS, is_fresh
+from cocoro.description import Joint
 from cocoro.health import WINDOW_S, Recent
 from cocoro.messages import LatchState, ServoCommand, ServoState
 from cocoro.messages.hardware import STOPPED_BY
-from cocoro.robot import Joint
 from services.servos import table
 from services.servos.motion import AT_GOAL_COUNTS, JointMotion
 from services.servos.table import ServoReading

@@ -13,13 +13,13 @@ from msgspec import Meta
 
 from cocoro import topics
 from cocoro.component import Implementation
+from cocoro.description import SERVO_COUNT_RAD
 from cocoro.errors import CocoroError, ConfigError
 from cocoro.faults import FaultReporter
 from cocoro.latch import ServiceLatch
 from cocoro.messages import LatchState, ServoCommand, ServoReply, ServoRequest, ServoState
 from cocoro.node import Node
 from cocoro.ports import port_path
-from cocoro.robot import SERVO_COUNT_RAD
 from cocoro.topics import Topic
 from cocoro.units import PositiveShare
 from services.servos import table

@@ -14,8 +14,8 @@ from typing import NamedTuple
 
 from serial.tools import list_ports
 
+from cocoro.description import SERVO_COUNT_RAD, Joint
 from cocoro.errors import CocoroError, RefusedError
-from cocoro.robot import SERVO_COUNT_RAD, Joint
 from services.servos import table
 from services.servos.bus import PortError, RefusedWriteError, ServoBus, SilentError
 

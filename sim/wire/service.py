@@ -12,10 +12,11 @@ from pathlib import Path
 
 from cocoro.child import ChildProcess, wait_or_kill
 from cocoro.component import Implementation
+from cocoro.description import Base, Joint
 from cocoro.errors import CocoroError
 from cocoro.node import Node
 from cocoro.ports import wire_dir
-from cocoro.robot import Base, Joint, Robot
+from cocoro.robot import Robot
 from sim.base import MobileBase
 from sim.camera import SimKinect
 from sim.realism import BodyRealism
