@@ -12,7 +12,9 @@ from cocoro.frames import Pose2
 from cocoro.messages import BaseCommand
 from cocoro.robot import Robot
 from services.planning.config import PlanningConfig
+from services.planning.course import Course, Move
 from services.planning.navigation import Driver, offset_to
+from services.planning.surroundings import Surroundings
 
 ROBOT = Robot.load()
 CONFIG = PlanningConfig().navigation
@@ -139,3 +141,13 @@ def test_the_preview_is_the_way_that_is_driven() -> None:
     assert arrived
     end = preview[-1]
     assert (end.x_m, end.y_m, end.yaw_rad) == pytest.approx((base.pose.x_m, base.pose.y_m, base.pose.yaw_rad), abs=0.06)
+
+
+def test_what_is_beyond_the_aim_does_not_hold_up_the_last_centimetres() -> None:
+    around, config = Surroundings("hand_marker"), PlanningConfig()
+    around.floor.bump([(ROBOT.base.chassis_diameter_m / 2 + 0.09, y) for y in (-0.05, 0.0, 0.05)])
+    fields = around.fields("", (), 0)
+    course = Course(ROBOT, config, AIM_M, arm="folded")
+    for left_m, direct, guarded in ((0.04, True, False), (0.30, True, True), (0.04, False, True)):
+        move = Move(0.20, 0.0, left_m, "", direct)
+        assert course.guarded(move, Pose2(), fields, Driver(CONFIG, ROBOT.base)) == guarded

@@ -118,6 +118,13 @@ def test_each_side_of_a_wall_is_looked_at_from_that_side() -> None:
     assert any(x > 0.75 for x, _ in places)
 
 
+def test_a_foot_that_no_place_shows_is_told() -> None:
+    room = searching([box(0.7, 0.0, 0.5, 0.0, 0.10, 0.05)])
+    too_far = Pose2(-3.0, 0.0)
+    assert room.seen.viewpoint(too_far, np.full((160, 160), np.inf), room.floor, ()) is None
+    assert any(x > 0.75 and abs(y) < 0.3 for _, x, y in room.seen.rest(room.floor, ()).patches)
+
+
 def test_floor_that_walls_enclose_is_told_apart() -> None:
     tall = 0.85
     walls = [
@@ -146,10 +153,6 @@ def test_a_second_search_of_a_task_begins_anew_about_the_same_place() -> None:
 
 def test_a_robot_that_did_not_know_its_place_does_not_say_that_it_saw_every_place() -> None:
     room = Room([])
-    room.seen.begin(Pose2())
-    look_around(room, Pose2())
-    for body in (Pose2(1.0, 0.0, 3.1), Pose2(-1.0, 0.0, 0.0)):
-        look_around(room, body)
     snapshot: Any = SimpleNamespace(
         estimator=SimpleNamespace(seen=room.seen),
         actuators=SimpleNamespace(config=PlanningConfig()),
@@ -157,21 +160,31 @@ def test_a_robot_that_did_not_know_its_place_does_not_say_that_it_saw_every_plac
         body=Pose2(),
     )
     exploring = Exploring(Explore(label="red_can"))
-    assert exploring._nothing_left(snapshot).startswith("every place within 2.0 m where red_can could stand was seen")
-    room.seen.doubt_m = 0.3
-    said = exploring._nothing_left(snapshot)
-    assert "knew its place only to 0.6 m" in said
-    assert "every place" not in said
+    for doubt_m in (0.3, 0.1):
+        room.doubt_m = doubt_m
+        room.seen.begin(Pose2())
+        for body in (Pose2(), Pose2(1.0, 0.0, 3.1), Pose2(-1.0, 0.0, 0.0)):
+            look_around(room, body)
+        said = exploring._nothing_left(snapshot)
+        assert said.startswith("every place within 2.0 m where red_can could stand was seen") == (doubt_m < 0.25)
+        assert ("knew its place only to 0.6 m" in said) == (doubt_m > 0.25)
 
 
-def test_the_doubt_is_that_of_the_newly_seen_floor_alone() -> None:
+def test_a_doubt_about_floor_beyond_the_radius_does_not_count() -> None:
     room = Room([])
     room.seen.begin(Pose2())
-    room.doubt_m = 0.1
-    room.look(0.3, 0.0, -0.6)
-    assert room.seen.doubt_m == 0.1
     room.doubt_m = 0.5
-    room.look(0.3, 0.0, -0.6)
-    assert room.seen.doubt_m == 0.1
+    room.look(0.3, body=Pose2(1.9, 0.0, 0.0))
+    assert counted(room, (3.0, 0.0))
+    assert room.seen.doubt_m(room.floor, ()) == 0.0
+
+
+def test_floor_that_is_seen_again_from_a_place_better_known_is_less_in_doubt() -> None:
+    room = Room([])
+    room.seen.begin(Pose2())
+    for doubt_m, expected_m in ((0.3, 0.3), (0.1, 0.1), (0.5, 0.1)):
+        room.doubt_m = doubt_m
+        room.look(0.3, 0.0, -0.6)
+        assert room.seen.doubt_m(room.floor, ()) == expected_m
     room.look(0.3, 1.5, -0.6)
-    assert room.seen.doubt_m == 0.5
+    assert room.seen.doubt_m(room.floor, ()) == 0.5

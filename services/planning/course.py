@@ -300,7 +300,10 @@ class Course:
         """Whether body or hand would reach an obstacle before the robot could stop."""
         if move.speed_mps == 0.0:
             return False
-        poses = [body.compose(pose) for pose in driver.stopping_poses(move.speed_mps, move.turn_radps)]
+        stopping = driver.stopping_poses(move.speed_mps, move.turn_radps)
+        if move.direct:  # it stops at the aim anyway
+            stopping = [pose for pose in stopping if hypot(pose.x_m, pose.y_m) <= move.left_m] or stopping[:1]
+        poses = [body.compose(pose) for pose in stopping]
         centres = np.array([[body.x_m, body.y_m], *([pose.x_m, pose.y_m] for pose in poses)])
         clearance = fields.body.at(centres) - self._body_m
         nearer = clearance[1:].min() < min(float(clearance[0]), self._config.clearance_m / 2)

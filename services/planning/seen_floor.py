@@ -116,8 +116,8 @@ class SeenFloor:
         """The sectors (bits) from which a cell was seen."""
         self._feet = False
         """Whether the feet of obstacles are looked at, too: all other floor was seen."""
-        self._claimed = np.ones((SIZE, SIZE), dtype=bool)
-        """Cells whose place must not be in doubt when they are seen."""
+        self._doubt_m = np.full((SIZE, SIZE), np.inf)
+        """By how much a cell's place was in doubt at the best of the scans that showed it."""
         self._corner: IntArray = np.zeros(2, dtype=np.int64)
         self._centre_m: tuple[float, float] | None = None
         self._avoided: list[tuple[float, float]] = []
@@ -126,8 +126,6 @@ class SeenFloor:
         """Whether a search goes on."""
         self.scans = 0
         """Depth images that this search has entered."""
-        self.doubt_m = 0.0
-        """By how much the place of some floor was in doubt when it was seen."""
 
     # --- updates ----------------------------------------------------------------------------------
 
@@ -147,9 +145,8 @@ class SeenFloor:
         self._missed[:] = 0
         self._from[:] = 0
         self._feet = False
-        self._claimed = ~self._beyond()
+        self._doubt_m[:] = np.inf
         self.scans = 0
-        self.doubt_m = 0.0
         self._avoided.clear()
 
     def clear(self) -> None:
@@ -169,8 +166,7 @@ class SeenFloor:
         x, y = body.apply((*seen.origin_m, 0.0))[:2]
         cells = self._crossed(x, y, rays, self._config.sight_m)
         sure = cv2.erode(cells.astype(np.uint8), _DOUBT).astype(bool)
-        if (sure & (self._count < _ENOUGH) & self._claimed).any():
-            self.doubt_m = max(self.doubt_m, doubt_m)
+        self._doubt_m[sure] = np.minimum(self._doubt_m[sure], doubt_m)
         self._count[sure] = np.minimum(self._count[sure] + 1, _ENOUGH)
         rays[:, 2] += _ROW_RAD * (rays[:, 2] ** 2 / _CAMERA_M + _CAMERA_M)
         rows, columns = np.nonzero(self._crossed(x, y, rays, _FOOT_M))
@@ -255,7 +251,7 @@ class SeenFloor:
         stands is such a place, too, if something can be seen when it turns round."""
         view = self._best_view(body, costs_m, around, known)
         if view is None and not self._feet:
-            self._feet, self._claimed = True, self._hidden(around, known)
+            self._feet = True
             view = self._best_view(body, costs_m, around, known)
         return view
 
@@ -325,6 +321,11 @@ class SeenFloor:
         found.sort(reverse=True)
         return Rest(sum(area for area, _, _ in found), tuple(found), enclosed)
 
+    def doubt_m(self, around: FloorMap, known: Sequence[tuple[float, ...]]) -> float:
+        """By how much the place of some floor that was seen is in doubt."""
+        seen = (self._count >= _ENOUGH) & ~self._beside(around, known) & ~self._beyond() & np.isfinite(self._doubt_m)
+        return float(self._doubt_m[seen].max(initial=0.0))
+
     def bearings(self, cells: BoolArray, body: Pose2) -> FloatArray:
         """Bearing, rad, and distance, m, of cells, body frame, (n, 2)."""
         rows, columns = np.nonzero(cells)
@@ -334,13 +335,16 @@ class SeenFloor:
 
     # --- cells ------------------------------------------------------------------------------------
 
-    def _hidden(self, around: FloorMap, known: Sequence[tuple[float, ...]]) -> BoolArray:
+    def _beside(self, around: FloorMap, known: Sequence[tuple[float, ...]]) -> BoolArray:
         wide = np.ones((2 * _BESIDE_CELLS + 1,) * 2, dtype=np.uint8)
         occupied = self._aligned(around, around.occupied(), beyond=False)
         beside = cv2.dilate(occupied.astype(np.uint8), wide).astype(bool)
         for x, y, radius in known:
             beside |= self._disc(x, y, radius + CELL_M / 2)
-        hidden = (self._count < _ENOUGH) & ~beside & ~self._beyond()
+        return np.asarray(beside)
+
+    def _hidden(self, around: FloorMap, known: Sequence[tuple[float, ...]]) -> BoolArray:
+        hidden = (self._count < _ENOUGH) & ~self._beside(around, known) & ~self._beyond()
         # What is narrower than two cells hides no object.
         block = hidden[:-1, :-1] & hidden[1:, :-1] & hidden[:-1, 1:] & hidden[1:, 1:]
         wide_enough = np.zeros_like(hidden)

@@ -289,7 +289,7 @@ class Exploring:
             return f"{self._label} was not found; nowhere else to look from{_not_seen(rest, snapshot.body)}"
         radius_m = snapshot.actuators.config.search.radius_m
         enclosed = f", except {rest.enclosed_m2:.2f} m2 that obstacles enclose" if rest.enclosed_m2 >= 0.01 else ""
-        doubt_m = 2 * snapshot.estimator.seen.doubt_m
+        doubt_m = 2 * snapshot.estimator.seen.doubt_m(*snapshot.stands_around)
         if doubt_m > self.DOUBT_M:
             return (
                 f"{self._label} was not found within {radius_m:.1f} m{enclosed}, but the robot knew its place only to"
