@@ -19,7 +19,7 @@ from cocoro.bus.local import LocalMesh
 from cocoro.clock import NS, VirtualClock
 from cocoro.component import load
 from cocoro.errors import CocoroError
-from cocoro.messages import CancelRequest, EstopRequest, TaskReply, TaskRequest
+from cocoro.messages import CancelRequest, EstopRequest, TaskReply, TaskRequest, TaskState
 from cocoro.node import Node
 from cocoro.robot import Robot
 from deploy.processes import hardware, named, needs
@@ -30,6 +30,8 @@ SERVICES = ("sim", "perception", "planning", "executive")
 STANDING_MPS = 0.01
 PATIENCE_S = 25.0
 """Time limit to reach full speed."""
+ARRIVED = ("reach", "end")
+"""Phases in which a robot does not drive any more."""
 WATCH_S = 1.0
 """Time that it is watched after a fault."""
 FRAMES = {"width": 320, "height": 240, "frame_rate_hz": 30.0, "sensors": "real"}
@@ -83,6 +85,8 @@ class FaultRobot:
         self._stack = AsyncExitStack()
         self._rows: list[MotionRow] = []
         self._said: dict[str, bytes] = {}
+        self._phase = ""
+        """The phase of the task."""
         self.operator = Node("operator", self._mesh.join(), self._clock, self._robot)
 
     async def __aenter__(self) -> FaultRobot:
@@ -95,6 +99,7 @@ class FaultRobot:
             await self._stack.enter_async_context(node)
             self._runs.append(asyncio.ensure_future(component.run(node, config)))
         await self._stack.enter_async_context(self.operator)
+        self.operator.on(topics.TASK, self._note_phase)
         self._mesh.join().subscribe(f"{self._robot.name}/**", Qos.EVENT, self._hear, depth=1)
         return self
 
@@ -109,6 +114,9 @@ class FaultRobot:
     def _hear(self, key: str, payload: Payload) -> None:
         self._said.setdefault(key, bytes(payload))
 
+    def _note_phase(self, state: TaskState) -> None:
+        self._phase = state.phase
+
     # --- before -----------------------------------------------------------------------------------
 
     async def drive(self, rng: random.Random) -> MotionRow:
@@ -117,7 +125,7 @@ class FaultRobot:
         await self._begin()
         full_mps = 0.97 * full_speed_mps(self._errand.task.name)
         end_s = PATIENCE_S + self._now_s()
-        while self._now_s() < end_s:
+        while self._now_s() < end_s and self._phase not in ARRIVED:
             await asyncio.sleep(0.02)
             if self._newest().speed_mps < full_mps:
                 continue

@@ -131,7 +131,7 @@ def test_a_core_that_fails_now_differs(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_equal_outputs_exit_with_0_and_json_says_the_same(capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = ["capture", "reexecute", str(GOLDEN), "--service", "planning", "--tolerance", str(TOLERANCE)]
+    arguments = ["capture", "reexecute", str(GOLDEN), "--service", "perception", "--tolerance", str(TOLERANCE)]
     assert main(arguments) == 0
     assert "every one equal" in capsys.readouterr().out
     assert main([*arguments, "--json"]) == 0

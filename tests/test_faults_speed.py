@@ -44,4 +44,5 @@ def test_whatever_happens_at_full_speed_the_robot_stands_in_time(trials: dict[in
 
 
 def test_a_trial_is_the_same_again(trials: dict[int, Trial]) -> None:
-    assert run_trial(SEED, NUMBERS[0]) == trials[NUMBERS[0]]
+    number = NUMBERS[1]  # a short one
+    assert run_trial(SEED, number) == trials[number]
