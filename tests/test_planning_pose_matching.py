@@ -199,9 +199,7 @@ def test_a_step_with_known_errors_is_longer_and_bent() -> None:
 
 
 def test_the_doubt_grows_along_a_way_on_which_each_wall_is_placed_by_the_one_before() -> None:
-    pairs = [
-        (((1.2 * k, 0.9), (1.2 * k + 0.7, 1.3)), ((1.2 * k + 0.5, -1.2), (1.2 * k + 1.1, -0.8))) for k in range(8)
-    ]
+    pairs = [(((1.2 * k, 0.9), (1.2 * k + 0.7, 1.3)), ((1.2 * k + 0.5, -1.2), (1.2 * k + 1.1, -0.8))) for k in range(8)]
     drive = Drive(tuple(wall for pair in pairs for wall in pair))
     doubts_m = []
     for _ in range(6):

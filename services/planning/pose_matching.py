@@ -135,9 +135,7 @@ class Lines:
     def nearest(self, places_m: FloatArray, ways: FloatArray, within_m: float) -> Matched:
         """The line of the reference that is nearest to each place (n, 2) seen from a direction (n, 2)."""
         n = len(places_m)
-        matched = Matched(
-            np.zeros((n, 2)), np.zeros((n, 2)), np.zeros(n), np.zeros((n, 3)), np.zeros(n, dtype=bool)
-        )
+        matched = Matched(np.zeros((n, 2)), np.zeros((n, 2)), np.zeros(n), np.zeros((n, 3)), np.zeros(n, dtype=bool))
         if not len(self._spots):
             return matched
         x, y = (places_m[:, None] - self._spots[None]).transpose(2, 0, 1)
