@@ -173,7 +173,7 @@ class Verdict:
     last: str = ""
     """The joint that moved last, and how far."""
     held: bool = False
-    """Claws that touch an object swing with it until their torques balance; they are reported, not judged."""
+    """The claws touched an object."""
     real_s: float = 0.0
     code: int | None = None
     faults: list[str] = field(default_factory=list)
@@ -226,7 +226,7 @@ async def _judge_task(robot: Watched, verdict: Verdict, before: str, command: Co
         verdict.faults.append(command.said.decode(errors="replace"))
     if verdict.body_s > BOUND_S:
         verdict.faults.append(f"the body moved for {verdict.body_s:.3f} s")
-    if verdict.joints_s > BOUND_S or (verdict.claws_s > BOUND_S and not verdict.held):
+    if max(verdict.joints_s, verdict.claws_s) > BOUND_S:
         verdict.faults.append(f"the joints moved for too long: {verdict.last}")
     following = await robot.do(PutDownTask() if robot.holding else ParkTask())
     if not following.accepted:
@@ -264,9 +264,7 @@ def _line(verdict: Verdict) -> str:
 def _summary(verdicts: list[Verdict]) -> bool:
     if not verdicts:
         return False
-    rest = sorted(
-        max(verdict.body_s, verdict.joints_s, 0.0 if verdict.held else verdict.claws_s) for verdict in verdicts
-    )
+    rest = sorted(max(verdict.body_s, verdict.joints_s, verdict.claws_s) for verdict in verdicts)
     good = sum(not verdict.faults for verdict in verdicts)
     print(
         f"{good} of {len(verdicts)}: at rest after {statistics.median(rest):.3f} s (median), {rest[-1]:.3f} s"
