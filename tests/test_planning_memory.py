@@ -182,3 +182,23 @@ def test_at_any_rate_of_perception_a_standing_object_stands(period_s: float) -> 
     estimate = believed(memory, end_s)
     assert np.linalg.norm(np.array(estimate.position_m) - CAN) < (0.012 if period_s < 0.3 else 0.02)
     assert np.linalg.norm(estimate.velocity_mps) < 0.06
+
+
+def test_what_was_seen_in_an_object_s_place_under_another_label_before_is_forgotten() -> None:
+    memory = TargetMemory(MemoryConfig())
+    end_s = feed(memory, [CAN + np.array([0.02, 0.01, -0.02])] * 5, label="ball")
+    feed(memory, [CAN] * 2, start_s=end_s + 1.0)
+    assert memory.sure("ball"), "two sightings may be a mistake"
+    feed(memory, [CAN], start_s=end_s + 2.0)
+    assert memory.sightings("ball") == 0
+    assert memory.sure("can")
+
+
+def test_objects_side_by_side_or_on_one_another_are_both_remembered() -> None:
+    memory = TargetMemory(MemoryConfig())
+    feed(memory, [CAN + np.array([0.07, 0.0, 0.0])] * 5, label="neighbour")
+    feed(memory, [CAN + np.array([0.0, 0.0, 0.12])] * 5, label="upper")
+    feed(memory, [CAN] * 5, start_s=1.0)
+    assert memory.sure("neighbour")
+    assert memory.sure("upper")
+    assert memory.sure("can")

@@ -196,3 +196,25 @@ def test_a_step_with_known_errors_is_longer_and_bent() -> None:
     assert step.yaw_rad == pytest.approx(0.8)
     assert step.x_m == pytest.approx(1.1 * cos(0.2))
     assert step.y_m == pytest.approx(1.1 * sin(0.2))
+
+
+def test_the_doubt_grows_along_a_way_on_which_each_wall_is_placed_by_the_one_before() -> None:
+    pairs = [(((1.2 * k, 0.9), (1.2 * k + 0.7, 1.3)), ((1.2 * k + 0.5, -1.2), (1.2 * k + 1.1, -0.8))) for k in range(8)]
+    drive = Drive(tuple(wall for pair in pairs for wall in pair))
+    doubts_m = []
+    for _ in range(6):
+        drive.go(0.02, 0.0, Constants(veer_radpm=VEER_RADPM), 50)
+        doubts_m.append(drive.matching.doubt_m)
+    error_m, _ = error(drive.matching.place(drive.odometry), drive.true)
+    assert doubts_m == sorted(doubts_m)
+    assert error_m < 2 * drive.matching.doubt_m
+    assert error_m > 2 * drive.matching.sigma_m, "the filter alone would be too sure"
+
+
+def test_walls_that_are_seen_again_bound_the_doubt() -> None:
+    drive = Drive(ROOM)
+    drive.loop(Constants(veer_radpm=VEER_RADPM))
+    once_m = drive.matching.doubt_m
+    for _ in range(3):
+        drive.loop(Constants(veer_radpm=VEER_RADPM))
+    assert drive.matching.doubt_m < 1.3 * once_m

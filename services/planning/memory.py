@@ -20,6 +20,8 @@ from services.planning.config import MemoryConfig
 
 _SURE = 3
 """Sightings after which an object counts as existing."""
+_ONE_PLACE_M = 0.05
+"""Two objects whose middles are nearer than this along each axis are one object, seen under two labels."""
 _AGREE = 3
 """Consecutive outliers in agreement that move the object to their position."""
 
@@ -73,6 +75,21 @@ class TargetMemory:
         self._update(track, predicted, position_m, dt_s, sigma_m)
         track.stamp_ns = stamp_ns
         track.sightings += 1
+        if track.sightings >= _SURE:
+            self._forget_mistaken(label, track)
+
+    def _forget_mistaken(self, label: str, track: Track) -> None:
+        """Forget what was seen in an object's place before under another label: from far or in part, a can may look
+        like a ball. It would be an obstacle in the object's own place."""
+        mistaken = [
+            other
+            for other, was in self._tracks.items()
+            if other != label
+            and was.stamp_ns < track.stamp_ns
+            and np.abs(was.position_m - track.position_m).max() < _ONE_PLACE_M
+        ]
+        for other in mistaken:
+            del self._tracks[other]
 
     def _update(self, track: Track, predicted: FloatArray, seen: FloatArray, dt_s: float, sigma_m: float) -> None:
         fade = exp(-dt_s / self._config.velocity_fade_s) if dt_s > 0.2 else 1.0

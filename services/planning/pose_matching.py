@@ -9,7 +9,7 @@ where nothing can be seen, too.
 
 from __future__ import annotations
 
-from math import cos, hypot, pi, sin
+from math import cos, hypot, pi, sin, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -84,6 +84,8 @@ class Matched(NamedTuple):
     """(n, 2)."""
     variance_m2: FloatArray
     """Of the references about the line, (n,)."""
+    doubt: FloatArray
+    """Variance of the pose from which each line's reference was entered: x, y in m2, yaw in rad2, (n, 3)."""
     exists: BoolArray
     """Whether a place has a line, (n,)."""
 
@@ -93,7 +95,7 @@ class References:
 
     def __init__(self) -> None:
         self._rows: dict[tuple[int, int, int], int] = {}
-        self._sums = np.zeros((_MOST_REFERENCES, 4))
+        self._sums = np.zeros((_MOST_REFERENCES, 7))
         self._count = np.zeros(_MOST_REFERENCES, dtype=np.int64)
 
     def clear(self) -> None:
@@ -101,8 +103,9 @@ class References:
         self._sums[:] = 0.0
         self._count[:] = 0
 
-    def enter(self, places_m: FloatArray, towards: FloatArray) -> None:
-        """Enter places (n, 2), seen from the directions (n, 2), unit vectors."""
+    def enter(self, places_m: FloatArray, towards: FloatArray, doubt: FloatArray) -> None:
+        """Enter places (n, 2), seen from the directions (n, 2), unit vectors. `doubt`: the variance of the pose that
+        they were seen from, (3,)."""
         cells = np.floor(places_m / CELL_M).astype(np.int64)
         quarters = np.floor(np.arctan2(towards[:, 1], towards[:, 0]) / (2 * pi / _QUARTERS)).astype(np.int64)
         for (x, y), quarter, place, way in zip(cells.tolist(), quarters.tolist(), places_m, towards, strict=True):
@@ -110,28 +113,29 @@ class References:
             if row >= _MOST_REFERENCES:
                 del self._rows[(x, y, quarter)]
             elif self._count[row] < _FROZEN:
-                self._sums[row] += (*place, *way)
+                self._sums[row] += (*place, *way, *doubt)
                 self._count[row] += 1
 
     def look(self) -> Lines:
         """The lines through the references as they are now."""
         n = len(self._rows)
         means = self._sums[:n] / np.maximum(self._count[:n, None], 1)
-        return Lines(means[:, :2], means[:, 2:])
+        return Lines(means[:, :2], means[:, 2:4], means[:, 4:])
 
 
 class Lines:
     """Lines through references, each worked out when it is first asked for."""
 
-    def __init__(self, spots_m: FloatArray, ways: FloatArray) -> None:
-        """`spots_m`: the references' places (n, 2); `ways`: the directions from which they were seen (n, 2)."""
-        self._spots, self._ways = spots_m, ways
+    def __init__(self, spots_m: FloatArray, ways: FloatArray, doubts: FloatArray) -> None:
+        """`spots_m`: the references' places (n, 2); `ways`: the directions from which they were seen (n, 2); `doubts`:
+        the variances of the poses from which they were seen (n, 3)."""
+        self._spots, self._ways, self._doubts = spots_m, ways, doubts
         self._known: dict[int, tuple[FloatArray, FloatArray, float] | None] = {}
 
     def nearest(self, places_m: FloatArray, ways: FloatArray, within_m: float) -> Matched:
         """The line of the reference that is nearest to each place (n, 2) seen from a direction (n, 2)."""
         n = len(places_m)
-        matched = Matched(np.zeros((n, 2)), np.zeros((n, 2)), np.zeros(n), np.zeros(n, dtype=bool))
+        matched = Matched(np.zeros((n, 2)), np.zeros((n, 2)), np.zeros(n), np.zeros((n, 3)), np.zeros(n, dtype=bool))
         if not len(self._spots):
             return matched
         x, y = (places_m[:, None] - self._spots[None]).transpose(2, 0, 1)
@@ -145,6 +149,7 @@ class Lines:
             if line is not None:
                 theirs = near & (nearest == number)
                 matched.middle_m[theirs], matched.normal[theirs], matched.variance_m2[theirs] = line
+                matched.doubt[theirs] = self._doubts[number]
                 matched.exists[theirs] = True
         return matched
 
@@ -181,6 +186,9 @@ class PoseMatching:
         self.shift: Pose2 | None = None
         """The odometry frame's pose in the corrected frame; None while nothing is corrected."""
         self._covariance = np.diag([0.0, 0.0, 0.0, *np.square(_CONSTANTS_SIGMA)])
+        self._doubt = np.zeros((3, 3))
+        """Covariance of the pose since the search began. The filter's own is that of the pose among the references: it
+        knows nothing of the error that they have in common, which grows from each to those that are entered by it."""
         self._marks: dict[str, Mark] = {}
         self._task_id = ""
         self._matched: tuple[Pose2, float] | None = None
@@ -193,6 +201,7 @@ class PoseMatching:
             self._references.clear()
             self._marks.clear()
             self._covariance[:3] = self._covariance[:, :3] = 0.0
+            self._doubt[:] = 0.0
             self._matched = None
 
     def place(self, odometry: Pose2) -> Pose2:
@@ -210,8 +219,9 @@ class PoseMatching:
 
     @property
     def doubt_m(self) -> float:
-        """Standard deviation of the floor that is seen at the usual distance."""
-        return self.sigma_m + self.sigma_rad * _USUAL_M
+        """Standard deviation of the floor that is seen at the usual distance, with the error of the references."""
+        place_m2 = float(np.linalg.eigvalsh(self._doubt[:2, :2])[-1].clip(0.0))
+        return sqrt(place_m2) + sqrt(self._doubt[2, 2]) * _USUAL_M
 
     def moved(self, before: Pose2, after: Pose2) -> None:
         """Note a step of the odometry."""
@@ -225,12 +235,14 @@ class PoseMatching:
         change[0, 2], change[1, 2] = -dy, dx
         change[:3, 3:] = [[dx, 0.0, 0.0], [dy, 0.0, 0.0], [0.0, turn, x]]
         length = hypot(x, y)
+        slip = np.array([_SLIP_M2 * length, _SLIP_M2 * length, _SLIP_RAD2 * length + _SLIP_TURN_RAD2 * abs(turn)])
+        before_pose = self._covariance[:3, :3].copy()
         self._covariance = change @ self._covariance @ change.T
-        self._covariance[[0, 1, 2], [0, 1, 2]] += (
-            _SLIP_M2 * length,
-            _SLIP_M2 * length,
-            _SLIP_RAD2 * length + _SLIP_TURN_RAD2 * abs(turn),
-        )
+        self._covariance[[0, 1, 2], [0, 1, 2]] += slip
+        # What a wrong constant adds depends on it, not on the pose.
+        turned = change[:3, :3]
+        self._doubt = turned @ self._doubt @ turned.T
+        self._doubt += self._covariance[:3, :3] - turned @ before_pose @ turned.T
 
     def scan(self, points_m: FloatArray, origin_m: tuple[float, float], odometry: Pose2, pan_rad: float) -> bool:
         """Match a scan's points (n, 2), body frame, seen from a place, and enter them; whether the pose changed."""
@@ -241,7 +253,9 @@ class PoseMatching:
             changed = self._match(points, ways, odometry)
         if self.sigma_m < _SURE_M and self.sigma_rad < _SURE_RAD:
             pose = self.place(odometry)
-            self._references.enter(_moved(points, pose), _moved(ways, Pose2(yaw_rad=pose.yaw_rad)))
+            self._references.enter(
+                _moved(points, pose), _moved(ways, Pose2(yaw_rad=pose.yaw_rad)), self._doubt.diagonal()
+            )
         return changed
 
     def _due(self, odometry: Pose2, pan_rad: float) -> bool:
@@ -290,8 +304,15 @@ class PoseMatching:
         change = gain @ off
         left = np.linalg.inv(prior + information)
         self._covariance -= gain @ (expected - left) @ gain.T
+        self._doubt_less(matched.doubt[known].mean(axis=0))
         self._correct(change, odometry)
         return True
+
+    def _doubt_less(self, theirs: FloatArray) -> None:
+        """After a match the pose is in doubt as its references are (3,), and as it is among them."""
+        now = theirs + self._covariance[:3, :3].diagonal()
+        share = np.sqrt(np.clip(now / np.maximum(self._doubt.diagonal(), 1e-12), 0.0, 1.0))
+        self._doubt = self._doubt * share[:, None] * share
 
     def sight(self, label: str, place_m: tuple[float, float], odometry: Pose2) -> bool:
         """Compare where a known object is seen, body frame, with where it was seen first; whether the pose changed. An
