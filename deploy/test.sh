@@ -17,13 +17,13 @@ check mypy
 check lint-imports --no-logo
 [ ${#unclean[@]} = 0 ] || echo "NOT CLEAN: ${unclean[*]}"
 
-# Tests marked `alone` measure real time, which load would falsify. The others run on two workers; each file
+# Tests that measure real time run alone, since load would falsify their times. The others run on two workers; each file
 # stays on one of them, so that what a file's tests share is made once.
 if [ $# = 0 ]; then
     echo "== pytest on two workers, without the tests that measure real time"
-    pytest -rs -n 2 --dist loadfile -m "not alone"
+    pytest -rs -n 2 --dist loadfile -m "not zenoh"
     tests=$?
-    set -- -m alone
+    set -- -m zenoh
 fi
 echo "== pytest $*"
 pytest -rs "$@" || tests=$?

@@ -228,7 +228,6 @@ async def joining_s(config: ZenohConfig) -> float:
 
 
 @pytest.mark.process
-@pytest.mark.alone
 @scenario
 async def test_a_crowd_of_idle_connections_keeps_nobody_out(directory: Path) -> None:
     """The connections do not speak zenoh. The directory is private, so only this user's processes can make such."""

@@ -37,7 +37,7 @@ from services.capture.log_clock import WALL_CLOCK, LogClock
 from services.capture.packing import Packer
 from services.capture.service import run
 
-pytestmark = [pytest.mark.alone, pytest.mark.zenoh]
+pytestmark = pytest.mark.zenoh
 
 ROBOT = "calliope"
 KILLS = 5

@@ -79,7 +79,7 @@ async def _until(content: Callable[[], object]) -> None:
 
 
 @pytest.mark.process
-@pytest.mark.alone
+@pytest.mark.zenoh
 def test_the_base_speaks_as_it_declares(tmp_path: Path) -> None:
     async def scenario() -> list[str]:
         with CreateBench(tmp_path) as bench:
@@ -90,7 +90,7 @@ def test_the_base_speaks_as_it_declares(tmp_path: Path) -> None:
     assert asyncio.run(scenario()) == []
 
 
-@pytest.mark.alone
+@pytest.mark.zenoh
 def test_the_servos_speak_as_they_declare(tmp_path: Path) -> None:
     async def scenario() -> list[str]:
         with ServoBench(tmp_path) as bench:
@@ -124,7 +124,7 @@ async def test_the_kinect_speaks_as_it_declares(monkeypatch: pytest.MonkeyPatch)
 
 
 @pytest.mark.process
-@pytest.mark.alone
+@pytest.mark.zenoh
 @pytest.mark.sim
 @pytest.mark.usefixtures("root")
 def test_the_simulator_behind_wires_speaks_as_it_declares() -> None:

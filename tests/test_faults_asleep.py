@@ -13,7 +13,7 @@ from faults_live import PROCESSES, LiveRobot, live
 from operator_shell import Running
 from test_faults_live import FAR
 
-pytestmark = [pytest.mark.alone, pytest.mark.zenoh, pytest.mark.sim, pytest.mark.process]
+pytestmark = [pytest.mark.zenoh, pytest.mark.sim, pytest.mark.process]
 
 LEASE_S = 1.0
 ASLEEP_S = 4.0

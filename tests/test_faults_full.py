@@ -17,7 +17,7 @@ from operator_shell import Shell
 from apps.cli import exits
 from cocoro.bus import shared
 
-pytestmark = [pytest.mark.alone, pytest.mark.zenoh, needs_root, pytest.mark.process]
+pytestmark = [pytest.mark.zenoh, needs_root, pytest.mark.process]
 
 
 @pytest.fixture

@@ -16,7 +16,7 @@ from spelled import asked
 from cocoro import topics
 from deploy.processes import hardware
 
-pytestmark = [pytest.mark.alone, pytest.mark.zenoh, pytest.mark.sim, pytest.mark.process]
+pytestmark = [pytest.mark.zenoh, pytest.mark.sim, pytest.mark.process]
 
 ZERO_S = 0.22
 """Bound from the fault until only zero is commanded."""

@@ -108,7 +108,6 @@ def test_a_simulator_and_the_hardware_it_stands_in_for_never_run_side_by_side(ru
 
 
 @pytest.mark.process
-@pytest.mark.alone
 @pytest.mark.zenoh
 @pytest.mark.parametrize(("process", "first"), [("executive", "executive"), ("sim", "arm")])
 def test_of_two_that_start_at_once_one_runs_and_one_is_refused_in_a_line(

@@ -90,7 +90,6 @@ def free_port() -> int:
 
 
 @pytest.mark.process
-@pytest.mark.alone
 @pytest.mark.zenoh
 def test_two_robots_behind_one_router_each_do_their_own(tmp_path: Path) -> None:
     async def scenario() -> None:

@@ -15,7 +15,7 @@ from apps.cli import exits
 from deploy.processes import hardware, stoppable
 from deploy.rundir import RunDir
 
-pytestmark = [pytest.mark.alone, pytest.mark.zenoh, pytest.mark.sim, pytest.mark.process]
+pytestmark = [pytest.mark.zenoh, pytest.mark.sim, pytest.mark.process]
 
 UNDER_WAY_S = 0.1
 """Allowance for messages under way on a busy machine, plus one period of the true state, s."""

@@ -100,7 +100,6 @@ def test_where_nobody_watches_nothing_is_kept(environment: dict[str, str], monke
 
 
 @pytest.mark.process
-@pytest.mark.alone
 @pytest.mark.zenoh
 def test_a_supervisor_pets_the_watchdog_from_when_the_robot_is_up(
     manager: Manager, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

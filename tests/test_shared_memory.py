@@ -69,7 +69,6 @@ def test_who_publishes_the_frames_says_so_in_the_process_table() -> None:
 
 @pytest.mark.process
 @needs_root
-@pytest.mark.alone
 @pytest.mark.zenoh
 @pytest.mark.parametrize(("kind", "publishers", "readers"), [("publisher", 1, 0), ("reader", 0, 1), ("plain", 0, 0)])
 def test_what_is_needed_is_what_is_taken_and_given_back(
@@ -131,7 +130,6 @@ os._exit(0)
 
 @pytest.mark.process
 @needs_root
-@pytest.mark.alone
 @pytest.mark.zenoh
 @pytest.mark.parametrize(
     ("soft", "hard", "has_it"), [(0, 8 << 20, False), (8 << 20, 64 << 20, True), (64 << 20, 64 << 20, True)]
@@ -195,7 +193,6 @@ def test_the_doctor_names_a_run_directory_that_is_another_user_s(root: Path) -> 
 # --- without ------------------------------------------------------------------------------------------
 
 
-@pytest.mark.alone
 @scenario
 async def test_frames_reach_a_receiver_without_shared_memory(directory: Path, needs_pool: None) -> None:
     """Frames arrive whole and in order beside a receiver with shared memory, from a publisher with it."""
@@ -231,7 +228,6 @@ def no_room(monkeypatch: pytest.MonkeyPatch) -> None:
     has_free(monkeypatch, 0)
 
 
-@pytest.mark.alone
 @scenario
 async def test_without_room_a_session_opens_and_a_publisher_says_why_its_frames_are_copied_once(
     directory: Path, no_room: None, caplog: pytest.LogCaptureFixture
@@ -248,7 +244,6 @@ async def test_without_room_a_session_opens_and_a_publisher_says_why_its_frames_
     assert [record.message for record in caplog.records] == [f"no shared memory: {why}; {shared.COSTS}"]
 
 
-@pytest.mark.alone
 @scenario
 async def test_room_for_a_session_but_not_for_frames_is_said_once(
     directory: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
@@ -265,7 +260,6 @@ async def test_room_for_a_session_but_not_for_frames_is_said_once(
 
 @pytest.mark.process
 @needs_root
-@pytest.mark.alone
 @pytest.mark.zenoh
 def test_what_fills_between_the_look_and_the_taking_ends_nothing(directory: Path) -> None:
     """Zenoh itself is refused then: the session opens without, and what was begun is given back."""

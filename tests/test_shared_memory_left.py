@@ -98,7 +98,6 @@ def test_a_pool_that_is_given_up_leaves_nothing(needs_pool: None) -> None:
 
 @pytest.mark.process
 @needs_root
-@pytest.mark.alone
 @pytest.mark.zenoh
 def test_a_live_process_s_segments_survive_the_sweep_of_what_a_killed_one_left(directory: Path) -> None:
     with Namespace({shared.PLACE: "size=64m"}) as namespace:

@@ -19,7 +19,7 @@ from bench.stop import SITUATIONS
 from cocoro.stop.record import latch_dir, read
 from deploy.rundir import RunDir
 
-pytestmark = [pytest.mark.alone, pytest.mark.zenoh, pytest.mark.sim, pytest.mark.process]
+pytestmark = [pytest.mark.zenoh, pytest.mark.sim, pytest.mark.process]
 
 ROOT = Path(__file__).parents[1]
 SMALL = ("--frames", "160x120@10")

@@ -12,7 +12,7 @@ from operator_shell import Shell
 
 from deploy.rundir import RunDir
 
-pytestmark = [pytest.mark.alone, pytest.mark.zenoh, pytest.mark.sim, pytest.mark.process]
+pytestmark = [pytest.mark.zenoh, pytest.mark.sim, pytest.mark.process]
 
 
 @pytest.fixture
