@@ -26,7 +26,7 @@ TICK_HZ = os.sysconf("SC_CLK_TCK")
 class Taker(NamedTuple):
     pid: int
     what: str
-    """The robot's name of it, or its command line, without the program's folder."""
+    """The robot's name of it, or its command line, without the folders of program and script."""
     share: float
     """Of one core."""
 
@@ -141,6 +141,8 @@ def _command(proc: Path, pid: int) -> str:
     except OSError:
         return "?"
     program, *arguments = (word.decode(errors="replace") for word in words)
+    if arguments and arguments[0].startswith("/"):  # an interpreter's script
+        arguments[0] = arguments[0].rpartition("/")[2]
     line = " ".join(filter(None, (program.rpartition("/")[2], *arguments)))
     printable = "".join(c if c.isprintable() else " " for c in line)
     return printable if len(printable) <= WORDS else f"{printable[: WORDS - 1]}…"

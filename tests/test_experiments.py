@@ -239,6 +239,7 @@ def made_up(run: ExperimentRun, lesson: RunResult) -> dict[str, Any]:
     }  # fmt: skip
 
 
+@pytest.mark.process  # matplotlib asks a program for this machine's fonts, once
 def test_the_report_has_tables_plots_and_verdicts_in_every_format(
     learned: tuple[ExperimentSettings, RunResult],
 ) -> None:

@@ -170,6 +170,8 @@ class Mark(NamedTuple):
     place_m: FloatArray
     """Mean place of its first sightings, corrected frame, (2,)."""
     sightings: int
+    doubt: FloatArray
+    """Variance of the pose at its first sighting: x, y in m2, yaw in rad2, (3,)."""
     from_: Pose2
     """The odometry's pose at the last sighting that counted."""
 
@@ -322,8 +324,9 @@ class PoseMatching:
         mark = self._marks.get(label)
         if mark is None or mark.sightings < _FIRST:
             if self.sigma_m < _SURE_M and self.sigma_rad < _SURE_RAD:
-                before, count = (mark.place_m, mark.sightings) if mark is not None else (there, 0)
-                self._marks[label] = Mark(before + (there - before) / (count + 1), count + 1, odometry)
+                mark = mark or Mark(there, 0, self._doubt.diagonal().copy(), odometry)
+                mean_m = mark.place_m + (there - mark.place_m) / (mark.sightings + 1)
+                self._marks[label] = Mark(mean_m, mark.sightings + 1, mark.doubt, odometry)
             return False
         step = mark.from_.inverse().compose(odometry)
         if hypot(step.x_m, step.y_m) < _MOVED_M and abs(wrap_rad(step.yaw_rad)) < _TURNED_RAD:
@@ -338,6 +341,7 @@ class PoseMatching:
             return False
         gain = self._covariance[:, :3] @ slope.T @ np.linalg.inv(expected)
         self._covariance -= gain @ expected @ gain.T
+        self._doubt_less(mark.doubt)
         self._correct(gain @ rest, odometry)
         self._marks[label] = mark._replace(from_=odometry)
         return True
