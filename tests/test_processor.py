@@ -42,19 +42,19 @@ def test_it_names_who_waited_and_who_took_the_processor(proc: Proc) -> None:
     robot = {"planning": 10, "executive": 11}
     proc.has(10, "planner", cpu_s=1.0, waited_s=2.0)
     proc.has(11, "executive", cpu_s=1.0, waited_s=2.0)
-    proc.has(20, "python -c loop", cpu_s=50.0)
+    proc.has(20, "python /else/where/loop.py now", cpu_s=50.0)
     assert watch.take(robot) is None
     proc.now_s += 10.0
     proc.has(10, "planner", cpu_s=3.0, waited_s=6.0)
     proc.has(11, "executive", cpu_s=1.1, waited_s=2.5)
-    proc.has(20, "python -c loop", cpu_s=57.0)
+    proc.has(20, "python /else/where/loop.py now", cpu_s=57.0)
     use = watch.take(robot)
     assert use is not None
     assert use.waited == pytest.approx({"planning": 0.4, "executive": 0.05})
     assert use.starved == ["planning"]
-    assert [(taker.pid, taker.what) for taker in use.takers] == [(20, "python -c loop"), (10, "planning")]
+    assert [(taker.pid, taker.what) for taker in use.takers] == [(20, "python loop.py now"), (10, "planning")]
     assert "of 10 s waited planning 40%" in use.words
-    assert "python -c loop (pid 20) 70%" in use.words
+    assert "python loop.py now (pid 20) 70%" in use.words
 
 
 def test_of_a_machine_with_room_nothing_is_said(proc: Proc) -> None:
