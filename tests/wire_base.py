@@ -99,7 +99,7 @@ class FakeService:
         self._asking.clear()
 
         def ask() -> None:
-            with suppress(BrokenPipeError):  # the guard has ended
+            with suppress(BrokenPipeError, ConnectionResetError):  # the guard has ended
                 while not self._asking.wait(0.02):
                     self.ask(left, right)
 
