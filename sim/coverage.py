@@ -39,7 +39,7 @@ class Coverage(msgspec.Struct, frozen=True, kw_only=True):
     missed: int
     """Not seen, though a pose would have shown it."""
     hiding: int
-    """Of the missed cells those in a square of two by two that were all missed: an object can stand there unseen."""
+    """Missed cells in squares of two by two that were all missed: an object can stand there unseen."""
     missed_at_m: tuple[tuple[float, float], ...]
     """Some of the missed cells, in the robot's frame at the start."""
 

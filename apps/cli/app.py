@@ -116,7 +116,8 @@ class CommandGroup(TyperGroup):
 
 
 _TAG = re.compile(r"\[[a-z#/@][^\[]*?\]")
-"""What `rich.markup` takes for a tag; it is not imported, since a shell that completes a word waits for it."""
+"""Brackets that `rich.markup` takes for a tag. That module is not imported: a shell that completes a word would wait for
+the import."""
 
 
 def with_brackets(command: Any) -> Any:

@@ -18,7 +18,8 @@ LOOK_S = 0.2
 REJOIN_S = 2.0
 """After so long without contact the mesh is joined anew, by another session, and so often again."""
 LIVING_S = 60.0
-"""So long an executive is looked for whose process lives; for one that may have died, RECOVERY_S."""
+"""Time for which the command looks for an executive whose process lives. One that may have died is looked for during
+RECOVERY_S."""
 LATE_S = 5.0
 """After so long without news of the task the executive is asked for it; it tells the task's state 5 times a second."""
 
