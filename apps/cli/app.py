@@ -116,8 +116,8 @@ class CommandGroup(TyperGroup):
 
 
 _TAG = re.compile(r"\[[a-z#/@][^\[]*?\]")
-"""Brackets that `rich.markup` takes for a tag. That module is not imported: a shell that completes a word would wait for
-the import."""
+"""Brackets that `rich.markup` takes for a tag. That module is not imported, since a shell that completes a word would
+wait for it."""
 
 
 def with_brackets(command: Any) -> Any:

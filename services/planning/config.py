@@ -66,7 +66,7 @@ class SearchConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     least_m2: Positive = 0.01
     """Least unseen floor for which the robot goes to another place."""
     least_foot_m2: Positive = 0.0075
-    """Least unseen floor at the feet of walls for which the robot goes to another place, once all other floor was seen."""
+    """Least unseen floor at the feet of walls for which it goes to another place, once all other floor was seen."""
     drive_mps: Positive = 0.2
     turn_radps: Positive = 0.7
     look_s: Positive = 5.0
