@@ -143,11 +143,22 @@ def test_the_preview_is_the_way_that_is_driven() -> None:
     assert (end.x_m, end.y_m, end.yaw_rad) == pytest.approx((base.pose.x_m, base.pose.y_m, base.pose.yaw_rad), abs=0.06)
 
 
-def test_what_is_beyond_the_aim_does_not_hold_up_the_last_centimetres() -> None:
+def test_before_an_aim_near_an_obstacle_the_robot_goes_so_slowly_that_it_can_stop_at_the_aim() -> None:
     around, config = Surroundings("hand_marker"), PlanningConfig()
     around.floor.bump([(ROBOT.base.chassis_diameter_m / 2 + 0.09, y) for y in (-0.05, 0.0, 0.05)])
-    fields = around.fields("", (), 0)
+    fields, driver = around.fields("", (), 0), Driver(CONFIG, ROBOT.base)
     course = Course(ROBOT, config, AIM_M, arm="folded")
-    for left_m, direct, guarded in ((0.04, True, False), (0.30, True, True), (0.04, False, True)):
-        move = Move(0.20, 0.0, left_m, "", direct)
-        assert course.guarded(move, Pose2(), fields, Driver(CONFIG, ROBOT.base)) == guarded
+
+    def speed_mps(left_m: float, direct: bool) -> float:
+        return course.careful(Move(0.20, 0.1, left_m, "", direct), Pose2(), fields, driver).speed_mps
+
+    assert course.guarded(Move(0.20, 0.1, 0.04, "", True), Pose2(), fields, driver)
+    assert 0.05 < speed_mps(0.04, direct=True) < 0.15
+    assert speed_mps(0.30, direct=True) == 0.0
+    assert speed_mps(0.04, direct=False) == 0.0
+
+
+@pytest.mark.parametrize("way_m", [0.02, 0.05, 0.12, 0.4])
+def test_at_the_stopping_speed_of_a_way_the_stopping_poses_end_with_it(way_m: float) -> None:
+    driver = Driver(CONFIG, ROBOT.base)
+    assert driver.stopping_poses(driver.stopping_mps(way_m), 0.0)[-1].x_m == pytest.approx(way_m)

@@ -284,9 +284,10 @@ class Course:
             move = move._replace(look_at=(x, y))
             if hypot(x - body.x_m, y - body.y_m) < 0.55 and move.speed_mps > 0:
                 move = move._replace(speed_mps=0.0, why=f"looking where to go; {move.why}")
-        if self.guarded(move, body, fields, driver):
-            move = move._replace(speed_mps=0.0, why=f"something is in the way; {move.why}")
-            self._planned_ns = None if self._planned_ns is None else min(self._planned_ns, now_ns - _REPLAN_NS // 2)
+        careful = self.careful(move, body, fields, driver)
+        if careful.speed_mps == 0.0 and move.speed_mps != 0.0 and self._planned_ns is not None:
+            self._planned_ns = min(self._planned_ns, now_ns - _REPLAN_NS // 2)
+        move = careful
         waiting = move.speed_mps == 0.0 and abs(move.turn_radps) < 0.05
         if not waiting:
             self._stuck_since_ns = None
@@ -296,14 +297,23 @@ class Course:
             return move._replace(blocked=True, why="there is no free way")
         return move
 
+    def careful(self, move: Move, body: Pose2, fields: Fields, driver: Driver) -> Move:
+        """The move, without speed where an obstacle is too near to stop before it. Before an aim that stands near an
+        obstacle the robot goes so slowly that it can stop at the aim."""
+        if not self.guarded(move, body, fields, driver):
+            return move
+        if move.direct:
+            share = min(driver.stopping_mps(move.left_m) / abs(move.speed_mps), 1.0)
+            slower = move._replace(speed_mps=share * move.speed_mps, turn_radps=share * move.turn_radps)
+            if not self.guarded(slower, body, fields, driver):
+                return slower
+        return move._replace(speed_mps=0.0, why=f"something is in the way; {move.why}")
+
     def guarded(self, move: Move, body: Pose2, fields: Fields, driver: Driver) -> bool:
         """Whether body or hand would reach an obstacle before the robot could stop."""
         if move.speed_mps == 0.0:
             return False
-        stopping = driver.stopping_poses(move.speed_mps, move.turn_radps)
-        if move.direct:  # it stops at the aim anyway
-            stopping = [pose for pose in stopping if hypot(pose.x_m, pose.y_m) <= move.left_m] or stopping[:1]
-        poses = [body.compose(pose) for pose in stopping]
+        poses = [body.compose(pose) for pose in driver.stopping_poses(move.speed_mps, move.turn_radps)]
         centres = np.array([[body.x_m, body.y_m], *([pose.x_m, pose.y_m] for pose in poses)])
         clearance = fields.body.at(centres) - self._body_m
         nearer = clearance[1:].min() < min(float(clearance[0]), self._config.clearance_m / 2)

@@ -18,6 +18,10 @@ from services.planning.config import NavigationConfig
 
 PREVIEW_S = 0.1
 """Time between two poses of a previewed drive, s."""
+_REACTION_S = 0.25
+"""Time that passes at full speed before the robot brakes."""
+_BRAKING_SHARE = 0.6
+"""Way of braking as a share of speed squared by acceleration: the half, and a fifth more."""
 
 
 @dataclass(frozen=True)
@@ -99,12 +103,17 @@ class Driver:
 
     def stopping_poses(self, speed_mps: float, turn_radps: float) -> list[Pose2]:
         """The poses, in the present body frame, while the robot reacts and stops."""
-        time_s = 0.25 + abs(speed_mps) / self._config.acceleration_mps2 * 0.6
+        time_s = _REACTION_S + _BRAKING_SHARE * abs(speed_mps) / self._config.acceleration_mps2
         steps = max(2, round(time_s / 0.08))
         poses = [Pose2()]
         for _ in range(steps):
             poses.append(poses[-1].compose(Pose2(speed_mps * time_s / steps, 0.0, turn_radps * time_s / steps)))
         return poses[1:]
+
+    def stopping_mps(self, way_m: float) -> float:
+        """The greatest speed from which the robot reacts and stops within a way, m: `stopping_poses` end there."""
+        braking = _BRAKING_SHARE / self._config.acceleration_mps2
+        return (sqrt(_REACTION_S**2 + 4 * braking * max(way_m, 0.0)) - _REACTION_S) / (2 * braking)
 
     def command(self, speed_mps: float, turn_radps: float, dt_s: float, *, brisk: bool = False) -> BaseCommand:
         """Approach a speed and turn rate within the acceleration limits; `brisk`: within twice the limits, for pursuit.

@@ -22,6 +22,7 @@ from cocoro.robot import Robot
 from services.planning.config import SearchConfig
 from services.planning.floor_map import CELL_M, SIZE, FloorMap, overlap
 from services.planning.head import PAN, TILT
+from services.planning.wall_feet import ANYWHERE, own_sides, sector
 
 _STRETCH_BYTES = 6
 _DOUBT = np.ones((3, 3), dtype=np.uint8)
@@ -34,16 +35,11 @@ _PATIENCE = 2
 """Looks that should have shown a cell and did not, after which it is given up."""
 _BESIDE_CELLS = 2
 """Cells about an obstacle that belong to it: the map shows only what faces the robot."""
-_AWAY_CELLS = 4
-"""Cells within which an obstacle's parts tell to which of its sides floor belongs."""
 _FOOT_M = 3.0
 """Distance up to which the foot of a wall counts as seen."""
 _ROW_RAD, _CAMERA_M = 0.0125, 0.73
 """Angle between two rows of a depth image's points, and the camera's height: shown floor ends up to a row before it
 ends."""
-_SECTORS = 60
-"""Directions from which a cell is seen are told apart by so many sectors."""
-_ANYWHERE = (1 << _SECTORS) - 1
 _RAYS, _STEP_M = 120, 0.075
 _FINE_RAYS = 540
 _CORNER_CELLS = 4
@@ -62,26 +58,6 @@ _AREA_M2 = CELL_M**2
 
 
 _Cells = TypeVar("_Cells", FloatArray, BoolArray)
-
-
-def _away_kernels() -> tuple[FloatArray, FloatArray]:
-    """Kernels that add up, for a cell, the directions from the obstacles' cells near it, along x and along y."""
-    reach = np.arange(-_AWAY_CELLS, _AWAY_CELLS + 1, dtype=np.float64)
-    x, y = np.meshgrid(reach, reach, indexing="ij")
-    share = 1.0 / np.maximum(x**2 + y**2, 1.0) ** 1.5
-    return -x * share, -y * share
-
-
-def _own_sides() -> IntArray:
-    """For each direction away from an obstacle (sectors) the sectors (bits) from which its foot is seen."""
-    sectors = (np.arange(_SECTORS) + 0.5) * (2 * np.pi / _SECTORS)
-    own = np.cos(sectors[:, None] - sectors) > -1e-9
-    sides: IntArray = (own.astype(np.int64) << np.arange(_SECTORS)).sum(axis=1)
-    return sides
-
-
-_AWAY_X, _AWAY_Y = _away_kernels()
-_OWN = _own_sides()
 
 
 class Viewpoint(NamedTuple):
@@ -171,7 +147,7 @@ class SeenFloor:
         rays[:, 2] += _ROW_RAD * (rays[:, 2] ** 2 / _CAMERA_M + _CAMERA_M)
         rows, columns = np.nonzero(self._crossed(x, y, rays, _FOOT_M))
         away_x, away_y = np.array([[x], [y]]) - (np.stack([rows, columns]) + self._corner[:, None] + 0.5) * CELL_M
-        self._from[rows, columns] |= 1 << _sector(np.arctan2(away_y, away_x))
+        self._from[rows, columns] |= 1 << sector(np.arctan2(away_y, away_x))
         self.scans += 1
 
     def _crossed(self, x_m: float, y_m: float, rays: FloatArray, up_to_m: float) -> BoolArray:
@@ -233,7 +209,7 @@ class SeenFloor:
         bearings = np.linspace(0.0, 2 * np.pi, _FINE_RAYS, endpoint=False)
         steps = np.arange(CELL_M, self._config.sight_m, CELL_M)
         flat, shown = self._cast(np.array([place_m], dtype=np.float64), bearings, steps, self._things(around, known))
-        wanted = self._wanted(around, known).reshape(-1)[flat] & (1 << _sector(bearings + np.pi))[:, None] > 0
+        wanted = self._wanted(around, known).reshape(-1)[flat] & (1 << sector(bearings + np.pi))[:, None] > 0
         cells = np.zeros(SIZE * SIZE, dtype=bool)
         cells[flat[shown & wanted & (flat >= 0)]] = True
         return cells.reshape(SIZE, SIZE)
@@ -275,7 +251,7 @@ class SeenFloor:
         flat, shown = self._cast(places, bearings, steps, self._things(around, known))
         # The mount hides what is near, except ahead.
         share = np.where(steps < _NEAR_M, _NEAR_SHARE, 1.0) * steps * (2 * np.pi / _RAYS) * _STEP_M
-        towards = (1 << _sector(bearings + np.pi))[:, None]
+        towards = (1 << sector(bearings + np.pi))[:, None]
         wanted = (unseen.reshape(-1)[flat] & towards > 0) & (flat >= 0) & shown
         gains = (wanted * share[None, None, :]).sum(axis=(1, 2))
         seconds = cost[rows, columns] / self._config.drive_mps + self._config.look_s
@@ -355,23 +331,15 @@ class SeenFloor:
 
     def _wanted(self, around: FloorMap, known: Sequence[tuple[float, ...]]) -> IntArray:
         """The sectors (bits) from which each cell is still to be seen."""
-        wanted = np.where(self.unseen(around, known), _ANYWHERE, 0)
+        wanted = np.where(self.unseen(around, known), ANYWHERE, 0)
         if self._feet:
             wanted |= np.where(self._missed < _PATIENCE, self._unseen_feet(around), 0)
         return wanted
 
     def _unseen_feet(self, around: FloorMap) -> IntArray:
         """The sectors (bits) from which the floor beside obstacles must be seen and was not: those on its side."""
-        cells = self._aligned(around, around.occupied(), beyond=False).astype(np.uint8)
-        things = cv2.morphologyEx(cells, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
-        inner, outer = (
-            cv2.dilate(things, np.ones((2 * reach + 1,) * 2, np.uint8)).astype(bool)
-            for reach in (_OPAQUE_CELLS, _OPAQUE_CELLS + 1)
-        )
-        here = outer & ~inner & ~self._beyond()
-        x, y = (cv2.filter2D(things.astype(np.float64), -1, kernel) for kernel in (_AWAY_X, _AWAY_Y))
-        own = _OWN[_sector(np.arctan2(y, x))]
-        return np.where(here & (self._from & own == 0), own, 0)
+        own = own_sides(self._aligned(around, around.occupied(), beyond=False), _OPAQUE_CELLS)
+        return np.where(~self._beyond() & (self._from & own == 0), own, 0)
 
     def _beyond(self) -> BoolArray:
         assert self._centre_m is not None
@@ -414,11 +382,6 @@ class SeenFloor:
         columns = (np.arange(SIZE) + self._corner[1] + 0.5) * CELL_M - y_m
         disc: BoolArray = rows[:, None] ** 2 + columns[None, :] ** 2 <= radius_m**2
         return disc
-
-
-def _sector(bearing_rad: FloatArray) -> IntArray:
-    sector: IntArray = np.floor(bearing_rad / (2 * np.pi / _SECTORS)).astype(np.int64) % _SECTORS
-    return sector
 
 
 def _large(cells: BoolArray, least_m2: float) -> BoolArray:
