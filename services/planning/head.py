@@ -1,4 +1,4 @@
-"""The head: sweeps to search, fixates what is seen, and the tilt error of its camera."""
+"""The head: it sweeps to search and fixates what is seen; the floor that its mount hides; its camera's tilt error."""
 
 from __future__ import annotations
 
@@ -8,12 +8,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cocoro.arrays import FloatArray
+from cocoro.arrays import BoolArray, FloatArray
 from cocoro.robot import Robot
 from cocoro.units import Vec3
 from services.planning.config import HeadConfig
 
 PAN, TILT = "neck_pan", "neck_tilt"
+_MOUNT_M = 0.01
+"""Margin about the camera's mount."""
 
 
 class Gaze:
@@ -163,3 +165,21 @@ class CameraTilt:
         away = hypot(level, up)
         true_up = height_m - self._axis_z_m
         return atan2(up, level) - atan2(true_up, max(away**2 - true_up**2, 1e-9) ** 0.5)
+
+
+def behind_mount(robot: Robot, bearing_rad: FloatArray, distance_m: FloatArray) -> BoolArray:
+    """Mark the places on the floor, by bearing, rad, and distance, m, each (n,), body frame, that the mount hides from
+    a camera that pans to them (slabs, Kay and Kajiya 1986); returns shape (n,)."""
+    kinect, (low, high) = robot.kinect, robot.joints[PAN].limits_rad
+    pan = np.clip(bearing_rad, low, high)
+    neck, camera = (robot.chain(link).position({PAN: 0.0, TILT: 0.0}) for link in ("neck_tilt", "camera"))
+    ahead_m = camera[0] - neck[0]
+    eye = np.stack(
+        [neck[0] + ahead_m * np.cos(pan), neck[1] + ahead_m * np.sin(pan), np.full(len(pan), camera[2])], axis=1
+    )
+    place = distance_m[:, None] * np.stack([np.cos(bearing_rad), np.sin(bearing_rad), 0 * bearing_rad], axis=1)
+    way = np.where(np.abs(place - eye) < 1e-9, 1e-9, place - eye)
+    one = (np.array(kinect.mount_min_m) - _MOUNT_M - eye) / way
+    other = (np.array(kinect.mount_max_m) + _MOUNT_M - eye) / way
+    hidden: BoolArray = np.minimum(one, other).max(axis=1) < np.maximum(one, other).min(axis=1)
+    return hidden

@@ -21,7 +21,7 @@ from cocoro.messages import Obstacles
 from cocoro.robot import Robot
 from services.planning.config import SearchConfig
 from services.planning.floor_map import CELL_M, SIZE, FloorMap, overlap
-from services.planning.head import PAN, TILT
+from services.planning.head import behind_mount
 from services.planning.wall_feet import ANYWHERE, own_sides, sector
 
 _STRETCH_BYTES = 6
@@ -40,8 +40,7 @@ _FOOT_M = 3.0
 _ROW_RAD, _CAMERA_M = 0.0125, 0.73
 """Angle between two rows of a depth image's points, and the camera's height: shown floor ends up to a row before it
 ends."""
-_RAYS, _STEP_M = 120, 0.075
-_FINE_RAYS = 540
+_RAYS, _FINE_RAYS, _STEP_M = 120, 540, 0.075
 _CORNER_CELLS = 4
 """Candidates are so many cells apart."""
 _OPAQUE_CELLS = 1
@@ -51,11 +50,9 @@ _NEAREST_M = 0.30
 """Nearer floor is not visible from a place: the body hides it."""
 _NEAR_M, _NEAR_SHARE = 1.0, 0.5
 """Floor nearer than this to a place to look from counts by this share."""
-_MOUNT_M = 0.01
 _TRIED = 12
 """The best places by coarse rays; the first of them that also shows something by fine rays is taken."""
 _AREA_M2 = CELL_M**2
-
 
 _Cells = TypeVar("_Cells", FloatArray, BoolArray)
 
@@ -185,24 +182,8 @@ class SeenFloor:
         cells = self.visible((body.x_m, body.y_m), around, known)
         rows, columns = np.nonzero(cells)
         bearing, distance = self.bearings(cells, body).T
-        cells[rows, columns] = ~self._behind_mount(bearing, distance)
+        cells[rows, columns] = ~behind_mount(self._robot, bearing, distance)
         return cells
-
-    def _behind_mount(self, bearing_rad: FloatArray, distance_m: FloatArray) -> BoolArray:
-        """Mark the places on the floor (n,), body frame, that the camera's mount hides (slabs, Kay and Kajiya 1986)."""
-        kinect, (low, high) = self._robot.kinect, self._robot.joints[PAN].limits_rad
-        pan = np.clip(bearing_rad, low, high)
-        neck, camera = (self._robot.chain(link).position({PAN: 0.0, TILT: 0.0}) for link in ("neck_tilt", "camera"))
-        ahead_m = camera[0] - neck[0]
-        eye = np.stack(
-            [neck[0] + ahead_m * np.cos(pan), neck[1] + ahead_m * np.sin(pan), np.full(len(pan), camera[2])], axis=1
-        )
-        place = distance_m[:, None] * np.stack([np.cos(bearing_rad), np.sin(bearing_rad), 0 * bearing_rad], axis=1)
-        way = np.where(np.abs(place - eye) < 1e-9, 1e-9, place - eye)
-        one = (np.array(kinect.mount_min_m) - _MOUNT_M - eye) / way
-        other = (np.array(kinect.mount_max_m) + _MOUNT_M - eye) / way
-        hidden: BoolArray = np.minimum(one, other).max(axis=1) < np.maximum(one, other).min(axis=1)
-        return hidden
 
     def visible(self, place_m: tuple[float, float], around: FloorMap, known: Sequence[tuple[float, ...]]) -> BoolArray:
         """The unseen floor that should be visible from a place, odometry frame, however the robot stands there."""
