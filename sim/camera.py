@@ -43,7 +43,7 @@ DRIFT_S = 5.0
 
 
 class SimKinect:
-    """Takes frames of the world that a renderer draws.
+    """Takes frames of the world that a renderer draws. A context manager, which closes the renderer.
 
     Args:
         robot: gives the Kinect's range and depth curve, and the places of its depth camera and projector.
@@ -85,6 +85,12 @@ class SimKinect:
             self._depth_noise = DepthNoise(rng, (height, width), DEPTH_SIGMA_PER_M)
             self._exposure = Drift(rng, EXPOSURE_DRIFT, DRIFT_S)
             self._white_balance = Drift(rng, WHITE_BALANCE_DRIFT, DRIFT_S)
+
+    def __enter__(self) -> SimKinect:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._renderer.close()
 
     def capture(self, poses: FloatArray, camera_pose: FloatArray, stamp_ns: int, light: Lighting) -> Frame:
         """Take the frame whose exposure has its middle at `stamp_ns`.

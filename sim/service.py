@@ -197,8 +197,8 @@ class Simulator:
 
 async def run(node: Node, config: SimConfig) -> None:
     """Simulate for ever, in real time or in the event loop's virtual time."""
-    with make_world(node.robot, config) as world:
-        simulator = Simulator(node, config, world, make_kinect(node.robot, config, world))
+    with make_world(node.robot, config) as world, make_kinect(node.robot, config, world) as kinect:
+        simulator = Simulator(node, config, world, kinect)
         async with AsyncExitStack() as stack:
             hardware = [await stack.enter_async_context(node.sibling(name)) for name in SIM.services]
             simulator.connect(*hardware)

@@ -43,6 +43,7 @@ KEEP = 1_000_000
 """Depth of the observer's queues: it loses nothing, even when it is late."""
 SLOW = {"width": 320, "height": 240, "frame_rate_hz": 30.0, "pace": 0.5}
 """Small images and a reduced frame rate, so that load does not make the robot late."""
+SHORT_LEASE = "[mesh]\nlease_s = 1.0\n"
 PROCESSES = ("sim", "perception", "planning", "executive")
 STANDING_MPS = 0.01
 

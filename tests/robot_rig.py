@@ -181,9 +181,9 @@ class RobotRig:
         wanted = "latched" if latched else "released"
         return {answer.service for answer in answers if answer.reply is not None and answer.reply.latch == wanted}
 
-    async def driving(self, speed_mps: float = 0.25) -> str:
-        """Start a fetch of the red can and wait until the robot drives at a speed, m/s; returns the task's id."""
-        task_id = await self.begin("fetch", "red_can")
+    async def driving(self, speed_mps: float = 0.25, task: str = "fetch") -> str:
+        """Start a task with the red can and wait until the robot drives at a speed, m/s; returns the task's id."""
+        task_id = await self.begin(task, "red_can")
         await self.until(lambda: self.speed_mps > speed_mps)
         return task_id
 

@@ -165,7 +165,9 @@ async def test_leaving_sends_the_events_that_wait(directory: Path) -> None:
     async with await ZenohBus.open(local(directory)) as reader:
         received: asyncio.Queue[int] = asyncio.Queue()
         reader.subscribe("robot/event", Qos.EVENT, lambda _, payload: received.put_nowait(int(bytes(payload))), depth=1)
+        reader.declare_alive("robot/reader/alive")
         async with await ZenohBus.open(local(directory)) as bus:
+            await appears(bus, "robot/reader/alive")
             publisher = bus.publisher("robot/event", Qos.EVENT)
             for number in range(count):
                 publisher.put(b"%d" % number)

@@ -5,20 +5,25 @@ from __future__ import annotations
 import hashlib
 import subprocess
 import sys
+from collections.abc import Sequence
 
 import msgspec
 import numpy as np
 import pytest
 from pictures import CAMERA, ROBOT, Lamp, profile, stripe
+from robot_rig import RobotRig
 from scipy.spatial.transform import Rotation
 
+import sim.service
 from cocoro.arrays import FloatArray
 from cocoro.errors import ConfigError
 from cocoro.messages import Frame
 from cocoro.robot import Camera
+from cocoro.vloop import run_virtual
 from sim.camera import SimKinect, moved
 from sim.realism import Sensors
-from sim.render import Images, Lighting, make_renderer
+from sim.render import Images, Lighting, Renderer, make_renderer
+from sim.render.choice import RendererChoice
 from sim.render.interface import Visual
 from sim.sensor_effects import (
     NO_DATA,
@@ -132,6 +137,28 @@ def test_a_frame_is_the_message_with_its_stamp_and_keeps_its_pixels() -> None:
 def test_the_renderers_size_must_be_the_kinects() -> None:
     with pytest.raises(ConfigError, match=r"320 x 240.*640 x 480"):
         SimKinect(ROBOT, Painted(), width=640, height=480)
+
+
+@pytest.mark.sim
+def test_a_simulator_that_ends_releases_what_it_drew_with(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Otherwise each rehearsal of a process would keep some megabytes."""
+    closed: list[bool] = []
+
+    def watched(visuals: Sequence[Visual], camera: Camera, choice: RendererChoice) -> Renderer:
+        renderer = make_renderer(visuals, camera, choice)
+        close = renderer.close
+        monkeypatch.setattr(renderer, "close", lambda: closed.append(close() is None))
+        return renderer
+
+    monkeypatch.setattr(sim.service, "make_renderer", watched)
+
+    async def scenario() -> None:
+        async with RobotRig(services=("sim",)) as rig:
+            await rig.advance(0.2)
+            assert not closed
+
+    run_virtual(scenario())
+    assert closed == [True]
 
 
 # --- colour of a real sensor ----------------------------------------------------------------------

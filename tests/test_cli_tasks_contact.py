@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import os
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
 
+import pytest
 from follower_rig import REQUEST, Executive, Scene, following, in_virtual_time
 
 from apps.cli import exits
@@ -15,6 +17,7 @@ from apps.cli.progress import LineDisplay
 from apps.cli.tasks import Follower
 from cocoro.bus.local import LocalMesh
 from cocoro.clock import VirtualClock
+from cocoro.errors import MeshError
 from cocoro.node import Node
 from cocoro.robot import Robot
 from cocoro.vloop import run_virtual
@@ -49,6 +52,13 @@ def with_claim(scenario: Callable[[Claimed], Awaitable[None]]) -> Callable[[Path
 
     test.__name__ = scenario.__name__
     return test
+
+
+@with_claim
+async def test_an_executive_that_lives_and_is_not_met_is_not_called_missing(scene: Claimed) -> None:
+    with pytest.raises(MeshError) as caught:
+        await scene.follower().run()
+    assert f"no contact with executive though its process {os.getpid()} lives" in str(caught.value)
 
 
 @in_virtual_time

@@ -9,15 +9,13 @@ import sys
 from pathlib import Path
 
 import pytest
-from faults_live import PROCESSES, LiveRobot, live
+from faults_live import PROCESSES, SHORT_LEASE, LiveRobot, live
 from operator_shell import Running
 from test_faults_live import FAR
 
 pytestmark = [pytest.mark.zenoh, pytest.mark.sim, pytest.mark.process]
 
-LEASE_S = 1.0
 ASLEEP_S = 4.0
-MESH = f"[mesh]\nlease_s = {LEASE_S}\n"
 SAID = "this machine was asleep or starved for"
 
 
@@ -43,7 +41,7 @@ def test_when_all_sleep_for_longer_than_the_lease_the_robot_stands_and_nobody_is
     tmp_path: Path, far: Path
 ) -> None:
     async def scenario() -> None:
-        async with live(tmp_path, scene=far, mesh=MESH) as robot:
+        async with live(tmp_path, scene=far, mesh=SHORT_LEASE) as robot:
             fetch = Running([sys.executable, "-m", "apps.cli.main", "fetch", "red_can"], robot.env)
             try:
                 await robot.drives()

@@ -10,7 +10,7 @@ import signal
 from pathlib import Path
 
 import pytest
-from faults_live import SERVICES, LiveRobot, live
+from faults_live import SERVICES, SHORT_LEASE, LiveRobot, live
 from spelled import asked
 
 from cocoro import topics
@@ -83,7 +83,7 @@ def test_who_is_stopped_for_longer_than_the_lease_ends_the_task_and_is_back_when
     tmp_path: Path, far: Path
 ) -> None:
     async def scenario() -> None:
-        async with live(tmp_path, scene=far) as robot:
+        async with live(tmp_path, scene=far, mesh=SHORT_LEASE) as robot:
             task_id = await robot.driving()
             pid = robot.pid("perception")
             stopped_s = await fault(robot, "perception", signal.SIGSTOP)
@@ -143,7 +143,7 @@ def test_bad_messages_on_every_key_of_a_robot_that_drives_are_counted_and_stop_n
 
 def test_a_simulator_that_is_killed_comes_back_and_all_others_work_with_it_as_before(tmp_path: Path) -> None:
     async def scenario() -> None:
-        async with live(tmp_path) as robot:
+        async with live(tmp_path, pace=1.0) as robot:
             task_id = await robot.driving()
             others = {service: robot.pid(service) for service in ("perception", "planning", "executive")}
             robot.signal("base", signal.SIGKILL)

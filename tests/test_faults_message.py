@@ -75,11 +75,11 @@ class Drive(NamedTuple):
 
 
 def drive(topic: Topic[Any] | None = None, spoil: Spoil | None = None, clock_of: ClockOf | None = None) -> Drive:
-    """Fetch the can; on the way to it send one bad message, if any."""
+    """Drive to the can; on the way send one bad message, if any."""
 
     async def scenario() -> Drive:
         async with RobotRig(clock_of=clock_of) as rig:
-            task_id = await rig.driving(0.2)
+            task_id = await rig.driving(0.2, "go-to")
             sent_s = rig.now_s
             if topic is not None and spoil is not None:
                 send(rig, topic, spoil(newest(rig, topic)))

@@ -37,6 +37,7 @@ def test_a_block_is_its_commands_without_comments(tmp_path: Path) -> None:
     assert (block.section, block.commands) == ("One", ("make it", "run 'a # b'"))
 
 
+@pytest.mark.zenoh  # its `cocoro stop` stops every robot of this machine
 @pytest.mark.sim
 @pytest.mark.process
 def test_the_robot_is_operated_looked_into_and_replayed_as_written() -> None:

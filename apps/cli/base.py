@@ -45,7 +45,7 @@ async def show(choice: RobotChoice, as_json: bool) -> int:
     """Prints the base's state and faults; the exit code is 1 when it has faults or is silent."""
     async with joined(choice) as link:
         if "base" not in await link.alive():
-            raise MeshError(f"{link.robot} has no base running: see `cocoro status`")
+            raise MeshError(link.missing("base"))
         state, health = link.latest(BASE_STATE), link.latest(HEALTH.of("base"))
         changed = asyncio.Event()
         link.inbox(BASE_STATE).add(lambda _key, _message: changed.set())

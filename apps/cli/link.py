@@ -68,7 +68,17 @@ class MeshLink(Participant):
         return Path(named) if named else None
 
     def unserved(self, request: Request[Any, Any]) -> str:
-        return f"{self.robot} has no {request.server} running: {START}, or see `cocoro status`"
+        return self.missing(request.server, START)
+
+    def missing(self, service: str, advice: str = "") -> str:
+        """The error's text for a service that this command did not find: whether its process lives, by its claim."""
+        by = self.run_dir.claimant(service)
+        if by is not None and by.name != REPLAY:
+            return (
+                f"no contact with {service} though its process {by.pid} lives: this machine may be too busy, or it"
+                " hangs; try again, and see `cocoro top`"
+            )
+        return f"{self.robot} has no {service} running: {f'{advice}, or ' if advice else ''}see `cocoro status`"
 
     def refused(self, answer: Answer[Any]) -> str:
         return f"{answer.service}: {answer.error}"

@@ -118,7 +118,7 @@ async def request(choice: RobotChoice, action: str, joints: list[str], as_json: 
         alive = await link.alive()
         missing = [network for network in networks if network not in alive]
         if missing:
-            raise MeshError(f"{link.robot} has no {missing[0]} running: see `cocoro status`")
+            raise MeshError(link.missing(missing[0]))
         for network, names in networks.items():
             reply = await _request_one(link, network, action, names)
             done.append({"network": network, "done": DONE_WORDS[action], "joints": reply.joints, "problem": reply.text})

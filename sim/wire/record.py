@@ -93,8 +93,11 @@ def record(
     """Write this many frames. Returns the truth: the places of the objects by label, in the body frame, m, and the
     head's angles, rad."""
     config = msgspec.structs.replace(config, width=WIDTH, height=HEIGHT)
-    with make_world(robot, config) as world, RecordingWriter(folder) as writer:
-        kinect = make_kinect(robot, config, world)
+    with (
+        make_world(robot, config) as world,
+        make_kinect(robot, config, world) as kinect,
+        RecordingWriter(folder) as writer,
+    ):
         _turn_head(world, pan_rad, tilt_rad)
         for number in range(frames):
             at_ns = START_NS + number * NS // RATE_HZ

@@ -174,17 +174,19 @@ async def run(node: Node, config: SimConfig) -> None:
     """Simulate for ever."""
     motors = WireMotors()
     folder = wire_dir(node.robot_name)
-    with make_world(node.robot, config, motors.make) as world:
-        kinect = make_kinect(node.robot, config, world)
-        with firmware_process(folder, setup_of(node.robot, motors, config.seed)) as channel:
-            simulator = WireSimulator(node, config, world, kinect, motors, channel)
-            async with node.sibling("kinect") as camera:
-                simulator.connect_camera(camera)
-                await asyncio.to_thread(select.select, [channel], [], [], START_S)  # its first orders show that it runs
-                simulator.publish_time()
-                for part in (node, camera):
-                    part.ready(f"simulated behind wires, scene {world.scene.name}, {config.sensors} sensors")
-                await keep_going(node, config, simulator)
+    with (
+        make_world(node.robot, config, motors.make) as world,
+        make_kinect(node.robot, config, world) as kinect,
+        firmware_process(folder, setup_of(node.robot, motors, config.seed)) as channel,
+    ):
+        simulator = WireSimulator(node, config, world, kinect, motors, channel)
+        async with node.sibling("kinect") as camera:
+            simulator.connect_camera(camera)
+            await asyncio.to_thread(select.select, [channel], [], [], START_S)  # its first orders show that it runs
+            simulator.publish_time()
+            for part in (node, camera):
+                part.ready(f"simulated behind wires, scene {world.scene.name}, {config.sensors} sensors")
+            await keep_going(node, config, simulator)
 
 
 implementation = Implementation(SimConfig, run)
