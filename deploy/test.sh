@@ -21,22 +21,24 @@ check lint-imports --no-logo
 unset PYTHONDONTWRITEBYTECODE
 
 # Tests that use zenoh or measure real time run one by one. Meanwhile the others run on two workers, with the processor
-# time that is left (SCHED_IDLE), so that they do not falsify those times; without chrt (util-linux) they run before.
-# Each file stays on one worker, so that what its tests share is made once. Files run in the order of their names: by
+# time that is left, so that they do not falsify those times: in the class SCHED_IDLE and, since Linux shares the
+# processor between sessions first, in a session of the least weight. Without chrt and setsid (util-linux) they run
+# before. Each file stays on one worker, so that what its tests share is made once. Files run in the order of their names: by
 # default those with few tests come last, and a long test would end alone.
 others=(pytest -rs -n 2 --dist loadfile --no-loadscope-reorder -m "not zenoh")
 tests=0
 if [ $# -gt 0 ]; then
     echo "== pytest $*"
     pytest -rs "$@" || tests=$?
-elif ! command -v chrt >/dev/null; then
+elif ! { command -v chrt && command -v setsid; } >/dev/null; then
     echo "== ${others[*]}"
     "${others[@]}" || tests=$?
     echo "== pytest -m zenoh"
     pytest -rs -m zenoh || tests=$?
 else
     said=$(mktemp)
-    chrt --idle 0 "${others[@]}" >"$said" 2>&1 &
+    aside='{ echo 19 >/proc/self/autogroup; } 2>/dev/null; exec chrt --idle 0 "$@"'
+    setsid bash -c "$aside" aside "${others[@]}" >"$said" 2>&1 &
     trap 'kill $! 2>/dev/null; rm -f "$said"' EXIT
     echo "== pytest -m zenoh"
     pytest -rs -m zenoh || tests=$?
