@@ -86,9 +86,12 @@ class Command:
 
 
 def _own(terminal: int, kind: str) -> None:
-    """Prepare the child as a shell does, with a controlling terminal; where `kind` says so it ignores a hang-up."""
+    """Prepare the child as a shell does, with a controlling terminal and signals that are heard, though this process
+    may run in the background or under nohup; where `kind` says so it ignores a hang-up."""
     if "pipe" not in kind:
         fcntl.ioctl(terminal, termios.TIOCSCTTY, 0)
+    for number in (signal.SIGINT, signal.SIGQUIT, signal.SIGHUP):
+        signal.signal(number, signal.SIG_DFL)
     if "unheard" in kind:
         signal.signal(signal.SIGHUP, signal.SIG_IGN)
 

@@ -18,7 +18,9 @@ SIGNALS = (signal.SIGTERM, signal.SIGHUP)
 
 
 def leave_when_ended() -> None:
-    """Make the signals of `SIGNALS` leave all contexts. Call it at the begin of a bench, in its main thread."""
+    """Make the signals of `SIGNALS` leave all contexts, and Ctrl-C be heard, which a shell has its background jobs
+    ignore, and by inheritance all that they start. Call it at the begin of a bench, in its main thread."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     for number in SIGNALS:
         signal.signal(number, _leave)
 

@@ -14,10 +14,10 @@ from bench.command_endings import ENDS, KINDS, Command
 from cocoro.bus.endpoints import default
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.clock import RealClock
-from cocoro.messages import CancelRequest, TaskReply, TaskRequest, TaskState
+from cocoro.messages import CancelRequest, ReportRequest, TaskReply, TaskRequest, TaskState
 from cocoro.node import Node
 from cocoro.robot import Robot
-from cocoro.topics import CANCEL, RUN, TASK
+from cocoro.topics import CANCEL, REPORT, RUN, TASK
 from services.executive.askers import Askers
 from services.executive.executive import GONE
 
@@ -42,6 +42,7 @@ class Executive:
         self._askers = Askers(node, lambda asker: self._end(self._asked[asker], "gone"))
         node.serve(RUN, self._run)
         node.serve(CANCEL, self._cancel)
+        node.serve(REPORT, self._report)
         node.ready()
 
     async def _run(self, request: TaskRequest) -> TaskReply:
@@ -56,10 +57,19 @@ class Executive:
         self._end(request.task_id, "operator")
         return TaskReply(accepted=True, task_id=request.task_id)
 
+    async def _report(self, request: ReportRequest) -> TaskState:
+        return self._state(request.task_id)
+
     def _end(self, task_id: str, by: str) -> None:
         self.ended.setdefault(task_id, by)
-        self._node.publish(TASK, TaskState(task_id=task_id, task="fetch", label="red_can", outcome="cancelled"))
+        self._node.publish(TASK, self._state(task_id))
         self.changed.set()
+
+    def _state(self, task_id: str) -> TaskState:
+        state = TaskState(task_id=task_id, task="fetch", label="red_can")
+        if task_id in self.ended:
+            state.outcome = "cancelled"
+        return state
 
     async def until_asked(self, task_id: str) -> None:
         while task_id not in self._asked.values():
