@@ -25,7 +25,7 @@ from pathlib import Path
 
 from bench.command_endings import ENDS, KINDS, Command
 from bench.ended import leave_when_ended
-from bench.live import Operator, operator
+from bench.live import NAME, Operator, operator
 from cocoro import topics
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.clock import NS, FollowedClock
@@ -125,7 +125,7 @@ async def robot_up(folder: Path) -> AsyncIterator[Watched]:
             raise CocoroError(said)
         async with (
             await ZenohBus.open(cocoro.run_dir.join_as("bench")) as bus,
-            Node("bench", bus, FollowedClock(), Robot.load()) as node,
+            Node("bench", bus, FollowedClock(), Robot.load(), robot_name=NAME) as node,
         ):
             watched = Watched(cocoro, node, motion)
             node.on(topics.TASK, lambda state: setattr(watched, "state", state))

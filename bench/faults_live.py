@@ -23,7 +23,7 @@ from pathlib import Path
 
 from bench.fault_robot import STANDING_MPS, full_speed_mps
 from bench.fault_scenes import DRIVES, Errand, draw_errand
-from bench.live import Operator, operator
+from bench.live import NAME, Operator, operator
 from cocoro import topics
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.clock import NS, FollowedClock
@@ -128,7 +128,7 @@ async def robot_up(
         raise CocoroError(said)
     async with (
         await ZenohBus.open(cocoro.run_dir.join_as("bench")) as bus,
-        Node("bench", bus, FollowedClock(), Robot.load()) as node,
+        Node("bench", bus, FollowedClock(), Robot.load(), robot_name=NAME) as node,
     ):
         yield LiveRobot(cocoro, node, motion)
 

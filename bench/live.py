@@ -36,11 +36,12 @@ from deploy.rundir import RunDir
 from sim.judge import HELD_S, Judge, Verdict
 from sim.random_scene import find_scene
 
-NAME = "calliope"
+NAME = f"bench-{os.getpid()}"
+"""Robots of benches have a name of their own: `cocoro stop --robot calliope` is for others, and theirs for them."""
 
 
 class Operator:
-    """`cocoro` with a separate run directory."""
+    """`cocoro` with a separate run directory; its `up` starts the robot NAME."""
 
     def __init__(self, root: Path) -> None:
         self.run_dir = RunDir(NAME, root)
@@ -48,7 +49,8 @@ class Operator:
         self.environment |= {"COCORO_STATE_DIR": str(root / "state")}
 
     def start(self, *arguments: str) -> subprocess.Popen[str]:
-        command = [sys.executable, "-m", "apps.cli.main", *arguments]
+        named = ("--set", f'robot="{NAME}"') if arguments[0] == "up" else ()
+        command = [sys.executable, "-m", "apps.cli.main", *arguments, *named]
         return subprocess.Popen(
             command, env=self.environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
         )
@@ -93,7 +95,7 @@ async def _fetch(cocoro: Operator) -> Fetched:
     judge = Judge(find_scene("paper", 0, "red_can"), "red_can")
     async with (
         await ZenohBus.open(cocoro.run_dir.join_as("bench")) as bus,
-        Node("bench", bus, FollowedClock(), Robot.load()) as node,
+        Node("bench", bus, FollowedClock(), Robot.load(), robot_name=NAME) as node,
     ):
         node.on(topics.TRUTH, judge.feed)
         begun_s = time.monotonic()
@@ -136,7 +138,7 @@ async def _commands(cocoro: Operator) -> dict[str, list[int]]:
     stamps: dict[str, list[int]] = {}
     async with (
         await ZenohBus.open(cocoro.run_dir.join_as("bench")) as bus,
-        Node("bench", bus, FollowedClock(), Robot.load()) as node,
+        Node("bench", bus, FollowedClock(), Robot.load(), robot_name=NAME) as node,
     ):
         for topic in (topics.BASE_COMMAND, topics.ARM_COMMAND, topics.DETECTIONS):
             arrived = stamps.setdefault(topic.name, [])

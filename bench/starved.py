@@ -12,20 +12,16 @@ import argparse
 import asyncio
 import json
 import re
-import shutil
 import subprocess
 import sys
-import tempfile
 import time
 from collections import Counter
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
-from pathlib import Path
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 from bench.ended import leave_when_ended
 from bench.faults_live import busy
-from bench.live import Operator
+from bench.live import NAME, Operator, operator
 from cocoro import topics
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.clock import FollowedClock
@@ -33,11 +29,9 @@ from cocoro.errors import CocoroError
 from cocoro.messages import PlannerStatus, ReportRequest, TaskState
 from cocoro.node import Node
 from cocoro.robot import Robot
-from deploy.rundir import RunDir
 from sim.judge import HELD_S, Judge, Verdict
 from sim.random_scene import find_scene
 
-ROBOT = "starved"
 FALSE = re.compile(r"\bdied\b|\bis silent\b|\bnot alive\b|no longer knows")
 """What nobody may say while all processes live."""
 PAUSED = re.compile(r"nothing from|lost contact|slower, for|waiting:")
@@ -69,18 +63,6 @@ class Trial(NamedTuple):
         return found
 
 
-@contextmanager
-def robot_of_its_own() -> Iterator[Operator]:
-    root = Path(tempfile.mkdtemp(prefix="cocoro"))
-    work = Operator(root)
-    work.run_dir = RunDir(ROBOT, root)
-    try:
-        yield work
-    finally:
-        work("down", "--robot", ROBOT)
-        shutil.rmtree(root, ignore_errors=True)
-
-
 async def _fetch(cocoro: Operator) -> tuple[Trial, str]:
     judge = Judge(find_scene("paper", 0, "red_can"), "red_can")
     pauses: Counter[str] = Counter()
@@ -96,12 +78,12 @@ async def _fetch(cocoro: Operator) -> tuple[Trial, str]:
 
     async with (
         await ZenohBus.open(cocoro.run_dir.join_as("bench")) as bus,
-        Node("bench", bus, FollowedClock(), Robot.load(), robot_name=ROBOT) as node,
+        Node("bench", bus, FollowedClock(), Robot.load(), robot_name=NAME) as node,
     ):
         node.on(topics.TRUTH, judge.feed)
         node.on(topics.PLAN, on_plan)
         begun_s = time.monotonic()
-        process = cocoro.start("fetch", "red_can", "--robot", ROBOT, "--json")
+        process = cocoro.start("fetch", "red_can", "--json")
         said, _ = await asyncio.to_thread(process.communicate)
         seconds = time.monotonic() - begun_s
         await node.sleep(HELD_S + 0.5)
@@ -120,8 +102,8 @@ def _logs(cocoro: Operator) -> str:
 
 
 def trial(number: int, loops: int, options: list[str]) -> bool:
-    with robot_of_its_own() as cocoro, busy(loops):
-        up, said_up, took_up = cocoro("up", "sim", "--detach", "--set", f"robot={ROBOT}", *options)
+    with operator() as cocoro, busy(loops):
+        up, said_up, took_up = cocoro("up", "sim", "--detach", *options)
         if up:
             print(f"FAIL {number:3d}  not up after {took_up:.0f} s:\n{said_up}")
             return False
