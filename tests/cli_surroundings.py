@@ -45,6 +45,7 @@ ARGUMENTS: dict[str, str] = {
     "capture remove": "{name} --yes",
     "capture reexecute": "{capture} --service {name}",
     "capture rerun": "{capture} --service {name}",
+    "capture latency": "{capture}",
     "new service": "nearest --into {name}",
     "new task": "greet --into {name}",
     "servos set-id": "1 2 --port {name}",

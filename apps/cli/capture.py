@@ -46,6 +46,10 @@ COLUMNS = (
     Column("dropped", 1, right=True),
 )  # fmt: skip
 
+LATENCY_COLUMNS = (
+    "stage", Column("median ms", right=True), Column("99% ms", right=True), Column("worst ms", right=True),
+)  # fmt: skip
+
 app = typer.Typer()
 capture = typer.Typer(no_args_is_help=True, help="List captures, look at them, keep, repair and re-execute them.")
 app.add_typer(capture, name="capture")
@@ -342,3 +346,29 @@ def reexecute_service(files: list[Path], service: str, against: str, tolerance: 
         print("\n".join(reexecution.describe_result(result)))
     bad = result.differing or result.problems or (against == "recorded" and not result.equal)
     return exits.FAILED if bad else exits.DONE
+
+
+# --- from pixel to motor --------------------------------------------------------------------------
+
+
+@capture.command("latency")
+def latency_of(file: CaptureArgument, json: JsonOption = False) -> None:
+    """How long the robot took from a frame to the first wheel command that used it, by stages."""
+    sys.exit(show_latency(file, json))
+
+
+def show_latency(file: Path, as_json: bool) -> int:
+    """Prints the times and returns the exit code: 1 when no frame led to a wheel command. Raises CaptureError when the
+    capture lacks the frames, the detections or the planner's steps."""
+    from apps.captures.latency import latency
+
+    with Capture.open(file) as capture:
+        found = latency([capture])
+    if as_json:
+        print_json(msgspec.to_builtins(found))
+        return exits.DONE if found.stages else exits.FAILED
+    rows = [(one.name, *(f"{ms:.1f}" for ms in (one.median_ms, one.p99_ms, one.worst_ms))) for one in found.stages]
+    if rows:
+        print(table(LATENCY_COLUMNS, rows))
+    print(f"{found.frames} frames, {found.seen} became detections, {found.used} led to a wheel command")
+    return exits.DONE if found.stages else exits.FAILED
