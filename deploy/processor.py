@@ -55,7 +55,7 @@ class ProcessorUse(NamedTuple):
         late = ", ".join(f"{name} {self.waited[name]:.0%}" for name in self.starved[:TAKERS])
         by = ", ".join(f"{taker.what} (pid {taker.pid}) {taker.share:.0%}" for taker in self.takers)
         return (
-            f"this machine is short of processor time: of {self.seconds:.0f} s waited {late}; "
+            f"this machine is short of processor time: of {self.seconds:.2g} s waited {late}; "
             f"of its {self.cores} cores took {by or 'nobody much'}"
         )
 

@@ -73,7 +73,7 @@ def test_the_tally_of_another_file_is_not_believed(
         assert found["notes"] == ["its metadata 'tally' belongs to another file, so the messages were counted"]
     assert main(["capture", "info", str(path)]) == 0
     assert "note: its metadata 'tally' belongs to another file" in capsys.readouterr().out
-    assert main(["capture", "repair", str(path)]) == 0
+    assert main(["capture", "repair", str(path), "--out", str(path.with_suffix(".repaired.mcap"))]) == 0
     again = info_of(path.with_suffix(".repaired.mcap"), capsys)
     assert (again["messages"], again["checked"], again["notes"]) == (count, False, [])
 
@@ -206,9 +206,9 @@ def twofold(tmp_path: Path) -> Path:
 def test_two_channels_of_one_topic_stay_two_when_told_and_repaired(
     twofold: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["capture", "repair", str(twofold)]) == 0
-    capsys.readouterr()
     repaired = twofold.with_suffix(".repaired.mcap")
+    assert main(["capture", "repair", str(twofold), "--out", str(repaired)]) == 0
+    capsys.readouterr()
     for path in (twofold, repaired):
         keys = info_of(path, capsys)["keys"]
         assert [(key["channel"], key["encoding"], key["messages"], key["size_bytes"]) for key in keys] == [

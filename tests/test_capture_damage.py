@@ -199,3 +199,11 @@ def test_a_damaged_capture_is_mended_as_far_as_it_goes(
     assert len(found) > len(original) / 2
     with Capture.open(path) as capture, pytest.raises(CaptureError, match="exists; remove it"):
         rewrite(capture, mended, Packer("zstd"))
+
+
+def test_a_whole_capture_is_not_repaired(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "whole.mcap"
+    path.write_bytes((Path(__file__).parent / "golden" / "fetch.mcap").read_bytes())
+    assert main(["capture", "repair", str(path)]) == 0
+    assert "it is whole, so there is nothing to repair" in capsys.readouterr().out
+    assert list(tmp_path.iterdir()) == [path]

@@ -34,7 +34,7 @@ def open_captures(run_dir: RunDir) -> list[Path]:
                 path = link.readlink()
                 if path.suffix == ".mcap" and path.exists():
                     found.append(path)
-    return found
+    return list(dict.fromkeys(found))  # it may have one open twice
 
 
 def shelf(robot: str | None = None) -> list[tuple[str, Path]]:

@@ -233,6 +233,14 @@ def repair_file(
     """
     packer = Packer(_compression(compression), level)
     with Capture.open(file) as capture:
+        if out is None and not (only or without or start_s is not None or end_s is not None):
+            capture.check()
+            if capture.whole and capture.follows_conventions:
+                if as_json:
+                    print_json({"path": str(file), "whole": True})
+                else:
+                    print(f"{file}: it is whole, so there is nothing to repair; --out FILE writes a copy all the same")
+                return exits.DONE
         key_filter = KeyFilter(capture.robot, only, without)
         check_span(capture, start_s, end_s)
         done = rewrite(

@@ -60,12 +60,12 @@ _SUMMARIES = {
         "run": "Run one process in this terminal, on the mesh of the profile.",
     },
     SAFETY: {
-        "estop": "Emergency stop, now: everything that moves stands still until `reset`.",
-        "stop": "Short for estop.",
+        "stop": "Emergency stop, now: everything that moves stands still until `reset`.",
+        "estop": "The same as stop.",
         "reset": "Release the emergency stop.",
     },
 }
-_HIDDEN = {"stop"}
+_HIDDEN = {"estop"}
 
 COMMANDS = tuple(
     CommandRow(name, panel, summary, hidden=name in _HIDDEN)

@@ -57,7 +57,10 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON, for script
 # --- profiles and the simulator -------------------------------------------------------------------
 
 ProfileArgument = Annotated[
-    str, typer.Argument(help="A profile's name (sim, robot) or file.", autocompletion=completions.profiles)
+    str,
+    typer.Argument(
+        help="A profile's name (sim, robot, sim-wire, replay) or file.", autocompletion=completions.profiles
+    ),
 ]
 ProfileOption = Annotated[
     str,
@@ -69,7 +72,11 @@ ProfileOption = Annotated[
     ),
 ]
 SceneOption = Annotated[
-    str | None, typer.Option(help="Simulator: a scene's name, or its file.", autocompletion=completions.scenes)
+    str | None,
+    typer.Option(
+        help="Simulator: a scene's name (paper, follow, targets, random; a wrong one lists all) or its file.",
+        autocompletion=completions.scenes,
+    ),
 ]
 SetOption = Annotated[
     list[str] | None,
