@@ -89,6 +89,7 @@ class RobotRig:
         for name in list(self._services):
             await self.kill(name)
         await self.operator.__aexit__()
+        self.tap.forget()  # some 70 MB of frames for a fetch, which would wait for the garbage collector
 
     # --- services -----------------------------------------------------------------------------------
 

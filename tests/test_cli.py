@@ -26,8 +26,8 @@ from deploy.processes import stoppable
 from services.executive.tasks import TASKS, FetchTask, FollowTask, PutDownTask
 
 COMMANDS = (
-    "up", "down", "status", "fetch", "follow", "park", "put-down", "estop", "reset", "cancel", "objects", "snapshot",
-    "run", "rehearse", "topics",
+    "up", "down", "status", "fetch", "follow", "park", "put-down", "stop", "estop", "reset", "cancel", "objects",
+    "snapshot", "run", "rehearse", "topics",
 )  # fmt: skip
 ROOT = Path(__file__).parent.parent
 
@@ -190,7 +190,7 @@ def test_a_task_of_the_project_is_found_without_a_search_for_third_parties(monke
 def test_a_commands_own_help_begins_with_its_line_of_the_list(row: listed.CommandRow) -> None:
     command = app.load(row.name)
     assert " ".join((command.help or "").split()).startswith(row.summary)
-    assert command.hidden == row.hidden
+    assert not command.hidden
 
 
 @pytest.mark.process

@@ -24,6 +24,7 @@ from cocoro.errors import choice_of
 COMMANDS = {" ".join(words): command for words, command, _ in commands()}
 TELLS_NOTHING = {
     "estop": "it reads its own --json, without typer",
+    "stop": "it reads its own --json, without typer",
     "run": "its output is the log of a process",
     "view": "it opens a window",
     "replay": "it publishes until its end, steered from the keyboard",

@@ -81,7 +81,7 @@ class CommandGroup(TyperGroup):
     def __init__(self, **attributes: Any) -> None:
         super().__init__(**attributes)
         for row in COMMANDS:
-            listed = TyperCommand(row.name, help=row.summary, rich_help_panel=row.panel, hidden=row.hidden)
+            listed = TyperCommand(row.name, help=row.summary, rich_help_panel=row.panel)
             self.add_command(listed)
 
     def list_commands(self, ctx: Any) -> list[str]:

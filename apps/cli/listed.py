@@ -14,7 +14,6 @@ class CommandRow(NamedTuple):
     name: str
     panel: str
     summary: str
-    hidden: bool = False
 
 
 _SUMMARIES = {
@@ -65,10 +64,7 @@ _SUMMARIES = {
         "reset": "Release the emergency stop.",
     },
 }
-_HIDDEN = {"estop"}
 
 COMMANDS = tuple(
-    CommandRow(name, panel, summary, hidden=name in _HIDDEN)
-    for panel, commands in _SUMMARIES.items()
-    for name, summary in commands.items()
+    CommandRow(name, panel, summary) for panel, commands in _SUMMARIES.items() for name, summary in commands.items()
 )

@@ -25,15 +25,15 @@ CONTEXT = {"allow_extra_args": True, "ignore_unknown_options": True, "help_optio
 
 
 @app.command(context_settings=CONTEXT)
-def estop(context: typer.Context) -> None:
-    """Emergency stop, now: everything that moves stands still until `reset`. (In short: `stop`.)"""
-    sys.exit(stopping.main("estop", context.args))
-
-
-@app.command(hidden=True, context_settings=CONTEXT)
 def stop(context: typer.Context) -> None:
-    """Short for estop."""
-    estop(context)
+    """Emergency stop, now: everything that moves stands still until `reset`."""
+    sys.exit(stopping.main("stop", context.args))
+
+
+@app.command(context_settings=CONTEXT)
+def estop(context: typer.Context) -> None:
+    """The same as stop."""
+    sys.exit(stopping.main("estop", context.args))
 
 
 @app.command()
