@@ -24,6 +24,9 @@ from services.executive.executive import GONE
 pytestmark = [pytest.mark.zenoh, pytest.mark.process]
 
 PATIENCE_S = 60.0
+UNANSWERED = b"the executive does not answer"
+MUTE = {kind for kind in KINDS if "closed" in kind or "gone" in kind or "unread" in kind}
+"""Endings after which nobody reads what the command says."""
 STARTS = 5
 AT_ONCE = 4
 """Commands at a time: more would be late on a busy machine, and give up."""
@@ -139,10 +142,13 @@ def test_a_task_is_cancelled_by_every_signal_hang_up_and_lost_reader(root: Path)
             turns = asyncio.Semaphore(AT_ONCE)
             ends = await asyncio.gather(*(in_turn(turns, end(executive, *one)) for one in enumerate(KINDS)))
         by = {kind: end.by for kind, end in zip(KINDS, ends, strict=True)}
+        # On a busy machine a request to cancel may get no answer in time. The command says so, if it still can, and
+        # drops its token; a second Ctrl-C may come before the request has left.
+        excused = (
+            {kind for kind, end in zip(KINDS, ends, strict=True) if UNANSWERED in end.said} | MUTE | {"Ctrl-C twice"}
+        )
         assert {by[kind] for kind in ENDS} == {"gone"}
-        # A command whose request to cancel is not answered in time on a busy machine drops its token; see
-        # test_cli_tasks_cancelled for each way in virtual time.
-        assert set(by.values()) == {"gone", "operator"}
+        assert {kind for kind in by if by[kind] == "gone"} <= ENDS.keys() | excused
         codes = {kind: end.code for kind, end in zip(KINDS, ends, strict=True)}
         assert codes == {kind: ENDS.get(kind, 3) for kind in KINDS}
         assert not [end.said for end in ends if b"Traceback" in end.said]
