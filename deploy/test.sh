@@ -40,6 +40,7 @@ else
     aside='{ echo 19 >/proc/self/autogroup; } 2>/dev/null; exec chrt --idle 0 "$@"'
     setsid bash -c "$aside" aside "${others[@]}" >"$said" 2>&1 &
     trap 'kill $! 2>/dev/null; rm -f "$said"' EXIT
+    trap 'exit 130' INT TERM # after pytest has ended, which hears Ctrl-C, too
     echo "== pytest -m zenoh"
     pytest -rs -m zenoh || tests=$?
     echo "== ${others[*]}, which began with the others"
