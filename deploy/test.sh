@@ -23,8 +23,8 @@ unset PYTHONDONTWRITEBYTECODE
 # Tests that use zenoh or measure real time run one by one. Meanwhile the others run on two workers, with the processor
 # time that is left, so that they do not falsify those times: in the class SCHED_IDLE and, since Linux shares the
 # processor between sessions first, in a session of the least weight. Without chrt and setsid (util-linux) they run
-# before. Each file stays on one worker, so that what its tests share is made once. Files run in the order of their names: by
-# default those with few tests come last, and a long test would end alone.
+# before. Each file stays on one worker, so that what its tests share is made once. Files run in the order of their
+# names: by default those with few tests come last, and a long test would end alone.
 others=(pytest -rs -n 2 --dist loadfile --no-loadscope-reorder -m "not zenoh")
 tests=0
 if [ $# -gt 0 ]; then

@@ -9,18 +9,18 @@ receives the command as the recorder does.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
 
-from apps.captures.reader import Capture, Record
-from apps.captures.recorded import Once
+from apps.captures.reader import Capture
+from apps.captures.recorded import Once, steps_of
 from cocoro.arrays import FloatArray
 from cocoro.capture.conventions import CaptureError
 from cocoro.capture.types import MessageHead
 from cocoro.messages import Detections, StepRecord
-from cocoro.topics import BASE_COMMAND, DETECTIONS, FRAME, STEPS, Topic
+from cocoro.topics import BASE_COMMAND, DETECTIONS, FRAME
 
 PLANNER = "planning"
 MS = 1e6
@@ -68,46 +68,31 @@ def latency(captures: Sequence[Capture]) -> Latency:
     frames: dict[Number, int] = {}
     detections: dict[Number, tuple[Number, int]] = {}
     commands: dict[Number, int] = {}
-    steps: list[StepRecord] = []
+    steps = [step for _, step in steps_of(captures, PLANNER)]
     heads = msgspec.msgpack.Decoder(MessageHead)
     whole = msgspec.msgpack.Decoder(Detections)
-    records = msgspec.msgpack.Decoder(StepRecord)
-    wanted = (FRAME, DETECTIONS, BASE_COMMAND, STEPS.of(PLANNER))
+    wanted = (FRAME, DETECTIONS, BASE_COMMAND)
     once = Once()
     for capture in captures:
         for record in once.each(capture.messages(*(f"{capture.robot}/{topic.name}" for topic in wanted))):
             topic = record.key.removeprefix(f"{capture.robot}/")
             try:
-                if topic == STEPS.of(PLANNER).name:
-                    steps.append(records.decode(record.payload))
-                elif topic == DETECTIONS.name:
+                if topic == DETECTIONS.name:
                     found = whole.decode(record.payload)
                     of_frame = (found.frame_incarnation, found.frame_seq)
                     detections.setdefault((found.incarnation, found.seq), (of_frame, record.log_ns))
                 else:
                     head = heads.decode(record.payload)
-                    _first(frames if topic == FRAME.name else commands, head, record)
+                    times = frames if topic == FRAME.name else commands
+                    times.setdefault((head.incarnation, head.seq), record.log_ns)
             except (msgspec.MsgspecError, ValueError, RecursionError):
                 continue  # readers reject it, too
-    _require(captures[0], {FRAME: frames, DETECTIONS: detections, STEPS.of(PLANNER): steps})
+    for name, messages in ((FRAME.name, frames), (DETECTIONS.name, detections)):
+        if not messages:
+            raise CaptureError(f"{captures[0].path}: it has no {name}")
     used = _used(frames, detections, commands, steps)
     seen = {frame for frame, _ in detections.values()}
     return Latency(frames=len(frames), seen=len(seen & frames.keys()), used=len(used), stages=_stages(used))
-
-
-def _first(times: dict[Number, int], head: MessageHead, record: Record) -> None:
-    times.setdefault((head.incarnation, head.seq), record.log_ns)
-
-
-def _require(capture: Capture, found: dict[Topic[Any], object]) -> None:
-    for topic, messages in found.items():
-        if not messages:
-            hint = (
-                f"; set record_steps = true in the profile's [service.{PLANNER}] to record them"
-                if topic.name == STEPS.of(PLANNER).name
-                else ""
-            )
-            raise CaptureError(f"{capture.path}: it has no {topic.name}{hint}")
 
 
 def _used(

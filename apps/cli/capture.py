@@ -233,14 +233,13 @@ def repair_file(
     """
     packer = Packer(_compression(compression), level)
     with Capture.open(file) as capture:
-        if out is None and not (only or without or start_s is not None or end_s is not None):
-            capture.check()
-            if capture.whole and capture.follows_conventions:
-                if as_json:
-                    print_json({"path": str(file), "whole": True})
-                else:
-                    print(f"{file}: it is whole, so there is nothing to repair; --out FILE writes a copy all the same")
-                return exits.DONE
+        part = only or without or start_s is not None or end_s is not None
+        if out is None and not part and capture.follows_conventions and _is_whole(file):
+            if as_json:
+                print_json({"path": str(file), "whole": True})
+            else:
+                print(f"{file}: it is whole, so there is nothing to repair; --out FILE writes a copy all the same")
+            return exits.DONE
         key_filter = KeyFilter(capture.robot, only, without)
         check_span(capture, start_s, end_s)
         done = rewrite(
@@ -263,6 +262,14 @@ def repair_file(
     if capture.ending:
         print(f"note: {file} was {capture.ending}")
     return exits.DONE
+
+
+def _is_whole(file: Path) -> bool:
+    """Whether a capture is closed and undamaged, by every byte."""
+    with Capture.open(file) as capture:
+        if capture.whole:
+            capture.check()
+        return capture.whole
 
 
 def _at(capture: Capture, seconds: float | None) -> int | None:

@@ -60,7 +60,7 @@ _SUMMARIES = {
     },
     SAFETY: {
         "stop": "Emergency stop, now: everything that moves stands still until `reset`.",
-        "estop": "The same as stop.",
+        "estop": "Emergency stop: the same command as `stop`.",
         "reset": "Release the emergency stop.",
     },
 }

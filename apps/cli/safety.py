@@ -32,7 +32,7 @@ def stop(context: typer.Context) -> None:
 
 @app.command(context_settings=CONTEXT)
 def estop(context: typer.Context) -> None:
-    """The same as stop."""
+    """Emergency stop: the same command as `stop`."""
     sys.exit(stopping.main("estop", context.args))
 
 

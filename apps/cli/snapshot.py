@@ -69,7 +69,7 @@ class SnapshotTaker:
         self._pair: tuple[Frame, Detections] | None = None
         self._changed = asyncio.Event()
         self.labels: list[str] | None = None
-        """What is detected in the written picture; None when perception is silent."""
+        """The detections of the written picture's frame; None when perception is silent."""
 
     def open(self) -> None:
         frames, detections = self._link.inbox(FRAME), self._link.inbox(DETECTIONS)

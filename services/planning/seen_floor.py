@@ -302,7 +302,7 @@ class SeenFloor:
 
     def _hidden(self, around: FloorMap, known: Sequence[tuple[float, ...]]) -> BoolArray:
         hidden = (self._count < _ENOUGH) & ~self._beside(around, known) & ~self._beyond()
-        # What is narrower than two cells hides no object.
+        # Unseen floor narrower than two cells hides no object.
         block = hidden[:-1, :-1] & hidden[1:, :-1] & hidden[:-1, 1:] & hidden[1:, 1:]
         wide_enough = np.zeros_like(hidden)
         for row in (slice(None, -1), slice(1, None)):
