@@ -16,6 +16,7 @@ unit: install
 
 manual:
 	@.venv/bin/python -m apps.cli.manual > docs/cocoro.1.new && mv docs/cocoro.1.new docs/cocoro.1
+	@.venv/bin/python -m apps.cli.help_page > apps/cli/help.page.new && mv apps/cli/help.page.new apps/cli/help.page
 
 clean:
 	rm -rf .venv out run build *.egg-info

@@ -243,7 +243,7 @@ def test_what_is_made_is_for_this_user_alone(shared: Path, monkeypatch: pytest.M
     """Without COCORO_RUN_DIR and XDG_RUNTIME_DIR the folders lie below the place for temporary files."""
     for variable in ("COCORO_RUN_DIR", "XDG_RUNTIME_DIR"):
         monkeypatch.delenv(variable, raising=False)
-    monkeypatch.setattr(tempfile, "tempdir", str(shared))
+    monkeypatch.setattr(private, "TEMPORARY", str(shared))
     run_dir = RunDir("robbie")
     assert run_dir.root == shared / f"cocoro-{os.getuid()}"
     for write, _ in WRITES.values():
@@ -290,12 +290,12 @@ def test_a_new_holder_is_not_taken_for_the_last_one_before_it_has_written_its_na
     """A process that looks in that moment waits for the name."""
     path, own = tmp_path / "executive", Holder("executive", os.getpid())
     if end == "its death":
-        path.write_bytes(msgspec.json.encode(Holder("executive", NO_PROCESS)))
+        path.write_bytes(msgspec.json.encode(Holder("executive", NO_PROCESS)._asdict()))
     else:
         held = held_file.hold(path, "executive")
         assert held is not None
         held.release()
     with path.open("rb") as new, path.open("rb") as reader:
         fcntl.flock(new, fcntl.LOCK_EX)
-        monkeypatch.setattr("time.sleep", lambda _: path.write_bytes(msgspec.json.encode(own)))
+        monkeypatch.setattr("time.sleep", lambda _: path.write_bytes(msgspec.json.encode(own._asdict())))
         assert holder_of(reader.fileno(), patience_s=60.0) == own
