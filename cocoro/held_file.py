@@ -116,8 +116,9 @@ def _read(data: bytes) -> Holder:
     except (ValueError, RecursionError):
         return UNKNOWN
     name, pid = (found.get("name"), found.get("pid")) if isinstance(found, dict) else (None, None)
-    well = isinstance(name, str) and isinstance(pid, int) and not isinstance(pid, bool) and 0 <= pid < 2**31
-    return Holder(name, pid) if well else UNKNOWN
+    if isinstance(name, str) and type(pid) is int and 0 <= pid < 2**31:
+        return Holder(name, pid)
+    return UNKNOWN
 
 
 def _lives(pid: int) -> bool:

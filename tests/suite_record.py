@@ -39,29 +39,23 @@ class Record:
         self._folder = folder
         self._config = config
         self._begun_s = time.monotonic()
+        self._before_s = processor_s()
         self._files: dict[str, dict[str, float]] = defaultdict(lambda: dict.fromkeys(FIGURES, 0.0))
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_makereport(self) -> Generator[None, pytest.TestReport, pytest.TestReport]:
         report = yield
-        report.processor_s = self._since_last()
-        report.memory_mb = memory_mb()
+        before_s, self._before_s = self._before_s, processor_s()
+        report.__dict__["figures"] = {"processor_s": self._before_s - before_s, "memory_mb": memory_mb()}
         return report
 
-    def _since_last(self) -> float:
-        before = self.__dict__.get("_last_s", self._first_s)
-        self._last_s = processor_s()
-        return self._last_s - before
-
-    def pytest_sessionstart(self) -> None:
-        self._first_s = processor_s()
-
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        figures: dict[str, float] = report.__dict__["figures"]
         file = self._files[report.nodeid.partition("::")[0]]
         file["tests"] += report.when == "call"
         file["wall_s"] += report.duration
-        file["processor_s"] += report.processor_s
-        file["memory_mb"] = max(file["memory_mb"], report.memory_mb)
+        file["processor_s"] += figures["processor_s"]
+        file["memory_mb"] = max(file["memory_mb"], figures["memory_mb"])
 
     def pytest_sessionfinish(self) -> None:
         if hasattr(self._config, "workerinput"):

@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
 from io import StringIO
+from typing import Any
 
 from rich.console import Console
 from typer import rich_utils
@@ -20,19 +24,31 @@ CODE = re.compile(r"\x1b\[[0-9;]*m")
 def drawn(width: int, colour: bool) -> str:
     """The help as the libraries draw it."""
     out = StringIO()
-    before = rich_utils.Console
     # Of the terminal that the libraries would find, only these are of interest.
-    rich_utils.Console = lambda **options: Console(  # type: ignore[assignment,misc]
-        file=out, theme=options["theme"], highlighter=options["highlighter"], width=width, force_terminal=colour,
-        color_system="standard" if colour else None, legacy_windows=False, _environ={},
+    console = partial(
+        Console, file=out, width=width, force_terminal=colour, color_system="standard" if colour else None,
+        legacy_windows=False, _environ={},
     )  # fmt: skip
-    try:
-        command = get_command(app)
-        with command.make_context("cocoro", [], resilient_parsing=True) as context:
-            command.get_help(context)
-    finally:
-        rich_utils.Console = before  # type: ignore[misc]
+    command = get_command(app)
+    with _console_of_typer(console), command.make_context("cocoro", [], resilient_parsing=True) as context:
+        command.get_help(context)
     return out.getvalue()
+
+
+@contextmanager
+def _console_of_typer(console: Callable[..., Console]) -> Iterator[None]:
+    """Has typer draw on this console."""
+
+    def made(*, theme: Any, highlighter: Any, **_: Any) -> Console:
+        return console(theme=theme, highlighter=highlighter)
+
+    typer_s: Any = rich_utils
+    before = typer_s.Console
+    typer_s.Console = made
+    try:
+        yield
+    finally:
+        typer_s.Console = before
 
 
 def page() -> str:

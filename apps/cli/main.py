@@ -24,7 +24,8 @@ if TYPE_CHECKING:
     from typing import NoReturn
 
 ESTOP = ("estop", "stop")
-HELP, STATUS = ([], ["--help"], ["-h"]), (["status"], ["status", "--json"])
+HELP: tuple[list[str], ...] = ([], ["--help"], ["-h"])
+STATUS = (["status"], ["status", "--json"])
 """Arguments that are answered before the libraries of the other commands are imported."""
 COMPLETES = "_COCORO_COMPLETE"
 """Environment variable by which a shell asks for the completion of a word."""
