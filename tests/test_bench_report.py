@@ -53,7 +53,12 @@ def test_a_share_of_trials_is_bounded_by_their_number() -> None:
 
 def test_things_take_turns_and_each_begins_a_round() -> None:
     order: list[str] = []
-    first, second = turns(3, warm=1, a=lambda: order.append("a") or 1, b=lambda: order.append("b") or 2)
+
+    def mark(name: str, value: int) -> int:
+        order.append(name)
+        return value
+
+    first, second = turns(3, warm=1, a=lambda: mark("a", 1), b=lambda: mark("b", 2))
     assert order == ["a", "b", "b", "a", "a", "b", "b", "a"]
     assert (first, second) == ([1, 1, 1], [2, 2, 2])
 
