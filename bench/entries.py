@@ -40,4 +40,7 @@ class Entry(NamedTuple):
             add(parser)
 
 
-ENTRIES: dict[str, Entry] = {}
+ENTRIES: dict[str, Entry] = {
+    "startup": Entry("startup", "suite"),
+    "tests": Entry("own_tests", "suite"),
+}

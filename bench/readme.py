@@ -198,7 +198,8 @@ def main() -> int:
                 print(ran.output)
             wrong += ran.wrong
             total_s += ran.seconds
-    print(f"{wrong} wrong; {total_s:.0f} s")
+    sections = len({block.section for block in chosen})
+    print(f"{wrong} wrong; {sections} sections; {total_s:.0f} s")
     return 1 if wrong else 0
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import fcntl
 import os
+import re
 import time
 from contextlib import suppress
 from pathlib import Path
@@ -18,6 +19,8 @@ from cocoro import private
 LOOK_S = 1.0
 """Upper bound for one look at a lock by another process, and for a new holder to write its name, s."""
 _HOLDER_BYTES = 4096
+_PLAIN = re.compile(rb'\{"name":"([a-z0-9_-]*)","pid":([0-9]{1,9})\}')
+"""A holder as nearly all are written; it is read without the module `json`."""
 
 
 class Holder(NamedTuple):
@@ -109,6 +112,8 @@ def _written(by: Holder) -> bytes:
 
 def _read(data: bytes) -> Holder:
     """What `_written` made; `UNKNOWN` when it is anything else."""
+    if plain := _PLAIN.fullmatch(data):
+        return Holder(plain[1].decode(), int(plain[2]))
     import json
 
     try:

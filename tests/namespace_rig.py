@@ -1,9 +1,11 @@
-"""A mount namespace with small file systems, for tests of full disks."""
+"""Namespaces: of mounts, with small disks that fill; of networks, in which an emergency stop is for itself."""
 
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
+from functools import cache
 from pathlib import Path
 from types import TracebackType
 
@@ -64,3 +66,18 @@ class Namespace:
 
 
 needs_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root can mount a file system")
+
+
+@cache
+def no_namespaces() -> str:
+    """The reason for which there are no namespaces to be had, or ''."""
+    if shutil.which("unshare") is None:
+        return "there is no unshare"
+    command = ["unshare", "--mount", "--net", "mount", "--make-rprivate", "/"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    return done.stderr.strip()
+
+
+def isolated(command: list[str]) -> list[str]:
+    """The command, to be run where its robots and those of this machine do not hear one another's emergency stop."""
+    return ["unshare", "--net", "sh", "-c", 'ip link set lo up; exec "$@"', "sh", *command]

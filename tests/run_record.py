@@ -1,7 +1,9 @@
-"""Writes what each file of tests took: wall time, processor time (also of processes that it waited for), memory.
+"""A record of a whole run of the tests, and their order in the next one.
 
-A pytest plugin. It does nothing unless `COCORO_SUITE_RECORD` names a folder; `deploy/test.sh` does that. Each run of
-pytest writes one file there, which `bench/suite.py` reads.
+A pytest plugin. It does nothing unless `COCORO_TESTS_RECORD` names a folder; `deploy/test.sh` does that. Each run of
+pytest writes a file there: for each file of tests its wall time, its processor time (with that of the processes that it
+waited for) and the memory of pytest itself. The files that took longest in the last run come first, so that no worker
+is left with a long one at the end. `python -m bench tests` shows the record.
 """
 
 from __future__ import annotations
@@ -16,8 +18,9 @@ from pathlib import Path
 
 import pytest
 
-FOLDER = "COCORO_SUITE_RECORD"
-"""Environment variable: the folder to write to."""
+FOLDER = "COCORO_TESTS_RECORD"
+"""Environment variable: the folder to write to. Beside it `last` is the folder of the last run."""
+LAST = "last"
 FIGURES = ("tests", "wall_s", "processor_s", "memory_mb")
 
 
@@ -32,8 +35,17 @@ def memory_mb() -> float:
     return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize() / 1e6
 
 
+def wall_s_of(folder: Path) -> dict[str, float]:
+    """Wall time of each file of tests in a record; empty without one."""
+    found: dict[str, float] = defaultdict(float)
+    for part in folder.glob("pytest-*.json"):
+        for file, figures in json.loads(part.read_text())["files"].items():
+            found[file] = max(found[file], figures["wall_s"])
+    return found
+
+
 class Record:
-    """With pytest-xdist the workers measure, and the reports carry it to the process that writes."""
+    """With pytest-xdist the workers measure, and their reports carry it to the process that writes."""
 
     def __init__(self, folder: Path, config: pytest.Config) -> None:
         self._folder = folder
@@ -41,6 +53,11 @@ class Record:
         self._begun_s = time.monotonic()
         self._before_s = processor_s()
         self._files: dict[str, dict[str, float]] = defaultdict(lambda: dict.fromkeys(FIGURES, 0.0))
+
+    @pytest.hookimpl(trylast=True)
+    def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
+        took_s = wall_s_of(self._folder.parent / LAST)
+        items.sort(key=lambda item: -took_s.get(_file(item.nodeid), 0.0))  # of a file, and of equals, the order stays
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_makereport(self) -> Generator[None, pytest.TestReport, pytest.TestReport]:
@@ -50,8 +67,8 @@ class Record:
         return report
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        figures: dict[str, float] = report.__dict__["figures"]
-        file = self._files[report.nodeid.partition("::")[0]]
+        figures: dict[str, float] = report.__dict__.get("figures", {"processor_s": 0.0, "memory_mb": 0.0})
+        file = self._files[_file(report.nodeid)]
         file["tests"] += report.when == "call"
         file["wall_s"] += report.duration
         file["processor_s"] += figures["processor_s"]
@@ -69,6 +86,10 @@ class Record:
         (self._folder / f"pytest-{os.getpid()}.json").write_text(json.dumps(written))
 
 
+def _file(nodeid: str) -> str:
+    return nodeid.partition("::")[0]
+
+
 def pytest_configure(config: pytest.Config) -> None:
     if folder := os.environ.get(FOLDER):
-        config.pluginmanager.register(Record(Path(folder), config), "suite record")
+        config.pluginmanager.register(Record(Path(folder), config), "record of the run")
