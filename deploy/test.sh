@@ -29,54 +29,25 @@ if [ $# -gt 0 ]; then
     exit 1
 fi
 
-# Tests that measure real time closely run one by one, then the others that use zenoh or measure real time on a few
-# workers, since they wait more than they compute. Meanwhile all other tests run on two workers with the processor time
-# that is left, so that they do not falsify those times: in the class SCHED_IDLE and, since Linux shares the processor
-# between sessions first, in a session of the least weight. Without chrt and setsid (util-linux) they run before. Each
-# file stays on one worker, so that what its tests share is made once. Files run in the order that `tests/run_record.py`
-# gives: by default those with few tests come last, and a long test would end alone.
-spread=(--dist loadfile --no-loadscope-reorder)
-others=(pytest -rs -n 2 "${spread[@]}" -m "not zenoh")
-alone=(pytest -rs -m "zenoh and alone")
-beside=(pytest -rs -n 3 "${spread[@]}" -m "zenoh and not alone")
+# Which tests run beside which, and why: tests/run_spread.py. What each file takes, and the memory of all, is kept in
+# out/tests/last.
 record=$PWD/out/tests
-tests=0
 rm -rf "$record/new"
 mkdir -p "$record/new"
 export COCORO_TESTS_RECORD=$record/new
-said=$(mktemp)
-waited=() # what is to be ended with this script
-python tests/run_memory.py "$COCORO_TESTS_RECORD" &
+python tests/run_memory.py "$record/new" &
 memory=$!
-trap 'kill $memory "${waited[@]}" 2>/dev/null; rm -f "$said"' EXIT
+trap 'kill $memory 2>/dev/null' EXIT
 trap 'exit 130' INT TERM # after pytest has ended, which hears Ctrl-C, too
-
-run() {
-    echo "== $*"
-    "$@" || tests=$?
-}
-
 begun=$SECONDS
-if { command -v chrt && command -v setsid; } >/dev/null; then
-    aside='{ echo 19 >/proc/self/autogroup; } 2>/dev/null; exec chrt --idle 0 "$@"'
-    setsid bash -c "$aside" aside "${others[@]}" >"$said" 2>&1 &
-    waited=($!)
-    run "${alone[@]}"
-    run "${beside[@]}"
-    echo "== ${others[*]}, which began with the others"
-    wait "${waited[0]}" || tests=$?
-    waited=()
-    cat "$said"
-else
-    run "${others[@]}"
-    run "${alone[@]}"
-    run "${beside[@]}"
-fi
+echo "== pytest --spread"
+pytest -rs --spread
+tests=$?
 kill $memory
 wait $memory
 echo "$((SECONDS - begun))" >"$record/new/seconds"
 rm -rf "$record/last"
 mv "$record/new" "$record/last"
-python -m bench tests || true # what each file took; its bounds are for a quiet machine
+python -m bench tests || true # its bounds are for a machine that does nothing else
 [ ${#unclean[@]} = 0 ] && exit $tests
 exit 1

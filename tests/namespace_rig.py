@@ -1,4 +1,4 @@
-"""Namespaces: of mounts, with small disks that fill; of networks, in which an emergency stop is for itself."""
+"""A mount namespace with small file systems, for tests of full disks."""
 
 from __future__ import annotations
 
@@ -76,8 +76,3 @@ def no_namespaces() -> str:
     command = ["unshare", "--mount", "--net", "mount", "--make-rprivate", "/"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     return done.stderr.strip()
-
-
-def isolated(command: list[str]) -> list[str]:
-    """The command, to be run where its robots and those of this machine do not hear one another's emergency stop."""
-    return ["unshare", "--net", "sh", "-c", 'ip link set lo up; exec "$@"', "sh", *command]

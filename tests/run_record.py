@@ -45,7 +45,7 @@ def wall_s_of(folder: Path) -> dict[str, float]:
 
 
 class Record:
-    """With pytest-xdist the workers measure, and their reports carry it to the process that writes."""
+    """With `--spread` the workers measure, and their reports carry it to the process that writes."""
 
     def __init__(self, folder: Path, config: pytest.Config) -> None:
         self._folder = folder
@@ -53,6 +53,10 @@ class Record:
         self._begun_s = time.monotonic()
         self._before_s = processor_s()
         self._files: dict[str, dict[str, float]] = defaultdict(lambda: dict.fromkeys(FIGURES, 0.0))
+
+    def begin(self) -> None:
+        """What was before is not counted: this process was forked."""
+        self._before_s = processor_s()
 
     @pytest.hookimpl(trylast=True)
     def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
@@ -75,8 +79,6 @@ class Record:
         file["memory_mb"] = max(file["memory_mb"], figures["memory_mb"])
 
     def pytest_sessionfinish(self) -> None:
-        if hasattr(self._config, "workerinput"):
-            return
         self._folder.mkdir(parents=True, exist_ok=True)
         written = {
             "arguments": list(self._config.invocation_params.args),

@@ -67,8 +67,21 @@ class Survey:
         alive = set(await self._link.alive())
         there = alive | self._link.replayed()
         wanted_news = {topic.name for topic in NEWS if topic.service in there}
+        asking = [asyncio.ensure_future(self._ask(topic)) for topic in (HEALTH.of("*"), *NEWS) if topic.slow]
         await within(HEALTH_S, lambda: there <= set(self._health) and wanted_news <= set(self._newest), self._changed)
+        for question in asking:
+            question.cancel()
+        await asyncio.gather(*asking, return_exceptions=True)
         return self._report(alive, there)
+
+    async def _ask(self, topic: Topic[Any]) -> None:
+        """Ask for messages that may not come of themselves for a second; one that came meanwhile is newer."""
+        for message in await self._link.newest(topic, HEALTH_S):
+            if isinstance(message, Health):
+                self._health.setdefault(message.service, message)
+            else:
+                self._newest.setdefault(topic.name, message)
+        self._changed.set()
 
     def _on_health(self, health: Health) -> None:
         self._health[health.service] = health
