@@ -12,7 +12,7 @@ test: install
 	@deploy/test.sh
 
 unit: install
-	@.venv/bin/pytest -n 2 --dist loadfile -m "not process and not sim and not sweep and not zenoh"
+	@.venv/bin/pytest --spread -m "not process and not sim and not sweep and not zenoh"
 
 manual:
 	@.venv/bin/python -m apps.cli.manual > docs/cocoro.1.new && mv docs/cocoro.1.new docs/cocoro.1
