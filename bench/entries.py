@@ -40,4 +40,6 @@ class Entry(NamedTuple):
             add(parser)
 
 
-ENTRIES: dict[str, Entry] = {}
+ENTRIES = {
+    "decoupling": Entry("decoupling", "suite"),
+}
