@@ -42,4 +42,5 @@ class Entry(NamedTuple):
 
 ENTRIES = {
     "decoupling": Entry("decoupling", "suite"),
+    "pixel": Entry("pixel", "suite"),
 }
