@@ -40,7 +40,9 @@ class Entry(NamedTuple):
             add(parser)
 
 
-ENTRIES: dict[str, Entry] = {
+ENTRIES = {
+    "decoupling": Entry("decoupling", "suite"),
+    "pixel": Entry("pixel", "suite"),
     "startup": Entry("startup", "suite"),
     "tests": Entry("own_tests", "suite"),
 }
