@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from apps.cli.options import RobotChoice
+from apps.cli.choice import RobotChoice
 from cocoro.bus.base import Bus
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.errors import ConfigError, MeshError, choice_of

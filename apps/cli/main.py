@@ -71,30 +71,43 @@ def _run(arguments: list[str]) -> int:
             print(text, end="\n" if arguments else "")  # as typer prints it
             return exits.DONE if arguments else exits.USAGE
     if arguments in STATUS:
-        _need_a_robot()
+        return _status("--json" in arguments)
     return _command(arguments)
 
 
-def _need_a_robot() -> None:
-    """Raises MeshError when no robot is up, which is known before anything is imported that asks one."""
+def _status(as_json: bool) -> int:
+    """The command without other options. That no robot is up is known before anything is imported that asks one; then
+    MeshError is raised."""
     from deploy.rundir import START, robots
 
     if not robots():
         from cocoro.errors import MeshError
 
         raise MeshError(f"no robot is up on this machine: {START}")
+    import asyncio
+
+    from apps.cli.choice import RobotChoice
+    from apps.cli.status import show_status
+
+    _report_failures()
+    return asyncio.run(show_status(RobotChoice(), as_json))
 
 
-def _command(arguments: list[str]) -> int:
+def _report_failures() -> None:
+    """Has the failures of threads and what libraries log reported as a command's own."""
     import threading
-
-    from typer.main import get_command
-
-    from apps.cli.app import app
 
     if output.taken_over():
         threading.excepthook = _thread_failed
         output.log_to_stderr()
+
+
+def _command(arguments: list[str]) -> int:
+    from typer.main import get_command
+
+    from apps.cli.app import app
+
+    _report_failures()
     try:
         get_command(app)(args=arguments, prog_name="cocoro")  # calling `app` would replace sys.excepthook
     except SystemExit as end:

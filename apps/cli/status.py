@@ -1,19 +1,20 @@
-"""`cocoro status`: the services that should run, their health, the task and the planner's reason."""
+"""What `cocoro status` shows: the services that should run, their health, the task and the planner's reason.
+
+Without options `apps/cli/main.py` calls it, so it does without the library that reads options.
+"""
 
 from __future__ import annotations
 
 import asyncio
-import sys
 from collections.abc import Iterator
 from functools import partial
 from typing import Any
 
 import msgspec
-import typer
 
 from apps.cli import exits
+from apps.cli.choice import RobotChoice
 from apps.cli.link import REPLAYED, MeshLink, joined, within
-from apps.cli.options import JsonOption, MeshOption, RobotChoice, RobotOption
 from apps.cli.output import print_json
 from apps.cli.terminal import Column, fields, print_table
 from cocoro.errors import ConfigError
@@ -30,14 +31,6 @@ COLUMNS = (
     "service", "state", Column("pid", 2, right=True), Column("cpu", right=True), Column("memory", right=True),
     Column("loop", 1, right=True), Column("", text=True),
 )  # fmt: skip
-
-app = typer.Typer()
-
-
-@app.command()
-def status(robot: RobotOption = None, profile: MeshOption = None, json: JsonOption = False) -> None:
-    """The running services, their health, the task and the planner's reason. Exit code 1 when a service is missing."""
-    sys.exit(asyncio.run(show_status(RobotChoice(robot, profile), json)))
 
 
 async def show_status(choice: RobotChoice, as_json: bool) -> int:
