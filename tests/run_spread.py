@@ -40,7 +40,7 @@ import pytest
 from run_record import memory_mb
 
 WORKERS = {"others": 2, "alone": 1, "beside": 2}
-GROWN_MB = 150.0
+GROWN_MB = 100.0
 NEW_NETWORK = 0x40000000
 """CLONE_NEWNET, see unshare(2)."""
 SET_FLAGS, UP, RUNNING = 0x8914, 0x1, 0x40
@@ -254,13 +254,15 @@ def work(config: pytest.Config, name: str, kind: str, queue: int, jobs: list[lis
     temporary._basetemp.mkdir(mode=0o700)
     if (record := plugins.getplugin("record of the run")) is not None:
         record.begin()
-    at_first_mb = memory_mb()
+    libc, at_first_mb = ctypes.CDLL(None), memory_mb()
     while number := os.read(queue, _NUMBER.size):
         items = jobs[_NUMBER.unpack(number)[0]]
         teller.tell("file", [item.nodeid for item in items])
         for item, after in zip(items, [*items[1:], None], strict=True):
             config.hook.pytest_runtest_protocol(item=item, nextitem=after)
             teller.tell("done", item.nodeid)
+        gc.collect()
+        libc.malloc_trim(0)  # gives back to the system what the allocator has kept
         if memory_mb() > at_first_mb + GROWN_MB:
             teller.tell("grown")
             return
