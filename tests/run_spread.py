@@ -89,9 +89,9 @@ class Spread:
         self._forked = 0
 
     @pytest.hookimpl(tryfirst=True)
-    def pytest_runtestloop(self, session: pytest.Session) -> bool:
-        if session.testsfailed:
-            raise session.Interrupted("errors during collection")
+    def pytest_runtestloop(self, session: pytest.Session) -> bool | None:
+        if session.testsfailed or self._config.option.collectonly:
+            return None  # pytest itself says so
         self._jobs = jobs_of(session.items)
         self._queues = {kind: _queue(len(jobs)) for kind, jobs in self._jobs.items()}
         may_be_alone()  # found out once for all
@@ -236,6 +236,7 @@ class Teller:
 
 def work(config: pytest.Config, name: str, kind: str, queue: int, jobs: list[list[pytest.Item]], writer: int) -> None:
     """Runs one file after another."""
+    os.setsid()  # Ctrl-C comes from the process that forked, once
     if kind == "others":
         step_back()
     if may_be_alone():
@@ -258,9 +259,13 @@ def work(config: pytest.Config, name: str, kind: str, queue: int, jobs: list[lis
     while number := os.read(queue, _NUMBER.size):
         items = jobs[_NUMBER.unpack(number)[0]]
         teller.tell("file", [item.nodeid for item in items])
-        for item, after in zip(items, [*items[1:], None], strict=True):
-            config.hook.pytest_runtest_protocol(item=item, nextitem=after)
-            teller.tell("done", item.nodeid)
+        try:
+            for item, after in zip(items, [*items[1:], None], strict=True):
+                config.hook.pytest_runtest_protocol(item=item, nextitem=after)
+                teller.tell("done", item.nodeid)
+        except KeyboardInterrupt:
+            items[0].session._setupstate.teardown_exact(None)  # so that its fixtures end
+            raise
         gc.collect()
         libc.malloc_trim(0)  # gives back to the system what the allocator has kept
         if memory_mb() > at_first_mb + GROWN_MB:
@@ -283,8 +288,7 @@ def be_alone() -> None:
 
 
 def step_back() -> None:
-    """Leaves the processor to all others, as far as the system allows it."""
-    os.setsid()
+    """Leaves the processor to all other sessions, as far as the system allows it."""
     with contextlib.suppress(OSError):
         Path("/proc/self/autogroup").write_text("19")
     with contextlib.suppress(OSError, AttributeError):
