@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from run_record import wall_s_of
 from run_spread import WORKERS, jobs_of
 
 from bench.own_tests import RECORD
@@ -95,3 +96,14 @@ def test_a_test_is_in_one_job(request: pytest.FixtureRequest) -> None:
     assert set(jobs) == set(WORKERS)
     placed = [item.nodeid for files in jobs.values() for file in files for item in file]
     assert sorted(placed) == sorted(item.nodeid for item in items)
+
+
+def test_the_files_that_took_longest_come_first_and_without_a_record_those_that_are_known_to_be_long(
+    tmp_path: Path,
+) -> None:
+    guessed = wall_s_of(tmp_path / "missing")
+    assert guessed
+    assert all((HERE.parent / file).is_file() for file in guessed)
+    (tmp_path / "pytest-1.json").write_text(json.dumps({"files": {"a.py": {"wall_s": 3.0}, "b.py": {"wall_s": 1.0}}}))
+    (tmp_path / "pytest-2.json").write_text(json.dumps({"files": {"b.py": {"wall_s": 4.0}}}))
+    assert wall_s_of(tmp_path) == {"a.py": 3.0, "b.py": 4.0}
