@@ -22,8 +22,8 @@ FOLDER = "COCORO_TESTS_RECORD"
 """Environment variable: the folder to write to. Beside it `last` is the folder of the last run."""
 LAST = "last"
 LONG = (
-    "faults_live", "readme", "stop_live", "faults_full", "capture_mesh", "wire_robot", "bus_leaving",
-    "faults_message", "cli_surroundings", "rehearse", "robot_faults", "faults_speed", "faults_silence", "faults_barrage",
+    "faults_live", "readme", "stop_live", "faults_full", "capture_mesh", "wire_robot", "bus_leaving", "rehearse",
+    "faults_message", "cli_surroundings", "robot_faults", "faults_speed", "faults_silence", "faults_barrage",
 )  # fmt: skip
 """Files that take long, without a record."""
 FIGURES = ("tests", "wall_s", "processor_s", "memory_mb")
