@@ -101,7 +101,6 @@ class Barrage:
 
 async def fetched(barrage_seed: int | None) -> TaskState:
     async with RobotRig() as rig:
-        rig.tap.leave_out(topics.FRAME)
         barrage = Barrage(rig, barrage_seed or 0)
         if barrage_seed is not None:
             rig.operator.spawn(barrage.fire())
