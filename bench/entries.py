@@ -40,4 +40,7 @@ class Entry(NamedTuple):
             add(parser)
 
 
-ENTRIES: dict[str, Entry] = {}
+ENTRIES: dict[str, Entry] = {
+    "baselines": Entry("baselines", "suite"),
+    "learning": Entry("learning", "suite"),
+}

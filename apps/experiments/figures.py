@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 OURS, OTHER, TRUE, FAINT = "#1b6ca8", "#c8553d", "#2f2f2f", "#b9b9b9"
-COLOURS = (OURS, OTHER, "#6a994e")
+COLOURS = (OURS, OTHER, "#6a994e", "#8a5a9e")
 SMOOTHED = 15
 """Number of sightings over which the bent arm's errors are averaged."""
 
@@ -75,8 +75,9 @@ def curves(seeds: Sequence[Mapping[str, Mapping[str, float]]]) -> Figure:
     figure, (axis,) = sheet(width=6.0)
     names = {
         "default": "ours: 81 bases over the nominal model",
-        "paper over drawing": "the paper's rule over the nominal model",
-        "paper": "the paper's rule, primed",
+        "rigid": "the rigid body, calibrated",
+        "paper searched": "the paper's rule, its grid search made again",
+        "paper": "the paper's rule, best reading of the text",
     }
     for (key, label), colour in zip(names.items(), COLOURS, strict=True):
         sizes = sorted({int(size) for seed in seeds for size in seed[key]})

@@ -21,6 +21,13 @@ from services.planning.teaching import Adapter
 
 SIZES = (100, 300, 1000, 2000)
 """Numbers of samples of the learning curves."""
+CURVES = {
+    "default": study.BEST,
+    "rigid": study.RIGID[-1],
+    "paper": study.PAPER,
+    "paper searched": study.PAPER_SEARCHED,
+}
+"""The learning curves: ours, and the baselines at their best."""
 
 
 def load_robot(description: str | None = None, measured: str | None = None) -> Robot:
@@ -43,7 +50,6 @@ def learn(
     nominal = NominalModel(robot)
     rows = dataset.read(Path(arm), HandRow, robot).rows
     learn, held = study.split(study.clean(sightings(rows), nominal))
-    methods = {"default": study.BEST, "paper": study.METHODS[0], "paper over drawing": study.METHODS[2]}
     sizes = [size for size in SIZES if size <= len(learn)]
     draws = np.unique([row.draw for row in rows])
     trials = dataset.read(Path(wheels), WheelRow, robot).rows
@@ -53,13 +59,25 @@ def learn(
         "held": len(held),
         "curves": {
             name: {str(s): e for s, e in zip(sizes, study.curve(m, nominal, learn, held, sizes), strict=True)}
-            for name, m in methods.items()
+            for name, m in CURVES.items()
         },
         "draws_used": len(draws),
         "draws_looked_at": int(draws.max() - draws.min() + 1),
         "babbled_s": _babbled_s(rows),
         "wheels": _fitted(fit, trials),
     }
+
+
+def rigid(
+    arm: str, wheels: str, into: str, description: str | None = None, measured: str | None = None
+) -> dict[str, Any]:  # fmt: skip
+    """Calibrates the rigid body by the arm's samples, and writes a model with it and with the learned wheels. Returns
+    its error."""
+    robot, file = load_robot(description, measured), Path(into)
+    file.unlink(missing_ok=True)
+    _, report = learn_arm(Path(arm), file, robot, method=study.RIGID[-1].name)
+    learn_wheels(Path(wheels), file, robot)
+    return {"held_out_m": report.scores[-1].held_out_m}
 
 
 def wheels(trials: str, into: str, description: str | None = None, measured: str | None = None) -> dict[str, Any]:
