@@ -193,7 +193,7 @@ def test_joint_zeros_are_found_where_nothing_else_is_wrong(nominal: NominalModel
     true = CalibratedModel(nominal, zeros)
     exact = Sightings(seen.angles_rad, true.predict(seen.angles_rad), seen.draws)
     left = rms(errors_m(calibrate(nominal, exact, "zeros"), exact))  # the prior keeps them a little too small
-    assert left < 0.01 * rms(errors_m(nominal, exact))
+    assert left < 0.02 * rms(errors_m(nominal, exact))
 
 
 def test_a_calibrated_body_comes_to_the_noise_of_what_was_seen(robot: Robot, nominal: NominalModel) -> None:
@@ -228,9 +228,12 @@ def test_the_experiments_compare_with_the_best_readings_and_with_the_calibrated_
             for name, error in ((PAPER.name, 0.02), (RIGID[-1].name, 0.01),
                                 ("the nominal model with its best constant offset", 0.04))
         ]},
-        "curves": {key: {} for key in CURVES}, "draws_used": 1, "draws_looked_at": 2, "babbled_s": 60.0, "learn": 3,
+        "readings": {"one": 0.05, "another": 0.03}, "curves": {key: {} for key in CURVES}, "draws_used": 1,
+        "draws_looked_at": 2, "babbled_s": 60.0, "learn": 3,
     }  # fmt: skip
     results = {run.name: {"error": "none"} for run in e1_hand_eye_map.runs(settings)} | {"learn-0": lesson}
-    rows = {(row.measure, row.values.mean) for row in e1_hand_eye_map.section(settings, results).rows}
+    shown = e1_hand_eye_map.section(settings, results).rows
+    assert [row.values.mean for row in shown if "whichever allowed reading" in row.who] == [pytest.approx(3.0)]
+    rows = {(row.measure, row.values.mean) for row in shown}
     assert (f"share of the error of: {PAPER.name}", 1.0) in rows
     assert (f"share of the error of: {RIGID[-1].name}", 2.0) in rows

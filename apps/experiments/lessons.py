@@ -12,6 +12,7 @@ import numpy as np
 from apps.learning import dataset, study
 from apps.learning.dataset import HandRow, WheelRow
 from apps.learning.lesson import learn_arm, learn_wheels, sightings
+from apps.learning.paper_rule import ALLOWED
 from apps.learning.wheels import WheelFit, fit_wheels
 from cocoro.clock import NS
 from cocoro.learning import model
@@ -41,7 +42,8 @@ def learn(
 ) -> dict[str, Any]:  # fmt: skip
     """Learns arm and wheels from two files of samples and writes the model to `into`.
 
-    Returns every method's score (or that of `method` alone), learning curves and the fit of the wheels.
+    Returns every method's score (or that of `method` alone), learning curves and the fit of the wheels; with every
+    method also the held-out error of each reading of the paper's rule that its text allows.
     """
     robot, file = load_robot(description, measured), Path(into)
     file.unlink(missing_ok=True)
@@ -52,6 +54,10 @@ def learn(
     learn, held = study.split(study.clean(sightings(rows), nominal))
     sizes = [size for size in SIZES if size <= len(learn)]
     draws = np.unique([row.draw for row in rows])
+    readings = {
+        one.name: study.rms(study.errors_m(study.fit(one.method, nominal, learn), held))
+        for one in (ALLOWED if method is None else ())
+    }
     trials = dataset.read(Path(wheels), WheelRow, robot).rows
     return {
         "arm": report.data(),
@@ -61,6 +67,7 @@ def learn(
             name: {str(s): e for s, e in zip(sizes, study.curve(m, nominal, learn, held, sizes), strict=True)}
             for name, m in CURVES.items()
         },
+        "readings": readings,
         "draws_used": len(draws),
         "draws_looked_at": int(draws.max() - draws.min() + 1),
         "babbled_s": _babbled_s(rows),

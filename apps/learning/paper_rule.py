@@ -148,6 +148,8 @@ def reading(*names: str) -> Reading:
 
 READINGS: tuple[Reading, ...] = tuple(Reading(choices) for choices in product(*AXES.values()))
 """Every combination, with the text's numbers."""
+ALLOWED: tuple[Reading, ...] = tuple(one for one in READINGS if not one.contradicts)
+"""Those that contradict no statement of the text."""
 
 GRID_BASES, GRID_SIGMA, GRID_RATE = (3, 4), (0.785, 1.11, 1.57), (0.025, 0.1, 0.4, 0.8)
 
