@@ -40,13 +40,9 @@ class Entry(NamedTuple):
             add(parser)
 
 
-<<<<<<< HEAD
 ENTRIES: dict[str, Entry] = {
-    "baselines": Entry("baselines", "suite"),
-    "learning": Entry("learning", "suite"),
-=======
-ENTRIES = {
     "decoupling": Entry("decoupling", "suite"),
     "pixel": Entry("pixel", "suite"),
->>>>>>> main
+    "baselines": Entry("baselines", "suite"),
+    "learning": Entry("learning", "suite"),
 }
