@@ -113,7 +113,7 @@ def begin(method: Method, nominal: NominalModel) -> tuple[HandMap, LeastSquares 
 
     The learner is None for the paper's rule, whose only state is the weights.
     """
-    learned, learner = _primed(method, nominal)
+    learned, learner = _primed(replace(method, name="", passes=1), nominal)  # neither matters to it
     network = learned.network.copy()
     return HandMap(
         nominal, network, over_nominal=method.over_nominal, coordinates=method.coordinates
