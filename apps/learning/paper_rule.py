@@ -8,7 +8,8 @@ source allows, so the experiments compare with the best readings (`AS_PRINTED`, 
 
 What the text is silent on, the first author's public library of such networks answers (github.com/bgalbraith/pyrbfn,
 September 2014): normalised activations, steps that are not divided by their length, centres at the ends of the range,
-and random weights at the start instead of zeros. It is no part of the text; with random weights every reading is worse.
+and random weights within +-1 at the start. It is no part of the text; here the weights start at zero, because one pass
+at the text's rates does not remove random ones.
 """
 
 from __future__ import annotations
