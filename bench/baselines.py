@@ -79,7 +79,7 @@ def read_text(errors: Mapping[Reading, Sequence[float]], report: Report) -> None
     report.value("the paper's rule, best of all readings: held-out error", errors[min(READINGS, key=mean)], "mm")
     report.ratio(
         "the reading that the experiments use / the best that the text allows", [mean(AS_PRINTED)], [mean(best)],
-        at_most=1.0,
+        at_most=1.2,
     )  # fmt: skip
     groups: dict[tuple[Statement, ...], list[Reading]] = {}
     for reading in READINGS:

@@ -72,6 +72,8 @@ def hand_places(samples: Path, learned: Path, robot: Robot) -> Figure:
 
 def curves(seeds: Sequence[Mapping[str, Mapping[str, float]]]) -> Figure:
     """Held-out error against the number of samples, for each method of `lessons.learn`; a line for each seed."""
+    from matplotlib.ticker import LogLocator
+
     figure, (axis,) = sheet(width=6.0)
     names = {
         "default": "ours: 81 bases over the nominal model",
@@ -85,6 +87,10 @@ def curves(seeds: Sequence[Mapping[str, Mapping[str, float]]]) -> Figure:
         axis.plot(sizes, lines.T, color=colour, linewidth=0.5, alpha=0.4)
         axis.plot(sizes, np.nanmean(lines, axis=0), color=colour, marker="o", markersize=4, label=label)
     axis.set(xscale="log", yscale="log", xlabel="samples", ylabel="held-out error, RMS, cm")
+    axis.xaxis.set_major_formatter("{x:g}")
+    axis.yaxis.set_major_formatter("{x:g}")
+    axis.yaxis.set_minor_locator(LogLocator(subs=(2, 3, 5)))
+    axis.yaxis.set_minor_formatter("{x:g}")
     axis.legend(frameon=False, fontsize=8)
     return figure
 
