@@ -4,17 +4,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from math import ceil, floor, sqrt
+from math import sqrt
 from typing import Protocol
 
 import numpy as np
 
-from cocoro.arrays import CodeArray, Float32Array, FloatArray, ImageArray
+from cocoro.arrays import CodeArray, Float32Array, FloatArray, ImageArray, IntArray
 from cocoro.messages import Frame
 from cocoro.robot import Camera, Robot
+from services.perception.registration import PixelBox, Registration, registration
 
-PixelBox = tuple[int, int, int, int]
-"""left, top, right, bottom, px; right and bottom are exclusive."""
+__all__ = ["Detector", "Evidence", "ImageSighting", "PixelBox", "RgbdImage"]
+
+_BOX_COSTS_PX = 30, 8000
+"""A box is registered in the time of a wider one with so many columns and pixels more."""
 
 
 class RgbdImage:
@@ -26,6 +29,8 @@ class RgbdImage:
         self.raw_depth = raw_depth
         self.height, self.width = raw_depth.shape
         self._robot = robot
+        self._registered: CodeArray = raw_depth
+        self._registered_boxes: list[PixelBox] = []
 
     @classmethod
     def of(cls, frame: Frame, robot: Robot) -> RgbdImage:
@@ -37,6 +42,15 @@ class RgbdImage:
     def camera(self) -> Camera:
         """The colour camera's parameters at this frame's resolution."""
         return self._robot.camera.scaled(self.width, self.height)
+
+    @property
+    def _registration(self) -> Registration:
+        return registration(self._robot, self.width, self.height)
+
+    @property
+    def registered_depth_m(self) -> Float32Array:
+        """Depth of each code of `codes_at`, m, shape (2048,); NaN for those without data."""
+        return self._registration.table
 
     @property
     def scale(self) -> float:
@@ -59,42 +73,30 @@ class RgbdImage:
         return depth if np.isfinite(depth) else None
 
     def depth_m(self, box: PixelBox) -> Float32Array:
-        """Depth along the optical axis at the colour pixels of a box, m, shape (bottom - top, right - left).
-
-        The depth camera is beside the colour camera, so each depth pixel of the neighbourhood is moved to the
-        colour pixel that shows its point; where several meet, the nearest counts. NaN without data, in an infrared
-        shadow, and in cracks between moved pixels.
-        """
+        """Depth along the optical axis at the colour pixels of a box, m, shape (bottom - top, right - left); NaN without
+        data, in an infrared shadow, and in cracks between moved pixels."""
         left, top, right, bottom = box
-        camera = self.camera
-        ox, oy, oz = self._robot.kinect.depth_offset_m
-        # A point at depth z moves by f * offset / z pixels between the two images, and farthest at the nearest depth.
-        nearest_m = self._robot.kinect.min_range_m
-        shift_u, shift_v = camera.fx * ox / nearest_m, camera.fy * oy / nearest_m
-        spare = ceil(abs(oz) / nearest_m * self.width) + 1
-        source_left, source_top, source_right, source_bottom = self.clip(
-            (
-                left + floor(min(-shift_u, 0)) - spare,
-                top + floor(min(-shift_v, 0)) - spare,
-                right + ceil(max(-shift_u, 0)) + spare,
-                bottom + ceil(max(-shift_v, 0)) + spare,
-            )
-        )
-        raw = self.raw_depth[source_top:source_bottom, source_left:source_right]
-        depth = self._robot.depth_m(raw)
-        rows, columns = np.nonzero(np.isfinite(depth))
-        z = depth[rows, columns]
-        z_colour = z + np.float32(oz)
-        u = ((columns + np.float32(source_left - camera.cx)) * z + np.float32(camera.fx * ox)) / z_colour
-        v = ((rows + np.float32(source_top - camera.cy)) * z + np.float32(camera.fy * oy)) / z_colour
-        column = np.rint(u + np.float32(camera.cx - left)).astype(np.int32)
-        row = np.rint(v + np.float32(camera.cy - top)).astype(np.int32)
-        width, height = right - left, bottom - top
-        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-        out = np.full(width * height, np.inf, dtype=np.float32)
-        np.minimum.at(out, row[inside] * width + column[inside], z_colour[inside])
-        out[np.isinf(out)] = np.nan
-        return out.reshape(height, width)
+        for done in self._registered_boxes:
+            if done[0] <= left and done[1] <= top and right <= done[2] and bottom <= done[3]:
+                return self._registration.depth_m(self._registered[top:bottom, left:right])
+        return self._registration.depth_m(self._registration.codes(self.raw_depth, box))
+
+    def register(self, boxes: IntArray) -> None:
+        """Compute the depth at the colour pixels of boxes, shape (n, 4), for `depth_m` and `codes_at`."""
+        left, top = boxes[:, :2].min(axis=0).tolist()
+        right, bottom = boxes[:, 2:].max(axis=0).tolist()
+        separately = int(((boxes[:, 2] - boxes[:, 0] + _BOX_COSTS_PX[0]) * (boxes[:, 3] - boxes[:, 1])).sum())
+        if separately + _BOX_COSTS_PX[1] * len(boxes) < (right - left) * (bottom - top):
+            self._registered_boxes = [(a, b, c, d) for a, b, c, d in boxes.tolist()]
+        else:
+            self._registered_boxes = [(left, top, right, bottom)]
+        self._registered = np.empty(self.raw_depth.shape, dtype=np.uint16)
+        for box in self._registered_boxes:
+            self._registered[box[1] : box[3], box[0] : box[2]] = self._registration.codes(self.raw_depth, box)
+
+    def codes_at(self, columns: IntArray, rows: IntArray) -> CodeArray:
+        """Codes of the depth at colour pixels within registered boxes, shape of `columns` and `rows`."""
+        return self._registered.reshape(-1).take(rows * self.width + columns)
 
 
 @dataclass(frozen=True)

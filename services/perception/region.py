@@ -54,7 +54,7 @@ class ColourRegion:
     @staticmethod
     def margin_px(image: RgbdImage) -> int:
         """The margin around a region: the ring of `surroundings` and one pixel."""
-        return _ring_px(image) + 2
+        return ring_px(image) + 2
 
     @property
     def diagonal_px(self) -> float:
@@ -91,7 +91,7 @@ class ColourRegion:
     @cached_property
     def surroundings(self) -> BoolArray:
         """A ring outside of the outline, shape of `box`, beyond blended pixels and the pixel that cleaning removes."""
-        ring = 2 * _ring_px(self.image) + 1
+        ring = 2 * ring_px(self.image) + 1
         outer = cv2.dilate(self.mask, np.ones((ring, ring), dtype=np.uint8))
         inner = cv2.dilate(self.mask, _AROUND)
         return np.asarray(outer, dtype=np.bool_) & ~np.asarray(inner, dtype=np.bool_)
@@ -104,7 +104,7 @@ class ColourRegion:
         if total == 0:
             return True
         own = np.where((self.mask > 0) & np.isfinite(self.depth), self.depth, np.float32(0))
-        reach = 2 * _ring_px(self.image) + 3
+        reach = 2 * ring_px(self.image) + 3
         beside = np.asarray(cv2.dilate(own, np.ones((reach, reach), dtype=np.uint8)))
         known = np.isfinite(self.depth)
         step = NEARER_STEP_M + depth_doubt_m(beside)
@@ -174,5 +174,5 @@ def components(
     return found
 
 
-def _ring_px(image: RgbdImage) -> int:
+def ring_px(image: RgbdImage) -> int:
     return 3 if image.scale > 0.75 else 2
