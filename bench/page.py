@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from bench.entries import ENTRIES
 from bench.report import Chart, Figure, Result, number
 from bench.suite import ROOT, STORED, names, read
 
@@ -43,7 +42,7 @@ def picture(name: str, chart: Chart) -> str:
 def section(result: Result) -> str:
     """A bench's part of the page."""
     machine = result.machine
-    lines = [f"## {result.bench.capitalize()}", "", f"{ENTRIES[result.bench].about}", "", f"`{result.command}`"]
+    lines = [f"## {result.bench.capitalize()}", "", result.about, "", f"`{result.command}`"]
     lines[-1] += (
         f", {result.seconds:.0f} s on {machine.cores} cores of {machine.processor}, Python {machine.python}, "
         f"{result.date}; other programs used {machine.busy_percent:.0f}% before it began."
