@@ -10,7 +10,7 @@ from perception_scenes import CATALOGUE, MS, ROBOT, STAMP_NS, Scene, Thing, bloc
 from services.perception.config import PerceptionConfig
 from services.perception.image import ImageSighting
 from services.perception.localise import Localiser
-from services.perception.shapes import distance_from, signed_distance
+from services.perception.shapes import Shapes, Solids
 from sim.realism import Sensors
 from sim.scene import Light
 

@@ -1,7 +1,4 @@
-"""Takes from the pixels of many regions at once what their objects are placed by: depths and evidence.
-
-`ColourRegion.depth_m` and `ColourRegion.evidence` do the same for one region.
-"""
+"""Takes from the pixels of many regions at once what their objects are placed by: depths and evidence."""
 
 from __future__ import annotations
 
@@ -11,8 +8,6 @@ import numpy as np
 from cocoro.arrays import Float32Array, FloatArray, ImageArray, IntArray
 from services.perception.image import Evidence, RgbdImage
 from services.perception.region import (
-    MAX_RAYS,
-    MAX_SURFACE_POINTS,
     MIN_DEPTH_PIXELS,
     MIN_DEPTH_SHARE,
     ColourRegion,
@@ -20,6 +15,9 @@ from services.perception.region import (
     ring_px,
 )
 from services.perception.segments import Segments
+
+MAX_SURFACE_POINTS = 80
+MAX_RAYS = 36
 
 
 def middle_depths_m(found: Segments, depth_px: Float32Array) -> FloatArray:
@@ -77,11 +75,13 @@ def evidences(
     on_surface &= found.core | ~use_core[own]
     on_outline = ~found.core & wanted[own]
     end = found.start + found.area_px
-    surface, surface_at = _rays(found.u, found.v, depth_px, on_surface, found.start, end, MAX_SURFACE_POINTS, image)
-    outline, outline_at = _rays(found.u, found.v, depth_px, on_outline, found.start, end, MAX_RAYS, image)
+    surface, surface_at, surface_px = _rays(
+        found.u, found.v, depth_px, on_surface, found.start, end, MAX_SURFACE_POINTS, image
+    )
+    outline, outline_at, _ = _rays(found.u, found.v, depth_px, on_outline, found.start, end, MAX_RAYS, image)
     u, v, depth, first, last = _surroundings(found, wanted, image)
-    beside, beside_at = _rays(u, v, depth, ~np.isnan(depth), first, last, MAX_RAYS, image)
-    surface_m = surface[:, :3] * surface[:, 3:]
+    beside, beside_at, _ = _rays(u, v, depth, ~np.isnan(depth), first, last, MAX_RAYS, image)
+    surface_m = surface[:, :3] * _smoothed_m(surface_px, surface_at, depth_m, window_m, found, image)[:, None]
     free_to_m = beside[:, 3] - 0.01 - depth_doubt_m(beside[:, 3])
     return [
         Evidence(
@@ -105,9 +105,10 @@ def _rays(
     last: IntArray,
     at_most: int,
     image: RgbdImage,
-) -> tuple[FloatArray, list[int]]:
-    """Directions with z = 1, and depth, m, of at most so many of the pixels in `where` of each of n groups; shape (m, 4),
-    and the index of each group's first, and m. The group i has the pixels from `first[i]` to before `last[i]`."""
+) -> tuple[FloatArray, list[int], IntArray]:
+    """Directions with z = 1, and depth, m, of at most so many of the pixels in `where` of each of n groups, shape (m, 4);
+    the index of each group's first ray, and m; and the rays' pixels, shape (m,). The group i has the pixels from
+    `first[i]` to before `last[i]`."""
     at = np.flatnonzero(where)
     begin, end = np.searchsorted(at, first), np.searchsorted(at, last)
     available = end - begin
@@ -122,7 +123,19 @@ def _rays(
     out[:, 1] = (v[pixels] - camera.cy) / camera.fy
     out[:, 2] = 1.0
     out[:, 3] = depth[pixels]
-    return out, offsets.tolist()
+    return out, offsets.tolist(), pixels
+
+
+def _smoothed_m(
+    pixels: IntArray, first: list[int], depth_m: FloatArray, window_m: Float32Array, found: Segments, image: RgbdImage
+) -> Float32Array:
+    """Depth at pixels on surfaces, m, (m,): the mean of a square of 3 x 3 around each, of what is on the surface."""
+    own = np.repeat(np.arange(len(depth_m)), np.diff(first))
+    columns = np.clip(found.u[pixels] + np.array([-1, 0, 1] * 3)[:, None], 0, image.width - 1)
+    rows = np.clip(found.v[pixels] + np.repeat([-1, 0, 1], 3)[:, None], 0, image.height - 1)
+    depth = image.registered_depth_m.take(image.codes_at(columns, rows))
+    near = np.abs(depth - depth_m.astype(np.float32)[own]) < window_m[own]
+    return np.where(near, depth, np.float32(0)).sum(axis=0) / np.count_nonzero(near, axis=0)
 
 
 def _surroundings(

@@ -17,12 +17,15 @@ from services.perception.region import depth_doubt_m
 from services.perception.shapes import Shapes, Solids
 
 ITERATIONS = 12
-SETTLED_M = 1e-4
+SETTLED_M = 3e-4
 PRIOR = np.eye(3) / 0.05**2
 """Inverse covariance of the first guess, 1/m2: it may be 5 cm off and decides only what the evidence leaves open."""
 RAY_SAMPLES = 5
 RAY_DOUBT_M, RAY_DOUBT_RAD = 0.001, 0.002
 """Standard deviation of the outline: a constant, and about a pixel at the object's distance."""
+SMOOTHED_DOUBT = 0.7
+"""Standard deviation of a surface point's depth, the mean of up to nine pixels, relative to that of one pixel. The mean
+does not reduce what neighbours have in common: quantisation, and the grain of the sensor's pattern."""
 HUBER = 1.5
 
 
@@ -55,8 +58,8 @@ def fit_centres(
 class _Fits:
     """Fits under way, n of them, in step. Lengths are m, relative to the first guess, in the body's axes.
 
-    Each row of the arrays (n, k) is one fit's evidence: points on the surface, then rays of the outline, then free rays,
-    then fill, which counts nothing.
+    Each row of the arrays (n, k) is one fit's evidence: points on the surface, then rays of the outline, then free
+    rays, then fill, which counts nothing.
     """
 
     def __init__(self, shapes: Shapes, evidence: Sequence[Evidence], rotation: FloatArray, guess: FloatArray) -> None:
@@ -70,7 +73,11 @@ class _Fits:
         rays = int((counts[1] + counts[2]).max())
         width = points + rays
         origin = np.arange(len(guess)) * width
-        column = [_runs(origin, counts[0]), _runs(origin + points, counts[1]), _runs(origin + points + counts[1], counts[2])]
+        column = [
+            _runs(origin, counts[0]),
+            _runs(origin + points, counts[1]),
+            _runs(origin + points + counts[1], counts[2]),
+        ]
         place = np.concatenate(column)
         turned = np.concatenate([part for kind in kinds for part in kind]) @ rotation.T
         seen = len(column[0])
@@ -81,7 +88,7 @@ class _Fits:
         self._at = np.zeros((3, len(guess), width), dtype=np.float32)
         self._at.reshape(3, -1)[:, place] = turned.T
         self._certainty = np.repeat(1 / ray_doubt, width).astype(np.float32)
-        self._certainty[column[0]] = 1 / depth_doubt_m(depth)
+        self._certainty[column[0]] = 1 / (SMOOTHED_DOUBT * depth_doubt_m(depth))
         self._certainty = self._certainty.reshape(-1, width)
         self._least, self._greatest = np.zeros((2, len(guess) * width), dtype=np.float32)
         self._least[column[0]] = self._least[column[2]] = -np.inf
@@ -100,8 +107,8 @@ class _Fits:
         self._step *= np.float32(1.5 / (RAY_SAMPLES - 1))
 
     def _search(self, step: Float32Array) -> None:
-        """Find the point in each ray's free part that is nearest to the shape, or deepest in it, within a depth of `step`,
-        (n, rays), from the last one."""
+        """Find the point in each ray's free part that is nearest to the shape, or deepest in it, within a depth of
+        `step`, (n, rays), from the last one."""
         eye = self._eye - self.moved.T[:, :, None].astype(np.float32)
         x, y, z = self._rays
         depths = self._depth + np.linspace(-1.0, 1.0, RAY_SAMPLES, dtype=np.float32)[:, None, None] * step

@@ -73,8 +73,8 @@ class RgbdImage:
         return depth if np.isfinite(depth) else None
 
     def depth_m(self, box: PixelBox) -> Float32Array:
-        """Depth along the optical axis at the colour pixels of a box, m, shape (bottom - top, right - left); NaN without
-        data, in an infrared shadow, and in cracks between moved pixels."""
+        """Depth along the optical axis at the colour pixels of a box, m, shape (bottom - top, right - left); NaN
+        without data, in an infrared shadow, and in cracks between moved pixels."""
         left, top, right, bottom = box
         for done in self._registered_boxes:
             if done[0] <= left and done[1] <= top and right <= done[2] and bottom <= done[3]:

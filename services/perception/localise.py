@@ -100,7 +100,7 @@ class Localiser:
         rows = zip(sightings, centres.tolist(), occluded.tolist(), displaced, strict=True)
         for sighting, (x, y, z), hidden, lost in rows:
             note = "cut" if sighting.cut else "occluded" if hidden else ""
-            gone = lost or bool(note) and self._underground(sighting.label, (x, y, z))
+            gone = lost or (bool(note) and self._underground(sighting.label, (x, y, z)))
             found[sighting.label] = None if gone else _detection(sighting, (x, y, z), note)
         return found
 

@@ -6,6 +6,7 @@ holds one pixel of every third row and column, so those pixels alone tell where 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -40,6 +41,27 @@ class Segments:
     """Each pixel's column and row in the image, shape (k,)."""
     core: BoolArray
     """Whether all pixels around a pixel belong to the region, too; shape (k,)."""
+
+    @classmethod
+    def of(cls, number: IntArray, masks: Sequence[ImageArray], boxes: Sequence[PixelBox]) -> Segments:
+        """The regions of objects with these numbers, (n,), by their masks, non-zero inside, and the masks' boxes."""
+        cores = [np.asarray(cv2.erode(mask, _AROUND)) for mask in masks]
+        pixels = [np.nonzero(mask) for mask in masks]
+        core = np.concatenate([core[at] != 0 for core, at in zip(cores, pixels, strict=True)])
+        rows, columns = ([at[axis] + box[1 - axis] for at, box in zip(pixels, boxes, strict=True)] for axis in (0, 1))
+        bounds = [(u.min(), v.min(), u.max() + 1, v.max() + 1) for u, v in zip(columns, rows, strict=True)]
+        area = np.array([len(u) for u in columns])
+        own = np.repeat(np.arange(len(area)), area)
+        return cls(
+            number,
+            np.cumsum(area) - area,
+            area,
+            np.array(bounds),
+            own,
+            np.concatenate(columns),
+            np.concatenate(rows),
+            core,
+        )
 
     def mask(self, region: int, box: PixelBox) -> ImageArray:
         """The region's pixels in a box that contains it: 1 inside, 0 outside; shape (bottom - top, right - left)."""
@@ -149,7 +171,7 @@ def _split(parts: NDArray[np.int32], labels: ImageArray, mixed: list[int], count
 
 
 def _largest(number: IntArray, area: IntArray) -> BoolArray:
-    """Which regions are of the largest of their objects, `MOST_OF_ONE` of each, shape (n,); those without area are not."""
+    """Which regions have an area and are among the `MOST_OF_ONE` largest of their object, shape (n,)."""
     kept: BoolArray = area > 0
     for crowded in np.flatnonzero(np.bincount(number[kept]) > MOST_OF_ONE).tolist():
         own = np.flatnonzero(kept & (number == crowded))

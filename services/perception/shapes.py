@@ -27,9 +27,7 @@ class Shapes:
         """Radius of the shape seen from above."""
         self.height_m: FloatArray = np.array([known.size_m[2] for known in objects])
         self.sphere: BoolArray = np.array([known.shape == "sphere" for known in objects], dtype=np.bool_)
-        self.reach_m: FloatArray = np.where(
-            self.sphere, self.radius_m, np.hypot(self.radius_m, self.height_m / 2)
-        )
+        self.reach_m: FloatArray = np.where(self.sphere, self.radius_m, np.hypot(self.radius_m, self.height_m / 2))
         """Radius of the circumscribed sphere."""
         # For elevations from 0 to 60 degrees.
         areas = np.array([self.seen_area_m2(sine) for sine in (0.0, 0.3, 0.5, 0.7, 0.866)])
