@@ -8,6 +8,7 @@ beside it enters the shape. The latter two are one-sided. Derived.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 
 import numpy as np
 
@@ -26,6 +27,8 @@ RAY_DOUBT_M, RAY_DOUBT_RAD = 0.001, 0.002
 SMOOTHED_DOUBT = 0.7
 """Standard deviation of a surface point's depth, the mean of up to nine pixels, relative to that of one pixel. The mean
 does not reduce what neighbours have in common: quantisation, and the grain of the sensor's pattern."""
+COARSE, COARSE_ITERATIONS, COARSE_SETTLED_M = 3, 4, 1e-3
+"""First every third piece of evidence is fitted, in so many steps at most, until the centre settles to a millimetre."""
 HUBER = 1.5
 
 
@@ -38,18 +41,11 @@ def fit_centres(
     `pose` is the camera's pose in the body frame, 4 x 4; `start` the first guesses, m, shape (n, 3).
     """
     fits = _Fits(shapes, evidence, pose[:3, :3], start - pose[:3, 3])
-    moved, misfit = np.zeros_like(start), np.zeros(len(start))
-    left = np.arange(len(start))
-    for _ in range(ITERATIONS):
-        move = fits.move()
-        moved[left] = fits.moved
-        misfit[left] = fits.misfit
-        going = np.abs(move).max(axis=1) >= SETTLED_M
-        if not going.any():
-            break
-        if not going.all():
-            left = left[going]
-            fits.keep(going)
+    # Most of the way by a part of the evidence, which takes a part of the time.
+    nearby = fits.part(COARSE)
+    moved = nearby.settle(COARSE_ITERATIONS, COARSE_SETTLED_M)[0]
+    fits.moved[:] = moved
+    moved, misfit = fits.settle(ITERATIONS, SETTLED_M)
     wandered = np.linalg.norm(moved, axis=1) >= 2 * shapes.reach_m
     moved[wandered] = 0.0
     return start + moved, misfit
@@ -90,28 +86,28 @@ class _Fits:
         self._certainty = np.repeat(1 / ray_doubt, width).astype(np.float32)
         self._certainty[column[0]] = 1 / (SMOOTHED_DOUBT * depth_doubt_m(depth))
         self._certainty = self._certainty.reshape(-1, width)
+        self._certainty2 = self._certainty * self._certainty * np.float32(HUBER)
         self._least, self._greatest = np.zeros((2, len(guess) * width), dtype=np.float32)
         self._least[column[0]] = self._least[column[2]] = -np.inf
         self._greatest[column[0]] = self._greatest[column[1]] = np.inf
         self._least, self._greatest = self._least.reshape(-1, width), self._greatest.reshape(-1, width)
         free_to = np.full(len(guess) * width, np.inf, dtype=np.float32)
         free_to[column[2]] = np.concatenate([each.free_to_m for each in evidence])
-        self._points = points
         self._free_to = free_to.reshape(-1, width)[:, points:]
         self._rays = self._at[:, :, points:].copy()
         self._eye = -guess.T[:, :, None].astype(np.float32)
         length2 = np.maximum((self._rays * self._rays).sum(axis=0), np.float32(1e-9))
         self._step = shapes.reach_m.astype(np.float32)[:, None] / np.sqrt(length2)
         self._depth = -(self._rays * self._eye).sum(axis=0) / length2
-        self._search(self._step)
-        self._step *= np.float32(1.5 / (RAY_SAMPLES - 1))
+        self._search(self._step, RAY_SAMPLES)
+        self._step *= np.float32(0.75 / (RAY_SAMPLES - 1))
 
-    def _search(self, step: Float32Array) -> None:
+    def _search(self, step: Float32Array, samples: int) -> None:
         """Find the point in each ray's free part that is nearest to the shape, or deepest in it, within a depth of
         `step`, (n, rays), from the last one."""
         eye = self._eye - self.moved.T[:, :, None].astype(np.float32)
         x, y, z = self._rays
-        depths = self._depth + np.linspace(-1.0, 1.0, RAY_SAMPLES, dtype=np.float32)[:, None, None] * step
+        depths = self._depth + np.linspace(-1.0, 1.0, samples, dtype=np.float32)[:, None, None] * step
         np.minimum(depths, self._free_to, out=depths)
         distance = self._solids.distance(depths * x + eye[0], depths * y + eye[1], depths * z + eye[2])
         best, self._depth = distance[0], depths[0]
@@ -120,30 +116,63 @@ class _Fits:
             best = np.where(nearer, other, best)
             self._depth = np.where(nearer, depth, self._depth)
 
-    def move(self) -> FloatArray:
+    def part(self, every: int) -> _Fits:
+        """The same fits with every so many pieces of the evidence."""
+        some = copy(self)
+        some.moved = self.moved.copy()
+        for name in ("_certainty", "_certainty2", "_least", "_greatest", "_free_to", "_step", "_depth", "_at", "_rays"):
+            setattr(some, name, getattr(self, name)[..., ::every].copy())
+        return some
+
+    def settle(self, iterations: int, settled_m: float) -> tuple[FloatArray, FloatArray]:
+        """Step until each fit moves by less than `settled_m`, at most so many times. Returns how far each moved in all, m,
+        (n, 3), and its mean misfit, (n,)."""
+        moved, misfit = self.moved.copy(), np.zeros(len(self.moved))
+        left = np.arange(len(moved))
+        for iteration in range(iterations):
+            move = self._move()
+            going = np.abs(move).max(axis=1) >= settled_m
+            if iteration == iterations - 1:
+                going[:] = False
+            if going.all():
+                continue
+            done = left[~going]
+            moved[done], misfit[done] = self.moved[~going], self._misfit(~going)
+            if len(done) == len(left):
+                break
+            left = left[going]
+            self._keep(going)
+        return moved, misfit
+
+    def _misfit(self, chosen: BoolArray) -> FloatArray:
+        """Mean misfit of some of the fits before the last step, (m,)."""
+        size = self._size[chosen]
+        loss = np.where(size < HUBER, 0.5 * size * size, HUBER * (size - 0.5 * HUBER))
+        misfit: FloatArray = loss.sum(axis=1) / self._pieces[chosen]
+        return misfit
+
+    def _move(self) -> FloatArray:
         """Make one step. Returns the moves, m, (n, 3)."""
-        self._search(self._step)
-        self._at[:, :, self._points :] = self._depth * self._rays + self._eye
+        self._search(self._step, 3)
+        self._at[:, :, -self._depth.shape[1] :] = self._depth * self._rays + self._eye
         offsets = self._at - self.moved.T[:, :, None].astype(np.float32)
         distance, along = self._solids.gradient(*offsets)
         np.maximum(distance, self._least, out=distance)
         np.minimum(distance, self._greatest, out=distance)
-        size = np.abs(distance) * self._certainty
-        weight = self._certainty * self._certainty * (np.float32(HUBER) / np.maximum(size, np.float32(HUBER)))
+        self._size = np.abs(distance) * self._certainty
+        weight = self._certainty2 / np.maximum(self._size, np.float32(HUBER))
         weight *= distance != 0
         weighted = (along * weight).transpose(1, 0, 2)
         curvature = (weighted @ along.transpose(1, 2, 0)).astype(np.float64) + PRIOR
         pull = (weighted @ distance[:, :, None]).astype(np.float64) - PRIOR @ self.moved[:, :, None]
         move: FloatArray = np.linalg.solve(curvature, pull)[..., 0]
-        loss = np.where(size < HUBER, 0.5 * size * size, HUBER * (size - 0.5 * HUBER))
-        self.misfit = loss.sum(axis=1) / self._pieces
         self.moved += move
         return move
 
-    def keep(self, going: BoolArray) -> None:
+    def _keep(self, going: BoolArray) -> None:
         """Go on with some of the fits only, (n,)."""
         self._solids = self._solids.of(going)
-        for name in ("moved", "_pieces", "_certainty", "_least", "_greatest", "_free_to", "_step", "_depth"):
+        for name in ("moved", "_pieces", "_certainty", "_certainty2", "_least", "_greatest", "_free_to", "_step", "_depth"):
             setattr(self, name, getattr(self, name)[going])
         for name in ("_at", "_rays", "_eye"):
             setattr(self, name, getattr(self, name)[:, going])
