@@ -11,12 +11,12 @@ from math import isnan
 
 import numpy as np
 
-from cocoro.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from cocoro.arrays import BoolArray, FloatArray, IntArray
 from cocoro.objects import Catalogue
 from services.perception.colours import ColourTable
 from services.perception.config import PerceptionConfig
-from services.perception.evidence import evidences, middle_depths_m
-from services.perception.image import ImageSighting, RgbdImage
+from services.perception.evidence import evidence_of, middle_depths_m
+from services.perception.image import ImageSighting, OwnEvidence, RgbdImage
 from services.perception.pieces import OneObject, depth_of
 from services.perception.region import ColourRegion
 from services.perception.segments import Segments, segments
@@ -34,25 +34,19 @@ class BlobDetector:
     def detect(self, image: RgbdImage) -> list[ImageSighting]:
         codes = self._table.packed(image.colour)
         min_area_px = self._config.min_area_px * image.scale**2
-        layers = [segments(codes, layer.table, min_area_px) for layer in self._table.layers]
-        found = [layer for layer in layers if layer is not None]
-        if not found:
-            return []
-        image.register(_with_margin(np.concatenate([layer.bounds for layer in found]), image))
-        sightings: dict[int, ImageSighting] = {}
-        for layer in found:
-            sightings.update(self._sightings(layer, image, min_area_px))
-        return [sightings[number] for number in sorted(sightings)]
+        layers = [segments(codes, layer.table, number, min_area_px) for number, layer in enumerate(self._table.layers)]
+        regions = [layer for layer in layers if layer is not None]
+        return self._sightings(Segments.joined(regions), image, min_area_px) if regions else []
 
-    def _sightings(self, found: Segments, image: RgbdImage, min_area_px: float) -> dict[int, ImageSighting]:
-        """The objects among a layer's regions, by their number in the catalogue.
+    def _sightings(self, found: Segments, image: RgbdImage, min_area_px: float) -> list[ImageSighting]:
+        """The objects among the regions of all colours, in the catalogue's order.
 
         An object's only region, when it may be all of the object, is the object; this is decided for all such regions
         at once. The others, in several pieces, hidden in part or before something of their colour, are looked at one by
         one.
         """
-        depth_px = image.registered_depth_m.take(image.codes_at(found.u, found.v))
-        depth_m = middle_depths_m(found, depth_px)
+        image.register(_with_margin(found.bounds, image))
+        depth_m = middle_depths_m(found, image.codes_at(found.u, found.v), image)
         fit = SizeFit(self._shapes.of(found.number), image.camera, self._config, min_area_px)
         diagonal_px = np.hypot(*(found.bounds[:, 2:] - found.bounds[:, :2]).T)
         alone = np.bincount(found.number)[found.number] == 1
@@ -60,21 +54,22 @@ class BlobDetector:
         hidden = simple & fit.too_small(found.area_px, depth_m)
         for number in np.flatnonzero(hidden).tolist():
             hidden[number] = _region(found, number, image).hidden
-        chosen = np.flatnonzero(simple)
-        sightings = self._told(found, chosen, depth_px, depth_m, hidden, image) if len(chosen) else {}
-        others = self._one_by_one(found, np.unique(found.number[~simple]), image, min_area_px)
-        if others:
-            regions = list(others.values())
-            joined = Segments.of(
-                np.array(list(others)), [region.mask for region in regions], [region.box for region in regions]
-            )
-            depth_px = image.registered_depth_m.take(image.codes_at(joined.u, joined.v))
-            depth_m = np.array([depth_of(region) for region in regions])
-            fit = SizeFit(self._shapes.of(joined.number), image.camera, self._config, min_area_px)
-            small = fit.too_small(joined.area_px, depth_m)
-            hidden = np.array([doubtful and region.hidden for doubtful, region in zip(small, regions, strict=True)])
-            sightings.update(self._told(joined, np.arange(len(regions)), depth_px, depth_m, hidden, image))
-        return sightings
+        parts = [found.among(simple)] if simple.any() else []
+        depth_m, hidden = depth_m[simple], hidden[simple]
+        if not simple.all():
+            others = self._one_by_one(found, np.unique(found.number[~simple]), image, min_area_px)
+            if others:
+                numbers, regions = np.array(list(others)), list(others.values())
+                layers = np.array([self._table.layer_of[number] for number in others])
+                parts.append(
+                    Segments.of_masks(numbers, layers, [each.mask for each in regions], [each.box for each in regions])
+                )
+                of_others = np.array([depth_of(region) for region in regions])
+                fit = SizeFit(self._shapes.of(numbers), image.camera, self._config, min_area_px)
+                small = fit.too_small(parts[-1].area_px, of_others).tolist()
+                depth_m = np.append(depth_m, of_others)
+                hidden = np.append(hidden, [less and each.hidden for less, each in zip(small, regions, strict=True)])
+        return self._told(Segments.joined(parts), depth_m, hidden, image) if parts else []
 
     def _one_by_one(
         self, found: Segments, numbers: IntArray, image: RgbdImage, min_area_px: float
@@ -91,47 +86,40 @@ class BlobDetector:
                 seen[number] = best
         return seen
 
-    def _told(
-        self,
-        found: Segments,
-        chosen: IntArray,
-        depth_px: Float32Array,
-        depth_m: FloatArray,
-        hidden: BoolArray,
-        image: RgbdImage,
-    ) -> dict[int, ImageSighting]:
-        """The sightings of objects that are the regions `chosen`, by their numbers in the catalogue. `depth_px` are the
-        depths of all pixels, m, shape (k,); `depth_m` the regions', m, and `hidden` whether they may be hidden in part,
-        shape (n,)."""
-        u_px, v_px = (np.add.reduceat(each, found.start)[chosen] / found.area_px[chosen] for each in (found.u, found.v))
-        seen = evidences(found, chosen, depth_px, depth_m, self._shapes.reach_m[found.number], image)
-        left, top, right, bottom = found.bounds[chosen].T
+    def _told(self, found: Segments, depth_m: FloatArray, hidden: BoolArray, image: RgbdImage) -> list[ImageSighting]:
+        """The sightings of objects that are these regions, in the catalogue's order. `depth_m` are the regions' depths,
+        m, NaN without, and `hidden` is whether something may hide a part of them, shape (n,)."""
+        u_px, v_px = (np.add.reduceat(each, found.start, dtype=np.int64) / found.area_px for each in (found.u, found.v))
+        left, top, right, bottom = found.bounds.T
         cut = (left <= 1) | (top <= 1) | (right >= image.width - 1) | (bottom >= image.height - 1)
-        columns = (
-            found.number[chosen],
-            u_px,
-            v_px,
-            found.area_px[chosen],
-            found.bounds[chosen],
-            depth_m[chosen],
-            cut,
-            hidden[chosen],
-        )
-        rows = zip(*(column.tolist() for column in columns), seen, strict=True)
-        return {
-            number: ImageSighting(
-                label=self._labels[number],
-                u_px=u,
-                v_px=v,
-                area_px=area,
-                box_px=(box[0], box[1], box[2], box[3]),
-                depth_m=None if isnan(depth) else depth,
-                cut=beyond,
-                hidden=part,
-                evidence=evidence,
+        deep = ~np.isnan(depth_m)
+        evidence: list[OwnEvidence | None] = [None] * len(depth_m)
+        if deep.any():
+            all_evidence = evidence_of(
+                found.among(deep), depth_m[deep], self._shapes.reach_m[found.number[deep]], image
             )
-            for number, u, v, area, box, depth, beyond, part, evidence in rows
-        }
+            for number, region in enumerate(np.flatnonzero(deep).tolist()):
+                evidence[region] = OwnEvidence(all_evidence, number)
+        columns = (u_px, v_px, found.area_px, found.bounds, depth_m, cut, hidden)
+        numbers = found.number.tolist()
+        rows = list(zip(*(column.tolist() for column in columns), evidence, strict=True))
+        sightings = []
+        for region in sorted(range(len(numbers)), key=numbers.__getitem__):
+            u, v, area, (left, top, right, bottom), depth, beyond, part, seen = rows[region]
+            sightings.append(
+                ImageSighting(
+                    label=self._labels[numbers[region]],
+                    u_px=u,
+                    v_px=v,
+                    area_px=area,
+                    box_px=(left, top, right, bottom),
+                    depth_m=None if isnan(depth) else depth,
+                    cut=beyond,
+                    hidden=part,
+                    evidence=seen,
+                )
+            )
+        return sightings
 
 
 def _region(found: Segments, number: int, image: RgbdImage) -> ColourRegion:

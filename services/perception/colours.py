@@ -49,11 +49,16 @@ class ColourTable:
         kept, half = np.array([[0xF8, 0xFC, 0xF8], [4, 2, 4]], dtype=np.uint8)
         lab = lab_of((corner & kept) + half).reshape(-1, 3)
         self.layers: list[ColourLayer] = []
+        self.layer_of: list[int] = []
+        """Each object's layer."""
         for number, known in enumerate(catalogue):
             own = matches(known, lab, by_shape=True)
-            if not any(layer.take(number, own) for layer in self.layers):
+            free = (place for place, layer in enumerate(self.layers) if layer.take(number, own))
+            place = next(free, len(self.layers))
+            if place == len(self.layers):
                 self.layers.append(ColourLayer())
-                self.layers[-1].take(number, own)
+                self.layers[place].take(number, own)
+            self.layer_of.append(place)
 
     @staticmethod
     def packed(colour: ImageArray) -> CodeArray:

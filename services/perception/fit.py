@@ -7,14 +7,10 @@ beside it enters the shape. The latter two are one-sided. Derived.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from copy import copy
-
 import numpy as np
 
-from cocoro.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from cocoro.arrays import BoolArray, Float32Array, FloatArray
 from services.perception.image import Evidence
-from services.perception.region import depth_doubt_m
 from services.perception.shapes import Shapes, Solids
 
 ITERATIONS = 12
@@ -24,27 +20,26 @@ PRIOR = np.eye(3) / 0.05**2
 RAY_SAMPLES = 5
 RAY_DOUBT_M, RAY_DOUBT_RAD = 0.001, 0.002
 """Standard deviation of the outline: a constant, and about a pixel at the object's distance."""
-SMOOTHED_DOUBT = 0.7
-"""Standard deviation of a surface point's depth, the mean of up to nine pixels, relative to that of one pixel. The mean
-does not reduce what neighbours have in common: quantisation, and the grain of the sensor's pattern."""
+MANY = 16
 COARSE, COARSE_ITERATIONS, COARSE_SETTLED_M = 3, 4, 1e-3
-"""First every third piece of evidence is fitted, in so many steps at most, until the centre settles to a millimetre."""
+"""So many fits go most of the way by every third piece of evidence, in so many steps at most, until the centre settles to
+a millimetre: that takes a third of the time. Of fewer fits the calls take the time, not the numbers."""
 HUBER = 1.5
 
 
 def fit_centres(
-    shapes: Shapes, evidence: Sequence[Evidence], pose: FloatArray, start: FloatArray
+    shapes: Shapes, evidence: Evidence, pose: FloatArray, start: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """The centre of each object's upright shape that fits its evidence best, body frame, m, shape (n, 3), and its mean
     misfit, shape (n,).
 
     `pose` is the camera's pose in the body frame, 4 x 4; `start` the first guesses, m, shape (n, 3).
     """
-    fits = _Fits(shapes, evidence, pose[:3, :3], start - pose[:3, 3])
-    # Most of the way by a part of the evidence, which takes a part of the time.
-    nearby = fits.part(COARSE)
-    moved = nearby.settle(COARSE_ITERATIONS, COARSE_SETTLED_M)[0]
-    fits.moved[:] = moved
+    rotation, guess = pose[:3, :3], start - pose[:3, 3]
+    fits = _Fits(shapes, evidence, rotation, guess)
+    if len(start) >= MANY:
+        nearby = _Fits(shapes, evidence.every(COARSE), rotation, guess)
+        fits.moved = nearby.settle(COARSE_ITERATIONS, COARSE_SETTLED_M)[0]
     moved, misfit = fits.settle(ITERATIONS, SETTLED_M)
     wandered = np.linalg.norm(moved, axis=1) >= 2 * shapes.reach_m
     moved[wandered] = 0.0
@@ -58,47 +53,27 @@ class _Fits:
     rays, then fill, which counts nothing.
     """
 
-    def __init__(self, shapes: Shapes, evidence: Sequence[Evidence], rotation: FloatArray, guess: FloatArray) -> None:
+    def __init__(self, shapes: Shapes, evidence: Evidence, rotation: FloatArray, guess: FloatArray) -> None:
         """`rotation` (3, 3) turns the camera's axes into the body's; `guess` (n, 3) is relative to the camera."""
         self._solids = Solids(shapes)
+        self._side = evidence.side
+        self._free_to = evidence.free_to_m
+        self._count = evidence.count
         self.moved = np.zeros_like(guess)
-        kinds = [[getattr(each, name) for each in evidence] for name in ("surface_m", "outline", "beside")]
-        counts = np.array([[len(part) for part in kind] for kind in kinds])
-        self._pieces = counts.sum(axis=0)
-        points = int(counts[0].max())
-        rays = int((counts[1] + counts[2]).max())
-        width = points + rays
-        origin = np.arange(len(guess)) * width
-        column = [
-            _runs(origin, counts[0]),
-            _runs(origin + points, counts[1]),
-            _runs(origin + points + counts[1], counts[2]),
-        ]
-        place = np.concatenate(column)
-        turned = np.concatenate([part for kind in kinds for part in kind]) @ rotation.T
-        seen = len(column[0])
-        owner = np.repeat(np.arange(len(guess)), counts[0])
-        ray_doubt = RAY_DOUBT_M + RAY_DOUBT_RAD * (guess @ rotation[:, 2])
-        depth = np.concatenate([each[:, 2] for each in kinds[0]])
-        turned[:seen] -= guess[owner]
-        self._at = np.zeros((3, len(guess), width), dtype=np.float32)
-        self._at.reshape(3, -1)[:, place] = turned.T
-        self._certainty = np.repeat(1 / ray_doubt, width).astype(np.float32)
-        self._certainty[column[0]] = 1 / (SMOOTHED_DOUBT * depth_doubt_m(depth))
-        self._certainty = self._certainty.reshape(-1, width)
-        self._certainty2 = self._certainty * self._certainty * np.float32(HUBER)
-        self._least, self._greatest = np.zeros((2, len(guess) * width), dtype=np.float32)
-        self._least[column[0]] = self._least[column[2]] = -np.inf
-        self._greatest[column[0]] = self._greatest[column[1]] = np.inf
-        self._least, self._greatest = self._least.reshape(-1, width), self._greatest.reshape(-1, width)
-        free_to = np.full(len(guess) * width, np.inf, dtype=np.float32)
-        free_to[column[2]] = np.concatenate([each.free_to_m for each in evidence])
-        self._free_to = free_to.reshape(-1, width)[:, points:]
-        self._rays = self._at[:, :, points:].copy()
         self._eye = -guess.T[:, :, None].astype(np.float32)
-        length2 = np.maximum((self._rays * self._rays).sum(axis=0), np.float32(1e-9))
+        turn = rotation.astype(np.float32)
+        self._rays = (turn @ evidence.rays.reshape(3, -1)).reshape(evidence.rays.shape)
+        points = (turn @ evidence.points_m.reshape(3, -1)).reshape(evidence.points_m.shape)
+        points += self._eye
+        self._at = np.concatenate([points, self._rays], axis=2)
+        ray_certainty = 1 / (RAY_DOUBT_M + RAY_DOUBT_RAD * (guess @ rotation[:, 2]))
+        of_rays = np.abs(evidence.side) * ray_certainty.astype(np.float32)[:, None]
+        self._certainty = np.concatenate([evidence.certainty, of_rays], axis=1)
+        self._certainty2 = self._certainty * self._certainty * np.float32(HUBER)
+        x, y, z = self._rays
+        length2 = np.maximum(x * x + y * y + z * z, np.float32(1e-9))
         self._step = shapes.reach_m.astype(np.float32)[:, None] / np.sqrt(length2)
-        self._depth = -(self._rays * self._eye).sum(axis=0) / length2
+        self._depth = -(x * self._eye[0] + y * self._eye[1] + z * self._eye[2]) / length2
         self._search(self._step, RAY_SAMPLES)
         self._step *= np.float32(0.75 / (RAY_SAMPLES - 1))
 
@@ -115,14 +90,6 @@ class _Fits:
             nearer = other < best
             best = np.where(nearer, other, best)
             self._depth = np.where(nearer, depth, self._depth)
-
-    def part(self, every: int) -> _Fits:
-        """The same fits with every so many pieces of the evidence."""
-        some = copy(self)
-        some.moved = self.moved.copy()
-        for name in ("_certainty", "_certainty2", "_least", "_greatest", "_free_to", "_step", "_depth", "_at", "_rays"):
-            setattr(some, name, getattr(self, name)[..., ::every].copy())
-        return some
 
     def settle(self, iterations: int, settled_m: float) -> tuple[FloatArray, FloatArray]:
         """Step until each fit moves by less than `settled_m`, at most so many times. Returns how far each moved in all, m,
@@ -148,7 +115,7 @@ class _Fits:
         """Mean misfit of some of the fits before the last step, (m,)."""
         size = self._size[chosen]
         loss = np.where(size < HUBER, 0.5 * size * size, HUBER * (size - 0.5 * HUBER))
-        misfit: FloatArray = loss.sum(axis=1) / self._pieces[chosen]
+        misfit: FloatArray = loss.sum(axis=1) / self._count[chosen]
         return misfit
 
     def _move(self) -> FloatArray:
@@ -157,8 +124,11 @@ class _Fits:
         self._at[:, :, -self._depth.shape[1] :] = self._depth * self._rays + self._eye
         offsets = self._at - self.moved.T[:, :, None].astype(np.float32)
         distance, along = self._solids.gradient(*offsets)
-        np.maximum(distance, self._least, out=distance)
-        np.minimum(distance, self._greatest, out=distance)
+        # A ray that meets the shape is no evidence, nor is a free one that does not.
+        missed = distance[:, -self._side.shape[1] :]
+        missed *= self._side
+        np.maximum(missed, 0, out=missed)
+        missed *= self._side
         self._size = np.abs(distance) * self._certainty
         weight = self._certainty2 / np.maximum(self._size, np.float32(HUBER))
         weight *= distance != 0
@@ -172,14 +142,7 @@ class _Fits:
     def _keep(self, going: BoolArray) -> None:
         """Go on with some of the fits only, (n,)."""
         self._solids = self._solids.of(going)
-        for name in ("moved", "_pieces", "_certainty", "_certainty2", "_least", "_greatest", "_free_to", "_step", "_depth"):
+        for name in ("moved", "_count", "_side", "_certainty", "_certainty2", "_free_to", "_step", "_depth"):
             setattr(self, name, getattr(self, name)[going])
         for name in ("_at", "_rays", "_eye"):
             setattr(self, name, getattr(self, name)[:, going])
-
-
-def _runs(first: IntArray, count: IntArray) -> IntArray:
-    """The numbers from each of `first` on, as many as `count` says; both (n,)."""
-    ends = np.cumsum(count)
-    numbers: IntArray = np.arange(ends[-1]) + np.repeat(first - (ends - count), count)
-    return numbers

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from math import sqrt
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from cocoro.arrays import CodeArray, Float32Array, FloatArray, ImageArray, IntArray
+from cocoro.arrays import CodeArray, Float32Array, ImageArray, IntArray
 from cocoro.messages import Frame
 from cocoro.robot import Camera, Robot
 from services.perception.registration import PixelBox, Registration, registration
 
-__all__ = ["Detector", "Evidence", "ImageSighting", "PixelBox", "RgbdImage"]
+__all__ = ["Detector", "Evidence", "ImageSighting", "OwnEvidence", "PixelBox", "RgbdImage"]
 
 _BOX_COSTS_PX = 30, 8000
 """A box is registered in the time of a wider one with so many columns and pixels more."""
@@ -46,6 +46,11 @@ class RgbdImage:
     @property
     def _registration(self) -> Registration:
         return registration(self._robot, self.width, self.height)
+
+    @property
+    def no_depth_code(self) -> int:
+        """The least code of `codes_at` that stands for no data; so do all greater ones."""
+        return self._registration.no_data
 
     @property
     def registered_depth_m(self) -> Float32Array:
@@ -101,20 +106,41 @@ class RgbdImage:
 
 @dataclass(frozen=True)
 class Evidence:
-    """An object's extent by the depth image, in the colour camera's frame (x right, y down, z forward)."""
+    """The extent of n objects by the depth image, in the colour camera's frame (x right, y down, z forward). Objects
+    with less of it than others have fill, of certainty 0."""
 
-    surface_m: FloatArray
-    """Points on its visible surface, m, shape (n, 3)."""
-    outline: FloatArray
-    """Directions with z = 1 of its outermost pixels, shape (k, 3); each ray meets the object."""
-    beside: FloatArray
-    """Directions with z = 1 of pixels just outside of its outline with known depth, shape (m, 3)."""
-    free_to_m: FloatArray
-    """Depth to which each ray of `beside` is known to be free, m, shape (m,)."""
+    points_m: Float32Array
+    """Points on the visible surfaces, m, shape (3, n, k)."""
+    certainty: Float32Array
+    """Inverse standard deviation of a point's distance from the surface, 1/m, shape (n, k)."""
+    rays: Float32Array
+    """Directions with z = 1, shape (3, n, m): of outermost pixels, whose rays meet the object, and of pixels just
+    outside of its outline with known depth."""
+    side: Float32Array
+    """1 for rays that meet the object, -1 for those beside it, 0 for fill, shape (n, m)."""
+    free_to_m: Float32Array
+    """Depth to which rays beside it are known to be free, m, infinite for the others, shape (n, m)."""
+    surface_count: IntArray
+    """Number of points, shape (n,)."""
+    count: IntArray
+    """Number of points and rays, shape (n,)."""
 
-    @property
-    def count(self) -> int:
-        return len(self.surface_m) + len(self.outline) + len(self.beside)
+    def of(self, objects: list[int]) -> Evidence:
+        """The evidence of some of the objects."""
+        values = (getattr(self, field.name) for field in fields(self))
+        return Evidence(*(value[:, objects] if value.ndim == 3 else value[objects] for value in values))
+
+    def every(self, step: int) -> Evidence:
+        """A part of the evidence: every so manieth point and ray."""
+        values = (getattr(self, field.name) for field in fields(self))
+        return Evidence(*(value[..., ::step] if value.ndim > 1 else value for value in values))
+
+
+class OwnEvidence(NamedTuple):
+    """The evidence of one object among those of a frame."""
+
+    frame: Evidence
+    number: int
 
 
 @dataclass(frozen=True)
@@ -130,7 +156,7 @@ class ImageSighting:
     """It touches the image's edge."""
     hidden: bool = False
     """It is smaller than the whole object, and something nearer may hide the rest."""
-    evidence: Evidence | None = None
+    evidence: OwnEvidence | None = None
     """None from a detector that uses the centroid alone."""
 
 

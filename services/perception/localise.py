@@ -82,19 +82,22 @@ class Localiser:
         rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=1)
         centres = first_guesses(shapes, rays * depth[:, None], pose)
         evidence = [sighting.evidence for sighting in sightings]
-        enough = [some if some and len(some.surface_m) >= MIN_SURFACE_POINTS else None for some in evidence]
-        fitted = [number for number, some in enumerate(enough) if some]
         misfit = np.zeros(len(sightings))
-        if fitted:
-            centres[fitted], misfit[fitted] = fit_centres(
-                shapes.of(fitted), [some for some in enough if some], pose, centres[fitted]
-            )
+        pieces = np.array([some.frame.count[some.number] if some else 0 for some in evidence])
+        fitted = [
+            row
+            for row, some in enumerate(evidence)
+            if some and some.frame.surface_count[some.number] >= MIN_SURFACE_POINTS
+        ]
+        some_evidence = next((some.frame for some in evidence if some), None)
+        if fitted and some_evidence is not None:
+            mine = some_evidence.of([some.number for row in fitted if (some := evidence[row])])
+            centres[fitted], misfit[fitted] = fit_centres(shapes.of(fitted), mine, pose, centres[fitted])
         most_px = expected_areas_px(shapes, centres, camera, pose)
         least_px = counted_px(most_px)
         occluded = area_px < self._occluded_share * least_px
         whole = np.array([not (sighting.cut or sighting.hidden) for sighting in sightings])
         size_misfit = 0.5 * (np.log(area_px / np.clip(area_px, least_px, most_px)) / SIZE_DOUBT) ** 2 * whole
-        pieces = np.array([some.count if some else 0 for some in evidence])
         displaced = _displaced(sightings, misfit, size_misfit, pieces)
         found: dict[str, Detection | None] = {}
         rows = zip(sightings, centres.tolist(), occluded.tolist(), displaced, strict=True)

@@ -7,7 +7,7 @@ holds one pixel of every third row and column, so those pixels alone tell where 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import cv2
 import numpy as np
@@ -34,34 +34,64 @@ class Segments:
     """Number of pixels, shape (n,)."""
     bounds: IntArray
     """Left, top, right, bottom, px; right and bottom are exclusive; shape (n, 4)."""
-    own: IntArray
-    """Each pixel's region, shape (k,)."""
-    u: IntArray
-    v: IntArray
+    u: NDArray[np.int32]
+    v: NDArray[np.int32]
     """Each pixel's column and row in the image, shape (k,)."""
     core: BoolArray
     """Whether all pixels around a pixel belong to the region, too; shape (k,)."""
 
+    layer: IntArray
+    """The layer of the object's colours, shape (n,)."""
+
     @classmethod
-    def of(cls, number: IntArray, masks: Sequence[ImageArray], boxes: Sequence[PixelBox]) -> Segments:
-        """The regions of objects with these numbers, (n,), by their masks, non-zero inside, and the masks' boxes."""
-        cores = [np.asarray(cv2.erode(mask, _AROUND)) for mask in masks]
+    def of_masks(
+        cls, number: IntArray, layer: IntArray, masks: Sequence[ImageArray], boxes: Sequence[PixelBox]
+    ) -> Segments:
+        """The regions of objects with these numbers and layers, (n,), by their masks, non-zero inside, and the masks'
+        boxes."""
         pixels = [np.nonzero(mask) for mask in masks]
-        core = np.concatenate([core[at] != 0 for core, at in zip(cores, pixels, strict=True)])
-        rows, columns = ([at[axis] + box[1 - axis] for at, box in zip(pixels, boxes, strict=True)] for axis in (0, 1))
-        bounds = [(u.min(), v.min(), u.max() + 1, v.max() + 1) for u, v in zip(columns, rows, strict=True)]
-        area = np.array([len(u) for u in columns])
-        own = np.repeat(np.arange(len(area)), area)
+        core = np.concatenate(
+            [np.asarray(cv2.erode(mask, _AROUND))[at] != 0 for mask, at in zip(masks, pixels, strict=True)]
+        )
+        u, v = (
+            [(at[1 - axis] + box[axis]).astype(np.int32) for at, box in zip(pixels, boxes, strict=True)]
+            for axis in (0, 1)
+        )
+        bounds = [(x.min(), y.min(), x.max() + 1, y.max() + 1) for x, y in zip(u, v, strict=True)]
+        area = np.array([len(x) for x in u])
         return cls(
-            number,
+            number, np.cumsum(area) - area, area, np.array(bounds), np.concatenate(u), np.concatenate(v), core, layer
+        )
+
+    @classmethod
+    def joined(cls, parts: Sequence[Segments]) -> Segments:
+        """The regions of all parts, of which there is at least one."""
+        if len(parts) == 1:
+            return parts[0]
+        whole = cls(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(cls)))
+        return replace(whole, start=np.cumsum(whole.area_px) - whole.area_px)
+
+    def among(self, chosen: BoolArray) -> Segments:
+        """Some of the regions, by `chosen`, (n,)."""
+        if chosen.all():
+            return self
+        pixels = np.repeat(chosen, self.area_px)
+        area = self.area_px[chosen]
+        return Segments(
+            self.number[chosen],
             np.cumsum(area) - area,
             area,
-            np.array(bounds),
-            own,
-            np.concatenate(columns),
-            np.concatenate(rows),
-            core,
+            self.bounds[chosen],
+            self.u[pixels],
+            self.v[pixels],
+            self.core[pixels],
+            self.layer[chosen],
         )
+
+    @property
+    def own(self) -> IntArray:
+        """Each pixel's region, shape (k,)."""
+        return np.repeat(np.arange(len(self.area_px)), self.area_px)
 
     def mask(self, region: int, box: PixelBox) -> ImageArray:
         """The region's pixels in a box that contains it: 1 inside, 0 outside; shape (bottom - top, right - left)."""
@@ -72,9 +102,9 @@ class Segments:
         return mask
 
 
-def segments(codes: CodeArray, table: ImageArray, min_area_px: float) -> Segments | None:
+def segments(codes: CodeArray, table: ImageArray, layer: int, min_area_px: float) -> Segments | None:
     """The regions of at least so many pixels; None without any. `codes` are from `ColourTable.packed`, shape (height,
-    width); `table` is a layer's."""
+    width); `table` is the layer's."""
     rect = _where(codes, table)
     if rect is None:
         return None
@@ -106,16 +136,23 @@ def segments(codes: CodeArray, table: ImageArray, min_area_px: float) -> Segment
     if not len(area):
         return None
     pixels = at.take(order)
-    v = pixels // (right - left)
-    u = pixels - v * (right - left) + left
+    place = pixels.astype(np.int32)
+    v = place // (right - left)
+    u = place - v * (right - left)
+    u += left
     v += top
-    end = start + area
     # Within a region pixels are row by row.
     bounds = np.stack(
-        [np.minimum.reduceat(u, start), v.take(start), np.maximum.reduceat(u, start) + 1, v.take(end - 1) + 1], axis=1
-    )
-    own = np.repeat(np.arange(len(area)), area)
-    return Segments(number, start, area, bounds, own, u, v, np.asarray(core).reshape(-1).take(pixels) != 0)
+        [
+            np.minimum.reduceat(u, start),
+            v.take(start),
+            np.maximum.reduceat(u, start) + 1,
+            v.take(start + area - 1) + 1,
+        ],
+        axis=1,
+    ).astype(np.int64)
+    inside = np.asarray(core).reshape(-1).take(pixels) != 0
+    return Segments(number, start, area, bounds, u, v, inside, np.full(len(area), layer))
 
 
 def _where(codes: CodeArray, table: ImageArray) -> PixelBox | None:
