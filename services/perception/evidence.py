@@ -13,12 +13,12 @@ from services.perception.image import Evidence, RgbdImage
 from services.perception.region import MIN_DEPTH_PIXELS, MIN_DEPTH_SHARE, ColourRegion, depth_doubt_m, ring_px
 from services.perception.segments import Segments
 
-MAX_SURFACE_POINTS = 96
-MAX_RAYS = 36
+MAX_SURFACE_POINTS = 80
+MAX_RAYS = 32
 SMOOTHED_DOUBT = 0.7
 """Standard deviation of a surface point's depth, the mean of up to nine pixels, relative to that of one pixel. The mean
 does not reduce what neighbours have in common: quantisation, and the grain of the sensor's pattern."""
-_SQUARE = np.array([(du, dv) for dv in (-1, 0, 1) for du in (-1, 0, 1)]).T[:, :, None]
+_SQUARE = np.array([(du, dv) for dv in (-1, 0, 1) for du in (-1, 0, 1)], dtype=np.int32).T[:, :, None]
 
 
 def middle_depths_m(found: Segments, codes: CodeArray, image: RgbdImage) -> FloatArray:

@@ -17,13 +17,17 @@ ITERATIONS = 12
 SETTLED_M = 3e-4
 PRIOR = np.eye(3) / 0.05**2
 """Inverse covariance of the first guess, 1/m2: it may be 5 cm off and decides only what the evidence leaves open."""
-RAY_SAMPLES = 5
+COARSE_STEPS = np.linspace(-1.0, 1.0, 5, dtype=np.float32)[:, None, None]
+FINE_STEPS = np.linspace(-0.1875, 0.1875, 3, dtype=np.float32)[:, None, None]
+"""Places along a ray where the point nearest to the shape is looked for, as shares of the shape's reach."""
 RAY_DOUBT_M, RAY_DOUBT_RAD = 0.001, 0.002
 """Standard deviation of the outline: a constant, and about a pixel at the object's distance."""
-MANY = 16
+MANY = 32
 COARSE, COARSE_ITERATIONS, COARSE_SETTLED_M = 3, 4, 1e-3
 """So many fits go most of the way by every third piece of evidence, in so many steps at most, until the centre settles to
 a millimetre: that takes a third of the time. Of fewer fits the calls take the time, not the numbers."""
+KEPT = 0.7
+"""The fits that have settled are left out when less than this share of them goes on."""
 HUBER = 1.5
 
 
@@ -72,43 +76,49 @@ class _Fits:
         self._certainty2 = self._certainty * self._certainty * np.float32(HUBER)
         x, y, z = self._rays
         length2 = np.maximum(x * x + y * y + z * z, np.float32(1e-9))
-        self._step = shapes.reach_m.astype(np.float32)[:, None] / np.sqrt(length2)
+        reach = shapes.reach_m.astype(np.float32)[:, None] / np.sqrt(length2)
         self._depth = -(x * self._eye[0] + y * self._eye[1] + z * self._eye[2]) / length2
-        self._search(self._step, RAY_SAMPLES)
-        self._step *= np.float32(0.75 / (RAY_SAMPLES - 1))
+        self._search(COARSE_STEPS * reach)
+        self._steps = FINE_STEPS * reach
 
-    def _search(self, step: Float32Array, samples: int) -> None:
-        """Find the point in each ray's free part that is nearest to the shape, or deepest in it, within a depth of
-        `step`, (n, rays), from the last one."""
-        eye = self._eye - self.moved.T[:, :, None].astype(np.float32)
-        x, y, z = self._rays
-        depths = self._depth + np.linspace(-1.0, 1.0, samples, dtype=np.float32)[:, None, None] * step
+    def _search(self, steps: Float32Array) -> None:
+        """Find the point in each ray's free part that is nearest to the shape, or deepest in it, among those at `steps`,
+        (s, n, rays), from the last one."""
+        depths = self._depth + steps
         np.minimum(depths, self._free_to, out=depths)
-        distance = self._solids.distance(depths * x + eye[0], depths * y + eye[1], depths * z + eye[2])
+        points = depths * self._rays[:, None]
+        points += self._from_centre()[:, None]
+        distance = self._solids.distance(points)
         best, self._depth = distance[0], depths[0]
         for other, depth in zip(distance[1:], depths[1:], strict=True):
             nearer = other < best
             best = np.where(nearer, other, best)
             self._depth = np.where(nearer, depth, self._depth)
 
+    def _from_centre(self) -> Float32Array:
+        """The camera relative to the shapes' centres, m, shape (3, n, 1)."""
+        return self._eye - self.moved.T[:, :, None].astype(np.float32)
+
     def settle(self, iterations: int, settled_m: float) -> tuple[FloatArray, FloatArray]:
-        """Step until each fit moves by less than `settled_m`, at most so many times. Returns how far each moved in all, m,
-        (n, 3), and its mean misfit, (n,)."""
-        moved, misfit = self.moved.copy(), np.zeros(len(self.moved))
-        left = np.arange(len(moved))
+        """Step until each fit moves by less than `settled_m`, at most so many times. Returns how far each moved in all,
+        m, (n, 3), and its mean misfit, (n,)."""
+        moved, misfit = np.zeros_like(self.moved), np.zeros(len(self.moved))
+        left, going = np.arange(len(moved)), np.ones(len(moved), dtype=np.bool_)
         for iteration in range(iterations):
             move = self._move()
-            going = np.abs(move).max(axis=1) >= settled_m
-            if iteration == iterations - 1:
-                going[:] = False
-            if going.all():
-                continue
-            done = left[~going]
-            moved[done], misfit[done] = self.moved[~going], self._misfit(~going)
-            if len(done) == len(left):
+            self.moved[going] += move[going]
+            settled = going & ((np.abs(move).max(axis=1) < settled_m) | (iteration == iterations - 1))
+            misfit[left[settled]] = self._misfit(settled)
+            going &= ~settled
+            remaining = np.count_nonzero(going)
+            if not remaining:
                 break
-            left = left[going]
-            self._keep(going)
+            if len(left) >= MANY and remaining < KEPT * len(left):
+                moved[left] = self.moved
+                left = left[going]
+                self._keep(going)
+                going = np.ones(remaining, dtype=np.bool_)
+        moved[left] = self.moved
         return moved, misfit
 
     def _misfit(self, chosen: BoolArray) -> FloatArray:
@@ -119,11 +129,12 @@ class _Fits:
         return misfit
 
     def _move(self) -> FloatArray:
-        """Make one step. Returns the moves, m, (n, 3)."""
-        self._search(self._step, 3)
-        self._at[:, :, -self._depth.shape[1] :] = self._depth * self._rays + self._eye
-        offsets = self._at - self.moved.T[:, :, None].astype(np.float32)
-        distance, along = self._solids.gradient(*offsets)
+        """The step that each fit should make, m, (n, 3)."""
+        self._search(self._steps)
+        ends = self._at[:, :, -self._depth.shape[1] :]
+        np.multiply(self._depth, self._rays, out=ends)
+        ends += self._eye
+        distance, along = self._solids.gradient(self._at - self.moved.T[:, :, None].astype(np.float32))
         # A ray that meets the shape is no evidence, nor is a free one that does not.
         missed = distance[:, -self._side.shape[1] :]
         missed *= self._side
@@ -136,13 +147,12 @@ class _Fits:
         curvature = (weighted @ along.transpose(1, 2, 0)).astype(np.float64) + PRIOR
         pull = (weighted @ distance[:, :, None]).astype(np.float64) - PRIOR @ self.moved[:, :, None]
         move: FloatArray = np.linalg.solve(curvature, pull)[..., 0]
-        self.moved += move
         return move
 
     def _keep(self, going: BoolArray) -> None:
         """Go on with some of the fits only, (n,)."""
         self._solids = self._solids.of(going)
-        for name in ("moved", "_count", "_side", "_certainty", "_certainty2", "_free_to", "_step", "_depth"):
+        for name in ("moved", "_count", "_side", "_certainty", "_certainty2", "_free_to", "_depth"):
             setattr(self, name, getattr(self, name)[going])
-        for name in ("_at", "_rays", "_eye"):
+        for name in ("_at", "_rays", "_eye", "_steps"):
             setattr(self, name, getattr(self, name)[:, going])

@@ -61,46 +61,47 @@ class Solids:
     def __init__(self, shapes: Shapes) -> None:
         self._radius = shapes.radius_m.astype(np.float32)[:, None]
         self._half = np.where(shapes.sphere, NO_LID_M, shapes.height_m / 2).astype(np.float32)[:, None]
-        self._round = shapes.sphere.astype(np.float32)[:, None]
+        self._across = np.ones((3, len(shapes), 1), dtype=np.float32)
+        self._across[2, :, 0] = shapes.sphere
+        """Directions in which the radius is measured."""
 
-    def of(self, chosen: Any) -> Solids:
-        """The surfaces of some of the objects."""
+    def of(self, chosen: BoolArray) -> Solids:
+        """The surfaces of some of the objects, (n,)."""
         some = Solids.__new__(Solids)
-        for name, values in vars(self).items():
-            setattr(some, name, values[chosen])
+        some._radius, some._half, some._across = self._radius[chosen], self._half[chosen], self._across[:, chosen]
         return some
 
-    def distance(self, x: Float32Array, y: Float32Array, z: Float32Array) -> Float32Array:
-        """Signed distances of points from the surfaces, m, negative inside, (..., n, k), by their offsets from the
-        centres, z up, m, (..., n, k)."""
-        beside = np.sqrt(x * x + y * y + self._round * (z * z)) - self._radius
-        above = np.abs(z) - self._half
+    def distance(self, offsets_m: Float32Array) -> Float32Array:
+        """Signed distances of points from the surfaces, m, negative inside, shape (n, k) or (s, n, k), by their offsets
+        from the centres, z up, m, shape (3, n, k) or (3, s, n, k)."""
+        across = offsets_m * (self._across if offsets_m.ndim == 3 else self._across[:, None])
+        across *= across
+        beside = np.sqrt(np.add.reduce(across, axis=0))
+        beside -= self._radius
+        above = np.abs(offsets_m[2])
+        above -= self._half
         radial, vertical = np.maximum(beside, 0), np.maximum(above, 0)
-        outside = np.sqrt(radial * radial + vertical * vertical)
-        distance: Float32Array = outside + np.minimum(np.maximum(beside, above), 0)
+        distance: Float32Array = np.sqrt(radial * radial + vertical * vertical)
+        distance += np.minimum(np.maximum(beside, above), 0)
         return distance
 
-    def gradient(self, x: Float32Array, y: Float32Array, z: Float32Array) -> tuple[Float32Array, Float32Array]:
-        """`distance` for points (n, k), and its gradient along x, y and z, shape (3, n, k)."""
-        planar = np.sqrt(x * x + y * y + self._round * (z * z))
+    def gradient(self, offsets_m: Float32Array) -> tuple[Float32Array, Float32Array]:
+        """`distance` for offsets (3, n, k), and its gradient along x, y and z, shape (3, n, k)."""
+        along = offsets_m * self._across
+        planar = np.sqrt(np.add.reduce(along * along, axis=0))
         beside = planar - self._radius
-        above = np.abs(z) - self._half
-        radial, vertical = np.maximum(beside, 0), np.maximum(above, 0)
-        outside = np.sqrt(radial * radial + vertical * vertical)
-        within = np.maximum(beside, above)
-        # Inside, the nearer one of side and lid counts.
-        deep = within <= 0
-        mantle = beside >= above
-        share = np.where(deep, np.float32(1), outside)
-        radial = np.where(deep, mantle, radial / share)
-        vertical = np.where(deep, ~mantle, vertical / share)
-        radial /= np.maximum(planar, np.float32(1e-9))
-        along = np.empty((3, *x.shape), dtype=np.float32)
-        np.multiply(x, radial, out=along[0])
-        np.multiply(y, radial, out=along[1])
-        np.multiply(z, self._round * radial, out=along[2])
-        along[2] += np.copysign(vertical, z)
-        return outside + np.minimum(within, 0), along
+        above = np.abs(offsets_m[2])
+        above -= self._half
+        # Outside, the distances from side and lid that are positive count; inside, the nearer one of both.
+        radial = beside * (beside >= np.minimum(above, 0))
+        vertical = above * (above > np.minimum(beside, 0))
+        length = np.sqrt(radial * radial + vertical * vertical)
+        length += np.float32(1e-12)
+        distance = np.copysign(length, np.maximum(beside, above))
+        radial /= distance * np.maximum(planar, np.float32(1e-9))
+        along *= radial
+        along[2] += np.copysign(vertical / distance, offsets_m[2])
+        return distance, along
 
 
 def counted_px(area_px: Any) -> Any:
