@@ -40,4 +40,7 @@ class Entry(NamedTuple):
             add(parser)
 
 
-ENTRIES: dict[str, Entry] = {}
+ENTRIES = {
+    "decoupling": Entry("decoupling", "suite"),
+    "pixel": Entry("pixel", "suite"),
+}

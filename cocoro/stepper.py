@@ -43,7 +43,6 @@ class Deadlines:
             self.next_ns += missed * self._period_ns
         return self.next_ns
 
-
     def restart(self, now_ns: int) -> None:
         """The next deadline is a period after `now_ns`, when work began before its deadline."""
         self.next_ns = now_ns + self._period_ns

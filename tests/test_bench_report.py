@@ -8,7 +8,20 @@ import pytest
 
 from bench import page, suite
 from bench.entries import ENTRIES
-from bench.report import Chart, Figure, Machine, Report, Result, Series, decode, encode, number, percentile, turns, worse
+from bench.report import (
+    Chart,
+    Figure,
+    Machine,
+    Report,
+    Result,
+    Series,
+    decode,
+    encode,
+    number,
+    percentile,
+    turns,
+    worse,
+)
 
 MACHINE = Machine("a processor", 2, 24.0, "Linux 6", "3.12", 0.0)
 
@@ -69,7 +82,8 @@ def test_a_percentile_lies_between_samples() -> None:
 
 
 @pytest.mark.parametrize(
-    ("value", "text"), [(0.0, "0"), (1234.6, "1,235"), (12.34, "12.3"), (1.239, "1.24"), (0.01234, "0.012"), (20.0, "20")]
+    ("value", "text"),
+    [(0.0, "0"), (1234.6, "1,235"), (12.34, "12.3"), (1.239, "1.24"), (0.01234, "0.012"), (20.0, "20")],
 )
 def test_numbers_have_three_digits(value: float, text: str) -> None:
     assert number(value) == text
