@@ -43,4 +43,5 @@ class Entry(NamedTuple):
 ENTRIES = {
     "decoupling": Entry("decoupling", "suite"),
     "pixel": Entry("pixel", "suite"),
+    "perception": Entry("perception", "suite"),
 }
