@@ -13,6 +13,7 @@ import numpy as np
 
 from cocoro.arrays import CodeArray, Float32Array, IntArray
 from cocoro.robot import Camera, Robot
+from cocoro.units import Vec3
 
 PixelBox = tuple[int, int, int, int]
 """left, top, right, bottom, px; right and bottom are exclusive."""
@@ -24,15 +25,17 @@ NO_DATA = 2047
 @lru_cache(maxsize=8)
 def registration(robot: Robot, width: int, height: int) -> Registration:
     """The registration of a robot's frames of `width` x `height` pixels."""
-    return Registration(robot, width, height)
+    return Registration(robot, width, height, robot.kinect.depth_offset_m)
 
 
 class Registration:
     """Registers parts of depth images of one size."""
 
-    def __init__(self, robot: Robot, width: int, height: int) -> None:
+    def __init__(self, robot: Robot, width: int, height: int, offset_m: Vec3) -> None:
+        """For a robot's frames of `width` x `height` pixels; `offset_m` is the depth camera's place in the colour
+        camera's frame."""
         self._camera: Camera = robot.camera.scaled(width, height)
-        self._offset_m = robot.kinect.depth_offset_m
+        self._offset_m = offset_m
         self._nearest_m = robot.kinect.min_range_m
         self._depth: Float32Array = robot.depth_m(np.arange(NO_DATA + 1, dtype=np.uint16))
         self.table: Float32Array = self._depth + np.float32(self._offset_m[2])
@@ -54,7 +57,7 @@ class Registration:
         """The depth codes at the colour pixels of a box, shape (bottom - top, right - left): of the point that the
         colour pixel shows; `NO_DATA` without data, in an infrared shadow, and in cracks between moved pixels.
         `raw_depth` is the depth camera's image, shape (height, width)."""
-        return self._moved_sideways(raw_depth, box) if self._sideways else self._moved(raw_depth, box)
+        return self._moved_sideways(raw_depth, box) if self._sideways else self.codes_generally(raw_depth, box)
 
     def _moved_sideways(self, raw_depth: CodeArray, box: PixelBox) -> CodeArray:
         """For cameras exactly side by side: pixels stay in their rows, and each code moves by an amount of its own.
@@ -81,8 +84,8 @@ class Registration:
             out[row : row + _ROWS].reshape(-1)[place] = part
         return out[:, most + left - first : most + right - first]
 
-    def _moved(self, raw_depth: CodeArray, box: PixelBox) -> CodeArray:
-        """For any offset between the cameras."""
+    def codes_generally(self, raw_depth: CodeArray, box: PixelBox) -> CodeArray:
+        """`codes` for any offset between the cameras; takes several times as long."""
         left, top, right, bottom = box
         camera = self._camera
         ox, oy, oz = self._offset_m
