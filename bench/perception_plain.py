@@ -1,4 +1,4 @@
-"""Other ways to find the same objects, for the bench: plain OpenCV as strong as it gets, and the paper's method in NumPy."""
+"""Other ways to find the same objects, for the bench: plain OpenCV, and the paper's method in NumPy."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class PlainOpenCV:
                 if not width:
                     continue
                 mask = mask[top : top + height, left : left + width]
-            count, labels, stats, centres = cv2.connectedComponentsWithStats(mask, connectivity=8, ltype=cv2.CV_32S)
+            count, _, stats, centres = cv2.connectedComponentsWithStats(mask, connectivity=8, ltype=cv2.CV_32S)
             if count < 2:
                 continue
             best = 1 + int(stats[1:, cv2.CC_STAT_AREA].argmax())

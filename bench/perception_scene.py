@@ -102,8 +102,9 @@ def colours(count: int) -> list[Bounds]:
 
 def _overlap(boxes: FloatArray) -> BoolArray:
     """Which of the boxes (n, 2, 3) have a common part; shape (n, n)."""
-    common: BoolArray = (boxes[:, None, 0] <= boxes[:, 1]) & (boxes[:, 0] <= boxes[:, None, 1])
-    return common.all(axis=-1)
+    common = (boxes[:, None, 0] <= boxes[:, 1]) & (boxes[:, 0] <= boxes[:, None, 1])
+    every: BoolArray = np.all(common, axis=-1)
+    return every
 
 
 def known_objects(count: int) -> tuple[Catalogue, list[FloatArray]]:

@@ -49,7 +49,7 @@ def one_by_one(picture: NDArray[np.uint16], min_area_px: float) -> set[Region]:
         large = sorted((i for i in range(1, count) if stats[i, 4] >= min_area_px), key=lambda i: -stats[i, 4])
         for i in large[:8]:
             left, top, width, height, area = stats[i].tolist()
-            pixels = frozenset(map(tuple, np.argwhere(np.asarray(parts) == i).tolist()))
+            pixels = frozenset((row, column) for row, column in np.argwhere(np.asarray(parts) == i).tolist())
             found.add((label - 1, area, (left, top, left + width, top + height), pixels))
     return found
 

@@ -24,8 +24,8 @@ RAY_DOUBT_M, RAY_DOUBT_RAD = 0.001, 0.002
 """Standard deviation of the outline: a constant, and about a pixel at the object's distance."""
 MANY = 32
 COARSE, COARSE_ITERATIONS, COARSE_SETTLED_M = 3, 4, 1e-3
-"""So many fits go most of the way by every third piece of evidence, in so many steps at most, until the centre settles to
-a millimetre: that takes a third of the time. Of fewer fits the calls take the time, not the numbers."""
+"""So many fits go most of the way by every third piece of evidence, in so many steps at most, until the centre settles
+to a millimetre: that takes a third of the time. Of fewer fits the calls take the time, not the numbers."""
 KEPT = 0.7
 """The fits that have settled are left out when less than this share of them goes on."""
 HUBER = 1.5
@@ -82,8 +82,8 @@ class _Fits:
         self._steps = FINE_STEPS * reach
 
     def _search(self, steps: Float32Array) -> None:
-        """Find the point in each ray's free part that is nearest to the shape, or deepest in it, among those at `steps`,
-        (s, n, rays), from the last one."""
+        """Find the point in each ray's free part that is nearest to the shape, or deepest in it, among those at
+        `steps`, (s, n, rays), from the last one."""
         depths = self._depth + steps
         np.minimum(depths, self._free_to, out=depths)
         points = depths * self._rays[:, None]

@@ -8,6 +8,7 @@ from math import sqrt
 from typing import NamedTuple, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cocoro.arrays import CodeArray, Float32Array, ImageArray, IntArray
 from cocoro.messages import Frame
@@ -16,6 +17,7 @@ from services.perception.registration import PixelBox, Registration, registratio
 
 __all__ = ["Detector", "Evidence", "ImageSighting", "OwnEvidence", "PixelBox", "RgbdImage"]
 
+PixelArray = NDArray[np.int32] | NDArray[np.int64]
 _BOX_COSTS_PX = 30, 8000
 """A box is registered in the time of a wider one with so many columns and pixels more."""
 
@@ -99,9 +101,10 @@ class RgbdImage:
         for box in self._registered_boxes:
             self._registered[box[1] : box[3], box[0] : box[2]] = self._registration.codes(self.raw_depth, box)
 
-    def codes_at(self, columns: IntArray, rows: IntArray) -> CodeArray:
+    def codes_at(self, columns: PixelArray, rows: PixelArray) -> CodeArray:
         """Codes of the depth at colour pixels within registered boxes, shape of `columns` and `rows`."""
-        return self._registered.reshape(-1).take(rows * self.width + columns)
+        codes: CodeArray = self._registered.reshape(-1).take(rows * self.width + columns)
+        return codes
 
 
 @dataclass(frozen=True)

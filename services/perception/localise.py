@@ -160,7 +160,8 @@ def first_guesses(shapes: Shapes, surface_m: FloatArray, pose: FloatArray) -> Fl
     points: FloatArray = inwards + pose[:3, 3]
     inwards[:, 2] *= shapes.sphere
     length = np.maximum(np.sqrt((inwards * inwards).sum(axis=1)), 1e-9)
-    return points + inwards * (shapes.radius_m / length)[:, None]
+    points += inwards * (shapes.radius_m / length)[:, None]
+    return points
 
 
 def expected_areas_px(shapes: Shapes, centres: FloatArray, camera: Camera, pose: FloatArray) -> FloatArray:
@@ -172,4 +173,5 @@ def expected_areas_px(shapes: Shapes, centres: FloatArray, camera: Camera, pose:
     here = (distance < 1e-6) | (depth < 1e-6)
     sine = np.abs(to_camera[:, 2]) / np.where(here, 1.0, distance)
     solid = shapes.seen_area_m2(np.minimum(sine, 1.0)) * camera.fx * camera.fy * distance
-    return np.where(here, np.inf, solid / np.where(here, 1.0, depth) ** 3)
+    areas: FloatArray = np.where(here, np.inf, solid / np.where(here, 1.0, depth) ** 3)
+    return areas

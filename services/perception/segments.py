@@ -115,9 +115,10 @@ def segments(codes: CodeArray, table: ImageArray, layer: int, min_area_px: float
     least, greatest = cv2.erode(labels, _AROUND), cv2.dilate(labels, _AROUND)
     core = cv2.bitwise_and(least, cv2.compare(least, greatest, cv2.CMP_EQ))
     opened = np.asarray(cv2.dilate(core, _AROUND), dtype=np.uint8)
-    count, parts = cv2.connectedComponents(opened, connectivity=8, ltype=cv2.CV_32S)
+    count, connected = cv2.connectedComponents(opened, connectivity=8, ltype=cv2.CV_32S)
     if count < 2:
         return None
+    parts: NDArray[np.int32] = np.asarray(connected, dtype=np.int32)
     at = np.flatnonzero(opened != 0)
     order, start, area = _grouped(parts.reshape(-1).take(at), count)
     label = opened.reshape(-1).take(at.take(order))
