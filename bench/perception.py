@@ -4,8 +4,8 @@
 turns with it: plain OpenCV that does the same work except the shape fit, the paper's method in NumPy, and one pass over
 the frame's memory, which is the floor. Every method must find every object within 3 px of its true place.
 
-Plain OpenCV looks for components in the box around a mask's pixels, which takes an eighth of the time. The usual way, in
-the whole image, is measured, too.
+Plain OpenCV looks for components in the box around a mask's pixels, which takes an eighth of the time. The usual way,
+in the whole image, is measured, too.
 """
 
 from __future__ import annotations
