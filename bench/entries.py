@@ -40,9 +40,12 @@ class Entry(NamedTuple):
             add(parser)
 
 
-ENTRIES = {
+ENTRIES: dict[str, Entry] = {
     "decoupling": Entry("decoupling", "suite"),
     "pixel": Entry("pixel", "suite"),
     "startup": Entry("startup", "suite"),
     "tests": Entry("own_tests", "suite"),
+    "baselines": Entry("baselines", "suite"),
+    "learning": Entry("learning", "suite"),
+    "perception": Entry("perception", "suite"),
 }
