@@ -14,7 +14,7 @@ from cocoro.objects import Catalogue
 from cocoro.topics import FRAME
 from services.perception.config import PerceptionConfig
 from services.perception.core import PerceptionCore
-from services.perception.evidence import middle_depths_m
+from services.perception.evidence import FEW, middle_depths_m, surroundings
 from services.perception.image import RgbdImage
 from services.perception.region import ColourRegion
 from services.perception.registration import Registration
@@ -134,6 +134,28 @@ def test_a_regions_depth_is_the_same_alone_as_among_others() -> None:
             box = image.clip((left, top, right, bottom), ColourRegion.margin_px(image))
             alone = ColourRegion(found.mask(region, box), box, image).depth_m
             assert alone == pytest.approx(depth_m, abs=1e-7) or (alone is None and depth_m != depth_m)
+
+
+def test_the_pixels_around_many_regions_are_those_around_each() -> None:
+    image = RgbdImage.of(canvas_of_all(1).frame(), ROBOT)
+    image.register(np.array([(0, 0, 640, 480)]))
+    for seed in range(4):
+        picture = np.zeros((480, 640), dtype=np.uint16)
+        picture[60:300, 40:360] = patches((240, 320), seed, labels=30)
+        found = segments(picture, TABLE, 0, 6.0)
+        assert found is not None
+        assert len(found.start) > FEW
+        u, v, _, first, counts = surroundings(found, image)
+        every, missing = 0, 0
+        for region in range(len(found.start)):
+            alone = surroundings(found.among(np.arange(len(found.start)) == region), image)
+            some = slice(first[region], first[region] + counts[region])
+            together = set(zip(u[some].tolist(), v[some].tolist(), strict=True))
+            expected = set(zip(alone[0].tolist(), alone[1].tolist(), strict=True))
+            assert together <= expected
+            every, missing = every + len(expected), missing + len(expected - together)
+        # Where the surroundings of three regions meet, two of them have the pixel.
+        assert missing <= 0.15 * every, (missing, every)
 
 
 # --- the whole detector ---------------------------------------------------------------------------
