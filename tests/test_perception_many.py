@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import cv2
+import msgspec
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -161,9 +162,9 @@ def test_the_pixels_around_many_regions_are_those_around_each() -> None:
 # --- the whole detector ---------------------------------------------------------------------------
 
 
-def detections(frame: Frame, catalogue: Catalogue) -> dict[str, Detection]:
+def detections(frame: Frame, catalogue: Catalogue, tilt: float = -0.3) -> dict[str, Detection]:
     core = PerceptionCore(ROBOT, PerceptionConfig(), catalogue)
-    around = [head_at(frame.stamp_ns + offset_ns, 0.1, -0.3) for offset_ns in (-10_000_000, 10_000_000)]
+    around = [head_at(frame.stamp_ns + offset_ns, 0.1, tilt) for offset_ns in (-10_000_000, 10_000_000)]
     message = core.step([*around, Sample(FRAME, frame)], frame.stamp_ns + 20_000_000)[0].message
     assert isinstance(message, Detections)
     return {one.label: one for one in message.detections}
@@ -183,3 +184,13 @@ def test_an_object_among_others_is_detected_as_it_is_alone(size: tuple[int, int]
             assert (seen.u_px, seen.v_px, seen.area_px) == (alone.u_px, alone.v_px, alone.area_px)
             assert (seen.depth_m, seen.note) == (alone.depth_m, alone.note)
             assert seen.position_m == pytest.approx(alone.position_m, abs=2e-4)
+
+
+def test_an_object_that_fills_the_whole_picture_has_no_outline_and_is_still_placed() -> None:
+    canvas = Canvas(wall_m=1.0)
+    canvas.colour[:] = np.round(200 * np.array(CATALOGUE["red_can"].rgb))
+    big = msgspec.structs.replace(CATALOGUE["red_can"], label="wall", radius_m=0.9, height_m=1.6)
+    found = detections(canvas.frame(), Catalogue((big,)), tilt=0.3)["wall"]
+    assert found.box_px == (0, 0, 640, 480)
+    assert found.depth_m == pytest.approx(1.0, abs=0.01)
+    assert found.position_m is not None

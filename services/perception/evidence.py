@@ -82,7 +82,7 @@ def evidence_of(found: Segments, depth_m: FloatArray, reach_m: FloatArray, image
     v = np.concatenate([found.v.take(inside), v_beside.take(beside)])
     met = np.minimum(edges, MAX_RAYS)
     rays = met + np.minimum(counts, MAX_RAYS)
-    width = int(rays.max())
+    width = max(int(rays.max()), 1)  # without any ray, one of fill
     place = np.concatenate([own_edge * width + within_edge, own_beside * width + met[own_beside] + within_beside])
     free_to = depth_beside.take(beside)
     free_to -= 0.01 + depth_doubt_m(free_to)
