@@ -194,3 +194,11 @@ def test_an_object_that_fills_the_whole_picture_has_no_outline_and_is_still_plac
     assert found.box_px == (0, 0, 640, 480)
     assert found.depth_m == pytest.approx(1.0, abs=0.01)
     assert found.position_m is not None
+
+
+@pytest.mark.parametrize("depth_m", [2.0, 2.5, 3.0])
+def test_in_a_small_picture_what_is_two_pixels_wide_is_still_seen(depth_m: float) -> None:
+    canvas = Canvas(160, 120)
+    canvas.rectangle("red_can", (80, 60), depth_m)
+    left, _, right, _ = detections(canvas.frame(), CATALOGUE)["red_can"].box_px
+    assert right - left == 2

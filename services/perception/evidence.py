@@ -13,8 +13,8 @@ from services.perception.image import Evidence, RgbdImage
 from services.perception.region import MIN_DEPTH_PIXELS, MIN_DEPTH_SHARE, ColourRegion, depth_doubt_m, ring_px
 from services.perception.segments import Segments
 
-MAX_SURFACE_POINTS = 80
-MAX_RAYS = 32
+MAX_SURFACE_POINTS = 96
+MAX_RAYS = 36
 FEW = 12
 """The pixels around so many regions are found sooner for each region by itself than in the image."""
 SMOOTHED_DOUBT = 0.7
