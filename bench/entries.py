@@ -45,4 +45,5 @@ ENTRIES: dict[str, Entry] = {
     "pixel": Entry("pixel", "suite"),
     "baselines": Entry("baselines", "suite"),
     "learning": Entry("learning", "suite"),
+    "perception": Entry("perception", "suite"),
 }
