@@ -7,6 +7,8 @@ does not depend on the number of frames before it. Motion blur is the exception:
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from cocoro.arrays import CodeArray, Float32Array, FloatArray, ImageArray
@@ -91,6 +93,13 @@ class SimKinect:
 
     def __exit__(self, *_: object) -> None:
         self._renderer.close()
+
+    def expose(
+        self, poses: FloatArray, camera_pose: FloatArray, stamp_ns: int, light: Lighting
+    ) -> Callable[[], Frame]:
+        """Expose a frame as `capture` does; the function that is returned gives it when it is to be delivered."""
+        frame = self.capture(poses, camera_pose, stamp_ns, light)
+        return lambda: frame
 
     def capture(self, poses: FloatArray, camera_pose: FloatArray, stamp_ns: int, light: Lighting) -> Frame:
         """Take the frame whose exposure has its middle at `stamp_ns`.

@@ -176,7 +176,7 @@ class _Rehearsal:
         if name == "sim":
             world: dict[str, Any] = {
                 field: getattr(request, field)
-                for field in ("scene", "seed", "sensors", "body", "width", "height", "frame_rate_hz")
+                for field in ("scene", "seed", "sensors", "body", "width", "height", "frame_rate_hz", "camera_process")
             }
             world |= {"target": request.task.target, "bend_at_s": request.bend_s}
             return world | held
