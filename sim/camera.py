@@ -94,9 +94,7 @@ class SimKinect:
     def __exit__(self, *_: object) -> None:
         self._renderer.close()
 
-    def expose(
-        self, poses: FloatArray, camera_pose: FloatArray, stamp_ns: int, light: Lighting
-    ) -> Callable[[], Frame]:
+    def expose(self, poses: FloatArray, camera_pose: FloatArray, stamp_ns: int, light: Lighting) -> Callable[[], Frame]:
         """Expose a frame as `capture` does; the function that is returned gives it when it is to be delivered."""
         frame = self.capture(poses, camera_pose, stamp_ns, light)
         return lambda: frame

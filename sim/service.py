@@ -83,9 +83,7 @@ class SimCamera(Protocol):
 
     def __exit__(self, *_: object) -> None: ...
 
-    def expose(
-        self, poses: FloatArray, camera_pose: FloatArray, stamp_ns: int, light: Lighting
-    ) -> Callable[[], Frame]:
+    def expose(self, poses: FloatArray, camera_pose: FloatArray, stamp_ns: int, light: Lighting) -> Callable[[], Frame]:
         """See `SimKinect.expose`."""
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import inspect
+import os
 import shlex
 import sys
 from collections.abc import Callable
@@ -129,6 +130,9 @@ def rehearse(
     json: JsonOption = False,
 ) -> None:
     """The whole robot is simulated in one process, in virtual time, and judged by the simulator's truth."""
+    # A fork of a process with one thread starts sooner, and small matrices gain nothing by threads.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    import sim.camera  # noqa: F401 # what both processes need is imported once
     from sim.camera_process.start import started_ahead
 
     with started_ahead():

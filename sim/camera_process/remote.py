@@ -73,9 +73,7 @@ class RemoteKinect:
     def __exit__(self, *_: object) -> None:
         self._started.end()
 
-    def expose(
-        self, poses: FloatArray, camera_pose: FloatArray, stamp_ns: int, light: Lighting
-    ) -> Callable[[], Frame]:
+    def expose(self, poses: FloatArray, camera_pose: FloatArray, stamp_ns: int, light: Lighting) -> Callable[[], Frame]:
         """See `SimKinect.expose`. The frame is valid until the next exposure, and must be asked for in the order of the
         exposures."""
         number = self._free.popleft()
@@ -116,6 +114,4 @@ class RemoteKinect:
         self._taken.add(taken.slot)
 
     def _fail(self) -> NoReturn:
-        self._started.end()
-        code = self._started.process.returncode
-        raise CocoroError(f"the process that draws the camera's pictures has ended (exit code {code})")
+        raise CocoroError(f"the camera's process has ended (exit code {self._started.end()})")

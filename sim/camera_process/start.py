@@ -2,28 +2,56 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import socket
-import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from typing import NamedTuple
+from pathlib import Path
+from typing import Protocol
 
 from cocoro import child
 
-MODULE = "sim.camera_process"
+THREADS = Path("/proc/self/task")
 
 
-class Started(NamedTuple):
-    """The process and this end of its channel (SOCK_SEQPACKET). The process ends when this end closes."""
+class Process(Protocol):
+    """The part of `subprocess.Popen` that is used here."""
 
-    process: subprocess.Popen[bytes]
-    channel: socket.socket
+    def kill(self) -> None: ...
 
-    def end(self) -> None:
-        """End the process at once: it has nothing to keep."""
-        self.channel.close()
-        self.process.kill()
-        self.process.wait()
+    def wait(self) -> int: ...
+
+
+class Started:
+    """A process and this end of its channel (SOCK_SEQPACKET). The process ends when this end closes."""
+
+    def __init__(self, process: Process, channel: socket.socket) -> None:
+        self.channel = channel
+        self._process = process
+        self._code: int | None = None
+
+    def end(self) -> int:
+        """End the process at once, for it has nothing to keep. Returns its exit code; may be called twice."""
+        if self._code is None:
+            self.channel.close()
+            self._process.kill()
+            self._code = self._process.wait()
+        return self._code
+
+
+class _Forked:
+    """A child that was forked."""
+
+    def __init__(self, pid: int) -> None:
+        self._pid = pid
+
+    def kill(self) -> None:
+        with suppress(ProcessLookupError):
+            os.kill(self._pid, signal.SIGKILL)
+
+    def wait(self) -> int:
+        return os.waitstatus_to_exitcode(os.waitpid(self._pid, 0)[1])
 
 
 _ahead: list[Started] = []
@@ -51,8 +79,36 @@ def _start() -> Started:
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     with theirs:
         try:
-            process = child.start(MODULE, str(theirs.fileno()), pass_fds=(theirs.fileno(),), env=child.environment_for())
+            process = _forked(theirs, ours) if _alone() else _spawned(theirs)
         except OSError:
             ours.close()
             raise
     return Started(process, ours)
+
+
+def _alone() -> bool:
+    """Whether this process has one thread: a fork of another might wait for ever for what the others hold."""
+    try:
+        return len([*THREADS.iterdir()]) == 1
+    except OSError:  # not on Linux
+        return False
+
+
+def _forked(channel: socket.socket, owners: socket.socket) -> Process:
+    """A copy of this process, which has imported already what it has."""
+    pid = os.fork()
+    if pid:
+        return _Forked(pid)
+    try:
+        signal.set_wakeup_fd(-1)
+        owners.close()  # or its death would go unnoticed
+        from sim.camera_process.__main__ import serve
+
+        serve(channel)
+    finally:
+        os._exit(1)  # `serve` does not return; nothing of the owner's may be finished or flushed here
+
+
+def _spawned(channel: socket.socket) -> Process:
+    number = channel.fileno()
+    return child.start("sim.camera_process", str(number), pass_fds=(number,), env=child.environment_for())

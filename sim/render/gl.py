@@ -59,7 +59,7 @@ class GlRenderer:
 
     def __init__(self, visuals: Sequence[Visual], camera: Camera) -> None:
         self.camera = camera
-        self._ctx = ctx = _context()
+        self._ctx = ctx = context()
         self._owned: list[_Owned] = []
         self._objects = instanced_meshes(ctx, visuals)
         self._floor, self._walls = floor_mesh(ctx), wall_mesh(ctx)
@@ -209,7 +209,7 @@ class GlRenderer:
 
 
 @cache
-def _context() -> moderngl.Context:
+def context() -> moderngl.Context:
     """The process's only OpenGL context, which all its renderers share."""
     create: Any = moderngl.create_context
     ctx: moderngl.Context = create(standalone=True, require=330, backend="egl", **LIBRARIES)
