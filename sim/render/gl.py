@@ -21,7 +21,7 @@ from cocoro.arrays import FloatArray, ImageArray
 from cocoro.robot import Camera
 from sim.render.interface import Images, Lighting, Visual
 from sim.render.meshes import floor_mesh, instanced_meshes, wall_mesh
-from sim.render.room import FLOOR_RGB, OTHER_TILE_RGB, TILE_M
+from sim.render.room import FLOOR_RGB, HALF_WIDTH_M, OTHER_TILE_RGB, TILE_M, WALL_PARTS_M, nearest_wall_m
 from sim.render.views import (
     PROJECTOR_BIAS_PER_M,
     PROJECTOR_NEAR_M,
@@ -38,6 +38,9 @@ LAMP_TEXELS = 512
 LAMP_HALF_WIDTH_M = 2.0
 """Half width of the cube in front of the camera that has shadows, 8 mm per texel. Everything outside is lit."""
 LAMP_AHEAD_M = 1.2
+PROJECTOR_REACH_M = 4.0
+"""Depth beyond which the depth camera does not see the projector's light, nor its shadows on the room's walls. The
+Kinect's range ends before."""
 
 
 class _Owned(Protocol):
@@ -67,7 +70,9 @@ class GlRenderer:
 
         self._lambert = self._program("object", "object")
         self._tiles = self._program("floor", "floor")
+        self._unshaded = self._program("far", "far")
         self._metres = self._program("depth", "depth")
+        self._plain_metres = self._program("shadow", "plain_depth")
         self._shade = self._program("shadow", "shadow")
         _set(self._tiles, rgb=FLOOR_RGB, other_rgb=OTHER_TILE_RGB, tile_m=TILE_M)
 
@@ -126,11 +131,13 @@ class GlRenderer:
         on_floor = max(-direction[2], 0.0)
         _set(self._lambert, view=view, lamp=lamp, to_lamp=-direction, ambient=ambient, diffuse=diffuse)
         _set(self._tiles, view=view, lamp=lamp, ambient=ambient, diffuse=diffuse * on_floor)
+        _set(self._unshaded, view=view, to_lamp=-direction, ambient=ambient, diffuse=diffuse)
         self._lamp_map.depth.use(0)
         self._colour_target.use()
         self._colour_target.clear()
-        for mesh in (*self._objects, self._walls):
+        for mesh in self._objects:
             mesh.draw(self._lambert)
+        self._walls.draw(self._lambert if _reaches_walls(direction, shadows_about_m) else self._unshaded)
         self._floor.draw(self._tiles)
 
     def picture(self) -> ImageArray:
@@ -147,14 +154,20 @@ class GlRenderer:
     # --- passes -----------------------------------------------------------------------------------
 
     def _draw_depth(self, pose: FloatArray, projector_pose: FloatArray | None) -> None:
+        view = self._projection @ rigid_inverse(pose)
+        _set(self._plain_metres, view=view)
+        lit = lit_walls = self._plain_metres
         if projector_pose is not None:
             self._draw_projector_map(projector_pose, float(np.linalg.norm(projector_pose[:3, 3] - pose[:3, 3])))
-        view = rigid_inverse(pose)
-        _set(self._metres, view=self._projection @ view, axis=view[2], projecting=projector_pose is not None)
+            _set(self._metres, view=view)
+            lit = self._metres
+            if nearest_wall_m(self.camera, pose) < PROJECTOR_REACH_M:
+                lit_walls = lit
         self._depth_target.use()
         self._depth_target.clear(red=np.inf)
-        for mesh in (*self._objects, self._floor, self._walls):
-            mesh.draw(self._metres)
+        for mesh in (*self._objects, self._floor):
+            mesh.draw(lit)
+        self._walls.draw(lit_walls)
 
     def _draw_projector_map(self, pose: FloatArray, baseline_m: float) -> None:
         """Draw the depth seen from the projector. It stands beside the depth camera and looks the same way, so a row of
@@ -222,6 +235,15 @@ def _set(program: moderngl.Program, **values: ArrayLike) -> None:
     for name, value in values.items():
         uniform: Any = program[name]
         uniform.write(np.asarray(value, np.float32).tobytes())
+
+
+def _reaches_walls(direction: FloatArray, about_m: FloatArray) -> bool:
+    """Whether the cube that has shadows may contain a part of the walls, or of the ceiling if light comes from below.
+
+    `direction`: of the lamp's light, (3,); `about_m`: the middle of the cube, (3,).
+    """
+    corner_m = 3**0.5 * LAMP_HALF_WIDTH_M
+    return bool(direction[2] > 0 or np.abs(about_m[:2]).max() + corner_m > HALF_WIDTH_M - WALL_PARTS_M)
 
 
 def _floor_ahead(pose: FloatArray) -> FloatArray:
