@@ -15,6 +15,7 @@ from cocoro.arrays import CodeArray, Float32Array, FloatArray, ImageArray
 from cocoro.errors import ConfigError
 from cocoro.messages import Frame
 from cocoro.robot import Robot
+from sim.memory import keep_freed_memory
 from sim.realism import Sensors
 from sim.render import Lighting, Renderer
 from sim.seeds import stream
@@ -80,7 +81,7 @@ class SimKinect:
         self._projector_offset_m = np.array(robot.kinect.projector_offset_m)
         self._coder = DepthCoder(robot)
         self._before: tuple[int, FloatArray] | None = None
-        _keep_freed_memory()
+        keep_freed_memory()
         if self._real:
             rng = stream(seed, "kinect")
             self._colour_noise = ByteNoise(rng, width * height, COLOUR_SIGMA)
@@ -159,11 +160,3 @@ def moved(camera_pose: FloatArray, offset_m: FloatArray) -> FloatArray:
     pose = camera_pose.copy()
     pose[:3, 3] += camera_pose[:3, :3] @ offset_m
     return pose
-
-
-def _keep_freed_memory() -> None:
-    """Make glibc keep freed memory for the next frame. Returning it to the system and faulting in fresh pages 30 times
-    a second would cost as much as the depth picture. glibc raises its limit to the largest block that was freed; with
-    another C library this does nothing."""
-    largest = np.empty(31 * 1024 * 1024, np.uint8)
-    del largest

@@ -18,6 +18,7 @@ from cocoro.messages import Frame
 from cocoro.robot import Robot
 from sim.camera_process.start import take
 from sim.camera_process.wire import MESSAGE_BYTES, Exposure, Setup, Taken, memory_bytes, slots_of
+from sim.memory import keep_freed_memory
 from sim.realism import Sensors
 from sim.render.choice import RendererChoice
 from sim.render.interface import Lighting, Visual
@@ -56,6 +57,7 @@ class RemoteKinect:
             self._started = take()
         except OSError as error:
             raise CocoroError(f"the camera's process cannot be started: {error.strerror}") from error
+        keep_freed_memory()  # for the messages that carry the frames
         memory = os.memfd_create("cocoro-frames")
         try:
             os.ftruncate(memory, memory_bytes(setup))

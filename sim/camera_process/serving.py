@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import mmap
+import os
 import socket
 from typing import NamedTuple
 
@@ -45,6 +46,8 @@ def serve(channel: socket.socket) -> None:
     """Take pictures until the owner's end closes. Raises ConnectionError when it closed early."""
     kept = _Kept()
     logging.getLogger().handlers[:] = [kept]
+    # Mesa's software renderer starts a thread for each core, but of two cores the owner needs one.
+    os.environ.setdefault("LP_NUM_THREADS", str(max((os.cpu_count() or 1) - 2, 0)))
     prepare()
     message, memory, _, _ = socket.recv_fds(channel, MESSAGE_BYTES, 1)
     if message:
