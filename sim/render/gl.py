@@ -17,7 +17,7 @@ import moderngl
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cocoro.arrays import FloatArray, ImageArray
+from cocoro.arrays import Float32Array, FloatArray, ImageArray
 from cocoro.robot import Camera
 from sim.render.interface import Images, Lighting, Visual
 from sim.render.meshes import floor_mesh, instanced_meshes, wall_mesh
@@ -96,10 +96,8 @@ class GlRenderer:
     ) -> Images:
         self.place(poses)
         self.draw(camera_pose, light, _floor_ahead(camera_pose))
-        self._draw_depth(depth_camera_pose, projector_pose)
-        colour = self.picture()
-        self._depth_target.read_into(self._depth_m, components=1, dtype="f4")
-        return Images(colour, self._depth_m)
+        self.draw_depth(depth_camera_pose, projector_pose)
+        return Images(self.picture(), self.metres())
 
     # --- a colour picture alone -------------------------------------------------------------------
 
@@ -146,14 +144,10 @@ class GlRenderer:
         cv2.cvtColor(self._rgba, cv2.COLOR_RGBA2RGB, dst=self._rgb)
         return self._rgb
 
-    def close(self) -> None:
-        for thing in self._owned:
-            thing.release()
-        self._owned.clear()
+    # --- a depth picture alone --------------------------------------------------------------------
 
-    # --- passes -----------------------------------------------------------------------------------
-
-    def _draw_depth(self, pose: FloatArray, projector_pose: FloatArray | None) -> None:
+    def draw_depth(self, pose: FloatArray, projector_pose: FloatArray | None) -> None:
+        """Draw the depth picture; see `render`."""
         view = self._projection @ rigid_inverse(pose)
         _set(self._plain_metres, view=view)
         lit = lit_walls = self._plain_metres
@@ -168,6 +162,18 @@ class GlRenderer:
         for mesh in (*self._objects, self._floor):
             mesh.draw(lit)
         self._walls.draw(lit_walls)
+
+    def metres(self) -> Float32Array:
+        """The newest depth picture, m, (height, width), which the next one overwrites."""
+        self._depth_target.read_into(self._depth_m, components=1, dtype="f4")
+        return self._depth_m
+
+    def close(self) -> None:
+        for thing in self._owned:
+            thing.release()
+        self._owned.clear()
+
+    # --- passes -----------------------------------------------------------------------------------
 
     def _draw_projector_map(self, pose: FloatArray, baseline_m: float) -> None:
         """Draw the depth seen from the projector. It stands beside the depth camera and looks the same way, so a row of
