@@ -43,4 +43,5 @@ class Entry(NamedTuple):
 ENTRIES = {
     "decoupling": Entry("decoupling", "suite"),
     "pixel": Entry("pixel", "suite"),
+    "simulator": Entry("simulator", "suite"),
 }

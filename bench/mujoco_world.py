@@ -66,9 +66,7 @@ def _exclude(spec: Any, model: RobotModel) -> None:
                 spec.add_exclude(bodyname1=one, bodyname2=other)
 
 
-def _place(
-    mujoco: Any, spec: Any, scene: Scene, item: SceneObject | Obstacle, yaw_rad: float, mass_kg: float
-) -> None:
+def _place(mujoco: Any, spec: Any, scene: Scene, item: SceneObject | Obstacle, yaw_rad: float, mass_kg: float) -> None:
     """Add a thing of the scene; without a mass it does not move."""
     half = (scene.robot.yaw_rad + yaw_rad) / 2
     body = spec.worldbody.add_body(pos=scene.to_world(item.centre_m), quat=[cos(half), 0.0, 0.0, sin(half)])
