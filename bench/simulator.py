@@ -6,6 +6,8 @@ A rehearsal is the whole process, from its start to its end with imports: `fetch
 camera's pictures drawn in a process of their own (as `cocoro rehearse` does), and in turns in the process itself. Its
 real-time factor is the simulated time of the run by the time of the process.
 
+A frame is what `SimKinect.capture` takes in one process: rendered, and made what the sensor would deliver.
+
 The split is that of one process that draws its pictures in its own thread. Each part has the time of its own functions
 without that of the other parts' functions that they call. MuJoCo (`pip install mujoco`) steps the same links, masses,
 shapes and scene with its own solver; where it is not installed, that comparison is left out, and the result says so.
@@ -20,12 +22,19 @@ import sys
 import time
 from argparse import Namespace
 from collections.abc import Callable
+from contextlib import ExitStack
+from itertools import count as count_up
 from pathlib import Path
 from typing import Any
 
 from bench.report import Report, Table, timed, turns
 from bench.simulator_split import PARTS
+from cocoro.clock import NS
+from cocoro.kinematics import turn_z
 from cocoro.robot import Robot
+from sim.camera import SimKinect
+from sim.realism import Sensors
+from sim.render import make_renderer
 from sim.scene import load_scene
 from sim.world import World
 
@@ -36,8 +45,12 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "320 x 240 at 15 Hz": {"width": 320, "height": 240, "frame_rate_hz": 15.0},
 }
 ROUNDS, SHORT_ROUNDS = 5, 1
+FRAMES, SHORT_FRAMES = 60, 10
 STEPS, SHORT_STEPS = 2000, 300
 PHYSICS_HZ = 240
+FRAME_HZ = 30
+TURN_RADPS = 0.5
+"""Speed of a turning camera: 10 pixels of blur."""
 LONGEST_S = 120.0
 
 
@@ -55,6 +68,7 @@ def measure(chosen: Namespace, report: Report) -> None:
             better="more",
         )
     report.tables.append(split_table())
+    frames(report, SHORT_FRAMES if chosen.short else FRAMES)
     physics(report, SHORT_STEPS if chosen.short else STEPS)
 
 
@@ -79,6 +93,32 @@ def split_table() -> Table:
             row.append(f"{times[part] / times['sim_s']:.3f} ({100 * times[part] / total:.0f}%)")
         rows[-1].append(f"{total / times['sim_s']:.3f}")
     return Table("Processor time for each simulated second, s, without start-up", ["part", *VARIANTS], rows)
+
+
+def frames(report: Report, count: int) -> None:
+    """The time of a frame of 640 x 480: ideal, and real with the camera at rest and turning, as the head does."""
+    robot = Robot.load()
+    with World(robot, load_scene("paper")) as world, ExitStack() as stack:
+
+        def camera(sensors: Sensors, turn_radps: float = 0.0) -> Callable[[], float]:
+            kinect = stack.enter_context(SimKinect(robot, make_renderer(world.visuals, robot.camera), sensors=sensors))
+            poses, pose, numbers = world.visual_poses(), world.camera_pose(), count_up()
+
+            def take() -> object:
+                number = next(numbers)
+                turned = pose.copy()
+                turned[:3, :3] = turn_z(turn_radps * number / FRAME_HZ)[:3, :3] @ pose[:3, :3]
+                return kinect.capture(poses, turned, round(number * NS / FRAME_HZ), world.light)
+
+            return timed(take)
+
+        ideal, still, turning = turns(
+            count, 3, ideal=camera("ideal"), still=camera("real"), turning=camera("real", TURN_RADPS)
+        )
+    report.value("frame, 640 x 480, ideal", ideal, "ms")
+    report.value("frame, real sensors, at rest", still, "ms")
+    report.value("frame, real sensors, turning", turning, "ms")
+    report.ratio("frame: real and turning / ideal", turning, ideal, better="less")
 
 
 def physics(report: Report, steps: int) -> None:
