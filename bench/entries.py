@@ -46,4 +46,5 @@ ENTRIES: dict[str, Entry] = {
     "baselines": Entry("baselines", "suite"),
     "learning": Entry("learning", "suite"),
     "perception": Entry("perception", "suite"),
+    "simulator": Entry("simulator", "suite"),
 }
