@@ -100,12 +100,11 @@ class IceoryxWay(Waits):
         return None, None, data.subscriber_builder().create(), event.listener_builder().create()
 
     def _send(self, *parts: Any) -> None:
-        sample = self._out.loan_slice_uninit(sum(part.nbytes for part in map(memoryview, parts)))
+        sample = self._out.loan_slice_uninit(sum(map(len, parts)))
         at = sample.payload_ptr
         for part in parts:
-            view = memoryview(part)
-            ctypes.memmove(at, part if isinstance(part, bytes) else part.ctypes.data, view.nbytes)
-            at += view.nbytes
+            ctypes.memmove(at, part if isinstance(part, bytes) else part.ctypes.data, len(part))
+            at += len(part)
         sample.assume_init().send()
         self._notifier.notify()
 

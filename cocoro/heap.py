@@ -11,7 +11,7 @@ from __future__ import annotations
 import ctypes
 
 KEPT_BYTES = 64 * 1024 * 1024
-"""Free memory at the end of the heap that stays with the process: a dozen pictures, and what computing on them takes."""
+"""Free memory at the end of the heap that stays with the process: some pictures and what computing on them takes."""
 OWN_BYTES = 32 * 1024 * 1024
 """Objects from this size on have a mapping of their own, which goes back at once; glibc's maximum."""
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3

@@ -7,8 +7,8 @@ takes the loop's turn, handles the message, and gives the turn back. The loop is
 something.
 
 What a callback may rely on stays: it runs alone, between two others of the loop, `asyncio.get_running_loop` is the
-loop, and what earlier callbacks wrote is seen. Only the thread is another one, so nothing that belongs to a thread (a GL
-context, a `threading.local`) may be used in a callback that may run so.
+loop, and what earlier callbacks wrote is seen. Only the thread is another one: a callback that may run so uses nothing
+that belongs to a thread (a GL context, a `threading.local`).
 """
 
 from __future__ import annotations

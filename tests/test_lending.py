@@ -184,7 +184,12 @@ def test_an_exception_in_a_borrowed_turn_goes_to_the_loop_and_the_next_sample_is
             second.set()
 
         ring = Ring(loop, deliver, 1 + 1, borrows=True)
-        thread = threading.Thread(target=lambda: [ring.push("x", item) for item in (1, 2)])
+
+        def push() -> None:
+            ring.push("x", 1)
+            ring.push("x", 2)
+
+        thread = threading.Thread(target=push)
         thread.start()
         await second.wait()
         thread.join()
@@ -208,7 +213,12 @@ def test_a_ring_in_any_loop_delivers_everything(borrows: bool) -> None:
                 everything.set()
 
         ring = Ring(loop, deliver, None, borrows=borrows)
-        threads = [threading.Thread(target=lambda: [ring.push("x", n) for n in range(1000)]) for _ in range(4)]
+
+        def push() -> None:
+            for n in range(1000):
+                ring.push("x", n)
+
+        threads = [threading.Thread(target=push) for _ in range(4)]
         for thread in threads:
             thread.start()
         await everything.wait()

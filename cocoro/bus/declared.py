@@ -146,7 +146,7 @@ class ZenohPublisher(Declared):
             self._put(data)
 
     def _put(self, data: bytes | zenoh.ZBytes) -> None:
-        try:  # `suppress` would take longer than encoding a message
+        try:  # noqa: SIM105 # `suppress` takes longer than encoding a message does
             self._declaration.put(data)
         except zenoh.ZError:  # the session has ended
             pass
