@@ -2,7 +2,8 @@
 
     python bench/bus.py [--pings N] [--seconds S]
 
-`python -m bench mesh` compares the way that a robot uses with other middleware. The figures depend on this machine and its load; compare within the table. Each ratio is to the first row.
+`python -m bench mesh` compares the way that a robot uses with other middleware. The figures depend on this machine and
+its load; compare within the table. Each ratio is to the first row.
 """
 
 from __future__ import annotations

@@ -91,8 +91,8 @@ class Bus(Protocol):
     def publisher(self, key: str, qos: Qos) -> RawPublisher: ...
 
     def subscribe(self, keyexpr: str, qos: Qos, handler: OnSample, *, depth: int) -> Subscription:
-        """Call `handler` in the loop's turn with each sample, in order per key. At most `depth` samples per key wait for
-        the loop; beyond it the oldest is dropped and counted, but none with Qos.EVENT."""
+        """Call `handler` in the loop's turn with each sample, in order per key. At most `depth` samples per key wait
+        for the loop; beyond it the oldest is dropped and counted, but none with Qos.EVENT."""
 
     def listen(self, keyexpr: str, handler: OnBatch, every_s: float) -> Handle:
         """Receives all samples, in batches at most every `every_s`; nothing is dropped. Batches, because waking the

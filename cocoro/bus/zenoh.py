@@ -1,8 +1,8 @@
 """The bus between processes, on zenoh. Nothing here blocks the event loop, and leaving the mesh never hangs.
 
 Zenoh calls back in its own threads. A callback takes the loop's turn while the loop waits; what arrives while the loop
-is busy is queued (`Ring`, `Batches`). In its turn the bytes are copied out of (shared) memory, and only those of samples that
-were not replaced by newer ones.
+is busy is queued (`Ring`, `Batches`). In its turn the bytes are copied out of (shared) memory, and only those of
+samples that were not replaced by newer ones.
 """
 
 from __future__ import annotations
