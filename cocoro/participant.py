@@ -101,7 +101,8 @@ class Participant:
         return found
 
     def on(self, topic: Topic[M], handler: Callable[[M], None], *, service: str | None = None) -> None:
-        """Calls `handler(message)` for each message."""
+        """Calls `handler(message)` for each message, alone, as a callback of the event loop. It must be short, and use
+        nothing that belongs to a thread: see `cocoro.lending`."""
         self.inbox(topic, service=service).add(lambda _key, message: handler(message))
 
     # --- requests ---------------------------------------------------------------------------------
