@@ -80,6 +80,7 @@ clock = "sim"
 processes = ["capture"]
 [service.capture]
 folder = "{folder}"
+per_occasion = false
 """
 
 

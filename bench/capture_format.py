@@ -20,6 +20,7 @@ from collections.abc import Callable
 from functools import partial
 from io import BytesIO
 from pathlib import Path
+from statistics import median
 
 import zstandard
 from mcap.data_stream import ReadDataStream
@@ -33,7 +34,7 @@ from apps.captures.contents import unpacked
 from apps.captures.reader import Capture
 from apps.rehearsal.rehearse import rehearse
 from apps.rehearsal.request import RehearsalRequest
-from bench.report import Report, turns
+from bench.report import Report, Table, number, turns
 from bench.trials import number_of, one_of, sized
 from cocoro.capture import mcap
 from cocoro.clock import NS
@@ -66,10 +67,12 @@ def measure(chosen: argparse.Namespace, report: Report) -> None:
     with tempfile.TemporaryDirectory(prefix="cocoro-", dir=MEMORY if MEMORY.is_dir() else None) as name:
         folder = Path(name)
         made = {sensors: recorded(folder, sensors, seconds) for sensors in kinds}
+        comparison = Comparison(report, times)
         if "files" in (chosen.parts or PARTS):
-            files(folder, made, times, report)
+            files(folder, made, comparison, report)
         if "records" in (chosen.parts or PARTS):
-            records(made, times, report)
+            records(made, comparison, report)
+        report.tables.append(Table("CPU time, ms", ["what", "here", "by the package"], comparison.rows))
 
 
 def recorded(folder: Path, sensors: Sensors, seconds: float) -> list[QueuedMessage]:
@@ -122,21 +125,31 @@ def read_by_package(path: Path) -> int:
         return sum(len(message.data) for _, _, message in make_reader(file, validate_crcs=True).iter_messages())
 
 
-def _spent(action: Callable[[], object]) -> Callable[[], float]:
-    """A function that returns the CPU time of a call of `action`, ms."""
+def _spent(action: Callable[[], object], repeat: int = 1) -> Callable[[], float]:
+    """A function that returns the CPU time of a call of `action`, ms: the mean of so many."""
 
     def way() -> float:
         begun_ns = time.process_time_ns()
-        action()
-        return (time.process_time_ns() - begun_ns) / 1e6
+        for _ in range(repeat):
+            action()
+        return (time.process_time_ns() - begun_ns) / 1e6 / repeat
 
     return way
 
 
-def _tell(report: Report, name: str, times: int, here: Callable[[], object], package: Callable[[], object]) -> None:
-    ours, theirs = turns(times, here=_spent(here), package=_spent(package))
-    report.value(f"{name}: here", ours, "ms")
-    report.ratio(f"{name}: the package / here", theirs, ours, better="more")
+class Comparison:
+    """The two take turns, so many times; each ratio is a figure, and the times are rows of a table."""
+
+    def __init__(self, report: Report, times: int) -> None:
+        self._report = report
+        self.times = times
+        self.rows: list[list[str]] = []
+
+    def tell(self, name: str, here: Callable[[], object], package: Callable[[], object], repeat: int = 1) -> None:
+        """Short actions are measured `repeat` times at once."""
+        ours, theirs = turns(self.times, here=_spent(here, repeat), package=_spent(package, repeat))
+        self._report.ratio(f"{name}: the package / here", theirs, ours, better="more")
+        self.rows.append([name, number(median(ours)), number(median(theirs))])
 
 
 def peak_of_a_frame(folder: Path, frame: QueuedMessage) -> float:
@@ -157,11 +170,11 @@ def _of(frame: QueuedMessage) -> tuple[str, str, bytes]:
     return frame.key, "calliope", frame.payload
 
 
-def files(folder: Path, made: dict[Sensors, list[QueuedMessage]], times: int, report: Report) -> None:
+def files(folder: Path, made: dict[Sensors, list[QueuedMessage]], comparison: Comparison, report: Report) -> None:
     for sensors, messages in made.items():
         small = [one for one in messages if len(one.payload) < SMALL_BYTES]
-        for name, some in (("frames and small messages", messages), ("small messages alone", small)):
-            _compare(folder, f"{sensors} sensors, {name}", some, times, report)
+        _compare(folder, f"{sensors} sensors, frames and small messages", messages, comparison)
+        _compare(folder, f"{sensors} sensors, small messages alone", small, comparison, repeat=5)
         frame = next(one for one in messages if one.key.endswith("kinect/frame"))
         report.value(
             f"{sensors} sensors: memory to write a frame of {len(frame.payload) / 1e6:.2f} MB",
@@ -170,7 +183,7 @@ def files(folder: Path, made: dict[Sensors, list[QueuedMessage]], times: int, re
         (folder / "peak.mcap").unlink()
 
 
-def _compare(folder: Path, name: str, made: list[QueuedMessage], times: int, report: Report) -> None:
+def _compare(folder: Path, name: str, made: list[QueuedMessage], comparison: Comparison, repeat: int = 1) -> None:
     out, paths = folder / "out.mcap", {"a file of ours": folder / "here.mcap", "one of its": folder / "package.mcap"}
 
     def into_a_new_file(write: Callable[[list[QueuedMessage], Path], None]) -> Callable[[], None]:
@@ -180,19 +193,17 @@ def _compare(folder: Path, name: str, made: list[QueuedMessage], times: int, rep
 
         return way
 
-    size_mb = sum(len(one.payload) for one in made) / 1e6
-    report.say(f"{name}: {len(made)} messages, {size_mb:.0f} MB")
-    _tell(report, f"{name}, written", times, into_a_new_file(write_here), into_a_new_file(write_by_package))
+    comparison.tell(f"{name}, written", into_a_new_file(write_here), into_a_new_file(write_by_package), repeat)
     write_here(made, paths["a file of ours"])
     write_by_package(made, paths["one of its"])
     for whose, path in paths.items():
         if read_here(path) != read_by_package(path):
             raise CocoroError(f"{name}: {whose}: the two read different messages")
-        _tell(report, f"{name}, {whose} read", times, partial(read_here, path), partial(read_by_package, path))
+        comparison.tell(f"{name}, {whose} read", partial(read_here, path), partial(read_by_package, path), repeat)
         path.unlink()
 
 
-def records(made: dict[Sensors, list[QueuedMessage]], times: int, report: Report) -> None:
+def records(made: dict[Sensors, list[QueuedMessage]], comparison: Comparison, report: Report) -> None:
     payload, count, places = bytes(220), 1000, list(range(40))
 
     def write_messages() -> bytes:
@@ -208,23 +219,25 @@ def records(made: dict[Sensors, list[QueuedMessage]], times: int, report: Report
     some = list(zip(places[::2], places[1::2], strict=True))
     assert file.message_index(3, places) == file.packed(MessageIndex(3, some))
     name = f"{count} messages of {len(payload)} bytes"
-    _tell(report, f"{name}, written", times, write_messages, write_messages_by_package)
-    _tell(
-        report, f"{name}, read", times,
+    comparison.tell(f"{name}, written", write_messages, write_messages_by_package, 20)
+    comparison.tell(
+        f"{name}, read",
         lambda: [mcap.message(content) for _, content, _ in mcap.records(raw)],
         lambda: breakup_chunk(small),
-    )  # fmt: skip
-    _tell(
-        report, f"{count} indices of {len(some)} messages, written", times,
+        20,
+    )
+    comparison.tell(
+        f"{count} indices of {len(some)} messages, written",
         lambda: [file.message_index(3, places) for _ in range(count)],
         lambda: [file.packed(MessageIndex(3, some)) for _ in range(count)],
-    )  # fmt: skip
+        5,
+    )
     for sensors, messages in made.items():
         frames = [one.payload for one in messages if one.key.endswith("kinect/frame")][::4]
-        _frames(f"frames, {sensors} sensors", frames, times, report)
+        _frames(f"frames, {sensors} sensors", frames, comparison, report)
 
 
-def _frames(name: str, frames: list[bytes], times: int, report: Report) -> None:
+def _frames(name: str, frames: list[bytes], comparison: Comparison, report: Report) -> None:
     head = bytes(mcap.MESSAGE_HEAD.size)
     raws = [head + frame for frame in frames]
     packer = zstandard.ZstdCompressor(compression_params=QUICK)
@@ -239,7 +252,7 @@ def _frames(name: str, frames: list[bytes], times: int, report: Report) -> None:
         for data, size, crc in packed:
             file.packed(Chunk("zstd", data, 0, 0, crc, size))
 
-    _tell(report, f"{name}, packed, chunk records made", times, write, write_by_package)
+    comparison.tell(f"{name}, packed, chunk records made", write, write_by_package, 200)
 
     def read() -> None:
         for content in contents:
@@ -249,7 +262,7 @@ def _frames(name: str, frames: list[bytes], times: int, report: Report) -> None:
         for content in contents:
             breakup_chunk(Chunk.read(ReadDataStream(BytesIO(content))), validate_crc=True)
 
-    _tell(report, f"{name}, chunk records read", times, read, read_by_package)
+    comparison.tell(f"{name}, chunk records read", read, read_by_package)
 
     def joined() -> None:
         for frame in frames:
@@ -263,6 +276,6 @@ def _frames(name: str, frames: list[bytes], times: int, report: Report) -> None:
             stream = packer.compressobj(size=len(head) + len(frame))
             _ = [stream.compress(head), stream.compress(frame), stream.flush()]
 
-    together, apart = turns(times, joined=_spent(joined), pieces=_spent(in_pieces))
+    together, apart = turns(comparison.times, joined=_spent(joined), pieces=_spent(in_pieces))
     report.value(f"{name}: joined and packed, each", [each / len(frames) for each in together], "ms")
     report.ratio(f"{name}: packed in pieces / joined and packed", apart, together, better="more")

@@ -39,6 +39,9 @@ FAR_NS = 10**19
 SPEEDS = {(round(1000 * left), round(1000 * right)) for left, right in WHEELS}
 TURNS = {((left - right) // 2, -((left - right) // 2)) for left, right in SPEEDS}
 """Wheel speeds that the reflexes may make of the commanded ones, mm/s."""
+TRIED, CRASHES, WRONG = "faults", "the services' process ended by itself", "wheels or goals that were not commanded"
+STUCK, SLOWEST = "did not move again", "the slowest stop"
+"""Names of figures."""
 GOOD_WHEELS = SPEEDS | TURNS | {(0, 0)}
 
 
@@ -365,16 +368,16 @@ def options(parser: argparse.ArgumentParser) -> None:
 def measure(chosen: argparse.Namespace, report: Report) -> None:
     found = run(sized(chosen, chosen.count, 100, 4), chosen.seed, report.say)
     tallies = [found[name] for name in sorted(found)]
-    report.value("faults", [sum(tally.tried for tally in tallies)], "faults")
+    report.value(TRIED, [sum(tally.tried for tally in tallies)], "faults")
     for name, counted in (
-        ("the services' process ended by itself", [tally.crashes for tally in tallies]),
-        ("wheels or goals that were not commanded", [tally.wrong for tally in tallies]),
+        (CRASHES, [tally.crashes for tally in tallies]),
+        (WRONG, [tally.wrong for tally in tallies]),
         ("stops that came late", [tally.late_stops for tally in tallies]),
         ("not reported", [tally.unseen for tally in tallies]),
-        ("did not move again", [tally.stuck for tally in tallies]),
+        (STUCK, [tally.stuck for tally in tallies]),
     ):
         report.value(name, [sum(counted)], "times", at_most=0)
-    report.value("the slowest stop", [max(tally.slowest_stop_ms for tally in tallies)], "ms")
+    report.value(SLOWEST, [max(tally.slowest_stop_ms for tally in tallies)], "ms")
     report.value("commands from damaged bytes to the Create", [sum(tally.garbled for tally in tallies)], "times")
     longest_ms = max(tally.garbled_longest_ms for tally in tallies)
     report.value("the longest effect of one", [longest_ms], "ms")

@@ -33,6 +33,8 @@ STANDING_MPS = 0.01
 BOUNDS_S = {"quiet": 0.3, "loaded": 1.0}
 """Bound for the slowest stop, s, by situation; 1.0 for those that are not named."""
 COUNTS = {"quiet": 50, "loaded": 50}
+TRUE = "had an effect, and said so"
+"""What each stop must be."""
 
 
 class Stopped(NamedTuple):
@@ -235,7 +237,7 @@ def _measure(report: Report, situation: str, count: int, *, any_time: bool) -> N
     for one in stops:
         fault = one.fault(PATIENCE_S if any_time else bound_s)
         runs.add(not fault, f"{situation}: {fault or f'zero after {one.zero_s:.3f} s'}")
-    runs.share(f"{situation}: had an effect, and said so")
+    runs.share(f"{situation}: {TRUE}")
     zero_s = [one.zero_s for one in stops]
     report.value(f"{situation}: wheels commanded zero after", zero_s, "s")
     report.value(f"{situation}: at the latest", [max(zero_s)], "s", at_most=None if any_time else bound_s)
