@@ -11,6 +11,7 @@ Exit code 1 when a figure does not keep its bound, a bench failed, or a ratio fe
 from __future__ import annotations
 
 import argparse
+import signal
 import subprocess
 import sys
 import time
@@ -105,10 +106,13 @@ def run(name: str, arguments: Sequence[str]) -> int:
 def main() -> int:
     """The command."""
     word, *rest = sys.argv[1:] or [""]
-    if word in entries.ENTRIES:
-        return run(word, rest)
-    if word in WORDS:
-        return WORDS[word](rest)
+    try:
+        if word in entries.ENTRIES:
+            return run(word, rest)
+        if word in WORDS:
+            return WORDS[word](rest)
+    except KeyboardInterrupt:
+        return 128 + signal.SIGINT
     print(__doc__)
     for kind, title in (("suite", "Run by `make bench`:"), ("trial", "Trials, with options of their own:")):
         print(title)

@@ -54,10 +54,14 @@ from services.capture.packing import Compression, Packer
 from services.executive.tasks import FetchTask
 from sim.realism import Sensors
 
-PARTS = ("traffic", "reexecute", "again", "kill", "frames")
+PARTS = ("traffic", "reexecute", "kill", "frames", "again")
+SHORT_PARTS = PARTS[:-1]
+"""A replay takes as long as its messages did, and has no ratio."""
 COCORO = [sys.executable, "-m", "apps.cli.main"]
 HEARD_S, LOOK_S = 10.0, 0.2
 """Longest wait for a replay's last messages at the second recorder, and the period of the check."""
+NOT_REPLAYED = ("alive", "requests", "recorder", "asker")
+"""Tokens of those who live, and what was asked of them."""
 SHARE_PERCENT = 10.0
 """The recorder's share of a core, at most."""
 PROFILE = """
@@ -93,7 +97,7 @@ class Form(NamedTuple):
     frames_s: float
 
 
-FULL, SHORT = Form(15.0, 10, 60.0, 4.0), Form(4.0, 1, 1.0, 0.6)
+FULL, SHORT = Form(15.0, 10, 20.0, 4.0), Form(3.0, 1, 1.0, 0.6)
 
 
 def options(parser: argparse.ArgumentParser) -> None:
@@ -112,7 +116,7 @@ def measure(chosen: argparse.Namespace, report: Report) -> None:
         traffic_s=sized(chosen, chosen.seconds, FULL.traffic_s, SHORT.traffic_s),
         kills=sized(chosen, chosen.times, FULL.kills, SHORT.kills),
     )
-    parts = chosen.parts or PARTS
+    parts = chosen.parts or (SHORT_PARTS if chosen.short else PARTS)
     with tempfile.TemporaryDirectory(prefix="cocoro-") as name:
         folder = Path(name)
         if set(parts) & {"traffic", "reexecute", "again"}:
@@ -238,7 +242,7 @@ def _published(path: Path) -> dict[str, list[int]]:
     with Capture.open(path) as capture:
         for each in capture.messages():
             service, _, topic = each.key.removeprefix(f"{NAME}/").partition("/")
-            if service != "capture" and topic not in ("alive", "requests", "recorder"):
+            if service != "capture" and topic not in NOT_REPLAYED:
                 found[each.key].append(hash(bytes(each.payload)))
     return found
 
