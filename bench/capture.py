@@ -105,7 +105,7 @@ def options(parser: argparse.ArgumentParser) -> None:
         "parts", nargs="*", type=one_of(PARTS), metavar="PART", help=f"{', '.join(PARTS)}; without one all"
     )
     parser.add_argument("--seconds", type=float, help="of the traffic (15)")
-    parser.add_argument("--sensors", choices=["ideal", "real"], default="real", help="of the traffic (real)")
+    parser.add_argument("--sensors", choices=["ideal", "real"], help="of the traffic (both; in the short form real)")
     parser.add_argument("--compression", choices=["zstd", "lz4", "none"], default="zstd", help="of the traffic (zstd)")
     parser.add_argument("--times", type=number_of, help="kills (10)")
 
@@ -119,12 +119,17 @@ def measure(chosen: argparse.Namespace, report: Report) -> None:
     parts = chosen.parts or (SHORT_PARTS if chosen.short else PARTS)
     with tempfile.TemporaryDirectory(prefix="cocoro-") as name:
         folder = Path(name)
+        recorded = folder
         if set(parts) & {"traffic", "reexecute", "again"}:
-            traffic(folder, form.traffic_s, chosen.sensors, chosen.compression, report)
+            both = "traffic" in parts and not chosen.short
+            for sensors in [chosen.sensors] if chosen.sensors else ["ideal", "real"] if both else ["real"]:
+                recorded = folder / sensors
+                recorded.mkdir()
+                traffic(recorded, form.traffic_s, sensors, chosen.compression, report)
         if "reexecute" in parts:
-            execute(folder, report)
+            execute(recorded, report)
         if "again" in parts:
-            again(folder, form.replayed_s, report)
+            again(recorded, form.replayed_s, report)
         if "kill" in parts:
             asyncio.run(kill(folder, form.kills, report))
         if "frames" in parts:
@@ -159,27 +164,26 @@ def traffic(folder: Path, seconds: float, sensors: str, compression: str, report
                 fetch.communicate()
         cocoro("down")
     cpu_s = after.user + after.system - before.user - before.system
-    report.value(
-        f"recorder, {sensors} sensors: share of a core", [100.0 * cpu_s / lasted_s], "%", at_most=SHARE_PERCENT
-    )
-    report.value("recorder: memory", [rss_mb], "MB")
+    name = f"recorder, {sensors} sensors"
+    report.value(f"{name}: share of a core", [100.0 * cpu_s / lasted_s], "%", at_most=SHARE_PERCENT)
+    report.value(f"{name}: memory", [rss_mb], "MB")
     found = []
     for path in _recorded(folder):
         with Capture.open(path) as capture:
             found.append(contents_of(capture))
-    keys = [key for each in found for key in each.keys]
     minutes = sum(each.duration_s for each in found) / 60
-    report.value("messages recorded", [sum(each.messages for each in found)], "messages", at_least=1)
-    report.value("dropped by the recorder", [sum(key.dropped for key in keys)], "messages", at_most=0)
-    report.value("lost on the way to it", [sum(key.lost for key in keys)], "messages")
-    report.value("payloads of a minute", [sum(each.raw_bytes for each in found) / minutes / 1e9], "GB")
-    report.value("disk space of a minute", [sum(each.size_bytes for each in found) / minutes / 1e9], "GB")
+    report.value(f"{name}: messages", [sum(each.messages for each in found)], "messages", at_least=1)
+    report.value(f"{name}: payloads of a minute", [sum(each.raw_bytes for each in found) / minutes / 1e9], "GB")
+    report.value(f"{name}: disk space of a minute", [sum(each.size_bytes for each in found) / minutes / 1e9], "GB")
+    newest = {key.key: key for each in found for key in each.keys}  # their losses are those since the recorder's start
+    report.value(f"{name}: dropped", [sum(key.dropped for key in newest.values())], "messages", at_most=0)
+    report.value(f"{name}: lost on the way", [sum(key.lost for key in newest.values())], "messages")
     rows = [
-        [key.key.partition("/")[2], str(key.messages), number(key.rate_hz), str(key.lost), str(key.dropped)]
-        for key in keys
+        [key.key.partition("/")[2], number(key.rate_hz), str(key.lost), str(key.dropped)]
+        for key in newest.values()
         if key.lost or key.dropped or key.key.endswith("kinect/frame")
     ]
-    report.tables.append(Table("Frames, and what was lost", ["key", "messages", "Hz", "lost", "dropped"], rows))
+    report.tables.append(Table(f"{name}: frames, and what was lost", ["key", "Hz", "lost", "dropped"], rows))
 
 
 def _recorded(folder: Path) -> list[Path]:
