@@ -14,6 +14,7 @@ import socket
 import subprocess
 import tempfile
 import time
+from importlib.util import find_spec
 from pathlib import Path
 
 from bench.exports import COCORO, FETCHES, rehearsed
@@ -30,6 +31,8 @@ def options(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(chosen: argparse.Namespace, report: Report) -> None:
+    if find_spec("rerun") is None:
+        raise CocoroError("this needs Rerun: pip install 'cocoro-mesh[view]'")
     if chosen.file is not None and not chosen.file.is_file():
         raise CocoroError(f"{chosen.file}: there is no such file")
     bare = {name: value for name, value in os.environ.items() if "DISPLAY" not in name}
