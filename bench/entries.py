@@ -40,9 +40,12 @@ class Entry(NamedTuple):
             add(parser)
 
 
-ENTRIES = {
+ENTRIES: dict[str, Entry] = {
     "decoupling": Entry("decoupling", "suite"),
     "pixel": Entry("pixel", "suite"),
+    "baselines": Entry("baselines", "suite"),
+    "learning": Entry("learning", "suite"),
+    "perception": Entry("perception", "suite"),
     "capture": Entry("capture", "suite"),
     "capture-format": Entry("capture_format", "suite"),
     "live": Entry("live", "suite"),

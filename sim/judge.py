@@ -169,11 +169,13 @@ class Pursuit(msgspec.Struct, frozen=True, kw_only=True):
     """Longest time for which the robot neither drove nor turned although it was off its distance by more than
     `STOOD_M`."""
     off_m: float = 0.0
-    """Root mean square of how far it was off its distance, since it first was near, as for `near_share`."""
+    """Root mean square of how far it was off its distance, without the first `SETTLE_S` of following."""
     off_axis_rad: float = 0.0
     """Root mean square of the angle between the camera's axis and the target, over the same time."""
 
 
+SETTLE_S = 5.0
+"""Time to come to the asked distance."""
 STOOD_M, STOOD_MPS, STOOD_RADPS = 0.15, 0.02, 0.05
 """Off its distance by more than this, and slower than this, a robot that follows stands."""
 
@@ -237,7 +239,7 @@ class PursuitJudge:
         near = off_m <= self._within_m
         if self._from_ns is None and (near or now_ns - self._began_ns > self._catch_up_s * 1e9):
             self._from_ns = self._last_ns = now_ns
-        if self._from_ns is not None:
+        if now_ns - self._began_ns > SETTLE_S * 1e9:
             self._off_m2.append(off_m**2)
             self._off_axis_rad2.append(self._off_axis_rad(truth, target) ** 2)
         if near:
