@@ -7,6 +7,7 @@ python -m bench installs operator         # one of them
 from __future__ import annotations
 
 import argparse
+import os
 import subprocess
 import sys
 import tempfile
@@ -84,4 +85,5 @@ def _installation(report: Report, extra: str, wheel: Path, venv: Path) -> None:
 
 def _run(command: list[str]) -> str:
     """What a command printed. Raises CalledProcessError for one that failed."""
-    return subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    return subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True, env=environment).stdout
