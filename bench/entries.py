@@ -42,10 +42,12 @@ class Entry(NamedTuple):
 
 ENTRIES: dict[str, Entry] = {
     "decoupling": Entry("decoupling", "suite"),
+    "mesh": Entry("mesh", "suite"),
     "pixel": Entry("pixel", "suite"),
     "baselines": Entry("baselines", "suite"),
     "learning": Entry("learning", "suite"),
     "perception": Entry("perception", "suite"),
+    "simulator": Entry("simulator", "suite"),
     "capture": Entry("capture", "suite"),
     "capture-format": Entry("capture_format", "suite"),
     "live": Entry("live", "suite"),

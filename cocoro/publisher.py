@@ -24,6 +24,7 @@ class Publisher(Generic[M]):
         self.key = key
         self.rate = Rate()
         self.newest_stamp_ns: int | None = None
+        self._type = topic.type
         self._raw = bus.publisher(key, topic.qos)
         self.incarnation = bus.new_incarnation()
         self._clock = clock
@@ -31,7 +32,7 @@ class Publisher(Generic[M]):
     def put(self, message: M, stamp_ns: int | None = None) -> M:
         """Publishes the message and returns it, completed in place. `stamp_ns` defaults to the message's own stamp, or
         to now when that is 0. Raises TypeError when the topic carries another type."""
-        if not isinstance(message, self.topic.type):
+        if not isinstance(message, self._type):
             raise TypeError(f"{self.topic.name} carries {self.topic.type.__name__}, not {type(message).__name__}")
         if stamp_ns is not None:
             message.stamp_ns = stamp_ns
@@ -41,7 +42,7 @@ class Publisher(Generic[M]):
         message.incarnation = self.incarnation
         self.rate.count += 1
         self.newest_stamp_ns = message.stamp_ns
-        self._raw.put(encode(message))
+        self._raw.put(_ENCODER.encode(message))
         return message
 
     def close(self) -> None:

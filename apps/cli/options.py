@@ -5,6 +5,7 @@ Every command file imports this one, and `cocoro --help` imports every command f
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ from typing import Annotated, Any
 import typer
 
 from apps.cli import completions
-from cocoro.errors import ConfigError
+from cocoro.errors import ConfigError, choice_of
 
 
 def name_option(*names: str, help: str) -> Any:
@@ -212,3 +213,23 @@ def latencies_of(texts: Iterable[str]) -> dict[str, float]:
         except ValueError:
             raise ConfigError(f"--latency {text}: write it as NAME=SECONDS, for example perception=0.5") from None
     return found
+
+
+def scene_of(scene: str) -> str:
+    """A scene's name unchanged; the path of a scene file made absolute. Raises ConfigError for an unknown name and a
+    missing file."""
+    if not scene.endswith(".toml") and os.sep not in scene:
+        from sim.scene_names import GENERATED, scene_names
+
+        return one_of("--scene", scene, (*scene_names(), *GENERATED))
+    if not Path(scene).is_file():
+        raise ConfigError(f"--scene {scene}: no such file; give a .toml file, or the name of a scene")
+    return str(Path(scene).resolve())
+
+
+def one_of(option: str, given: str, known: Iterable[str]) -> str:
+    """A value that is allowed, unchanged. Raises ConfigError for another."""
+    names = [*known]
+    if given not in names:
+        raise ConfigError(f"{option} {given}: {choice_of(given, names)}")
+    return given
