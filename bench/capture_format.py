@@ -138,17 +138,21 @@ def _spent(action: Callable[[], object], repeat: int = 1) -> Callable[[], float]
 
 
 class Comparison:
-    """The two take turns, so many times; each ratio is a figure, and the times are rows of a table."""
+    """The two take turns, so many times. Ratios are figures, and the times are rows of a table."""
 
     def __init__(self, report: Report, times: int) -> None:
         self._report = report
         self.times = times
         self.rows: list[list[str]] = []
 
-    def tell(self, name: str, here: Callable[[], object], package: Callable[[], object], repeat: int = 1) -> None:
-        """Short actions are measured `repeat` times at once."""
+    def tell(
+        self, name: str, here: Callable[[], object], package: Callable[[], object], repeat: int = 1, ratio: bool = True
+    ) -> None:
+        """Short actions are measured `repeat` times at once. Without `ratio` there is only the row: the ratio would
+        depend on how much is packed, and so on the form of the run."""
         ours, theirs = turns(self.times, here=_spent(here, repeat), package=_spent(package, repeat))
-        self._report.ratio(f"{name}: the package / here", theirs, ours, better="more")
+        if ratio:
+            self._report.ratio(f"{name}: the package / here", theirs, ours, better="more")
         self.rows.append([name, number(median(ours)), number(median(theirs))])
 
 
@@ -252,7 +256,7 @@ def _frames(name: str, frames: list[bytes], comparison: Comparison, report: Repo
         for data, size, crc in packed:
             file.packed(Chunk("zstd", data, 0, 0, crc, size))
 
-    comparison.tell(f"{name}, packed, chunk records made", write, write_by_package, 200)
+    comparison.tell(f"{name}, packed, chunk records made", write, write_by_package, 200, ratio=False)
 
     def read() -> None:
         for content in contents:
