@@ -62,7 +62,7 @@ def options(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(chosen: argparse.Namespace, report: Report) -> None:
-    seconds, times = sized(chosen, chosen.seconds, 4.0, 0.6), sized(chosen, chosen.times, 5, 2)
+    seconds, times = sized(chosen, chosen.seconds, 4.0, 1.2), sized(chosen, chosen.times, 5, 3)
     kinds: tuple[Sensors, ...] = ("ideal", "real")
     with tempfile.TemporaryDirectory(prefix="cocoro-", dir=MEMORY if MEMORY.is_dir() else None) as name:
         folder = Path(name)
