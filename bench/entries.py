@@ -44,6 +44,8 @@ ENTRIES: dict[str, Entry] = {
     "decoupling": Entry("decoupling", "suite"),
     "mesh": Entry("mesh", "suite"),
     "pixel": Entry("pixel", "suite"),
+    "startup": Entry("startup", "suite"),
+    "tests": Entry("own_tests", "suite"),
     "baselines": Entry("baselines", "suite"),
     "learning": Entry("learning", "suite"),
     "perception": Entry("perception", "suite"),

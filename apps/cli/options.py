@@ -8,13 +8,13 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from apps.cli import completions
+from apps.cli.choice import RobotChoice as RobotChoice
 from cocoro.errors import ConfigError, choice_of
 
 
@@ -42,15 +42,6 @@ MeshOption = Annotated[
         autocompletion=completions.profiles,
     ),
 ]
-
-
-@dataclass(frozen=True)
-class RobotChoice:
-    """The robot that a command is for, from `--robot` and `--profile`; neither is needed when one robot is up here."""
-
-    robot: str | None = None
-    profile: str | None = None
-    """Reach it through the mesh of this profile, on another machine."""
 
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON, for scripts.")]
