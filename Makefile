@@ -1,6 +1,6 @@
 PYTHON ?= python3
 
-.PHONY: demo test unit install manual clean
+.PHONY: demo test unit bench install manual clean
 
 install:
 	@PYTHON=$(PYTHON) deploy/install.sh
@@ -13,6 +13,9 @@ test: install
 
 unit: install
 	@.venv/bin/pytest --spread -m "not process and not sim and not sweep and not zenoh"
+
+bench: install
+	@.venv/bin/python -m bench suite
 
 manual:
 	@.venv/bin/python -m apps.cli.manual > docs/cocoro.1.new && mv docs/cocoro.1.new docs/cocoro.1

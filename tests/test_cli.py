@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from cocoro.errors import CocoroError, ConfigError
 from cocoro.topics import TOPICS
 from deploy.processes import stoppable
 from services.executive.tasks import TASKS, FetchTask, FollowTask, PutDownTask
+from sim.camera_process import start
 
 COMMANDS = (
     "up", "down", "status", "fetch", "follow", "park", "put-down", "stop", "estop", "reset", "cancel", "objects",
@@ -252,6 +254,7 @@ def simulator(monkeypatch: pytest.MonkeyPatch) -> list[RehearsalRequest]:
         return RESULT | {"outcome": "failed" if request.task.label == "blue_can" else "done"}
 
     monkeypatch.setattr(rehearsing, "rehearse", run)
+    monkeypatch.setattr(start, "started_ahead", nullcontext)
     return asked
 
 
@@ -265,7 +268,7 @@ def test_every_option_of_rehearse_reaches_the_request(simulator: list[RehearsalR
         RehearsalRequest(
             task=FetchTask(label="red_can", bring=True), scene="paper", seed=3, sensors="real",
             latency={"perception": 0.1, "planning": 0.02}, lockstep=True,
-            width=320, height=240, frame_rate_hz=15.0, timeout_s=60.0,
+            width=320, height=240, frame_rate_hz=15.0, timeout_s=60.0, camera_process=True,
         )
     ]  # fmt: skip
 
@@ -316,6 +319,7 @@ def test_a_refused_rehearsal_exits_as_the_refused_task_would(
     assert main(["rehearse", "fetch", "grey_can"]) == code
 
 
+@pytest.mark.process
 @pytest.mark.sim
 def test_a_scene_with_an_error_is_bad_usage_too(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scene = tmp_path / "scene.toml"

@@ -1,6 +1,6 @@
 """Faults at full speed, at random moments: the body stands within 0.3 s, by the truth at every step of the physics.
 
-Policies: docs/faults.md; two hundred of them: `python -m bench.faults`.
+Policies: docs/faults.md; two hundred of them: `python -m bench faults`.
 """
 
 from __future__ import annotations
@@ -10,8 +10,8 @@ from concurrent.futures import ProcessPoolExecutor
 
 import pytest
 
-from bench.fault_robot import full_speed_mps
-from bench.faults import HAPPENINGS, STAND_S, Trial, happening_of, run_trial
+from bench.fault_robot import STAND_S, full_speed_mps
+from bench.faults import HAPPENINGS, Trial, happening_of, run_trial
 from deploy.processes import hardware
 
 pytestmark = pytest.mark.sim

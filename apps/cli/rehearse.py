@@ -64,10 +64,16 @@ def _capture_beside(video: Path) -> Iterator[str]:
 
 
 def _run(request: RehearsalRequest, as_json: bool) -> int:
-    from apps.rehearsal.rehearse import rehearse as run  # imports the simulator, which is slow
+    # A fork of a process with one thread starts sooner, and small matrices gain nothing by threads.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    import sim.camera  # noqa: F401 # what both processes need is imported once
+    from sim.camera_process.start import started_ahead
 
+    request = msgspec.structs.replace(request, camera_process=True)
     try:
-        with _output_to_stderr() if as_json else nullcontext(), StatusLine(sys.stderr) as line:
+        with started_ahead(), _output_to_stderr() if as_json else nullcontext(), StatusLine(sys.stderr) as line:
+            from apps.rehearsal.rehearse import rehearse as run  # imports the simulator, which is slow
+
             tell: Tell = (lambda progress: line.show(str(progress))) if line.shown else ignored
             result: dict[str, Any] = run(request, tell)
     except CocoroError as error:

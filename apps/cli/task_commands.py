@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import asyncio
 import inspect
-import os
 import shlex
 import sys
 from collections.abc import Callable
@@ -130,23 +129,16 @@ def rehearse(
     json: JsonOption = False,
 ) -> None:
     """The whole robot is simulated in one process, in virtual time, and judged by the simulator's truth."""
-    # A fork of a process with one thread starts sooner, and small matrices gain nothing by threads.
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    import sim.camera  # noqa: F401 # what both processes need is imported once
-    from sim.camera_process.start import started_ahead
+    from apps.cli import rehearse as rehearsing
 
-    with started_ahead():
-        from apps.cli import rehearse as rehearsing  # imports much
-
-        options = {
-            "task": task, "scene": scene, "seed": seed, "sensors": sensors, "body": body, "model": _text(model),
-            "reach": reach or "learned", "adapt": adapt, "bend_s": bend, "samples": _text(samples),
-            "lockstep": lockstep, "description": _text(description), "measured": _text(measured),
-            "wait_s": wait, "then": [task_of(words, "--then") for words in then or []],
-            "objects": _text(objects), "timeout_s": timeout, "picture": _text(picture), "record": _text(record),
-            "camera_process": True,
-        }  # fmt: skip
-        sys.exit(rehearsing.rehearse(options, latency or [], frames, json, video, camera))
+    options = {
+        "task": task, "scene": scene, "seed": seed, "sensors": sensors, "body": body, "model": _text(model),
+        "reach": reach or "learned", "adapt": adapt, "bend_s": bend, "samples": _text(samples), "lockstep": lockstep,
+        "description": _text(description), "measured": _text(measured),
+        "wait_s": wait, "then": [task_of(words, "--then") for words in then or []],
+        "objects": _text(objects), "timeout_s": timeout, "picture": _text(picture), "record": _text(record),
+    }  # fmt: skip
+    sys.exit(rehearsing.rehearse(options, latency or [], frames, json, video, camera))
 
 
 def _text(path: Path | None) -> str | None:
