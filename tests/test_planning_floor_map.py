@@ -6,7 +6,8 @@ import pytest
 from depth_room import Room, box
 
 from cocoro.frames import Pose2
-from services.planning.floor_map import Solid
+from cocoro.messages import Obstacles
+from services.planning.floor_map import FloorMap, Solid
 
 SOMEBODY = box(1.5, 0.0, 0.35, 0.0, 1.7, depth=0.3)
 WALL = box(2.8, 0.0, 3.0, 0.0, 2.0)
@@ -137,3 +138,16 @@ def test_what_held_up_the_hand_stays_where_something_is_seen_at_its_height() -> 
     room.floor.bump([(1.32, 0.02)], 0.35)
     room.look(5.0, tilt=-0.4)
     assert room.occupied((1.32, 0.02), within_m=0.1) >= 1
+
+
+@pytest.mark.parametrize("far_m", [1e4, 1e15, 1e300])
+def test_a_ray_of_any_length_frees_the_map_to_its_edge_and_takes_no_memory_for_its_length(far_m: float) -> None:
+    floors = [FloorMap(), FloorMap()]
+    for floor, length_m in zip(floors, (30.0, far_m), strict=True):
+        for _ in range(3):
+            floor.enter(Obstacles(points_m=((1.5, 0.0, 0.2),), lowest_m=(0.01,)), Pose2(), None)
+        assert floor.occupied().any()
+        for _ in range(20):
+            floor.enter(Obstacles(free=((0.0, 0.3, length_m),)), Pose2(), None)
+    assert not floors[0].occupied().any()
+    assert (floors[0].occupied() == floors[1].occupied()).all()

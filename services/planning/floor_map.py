@@ -182,7 +182,8 @@ class FloorMap:
         numbers. A ray stands for 2 degrees, so it is spread, or cells between two rays would be left out."""
         rays = np.repeat(rays, len(_SPREAD_RAD), axis=0)
         rays[:, 0] += np.tile(_SPREAD_RAD, len(rays) // len(_SPREAD_RAD))
-        steps = np.arange(0.0, float(rays[:, 2].max()), CELL_M)
+        # A ray that is longer than the map's diagonal, by whatever mistake, must not take memory for its length.
+        steps = np.arange(0.0, min(float(rays[:, 2].max()), 1.5 * SIZE * CELL_M), CELL_M)
         ray, step = np.nonzero((steps >= rays[:, 1:2]) & (steps <= rays[:, 2:3]))
         bearing, away = rays[:, 0] + yaw_rad, steps[step]
         row, column = (
