@@ -1,8 +1,7 @@
 """The arm's trajectories: unfolding, folding, and moving the hand to a pose, one step at a time.
 
-Between the parked pose and the space in front of the robot the arm passes two poses: unfolded in the plane that it
-parks in (the hand's thin side towards the camera mount), then swung to the front with the hand level, so that it passes
-over obstacles. References are commanded angles: feedback of the servos' coarse positions would add their steps to the
+Between the parked pose and the space in front of the robot the arm passes one pose: unfolded in the plane that it parks
+in, with the hand level. From there it swings to the front, so that it passes over obstacles. References are commanded angles: feedback of the servos' coarse positions would add their steps to the
 motion.
 """
 
@@ -104,8 +103,6 @@ class ArmController:
         self._astray = False
         if abs(reference["arm_base"] - self._park["arm_base"]) > _NEAR_RAD:
             return self._joints(_OUT | {"arm_base": self._park["arm_base"]}, dt_s)._replace(arrived=False)
-        if abs(reference[ROLL]) > _NEAR_RAD:
-            return self._joints(_OUT | {ROLL: 0.0}, dt_s)._replace(arrived=False)
         return self._joints(self._park | {ROLL: 0.0}, dt_s)
 
     def reach(self, goal: HandPose, speed_mps: float, measured: Mapping[str, float], dt_s: float) -> ArmStep:
@@ -116,11 +113,9 @@ class ArmController:
             out = all(abs(reference[name] - angle) < _NEAR_RAD for name, angle in _OUT.items())
             in_park_plane = reference["arm_base"] > self._park["arm_base"] - 0.2
             if not out and in_park_plane:
-                stage = _OUT | {ROLL: 0.0}
-            elif abs(reference[ROLL] - self._roll_rad) > _NEAR_RAD:
                 stage = _OUT | {ROLL: self._roll_rad}
             else:
-                stage = _OUT | {"arm_base": _FRONT_RAD}
+                stage = _OUT | {"arm_base": _FRONT_RAD, ROLL: self._roll_rad}
         elif reference["arm_base"] > 0.35 and goal.azimuth_rad < 0.3:
             stage = _OUT | {"arm_base": _FRONT_RAD, ROLL: self._roll_rad}
         elif self._is_astray(reference, self._reacher.pose(reference)):

@@ -85,7 +85,7 @@ class Driver:
         elif ahead > 0:
             speed *= max(0.0, 1.0 - abs(heading) / config.turn_in_place_rad)
         arc = 2.0 * speed * sin(heading) / max(abs(ahead), 0.15) if ahead > 0 else 0.0
-        align = 1.8 * heading if abs(heading) > config.heading_tolerance_rad / 2 else 0.0
+        align = config.turn_gain_per_s * heading if abs(heading) > config.heading_tolerance_rad / 2 else 0.0
         turn = arc if abs(arc) > abs(align) else align
         return speed, min(max(turn, -config.max_turn_radps), config.max_turn_radps)
 

@@ -8,8 +8,9 @@ from cocoro.clock import NS
 from cocoro.frames import Pose2
 from cocoro.messages import BaseState, TargetEstimate
 from cocoro.messages.actions import Approach, Carry
+from cocoro.units import Vec3
 from services.planning.arm import ArmStep
-from services.planning.behaviours.base import Actuators, Plan, Snapshot, hand_place
+from services.planning.behaviours.base import Actuators, Plan, Snapshot, hand_place, planar_m
 from services.planning.course import Course, Move
 from services.planning.navigation import PREVIEW_S
 from services.planning.reach import HandPose
@@ -72,6 +73,7 @@ class Approaching:
         self._back_off = BackOff()
         self._stalls = 0
         self._glance_since_ns: int | None = None
+        self._unsure_since_ns: int | None = None
 
     def step(self, snapshot: Snapshot) -> Plan:
         actuators, config = snapshot.actuators, snapshot.actuators.config
@@ -83,7 +85,7 @@ class Approaching:
         if target is None:
             return Plan(snapshot.stand(), snapshot.still(), f"{self._label} is unknown", None, "failed", "lost")
         fields = snapshot.fields(self._label)
-        head = snapshot.look_at(target.position_m)
+        head = snapshot.look_at(target.position_m, self._floor_ahead(target))
         backing = self._back_off.step(snapshot, head)
         if backing is not None:
             return backing
@@ -103,7 +105,8 @@ class Approaching:
             return Plan(snapshot.stand(), snapshot.still(), why, head, "failed", "blocked")
         arm, move = self._ready_hand(snapshot, target, move, fields)
         if move.look_at is not None:
-            head = snapshot.look_at(snapshot.body.inverse().apply((*move.look_at, 0.0)))
+            place_m = snapshot.body.inverse().apply((*move.look_at, 0.0))
+            head = snapshot.look_at(place_m, target.position_m, self._floor_ahead(target))
         if move.blocked:
             return Plan(snapshot.stand(), arm, move.why, head, "failed", "blocked")
         if arm.blocked:
@@ -111,10 +114,39 @@ class Approaching:
                 snapshot.stand(), arm, "the hand cannot get ready: its way is blocked", head, "failed", "blocked"
             )
         base = actuators.driver.command(move.speed_mps, move.turn_radps, snapshot.dt_s)
-        if move.arrived and snapshot.standing and arm.arrived:
+        if move.arrived and self._unsure(snapshot, target):
+            return Plan(base, arm, "there; waiting to see where exactly it is", head, distance_m=move.left_m)
+        if move.arrived and self._comes_to_rest(snapshot) and arm.arrived:
             return Plan(base, arm, f"{self._label} is in reach", head, "done", distance_m=move.left_m)
         why = "there; waiting for base and hand to come to rest" if move.arrived else move.why
         return Plan(base, arm, why, head, distance_m=move.left_m)
+
+    AHEAD_M = 0.55
+    """Floor at this distance is looked at together with the target."""
+
+    def _floor_ahead(self, target: TargetEstimate) -> Vec3:
+        x, y, _ = target.position_m
+        share = min(self.AHEAD_M / max(planar_m(target), 1e-6), 1.0)
+        return share * x, share * y, 0.0
+
+    UNSURE_S = 1.0
+
+    def _unsure(self, snapshot: Snapshot, target: TargetEstimate) -> bool:
+        """Whether the target must be seen again before the hand reaches for it; for a limited time, because the hand
+        may hide it."""
+        if target.sigma_m <= snapshot.actuators.config.arm.grasp_sigma_m:
+            return False
+        if self._unsure_since_ns is None:
+            self._unsure_since_ns = snapshot.now_ns
+        return snapshot.now_ns - self._unsure_since_ns < (self.UNSURE_S + 2 * snapshot.estimator.sight_lag_s) * NS
+
+    @staticmethod
+    def _comes_to_rest(snapshot: Snapshot) -> bool:
+        """Whether the base stands, or brakes from so little speed that the hand may begin to reach out."""
+        base, navigation = snapshot.estimator.base, snapshot.actuators.config.navigation
+        ready = snapshot.actuators.ready_on_the_way
+        limit_mps = navigation.coasting_mps if ready else 0.01
+        return base is not None and abs(base.speed_mps) < limit_mps and abs(base.turn_rate_radps) < 10 * limit_mps
 
     MAX_STALLS = 2
 
