@@ -1,8 +1,8 @@
 """The arm's trajectories: unfolding, folding, and moving the hand to a pose, one step at a time.
 
 Between the parked pose and the space in front of the robot the arm passes one pose: unfolded in the plane that it parks
-in, with the hand level. From there it swings to the front, so that it passes over obstacles. References are commanded angles: feedback of the servos' coarse positions would add their steps to the
-motion.
+in, with the hand level. From there it swings to the front, so that it passes over obstacles. References are commanded
+angles: feedback of the servos' coarse positions would add their steps to the motion.
 """
 
 from __future__ import annotations

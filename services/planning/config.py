@@ -109,8 +109,8 @@ class NavigationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     distance_tolerance_m: Positive = 0.012
     heading_tolerance_rad: Positive = 0.05
     turn_gain_per_s: Positive = 3.0
-    coasting_mps: Positive = 0.15
-    """Below this speed the arm reaches out while the base still brakes, for about a centimetre."""
+    coasting_mps: Positive = 0.3
+    """Below this speed the hand reaches out while the base still brakes."""
 
 
 class ArmConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -77,7 +77,8 @@ class Sweep:
         pans = [side * config.sweep_pan_rad * number / count for number in range(count + 1)]
         far, near = config.sweep_tilts_rad
         ahead, first, rest = pans[0], pans[1], pans[2:]
-        self._aims = [(pan, far) for pan in (ahead, first, -first, *(-pan for pan in rest), *rest)]
+        self._aims = [(ahead, config.middle_tilt_rad)]  # shows the floor that the robot would drive over first, too
+        self._aims += [(pan, far) for pan in (first, -first, *(-pan for pan in rest), *rest)]
         self._aims += [(pan, near) for pan in (*reversed(pans), *(-pan for pan in pans[1:]))]
         self._passed = 0
 

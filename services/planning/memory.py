@@ -39,7 +39,7 @@ class Track:
     surprise: float = 1.0
     """Smoothed normalised innovation; above 1 the object moves more than expected."""
     outliers: list[FloatArray] = field(default_factory=list)
-    body: Pose2 = Pose2()
+    body: Pose2 = field(default_factory=Pose2)
     """Where the robot was at the newest sighting, odometry frame."""
 
 

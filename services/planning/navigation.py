@@ -23,6 +23,11 @@ _REACTION_S = 0.25
 _BRAKING_SHARE = 0.6
 """Way of braking as a share of speed squared by acceleration: the half, and a fifth more."""
 
+_COAST_S = 0.04
+"""Time between a command and the pose that shows it."""
+_IN_ONE = 0.8
+"""Largest share of the rest of a drive that one command may cover."""
+
 
 @dataclass(frozen=True)
 class Offset:
@@ -52,6 +57,8 @@ class Driver:
         self._separation_m = base.wheel_separation_m
         self._speed_mps = 0.0
         self._turn_radps = 0.0
+        self.hold_s = 0.0
+        """Time for which a command holds until the next."""
 
     def turn_with(self, separation_m: float | None) -> None:
         """Use a learned wheel distance; None is the nominal one."""
@@ -63,6 +70,12 @@ class Driver:
     @property
     def moving(self) -> bool:
         return abs(self._speed_mps) > 1e-3 or abs(self._turn_radps) > 1e-3
+
+    @property
+    def coast_m(self) -> float:
+        """The way that the robot still drives when it brakes now."""
+        speed = abs(self._speed_mps)
+        return speed**2 / (2 * self._config.acceleration_mps2) + _COAST_S * speed
 
     def arrived(self, offset: Offset) -> bool:
         config = self._config
@@ -78,8 +91,11 @@ class Driver:
         if abs(ahead) <= config.distance_tolerance_m:
             speed = 0.0
         else:
-            # Slow enough to brake within the remaining distance.
-            speed = copysign(min(config.max_speed_mps, sqrt(config.acceleration_mps2 * abs(ahead))), ahead)
+            # Slow enough to brake within the remaining distance, and not to pass the place before the next command.
+            speed = sqrt(abs(ahead) * config.acceleration_mps2 / _BRAKING_SHARE)
+            if self.hold_s:
+                speed = min(speed, _IN_ONE * abs(ahead) / self.hold_s)
+            speed = copysign(min(config.max_speed_mps, speed), ahead)
         if abs(heading) > config.turn_in_place_rad:
             speed = 0.0
         elif ahead > 0:
@@ -87,6 +103,9 @@ class Driver:
         arc = 2.0 * speed * sin(heading) / max(abs(ahead), 0.15) if ahead > 0 else 0.0
         align = config.turn_gain_per_s * heading if abs(heading) > config.heading_tolerance_rad / 2 else 0.0
         turn = arc if abs(arc) > abs(align) else align
+        if self.hold_s:
+            most = _IN_ONE * abs(heading) / self.hold_s
+            turn = min(max(turn, -most), most)
         return speed, min(max(turn, -config.max_turn_radps), config.max_turn_radps)
 
     def preview(self, target_m: tuple[float, float], aim_m: tuple[float, float]) -> list[Pose2]:

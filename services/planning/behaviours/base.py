@@ -146,6 +146,19 @@ class Snapshot:
     def still(self) -> ArmStep:
         return self.actuators.arm.hold(self.angles, self.dt_s)
 
+    AHEAD_M: ClassVar[float] = 0.55
+
+    def floor_before(self, target: TargetEstimate) -> Vec3:
+        """Floor near the robot on the straight way to a target, body frame, m, which is looked at with the target."""
+        x, y, _ = target.position_m
+        share = min(self.AHEAD_M / max(planar_m(target), 1e-6), 1.0)
+        return share * x, share * y, 0.0
+
+    def at_rest(self, target: TargetEstimate) -> Vec3:
+        """Where a target will be, body frame, m, when the robot has braked."""
+        x, y, z = target.position_m
+        return x - self.actuators.driver.coast_m, y, z
+
     def look_at(self, point_m: Vec3, *others_m: Vec3) -> tuple[float, float, float]:
         """Aim of the head, with its speed, for a point in the body frame, m, and for a picture that also shows the
         first of the others that is near enough."""

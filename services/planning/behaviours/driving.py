@@ -8,11 +8,10 @@ from cocoro.clock import NS
 from cocoro.frames import Pose2
 from cocoro.messages import BaseState, TargetEstimate
 from cocoro.messages.actions import Approach, Carry
-from cocoro.units import Vec3
 from services.planning.arm import ArmStep
-from services.planning.behaviours.base import Actuators, Plan, Snapshot, hand_place, planar_m
+from services.planning.behaviours.base import Actuators, Plan, Snapshot, hand_place
 from services.planning.course import Course, Move
-from services.planning.navigation import PREVIEW_S
+from services.planning.navigation import PREVIEW_S, offset_to
 from services.planning.reach import HandPose
 from services.planning.surroundings import Fields
 
@@ -85,7 +84,7 @@ class Approaching:
         if target is None:
             return Plan(snapshot.stand(), snapshot.still(), f"{self._label} is unknown", None, "failed", "lost")
         fields = snapshot.fields(self._label)
-        head = snapshot.look_at(target.position_m, self._floor_ahead(target))
+        head = snapshot.look_at(target.position_m, snapshot.floor_before(target))
         backing = self._back_off.step(snapshot, head)
         if backing is not None:
             return backing
@@ -106,7 +105,7 @@ class Approaching:
         arm, move = self._ready_hand(snapshot, target, move, fields)
         if move.look_at is not None:
             place_m = snapshot.body.inverse().apply((*move.look_at, 0.0))
-            head = snapshot.look_at(place_m, target.position_m, self._floor_ahead(target))
+            head = snapshot.look_at(place_m, target.position_m, snapshot.floor_before(target))
         if move.blocked:
             return Plan(snapshot.stand(), arm, move.why, head, "failed", "blocked")
         if arm.blocked:
@@ -114,20 +113,13 @@ class Approaching:
                 snapshot.stand(), arm, "the hand cannot get ready: its way is blocked", head, "failed", "blocked"
             )
         base = actuators.driver.command(move.speed_mps, move.turn_radps, snapshot.dt_s)
-        if move.arrived and self._unsure(snapshot, target):
+        there = move.arrived or (move.direct and actuators.ready_on_the_way and self._coasts_there(snapshot, target))
+        if there and self._unsure(snapshot, target):
             return Plan(base, arm, "there; waiting to see where exactly it is", head, distance_m=move.left_m)
-        if move.arrived and self._comes_to_rest(snapshot) and arm.arrived:
+        if there and arm.arrived and (actuators.ready_on_the_way or snapshot.standing):
             return Plan(base, arm, f"{self._label} is in reach", head, "done", distance_m=move.left_m)
         why = "there; waiting for base and hand to come to rest" if move.arrived else move.why
         return Plan(base, arm, why, head, distance_m=move.left_m)
-
-    AHEAD_M = 0.55
-    """Floor at this distance is looked at together with the target."""
-
-    def _floor_ahead(self, target: TargetEstimate) -> Vec3:
-        x, y, _ = target.position_m
-        share = min(self.AHEAD_M / max(planar_m(target), 1e-6), 1.0)
-        return share * x, share * y, 0.0
 
     UNSURE_S = 1.0
 
@@ -140,13 +132,12 @@ class Approaching:
             self._unsure_since_ns = snapshot.now_ns
         return snapshot.now_ns - self._unsure_since_ns < (self.UNSURE_S + 2 * snapshot.estimator.sight_lag_s) * NS
 
-    @staticmethod
-    def _comes_to_rest(snapshot: Snapshot) -> bool:
-        """Whether the base stands, or brakes from so little speed that the hand may begin to reach out."""
-        base, navigation = snapshot.estimator.base, snapshot.actuators.config.navigation
-        ready = snapshot.actuators.ready_on_the_way
-        limit_mps = navigation.coasting_mps if ready else 0.01
-        return base is not None and abs(base.speed_mps) < limit_mps and abs(base.turn_rate_radps) < 10 * limit_mps
+    def _coasts_there(self, snapshot: Snapshot, target: TargetEstimate) -> bool:
+        """Whether the robot comes to rest at the target when it brakes now."""
+        driver, (x, y, _) = snapshot.actuators.driver, snapshot.at_rest(target)
+        base = snapshot.estimator.base
+        slow = base is not None and abs(base.speed_mps) < snapshot.actuators.config.navigation.coasting_mps
+        return slow and driver.arrived(offset_to((x, y), grasp_aim(snapshot.actuators)))
 
     MAX_STALLS = 2
 

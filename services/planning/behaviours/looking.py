@@ -94,7 +94,7 @@ class Searching:
         config = snapshot.actuators.config.head
         target = snapshot.target(self._label)
         if target is not None:
-            head = snapshot.look_at(target.position_m)
+            head = snapshot.look_at(target.position_m, snapshot.floor_before(target))
             sightings = snapshot.estimator.memory.sightings(self._label)
             lag_s = snapshot.estimator.sight_lag_s
             sure = snapshot.confirmed(self._label) or (snapshot.estimator.slow_sight and snapshot.clear(target))
