@@ -34,7 +34,11 @@ class Output(NamedTuple):
 
 @dataclass(frozen=True)
 class Schedule:
-    """The times at which a core is stepped: at a fixed rate, when a message of a triggering topic arrives, or both."""
+    """The times at which a core is stepped: at a fixed rate, when a message of a triggering topic arrives, or both.
+
+    With both, a message that arrives between two steps brings the next one forward, and the following one comes a
+    period after that. So a step comes at most a period after the one before.
+    """
 
     rate_hz: float | None
     triggers: tuple[Topic[Any], ...] = ()

@@ -19,7 +19,7 @@ M = TypeVar("M", bound=Message)
 
 class Deadlines:
     """Deadlines at a fixed rate, from the construction on. A late loop skips whole periods and keeps its phase; a new
-    epoch of the clock restarts the deadlines. Raises ValueError for a rate that is not positive."""
+    epoch of the clock and `restart` begin a new phase. Raises ValueError for a rate that is not positive."""
 
     def __init__(self, clock: Clock, rate_hz: float, meter: LoopMeter) -> None:
         if rate_hz <= 0:
@@ -42,6 +42,10 @@ class Deadlines:
             self._meter.overruns += missed
             self.next_ns += missed * self._period_ns
         return self.next_ns
+
+    def restart(self, now_ns: int) -> None:
+        """The next deadline is a period after `now_ns`, when work began before its deadline."""
+        self.next_ns = now_ns + self._period_ns
 
 
 async def every(clock: Clock, rate_hz: float, meter: LoopMeter) -> AsyncIterator[int]:
@@ -150,7 +154,7 @@ class Stepper:
 
 
 async def drive(step: Stepper, schedule: Schedule, clock: Clock, meter: LoopMeter) -> None:
-    """Steps for ever: at the schedule's rate, and as soon as a triggering topic arrives."""
+    """Steps for ever, at the times of a core's schedule."""
     deadlines = Deadlines(clock, schedule.rate_hz, meter) if schedule.rate_hz else None
     epoch = clock.epoch
     while True:
@@ -165,13 +169,14 @@ async def drive(step: Stepper, schedule: Schedule, clock: Clock, meter: LoopMete
             due = True
         step.wake.clear()
         now_ns = clock.now_ns()
-        if due:
-            meter.began(now_ns)
+        meter.began(now_ns)
         started = time.perf_counter()
         await step(now_ns)
         meter.steps_ms.append((time.perf_counter() - started) * 1e3)
-        if due and deadlines is not None:
+        if deadlines is not None and due:
             deadlines.advance()
+        elif deadlines is not None:
+            deadlines.restart(now_ns)
 
 
 async def _wait(clock: Clock, wake: asyncio.Event, deadline_ns: int) -> bool:

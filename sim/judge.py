@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from math import acos, degrees, hypot, sqrt
+from math import acos, atan2, degrees, hypot, sqrt
 
 import msgspec
 import numpy as np
@@ -168,8 +168,14 @@ class Pursuit(msgspec.Struct, frozen=True, kw_only=True):
     stood_s: float = 0.0
     """Longest time for which the robot neither drove nor turned although it was off its distance by more than
     `STOOD_M`."""
+    off_m: float = 0.0
+    """Root mean square of how far it was off its distance, without the first `SETTLE_S` of following."""
+    off_axis_rad: float = 0.0
+    """Root mean square of the angle between the camera's axis and the target, over the same time."""
 
 
+SETTLE_S = 5.0
+"""Time to come to the asked distance."""
 STOOD_M, STOOD_MPS, STOOD_RADPS = 0.15, 0.02, 0.05
 """Off its distance by more than this, and slower than this, a robot that follows stands."""
 
@@ -193,6 +199,8 @@ class PursuitJudge:
         self._began_ns = self._last_ns = 0
         self._from_ns: int | None = None
         self._near_ns = 0
+        self._off_m2: list[float] = []
+        self._off_axis_rad2: list[float] = []
         self._moving_ns = self._stood_ns = 0
         self._poses: deque[tuple[int, FloatArray]] = deque(maxlen=5)
         """Stamps and poses (x, y, yaw), from which speeds are taken."""
@@ -215,7 +223,7 @@ class PursuitJudge:
             return
         target = next(item for item in truth.objects if item.label == self._target)
         distance_m = hypot(target.position_m[0] - truth.body_m[0], target.position_m[1] - truth.body_m[1])
-        self._feed_distance(truth, abs(distance_m - self._distance_m))
+        self._feed_distance(truth, target, abs(distance_m - self._distance_m))
         self._gaps_m.append(distance_m - self._radius_m)
         if self._seen_ns is None or self._in_picture(truth, target):
             self._seen_ns = truth.stamp_ns
@@ -224,13 +232,16 @@ class PursuitJudge:
         self._contacts += len(touching - self._touching)
         self._touching = touching
 
-    def _feed_distance(self, truth: Truth, off_m: float) -> None:
+    def _feed_distance(self, truth: Truth, target: TrueObject, off_m: float) -> None:
         now_ns = truth.stamp_ns
         if not self._gaps_m:
             self._began_ns = self._last_ns = self._moving_ns = now_ns
         near = off_m <= self._within_m
         if self._from_ns is None and (near or now_ns - self._began_ns > self._catch_up_s * 1e9):
             self._from_ns = self._last_ns = now_ns
+        if now_ns - self._began_ns > SETTLE_S * 1e9:
+            self._off_m2.append(off_m**2)
+            self._off_axis_rad2.append(self._off_axis_rad(truth, target) ** 2)
         if near:
             self._near_ns += now_ns - self._last_ns
         self._last_ns = now_ns
@@ -249,12 +260,21 @@ class PursuitJudge:
             return 0.0
         return self._near_ns / (self._last_ns - self._from_ns) if self._last_ns > self._from_ns else 1.0
 
-    def _in_picture(self, truth: Truth, target: TrueObject) -> bool:
+    def _from_camera_m(self, truth: Truth, target: TrueObject) -> FloatArray:
+        """The target's place in the camera's optical frame, (3,), m."""
         body = np.eye(4)
         body[:3, :3] = rotation(truth.body_orientation)
         body[:3, 3] = truth.body_m
         pose: FloatArray = body @ self._chain.pose(truth.joints_rad)
-        x, y, z = pose[:3, :3].T @ (np.array(target.position_m) - pose[:3, 3])
+        place: FloatArray = pose[:3, :3].T @ (np.array(target.position_m) - pose[:3, 3])
+        return place
+
+    def _off_axis_rad(self, truth: Truth, target: TrueObject) -> float:
+        x, y, z = self._from_camera_m(truth, target).tolist()
+        return atan2(hypot(x, y), z)
+
+    def _in_picture(self, truth: Truth, target: TrueObject) -> bool:
+        x, y, z = self._from_camera_m(truth, target).tolist()
         if z <= 0:
             return False
         u, v = self._camera.cx + self._camera.fx * x / z, self._camera.cy + self._camera.fy * y / z
@@ -270,4 +290,6 @@ class PursuitJudge:
             contacts=self._contacts,
             near_share=round(self._near_share(), 3),
             stood_s=round(self._stood_ns / 1e9, 3),
+            off_m=round(sqrt(float(np.mean(self._off_m2 or [0.0]))), 4),
+            off_axis_rad=round(sqrt(float(np.mean(self._off_axis_rad2 or [0.0]))), 4),
         )

@@ -202,3 +202,19 @@ def test_objects_side_by_side_or_on_one_another_are_both_remembered() -> None:
     assert memory.sure("neighbour")
     assert memory.sure("upper")
     assert memory.sure("can")
+
+
+def test_a_slow_perception_takes_no_velocity_from_what_moves() -> None:
+    """Seen every 0.5 s, 0.5 s late: it was not unseen, and its velocity is the true one."""
+    memory = TargetMemory(MemoryConfig())
+    memory.sight_lag_s = 1.0
+    for number in range(20):
+        at_s = number * 0.5
+        memory.see("ball", np.array([0.25 * at_s, 0.0, 0.7]), 1.0, round(at_s * NS), doubtful=False)
+    estimate = memory.estimate("ball", Pose2(), round(10.4 * NS))
+    assert estimate is not None
+    assert estimate.velocity_mps[0] == pytest.approx(0.25, abs=0.005)
+    assert estimate.odometry_position_m[0] == pytest.approx(0.25 * 10.4, abs=0.01)
+    late = memory.estimate("ball", Pose2(), round(30.0 * NS))
+    assert late is not None
+    assert late.odometry_position_m[0] == pytest.approx(0.25 * (9.5 + 1.0 + 0.8), abs=0.02)

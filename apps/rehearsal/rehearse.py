@@ -18,6 +18,7 @@ from msgspec.structs import replace
 
 from apps.learning.collector import SampleCollector, collector
 from apps.pictures import draw, save_png
+from apps.rehearsal.command_periods import command_periods
 from apps.rehearsal.lockstep import LOCKSTEP_PLANNER, LOCKSTEP_SETTINGS, LockstepCycle, LockstepNode
 from apps.rehearsal.progress import RehearsalProgress, Tell, ignored
 from apps.rehearsal.request import RehearsalRequest
@@ -27,7 +28,7 @@ from cocoro.clock import NS, VirtualClock
 from cocoro.component import load
 from cocoro.errors import CocoroError, ConfigError, choice_of
 from cocoro.inbox import Stream
-from cocoro.messages import Detections, Frame, Recording, TaskReply, TaskRequest, TaskState, Truth
+from cocoro.messages import BaseCommand, Detections, Frame, Recording, TaskReply, TaskRequest, TaskState, Truth
 from cocoro.node import Node
 from cocoro.objects import Catalogue
 from cocoro.robot import Robot
@@ -91,6 +92,9 @@ class _Rehearsal:
         self._asked = False
         self._steps: list[dict[str, Any]] = []
         """Results of the tasks that have ended, in order."""
+        self._commands_ns: list[int] = []
+        """Stamps of the wheel commands since the first task was accepted."""
+        self._commanded = False
         self._frame: Frame | None = None
         self._seen: Detections | None = None
         self._recording: Recording | None = None
@@ -124,6 +128,7 @@ class _Rehearsal:
             operator.on(topics.TRUTH, self._trace.feed)
             operator.on(topics.PLAN, self._trace.status)
             operator.on(topics.TASK, self._trace.state)
+            operator.on(topics.BASE_COMMAND, self._keep_command)
             operator.on(topics.RECORDING.of(RECORDER), self._keep_recording)
             samples = request.task.samples
             if request.samples is not None and samples is not None:
@@ -207,6 +212,7 @@ class _Rehearsal:
                 reply = await self._ask(operator, question)
             if not reply.accepted:
                 raise TaskRefusedError(reply)
+            self._commanded = True
             state = await self._watch(states, reply.task_id)
             self._keep_step(state)
             if state.outcome != "done":
@@ -270,6 +276,10 @@ class _Rehearsal:
         known = catalogue.get(self._task.target)
         return known.size_m[2] / 2 if known is not None else None
 
+    def _keep_command(self, command: BaseCommand) -> None:
+        if self._commanded:
+            self._commands_ns.append(command.stamp_ns)
+
     def _keep_recording(self, recording: Recording) -> None:
         self._recording = recording
 
@@ -315,6 +325,7 @@ class _Rehearsal:
                 for phase in state.phases
             ],
             "truth": msgspec.to_builtins(self._judge.result()),
+            "commands": msgspec.to_builtins(command_periods(self._commands_ns)),
             "tasks": self._steps,
             "body": self._true_body(),
             **({} if self._coverage is None else {"seen_floor": msgspec.to_builtins(self._coverage.result())}),

@@ -47,6 +47,9 @@ class TargetMemory:
     def __init__(self, config: MemoryConfig) -> None:
         self._config = config
         self._tracks: dict[str, Track] = {}
+        self.sight_lag_s = 0.0
+        """Usual age of a sighting when the next one arrives. Up to that age an object goes on as it went; only one that
+        should have been seen again loses its velocity."""
 
     def clear(self) -> None:
         self._tracks.clear()
@@ -78,7 +81,7 @@ class TargetMemory:
         dt_s = (stamp_ns - track.stamp_ns) / NS
         if dt_s < 0:
             return
-        predicted = _moved(track, dt_s, config.velocity_fade_s)
+        predicted = self._moved(track, dt_s)
         off_m = float(np.linalg.norm(position_m - predicted))
         drift_m = self._drift_m(track, body, predicted)
         spread_m = float(np.sqrt(track.covariance[0, 0] + drift_m**2 + (0.1 * dt_s) ** 2) + sigma_m)
@@ -117,7 +120,8 @@ class TargetMemory:
         return hypot(turn_rad * (away_m + driven_m / 2), config.drift_share * driven_m)
 
     def _update(self, track: Track, predicted: FloatArray, seen: FloatArray, dt_s: float, sigma_m: float) -> None:
-        fade = exp(-dt_s / self._config.velocity_fade_s) if dt_s > 0.2 else 1.0
+        unseen_s = max(dt_s - max(self.sight_lag_s, 0.2), 0.0)
+        fade = exp(-unseen_s / self._config.velocity_fade_s)
         q = self._config.acceleration_mps2**2 * max(track.surprise, 1.0) ** 2
         step = np.array([[1.0, dt_s], [0.0, fade]])
         noise = q * np.array([[dt_s**4 / 4, dt_s**3 / 2], [dt_s**3 / 2, dt_s**2]])
@@ -160,7 +164,7 @@ class TargetMemory:
         if age_s > self._config.forget_s:
             del self._tracks[label]
             return None
-        position = _moved(track, age_s, self._config.velocity_fade_s)
+        position = self._moved(track, age_s)
         return TargetEstimate(
             label=label,
             position_m=body.inverse().apply(position.tolist()),
@@ -180,7 +184,7 @@ class TargetMemory:
         track = self._tracks.get(label)
         if track is None or not self.sure(label) or abs(stamp_ns - track.stamp_ns) > within_s * NS:
             return None
-        x, y, z = _moved(track, max((stamp_ns - track.stamp_ns) / NS, 0.0), self._config.velocity_fade_s).tolist()
+        x, y, z = self._moved(track, max((stamp_ns - track.stamp_ns) / NS, 0.0)).tolist()
         return x, y, z
 
     def sightings(self, label: str) -> int:
@@ -196,7 +200,7 @@ class TargetMemory:
         found = (self.estimate(label, body, now_ns) for label in labels)
         return tuple(estimate for estimate in found if estimate is not None)
 
-
-def _moved(track: Track, dt_s: float, fade_s: float) -> FloatArray:
-    """The position (3,) after `dt_s` with a decaying velocity: the integral of v exp(-t / fade)."""
-    return track.position_m + track.velocity_mps * fade_s * (1.0 - exp(-dt_s / fade_s))
+    def _moved(self, track: Track, dt_s: float) -> FloatArray:
+        """The position (3,) after `dt_s`. Beyond the usual lag the velocity decays: integral of v exp(-t / fade)."""
+        fade_s, known_s = self._config.velocity_fade_s, min(dt_s, self.sight_lag_s)
+        return track.position_m + track.velocity_mps * (known_s + fade_s * (1.0 - exp(-(dt_s - known_s) / fade_s)))

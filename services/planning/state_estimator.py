@@ -200,6 +200,7 @@ class StateEstimator:
     def localise(self, now_ns: int) -> None:
         """Enter detections whose odometry is known into the memory; others wait for 0.2 s."""
         self._sightings.clear()
+        self.memory.sight_lag_s = self.sight_lag_s
         for _ in range(len(self._waiting)):
             detections = self._waiting.popleft()
             pose = self._odometry.at(detections.stamp_ns, self._gap_ns)

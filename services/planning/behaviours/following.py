@@ -68,7 +68,7 @@ class Following:
         self._looking_since_ns = None
         fade_s = snapshot.actuators.config.memory.velocity_fade_s
         self._velocity_mps = target.velocity_mps
-        self._counted_s = fade_s  # the memory lets a lost target run out by so much
+        self._counted_s = fade_s + snapshot.estimator.sight_lag_s  # the memory lets a lost target run out by so much
         gap = planar_m(target) - config.distance_m
         move = self._straight(target, snapshot, config)
         if self._free(snapshot, move, gap, fields):
