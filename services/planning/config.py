@@ -114,7 +114,7 @@ class NavigationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class ArmConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    joint_speed_radps: Positive = 3.0
+    joint_speed_radps: Positive = 2.4
     hand_speed_mps: Positive = 0.5
     insert_speed_mps: Positive = 0.35
     lift_speed_mps: Positive = 0.35
