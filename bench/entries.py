@@ -40,7 +40,10 @@ class Entry(NamedTuple):
             add(parser)
 
 
-ENTRIES = {
+ENTRIES: dict[str, Entry] = {
     "decoupling": Entry("decoupling", "suite"),
     "pixel": Entry("pixel", "suite"),
+    "baselines": Entry("baselines", "suite"),
+    "learning": Entry("learning", "suite"),
+    "perception": Entry("perception", "suite"),
 }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from apps.learning.study import Sightings
+from apps.learning.sightings import Sightings
 from cocoro.arrays import FloatArray
 from cocoro.learning.handmap import NominalModel
 from cocoro.robot import Robot

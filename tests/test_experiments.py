@@ -192,7 +192,7 @@ def test_a_lesson_tells_how_good_the_map_is_and_what_the_wheels_are(
     assert settings.model_file(0).is_file()
     assert {score["name"] for score in result["arm"]["scores"]} >= {"the nominal model", result["arm"]["chosen"]}
     assert result["wheels"]["separation_m"] == pytest.approx(0.255, abs=1e-3)
-    assert set(result["curves"]["default"]) == set(result["curves"]["paper"])
+    assert set(result["curves"]["default"]) == set(result["curves"]["paper"]) == set(result["curves"]["rigid"])
     json.dumps(result, allow_nan=False)
 
 
@@ -228,6 +228,8 @@ def made_up(run: ExperimentRun, lesson: RunResult) -> dict[str, Any]:
     """A plausible result of a run."""
     if run.kind in ("learn", "learn-wheels"):
         return lesson
+    if run.kind == "learn-rigid":
+        return {"held_out_m": 0.003}
     if run.kind == "bend":
         return {"bent_at": 20, "fixed_m": [0.004] * 20 + [0.03] * 180, "adapted_m": [0.004] * 200, "changes": 1}
     task = run.fields["task"].name

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from learning_arm import sightings
 
-from apps.learning.study import BEST, Sightings, errors_m, fit, rms, split
+from apps.learning.sightings import Sightings
+from apps.learning.study import BEST, errors_m, fit, rms, split
 from cocoro.learning.handmap import NominalModel
 from cocoro.robot import Robot
 from services.planning.teaching import Adapter

@@ -15,7 +15,7 @@ from learning_arm import sightings
 
 from apps.learning import dataset
 from apps.learning.dataset import HandRow, SampleFile, WheelRow, hand_header, wheel_header
-from apps.learning.study import BEST, METHODS, fit
+from apps.learning.study import BEST, PAPER, fit
 from cocoro.errors import ConfigError, RefusedError
 from cocoro.learning import model
 from cocoro.learning.handmap import NominalModel
@@ -177,7 +177,7 @@ def learned(robot: Robot) -> model.BodyModel:
     )
 
 
-@pytest.mark.parametrize("method", [BEST, METHODS[1]], ids=lambda method: method.name)
+@pytest.mark.parametrize("method", [BEST, PAPER], ids=lambda method: method.name)
 def test_a_map_computes_the_same_after_it_was_saved(
     tmp_path: Path, robot: Robot, method: object, learned: model.BodyModel
 ) -> None:

@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 from learning_arm import NOISE_M, sightings, slope_by_differences
 
+from apps.learning.method import Method
 from apps.learning.rules import inliers
+from apps.learning.sightings import Sightings
 from apps.learning.study import (
     BEST,
     METHODS,
-    Method,
-    Sightings,
+    PAPER,
+    PAPER_LIBRARY,
     baselines,
     begin,
     best,
@@ -64,7 +66,7 @@ def test_spherical_coordinates_are_those_of_the_common_frame() -> None:
     assert np.allclose(cartesian_of(spherical_of(places)), places)
 
 
-@pytest.mark.parametrize("method", [*METHODS[:4], BEST, METHODS[6]], ids=lambda method: method.name)
+@pytest.mark.parametrize("method", [*METHODS[:3], BEST, METHODS[7]], ids=lambda method: method.name)
 def test_every_maps_jacobian_is_that_of_finite_differences(
     method: Method, nominal: NominalModel, seen: Sightings
 ) -> None:
@@ -77,7 +79,7 @@ def test_every_maps_jacobian_is_that_of_finite_differences(
 def test_over_the_drawing_the_map_comes_near_to_the_noise_of_what_was_seen(robot: Robot, seed: int) -> None:
     nominal = NominalModel(robot)
     learn, held = split(sightings(robot, seed=seed, draws=200))
-    plain, shifted = baselines(nominal, learn, held)
+    plain, shifted, *_ = baselines(nominal, learn, held)
     reached = score(BEST, nominal, learn, held)
     assert reached.held_out_m < 1.5 * NOISE_M
     assert reached.held_out_m < 0.6 * shifted.held_out_m < plain.held_out_m
@@ -89,11 +91,12 @@ def test_the_papers_rule_learns_and_least_squares_learns_more_of_the_same(
 ) -> None:
     learn, held = split(seen)
     by_name = {method.name: method for method in METHODS}
-    rule, squares = by_name["the paper's rule, 81 bases"], by_name["81 bases, least squares"]
+    rule, squares = PAPER, by_name["81 bases, least squares"]
     untaught = rms(errors_m(begin(rule, nominal)[0], held))
     taught = rms(errors_m(fit(rule, nominal, learn), held))
     assert taught < untaught
-    assert rms(errors_m(fit(squares, nominal, learn), held)) < 0.3 * taught
+    assert rms(errors_m(fit(squares, nominal, learn), held)) < 0.8 * taught
+    assert taught < 0.3 * rms(errors_m(fit(PAPER_LIBRARY, nominal, learn), held))
 
 
 def test_more_sightings_make_the_map_better(nominal: NominalModel, seen: Sightings) -> None:
@@ -116,7 +119,7 @@ def test_too_few_draws_cannot_be_cross_validated(nominal: NominalModel, seen: Si
 
 def test_the_best_is_the_one_of_the_smallest_cross_validated_error(nominal: NominalModel, seen: Sightings) -> None:
     learn, held = split(seen)
-    methods = (METHODS[2], BEST)
+    methods = (PAPER, BEST)
     scores = [score(method, nominal, learn, held) for method in methods]
     assert best(scores, methods) is BEST
     assert best([s._replace(cross_validated_m=float("nan")) for s in scores], methods) is BEST

@@ -9,8 +9,8 @@ from perception_scenes import CATALOGUE, MS, ROBOT, STAMP_NS, Scene, Thing, bloc
 
 from services.perception.config import PerceptionConfig
 from services.perception.image import ImageSighting
-from services.perception.localise import Localiser
-from services.perception.shapes import distance_from, signed_distance
+from services.perception.localise import Localiser, first_guesses
+from services.perception.shapes import Shapes, Solids
 from sim.realism import Sensors
 from sim.scene import Light
 
@@ -238,34 +238,35 @@ def test_a_half_hidden_can_is_not_taken_for_a_ball(left_m: float) -> None:
 # --- the shapes themselves ------------------------------------------------------------------------
 
 
+def offsets_from_centre(points: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Points (k, 3) as offsets of one object, shape (3, 1, k)."""
+    return points.T[:, None, :].astype(np.float32)
+
+
 @pytest.mark.parametrize("label", ["red_can", "yellow_ball"])
 def test_distances_are_zero_on_the_surface_and_grow_by_the_metre_outwards(label: str) -> None:
-    shape = CATALOGUE[label]
-    draws = np.random.default_rng(3)
-    points = draws.uniform(-0.2, 0.2, (500, 3))
-    distance, gradient = signed_distance(shape, points)
-    np.testing.assert_allclose(distance, distance_from(shape, points), atol=1e-12)
-    np.testing.assert_allclose(np.linalg.norm(gradient, axis=1), 1.0, atol=1e-9)
-    onto = points - distance[:, None] * gradient
-    np.testing.assert_allclose(distance_from(shape, onto), 0.0, atol=1e-9)
+    surface = Solids(Shapes([CATALOGUE[label]]))
+    points = offsets_from_centre(np.random.default_rng(3).uniform(-0.2, 0.2, (500, 3)))
+    distance, gradient = surface.gradient(points)
+    np.testing.assert_allclose(distance, surface.distance(points), atol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(gradient, axis=0), 1.0, atol=1e-5)
+    np.testing.assert_allclose(surface.distance(points - distance * gradient), 0.0, atol=1e-6)
 
 
 def test_a_can_is_inside_within_its_radius_and_half_height() -> None:
-    can = CATALOGUE[CAN]
+    surface = Solids(Shapes([CATALOGUE[CAN]]))
     inside = np.array([[0.0, 0.0, 0.0], [0.03, 0.0, 0.0], [0.0, 0.0, 0.055], [0.0, 0.032, -0.059]])
     outside = np.array([[0.034, 0.0, 0.0], [0.0, 0.0, 0.061], [0.03, 0.03, 0.0]])
-    assert (distance_from(can, inside) < 0).all()
-    assert (distance_from(can, outside) > 0).all()
-    assert distance_from(can, np.array([[0.043, 0.0, 0.06 + 0.01]])) == pytest.approx(np.hypot(0.01, 0.01))
+    assert (surface.distance(offsets_from_centre(inside)) < 0).all()
+    assert (surface.distance(offsets_from_centre(outside)) > 0).all()
+    corner = offsets_from_centre(np.array([[0.043, 0.0, 0.06 + 0.01]]))
+    assert surface.distance(corner).item() == pytest.approx(np.hypot(0.01, 0.01), abs=1e-6)
 
 
 def test_the_first_guess_pushes_the_surface_inwards_by_the_radius() -> None:
-    from services.perception.localise import first_guess
-
     pose = ROBOT.chain("camera").pose({"neck_pan": 0.0, "neck_tilt": radians(-50)})
-    surface = np.array([0.0, 0.0, 0.7])
-    point = pose[:3, :3] @ surface + pose[:3, 3]
-    can = first_guess(CATALOGUE[CAN], surface, pose) - point
+    surface = np.array([[0.0, 0.0, 0.7]] * 2)
+    points = surface @ pose[:3, :3].T + pose[:3, 3]
+    can, ball = first_guesses(Shapes([CATALOGUE[CAN], CATALOGUE["yellow_ball"]]), surface, pose) - points
     assert can == pytest.approx([0.033, 0.0, 0.0], abs=1e-9)
-    ball = first_guess(CATALOGUE["yellow_ball"], surface, pose) - point
     assert ball == pytest.approx(0.03 * pose[:3, 2], abs=1e-9)

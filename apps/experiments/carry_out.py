@@ -18,6 +18,7 @@ RunResult = dict[str, Any]
 """A run's result as JSON data; a failed run has its message under 'error'."""
 LESSONS: dict[str, Callable[..., dict[str, Any]]] = {
     "learn": lessons.learn,
+    "learn-rigid": lessons.rigid,
     "learn-wheels": lessons.wheels,
     "bend": lessons.bend,
 }

@@ -8,11 +8,11 @@ from typing import Any
 
 from apps.experiments import figures, plan
 from apps.experiments.carry_out import RunResult
-from apps.experiments.lessons import SIZES
+from apps.experiments.lessons import CURVES, SIZES
 from apps.experiments.plan import ExperimentSettings
 from apps.experiments.results import Plot, Section, row
 from apps.experiments.runs import ExperimentRun
-from apps.learning.study import BEST, METHODS
+from apps.learning.study import BEST, METHODS, PAPER, RIGID
 from services.executive.tasks import BabbleArmTask
 
 KEY, TITLE = "E1", "The hand-eye map, from babbling"
@@ -68,12 +68,24 @@ def section(settings: ExperimentSettings, results: Mapping[str, RunResult]) -> S
         row("share of that baseline's error", "ours", ratio, "", digits=2, wanted="at most 0.6 in each seed",
             held=bool(ratio) and max(ratio) <= 0.6)
     )  # fmt: skip
-    for name in ("the nominal model", *(method.name for method in METHODS)):
+    for name in (PAPER.name, RIGID[-1].name):
+        over = [scores[name]["held_out_m"] for scores in by_name.values() if name in scores]
+        if len(over) == len(chosen):
+            shares = [ours / theirs for ours, theirs in zip(chosen, over, strict=True)]
+            made.rows.append(row(f"share of the error of: {name}", "ours", shares, "", digits=2))
+    best = [100 * min(r["readings"].values()) for r in good.values() if r["readings"]]
+    made.rows.append(
+        row(measure, "the paper's rule, whichever allowed reading is best for the body", best, "cm", digits=2)
+    )
+    for name in ("the nominal model", *(method.name for method in (*RIGID, *METHODS))):
         values = [100 * scores[name]["held_out_m"] for scores in by_name.values() if name in scores]
-        who = "ours, the default: " if name == BEST.name else "baseline: " if name == "the nominal model" else ""
+        rigid = name == "the nominal model" or name in {method.name for method in RIGID}
+        who = "ours, the default: " if name == BEST.name else "baseline: " if rigid else ""
         paper = "seen almost 10 cm nearer than the model" if name == "the nominal model" else ""
         made.rows.append(row(measure, who + name, values, "cm", digits=2, paper=paper))
-    for key, who in (("default", "ours, the default"), ("paper", "the paper's 81-base rule")):
+    for key, who in {
+        key: "ours, the default" if key == "default" else method.name for key, method in CURVES.items()
+    }.items():
         for size in SIZES:
             values = [100 * r["curves"][key][str(size)] for r in good.values() if str(size) in r["curves"][key]]
             made.rows.append(row(f"held-out error after {size:,} samples", who, values, "cm", digits=2))

@@ -21,8 +21,9 @@ STALL_S = 2.0
 SCENES = {"targets": "in view", "targets-hidden": "marker hidden at the fourth"}
 WAYS: dict[str, tuple[str, dict[str, Any]]] = {
     "learned": ("ours: the learned map", {}),
-    "seen": ("baseline: rigid body, hand seen", {"reach": "rigid", "see_hand": True}),
-    "rigid": ("baseline: rigid body alone", {"reach": "rigid"}),
+    "calibrated": ("baseline: rigid body, calibrated", {"rigid": True}),
+    "seen": ("baseline: rigid body as drawn, hand seen", {"reach": "rigid", "see_hand": True}),
+    "rigid": ("baseline: rigid body as drawn", {"reach": "rigid"}),
 }
 REACHED = {"rho_m": 0.02, "azimuth_rad": 0.034, "elevation_rad": 0.034}
 
@@ -30,7 +31,7 @@ REACHED = {"rho_m": 0.02, "azimuth_rad": 0.034, "elevation_rad": 0.034}
 def runs(settings: ExperimentSettings) -> list[ExperimentRun]:
     found = []
     for seed in settings.seeds:
-        found += plan.learned(settings, seed)
+        found += [*plan.learned(settings, seed), plan.calibrated(settings, seed)]
         for scene in SCENES:
             for way, (_, fields) in WAYS.items():
                 order = TARGETS * ROUNDS

@@ -19,7 +19,8 @@ CANS = ("red_can", "green_can", "blue_can")
 SHARE = 28 / 30
 WAYS: dict[str, tuple[str, dict[str, Any]]] = {
     "learned": ("ours: the learned map", {}),
-    "rigid": ("baseline: rigid body", {"model": None}),
+    "rigid": ("baseline: rigid body as drawn", {"model": None}),
+    "calibrated": ("baseline: rigid body, calibrated", {"rigid": True}),
     "lockstep": ("baseline: learned map, lock-step", {"lockstep": True}),
 }
 
@@ -27,7 +28,7 @@ WAYS: dict[str, tuple[str, dict[str, Any]]] = {
 def runs(settings: ExperimentSettings) -> list[ExperimentRun]:
     found = []
     for seed in settings.seeds:
-        found += plan.learned(settings, seed)
+        found += [*plan.learned(settings, seed), plan.calibrated(settings, seed)]
         for way, (_, fields) in WAYS.items():
             for can in CANS:
                 name = f"fetch-{way}-{can}-{seed}"

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 OURS, OTHER, TRUE, FAINT = "#1b6ca8", "#c8553d", "#2f2f2f", "#b9b9b9"
-COLOURS = (OURS, OTHER, "#6a994e")
+COLOURS = (OURS, OTHER, "#6a994e", "#8a5a9e")
 SMOOTHED = 15
 """Number of sightings over which the bent arm's errors are averaged."""
 
@@ -72,11 +72,14 @@ def hand_places(samples: Path, learned: Path, robot: Robot) -> Figure:
 
 def curves(seeds: Sequence[Mapping[str, Mapping[str, float]]]) -> Figure:
     """Held-out error against the number of samples, for each method of `lessons.learn`; a line for each seed."""
+    from matplotlib.ticker import LogLocator
+
     figure, (axis,) = sheet(width=6.0)
     names = {
         "default": "ours: 81 bases over the nominal model",
-        "paper over drawing": "the paper's rule over the nominal model",
-        "paper": "the paper's rule, primed",
+        "rigid": "the rigid body, calibrated",
+        "paper searched": "the paper's rule, its grid search made again",
+        "paper": "the paper's rule, best reading of the text",
     }
     for (key, label), colour in zip(names.items(), COLOURS, strict=True):
         sizes = sorted({int(size) for seed in seeds for size in seed[key]})
@@ -84,6 +87,10 @@ def curves(seeds: Sequence[Mapping[str, Mapping[str, float]]]) -> Figure:
         axis.plot(sizes, lines.T, color=colour, linewidth=0.5, alpha=0.4)
         axis.plot(sizes, np.nanmean(lines, axis=0), color=colour, marker="o", markersize=4, label=label)
     axis.set(xscale="log", yscale="log", xlabel="samples", ylabel="held-out error, RMS, cm")
+    axis.xaxis.set_major_formatter("{x:g}")
+    axis.yaxis.set_major_formatter("{x:g}")
+    axis.yaxis.set_minor_locator(LogLocator(subs=(2, 3, 5)))
+    axis.yaxis.set_minor_formatter("{x:g}")
     axis.legend(frameon=False, fontsize=8)
     return figure
 

@@ -12,6 +12,7 @@ import numpy as np
 from apps.learning import dataset, study
 from apps.learning.dataset import HandRow, WheelRow
 from apps.learning.lesson import learn_arm, learn_wheels, sightings
+from apps.learning.paper_rule import ALLOWED
 from apps.learning.wheels import WheelFit, fit_wheels
 from cocoro.clock import NS
 from cocoro.learning import model
@@ -21,6 +22,13 @@ from services.planning.teaching import Adapter
 
 SIZES = (100, 300, 1000, 2000)
 """Numbers of samples of the learning curves."""
+CURVES = {
+    "default": study.BEST,
+    "rigid": study.RIGID[-1],
+    "paper": study.PAPER,
+    "paper searched": study.PAPER_SEARCHED,
+}
+"""The learning curves: ours, and the baselines at their best."""
 
 
 def load_robot(description: str | None = None, measured: str | None = None) -> Robot:
@@ -34,7 +42,8 @@ def learn(
 ) -> dict[str, Any]:  # fmt: skip
     """Learns arm and wheels from two files of samples and writes the model to `into`.
 
-    Returns every method's score (or that of `method` alone), learning curves and the fit of the wheels.
+    Returns every method's score (or that of `method` alone), learning curves and the fit of the wheels; with every
+    method also the held-out error of each reading of the paper's rule that its text allows.
     """
     robot, file = load_robot(description, measured), Path(into)
     file.unlink(missing_ok=True)
@@ -43,9 +52,12 @@ def learn(
     nominal = NominalModel(robot)
     rows = dataset.read(Path(arm), HandRow, robot).rows
     learn, held = study.split(study.clean(sightings(rows), nominal))
-    methods = {"default": study.BEST, "paper": study.METHODS[0], "paper over drawing": study.METHODS[2]}
     sizes = [size for size in SIZES if size <= len(learn)]
     draws = np.unique([row.draw for row in rows])
+    readings = {
+        one.name: study.rms(study.errors_m(study.fit(one.method, nominal, learn), held))
+        for one in (ALLOWED if method is None else ())
+    }
     trials = dataset.read(Path(wheels), WheelRow, robot).rows
     return {
         "arm": report.data(),
@@ -53,13 +65,26 @@ def learn(
         "held": len(held),
         "curves": {
             name: {str(s): e for s, e in zip(sizes, study.curve(m, nominal, learn, held, sizes), strict=True)}
-            for name, m in methods.items()
+            for name, m in CURVES.items()
         },
+        "readings": readings,
         "draws_used": len(draws),
         "draws_looked_at": int(draws.max() - draws.min() + 1),
         "babbled_s": _babbled_s(rows),
         "wheels": _fitted(fit, trials),
     }
+
+
+def rigid(
+    arm: str, wheels: str, into: str, description: str | None = None, measured: str | None = None
+) -> dict[str, Any]:  # fmt: skip
+    """Calibrates the rigid body by the arm's samples, and writes a model with it and with the learned wheels. Returns
+    its error."""
+    robot, file = load_robot(description, measured), Path(into)
+    file.unlink(missing_ok=True)
+    _, report = learn_arm(Path(arm), file, robot, method=study.RIGID[-1].name)
+    learn_wheels(Path(wheels), file, robot)
+    return {"held_out_m": report.scores[-1].held_out_m}
 
 
 def wheels(trials: str, into: str, description: str | None = None, measured: str | None = None) -> dict[str, Any]:

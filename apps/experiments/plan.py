@@ -62,6 +62,9 @@ class ExperimentSettings(msgspec.Struct, frozen=True, kw_only=True):
     def model_file(self, seed: int) -> Path:
         return self.out / "models" / f"seed-{seed}.json"
 
+    def rigid_file(self, seed: int) -> Path:
+        return self.out / "models" / f"seed-{seed}.rigid.json"
+
 
 # --- the runs that all experiments need ------------------------------------------------------------
 
@@ -108,7 +111,20 @@ def learned_name(seed: int) -> str:
     return f"learn-{seed}"
 
 
-def with_model(settings: ExperimentSettings, seed: int, name: str, **fields: Any) -> ExperimentRun:
-    """A rehearsal with the model of a body; `fields` are further fields of the request."""
-    request = {**settings.common(seed), "model": str(settings.model_file(seed)), **fields}
-    return ExperimentRun(name, "rehearse", request, needs=(learned_name(seed),))
+def calibrated(settings: ExperimentSettings, seed: int) -> ExperimentRun:
+    """Calibrating the rigid body of one body, from the same samples; it needs the runs of `learned`."""
+    fields = {
+        "arm": str(settings.arm_file(seed)), "wheels": str(settings.wheels_file(seed)),
+        "into": str(settings.rigid_file(seed)), **settings.robot_files,
+    }  # fmt: skip
+    return ExperimentRun(f"learn-rigid-{seed}", "learn-rigid", fields, needs=(learned_name(seed),))
+
+
+def with_model(
+    settings: ExperimentSettings, seed: int, name: str, *, rigid: bool = False, **fields: Any
+) -> ExperimentRun:
+    """A rehearsal with the model of a body, or with its calibrated rigid body; `fields` are further fields of the
+    request."""
+    file = settings.rigid_file(seed) if rigid else settings.model_file(seed)
+    request = {**settings.common(seed), "model": str(file), **fields}
+    return ExperimentRun(name, "rehearse", request, needs=(f"learn-rigid-{seed}" if rigid else learned_name(seed),))

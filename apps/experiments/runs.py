@@ -28,7 +28,7 @@ class ExperimentRun:
 
     name: str
     """Name of its result's file in the folder `runs`."""
-    kind: Literal["rehearse", "learn", "learn-wheels", "bend"]
+    kind: Literal["rehearse", "learn", "learn-rigid", "learn-wheels", "bend"]
     fields: dict[str, Any] = field(hash=False)
     """Rehearse: the request's fields; otherwise the arguments of the lesson of that name."""
     needs: tuple[str, ...] = ()

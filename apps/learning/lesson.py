@@ -13,7 +13,9 @@ import numpy as np
 
 from apps.learning import dataset, study
 from apps.learning.dataset import HandRow, WheelRow
-from apps.learning.study import METHODS, Method, Score, Sightings
+from apps.learning.method import Method
+from apps.learning.sightings import Sightings
+from apps.learning.study import METHODS, RIGID, Score
 from apps.learning.wheels import WheelFit, fit_wheels
 from cocoro.errors import ConfigError
 from cocoro.learning import model
@@ -84,7 +86,7 @@ def learn_arm(
     scores = []
     for number, one in enumerate(methods, 1):
         tell(f"{number} of {len(methods)}: {one.name}")
-        scores.append(study.score(one, nominal, learn, held))
+        scores.append(study.score(one, nominal, learn, held, validate=one not in RIGID))
     chosen = study.best(scores, methods)
     sizes = [*[size for size in CURVE if size < len(learn)], len(learn)]
     curve_m = study.curve(chosen, nominal, learn, held, sizes)
@@ -135,9 +137,10 @@ def _methods(search: bool, method: str | None) -> Sequence[Method]:
     methods = [*METHODS, *study.grid("in order"), *study.grid("least squares")] if search else list(METHODS)
     if method is None:
         return methods
-    found = [one for one in methods if one.name == method]
+    known = [*methods, *RIGID]
+    found = [one for one in known if one.name == method]
     if not found:
-        names = "\n  ".join(one.name for one in methods)
+        names = "\n  ".join(one.name for one in known)
         raise ConfigError(f"there is no method {method!r}; known are\n  {names}")
     return found
 

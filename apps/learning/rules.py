@@ -18,20 +18,27 @@ NEIGHBOUR_M = 0.025
 SPARSE_FACTOR = 4.0
 
 
-def learn_in_order(network: HyperplaneRbf, inputs: FloatArray, targets: FloatArray, rate: float) -> None:
+def learn_in_order(
+    network: HyperplaneRbf, inputs: FloatArray, targets: FloatArray, rate: float, *, by_length: bool = False
+) -> None:
     """The paper's rule: learns each sample once, in order. Changes the network. Inputs (b, n), targets (b, k).
 
-    Block by block, exactly as sample by sample: with G the Gram matrix of a block's features, the errors E that the
-    rule meets one after the other are the solution of the triangular system (I + rate tril(G, -1)) E = T - Phi W, and
-    the weights then gain rate Phi' E (derived).
+    With `by_length` each step is divided by |phi|^2, so that it removes the share `rate` of the sample's error (the
+    normalised least mean squares rule, Nagumo and Noda 1967).
+
+    Block by block, exactly as sample by sample: with G the Gram matrix of a block's features and R the steps' rates on
+    a diagonal, the errors E that the rule meets one after the other are the solution of the triangular system
+    (I + tril(G R, -1)) E = T - Phi W, and the weights then gain Phi' R E (derived).
     """
     for start in range(0, len(inputs), _BLOCK):
         phi = network.features(inputs[start : start + _BLOCK])
+        gram = phi @ phi.T
+        rates = rate / gram.diagonal() if by_length else np.full(len(phi), rate)
         before = targets[start : start + _BLOCK] - phi @ network.weights
-        system = np.tril(rate * (phi @ phi.T), -1)
+        system = np.tril(gram * rates, -1)
         np.fill_diagonal(system, 1.0)
-        errors = scipy.linalg.solve_triangular(system, before, lower=True, unit_diagonal=True)
-        network.weights += rate * (phi.T @ errors)
+        errors = scipy.linalg.solve_triangular(system, before, lower=True, unit_diagonal=True, check_finite=False)
+        network.weights += phi.T @ (errors * rates[:, None])
 
 
 def folds(groups: IntArray, count: int) -> Iterable[tuple[BoolArray, BoolArray]]:

@@ -9,23 +9,21 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 from typing import Literal, NamedTuple
 
 import numpy as np
 
+from apps.learning import paper_rule
+from apps.learning.calibration import CalibratedModel, Freedom, as_map, calibrate
+from apps.learning.method import Method
+from apps.learning.paper_rule import AS_PRINTED, IN_THE_LIBRARY, SEARCHED, Reading
 from apps.learning.rules import folds, inliers, learn_in_order, plausible
-from cocoro.arrays import BoolArray, FloatArray, IntArray
-from cocoro.learning.handmap import Coordinates, HandMap, NominalModel
-from cocoro.learning.network import (
-    PAPER_BASES,
-    PAPER_RANGE_RAD,
-    PAPER_RATE,
-    PAPER_WIDTH_RAD,
-    HyperplaneRbf,
-    LeastSquares,
-)
+from apps.learning.sightings import Sightings
+from cocoro.arrays import FloatArray
+from cocoro.learning.handmap import HandMap, NominalModel
+from cocoro.learning.network import PAPER_RANGE_RAD, HyperplaneRbf, LeastSquares
 
 PRIMING_SHARE = 0.1
 """Weight (or rate) of a priming point against a sighting."""
@@ -36,45 +34,15 @@ CHANCE = 0.05
 """Relative difference of errors below which no method counts as better."""
 
 
-@dataclass(frozen=True)
-class Sightings:
-    """Sightings as arrays: angles (b, n) rad, positions (b, 3) m in the body frame, numbers of the draws (b,)."""
-
-    angles_rad: FloatArray
-    places_m: FloatArray
-    draws: IntArray
-
-    def __len__(self) -> int:
-        return len(self.draws)
-
-    def pick(self, mask: BoolArray | slice) -> Sightings:
-        """The sightings of a mask (b,) or slice."""
-        return Sightings(self.angles_rad[mask], self.places_m[mask], self.draws[mask])
-
-
-@dataclass(frozen=True)
-class Method:
-    """One method of learning."""
-
-    name: str
-    rule: Literal["in order", "least squares"] = "least squares"
-    over_nominal: bool = True
-    """The network learns what the nominal model leaves unexplained; else the whole map, primed by the nominal model."""
-    coordinates: Coordinates = "cartesian"
-    bases: int = PAPER_BASES
-    """Bases per joint."""
-    width_rad: float = PAPER_WIDTH_RAD
-    rate: float = PAPER_RATE
-    """For "in order": a in the paper's rule."""
-    doubt: float = 100.0
-    """For "least squares": prior variance of the weights in units of a sighting's variance."""
-
-
 BEST = Method("81 bases over the nominal model, least squares")
+PAPER = replace(AS_PRINTED.method, name="the paper's rule, best reading of the text")
+PAPER_SEARCHED = replace(SEARCHED.method, name="the paper's rule, its grid search made again")
+PAPER_LIBRARY = replace(IN_THE_LIBRARY.method, name="the paper's rule, normalised as in its author's library")
 METHODS: tuple[Method, ...] = (
-    Method("the paper's rule, 81 bases", "in order", over_nominal=False),
-    Method("the paper's rule, spherical", "in order", over_nominal=False, coordinates="spherical"),
-    Method("the paper's rule over the nominal model", "in order"),
+    PAPER,
+    PAPER_SEARCHED,
+    PAPER_LIBRARY,
+    Method("the paper's rule over the nominal model", "in order", normalised=False),
     Method("81 bases, least squares", over_nominal=False),
     Method("256 bases, least squares", over_nominal=False, bases=4, width_rad=1.05),
     BEST,
@@ -82,6 +50,14 @@ METHODS: tuple[Method, ...] = (
     Method("16 bases over the nominal model", bases=2, width_rad=2.5),
     Method("256 bases over the nominal model", bases=4, width_rad=1.05),
 )
+RIGID: tuple[Method, ...] = (
+    Method("the rigid body, joint zeros calibrated", "rigid"),
+    Method("the rigid body, zeros, hand and camera calibrated", "rigid"),
+    Method("the rigid body, all calibrated", "rigid"),
+)
+"""The nominal model with a geometry fitted to the sightings (`apps.learning.calibration`), one for each freedom. They
+are baselines: chosen for a model only when asked for by name."""
+_FREEDOM: dict[str, Freedom] = dict(zip((method.name for method in RIGID), ("zeros", "hand", "all"), strict=True))
 
 
 class Score(NamedTuple):
@@ -115,13 +91,21 @@ def split(sightings: Sightings, every: int = HELD_OUT) -> tuple[Sightings, Sight
 
 def fit(method: Method, nominal: NominalModel, sightings: Sightings) -> HandMap:
     """Fit a map to the sightings."""
+    if method.rule == "rigid":
+        return as_map(calibrated(method, nominal, sightings), nominal)
     learned, learner = begin(method, nominal)
     targets = learned.targets(sightings.angles_rad, sightings.places_m)
     if learner is None:
-        learn_in_order(learned.network, sightings.angles_rad, targets, method.rate)
+        for _ in range(method.passes):
+            learn_in_order(learned.network, sightings.angles_rad, targets, method.rate, by_length=method.by_length)
     else:
         learner.add_all(sightings.angles_rad, targets)
     return learned
+
+
+def calibrated(method: Method, nominal: NominalModel, sightings: Sightings) -> CalibratedModel:
+    """The rigid body of a method of `RIGID`."""
+    return calibrate(nominal, sightings, _FREEDOM[method.name])
 
 
 def begin(method: Method, nominal: NominalModel) -> tuple[HandMap, LeastSquares | None]:
@@ -129,7 +113,7 @@ def begin(method: Method, nominal: NominalModel) -> tuple[HandMap, LeastSquares 
 
     The learner is None for the paper's rule, whose only state is the weights.
     """
-    learned, learner = _primed(method, nominal)
+    learned, learner = _primed(replace(method, name="", passes=1), nominal)  # neither matters to it
     network = learned.network.copy()
     return HandMap(
         nominal, network, over_nominal=method.over_nominal, coordinates=method.coordinates
@@ -139,15 +123,17 @@ def begin(method: Method, nominal: NominalModel) -> tuple[HandMap, LeastSquares 
 @lru_cache(maxsize=16)
 def _primed(method: Method, nominal: NominalModel) -> tuple[HandMap, LeastSquares | None]:
     count = len(nominal.joints)
-    ranges = np.tile([-PAPER_RANGE_RAD, PAPER_RANGE_RAD], (count, 1))
+    reach_rad = PAPER_RANGE_RAD * (1.0 if method.centres == "at the ends" else 1.0 - 1.0 / method.bases)
+    ranges = np.tile([-reach_rad, reach_rad], (count, 1))
     network = HyperplaneRbf.spread([method.bases] * count, [method.width_rad] * count, ranges)
+    network.normalised = method.normalised
     learned = HandMap(nominal, network, over_nominal=method.over_nominal, coordinates=method.coordinates)
     learner = LeastSquares(network, method.doubt) if method.rule == "least squares" else None
-    if not method.over_nominal:
-        angles, places = nominal.priming()
+    if not method.over_nominal and method.priming != "none":
+        angles, places = nominal.priming(shuffled=method.priming == "shuffled")
         targets = learned.targets(angles, places)
         if learner is None:
-            learn_in_order(network, angles, targets, PRIMING_SHARE * method.rate)
+            learn_in_order(network, angles, targets, PRIMING_SHARE * method.rate, by_length=method.by_length)
         else:
             learner.add_all(angles, targets, PRIMING_SHARE)
     return learned, learner
@@ -181,16 +167,31 @@ def cross_validate(method: Method, nominal: NominalModel, learn: Sightings) -> f
 
 
 def baselines(nominal: NominalModel, learn: Sightings, held: Sightings) -> list[Score]:
-    """Scores of the nominal model, and of it with the constant offset that fits the sightings best."""
+    """Scores of the rigid body: as drawn, with the constant offset that fits the sightings best, and with a fitted
+    geometry (`RIGID`)."""
     offset = (learn.places_m - nominal.predict(learn.angles_rad)).mean(axis=0)
     moved = replace(held, places_m=held.places_m - offset)
-    return [
-        Score(name, float("nan"), rms(errors), float(np.quantile(errors, 0.95)), 0.0)
-        for name, errors in (
-            ("the nominal model", errors_m(nominal, held)),
-            ("the nominal model with its best constant offset", errors_m(nominal, moved)),
-        )
+    found = [
+        ("the nominal model", errors_m(nominal, held), 0.0),
+        ("the nominal model with its best constant offset", errors_m(nominal, moved), 0.0),
     ]
+    for method in RIGID:
+        started = time.process_time()
+        body = calibrated(method, nominal, learn)
+        found.append((method.name, errors_m(body, held), time.process_time() - started))
+    return [
+        Score(name, float("nan"), rms(errors), float(np.quantile(errors, 0.95)), took_s)
+        for name, errors, took_s in found
+    ]
+
+
+def search(one: Reading, nominal: NominalModel, bodies: Sequence[Sightings]) -> list[Reading]:
+    """The paper's grid search, for each of several bodies: the numbers with the least cross-validated error. A
+    combination at which the rule diverges has lost."""
+    candidates = list(paper_rule.grid(one))
+    with np.errstate(all="ignore"):
+        errors = [[cross_validate(other.method, nominal, learn) for learn in bodies] for other in candidates]
+    return [candidates[int(row)] for row in np.nan_to_num(np.array(errors), nan=np.inf).argmin(axis=0)]
 
 
 def grid(rule: Literal["in order", "least squares"]) -> Sequence[Method]:
@@ -201,7 +202,9 @@ def grid(rule: Literal["in order", "least squares"]) -> Sequence[Method]:
             if rule == "in order":
                 for rate in (0.025, 0.1, 0.3):
                     name = f"{bases**4} bases, sigma {width:g}, rate {rate:g}"
-                    found.append(Method(name, rule, over_nominal=False, bases=bases, width_rad=width, rate=rate))
+                    found.append(
+                        Method(name, rule, over_nominal=False, bases=bases, width_rad=width, rate=rate, by_length=True)
+                    )
             else:
                 for doubt in (10.0, 100.0, 1000.0):
                     name = f"{bases**4} bases over the nominal model, sigma {width:g}, doubt {doubt:g}"
@@ -224,4 +227,6 @@ def curve(
     method: Method, nominal: NominalModel, learn: Sightings, held: Sightings, sizes: Sequence[int]
 ) -> list[float]:
     """Held-out errors (RMS, m) after the first `sizes` sightings."""
-    return [rms(errors_m(fit(method, nominal, learn.pick(slice(size))), held)) for size in sizes if size <= len(learn)]
+    model = calibrated if method.rule == "rigid" else fit
+    parts = [learn.pick(slice(size)) for size in sizes if size <= len(learn)]
+    return [rms(errors_m(model(method, nominal, part), held)) for part in parts]

@@ -114,15 +114,18 @@ class NominalModel:
         # The cross product, written out: np.cross takes as long as all the rest.
         return np.asarray((axes[:, _NEXT] * arms[:, _LAST] - axes[:, _LAST] * arms[:, _NEXT]).T)
 
-    def priming(self, count: int = PRIMING_A_JOINT, reach_rad: float = 2.62) -> tuple[FloatArray, FloatArray]:
+    def priming(
+        self, count: int = PRIMING_A_JOINT, reach_rad: float = 2.62, *, shuffled: bool = True
+    ) -> tuple[FloatArray, FloatArray]:
         """Evenly spaced postures (count ** n, n) and their marker positions (count ** n, 3), for priming a network.
 
         As in the paper they cover +-`reach_rad` of every joint, whatever its limits. Their order is a fixed shuffle,
-        because a single pass over a sorted grid would end in one corner of it.
+        because a single pass over a sorted grid ends in one corner of it; `shuffled=False` is that order.
         """
         axis = np.linspace(-reach_rad, reach_rad, count)
         grid = np.stack(np.meshgrid(*[axis] * len(self.joints), indexing="ij"), axis=-1).reshape(-1, len(self.joints))
-        grid = grid[np.random.default_rng(0).permutation(len(grid))]
+        if shuffled:
+            grid = grid[np.random.default_rng(0).permutation(len(grid))]
         return grid, self.predict(grid)
 
 

@@ -40,7 +40,7 @@ class Training(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     """By name, which ends with the unit: held_out_rms_m, drawing_offset_rms_m."""
 
 
-class ArmModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class ArmModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
     """The hand-eye map."""
 
     joints: tuple[str, ...]
@@ -51,6 +51,8 @@ class ArmModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     centres: list[list[Weight]]
     widths: list[Annotated[float, Meta(gt=0, le=100)]]
     weights: list[list[Weight]]
+    normalised: bool = True
+    """The activations of the network's bases add up to one."""
     seen_m: list[FiniteVec3]
     """Positions where the hand was seen; the reachability mesh is made of them."""
     training: Training
@@ -160,6 +162,7 @@ def arm_model(learned: HandMap, roll_rad: float, seen_m: FloatArray, training: T
         centres=network.centres.tolist(),
         widths=network.widths.tolist(),
         weights=network.weights.tolist(),
+        normalised=network.normalised,
         seen_m=[(x, y, z) for x, y, z in np.round(seen_m, 4).tolist()],
         training=training,
     )
@@ -170,7 +173,7 @@ def hand_map(arm: ArmModel, robot: Robot, where: str = "arm") -> HandMap:
     nominal = NominalModel(robot, arm.roll_rad)
     try:
         centres, weights = np.array(arm.centres), np.array(arm.weights)
-        network = HyperplaneRbf(centres, np.array(arm.widths), 3)
+        network = HyperplaneRbf(centres, np.array(arm.widths), 3, normalised=arm.normalised)
         if weights.shape != network.weights.shape or arm.joints != nominal.joints:
             raise ValueError(f"weights {weights.shape} for joints {', '.join(arm.joints)}")
     except ValueError as error:

@@ -1,8 +1,9 @@
 """The hyperplane radial basis function network (Guenther and Micci Barreca 1997), its Jacobian, and least squares.
 
 Inputs x (n), centres mu_j (m of them), widths sigma (n): c_j = (x - mu_j) / sigma, g_j = exp(-|c_j|^2 / 2),
-h_j = g_j / sum g, y_k = sum_j h_j (w_kj + sum_i v_kji c_ji). Linear in its weights: with the features
-phi = (h_1 .. h_m, h_1 c_11 .. h_m c_mn), y = phi W. Where the paper's equations were lost, they are derived.
+y_k = sum_j h_j (w_kj + sum_i v_kji c_ji). The activations h_j are g_j / sum g (normalised) or g_j (plain). Linear in
+its weights: with the features phi = (h_1 .. h_m, h_1 c_11 .. h_m c_mn), y = phi W. The paper's text lost its equations;
+these are derived, and `apps/learning/paper_rule.py` has every reading that the text allows.
 """
 
 from __future__ import annotations
@@ -27,14 +28,16 @@ class HyperplaneRbf:
     """A network with `centres` (m, n), `widths` (n,) and `outputs` outputs; its weights start at zero.
 
     Inputs, centres and widths have one unit (radians for joint angles); outputs have that of the targets it learns.
+    `normalised`: the activations of all bases add up to one.
     """
 
-    def __init__(self, centres: FloatArray, widths: FloatArray, outputs: int) -> None:
+    def __init__(self, centres: FloatArray, widths: FloatArray, outputs: int, *, normalised: bool = True) -> None:
         self.centres = np.ascontiguousarray(centres, dtype=np.float64)
         self.widths = np.asarray(widths, dtype=np.float64)
         count, inputs = self.centres.shape
         if self.widths.shape != (inputs,) or (self.widths <= 0).any():
             raise ValueError(f"{inputs} positive widths are needed, not {widths}")
+        self.normalised = normalised
         self._scale = 1.0 / self.widths
         self._minus_half = np.full(inputs, -0.5)
         self.weights = np.zeros((count * (1 + inputs), outputs))
@@ -88,12 +91,13 @@ class HyperplaneRbf:
 
     def jacobian(self, x: FloatArray) -> FloatArray:
         """dy/dx at one input (n,), exact, shape (k, n). Derived: with a_j = w_j + V_j c_j the value of plane j and
-        dh_j/dx_i = h_j (sum_l h_l c_li - c_ji) / sigma_i, it is sum_j a_j dh_j/dx + sum_j h_j V_j / sigma."""
+        dh_j/dx_i = h_j (sum_l h_l c_li - c_ji) / sigma_i, it is sum_j a_j dh_j/dx + sum_j h_j V_j / sigma. Plain
+        activations have dh_j/dx_i = -h_j c_ji / sigma_i."""
         h, c = self._activate_one(x)
         count, inputs = c.shape
         planes = self.weights[count:]
         values = self.weights[:count] + np.matmul(c[:, None, :], planes.reshape(count, inputs, -1))[:, 0]
-        slopes = h[:, None] * (h.dot(c) - c)
+        slopes = h[:, None] * (h.dot(c) - c if self.normalised else -c)
         jac = values.T.dot(slopes)
         jac += h.dot(planes.reshape(count, -1)).reshape(inputs, -1).T
         return np.asarray(jac * self._scale)
@@ -104,7 +108,7 @@ class HyperplaneRbf:
         self.weights += np.multiply.outer(rate * phi, target - phi @ self.weights)
 
     def copy(self) -> HyperplaneRbf:
-        other = HyperplaneRbf(self.centres, self.widths, self.outputs)
+        other = HyperplaneRbf(self.centres, self.widths, self.outputs, normalised=self.normalised)
         other.weights = self.weights.copy()
         return other
 
@@ -112,6 +116,8 @@ class HyperplaneRbf:
         """h (m,) and c (m, n) for one input: a faster `_activate`."""
         c = (x - self.centres) * self._scale
         exponent = (c * c).dot(self._minus_half)
+        if not self.normalised:
+            return np.exp(exponent, out=exponent), c
         exponent -= exponent.max()
         g = np.exp(exponent, out=exponent)
         return g / g.sum(), c
@@ -120,6 +126,8 @@ class HyperplaneRbf:
         """h (b, m) and c (b, m, n)."""
         c = (x[:, None, :] - self.centres) / self.widths
         exponent = -0.5 * np.einsum("bmn,bmn->bm", c, c)
+        if not self.normalised:
+            return np.exp(exponent), c
         g = np.exp(exponent - exponent.max(axis=1, keepdims=True))  # far from all centres the nearest one decides
         return g / g.sum(axis=1, keepdims=True), c
 

@@ -7,164 +7,131 @@ size; a blob without depth is reported without depth.
 
 from __future__ import annotations
 
-from math import log, sqrt
+from math import isnan
 
-import cv2
 import numpy as np
 
-from cocoro.arrays import MaskArray
-from cocoro.objects import Catalogue, ObjectSpec
+from cocoro.arrays import BoolArray, FloatArray, IntArray
+from cocoro.objects import Catalogue
 from services.perception.colours import ColourTable
 from services.perception.config import PerceptionConfig
-from services.perception.image import ImageSighting, PixelBox, RgbdImage
-from services.perception.region import ColourRegion, components
-from services.perception.shapes import area_range_m2, counted_px, reach_m
-
-NEAREST_M = 0.3
-"""The size limit of a blob without depth is the object's size at this distance. Nearer objects hardly fit into the
-image."""
-MAX_STRETCH = 1.5
-"""Largest ratio of a blob's diagonal to that of the whole object's outline."""
+from services.perception.evidence import evidence_of, middle_depths_m
+from services.perception.image import ImageSighting, OwnEvidence, RgbdImage
+from services.perception.pieces import OneObject, depth_of
+from services.perception.region import ColourRegion
+from services.perception.segments import Segments, segments
+from services.perception.shapes import Shapes
+from services.perception.sizes import SizeFit
 
 
 class BlobDetector:
     def __init__(self, catalogue: Catalogue, config: PerceptionConfig) -> None:
-        self._catalogue = catalogue
+        self._labels = catalogue.labels
         self._config = config
         self._table = ColourTable(catalogue)
+        self._shapes = Shapes(catalogue.objects)
 
     def detect(self, image: RgbdImage) -> list[ImageSighting]:
-        classes = self._table.classify(image.colour)
-        # Rows and columns that contain each object's colours, in one pass for all objects.
-        rows, columns = np.bitwise_or.reduce(classes, axis=1), np.bitwise_or.reduce(classes, axis=0)
+        codes = self._table.packed(image.colour)
+        min_area_px = self._config.min_area_px * image.scale**2
+        layers = [segments(codes, layer.table, number, min_area_px) for number, layer in enumerate(self._table.layers)]
+        regions = [layer for layer in layers if layer is not None]
+        return self._sightings(Segments.joined(regions), image, min_area_px) if regions else []
+
+    def _sightings(self, found: Segments, image: RgbdImage, min_area_px: float) -> list[ImageSighting]:
+        """The objects among the regions of all colours, in the catalogue's order.
+
+        An object's only region, when it may be all of the object, is the object; this is decided for all such regions
+        at once. The others, in several pieces, hidden in part or before something of their colour, are looked at one by
+        one.
+        """
+        image.register(_with_margin(found.bounds, image))
+        depth_m = middle_depths_m(found, image.codes_at(found.u, found.v), image)
+        fit = SizeFit(self._shapes.of(found.number), image.camera, self._config, min_area_px)
+        diagonal_px = np.hypot(*(found.bounds[:, 2:] - found.bounds[:, :2]).T)
+        alone = np.bincount(found.number)[found.number] == 1
+        simple = alone & fit.whole(found.area_px, diagonal_px, depth_m)
+        hidden = simple & fit.too_small(found.area_px, depth_m)
+        for number in np.flatnonzero(hidden).tolist():
+            hidden[number] = _region(found, number, image).hidden
+        parts = [found.among(simple)] if simple.any() else []
+        depth_m, hidden = depth_m[simple], hidden[simple]
+        if not simple.all():
+            others = self._one_by_one(found, np.unique(found.number[~simple]), image, min_area_px)
+            if others:
+                numbers, regions = np.array(list(others)), list(others.values())
+                layers = np.array([self._table.layer_of[number] for number in others])
+                parts.append(
+                    Segments.of_masks(numbers, layers, [each.mask for each in regions], [each.box for each in regions])
+                )
+                of_others = np.array([depth_of(region) for region in regions])
+                fit = SizeFit(self._shapes.of(numbers), image.camera, self._config, min_area_px)
+                small = fit.too_small(parts[-1].area_px, of_others).tolist()
+                depth_m = np.append(depth_m, of_others)
+                hidden = np.append(hidden, [less and each.hidden for less, each in zip(small, regions, strict=True)])
+        return self._told(Segments.joined(parts), depth_m, hidden, image) if parts else []
+
+    def _one_by_one(
+        self, found: Segments, numbers: IntArray, image: RgbdImage, min_area_px: float
+    ) -> dict[int, ColourRegion]:
+        """The region of each of the objects with these numbers that is seen."""
+        seen = {}
+        for number in numbers.tolist():
+            regions = np.flatnonzero(found.number == number)
+            largest_first = regions[np.argsort(-found.area_px[regions], kind="stable")].tolist()
+            parts = [_region(found, region, image) for region in largest_first]
+            fit = SizeFit(self._shapes.of(number), image.camera, self._config, min_area_px)
+            best = OneObject(fit, float(self._shapes.reach_m[number])).among(parts)
+            if best is not None:
+                seen[number] = best
+        return seen
+
+    def _told(self, found: Segments, depth_m: FloatArray, hidden: BoolArray, image: RgbdImage) -> list[ImageSighting]:
+        """The sightings of objects that are these regions, in the catalogue's order. `depth_m` are the regions' depths,
+        m, NaN without, and `hidden` is whether something may hide a part of them, shape (n,)."""
+        u_px, v_px = (np.add.reduceat(each, found.start, dtype=np.int64) / found.area_px for each in (found.u, found.v))
+        left, top, right, bottom = found.bounds.T
+        cut = (left <= 1) | (top <= 1) | (right >= image.width - 1) | (bottom >= image.height - 1)
+        deep = ~np.isnan(depth_m)
+        evidence: list[OwnEvidence | None] = [None] * len(depth_m)
+        if deep.any():
+            all_evidence = evidence_of(
+                found.among(deep), depth_m[deep], self._shapes.reach_m[found.number[deep]], image
+            )
+            for number, region in enumerate(np.flatnonzero(deep).tolist()):
+                evidence[region] = OwnEvidence(all_evidence, number)
+        columns = (u_px, v_px, found.area_px, found.bounds, depth_m, cut, hidden)
+        numbers = found.number.tolist()
+        rows = list(zip(*(column.tolist() for column in columns), evidence, strict=True))
         sightings = []
-        for bit, known in enumerate(self._catalogue):
-            own = classes.dtype.type(1 << bit)
-            across, down = np.flatnonzero(columns & own), np.flatnonzero(rows & own)
-            if len(across) and len(down):
-                left, top = int(across[0]), int(down[0])
-                crop = classes[top : int(down[-1]) + 1, left : int(across[-1]) + 1] & own
-                sighting = self._find(known, (crop != 0).view(np.uint8), (left, top), image)
-                if sighting is not None:
-                    sightings.append(sighting)
+        for region in sorted(range(len(numbers)), key=numbers.__getitem__):
+            u, v, area, (left, top, right, bottom), depth, beyond, part, seen = rows[region]
+            sightings.append(
+                ImageSighting(
+                    label=self._labels[numbers[region]],
+                    u_px=u,
+                    v_px=v,
+                    area_px=area,
+                    box_px=(left, top, right, bottom),
+                    depth_m=None if isnan(depth) else depth,
+                    cut=beyond,
+                    hidden=part,
+                    evidence=seen,
+                )
+            )
         return sightings
 
-    def _find(
-        self, known: ObjectSpec, mask: MaskArray, origin: tuple[int, int], image: RgbdImage
-    ) -> ImageSighting | None:
-        """Find one object. `mask` has its matching pixels, shape (height, width), and covers the part of the image
-        whose first pixel is `origin`, (column, row)."""
-        parts = _clean_components(mask, origin, image, self._config.min_area_px * image.scale**2)
-        if not parts:
-            return None
-        fit = _SizeFit(known, image, self._config)
-        regions: list[ColourRegion] = []
-        plausible: list[ColourRegion] = []
-        for part in parts:
-            region = ColourRegion(*part, image)
-            if fit.too_large(region):
-                pieces = [ColourRegion(*piece, image) for piece in region.split_by_depth()]
-                regions += pieces
-                plausible += [piece for piece in pieces if fit.whole(piece)]
-            else:
-                regions.append(region)
-                if fit.whole(region) or fit.partly_hidden(region):
-                    plausible.append(region)
-        if not plausible:
-            return None
-        best = fit.completed(max(plausible, key=fit.score), regions)
-        return ImageSighting(
-            label=known.label,
-            u_px=best.u_px,
-            v_px=best.v_px,
-            area_px=best.area_px,
-            box_px=best.bounds,
-            depth_m=best.depth_m,
-            cut=best.cut,
-            hidden=fit.too_small(best) and best.hidden,
-            evidence=best.evidence(reach_m(known)),
-        )
+
+def _region(found: Segments, number: int, image: RgbdImage) -> ColourRegion:
+    left, top, right, bottom = found.bounds[number].tolist()
+    box = image.clip((left, top, right, bottom), ColourRegion.margin_px(image))
+    return ColourRegion(found.mask(number, box), box, image)
 
 
-class _SizeFit:
-    """Compares a region's size with that of one known object at the region's distance."""
-
-    def __init__(self, known: ObjectSpec, image: RgbdImage, config: PerceptionConfig) -> None:
-        camera = image.camera
-        self._config = config
-        self._focal2 = camera.fx * camera.fy
-        self._least_m2, self._greatest_m2 = area_range_m2(known)
-        self._reach_m = reach_m(known)
-        self._inwards_m = known.planar_radius_m
-        self._min_area_px = config.min_area_px * image.scale**2
-
-    def _pixels(self, area_m2: float, depth_m: float) -> float:
-        return counted_px(area_m2 * self._focal2 / (depth_m + self._inwards_m) ** 2)
-
-    def _diagonal_px(self, depth_m: float) -> float:
-        return MAX_STRETCH * 2 * self._reach_m * sqrt(self._focal2) / depth_m + 4
-
-    def too_large(self, region: ColourRegion) -> bool:
-        depth_m = region.depth_m or NEAREST_M
-        most = self._config.max_share * self._pixels(self._greatest_m2, depth_m)
-        return region.area_px > most or region.diagonal_px > self._diagonal_px(depth_m)
-
-    def whole(self, region: ColourRegion) -> bool:
-        """Whether it may be the whole object. A region without depth passes if it is not too large."""
-        if region.area_px < self._min_area_px or self.too_large(region):
-            return False
-        return not self.too_small(region, self._config.min_share)
-
-    def partly_hidden(self, region: ColourRegion) -> bool:
-        """Whether it may be part of the object, with the rest beyond the image's edge or behind something nearer."""
-        if region.area_px < 2 * self._min_area_px or self.too_small(region, self._config.min_hidden_share):
-            return False
-        return region.cut or region.hidden
-
-    def too_small(self, region: ColourRegion, share: float = 0.85) -> bool:
-        """Whether it has less than `share` of the pixels that the whole object would have at its depth."""
-        return region.depth_m is not None and region.area_px < share * self._pixels(self._least_m2, region.depth_m)
-
-    def score(self, region: ColourRegion) -> tuple[bool, float, int]:
-        """Greater is better: regions with depth first, then those closest to the expected size."""
-        if region.depth_m is None:
-            return False, 0.0, region.area_px
-        expected_px = self._pixels(sqrt(self._least_m2 * self._greatest_m2), region.depth_m)
-        # In half-octave steps, so that among regions of about the right size the largest, the nearest, wins.
-        return True, -round(2 * abs(log(region.area_px / expected_px, 2))), region.area_px
-
-    def completed(self, best: ColourRegion, regions: list[ColourRegion]) -> ColourRegion:
-        """The region joined with other pieces of the same object, which something in front of it separates."""
-        for other in regions:
-            if other is best or best.depth_m is None or other.depth_m is None:
-                continue
-            if abs(other.depth_m - best.depth_m) < self._reach_m:
-                both = _union(best, other)
-                if not self.too_large(both):
-                    best = both
-        return best
-
-
-def _clean_components(
-    mask: MaskArray, origin: tuple[int, int], image: RgbdImage, min_area_px: float
-) -> list[tuple[MaskArray, PixelBox]]:
-    """The mask's connected regions, after opening has removed specks and threads of noise."""
-    if cv2.countNonZero(mask) < min_area_px:
-        return []
-    opened = cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((3, 3), dtype=np.uint8))
-    return components(np.asarray(opened, dtype=np.uint8), origin, image, min_area_px)
-
-
-def _union(a: ColourRegion, b: ColourRegion) -> ColourRegion:
-    box = (
-        min(a.box[0], b.box[0]),
-        min(a.box[1], b.box[1]),
-        max(a.box[2], b.box[2]),
-        max(a.box[3], b.box[3]),
+def _with_margin(bounds: IntArray, image: RgbdImage) -> IntArray:
+    """The boxes (n, 4), px, of regions with these bounds: grown by a margin and clipped to the image."""
+    margin = ColourRegion.margin_px(image)
+    lowest, highest = np.array([0, 0]), np.array([image.width, image.height])
+    return np.concatenate(
+        [np.maximum(bounds[:, :2] - margin, lowest), np.minimum(bounds[:, 2:] + margin, highest)], axis=1
     )
-    mask = np.zeros((box[3] - box[1], box[2] - box[0]), dtype=np.uint8)
-    for region in (a, b):
-        left, top = region.box[0] - box[0], region.box[1] - box[1]
-        height, width = region.mask.shape
-        mask[top : top + height, left : left + width] |= region.mask
-    return ColourRegion(mask, box, a.image)

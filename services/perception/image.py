@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
-from math import ceil, floor, sqrt
-from typing import Protocol
+from math import sqrt
+from typing import NamedTuple, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
-from cocoro.arrays import CodeArray, Float32Array, FloatArray, ImageArray
+from cocoro.arrays import CodeArray, Float32Array, ImageArray, IntArray
 from cocoro.messages import Frame
 from cocoro.robot import Camera, Robot
+from services.perception.registration import PixelBox, Registration, registration
 
-PixelBox = tuple[int, int, int, int]
-"""left, top, right, bottom, px; right and bottom are exclusive."""
+__all__ = ["Detector", "Evidence", "ImageSighting", "OwnEvidence", "PixelBox", "RgbdImage"]
+
+PixelArray = NDArray[np.int32] | NDArray[np.int64]
+_BOX_COSTS_PX = 30, 8000
+"""A box is registered in the time of a wider one with so many columns and pixels more."""
 
 
 class RgbdImage:
@@ -26,6 +31,8 @@ class RgbdImage:
         self.raw_depth = raw_depth
         self.height, self.width = raw_depth.shape
         self._robot = robot
+        self._registered: CodeArray = raw_depth
+        self._registered_boxes: list[PixelBox] = []
 
     @classmethod
     def of(cls, frame: Frame, robot: Robot) -> RgbdImage:
@@ -37,6 +44,20 @@ class RgbdImage:
     def camera(self) -> Camera:
         """The colour camera's parameters at this frame's resolution."""
         return self._robot.camera.scaled(self.width, self.height)
+
+    @property
+    def _registration(self) -> Registration:
+        return registration(self._robot, self.width, self.height)
+
+    @property
+    def no_depth_code(self) -> int:
+        """The least code of `codes_at` that stands for no data; so do all greater ones."""
+        return self._registration.no_data
+
+    @property
+    def registered_depth_m(self) -> Float32Array:
+        """Depth of each code of `codes_at`, m, shape (2048,); NaN for those without data."""
+        return self._registration.table
 
     @property
     def scale(self) -> float:
@@ -59,60 +80,70 @@ class RgbdImage:
         return depth if np.isfinite(depth) else None
 
     def depth_m(self, box: PixelBox) -> Float32Array:
-        """Depth along the optical axis at the colour pixels of a box, m, shape (bottom - top, right - left).
-
-        The depth camera is beside the colour camera, so each depth pixel of the neighbourhood is moved to the
-        colour pixel that shows its point; where several meet, the nearest counts. NaN without data, in an infrared
-        shadow, and in cracks between moved pixels.
-        """
+        """Depth along the optical axis at the colour pixels of a box, m, shape (bottom - top, right - left); NaN
+        without data, in an infrared shadow, and in cracks between moved pixels."""
         left, top, right, bottom = box
-        camera = self.camera
-        ox, oy, oz = self._robot.kinect.depth_offset_m
-        # A point at depth z moves by f * offset / z pixels between the two images, and farthest at the nearest depth.
-        nearest_m = self._robot.kinect.min_range_m
-        shift_u, shift_v = camera.fx * ox / nearest_m, camera.fy * oy / nearest_m
-        spare = ceil(abs(oz) / nearest_m * self.width) + 1
-        source_left, source_top, source_right, source_bottom = self.clip(
-            (
-                left + floor(min(-shift_u, 0)) - spare,
-                top + floor(min(-shift_v, 0)) - spare,
-                right + ceil(max(-shift_u, 0)) + spare,
-                bottom + ceil(max(-shift_v, 0)) + spare,
-            )
-        )
-        raw = self.raw_depth[source_top:source_bottom, source_left:source_right]
-        depth = self._robot.depth_m(raw)
-        rows, columns = np.nonzero(np.isfinite(depth))
-        z = depth[rows, columns]
-        z_colour = z + np.float32(oz)
-        u = ((columns + np.float32(source_left - camera.cx)) * z + np.float32(camera.fx * ox)) / z_colour
-        v = ((rows + np.float32(source_top - camera.cy)) * z + np.float32(camera.fy * oy)) / z_colour
-        column = np.rint(u + np.float32(camera.cx - left)).astype(np.int32)
-        row = np.rint(v + np.float32(camera.cy - top)).astype(np.int32)
-        width, height = right - left, bottom - top
-        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-        out = np.full(width * height, np.inf, dtype=np.float32)
-        np.minimum.at(out, row[inside] * width + column[inside], z_colour[inside])
-        out[np.isinf(out)] = np.nan
-        return out.reshape(height, width)
+        for done in self._registered_boxes:
+            if done[0] <= left and done[1] <= top and right <= done[2] and bottom <= done[3]:
+                return self._registration.depth_m(self._registered[top:bottom, left:right])
+        return self._registration.depth_m(self._registration.codes(self.raw_depth, box))
+
+    def register(self, boxes: IntArray) -> None:
+        """Compute the depth at the colour pixels of boxes, shape (n, 4), for `depth_m` and `codes_at`."""
+        left, top = boxes[:, :2].min(axis=0).tolist()
+        right, bottom = boxes[:, 2:].max(axis=0).tolist()
+        separately = int(((boxes[:, 2] - boxes[:, 0] + _BOX_COSTS_PX[0]) * (boxes[:, 3] - boxes[:, 1])).sum())
+        if separately + _BOX_COSTS_PX[1] * len(boxes) < (right - left) * (bottom - top):
+            self._registered_boxes = [(a, b, c, d) for a, b, c, d in boxes.tolist()]
+        else:
+            self._registered_boxes = [(left, top, right, bottom)]
+        self._registered = np.empty(self.raw_depth.shape, dtype=np.uint16)
+        for box in self._registered_boxes:
+            self._registered[box[1] : box[3], box[0] : box[2]] = self._registration.codes(self.raw_depth, box)
+
+    def codes_at(self, columns: PixelArray, rows: PixelArray) -> CodeArray:
+        """Codes of the depth at colour pixels within registered boxes, shape of `columns` and `rows`."""
+        codes: CodeArray = self._registered.reshape(-1).take(rows * self.width + columns)
+        return codes
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """An object's extent by the depth image, in the colour camera's frame (x right, y down, z forward)."""
+    """The extent of n objects by the depth image, in the colour camera's frame (x right, y down, z forward). Objects
+    with less of it than others have fill, of certainty 0."""
 
-    surface_m: FloatArray
-    """Points on its visible surface, m, shape (n, 3)."""
-    outline: FloatArray
-    """Directions with z = 1 of its outermost pixels, shape (k, 3); each ray meets the object."""
-    beside: FloatArray
-    """Directions with z = 1 of pixels just outside of its outline with known depth, shape (m, 3)."""
-    free_to_m: FloatArray
-    """Depth to which each ray of `beside` is known to be free, m, shape (m,)."""
+    points_m: Float32Array
+    """Points on the visible surfaces, m, shape (3, n, k)."""
+    certainty: Float32Array
+    """Inverse standard deviation of a point's distance from the surface, 1/m, shape (n, k)."""
+    rays: Float32Array
+    """Directions with z = 1, shape (3, n, m): of outermost pixels, whose rays meet the object, and of pixels just
+    outside of its outline with known depth."""
+    side: Float32Array
+    """1 for rays that meet the object, -1 for those beside it, 0 for fill, shape (n, m)."""
+    free_to_m: Float32Array
+    """Depth to which rays beside it are known to be free, m, infinite for the others, shape (n, m)."""
+    surface_count: IntArray
+    """Number of points, shape (n,)."""
+    count: IntArray
+    """Number of points and rays, shape (n,)."""
 
-    @property
-    def count(self) -> int:
-        return len(self.surface_m) + len(self.outline) + len(self.beside)
+    def of(self, objects: list[int]) -> Evidence:
+        """The evidence of some of the objects."""
+        values = (getattr(self, field.name) for field in fields(self))
+        return Evidence(*(value[:, objects] if value.ndim == 3 else value[objects] for value in values))
+
+    def every(self, step: int) -> Evidence:
+        """A part of the evidence: every so manieth point and ray."""
+        values = (getattr(self, field.name) for field in fields(self))
+        return Evidence(*(value[..., ::step] if value.ndim > 1 else value for value in values))
+
+
+class OwnEvidence(NamedTuple):
+    """The evidence of one object among those of a frame."""
+
+    frame: Evidence
+    number: int
 
 
 @dataclass(frozen=True)
@@ -128,7 +159,7 @@ class ImageSighting:
     """It touches the image's edge."""
     hidden: bool = False
     """It is smaller than the whole object, and something nearer may hide the rest."""
-    evidence: Evidence | None = None
+    evidence: OwnEvidence | None = None
     """None from a detector that uses the centroid alone."""
 
 

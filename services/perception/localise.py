@@ -1,4 +1,4 @@
-"""Computes an object's position in the body frame from a sighting.
+"""Computes objects' positions in the body frame from sightings.
 
 The visible surface is not the object: the visible centroid of a can is 19 to 33 mm in front of its axis, and moves
 by 5 to 10 mm when a hand is in front of it. So the upright known shape is fitted to the visible surface points and
@@ -8,29 +8,20 @@ to the rays beside it that are known to be free. Hidden parts are no evidence an
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import hypot, log
-from typing import NamedTuple
+from math import hypot
 
 import numpy as np
 
 from cocoro.arrays import FloatArray
 from cocoro.messages import Detection
-from cocoro.objects import Catalogue, ObjectSpec
+from cocoro.objects import Catalogue
 from cocoro.robot import Camera, Robot
 from cocoro.units import Vec3
-from services.perception.image import Evidence, ImageSighting, PixelBox
-from services.perception.region import depth_doubt_m
-from services.perception.shapes import counted_px, distance_from, reach_m, seen_area_m2, signed_distance
+from services.perception.fit import fit_centres
+from services.perception.image import ImageSighting
+from services.perception.shapes import Shapes, counted_px
 
-ITERATIONS = 12
-SETTLED_M = 1e-4
 MIN_SURFACE_POINTS = 12
-PRIOR = np.eye(3) / 0.05**2
-"""Inverse covariance of the first guess, 1/m2: it may be 5 cm off and decides only what the evidence leaves open."""
-RAY_SAMPLES = 5
-RAY_DOUBT_M, RAY_DOUBT_RAD = 0.001, 0.002
-"""Standard deviation of the outline: a constant, and about a pixel at the object's distance."""
-HUBER = 1.5
 SAME_PLACE = 0.5
 """Overlap of two boxes (intersection over union) from which they show one place."""
 UNDER_FLOOR_M, UNDER_FLOOR_PER_M = 0.03, 0.03
@@ -43,6 +34,8 @@ SIZE_DOUBT = 0.2
 class Localiser:
     def __init__(self, robot: Robot, catalogue: Catalogue, occluded_share: float) -> None:
         self._catalogue = catalogue
+        self._shapes = Shapes(catalogue.objects)
+        self._numbers = {label: number for number, label in enumerate(catalogue.labels)}
         self._chain = robot.chain("camera")
         self._occluded_share = occluded_share
         self.joints = self._chain.joints
@@ -62,181 +55,123 @@ class Localiser:
         Of two objects with a common colour that are seen in one place, the one stays whose shape and size fit
         better.
         """
-        pose = None if angles_rad is None else self.camera_pose(angles_rad)
-        placed = [self._place(sighting, camera, pose) for sighting in sightings]
-        return [
-            one.detection
-            for one in placed
-            if not self._underground(one.detection) and not any(other.displaces(one) for other in placed)
-        ]
+        placed: dict[str, Detection | None] = {}
+        if angles_rad is not None:
+            seen = [sighting for sighting in sightings if sighting.depth_m is not None]
+            placed = self._place(seen, camera, self.camera_pose(angles_rad)) if seen else {}
+        found = []
+        for sighting in sightings:
+            if sighting.depth_m is None:
+                found.append(_detection(sighting, None, "no depth"))
+            elif angles_rad is None:
+                found.append(_detection(sighting, None, "no head angles"))
+            else:
+                detection = placed[sighting.label]
+                if detection is not None:
+                    found.append(detection)
+        return found
 
-    def _underground(self, detection: Detection) -> bool:
-        """Whether the object would reach below the floor: then it is part of another, larger thing of its colour."""
-        if detection.position_m is None or not detection.note:
-            return False
-        x, y, z = detection.position_m
-        bottom_m = z - self._catalogue[detection.label].size_m[2] / 2
+    def _place(
+        self, sightings: Sequence[ImageSighting], camera: Camera, pose: FloatArray
+    ) -> dict[str, Detection | None]:
+        """The detections of sightings with depth, by their labels; None for what is no such object."""
+        shapes = self._shapes.of([self._numbers[sighting.label] for sighting in sightings])
+        u, v, depth, area_px = np.array(
+            [(sighting.u_px, sighting.v_px, sighting.depth_m, sighting.area_px) for sighting in sightings]
+        ).T
+        rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=1)
+        centres = first_guesses(shapes, rays * depth[:, None], pose)
+        evidence = [sighting.evidence for sighting in sightings]
+        misfit = np.zeros(len(sightings))
+        pieces = np.array([some.frame.count[some.number] if some else 0 for some in evidence])
+        fitted = [
+            row
+            for row, some in enumerate(evidence)
+            if some and some.frame.surface_count[some.number] >= MIN_SURFACE_POINTS
+        ]
+        some_evidence = next((some.frame for some in evidence if some), None)
+        if fitted and some_evidence is not None:
+            mine = some_evidence.of([some.number for row in fitted if (some := evidence[row])])
+            centres[fitted], misfit[fitted] = fit_centres(shapes.of(fitted), mine, pose, centres[fitted])
+        most_px = expected_areas_px(shapes, centres, camera, pose)
+        least_px = counted_px(most_px)
+        occluded = area_px < self._occluded_share * least_px
+        whole = np.array([not (sighting.cut or sighting.hidden) for sighting in sightings])
+        size_misfit = 0.5 * (np.log(area_px / np.clip(area_px, least_px, most_px)) / SIZE_DOUBT) ** 2 * whole
+        displaced = _displaced(sightings, misfit, size_misfit, pieces)
+        found: dict[str, Detection | None] = {}
+        rows = zip(sightings, centres.tolist(), occluded.tolist(), displaced, strict=True)
+        for sighting, (x, y, z), hidden, lost in rows:
+            note = "cut" if sighting.cut else "occluded" if hidden else ""
+            gone = lost or (bool(note) and self._underground(sighting.label, (x, y, z)))
+            found[sighting.label] = None if gone else _detection(sighting, (x, y, z), note)
+        return found
+
+    def _underground(self, label: str, position_m: Vec3) -> bool:
+        """Whether the object would reach below the floor: then what is seen is part of another, larger thing of its
+        colour."""
+        x, y, z = position_m
+        bottom_m = z - self._catalogue[label].size_m[2] / 2
         return bottom_m < -UNDER_FLOOR_M - UNDER_FLOOR_PER_M * hypot(x, y)
 
-    def _place(self, sighting: ImageSighting, camera: Camera, pose: FloatArray | None) -> _Placed:
-        position: Vec3 | None = None
-        fit: _ShapeFit | None = None
-        note = ""
-        if sighting.depth_m is None:
-            note = "no depth"
-        elif pose is None:
-            note = "no head angles"
-        else:
-            known = self._catalogue[sighting.label]
-            misfit = 0.0
-            centre = first_guess(known, camera.ray(sighting.u_px, sighting.v_px) * sighting.depth_m, pose)
-            evidence = sighting.evidence
-            if evidence is not None and len(evidence.surface_m) >= MIN_SURFACE_POINTS:
-                centre, misfit = fit_centre(known, evidence, pose, centre)
-            position = float(centre[0]), float(centre[1]), float(centre[2])
-            most_px = expected_area_px(known, centre, camera, pose)
-            least_px = counted_px(most_px)
-            if evidence is not None:
-                whole = not (sighting.cut or sighting.hidden)
-                size_misfit = _size_misfit(sighting.area_px, least_px, most_px) if whole else 0.0
-                fit = _ShapeFit(misfit, size_misfit, evidence.count)
-            occluded = sighting.area_px < self._occluded_share * least_px
-            note = "cut" if sighting.cut else "occluded" if occluded else ""
-        detection = Detection(
-            label=sighting.label,
-            u_px=sighting.u_px,
-            v_px=sighting.v_px,
-            area_px=sighting.area_px,
-            box_px=sighting.box_px,
-            depth_m=sighting.depth_m,
-            position_m=position,
-            note=note,
-        )
-        return _Placed(detection, fit)
+
+def _detection(sighting: ImageSighting, position_m: Vec3 | None, note: str) -> Detection:
+    return Detection(
+        label=sighting.label,
+        u_px=sighting.u_px,
+        v_px=sighting.v_px,
+        area_px=sighting.area_px,
+        box_px=sighting.box_px,
+        depth_m=sighting.depth_m,
+        position_m=position_m,
+        note=note,
+    )
 
 
-class _ShapeFit(NamedTuple):
-    misfit: float
-    """Mean misfit per piece of evidence: half the squared residual over its standard deviation, by Huber's loss."""
-    size_misfit: float
-    """As `misfit`, for the pixel count."""
-    pieces: int
+def _displaced(
+    sightings: Sequence[ImageSighting], misfit: FloatArray, size_misfit: FloatArray, pieces: FloatArray
+) -> list[bool]:
+    """For each sighting whether another one with evidence shows the same place and fits better, by the mean misfit per
+    piece of evidence (n,) (half the squared residual over its standard deviation, by Huber's loss), that of the pixel
+    count (n,), and the number of pieces (n,)."""
+    boxes = np.array([sighting.box_px for sighting in sightings], dtype=np.float64)
+    low, high = boxes[:, None, :2], boxes[:, None, 2:]
+    common = np.maximum(np.minimum(high, boxes[:, 2:]) - np.maximum(low, boxes[:, :2]), 0.0).prod(axis=2)
+    areas = (boxes[:, 2:] - boxes[:, :2]).prod(axis=1)
+    together = common >= SAME_PLACE * (areas[:, None] + areas - common)
+    lost = [False] * len(sightings)
+    for one, other in np.argwhere(np.triu(together, 1)).tolist():
+        if pieces[one] and pieces[other]:
+            fewer = min(pieces[one], pieces[other])
+            left, right = (misfit[i] * fewer + size_misfit[i] for i in (one, other))
+            lost[one] |= bool(right < left)
+            lost[other] |= bool(left < right)
+    return lost
 
 
-class _Placed(NamedTuple):
-    detection: Detection
-    fit: _ShapeFit | None
-    """None when no shape was fitted."""
+def first_guesses(shapes: Shapes, surface_m: FloatArray, pose: FloatArray) -> FloatArray:
+    """First estimates of the objects' centres in the body frame, m, shape (n, 3).
 
-    def displaces(self, other: _Placed) -> bool:
-        """Whether this is another object in the same place that fits better."""
-        if self is other or self.fit is None or other.fit is None:
-            return False
-        if _overlap(self.detection.box_px, other.detection.box_px) < SAME_PLACE:
-            return False
-        pieces = min(self.fit.pieces, other.fit.pieces)
-        own, others = (fit.misfit * pieces + fit.size_misfit for fit in (self.fit, other.fit))
-        return own < others
-
-
-def _size_misfit(area_px: float, least_px: float, most_px: float) -> float:
-    return 0.5 * (log(area_px / min(max(area_px, least_px), most_px)) / SIZE_DOUBT) ** 2
-
-
-def _overlap(a: PixelBox, b: PixelBox) -> float:
-    """Intersection over union."""
-    across, down = min(a[2], b[2]) - max(a[0], b[0]), min(a[3], b[3]) - max(a[1], b[1])
-    common = max(across, 0) * max(down, 0)
-    return common / ((a[2] - a[0]) * (a[3] - a[1]) + (b[2] - b[0]) * (b[3] - b[1]) - common)
-
-
-def first_guess(known: ObjectSpec, surface_m: FloatArray, pose: FloatArray) -> FloatArray:
-    """A first estimate of the object's centre in the body frame, m, shape (3,).
-
-    `surface_m` is a point on its visible surface in the camera's frame, m, shape (3,); `pose` the camera's pose in
-    the body frame, 4 x 4. The point is moved inwards by the radius: along the ray for a sphere, horizontally for
-    upright shapes.
+    `surface_m` is a point on the visible surface of each in the camera's frame, m, shape (n, 3); `pose` the camera's
+    pose in the body frame, 4 x 4. The point is moved inwards by the radius: along the ray for a sphere, horizontally
+    for upright shapes.
     """
-    point: FloatArray = pose[:3, :3] @ surface_m + pose[:3, 3]
-    inwards: FloatArray = point - pose[:3, 3]
-    if known.shape != "sphere":
-        inwards = inwards * np.array([1.0, 1.0, 0.0])
-    return point + inwards * (known.planar_radius_m / max(float(np.linalg.norm(inwards)), 1e-9))
+    inwards = surface_m @ pose[:3, :3].T
+    points: FloatArray = inwards + pose[:3, 3]
+    inwards[:, 2] *= shapes.sphere
+    length = np.maximum(np.sqrt((inwards * inwards).sum(axis=1)), 1e-9)
+    points += inwards * (shapes.radius_m / length)[:, None]
+    return points
 
 
-def fit_centre(known: ObjectSpec, evidence: Evidence, pose: FloatArray, start: FloatArray) -> tuple[FloatArray, float]:
-    """The centre of the upright shape that fits the evidence best, body frame, m, shape (3,), and its mean misfit.
-
-    `pose` is the camera's pose in the body frame, 4 x 4; `start` the first guess, m, shape (3,). Gauss-Newton on
-    signed distances with Huber weights. Residuals: a surface point's distance from the shape, over its depth's
-    standard deviation; the distance by which a ray of the outline misses the shape; the depth by which a free ray
-    beside it enters the shape. The latter two are one-sided. Derived.
-    """
-    rotation, origin = pose[:3, :3], pose[:3, 3]
-    guess = start - origin  # relative to the camera from here on, in the body's directions
-    surface = evidence.surface_m @ rotation.T
-    rays = _Rays(known, evidence, rotation, guess)
-    seen, met = len(surface), len(surface) + len(evidence.outline)
-    points = np.concatenate([surface, rays.directions])
-    ray_doubt = RAY_DOUBT_M + RAY_DOUBT_RAD * float(guess @ rotation[:, 2])
-    doubt = np.concatenate([depth_doubt_m(evidence.surface_m[:, 2]), np.full(len(points) - seen, ray_doubt)])
-    centre = guess
-    for _ in range(ITERATIONS):
-        points[seen:] = rays.nearest(centre)
-        distance, gradient = signed_distance(known, points - centre)
-        np.maximum(distance[seen:met], 0.0, out=distance[seen:met])
-        np.minimum(distance[met:], 0.0, out=distance[met:])
-        residual = distance / doubt
-        rows = gradient / -doubt[:, None]
-        size = np.abs(residual)
-        weight = HUBER / np.maximum(size, HUBER) * (residual != 0.0)
-        weighted = rows * weight[:, None]
-        move = np.linalg.solve(weighted.T @ rows + PRIOR, -weighted.T @ residual - PRIOR @ (centre - guess))
-        centre = centre + move
-        if float(np.abs(move).max()) < SETTLED_M:
-            break
-    misfit = float(np.where(size < HUBER, 0.5 * size**2, HUBER * (size - 0.5 * HUBER)).mean())
-    wandered_m = float(np.linalg.norm(centre - guess))
-    return (centre if wandered_m < 2 * reach_m(known) else guess) + origin, misfit
-
-
-class _Rays:
-    """The evidence's rays and the point of each that is nearest to the shape, relative to the camera, m.
-
-    Along a ray the distance from a convex shape is convex: after one coarse search, a fine search around the last
-    nearest point follows the centre as it moves.
-    """
-
-    def __init__(self, known: ObjectSpec, evidence: Evidence, rotation: FloatArray, guess: FloatArray) -> None:
-        self._known = known
-        self.directions: FloatArray = np.concatenate([evidence.outline, evidence.beside]) @ rotation.T
-        self._free_to = np.concatenate([np.full(len(evidence.outline), np.inf), evidence.free_to_m])[:, None]
-        self._every = np.arange(len(self.directions))
-        length2 = (self.directions * self.directions).sum(axis=1)
-        steps = np.linspace(-1.0, 1.0, RAY_SAMPLES) * (reach_m(known) / np.sqrt(length2))[:, None]
-        self._depth = self._nearest_depth((self.directions @ guess / length2)[:, None] + steps, guess)
-        self._fine_steps = steps * 1.5 / (RAY_SAMPLES - 1)
-
-    def nearest(self, centre: FloatArray) -> FloatArray:
-        """The point in each ray's free part that is nearest to the shape, or deepest in it, m, shape (n, 3). `centre`
-        has shape (3,)."""
-        self._depth = self._nearest_depth(self._depth[:, None] + self._fine_steps, centre)
-        return self._depth[:, None] * self.directions
-
-    def _nearest_depth(self, depths: FloatArray, centre: FloatArray) -> FloatArray:
-        depths = np.minimum(depths, self._free_to)
-        points = depths[:, :, None] * self.directions[:, None, :] - centre
-        nearest: FloatArray = depths[self._every, distance_from(self._known, points).argmin(axis=1)]
-        return nearest
-
-
-def expected_area_px(known: ObjectSpec, centre: FloatArray, camera: Camera, pose: FloatArray) -> float:
-    """Number of pixels that the whole object covers: the solid angle of its silhouette over that of a pixel. `centre`
-    is in the body frame, m, shape (3,); `pose` the camera's, 4 x 4."""
-    to_camera = pose[:3, 3] - centre
-    distance = float(np.linalg.norm(to_camera))
-    depth = float(-to_camera @ pose[:3, 2])
-    if distance < 1e-6 or depth < 1e-6:
-        return float("inf")
-    sine = abs(float(to_camera[2])) / distance
-    return seen_area_m2(known, sine) * camera.fx * camera.fy * distance / depth**3
+def expected_areas_px(shapes: Shapes, centres: FloatArray, camera: Camera, pose: FloatArray) -> FloatArray:
+    """Number of pixels that each whole object covers, (n,): the solid angle of its silhouette over that of a pixel.
+    `centres` are in the body frame, m, shape (n, 3); `pose` is the camera's, 4 x 4."""
+    to_camera = pose[:3, 3] - centres
+    distance = np.sqrt((to_camera * to_camera).sum(axis=1))
+    depth = -to_camera @ pose[:3, 2]
+    here = (distance < 1e-6) | (depth < 1e-6)
+    sine = np.abs(to_camera[:, 2]) / np.where(here, 1.0, distance)
+    solid = shapes.seen_area_m2(np.minimum(sine, 1.0)) * camera.fx * camera.fy * distance
+    areas: FloatArray = np.where(here, np.inf, solid / np.where(here, 1.0, depth) ** 3)
+    return areas

@@ -8,8 +8,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from cocoro.arrays import BoolArray, Float32Array, FloatArray, MaskArray
-from services.perception.image import Evidence, PixelBox, RgbdImage
+from cocoro.arrays import BoolArray, Float32Array, MaskArray
+from services.perception.image import PixelBox, RgbdImage
 
 MIN_DEPTH_PIXELS = 6
 MIN_DEPTH_SHARE = 0.4
@@ -23,9 +23,6 @@ UNKNOWN_WITHIN_M = 1.0
 """Shares of the outline beside something nearer, or beside no data, from which more of the object may be hidden. No
 data counts only beside regions within 1 m, where it may be the robot's own hand, too near to be measured; farther
 away it is beyond the sensor's range. An infrared shadow takes a smaller share."""
-MAX_SURFACE_POINTS = 140
-MAX_RAYS = 40
-
 _AROUND = np.ones((3, 3), dtype=np.uint8)
 
 
@@ -54,7 +51,7 @@ class ColourRegion:
     @staticmethod
     def margin_px(image: RgbdImage) -> int:
         """The margin around a region: the ring of `surroundings` and one pixel."""
-        return _ring_px(image) + 2
+        return ring_px(image) + 2
 
     @property
     def diagonal_px(self) -> float:
@@ -91,7 +88,7 @@ class ColourRegion:
     @cached_property
     def surroundings(self) -> BoolArray:
         """A ring outside of the outline, shape of `box`, beyond blended pixels and the pixel that cleaning removes."""
-        ring = 2 * _ring_px(self.image) + 1
+        ring = 2 * ring_px(self.image) + 1
         outer = cv2.dilate(self.mask, np.ones((ring, ring), dtype=np.uint8))
         inner = cv2.dilate(self.mask, _AROUND)
         return np.asarray(outer, dtype=np.bool_) & ~np.asarray(inner, dtype=np.bool_)
@@ -104,7 +101,7 @@ class ColourRegion:
         if total == 0:
             return True
         own = np.where((self.mask > 0) & np.isfinite(self.depth), self.depth, np.float32(0))
-        reach = 2 * _ring_px(self.image) + 3
+        reach = 2 * ring_px(self.image) + 3
         beside = np.asarray(cv2.dilate(own, np.ones((reach, reach), dtype=np.uint8)))
         known = np.isfinite(self.depth)
         step = NEARER_STEP_M + depth_doubt_m(beside)
@@ -123,34 +120,6 @@ class ColourRegion:
         return components(
             ((self.mask > 0) & smooth & (depth > 0)).astype(np.uint8), self.box[:2], self.image, self.area_px // 50
         )
-
-    def evidence(self, reach_m: float) -> Evidence | None:
-        """Evidence for fitting an object that reaches `reach_m` from its centre; None without depth."""
-        if self.depth_m is None:
-            return None
-        core = np.asarray(cv2.erode(self.mask, _AROUND))
-        inside = (core if np.count_nonzero(core) > self.area_px // 2 else self.mask) > 0
-        window_m = 1.5 * reach_m + depth_doubt_m(self.depth_m)
-        on_surface = inside & (np.abs(self.depth - np.float32(self.depth_m)) < window_m)
-        surface = self._rays(on_surface, MAX_SURFACE_POINTS)
-        around = self._rays(self.surroundings & np.isfinite(self.depth), MAX_RAYS)
-        free_to_m = around[:, 3] - 0.01 - depth_doubt_m(around[:, 3])
-        outline = self._rays((self.mask > 0) & (core == 0), MAX_RAYS)
-        return Evidence(surface[:, :3] * surface[:, 3:], outline[:, :3], around[:, :3], free_to_m)
-
-    def _rays(self, where: BoolArray, at_most: int) -> FloatArray:
-        """Directions with z = 1, and depth, m, of at most so many of the pixels in `where`; shape (n, 4)."""
-        camera = self.image.camera
-        rows, columns = np.nonzero(where)
-        if len(rows) > at_most:
-            some = np.arange(at_most) * len(rows) // at_most
-            rows, columns = rows[some], columns[some]
-        out = np.empty((len(rows), 4))
-        out[:, 0] = (columns + self.box[0] - camera.cx) / camera.fx
-        out[:, 1] = (rows + self.box[1] - camera.cy) / camera.fy
-        out[:, 2] = 1.0
-        out[:, 3] = self.depth[rows, columns]
-        return out
 
 
 def components(
@@ -174,5 +143,5 @@ def components(
     return found
 
 
-def _ring_px(image: RgbdImage) -> int:
+def ring_px(image: RgbdImage) -> int:
     return 3 if image.scale > 0.75 else 2

@@ -1,78 +1,110 @@
-"""Known shapes as signed distances, for fitting to points, and their expected size in the image."""
+"""Known shapes as signed distances, for fitting to points, and their expected size in the image.
+
+Shapes stand upright: cylinders, and spheres, which are cylinders without lids whose radius is measured in all
+directions. A box counts as the cylinder of equal base area and height, since its yaw is unknown.
+"""
 
 from __future__ import annotations
 
-from math import hypot, pi, sqrt
+from collections.abc import Sequence
+from math import pi
+from typing import Any
 
 import numpy as np
 
-from cocoro.arrays import FloatArray
+from cocoro.arrays import BoolArray, Float32Array, FloatArray
 from cocoro.objects import ObjectSpec
 
-
-def distance_from(known: ObjectSpec, offsets_m: FloatArray) -> FloatArray:
-    """Signed distance from the upright object's surface, m, negative inside, shape (...). `offsets_m` are points
-    relative to its centre, z up, shape (..., 3).
-
-    A box counts as the cylinder of equal base area and height, since its yaw is unknown.
-    """
-    squares = offsets_m * offsets_m
-    planar2 = squares[..., 0] + squares[..., 1]
-    if known.shape == "sphere":
-        from_centre: FloatArray = np.sqrt(planar2 + squares[..., 2])
-        return from_centre - known.planar_radius_m
-    beside = np.sqrt(planar2) - known.planar_radius_m
-    above = np.abs(offsets_m[..., 2]) - known.size_m[2] / 2
-    outside: FloatArray = np.sqrt(np.maximum(beside, 0.0) ** 2 + np.maximum(above, 0.0) ** 2)
-    return outside + np.minimum(np.maximum(beside, above), 0.0)
+NO_LID_M = 1e6
+"""Half height of a shape without a lid: more than any height."""
 
 
-def signed_distance(known: ObjectSpec, offsets_m: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """`distance_from` for points of shape (n, 3): distances, m, shape (n,), and their gradient, shape (n, 3)."""
-    if known.shape == "sphere":
-        length = np.sqrt((offsets_m * offsets_m).sum(axis=1))
-        return length - known.planar_radius_m, offsets_m / np.maximum(length, 1e-9)[:, None]
-    planar = np.sqrt(offsets_m[:, 0] ** 2 + offsets_m[:, 1] ** 2)
-    beside = planar - known.planar_radius_m
-    above = np.abs(offsets_m[:, 2]) - known.size_m[2] / 2
-    radial, vertical = np.maximum(beside, 0.0), np.maximum(above, 0.0)
-    outside = np.sqrt(radial * radial + vertical * vertical)
-    within = np.maximum(beside, above)
-    # Inside, the nearer one of side and lid counts.
-    deep = within <= 0.0
-    mantle = beside >= above
-    share = np.where(deep, 1.0, outside)
-    radial = np.where(deep, mantle, radial / share)
-    vertical = np.where(deep, ~mantle, vertical / share)
-    gradient = np.empty_like(offsets_m)
-    gradient[:, :2] = offsets_m[:, :2] * (radial / np.maximum(planar, 1e-9))[:, None]
-    gradient[:, 2] = np.copysign(vertical, offsets_m[:, 2])
-    return outside + np.minimum(within, 0.0), gradient
+class Shapes:
+    """The shapes of n objects; each attribute has the shape (n,)."""
+
+    def __init__(self, objects: Sequence[ObjectSpec]) -> None:
+        self.radius_m: FloatArray = np.array([known.planar_radius_m for known in objects])
+        """Radius of the shape seen from above."""
+        self.height_m: FloatArray = np.array([known.size_m[2] for known in objects])
+        self.sphere: BoolArray = np.array([known.shape == "sphere" for known in objects], dtype=np.bool_)
+        self.reach_m: FloatArray = np.where(self.sphere, self.radius_m, np.hypot(self.radius_m, self.height_m / 2))
+        """Radius of the circumscribed sphere."""
+        # For elevations from 0 to 60 degrees.
+        areas = np.array([self.seen_area_m2(sine) for sine in (0.0, 0.3, 0.5, 0.7, 0.866)])
+        self.least_m2: FloatArray = areas.min(axis=0)
+        """Smallest silhouette from usual elevations."""
+        self.greatest_m2: FloatArray = areas.max(axis=0)
+        """Largest silhouette from usual elevations."""
+
+    def __len__(self) -> int:
+        return len(self.radius_m)
+
+    def of(self, numbers: Any) -> Shapes:
+        """The shapes of the objects with these numbers (m,). For one number the attributes are numbers."""
+        some = Shapes.__new__(Shapes)
+        for name, values in vars(self).items():
+            setattr(some, name, values[numbers])
+        return some
+
+    def seen_area_m2(self, elevation_sine: Any) -> FloatArray:
+        """Area of each object's orthographic silhouette, m2, (n,), seen from `elevation_sine` (0 to 1) above the
+        horizontal, a number or of shape (n,)."""
+        level = np.sqrt(1.0 - elevation_sine**2)
+        base = pi * self.radius_m**2
+        side = 2 * self.radius_m * self.height_m * level
+        return np.where(self.sphere, base, side + base * elevation_sine)
 
 
-def reach_m(known: ObjectSpec) -> float:
-    """Radius of the circumscribed sphere, m."""
-    if known.shape == "sphere":
-        return known.planar_radius_m
-    return hypot(known.planar_radius_m, known.size_m[2] / 2)
+class Solids:
+    """The surfaces of n objects, to measure points against."""
+
+    def __init__(self, shapes: Shapes) -> None:
+        self._radius = shapes.radius_m.astype(np.float32)[:, None]
+        self._half = np.where(shapes.sphere, NO_LID_M, shapes.height_m / 2).astype(np.float32)[:, None]
+        self._across = np.ones((3, len(shapes), 1), dtype=np.float32)
+        self._across[2, :, 0] = shapes.sphere
+        """Directions in which the radius is measured."""
+
+    def of(self, chosen: BoolArray) -> Solids:
+        """The surfaces of some of the objects, (n,)."""
+        some = Solids.__new__(Solids)
+        some._radius, some._half, some._across = self._radius[chosen], self._half[chosen], self._across[:, chosen]
+        return some
+
+    def distance(self, offsets_m: Float32Array) -> Float32Array:
+        """Signed distances of points from the surfaces, m, negative inside, shape (n, k) or (s, n, k), by their offsets
+        from the centres, z up, m, shape (3, n, k) or (3, s, n, k)."""
+        across = offsets_m * (self._across if offsets_m.ndim == 3 else self._across[:, None])
+        across *= across
+        beside = np.sqrt(np.add.reduce(across, axis=0))
+        beside -= self._radius
+        above = np.abs(offsets_m[2])
+        above -= self._half
+        radial, vertical = np.maximum(beside, 0), np.maximum(above, 0)
+        distance: Float32Array = np.sqrt(radial * radial + vertical * vertical)
+        distance += np.minimum(np.maximum(beside, above), 0)
+        return distance
+
+    def gradient(self, offsets_m: Float32Array) -> tuple[Float32Array, Float32Array]:
+        """`distance` for offsets (3, n, k), and its gradient along x, y and z, shape (3, n, k)."""
+        along = offsets_m * self._across
+        planar = np.sqrt(np.add.reduce(along * along, axis=0))
+        beside = planar - self._radius
+        above = np.abs(offsets_m[2])
+        above -= self._half
+        # Outside, the distances from side and lid that are positive count; inside, the nearer one of both.
+        radial = beside * (beside >= np.minimum(above, 0))
+        vertical = above * (above > np.minimum(beside, 0))
+        length = np.sqrt(radial * radial + vertical * vertical)
+        length += np.float32(1e-12)
+        distance = np.copysign(length, np.maximum(beside, above))
+        radial /= distance * np.maximum(planar, np.float32(1e-9))
+        along *= radial
+        along[2] += np.copysign(vertical / distance, offsets_m[2])
+        return distance, along
 
 
-def seen_area_m2(known: ObjectSpec, elevation_sine: float) -> float:
-    """Area of the object's orthographic silhouette, m2, seen from `elevation_sine` (0 to 1) above the horizontal."""
-    radius = known.planar_radius_m
-    if known.shape == "sphere":
-        return pi * radius**2
-    level = sqrt(1.0 - elevation_sine**2)
-    return 2 * radius * known.size_m[2] * level + pi * radius**2 * elevation_sine
-
-
-def counted_px(area_px: float) -> float:
-    """Number of pixels that are found of an outline that encloses `area_px`: about half of those along the edge are
-    blended with the background or removed by cleaning. Measured on rendered frames."""
-    return area_px - min(2.0 * sqrt(area_px), 0.5 * area_px)
-
-
-def area_range_m2(known: ObjectSpec) -> tuple[float, float]:
-    """Smallest and largest silhouette, m2, for elevations from 0 to 60 degrees."""
-    areas = [seen_area_m2(known, sine) for sine in (0.0, 0.3, 0.5, 0.7, 0.866)]
-    return min(areas), max(areas)
+def counted_px(area_px: Any) -> Any:
+    """Number of pixels that are found of an outline that encloses `area_px`, for areas of any shape: about half of
+    those along the edge are blended with the background or removed by cleaning. Measured on rendered frames."""
+    return area_px - np.minimum(2.0 * np.sqrt(area_px), 0.5 * area_px)
