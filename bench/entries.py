@@ -42,6 +42,7 @@ class Entry(NamedTuple):
 
 ENTRIES: dict[str, Entry] = {
     "decoupling": Entry("decoupling", "suite"),
+    "fetch": Entry("fetch", "suite"),
     "pixel": Entry("pixel", "suite"),
     "baselines": Entry("baselines", "suite"),
     "learning": Entry("learning", "suite"),

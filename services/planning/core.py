@@ -85,7 +85,7 @@ class PlanningCore:
             self._estimator.take(sample.topic, sample.message, now_ns)
         self._estimator.localise(now_ns)
         self.learned.step(self._estimator.sightings_of(self._config.marker), now_ns)
-        dt_s = self.actuators.driver.hold_s = self._elapsed(now_ns)
+        dt_s = self._elapsed(now_ns)
         self._follow_intent(now_ns)
         missing, hand, body = self._estimator.missing(now_ns), self._estimator.hand, self._estimator.body()
         if missing or hand is None or body is None:

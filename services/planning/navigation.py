@@ -25,8 +25,6 @@ _BRAKING_SHARE = 0.6
 
 _COAST_S = 0.04
 """Time between a command and the pose that shows it."""
-_IN_ONE = 0.8
-"""Largest share of the rest of a drive that one command may cover."""
 
 
 @dataclass(frozen=True)
@@ -57,8 +55,6 @@ class Driver:
         self._separation_m = base.wheel_separation_m
         self._speed_mps = 0.0
         self._turn_radps = 0.0
-        self.hold_s = 0.0
-        """Time for which a command holds until the next."""
 
     def turn_with(self, separation_m: float | None) -> None:
         """Use a learned wheel distance; None is the nominal one."""
@@ -91,10 +87,8 @@ class Driver:
         if abs(ahead) <= config.distance_tolerance_m:
             speed = 0.0
         else:
-            # Slow enough to brake within the remaining distance, and not to pass the place before the next command.
+            # Slow enough to brake within the remaining distance.
             speed = sqrt(abs(ahead) * config.acceleration_mps2 / _BRAKING_SHARE)
-            if self.hold_s:
-                speed = min(speed, _IN_ONE * abs(ahead) / self.hold_s)
             speed = copysign(min(config.max_speed_mps, speed), ahead)
         if abs(heading) > config.turn_in_place_rad:
             speed = 0.0
@@ -103,9 +97,6 @@ class Driver:
         arc = 2.0 * speed * sin(heading) / max(abs(ahead), 0.15) if ahead > 0 else 0.0
         align = config.turn_gain_per_s * heading if abs(heading) > config.heading_tolerance_rad / 2 else 0.0
         turn = arc if abs(arc) > abs(align) else align
-        if self.hold_s:
-            most = _IN_ONE * abs(heading) / self.hold_s
-            turn = min(max(turn, -most), most)
         return speed, min(max(turn, -config.max_turn_radps), config.max_turn_radps)
 
     def preview(self, target_m: tuple[float, float], aim_m: tuple[float, float]) -> list[Pose2]:
