@@ -62,7 +62,8 @@ def test_it_never_looks_further_than_the_neck_turns(point: tuple[float, float, f
 
 def swept(pan: float) -> list[tuple[float, float]]:
     """The aims of a sweep, in order."""
-    sweep, aims = Sweep(CONFIG, pan), []
+    sweep = Sweep(CONFIG, pan)
+    aims: list[tuple[float, float]] = []
     for _ in range(100):
         if sweep.done:
             return aims

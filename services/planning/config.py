@@ -75,6 +75,9 @@ class SearchConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Least unseen floor for which the robot goes to another place."""
     least_foot_m2: Positive = 0.0075
     """Least unseen floor at the feet of walls for which it goes to another place, once all other floor was seen."""
+    max_speed_mps: Positive = 0.35
+    max_turn_radps: Positive = 0.9
+    """On the way: a camera that turns faster does not correct the body's pose."""
     drive_mps: Positive = 0.2
     turn_radps: Positive = 0.7
     look_s: Positive = 5.0

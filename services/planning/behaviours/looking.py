@@ -8,6 +8,7 @@ import numpy as np
 
 from cocoro.clock import NS
 from cocoro.frames import Pose2
+from cocoro.messages import BaseCommand
 from cocoro.messages.actions import Explore, Idle, Park, Search
 from services.planning.behaviours.base import Plan, Snapshot, planar_m
 from services.planning.behaviours.driving import BackOff
@@ -274,7 +275,7 @@ class Exploring:
             move = move._replace(speed_mps=0.0, turn_radps=0.0)
         if move.look_at is not None:
             head = snapshot.look_at(snapshot.body.inverse().apply((*move.look_at, 0.0)))
-        base = actuators.driver.command(move.speed_mps, move.turn_radps, snapshot.dt_s)
+        base = self._drive(snapshot, move.speed_mps, move.turn_radps)
         why = f"going where {self._view.gain_m2:.2f} m2 of unseen floor can be seen: {move.why}"
         plan = Plan(base, arm, why, head, distance_m=move.left_m)
         if move.blocked:
@@ -293,13 +294,20 @@ class Exploring:
     def _turn(self, snapshot: Snapshot, bearing_rad: float, head: tuple[float, float, float]) -> Plan:
         arm = snapshot.actuators.arm.park(snapshot.angles, snapshot.dt_s)
         turn = 1.8 * bearing_rad if snapshot.actuators.arm.parked(snapshot.angles) else 0.0
-        base = snapshot.actuators.driver.command(0.0, turn, snapshot.dt_s)
+        base = self._drive(snapshot, 0.0, turn)
         plan = Plan(
             base, arm, f"turning to look where the camera's mount hides the floor: {bearing_rad:+.2f} rad", head
         )
         if abs(bearing_rad) < self.AHEAD_RAD:
             plan.state = "done"
         return plan
+
+    @staticmethod
+    def _drive(snapshot: Snapshot, speed_mps: float, turn_radps: float) -> BaseCommand:
+        """A command on the same arc, slow enough that the scans on the way correct the body's pose."""
+        search = snapshot.actuators.config.search
+        excess = max(abs(speed_mps) / search.max_speed_mps, abs(turn_radps) / search.max_turn_radps, 1.0)
+        return snapshot.actuators.driver.command(speed_mps / excess, turn_radps / excess, snapshot.dt_s)
 
     def _in_view(self, snapshot: Snapshot) -> bool:
         target = snapshot.target(self._label)
