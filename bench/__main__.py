@@ -11,6 +11,7 @@ Exit code 1 when a figure does not keep its bound, a bench failed, or a ratio fe
 from __future__ import annotations
 
 import argparse
+import signal
 import subprocess
 import sys
 import time
@@ -18,11 +19,13 @@ from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from bench import entries, page, suite
 from bench.ended import leave_when_ended
 from bench.report import Report, Result, encode, said, this_machine
+from cocoro.errors import CocoroError
 
 WORDS: dict[str, Callable[[Sequence[str]], int]] = {
     "suite": suite.run_suite,
@@ -35,16 +38,17 @@ WORDS: dict[str, Callable[[Sequence[str]], int]] = {
 def show(result: Result) -> None:
     """Print a result as a person reads it."""
     console = Console(width=None if sys.stdout.isatty() else 140)
-    table = Table("figure", "median (middle 80%)", "samples", "bound", "", title=result.about, title_justify="left")
+    table = Table("figure", "median (middle 80%)", "samples", "bound", "", title_justify="left")
+    table.title = escape(result.about)
     for figure in result.figures:
         bounded = bool(figure.bound)
         verdict = "" if not bounded else "kept" if figure.kept else "[red]MISSED[/red]"
-        table.add_row(figure.name, said(figure), str(figure.count), figure.bound, verdict)
+        table.add_row(escape(figure.name), said(figure), str(figure.count), figure.bound, verdict)
     console.print(table)
     for shown in result.tables:
-        rows = Table(*shown.head, title=shown.title, title_justify="left")
+        rows = Table(*map(escape, shown.head), title=escape(shown.title), title_justify="left")
         for row in shown.rows:
-            rows.add_row(*row)
+            rows.add_row(*map(escape, row))
         console.print(rows)
     for note in result.notes:
         console.print(f"- {note}", markup=False)
@@ -73,7 +77,11 @@ def run(name: str, arguments: Sequence[str]) -> int:
     leave_when_ended()
     report = Report(lambda line: print(line, file=sys.stderr, flush=True))
     machine, begun_s = this_machine(), time.monotonic()
-    entry.load().measure(chosen, report)
+    try:
+        entry.load().measure(chosen, report)
+    except CocoroError as error:
+        print(f"{name}: {error}", file=sys.stderr)
+        return 1
     result = Result(
         bench=name,
         about=entry.about,
@@ -98,10 +106,13 @@ def run(name: str, arguments: Sequence[str]) -> int:
 def main() -> int:
     """The command."""
     word, *rest = sys.argv[1:] or [""]
-    if word in entries.ENTRIES:
-        return run(word, rest)
-    if word in WORDS:
-        return WORDS[word](rest)
+    try:
+        if word in entries.ENTRIES:
+            return run(word, rest)
+        if word in WORDS:
+            return WORDS[word](rest)
+    except KeyboardInterrupt:
+        return 128 + signal.SIGINT
     print(__doc__)
     for kind, title in (("suite", "Run by `make bench`:"), ("trial", "Trials, with options of their own:")):
         print(title)

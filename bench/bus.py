@@ -1,8 +1,9 @@
-"""Measures the mesh: latencies, the CPU share of a camera's stream, and the time to join.
+"""Measures the mesh over Unix sockets, tcp and routers: latencies, the CPU share of a camera, and the time to join.
 
     python bench/bus.py [--pings N] [--seconds S]
 
-The figures depend on this machine and its load; compare within the table. Each ratio is to the first row.
+`python -m bench mesh` compares the way that a robot uses with other middleware. The figures depend on this machine and
+its load; compare within the table. Each ratio is to the first row.
 """
 
 from __future__ import annotations

@@ -1,6 +1,4 @@
-"""Tries every command that takes a capture on damaged captures.
-
-    python bench/capture_damage.py [--times 1000]
+"""Tries every command that takes a capture on damaged captures: `python -m bench capture-damage [--times 1000]`.
 
 Damages a second of a rehearsed fetch at random, repeatedly, and has each command read it. None may hang, fail
 without an explanation, or find a message that was not recorded.
@@ -22,14 +20,28 @@ from apps.captures.rewrite import rewrite
 from apps.cli.main import main as cocoro
 from apps.rehearsal.rehearse import rehearse
 from apps.rehearsal.request import RehearsalRequest
+from bench.report import Report, Table
+from bench.trials import Runs, number_of, sized
 from cocoro.capture.conventions import CaptureError
 from cocoro.clock import NS
 from services.capture.packing import Packer
 from services.executive.tasks import FetchTask
 
+HANGS_S = 60.0
+"""A command that takes longer hangs."""
 
-def damage(folder: Path, times: int) -> None:
-    """Run each command on damaged captures and print the results."""
+
+def options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--times", type=number_of, help="damages (1000)")
+
+
+def measure(chosen: argparse.Namespace, report: Report) -> None:
+    with tempfile.TemporaryDirectory(prefix="cocoro-") as folder:
+        _damage(Path(folder), sized(chosen, chosen.times, 1000, 3), report)
+
+
+def _damage(folder: Path, times: int, report: Report) -> None:
+    """Run each command on damaged captures."""
     second, spoilt = folder / "second.mcap", folder / "spoilt.mcap"
     request = RehearsalRequest(
         task=FetchTask(label="red_can"), width=160, height=120, frame_rate_hz=10.0, record=str(folder / "whole.mcap")
@@ -41,7 +53,7 @@ def damage(folder: Path, times: int) -> None:
         recorded = {_fingerprint(each) for each in capture.messages()}
     data, draw = second.read_bytes(), random.Random(times)
     counts: dict[tuple[str, int], int] = defaultdict(int)
-    slowest_s = 0.0
+    runs, slowest_s = Runs(report), 0.0
     for number in range(times):
         spoilt.write_bytes(_spoilt(data, draw))
         commands = [
@@ -52,23 +64,26 @@ def damage(folder: Path, times: int) -> None:
             ["export", str(spoilt), "--csv", str(folder / "csv"), "--foxglove", str(folder / f"{number}-fox.mcap")],
             ["export", str(spoilt), "--video", str(folder / f"{number}.mp4")],
         ]
+        wrong = []
         for command in commands:
             said, started = io.StringIO(), time.monotonic()
             with redirect_stdout(said), redirect_stderr(said):
                 code = cocoro(command)
             slowest_s = max(slowest_s, time.monotonic() - started)
-            assert code in (0, 1), (number, command, code)
-            assert "Traceback" not in said.getvalue(), (number, command, said.getvalue())
+            if code not in (0, 1) or "Traceback" in said.getvalue():
+                wrong.append(f"{' '.join(command)}: exit code {code}: {said.getvalue()}")
             counts[" ".join(word for word in command if "/" not in word), code] += 1
         with suppress(CaptureError), Capture.open(spoilt) as capture:
             found = [_fingerprint(each) for each in capture.messages()]
-            assert set(found) <= recorded, number
-            assert len(found) == len(set(found)), number
+            if not set(found) <= recorded or len(found) != len(set(found)):
+                wrong.append("a message was read that was not recorded, or twice")
         for made in folder.glob(f"{number}*"):
             made.unlink()
-    print(f"{times} damages; nothing but words, nothing that was not recorded; the slowest command {slowest_s:.1f} s")
-    for (command_words, code), count in sorted(counts.items()):
-        print(f"  {command_words}: exit code {code}, {count} times")
+        runs.add(not wrong, f"damage {number}", wrong)
+    runs.share("every command ended in words, and nothing was found that was not recorded")
+    report.value("the slowest command", [slowest_s], "s", at_most=HANGS_S)
+    rows = [[words, str(code), str(count)] for (words, code), count in sorted(counts.items())]
+    report.tables.append(Table("Ends of the commands", ["command", "exit code", "times"], rows))
 
 
 def _fingerprint(record: Record) -> tuple[str, int, int, int, int]:
@@ -92,15 +107,3 @@ def _spoilt(whole: bytes, draw: random.Random) -> bytes:
     else:
         data[at:at] = draw.randbytes(length)
     return bytes(data)
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--times", type=int, default=1000)
-    options = parser.parse_args()
-    with tempfile.TemporaryDirectory(prefix="cocoro-") as folder:
-        damage(Path(folder), options.times)
-
-
-if __name__ == "__main__":
-    main()

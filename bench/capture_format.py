@@ -1,26 +1,26 @@
-"""Compares the speed of writing and reading captures with the mcap package's.
+"""Compares the speed of writing and reading captures with the `mcap` package's.
 
-    python bench/capture_format.py files [--seconds 5] [--times 5]
-    python bench/capture_format.py records [--times 5]
+    python -m bench capture-format [files] [records] [--seconds 4] [--times 5]
 
 `files`: both write the messages of a rehearsed fetch (30 frames of 1.54 MB and some 800 small messages a second)
 with zstd, each in its own way, and read the same files. `records`: each kind of record that is encoded or decoded
 here, and a frame that is joined with its head before compression or compressed piece by piece. The two take turns
-in one run. The figures are medians of this process's CPU time, reader threads included; a ratio is the package's
-time over that of the code here. Files are in memory (/dev/shm) where possible, so no disk is measured.
+in one run. The figures are this process's CPU time, reader threads included. Files are in memory (/dev/shm) where
+possible, so no disk is measured.
 """
 
 from __future__ import annotations
 
 import argparse
-import statistics
 import tempfile
 import time
 import tracemalloc
 import zlib
 from collections.abc import Callable
+from functools import partial
 from io import BytesIO
 from pathlib import Path
+from statistics import median
 
 import zstandard
 from mcap.data_stream import ReadDataStream
@@ -34,8 +34,11 @@ from apps.captures.contents import unpacked
 from apps.captures.reader import Capture
 from apps.rehearsal.rehearse import rehearse
 from apps.rehearsal.request import RehearsalRequest
+from bench.report import Report, Table, number, turns
+from bench.trials import number_of, one_of, sized
 from cocoro.capture import mcap
 from cocoro.clock import NS
+from cocoro.errors import CocoroError
 from services.capture import file, packing
 from services.capture.keys import QueuedMessage, info_of
 from services.capture.packing import QUICK, Packer
@@ -47,15 +50,39 @@ SMALL_BYTES = 64 * 1024
 MEMORY = Path("/dev/shm")
 
 
+PARTS = ("files", "records")
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "parts", nargs="*", type=one_of(PARTS), metavar="PART", help=f"{', '.join(PARTS)}; without one both"
+    )
+    parser.add_argument("--seconds", type=float, help="of the fetch (4)")
+    parser.add_argument("--times", type=number_of, help="turns (5)")
+
+
+def measure(chosen: argparse.Namespace, report: Report) -> None:
+    seconds, times = sized(chosen, chosen.seconds, 4.0, 1.2), sized(chosen, chosen.times, 5, 3)
+    kinds: tuple[Sensors, ...] = ("ideal", "real")
+    with tempfile.TemporaryDirectory(prefix="cocoro-", dir=MEMORY if MEMORY.is_dir() else None) as name:
+        folder = Path(name)
+        made = {sensors: recorded(folder, sensors, seconds) for sensors in kinds}
+        comparison = Comparison(report, times)
+        if "files" in (chosen.parts or PARTS):
+            files(folder, made, comparison, report)
+        if "records" in (chosen.parts or PARTS):
+            records(made, comparison, report)
+        report.tables.append(Table("CPU time, ms", ["what", "here", "by the package"], comparison.rows))
+
+
 def recorded(folder: Path, sensors: Sensors, seconds: float) -> list[QueuedMessage]:
-    """The first messages of a rehearsed fetch, in order."""
+    """The messages of the first seconds of a rehearsed fetch, in order."""
     path = folder / f"{sensors}.mcap"
-    rehearse(RehearsalRequest(task=FetchTask(label="red_can"), sensors=sensors, record=str(path)))
+    rehearse(RehearsalRequest(task=FetchTask(label="red_can"), sensors=sensors, timeout_s=seconds, record=str(path)))
     with Capture.open(path) as capture:
-        end_ns = capture.start_ns + round(seconds * NS)
         made = [
             QueuedMessage(one.key, one.sequence, one.log_ns, one.publish_ns, bytes(one.payload))
-            for one in capture.messages(end_ns=end_ns)
+            for one in capture.messages()
         ]
     path.unlink()
     return made
@@ -98,15 +125,35 @@ def read_by_package(path: Path) -> int:
         return sum(len(message.data) for _, _, message in make_reader(file, validate_crcs=True).iter_messages())
 
 
-def in_turn(times: int, **ways: Callable[[], object]) -> dict[str, float]:
-    """Median CPU time of each way, s, over so many turns."""
-    spent: dict[str, list[float]] = {name: [] for name in ways}
-    for _ in range(times):
-        for name, way in ways.items():
-            started = time.process_time()
-            way()
-            spent[name].append(time.process_time() - started)
-    return {name: statistics.median(all_s) for name, all_s in spent.items()}
+def _spent(action: Callable[[], object], repeat: int = 1) -> Callable[[], float]:
+    """A function that returns the CPU time of a call of `action`, ms: the mean of so many."""
+
+    def way() -> float:
+        begun_ns = time.process_time_ns()
+        for _ in range(repeat):
+            action()
+        return (time.process_time_ns() - begun_ns) / 1e6 / repeat
+
+    return way
+
+
+class Comparison:
+    """The two take turns, so many times. Ratios are figures, and the times are rows of a table."""
+
+    def __init__(self, report: Report, times: int) -> None:
+        self._report = report
+        self.times = times
+        self.rows: list[list[str]] = []
+
+    def tell(
+        self, name: str, here: Callable[[], object], package: Callable[[], object], repeat: int = 1, ratio: bool = True
+    ) -> None:
+        """Short actions are measured `repeat` times at once. Without `ratio` there is only the row: the ratio would
+        depend on how much is packed, and so on the form of the run."""
+        ours, theirs = turns(self.times, here=_spent(here, repeat), package=_spent(package, repeat))
+        if ratio:
+            self._report.ratio(f"{name}: the package / here", theirs, ours, better="more")
+        self.rows.append([name, number(median(ours)), number(median(theirs))])
 
 
 def peak_of_a_frame(folder: Path, frame: QueuedMessage) -> float:
@@ -127,19 +174,21 @@ def _of(frame: QueuedMessage) -> tuple[str, str, bytes]:
     return frame.key, "calliope", frame.payload
 
 
-def compare(folder: Path, seconds: float, times: int) -> None:
-    for sensors in ("ideal", "real"):
-        made = recorded(folder, sensors, seconds)
-        small = [one for one in made if len(one.payload) < SMALL_BYTES]
-        for name, some in (("frames and small messages", made), ("small messages alone", small)):
-            _compare(folder, f"{sensors} sensors, {name}", some, times)
-        frame = next(one for one in made if one.key.endswith("kinect/frame"))
-        print(f"one frame of {len(frame.payload) / 1e6:.2f} MB takes {peak_of_a_frame(folder, frame):.2f} MB more")
+def files(folder: Path, made: dict[Sensors, list[QueuedMessage]], comparison: Comparison, report: Report) -> None:
+    for sensors, messages in made.items():
+        small = [one for one in messages if len(one.payload) < SMALL_BYTES]
+        _compare(folder, f"{sensors} sensors, frames and small messages", messages, comparison)
+        _compare(folder, f"{sensors} sensors, small messages alone", small, comparison, repeat=5)
+        frame = next(one for one in messages if one.key.endswith("kinect/frame"))
+        report.value(
+            f"{sensors} sensors: memory to write a frame of {len(frame.payload) / 1e6:.2f} MB",
+            [peak_of_a_frame(folder, frame)], "MB",
+        )  # fmt: skip
         (folder / "peak.mcap").unlink()
 
 
-def _compare(folder: Path, name: str, made: list[QueuedMessage], times: int) -> None:
-    out, paths = folder / "out.mcap", [folder / "here.mcap", folder / "package.mcap"]
+def _compare(folder: Path, name: str, made: list[QueuedMessage], comparison: Comparison, repeat: int = 1) -> None:
+    out, paths = folder / "out.mcap", {"a file of ours": folder / "here.mcap", "one of its": folder / "package.mcap"}
 
     def into_a_new_file(write: Callable[[list[QueuedMessage], Path], None]) -> Callable[[], None]:
         def way() -> None:
@@ -148,25 +197,17 @@ def _compare(folder: Path, name: str, made: list[QueuedMessage], times: int) -> 
 
         return way
 
-    spent = in_turn(times, here=into_a_new_file(write_here), package=into_a_new_file(write_by_package))
-    print(f"{name}: {len(made)} messages, {sum(len(one.payload) for one in made) / 1e6:.0f} MB")
-    print(f"  written here {spent['here']:.3f} s, by the package {spent['package']:.3f} s: {_ratio(spent):.1f} times")
-    write_here(made, paths[0])
-    write_by_package(made, paths[1])
-    for path in paths:
-        assert read_here(path) == read_by_package(path)
-        spent = in_turn(times, here=lambda p=path: read_here(p), package=lambda p=path: read_by_package(p))  # type: ignore[misc]
-        size = f"{path.name}, {path.stat().st_size / 1e6:.1f} MB"
-        print(f"  {size}: read here {spent['here']:.3f} s, by the package {spent['package']:.3f} s: ", end="")
-        print(f"{_ratio(spent):.1f} times")
+    comparison.tell(f"{name}, written", into_a_new_file(write_here), into_a_new_file(write_by_package), repeat)
+    write_here(made, paths["a file of ours"])
+    write_by_package(made, paths["one of its"])
+    for whose, path in paths.items():
+        if read_here(path) != read_by_package(path):
+            raise CocoroError(f"{name}: {whose}: the two read different messages")
+        comparison.tell(f"{name}, {whose} read", partial(read_here, path), partial(read_by_package, path), repeat)
         path.unlink()
 
 
-def _ratio(spent: dict[str, float]) -> float:
-    return spent["package"] / spent["here"]
-
-
-def records(folder: Path, times: int) -> None:
+def records(made: dict[Sensors, list[QueuedMessage]], comparison: Comparison, report: Report) -> None:
     payload, count, places = bytes(220), 1000, list(range(40))
 
     def write_messages() -> bytes:
@@ -181,23 +222,26 @@ def records(folder: Path, times: int) -> None:
     small = Chunk("", raw, 0, 0, 0, len(raw))
     some = list(zip(places[::2], places[1::2], strict=True))
     assert file.message_index(3, places) == file.packed(MessageIndex(3, some))
-    _tell(f"{count} messages of {len(payload)} bytes, written", times, write_messages, write_messages_by_package)
-    _tell(
-        "the same, read", times,
+    name = f"{count} messages of {len(payload)} bytes"
+    comparison.tell(f"{name}, written", write_messages, write_messages_by_package, 20)
+    comparison.tell(
+        f"{name}, read",
         lambda: [mcap.message(content) for _, content, _ in mcap.records(raw)],
         lambda: breakup_chunk(small),
-    )  # fmt: skip
-    _tell(
-        f"{count} indices of {len(some)} messages, written", times,
+        20,
+    )
+    comparison.tell(
+        f"{count} indices of {len(some)} messages, written",
         lambda: [file.message_index(3, places) for _ in range(count)],
         lambda: [file.packed(MessageIndex(3, some)) for _ in range(count)],
-    )  # fmt: skip
-    for sensors in ("ideal", "real"):
-        frames = [one.payload for one in recorded(folder, sensors, 3.0) if one.key.endswith("kinect/frame")][::4]
-        _frames(f"{len(frames)} frames, {sensors} sensors", frames, times)
+        5,
+    )
+    for sensors, messages in made.items():
+        frames = [one.payload for one in messages if one.key.endswith("kinect/frame")][::4]
+        _frames(f"frames, {sensors} sensors", frames, comparison, report)
 
 
-def _frames(name: str, frames: list[bytes], times: int) -> None:
+def _frames(name: str, frames: list[bytes], comparison: Comparison, report: Report) -> None:
     head = bytes(mcap.MESSAGE_HEAD.size)
     raws = [head + frame for frame in frames]
     packer = zstandard.ZstdCompressor(compression_params=QUICK)
@@ -212,7 +256,7 @@ def _frames(name: str, frames: list[bytes], times: int) -> None:
         for data, size, crc in packed:
             file.packed(Chunk("zstd", data, 0, 0, crc, size))
 
-    _tell(f"{name}, packed: chunk records made", times, write, write_by_package)
+    comparison.tell(f"{name}, packed, chunk records made", write, write_by_package, 200, ratio=False)
 
     def read() -> None:
         for content in contents:
@@ -222,7 +266,7 @@ def _frames(name: str, frames: list[bytes], times: int) -> None:
         for content in contents:
             breakup_chunk(Chunk.read(ReadDataStream(BytesIO(content))), validate_crc=True)
 
-    _tell(f"{name}: chunk records read", times, read, read_by_package)
+    comparison.tell(f"{name}, chunk records read", read, read_by_package)
 
     def joined() -> None:
         for frame in frames:
@@ -236,29 +280,6 @@ def _frames(name: str, frames: list[bytes], times: int) -> None:
             stream = packer.compressobj(size=len(head) + len(frame))
             _ = [stream.compress(head), stream.compress(frame), stream.flush()]
 
-    spent = in_turn(times, here=joined, pieces=in_pieces)
-    print(f"{name}: joined and packed {1e3 * spent['here'] / len(frames):.2f} ms each, ", end="")
-    print(f"packed in pieces {1e3 * spent['pieces'] / len(frames):.2f} ms")
-
-
-def _tell(name: str, times: int, here: Callable[[], object], package: Callable[[], object]) -> None:
-    spent = in_turn(times, here=here, package=package)
-    print(f"{name}: here {1e3 * spent['here']:.2f} ms, by the package {1e3 * spent['package']:.2f} ms: ", end="")
-    print(f"{_ratio(spent):.1f} times")
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("files", "records"))
-    parser.add_argument("--seconds", type=float, default=5.0)
-    parser.add_argument("--times", type=int, default=5)
-    options = parser.parse_args()
-    with tempfile.TemporaryDirectory(prefix="cocoro-", dir=MEMORY if MEMORY.is_dir() else None) as folder:
-        if options.what == "records":
-            records(Path(folder), options.times)
-        else:
-            compare(Path(folder), options.seconds, options.times)
-
-
-if __name__ == "__main__":
-    main()
+    together, apart = turns(comparison.times, joined=_spent(joined), pieces=_spent(in_pieces))
+    report.value(f"{name}: joined and packed, each", [each / len(frames) for each in together], "ms")
+    report.ratio(f"{name}: packed in pieces / joined and packed", apart, together, better="more")

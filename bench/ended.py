@@ -7,8 +7,6 @@ terminal would end the process at once instead.
 from __future__ import annotations
 
 import signal
-import subprocess
-import sys
 from contextlib import suppress
 from types import FrameType
 
@@ -32,13 +30,3 @@ def _leave(number: int, _frame: FrameType | None) -> None:
         with suppress(psutil.Error):
             child.send_signal(signal.SIGINT)  # somebody may wait for it
     raise SystemExit(128 + number)
-
-
-def cocoro(*words: str) -> None:
-    """Run a command of the command line. Raises CalledProcessError for one that fails. Unlike `subprocess.run` it never
-    kills the command, which may be about to start a robot."""
-    command = [sys.executable, "-m", "apps.cli.main", *words]
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
-        code = process.wait()
-    if code:
-        raise subprocess.CalledProcessError(code, command)

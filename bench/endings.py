@@ -1,12 +1,12 @@
-"""Endings of a task's command, over real processes: `python -m bench.endings [--count 60] [--seed 0] [--only KIND]`
+"""Judges endings of a task's command, over real processes: `python -m bench endings [--count 60] [--only KIND]`.
 
 Each case starts `cocoro fetch LABEL --bring` (or `babble`) on a simulated robot, waits for a phase of the task, and
 ends the command, or lets go of it, in one of the ways of `KINDS` (bench/command_endings.py). It then judges by the
 simulator's truth when the robot came to rest, in simulated seconds from the last physics step before the ending (240 Hz
 for the body, 30 Hz for the joints); that the task was cancelled; and that the next task is accepted.
 
-Case N is the same for the same seed, so a bench in parts (`--from 20 --count 20`) is the same bench. Exit code 1 when a
-case missed the bound.
+Case N is the same for the same seed, so a bench in parts (`--from 20 --count 20`) is the same bench. Each case must
+keep the bound.
 """
 
 from __future__ import annotations
@@ -14,8 +14,6 @@ from __future__ import annotations
 import argparse
 import asyncio
 import random
-import statistics
-import sys
 import tempfile
 import time
 from collections.abc import AsyncIterator, Callable, Mapping
@@ -24,8 +22,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from bench.command_endings import ENDS, KINDS, Command
-from bench.ended import leave_when_ended
 from bench.live import NAME, Operator, operator
+from bench.report import Report
+from bench.trials import Runs, number_of, sized
 from cocoro import topics
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.clock import NS, FollowedClock
@@ -245,10 +244,33 @@ async def _judge_task(robot: Watched, verdict: Verdict, before: str, command: Co
         verdict.faults.append(f"the next task is refused: {following.text}")
 
 
-async def bench(first: int, count: int, seed: int, only: str, phase: str) -> bool:
-    verdicts: list[Verdict] = []
-    cases = [case(number, seed) for number in range(first, first + count)]
-    cases = [one for one in cases if only in one.kind and phase in one.phase]
+# --- the bench ------------------------------------------------------------------------------------
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--count", type=number_of, help="cases (60)")
+    parser.add_argument("--from", dest="first", type=int, default=0, help="the number of the first case")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", default="", metavar="KIND", help=f"one of: {', '.join(KINDS)}")
+    parser.add_argument("--phase", default="", metavar="PHASE", help=f"one of: {', '.join(PHASES)}")
+
+
+def measure(chosen: argparse.Namespace, report: Report) -> None:
+    numbers = range(chosen.first, chosen.first + sized(chosen, chosen.count, 60, 1))
+    cases = [case(number, chosen.seed) for number in numbers]
+    cases = [one for one in cases if chosen.only in one.kind and chosen.phase in one.phase]
+    runs, verdicts = Runs(report), list[Verdict]()
+    if cases:
+        asyncio.run(_judge_all(cases, verdicts, runs, report))
+    runs.share("ended well")
+    rest_s = [max(verdict.body_s, verdict.joints_s, verdict.claws_s) for verdict in verdicts]
+    report.value("at rest after", rest_s, "s")
+    report.value("at rest after, the longest", [max(rest_s)], "s", at_most=BOUND_S)
+    report.value("the body at rest after, the longest", [max(verdict.body_s for verdict in verdicts)], "s")
+    report.value("the same by the machine's clock", [max(verdict.real_s for verdict in verdicts)], "s")
+
+
+async def _judge_all(cases: list[Case], verdicts: list[Verdict], runs: Runs, report: Report) -> None:
     with tempfile.TemporaryDirectory(prefix="endings") as name:
         async with robot_up(Path(name)) as robot:
             await robot.until(lambda: bool(robot.truths))
@@ -256,48 +278,16 @@ async def bench(first: int, count: int, seed: int, only: str, phase: str) -> boo
                 for _ in range(4):
                     robot.truths.clear()
                     if (verdict := await judge(robot, one, Path(name))) is not None:
+                        verdicts.append(verdict)
+                        runs.add(not verdict.faults, _line(verdict))
                         break
                     await robot.until(lambda: robot.state.outcome is not None)
                     await robot.do(PutDownTask() if robot.holding else ParkTask())
                 else:
-                    print(f"  {one.number:3d}: {one.phase} was not reached, which is no case", flush=True)
-                    continue
-                verdicts.append(verdict)
-                print(f"  {_line(verdict)}", flush=True)
-    return _summary(verdicts)
+                    report.notes.append(f"case {one.number}: {one.phase} was not reached, which is no case")
 
 
 def _line(verdict: Verdict) -> str:
     one, holds = verdict.case, " (hold)" if verdict.held else ""
     times = f"body {verdict.body_s:.3f} s, joints {verdict.joints_s:.3f} s, claws {verdict.claws_s:.3f} s{holds}"
     return f"{one.number:3d}: {one.kind:27s} {one.phase:10s} {times}; code {verdict.code} {'; '.join(verdict.faults)}"
-
-
-def _summary(verdicts: list[Verdict]) -> bool:
-    if not verdicts:
-        return False
-    rest = sorted(max(verdict.body_s, verdict.joints_s, verdict.claws_s) for verdict in verdicts)
-    good = sum(not verdict.faults for verdict in verdicts)
-    print(
-        f"{good} of {len(verdicts)}: at rest after {statistics.median(rest):.3f} s (median), {rest[-1]:.3f} s"
-        f" (longest); the body {max(verdict.body_s for verdict in verdicts):.3f} s, by the machine's clock"
-        f" {max(verdict.real_s for verdict in verdicts):.3f} s"
-    )
-    return good == len(verdicts)
-
-
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--count", type=int, default=60)
-    parser.add_argument("--from", dest="first", type=int, default=0)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--only", default="", metavar="KIND", help=f"one of: {', '.join(KINDS)}")
-    parser.add_argument("--phase", default="", metavar="PHASE", help=f"one of: {', '.join(PHASES)}")
-    arguments = parser.parse_args()
-    leave_when_ended()
-    well = asyncio.run(bench(arguments.first, arguments.count, arguments.seed, arguments.only, arguments.phase))
-    return 0 if well else 1
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -42,9 +42,38 @@ class Entry(NamedTuple):
 
 ENTRIES: dict[str, Entry] = {
     "decoupling": Entry("decoupling", "suite"),
+<<<<<<< HEAD
     "fetch": Entry("fetch", "suite"),
+=======
+    "mesh": Entry("mesh", "suite"),
+>>>>>>> main
     "pixel": Entry("pixel", "suite"),
+    "startup": Entry("startup", "suite"),
+    "tests": Entry("own_tests", "suite"),
     "baselines": Entry("baselines", "suite"),
     "learning": Entry("learning", "suite"),
     "perception": Entry("perception", "suite"),
+    "simulator": Entry("simulator", "suite"),
+    "capture": Entry("capture", "suite"),
+    "capture-format": Entry("capture_format", "suite"),
+    "live": Entry("live", "suite"),
+    "alarms": Entry("alarms"),
+    "capture-damage": Entry("capture_damage"),
+    "endings": Entry("endings"),
+    "exports": Entry("exports"),
+    "faults": Entry("faults"),
+    "faults-live": Entry("faults_live"),
+    "fuzz": Entry("fuzz"),
+    "hardware-faults": Entry("hardware_faults"),
+    "idle": Entry("idle"),
+    "installs": Entry("installs"),
+    "pursuit": Entry("pursuit"),
+    "readme": Entry("readme"),
+    "rehearsals": Entry("rehearsals"),
+    "rooms": Entry("rooms"),
+    "servos": Entry("servos"),
+    "starved": Entry("starved"),
+    "stop": Entry("stop"),
+    "stop-restarts": Entry("stop_restarts"),
+    "viewer": Entry("viewer"),
 }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import random
+from collections.abc import Sequence
 from contextlib import AsyncExitStack, suppress
 from pathlib import Path
 from types import TracebackType
@@ -13,6 +14,7 @@ import msgspec
 
 from bench.fault_bus import LATE_S, FaultyBus, Way
 from bench.fault_scenes import Errand
+from bench.report import Report
 from cocoro import topics
 from cocoro.bus.base import Payload, Qos
 from cocoro.bus.local import LocalMesh
@@ -28,6 +30,8 @@ from sim.motion import MotionRow, read_motion
 
 SERVICES = ("sim", "perception", "planning", "executive")
 STANDING_MPS = 0.01
+STAND_S = 0.3
+"""Bound from a fault until the body stands for good."""
 PATIENCE_S = 25.0
 """Time limit to reach full speed."""
 ARRIVED = ("reach", "end")
@@ -196,3 +200,14 @@ class FaultRobot:
             bad = rng.choice((b"", good, good[: rng.randrange(len(good))], rng.randbytes(rng.randrange(1, 60))))
             self._mesh.publish(key, bad)
             await asyncio.sleep(0.001)
+
+
+def report_stands(report: Report, times_s: Sequence[float]) -> None:
+    """The figures of times from a fault until the body stood for good, s. In each trial that must be within `STAND_S`.
+    Raises CocoroError without times."""
+    if not times_s:
+        raise CocoroError("no trial came about")
+    report.value("time to stand", times_s, "s")
+    report.value("longest time to stand", [max(times_s)], "s", at_most=STAND_S)
+    good = sum(time_s <= STAND_S for time_s in times_s)
+    report.share(f"stood within {STAND_S:g} s", good, len(times_s), at_least=len(times_s))

@@ -1,29 +1,28 @@
-"""Faults and false alarms of a live robot: processes on zenoh in real time, judged at every physics step.
+"""Measures the time to stand of processes in real time: `python -m bench faults-live [--count 6]`.
 
-`live`: each trial starts a robot (profile `sim`, real sensors), lets it drive at full speed, and kills or stops one of
-its processes. `alarms`: nothing is killed. It counts how often a robot that fetches and follows is slowed or stopped by
-a service's patience although all services live. Times are simulated; real times are printed beside them.
+Each trial starts a robot (profile `sim`, real sensors), lets it drive at full speed, and kills or stops one of its
+processes. It is judged at every physics step. Times are simulated; real times are beside them. In every trial the robot
+must stand within 0.3 s.
 """
 
 from __future__ import annotations
 
+import argparse
 import asyncio
 import random
 import signal
-import statistics
-import subprocess
-import sys
 import tempfile
 import time
-from collections import Counter
-from collections.abc import AsyncIterator, Iterator, Sequence
-from contextlib import ExitStack, asynccontextmanager, contextmanager
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from bench.fault_robot import STANDING_MPS, full_speed_mps
+from bench.fault_robot import STAND_S, STANDING_MPS, full_speed_mps, report_stands
 from bench.fault_scenes import DRIVES, Errand, draw_errand
 from bench.live import NAME, Operator, operator
+from bench.report import Report
+from bench.trials import number_of, sized
 from cocoro import topics
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.clock import NS, FollowedClock
@@ -32,7 +31,6 @@ from cocoro.messages import PlannerStatus, TaskReply, TaskRequest, TaskState
 from cocoro.node import Node
 from cocoro.robot import Robot
 from deploy.rundir import Target
-from services.executive.tasks import FetchTask, FollowTask
 from sim.motion import MotionRow, read_motion
 
 VICTIMS = {"sim": ("planning", "executive", "perception"), "sim-wire": ("base", "arm")}
@@ -74,7 +72,7 @@ class LiveRobot:
         self.whys.append(status.why)
 
     def read(self) -> MotionRow:
-        """Time of the newest physics step."""
+        """The newest physics step."""
         self.rows += read_motion(self._motion, len(self.rows))
         return self.rows[-1]
 
@@ -161,124 +159,27 @@ async def _trial(number: int, profile: str, rng: random.Random) -> LiveTrial:
     )  # fmt: skip
 
 
-def live(count: int, seed: int, profile: str, bound_s: float) -> bool:
-    """Print each trial and a summary; returns whether the robot stood in time in every trial."""
+def options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--count", type=number_of, help="faults, each with a robot that is started for it (6)")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--profile", choices=VICTIMS, default="sim", help="of the robot")
+
+
+def measure(chosen: argparse.Namespace, report: Report) -> None:
     trials: list[LiveTrial] = []
-    for number in range(count):
+    for number in range(sized(chosen, chosen.count, 6, 1)):
         try:
-            trial = asyncio.run(_trial(number, profile, random.Random(f"live/{seed}/{number}")))
+            trial = asyncio.run(_trial(number, chosen.profile, random.Random(f"live/{chosen.seed}/{number}")))
         except TimeoutError:
-            print(f"  {number}: never at full speed in time, which is no trial", flush=True)
+            report.notes.append(f"trial {number}: never at full speed in time, which is no trial")
             continue
         trials.append(trial)
-        print(
-            f"  {number}: {trial.what}, {trial.drive} at {trial.speed_mps:.3f} m/s: stands after {trial.stand_s:.3f} s"
-            f" ({trial.real_s:.3f} s of the machine's)", flush=True,
-        )  # fmt: skip
-    times = sorted(trial.stand_s for trial in trials)
-    if not times:
-        return False
-    print(
-        f"{len(times)} faults: median {statistics.median(times):.3f} s, worst {times[-1]:.3f} s,"
-        f" margin {bound_s - times[-1]:+.3f} s; by the machine's clock {max(t.real_s for t in trials):.3f} s at worst"
-    )
-    return times[-1] <= bound_s
-
-
-# --- false alarms ---------------------------------------------------------------------------------
-
-
-@dataclass
-class Alarms:
-    """The number of times that a service's patience ended although all services lived."""
-
-    task: str
-    seconds: float
-    driven: float
-    """Time in which the wheels turned."""
-    base: int
-    """Number of times that the base's deadman stopped turning wheels."""
-    deepest: float
-    """Greatest share of its speed that the robot lost by that."""
-    stood: int
-    """Number of times that it stood because of that."""
-    slower: int
-    """Number of times that the planner slowed down because of a late service."""
-    halted: Counter[str]
-    """Number of times that it commanded zero because of a silent service, by its stated reason."""
-    outcome: str = ""
-
-    def line(self) -> str:
-        halts = ", ".join(f"{count} x {why!r}" for why, count in self.halted.items()) or "none"
-        return (
-            f"{self.task:12s} {self.outcome:9s} {self.seconds:5.1f} s, {self.driven:5.1f} s of it driving:"
-            f" deadman {self.base} (deepest {self.deepest:.0%}, stood {self.stood}),"
-            f" planner slower {self.slower}, halts {halts}"
+        line = (
+            f"trial {number}, {trial.what}, {trial.drive} at {trial.speed_mps:.3f} m/s: stood after"
+            f" {trial.stand_s:.3f} s ({trial.real_s:.3f} s of the machine's)"
         )
-
-
-def _deadman(rows: Sequence[MotionRow]) -> tuple[int, float, int]:
-    """Number of events, the greatest share of speed lost, and the number that ended in standing."""
-    events, deepest, stood = 0, 0.0, 0
-    began_mps: float | None = None
-    for row in rows:
-        if row.no_command and began_mps is None and row.asked_mps > STANDING_MPS:
-            events, began_mps = events + 1, row.asked_mps
-        elif not row.no_command and began_mps is not None:
-            began_mps = None
-        if began_mps is not None and row.no_command:
-            deepest = max(deepest, 1.0 - row.asked_mps / began_mps)
-            if row.asked_mps == 0.0:
-                stood, began_mps = stood + 1, None
-    return events, deepest, stood
-
-
-def _events(whys: Sequence[str], start: str) -> Iterator[str]:
-    before = ""
-    for why in whys:
-        if why.startswith(start) and not before.startswith(start):
-            yield why
-        before = why
-
-
-async def _alarms(scene: str, question: TaskRequest, *settings: str) -> Alarms:
-    with operator() as cocoro, tempfile.TemporaryDirectory(prefix="faults") as name:
-        async with robot_up(cocoro, "sim", scene, Path(name), *settings) as robot:
-            task_id = await robot.begin(question)
-            robot.read()
-            first, said = len(robot.rows), len(robot.whys)
-            state = await robot.ended(task_id)
-            robot.read()
-        rows, whys = robot.rows[first:], robot.whys[said:]
-    events, deepest, stood = _deadman(rows)
-    steps = 1.0 / 240
-    return Alarms(
-        f"{question.task.name} {scene}", state.elapsed_s, steps * sum(row.asked_mps > STANDING_MPS for row in rows),
-        events, deepest, stood, sum(1 for _ in _events(whys, "slower, for")),
-        Counter(_events(whys, "standing still:")), state.outcome or "",
-    )  # fmt: skip
-
-
-@contextmanager
-def busy(processes: int) -> Iterator[None]:
-    """Processes that load the machine meanwhile."""
-    with ExitStack() as stack:
-        for _ in range(processes):
-            process = stack.enter_context(subprocess.Popen([sys.executable, "-c", "while True: pass"]))
-            stack.callback(process.kill)
-        yield
-
-
-def alarms(count: int, others: int, settings: Sequence[str]) -> bool:
-    """Run a fetch and a pursuit `count` times and print the alarms; returns whether all tasks ended as they should."""
-    well = True
-    with busy(others):
-        for _ in range(count):
-            for scene, question in (
-                ("paper", TaskRequest(task=FetchTask(label="red_can"))),
-                ("follow-fast", TaskRequest(task=FollowTask(label="blue_ball", for_s=24.0))),
-            ):
-                met = asyncio.run(_alarms(scene, question, *settings))
-                well = well and met.outcome == "done"
-                print(met.line(), flush=True)
-    return well
+        report.say(line)
+        if trial.stand_s > STAND_S:
+            report.notes.append(line)
+    report_stands(report, [trial.stand_s for trial in trials])
+    report.value("longest time by the machine's clock", [max(trial.real_s for trial in trials)], "s")

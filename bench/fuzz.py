@@ -1,4 +1,4 @@
-"""Feeds mutated bytes to both hardware parsers: `python -m bench.fuzz --seconds 300 --seed 0`.
+"""Feeds mutated bytes to both hardware parsers: `python -m bench fuzz --seconds 300 --seed 0`.
 
 Valid frames are flipped, cut, spliced, doubled and mixed with noise, and fed in random pieces. Every parsed frame must
 be valid by an independent check; an exception ends the run.
@@ -11,6 +11,8 @@ import random
 import time
 from collections.abc import Callable
 
+from bench.report import Report
+from bench.trials import sized
 from services.base import oi
 from services.base.guard_logic import LONG, MS, SHORT, GuardLogic
 from services.servos import table
@@ -113,15 +115,16 @@ class Fuzzer:
                 self.runs += 2
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(prog="python -m bench.fuzz", description="Fuzz the hardware's parsers.")
-    parser.add_argument("--seconds", type=float, default=300.0)
+def options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--seconds", type=float, help="how long (300)")
     parser.add_argument("--seed", type=int, default=0)
-    options = parser.parse_args()
-    fuzzer = Fuzzer(options.seed)
-    fuzzer.run(options.seconds)
-    print(f"{fuzzer.runs} inputs, {fuzzer.found} whole frames and packets among them, nothing but clean rejections")
 
 
-if __name__ == "__main__":
-    main()
+def measure(chosen: argparse.Namespace, report: Report) -> None:
+    fuzzer = Fuzzer(chosen.seed)
+    seconds = sized(chosen, chosen.seconds, 300.0, 3.0)
+    fuzzer.run(seconds)
+    report.value("fed", [fuzzer.runs], "inputs", at_least=1)
+    report.value("whole among them", [fuzzer.found], "frames and packets", at_least=1)
+    report.value("speed", [fuzzer.runs / seconds], "inputs/s")
+    report.notes.append("nothing but clean rejections")

@@ -1,7 +1,7 @@
 """The base and servo services in one process, with commands that keep the robot moving.
 
-`python -m bench.hardware_driver CREATE ARM HAND`, started by `bench.hardware_faults`. It prints the contents of `cocoro
-status` ten times a second, each as a JSON line, and accepts {"do": "recover"} and {"do": "clear"}.
+`python -m bench.hardware_driver CREATE ARM HAND`, started by the bench `hardware-faults`. It prints the contents of
+`cocoro status` ten times a second, each as a JSON line, and accepts {"do": "recover"} and {"do": "clear"}.
 """
 
 from __future__ import annotations

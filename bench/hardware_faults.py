@@ -1,6 +1,4 @@
-"""Faults at random moments of a moving robot, at the ends of emulated wires.
-
-    python -m bench.hardware_faults --count 1000
+"""Tries faults at the ends of emulated wires while a robot moves: `python -m bench hardware-faults [--count 1000]`.
 
 The services run in a separate process (`bench.hardware_driver`), which keeps wheels and joints moving; this process
 emulates the hardware. Each fault is caused, observed from the hardware's side and ended. Then the robot must move again
@@ -17,21 +15,21 @@ without a restart (unless its process was killed). Counted for each kind:
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import random
 import signal
-import sys
 import tempfile
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
 from bench.hardware_driver import REACH_RAD, WHEELS
 from bench.hardware_rig import LINES, MS, NS, ROBOT, Hardware, Services
+from bench.report import Report, Table
+from bench.trials import number_of, sized
 from sim.wire.dynamixel import EmulatedServo
 from sim.wire.line import KINDS, LineFault
 
@@ -41,6 +39,9 @@ FAR_NS = 10**19
 SPEEDS = {(round(1000 * left), round(1000 * right)) for left, right in WHEELS}
 TURNS = {((left - right) // 2, -((left - right) // 2)) for left, right in SPEEDS}
 """Wheel speeds that the reflexes may make of the commanded ones, mm/s."""
+TRIED, CRASHES, WRONG = "faults", "the services' process ended by itself", "wheels or goals that were not commanded"
+STUCK, SLOWEST = "did not move again", "the slowest stop"
+"""Names of figures."""
 GOOD_WHEELS = SPEEDS | TURNS | {(0, 0)}
 
 
@@ -345,7 +346,7 @@ def _pause(seconds: float) -> None:
 
 
 def run(count: int, seed: int, tell: Callable[[str], None]) -> dict[str, Tally]:
-    """Print the results of each kind of fault."""
+    """What came of so many faults, by kind. Says what goes wrong, and the progress."""
     with tempfile.TemporaryDirectory(prefix="cocoro") as name:
         folder = Path(name)
         hardware = Hardware(folder, seed)
@@ -359,28 +360,36 @@ def run(count: int, seed: int, tell: Callable[[str], None]) -> dict[str, Tally]:
             return campaign.tallies
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(prog="python -m bench.hardware_faults", description="Faults at random moments.")
-    parser.add_argument("--count", type=int, default=100)
+def options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--count", type=number_of, help="faults (100)")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--json", action="store_true")
-    options = parser.parse_args()
-    tallies = run(options.count, options.seed, lambda text: print(text, file=sys.stderr, flush=True))
-    if options.json:
-        print(json.dumps({name: asdict(tally) for name, tally in tallies.items()}))
-        return 0
-    print(f"{'fault':34} tried crash wrong garbled longest  late slowest unseen stuck")
-    for name, tally in sorted(tallies.items()):
-        print(
-            f"{name:34} {tally.tried:5} {tally.crashes:5} {tally.wrong:5} {tally.garbled:7}"
-            f" {tally.garbled_longest_ms:4.0f} ms {tally.late_stops:5} {tally.slowest_stop_ms:4.0f} ms"
-            f" {tally.unseen:6} {tally.stuck:5}  {'; '.join(tally.notes[:2])}"
-        )
-    total = sum(tally.tried for tally in tallies.values())
-    bad = [name for name, tally in tallies.items() if not tally.good]
-    print(f"{total} faults, {len(bad)} kinds with something wrong{': ' + ', '.join(bad) if bad else ''}")
-    return 1 if bad else 0
 
 
-if __name__ == "__main__":
-    sys.exit(main())
+def measure(chosen: argparse.Namespace, report: Report) -> None:
+    found = run(sized(chosen, chosen.count, 100, 4), chosen.seed, report.say)
+    tallies = [found[name] for name in sorted(found)]
+    report.value(TRIED, [sum(tally.tried for tally in tallies)], "faults")
+    for name, counted in (
+        (CRASHES, [tally.crashes for tally in tallies]),
+        (WRONG, [tally.wrong for tally in tallies]),
+        ("stops that came late", [tally.late_stops for tally in tallies]),
+        ("not reported", [tally.unseen for tally in tallies]),
+        (STUCK, [tally.stuck for tally in tallies]),
+    ):
+        report.value(name, [sum(counted)], "times", at_most=0)
+    report.value(SLOWEST, [max(tally.slowest_stop_ms for tally in tallies)], "ms")
+    report.value("commands from damaged bytes to the Create", [sum(tally.garbled for tally in tallies)], "times")
+    longest_ms = max(tally.garbled_longest_ms for tally in tallies)
+    report.value("the longest effect of one", [longest_ms], "ms")
+    report.notes += [f"{name}: {note}" for name in sorted(found) for note in found[name].notes[:2]]
+    head = ["fault", "tried", "crash", "wrong", "garbled", "longest, ms", "late", "slowest, ms", "unseen", "stuck"]
+    rows = [[name, *_row(found[name])] for name in sorted(found)]
+    report.tables.append(Table("By kind", head, rows))
+
+
+def _row(tally: Tally) -> list[str]:
+    numbers = (
+        tally.tried, tally.crashes, tally.wrong, tally.garbled, round(tally.garbled_longest_ms), tally.late_stops,
+        round(tally.slowest_stop_ms), tally.unseen, tally.stuck,
+    )  # fmt: skip
+    return [str(number) for number in numbers]

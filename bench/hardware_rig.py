@@ -1,4 +1,4 @@
-"""The two sides of `bench.hardware_faults`: the emulated robot and the services' process."""
+"""The two sides of the bench `hardware-faults`: the emulated robot and the services' process."""
 
 from __future__ import annotations
 

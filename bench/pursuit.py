@@ -1,25 +1,26 @@
-"""Measures pursuits by the true state: `python -m bench.pursuit travels --seeds 0:20` and `walls --seeds 0:10`.
+"""Measures pursuits by the true state: `python -m bench pursuit travels|walls [--seeds 0:20]`.
 
 `travels`: a ball is carried round for 30 s before the robot is asked to follow it for 20 s. Reached: the task is done,
 and the robot never stood for longer than 0.3 s while it was off its distance. `walls`: a ball stands or is carried
 behind a wall that it is seen beside or above. Reached: the task is done, at least half of the time was with the ball,
-and nothing was touched. Real sensors; exit code 1 where fewer than `--least` of the set were reached.
+and nothing was touched. Real sensors. At least `--least` of the set must be reached.
 """
 
 from __future__ import annotations
 
 import argparse
-import sys
 import tempfile
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
-from math import cos, sin
+from math import ceil, cos, sin
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from apps.rehearsal.request import RehearsalRequest
+from bench.report import Report
+from bench.trials import Runs, add_frames, add_jobs, number_of, sized, span
 from services.executive.tasks import FollowTask
 
 LABEL = "blue_ball"
@@ -94,11 +95,12 @@ def _went_round(result: dict[str, Any]) -> bool:
     return bool(result["outcome"] == "done" and truth["near_share"] >= NEAR_SHARE and truth["contacts"] == 0)
 
 
-SETS: dict[str, tuple[Callable[[int], tuple[str, dict[str, Any]]], Callable[[dict[str, Any]], bool], int]] = {
-    "travels": (travels, _travelled, 20),
-    "walls": (walls, _went_round, 8),
+Make = Callable[[int], tuple[str, dict[str, Any]]]
+SETS: dict[str, tuple[Make, Callable[[dict[str, Any]], bool], range, int]] = {
+    "travels": (travels, _travelled, range(20), 20),
+    "walls": (walls, _went_round, range(10), 8),
 }
-"""By name: the scene and the task of a seed, what is reached, and how many of the usual seeds must be."""
+"""By name: the scene and the task of a seed, what is reached, the usual seeds, and how many of them must be."""
 
 
 def _run(request: RehearsalRequest) -> dict[str, Any]:
@@ -107,44 +109,50 @@ def _run(request: RehearsalRequest) -> dict[str, Any]:
     return rehearse(request)
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("set", choices=SETS)
-    parser.add_argument("--seeds", help="from:to; 0:20 of travels, 0:10 of walls")
-    parser.add_argument("--least", type=int, help="20 of travels, 8 of walls")
-    parser.add_argument("--frames", default="320x240@15")
-    parser.add_argument("--jobs", type=int, default=2)
-    asked = parser.parse_args()
-    make, good, least = SETS[asked.set]
-    first, last = (int(n) for n in (asked.seeds or ("0:20" if asked.set == "travels" else "0:10")).split(":"))
-    size, _, rate = asked.frames.partition("@")
-    width, height = (int(number) for number in size.split("x"))
-    count = 0
-    with tempfile.TemporaryDirectory() as folder, ProcessPoolExecutor(asked.jobs, max_tasks_per_child=1) as pool:
+SHOWN = {
+    "stood_s": ("stood while it was off its distance", "s"),
+    "near_share": ("share of the time with the ball", "of 1"),
+    "mean_gap_m": ("mean gap", "m"),
+    "lost_s": ("lost", "s"),
+}
+"""By the truth's field: what it is called, and its unit."""
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("set", choices=SETS, nargs="?", default="travels")
+    parser.add_argument("--seeds", type=span, metavar="FROM:TO", help="0:20 of travels, 0:10 of walls")
+    parser.add_argument("--least", type=number_of, help="that must be reached; of walls 8 of 10, else all")
+    add_frames(parser, "320x240@15")
+    add_jobs(parser)
+
+
+def measure(chosen: argparse.Namespace, report: Report) -> None:
+    make, good, usual, usual_least = SETS[chosen.set]
+    seeds = sized(chosen, chosen.seeds, usual, usual[:1])
+    least = chosen.least or ceil(len(seeds) * usual_least / len(usual))
+    runs = Runs(report)
+    measured: dict[str, list[float]] = {name: [] for name in SHOWN}
+    with tempfile.TemporaryDirectory() as folder, ProcessPoolExecutor(chosen.jobs, max_tasks_per_child=1) as pool:
         requests = []
-        for seed in range(first, last):
+        for seed in seeds:
             text, fields = make(seed)
-            scene = Path(folder) / f"{asked.set}-{seed}.toml"
+            scene = Path(folder) / f"{chosen.set}-{seed}.toml"
             scene.write_text(text)
-            requests.append(
-                RehearsalRequest(
-                    scene=str(scene), seed=seed, sensors="real", width=width, height=height,
-                    frame_rate_hz=float(rate or 15.0), **fields,
-                )
-            )  # fmt: skip
+            requests.append(RehearsalRequest(scene=str(scene), seed=seed, sensors="real", **chosen.frames, **fields))
         for request, result in zip(requests, pool.map(_run, requests), strict=True):
-            reached, truth = good(result), result["truth"]
-            count += reached
-            print(
-                f"{'ok ' if reached else 'BAD'} {asked.set} seed {request.seed:2d}  {result['outcome']}"
-                f" {result['reason']}  stood {truth['stood_s']:.2f} s, with it {truth['near_share']:.0%} (its own"
-                f" measure {result['measures'].get('near_share', 0.0):.0%}), mean gap {truth['mean_gap_m']:.2f} m,"
-                f" lost {truth['lost_s']:.1f} s, touched {truth['contacts']}",
-                flush=True,
-            )
-    print(f"{count} of {len(requests)}")
-    return 0 if count >= (least if asked.least is None else asked.least) else 1
+            for name, values in measured.items():
+                values.append(result["truth"][name])
+            runs.add(good(result), _line(chosen.set, request, result))
+    runs.share(f"{chosen.set}: reached by the truth", least)
+    for name, (what, unit) in SHOWN.items():
+        report.value(what, measured[name], unit)
+    report.value("longest stand", [max(measured["stood_s"])], "s")
 
 
-if __name__ == "__main__":
-    sys.exit(main())
+def _line(name: str, request: RehearsalRequest, result: dict[str, Any]) -> str:
+    truth = result["truth"]
+    return (
+        f"{name} seed {request.seed:2d}  {result['outcome']} {result['reason']}  stood {truth['stood_s']:.2f} s, with"
+        f" it {truth['near_share']:.0%} (its own measure {result['measures'].get('near_share', 0.0):.0%}), mean gap"
+        f" {truth['mean_gap_m']:.2f} m, lost {truth['lost_s']:.1f} s, touched {truth['contacts']}"
+    )

@@ -1,8 +1,8 @@
-"""The README's commands, block by block, in order and as they are written: `python -m bench.readme`.
+"""Runs the README's commands, block by block, in order and as they are written: `python -m bench readme`.
 
-    python -m bench.readme                    # every block; some last for minutes
-    python -m bench.readme Operate Rehearse   # the blocks of the sections whose names begin so
-    python -m bench.readme --quick            # what continuous integration runs (tests/test_readme.py)
+    python -m bench readme                    # every block; some last for minutes
+    python -m bench readme Operate Rehearse   # the blocks of the sections whose names begin so
+    python -m bench readme --short            # what continuous integration runs (tests/test_readme.py)
 
 Each block runs in a folder of its own, with a run directory, captures and latches of its own.
 """
@@ -22,7 +22,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from bench.ended import leave_when_ended
+from bench.report import Report
+from bench.trials import Runs
 
 ROOT = Path(__file__).parent.parent
 PAGE = ROOT / "README.md"
@@ -177,30 +178,20 @@ def run_blocks(chosen: list[Block], terminal: Terminal) -> Iterator[Ran]:
         terminal.run("cocoro down")
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("sections", nargs="*", metavar="SECTION")
-    parser.add_argument("--quick", action="store_true")
-    parser.add_argument("--frames", metavar="WxH@HZ")
-    options = parser.parse_args()
-    leave_when_ended()
-    chosen = [block for block in blocks() if block.section.startswith(tuple(options.sections) or "")]
-    wrong, total_s = 0, 0.0
+def options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("sections", nargs="*", metavar="SECTION", help="the first words of a section's name")
+    parser.add_argument("--frames", metavar="WxH@HZ", help="of all robots")
+
+
+def measure(chosen: argparse.Namespace, report: Report) -> None:
+    wanted = [block for block in blocks() if block.section.startswith(tuple(chosen.sections) or "")]
+    runs, seconds = Runs(report), 0.0
     with tempfile.TemporaryDirectory(prefix="readme-") as folder:
-        terminal = Terminal(Path(folder), options.frames, options.quick)
-        for ran in run_blocks(chosen, terminal):
+        terminal = Terminal(Path(folder), chosen.frames, chosen.short)
+        for ran in run_blocks(wanted, terminal):
             last = (ran.output.strip().splitlines() or [""])[-1]
-            print(
-                f"{'WRONG' if ran.wrong else 'ok   '} {ran.code} {ran.seconds:6.1f} s  {ran.command:<60} {last[:80]}",
-                flush=True,
-            )
-            if ran.wrong:
-                print(ran.output)
-            wrong += ran.wrong
-            total_s += ran.seconds
-    print(f"{wrong} wrong; {total_s:.0f} s")
-    return 1 if wrong else 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+            line = f"{ran.code} {ran.seconds:6.1f} s  {ran.command:<60} {last[:80]}"
+            runs.add(not ran.wrong, line, ran.output.splitlines())
+            seconds += ran.seconds
+    runs.share("commands that did as they should")
+    report.value("all of them", [seconds], "s")

@@ -1,20 +1,21 @@
-"""Measures how often tasks succeed by the true state: `python -m bench.rehearsals paper --sensors real --seeds 0:10`.
+"""Measures how often tasks succeed by the true state: `python -m bench rehearsals paper --seeds 0:10`.
 
-Runs rehearsals in parallel processes and prints a line for each, then the share that met the set's conditions. Exit
-code 1 when one did not. Only the wall time depends on the machine's load.
+Rehearsals run in parallel processes; the share of those that met the set's conditions must be all, or `--least`. Only
+the wall time depends on the machine's load. `python -m bench rehearsals random --latency perception=0.2 --seeds 0:100`
+has perception take 0.2 s longer for each frame.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import statistics
-import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from typing import Any
 
 from apps.rehearsal.request import RehearsalRequest
+from bench.report import Report
+from bench.trials import Runs, add_frames, add_jobs, add_latency, number_of, sized, span
 from services.executive.tasks import FetchTask, FollowTask
 from sim.random_scene import random_scene
 
@@ -86,56 +87,40 @@ def _run(request: RehearsalRequest) -> Result:
         return {"outcome": "error", "reason": str(error), "sim_s": 0.0, "wall_s": 0.0, "truth": {}}
 
 
-def _line(request: RehearsalRequest, result: Result, good: bool) -> str:
+def _line(request: RehearsalRequest, result: Result) -> str:
     truth = {
         name: round(value, 3) if isinstance(value, float) else value
         for name, value in result["truth"].items()
         if value not in ([], None)
     }
-    mark = "ok " if good else "BAD"
     what = f"{request.task.name} {request.task.target} {request.scene} seed {request.seed}"
-    return f"{mark} {what:44s} {result['outcome']} {result['reason']} {result['sim_s']:.1f} s {json.dumps(truth)}"
+    return f"{what:44s} {result['outcome']} {result['reason']} {result['sim_s']:.1f} s {json.dumps(truth)}"
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("set", choices=SETS)
-    parser.add_argument("--seeds", default="0:10", help="from:to")
+def options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("set", choices=SETS, nargs="?", default="paper")
+    parser.add_argument("--seeds", type=span, metavar="FROM:TO", help="of each task (0:10)")
+    parser.add_argument("--least", type=number_of, help="rehearsals that must be good (all)")
     parser.add_argument("--sensors", choices=("ideal", "real"), default="real")
-    parser.add_argument("--frames", default="640x480@30")
-    parser.add_argument("--lockstep", action="store_true")
-    parser.add_argument("--latency", type=float, default=0.0, help="of perception, seconds")
-    parser.add_argument("--jobs", type=int, default=2)
-    asked = parser.parse_args()
-    size, _, rate = asked.frames.partition("@")
-    width, height = (int(number) for number in size.split("x"))
-    make, good = SETS[asked.set]
-    first, last = (int(number) for number in asked.seeds.split(":"))
-    common: dict[str, Any] = {
-        "sensors": asked.sensors,
-        "width": width,
-        "height": height,
-        "frame_rate_hz": float(rate or 30.0),
-        "lockstep": asked.lockstep,
-        "latency": {"perception": asked.latency} if asked.latency else {},
-    }
-    requests = [RehearsalRequest(**common, **what, seed=seed) for seed in range(first, last) for what in make(seed)]
-    times: list[float] = []
-    rates: list[float] = []
-    count = 0
-    with ProcessPoolExecutor(asked.jobs, max_tasks_per_child=1) as pool:
+    add_frames(parser, "640x480@30")
+    parser.add_argument("--lockstep", action="store_true", help="perception and planning as one serial cycle")
+    add_latency(parser)
+    add_jobs(parser)
+
+
+def measure(chosen: argparse.Namespace, report: Report) -> None:
+    make, good = SETS[chosen.set]
+    latency = {name: seconds for each in chosen.latency for name, seconds in each.items()}
+    common = {"sensors": chosen.sensors, "lockstep": chosen.lockstep, "latency": latency, **chosen.frames}
+    seeds = sized(chosen, chosen.seeds, range(10), range(1))
+    requests = [RehearsalRequest(**common, **what, seed=seed) for seed in seeds for what in make(seed)]
+    runs, times, rates = Runs(report), [], []
+    with ProcessPoolExecutor(chosen.jobs, max_tasks_per_child=1) as pool:
         for request, result in zip(requests, pool.map(_run, requests), strict=True):
-            reached = good(result) if result["truth"] else False
-            count += reached
             times.append(result["sim_s"])
             rates.append(result["sim_s"] / max(result["wall_s"], 1e-9))
-            print(_line(request, result, reached), flush=True)
-    print(
-        f"{count} of {len(requests)}; simulated {statistics.median(times):.1f} s median, {max(times):.1f} s longest;"
-        f" {statistics.median(rates):.2f} times real time with {asked.jobs} at once"
-    )
-    return 0 if count == len(requests) else 1
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+            runs.add(bool(result["truth"]) and good(result), _line(request, result))
+    runs.share(f"{chosen.set}: good by the truth", chosen.least)
+    report.value("time, simulated", times, "s")
+    report.value("longest time, simulated", [max(times)], "s")
+    report.value(f"speed as a multiple of real time, {chosen.jobs} at once", rates, "times")

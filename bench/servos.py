@@ -1,4 +1,4 @@
-"""Measures the CPU time of the hardware services on emulated wires: `python -m bench.servos`.
+"""Measures the CPU time of the hardware services on emulated wires: `python -m bench servos`.
 
 The emulated hardware is a separate process. The figures contain everything in the services' processes: messages (on a
 local bus), the threads of the lines, and the guard of the base's port.
@@ -17,9 +17,12 @@ from pathlib import Path
 
 import psutil
 
+from bench.report import Report, percentile
+from bench.trials import sized
 from cocoro import topics
 from cocoro.bus.local import LocalMesh
 from cocoro.clock import RealClock
+from cocoro.errors import CocoroError
 from cocoro.messages import BaseCommand, BaseState, Latch, ServoCommand, ServoState
 from cocoro.node import Node
 from cocoro.robot import Robot
@@ -44,18 +47,21 @@ class Meter:
         self.count += 1
         self.ages_s.append((time.time_ns() - message.stamp_ns) / 1e9)
 
-    def result(self) -> str:
+    def tell(self, report: Report, name: str) -> None:
+        """The figures since it was made. Raises psutil.NoSuchProcess when a child has ended."""
         wall_s = time.perf_counter() - self._wall_s
         share = (self._used_s() - self._cpu_s) / wall_s
-        ages_ms = sorted(1e3 * age for age in self.ages_s)
-        median, p99 = ages_ms[len(ages_ms) // 2], ages_ms[int(0.99 * len(ages_ms))]
-        return f"{self.count / wall_s:5.1f} Hz, {100 * share:4.1f}% of a core, age {median:.1f} ms (p99 {p99:.1f} ms)"
+        ages_ms = [1e3 * age for age in self.ages_s]
+        report.value(f"{name}: share of a core", [100.0 * share], "%")
+        report.value(f"{name}: rate of states", [self.count / wall_s], "Hz")
+        report.value(f"{name}: age of a state at its arrival", ages_ms, "ms")
+        report.value(f"{name}: age of a state, 99%", [percentile(ages_ms, 99)], "ms")
 
     def _used_s(self) -> float:
         return sum(sum(process.cpu_times()[:2]) for process in self._processes)
 
 
-async def measure_arm(folder: Path, seconds: float) -> str:
+async def measure_arm(folder: Path, seconds: float, report: Report) -> None:
     """Six servos on one line, each commanded and reported at 50 Hz."""
     robot, mesh, clock = Robot.load(), LocalMesh(), RealClock()
     joints = robot.network_joints("arm")
@@ -77,13 +83,12 @@ async def measure_arm(folder: Path, seconds: float) -> str:
             if time.perf_counter() - started_s > seconds + 1.0:
                 break
         assert meter is not None
-        result = meter.result()
+        meter.tell(report, "arm, 6 servos")
         work.cancel()
         await asyncio.gather(work, return_exceptions=True)
-    return result
 
 
-async def measure_base(folder: Path, seconds: float) -> str:
+async def measure_base(folder: Path, seconds: float, report: Report) -> None:
     """A driving base with the guard's process, reported at the Create's rate."""
     robot, mesh, clock = Robot.load(), LocalMesh(), RealClock()
     async with Node("base", mesh.join(), clock, robot) as node, Node("other", mesh.join(), clock, robot) as other:
@@ -101,15 +106,17 @@ async def measure_base(folder: Path, seconds: float) -> str:
                 break
         assert meter is not None
         try:
-            return meter.result()
+            meter.tell(report, "base, with its guard")
         except psutil.NoSuchProcess:
-            return "not measured: the guard was replaced meanwhile, this machine is too busy"
+            raise CocoroError("base: the guard was replaced meanwhile: this machine is too busy") from None
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(prog="python -m bench.servos", description=__doc__)
-    parser.add_argument("--seconds", type=float, default=10.0)
-    seconds = parser.parse_args().seconds
+def options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--seconds", type=float, help="of arm and base each (10)")
+
+
+def measure(chosen: argparse.Namespace, report: Report) -> None:
+    seconds = sized(chosen, chosen.seconds, 10.0, 2.0)
     with tempfile.TemporaryDirectory(prefix="cocoro") as name:
         folder = Path(name)
         with subprocess.Popen([sys.executable, "-m", "sim.wire", name], stdout=subprocess.PIPE) as emulated:
@@ -117,11 +124,7 @@ def main() -> None:
             for _ in range(3):
                 emulated.stdout.readline()
             try:
-                print(f"arm, 6 servos  {asyncio.run(measure_arm(folder, seconds))}")
-                print(f"base, guard    {asyncio.run(measure_base(folder, seconds))}")
+                asyncio.run(measure_arm(folder, seconds, report))
+                asyncio.run(measure_base(folder, seconds, report))
             finally:
                 emulated.terminate()
-
-
-if __name__ == "__main__":
-    main()

@@ -1,9 +1,8 @@
-"""Fetches on a machine that is short of processor time: `python -m bench.starved [--count 20] [--busy 3]`.
+"""Fetches on a machine that is short of processor time: `python -m bench starved [--count 20] [--busy 3]`.
 
 Each trial starts a robot beside busy loops, fetches the red can and ends the robot. Nothing dies, so no output and no
 log may say that something died or is silent; the command's exit code and outcome must be the executive's, and by the
-simulator's true state the can is held exactly if it is done. Real time: results depend on the machine. Exit code 1 when
-one was not so.
+simulator's true state the can is held exactly if it is done. Real time: results depend on the machine.
 """
 
 from __future__ import annotations
@@ -12,16 +11,15 @@ import argparse
 import asyncio
 import json
 import re
-import subprocess
-import sys
 import time
 from collections import Counter
 from contextlib import suppress
 from typing import Any, NamedTuple
 
-from bench.ended import leave_when_ended
-from bench.faults_live import busy
+from bench.alarms import busy
 from bench.live import NAME, Operator, operator
+from bench.report import Report
+from bench.trials import Runs, number_of, sized
 from cocoro import topics
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.clock import FollowedClock
@@ -101,46 +99,43 @@ def _logs(cocoro: Operator) -> str:
     return "".join(file.read_text(errors="replace") for file in sorted(cocoro.run_dir.logs.glob("*.log*")))
 
 
-def trial(number: int, loops: int, options: list[str]) -> bool:
-    with operator() as cocoro, busy(loops):
-        up, said_up, took_up = cocoro("up", "sim", "--detach", *options)
-        if up:
-            print(f"FAIL {number:3d}  not up after {took_up:.0f} s:\n{said_up}")
-            return False
-        pids = {service: by.pid for service, by in cocoro.run_dir.claims().items()}
-        done, said = asyncio.run(_fetch(cocoro))
-        lived = {service: by.pid for service, by in cocoro.run_dir.claims().items()} == pids
-        false = sorted({line for line in (said_up + said + _logs(cocoro)).splitlines() if FALSE.search(line)})
-    wrong = [*done.wrong, *(f"said: {line}" for line in false), *([] if lived else ["a process ended"])]
-    outcome = f"{done.result.get('outcome')} {done.result.get('reason', '')}".strip()
-    late = ", ".join(f"{count} x {text!r}" for text, count in done.pauses.most_common())
-    print(
-        f"{'FAIL' if wrong else 'ok  '} {number:3d}  up {took_up:.1f} s, {outcome} after {done.seconds:.1f} s"
-        f" ({float(done.result.get('elapsed_s', 0)):.1f} s of the robot's); {late or 'nobody late'}"
-    )
-    for line in (*wrong, *([said] if wrong else []), *filter(None, [str(done.result.get("machine", ""))])):
-        print(f"     {line}")
-    sys.stdout.flush()
-    return not wrong
-
-
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--count", type=int, default=20)
+def options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--count", type=number_of, help="fetches, each with a robot that is started for it (20)")
     parser.add_argument("--busy", type=int, default=3, help="busy loops beside the robot")
     parser.add_argument("--sensors", choices=["ideal", "real"], default="real")
-    parser.add_argument("--frames", default="640x480@30")
-    asked = parser.parse_args()
-    leave_when_ended()
-    options = ["--sensors", asked.sensors, "--frames", asked.frames]
-    try:
-        good = sum(trial(number + 1, asked.busy, options) for number in range(asked.count))
-    except subprocess.TimeoutExpired as error:
-        print(f"a command did not end: {error}")
-        return 1
-    print(f"{good} of {asked.count}")
-    return 0 if good == asked.count else 1
+    parser.add_argument("--frames", default="640x480@30", metavar="WxH@HZ")
 
 
-if __name__ == "__main__":
-    sys.exit(main())
+def measure(chosen: argparse.Namespace, report: Report) -> None:
+    runs = Runs(report)
+    up_s: list[float] = []
+    trials: list[Trial] = []
+    for number in range(1, sized(chosen, chosen.count, 20, 1) + 1):
+        with operator() as cocoro, busy(chosen.busy):
+            code, said_up, seconds = cocoro(
+                "up", "sim", "--detach", "--sensors", chosen.sensors, "--frames", chosen.frames
+            )
+            if code:
+                runs.add(False, f"{number}: not up after {seconds:.0f} s", [said_up])
+                continue
+            up_s.append(seconds)
+            pids = {service: by.pid for service, by in cocoro.run_dir.claims().items()}
+            done, said = asyncio.run(_fetch(cocoro))
+            lived = {service: by.pid for service, by in cocoro.run_dir.claims().items()} == pids
+            false = sorted({line for line in (said_up + said + _logs(cocoro)).splitlines() if FALSE.search(line)})
+        trials.append(done)
+        wrong = [*done.wrong, *(f"said: {line}" for line in false), *([] if lived else ["a process ended"])]
+        runs.add(not wrong, f"{number}: {_line(done)}", [*wrong, said])
+    runs.share("nobody said what was not true")
+    if trials:
+        report.share("done", sum(one.result.get("outcome") == "done" for one in trials), len(trials))
+        report.value("start", up_s, "s")
+        report.value("fetch, by the machine's clock", [one.seconds for one in trials], "s")
+
+
+def _line(done: Trial) -> str:
+    outcome = f"{done.result.get('outcome')} {done.result.get('reason', '')}".strip()
+    late = ", ".join(f"{count} x {text!r}" for text, count in done.pauses.most_common())
+    elapsed_s = float(done.result.get("elapsed_s", 0))
+    machine = f"; {done.result['machine']}" if done.result.get("machine") else ""
+    return f"{outcome} after {done.seconds:.1f} s ({elapsed_s:.1f} s of the robot's); {late or 'nobody late'}{machine}"

@@ -1,12 +1,11 @@
-"""Measures the emergency stop of a robot at full speed under hostile conditions: `python -m bench.stop [SITUATION]`
+"""Measures the emergency stop of a robot at full speed under hostile conditions: `python -m bench stop [SITUATION]`.
 
 The time of a stop is from the start of the program `cocoro stop` until the base commands zero, by the base's
-acknowledgement (both on CLOCK_MONOTONIC). The base's state must then be latched and standing.
-`python -m bench.stop restarts` stops the robot, kills supervisor, executive and hardware in random order, starts it
-again and checks that it is still latched.
+acknowledgement (both on CLOCK_MONOTONIC). The base's state must then be latched and standing. Each stop must have an
+effect, be reported truly, and come within the bound.
 
 Runs as root in separate mount and network namespaces, so that it fills no disk of this machine and stops no other
-robot. Exit code 1 when a stop had no effect, was reported wrongly or came later than the bound.
+robot.
 """
 
 from __future__ import annotations
@@ -16,36 +15,26 @@ import asyncio
 import fcntl
 import json
 import os
-import random
-import signal
 import socket
-import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import msgspec
-
-from bench.ended import leave_when_ended
-from bench.stop_rig import NAME, PATIENCE_S, Driver, Place, driving, place
+from bench.report import Report
+from bench.stop_rig import NAME, PATIENCE_S, Driver, Place, driving, in_namespaces, place
+from bench.trials import Runs, number_of, one_of, sized
 from cocoro import topics
-from cocoro.bus.zenoh import ZenohBus
-from cocoro.clock import FollowedClock
-from cocoro.messages import TaskRequest
-from cocoro.node import Node
-from cocoro.robot import Robot
-from cocoro.topics import Topic
-from deploy.rundir import Target
-from services.executive.tasks import FetchTask
 
 STANDING_MPS = 0.01
 BOUNDS_S = {"quiet": 0.3, "loaded": 1.0}
 """Bound for the slowest stop, s, by situation; 1.0 for those that are not named."""
-COUNTS = {"quiet": 50, "loaded": 50, "restarts": 50}
+COUNTS = {"quiet": 50, "loaded": 50}
+TRUE = "had an effect, and said so"
+"""What each stop must be."""
 
 
 class Stopped(NamedTuple):
@@ -136,8 +125,8 @@ while True:
 
 
 @contextmanager
-def flood(here: Place, rate_hz: float) -> Iterator[None]:
-    """Two processes of the same user that publish garbage on the base's command key."""
+def flood(here: Place, rate_hz: float, note: Callable[[str], None]) -> Iterator[None]:
+    """Two processes of the same user that publish garbage on the base's command key; notes their true rate."""
     sockets = [f"unixsock-stream/{path}" for path in sorted(here.run_dir.path.glob("*.sock"))]
     options = json.dumps(
         {
@@ -151,7 +140,7 @@ def flood(here: Place, rate_hz: float) -> Iterator[None]:
     try:
         rates = [process.stdout.readline() for process in processes if process.stdout]
         yield
-        print(f"  flooded with {sum(float(rate) for rate in rates if rate):.0f} messages a second")
+        note(f"flooded with {sum(float(rate) for rate in rates if rate):.0f} messages a second")
     finally:
         for process in processes:
             process.kill()
@@ -196,7 +185,7 @@ SITUATIONS: dict[str, str] = {
 }
 
 
-async def measure(here: Place, situation: str, count: int) -> list[Stopped]:
+async def stops_in(here: Place, situation: str, count: int, note: Callable[[str], None]) -> list[Stopped]:
     env: dict[str, str] | None = {} if situation == "environment" else None
     async with driving(here) as driver:
         await driver.reset()
@@ -213,134 +202,45 @@ async def measure(here: Place, situation: str, count: int) -> list[Stopped]:
             elif situation == "idle-connections":
                 stack.enter_context(idle_connections(here, 120))
             elif situation == "flood":
-                stack.enter_context(flood(here, 100_000.0))
+                stack.enter_context(flood(here, 100_000.0, note))
             return [await stop(here, driver, env) for _ in range(count)]
 
 
-def run(situation: str, count: int, any_time: bool) -> dict[str, Any]:
-    bound_s = PATIENCE_S if any_time else BOUNDS_S.get(situation, 1.0)
+# --- the bench ------------------------------------------------------------------------------------
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "situations", nargs="*", type=one_of(SITUATIONS), metavar="SITUATION", help=f"{', '.join(SITUATIONS)}; or all"
+    )
+    parser.add_argument("--count", type=number_of, help="stops in each; 50 where it is quiet or loaded, else 20")
+    parser.add_argument("--any-time", action="store_true", help="judge the effect and the report, not the time")
+
+
+def measure(chosen: argparse.Namespace, report: Report) -> None:
+    in_namespaces()
+    for situation in chosen.situations or (["quiet"] if chosen.short else SITUATIONS):
+        report.say(f"{situation}: {SITUATIONS[situation]}")
+        count = sized(chosen, chosen.count, COUNTS.get(situation, 20), 2)
+        _measure(report, situation, count, any_time=chosen.any_time)
+
+
+def _measure(report: Report, situation: str, count: int, *, any_time: bool) -> None:
+    bound_s = BOUNDS_S.get(situation, 1.0)
     with ExitStack() as stack:
         if situation.startswith("shm"):
             stack.enter_context(small_shm("16M" if situation == "shm-16M" else "64M"))
         here = stack.enter_context(place())
         here.up()
-        stops = asyncio.run(measure(here, situation, count))
-    zero = sorted(one.zero_s for one in stops)
-    faults = [fault for one in stops if (fault := one.fault(bound_s))]
-    return {
-        "situation": situation, "count": count, "median_s": statistics.median(zero), "worst_s": zero[-1],
-        "command_median_s": statistics.median(one.ended_s for one in stops),
-        "command_worst_s": max(one.ended_s for one in stops),
-        "standing_worst_s": max(one.stood_s for one in stops),
-        "acknowledged": sum(one.code == 0 for one in stops), "faults": faults,
-    }  # fmt: skip
-
-
-# --- restarts -------------------------------------------------------------------------------------
-
-
-async def _still_latched(here: Place) -> str:
-    """The fault of the latch of a restarted robot; '' when it is latched."""
-    async with (
-        await ZenohBus.open(here.run_dir.join_as("bench")) as bus,
-        Node("tester", bus, FollowedClock(), Robot.load()) as node,
-    ):
-        states: dict[str, str] = {}
-        node.on(topics.BASE_STATE, lambda state: states.update(base=state.latch))
-        node.on(topics.ARM_STATE, lambda state: states.update(arm=state.latch))
-        node.on(topics.HAND_STATE, lambda state: states.update(hand=state.latch))
-        reporting: tuple[Topic[Any], ...] = (topics.BASE_STATE, topics.ARM_STATE, topics.HAND_STATE)
-        for topic in reporting:
-            await asyncio.wait_for(node.latest(topic).next(), PATIENCE_S)
-        await asyncio.sleep(1.5)  # longer than the executive takes to believe a cold start
-        reply = await node.call(topics.RUN, TaskRequest(task=FetchTask(label="red_can")), 10.0)
-        if reply.accepted or set(states.values()) != {"latched"}:
-            return f"{states}, a fetch was {reply.refusal or 'accepted'}"
-    return ""
-
-
-def _kill(here: Place, who: str) -> None:
-    file = here.run_dir.path / "supervisor" if who == "supervisor" else here.run_dir.path / "claims" / who
-    target = Target(file)
-    target.signal(signal.SIGKILL)
-    target.wait(10.0)
-    target.close()
-
-
-def restarts(count: int, seed: int) -> list[str]:
-    """Kill processes of a stopped robot, `count` times; lists the cases in which the latch was lost, in words."""
-    draws = random.Random(seed)
-    forgotten = []
-    for number in range(count):
-        wire = number % 5 == 4
-        with place() as here:
-            here.up("sim-wire" if wire else "sim", "--frames", "160x120@10")
-            code, said = here.run("stop", "--json")
-            order = ["supervisor", "executive", "base", *(["arm"] if wire else [])]
-            draws.shuffle(order)
-            order = order[: draws.randint(1, len(order))]
-            for who in order:
-                time.sleep(draws.choice((0.0, 0.0, 0.05, 0.3, 1.0)))  # a random moment of the restart
-                _kill(here, who)
-            if "supervisor" in order:
-                here.up("sim-wire" if wire else "sim", "--frames", "160x120@10")
-            wrong = asyncio.run(_still_latched(here)) or ("" if code == 0 else said)
-        what = f"{'sim-wire' if wire else 'sim'}: killed {', '.join(order)}: {wrong or 'latched'}"
-        print(f"  {number + 1:3d} {what}", flush=True)
-        if wrong:
-            forgotten.append(what)
-    return forgotten
-
-
-# --- the command ----------------------------------------------------------------------------------
-
-
-def in_namespaces() -> None:
-    """Enter new mount and network namespaces."""
-    if os.environ.get("BENCH_STOP_INSIDE"):
-        subprocess.run(["mount", "--make-rprivate", "/"], check=True)
-        return
-    command = ["unshare", "--mount", "--net", sys.executable, "-m", "bench.stop", *sys.argv[1:]]
-    os.execvpe("unshare", command, os.environ | {"BENCH_STOP_INSIDE": "1"})
-
-
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("situations", nargs="*", metavar="SITUATION", help=f"{', '.join(SITUATIONS)}, restarts; or all")
-    parser.add_argument("--count", type=int, help="stops in each; 50 where it is quiet or loaded, else 20")
-    parser.add_argument("--seed", type=int, default=0, help="of the restarts")
-    parser.add_argument("--any-time", action="store_true", help="judge the effect and the report, not the time")
-    parser.add_argument("--json", action="store_true")
-    options = parser.parse_args()
-    leave_when_ended()
-    wanted = options.situations or list(SITUATIONS)
-    if unknown := set(wanted) - {*SITUATIONS, "restarts"}:
-        parser.error(f"there is no situation {unknown.pop()!r}")
-    in_namespaces()
-    well = True
-    for situation in wanted:
-        count = options.count or COUNTS.get(situation, 20)
-        if situation == "restarts":
-            forgotten = restarts(count, options.seed)
-            print(f"restarts: latched {count - len(forgotten)} of {count} times")
-            well = well and not forgotten
-            continue
-        result = run(situation, count, options.any_time)
-        well = well and not result["faults"]
-        if options.json:
-            print(msgspec.json.encode(result).decode())
-        else:
-            print(
-                f"{situation:17s} zero after {result['median_s']:.3f} s in the median, {result['worst_s']:.3f} in the "
-                f"worst of {count}; standing after {result['standing_worst_s']:.3f} at most; the command took "
-                f"{result['command_median_s']:.3f}, at most {result['command_worst_s']:.3f} s; "
-                f"{result['acknowledged']} with exit code 0 ({SITUATIONS[situation]})"
-            )
-            for fault in result["faults"]:
-                print(f"  WRONG: {fault}")
-        sys.stdout.flush()
-    return 0 if well else 1
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+        stops = asyncio.run(stops_in(here, situation, count, report.notes.append))
+    runs = Runs(report)
+    for one in stops:
+        fault = one.fault(PATIENCE_S if any_time else bound_s)
+        runs.add(not fault, f"{situation}: {fault or f'zero after {one.zero_s:.3f} s'}")
+    runs.share(f"{situation}: {TRUE}")
+    zero_s = [one.zero_s for one in stops]
+    report.value(f"{situation}: wheels commanded zero after", zero_s, "s")
+    report.value(f"{situation}: at the latest", [max(zero_s)], "s", at_most=None if any_time else bound_s)
+    report.value(f"{situation}: standing at the latest after", [max(one.stood_s for one in stops)], "s")
+    report.value(f"{situation}: the command took", [one.ended_s for one in stops], "s")
+    report.share(f"{situation}: ended with exit code 0", sum(one.code == 0 for one in stops), count)

@@ -1,4 +1,4 @@
-"""The robot of `bench.stop`: its directories and its driver."""
+"""The robot of the benches `stop` and `stop-restarts`: its namespaces, its directories and its driver."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from pathlib import Path
 from cocoro import topics
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.clock import FollowedClock
+from cocoro.errors import CocoroError
 from cocoro.messages import BaseCommand, BaseState, EstopRequest
 from cocoro.node import Node
 from cocoro.robot import Robot
@@ -44,6 +45,18 @@ height_m = 0.12
 position_m = [4.0, 4.0]
 """
 """A scene without obstacles."""
+
+
+def in_namespaces() -> None:
+    """Go on in new mount and network namespaces, as a new run of this program. Raises CocoroError for a user who may
+    not make them."""
+    if os.environ.get("BENCH_STOP_INSIDE"):
+        subprocess.run(["mount", "--make-rprivate", "/"], check=True)
+        return
+    if os.geteuid():
+        raise CocoroError("this bench makes namespaces and mounts disks: run it as root")
+    command = ["unshare", "--mount", "--net", sys.executable, "-m", "bench", *sys.argv[1:]]
+    os.execvpe("unshare", command, os.environ | {"BENCH_STOP_INSIDE": "1"})
 
 
 class Driver:
@@ -82,7 +95,7 @@ class Driver:
                 async with asyncio.timeout(3.0):
                     await self.until(lambda state: state.latch == "released" and state.speed_mps > FULL_MPS)
                     return
-        raise RuntimeError("the robot does not drive")
+        raise CocoroError("the robot does not drive")
 
 
 class Place:
@@ -114,7 +127,7 @@ class Place:
     def up(self, profile: str | None = None, *arguments: str) -> None:
         code, said = self.run("up", profile or str(self.profile), "--detach", *arguments)
         if code:
-            raise RuntimeError(said)
+            raise CocoroError(said)
 
 
 @contextmanager

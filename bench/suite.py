@@ -9,6 +9,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
+from bench.ended import leave_when_ended
 from bench.entries import ENTRIES
 from bench.report import Result, decode, number, ratios, worse
 
@@ -31,15 +32,16 @@ def _run(name: str, short: bool) -> Result | None:
     """Run a bench in a process of its own, and keep its result; None where it ended without one."""
     command = [sys.executable, "-m", "bench", name, "--json", *(["--short"] if short else [])]
     begun_s = time.monotonic()
-    ended = subprocess.run(command, cwd=ROOT, stdout=subprocess.PIPE, check=False)
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE) as process:  # not killed: it may have a robot
+        printed, _ = process.communicate()
     seconds = time.monotonic() - begun_s
     try:
-        result = decode(ended.stdout, f"what {name} printed")
+        result = decode(printed, f"what {name} printed")
     except ValueError as error:
-        print(f"{name:<14} {seconds:4.0f} s  FAILED with exit code {ended.returncode}: {error}", flush=True)
+        print(f"{name:<14} {seconds:4.0f} s  FAILED with exit code {process.returncode}: {error}", flush=True)
         return None
     FRESH.mkdir(parents=True, exist_ok=True)
-    (FRESH / f"{name}{'-short' if short else ''}.json").write_bytes(ended.stdout)
+    (FRESH / f"{name}{'-short' if short else ''}.json").write_bytes(printed)
     missed = [figure for figure in result.figures if not figure.kept]
     bounded = sum(bool(figure.bound) for figure in result.figures)
     print(f"{name:<14} {seconds:4.0f} s  {bounded - len(missed)} of {bounded} bounds kept", flush=True)
@@ -59,6 +61,7 @@ def run_suite(arguments: Sequence[str]) -> int:
     parser = _parser("suite", "Run the suite's benches one after another.")
     parser.add_argument("--short", action="store_true", help="the short form of each")
     chosen = parser.parse_args(arguments)
+    leave_when_ended()
     begun_s = time.monotonic()
     results = [_run(name, chosen.short) for name in names(chosen.names)]
     print(f"all in {(time.monotonic() - begun_s) / 60:.1f} min; results in {FRESH.relative_to(ROOT)}")
@@ -98,6 +101,7 @@ def check(arguments: Sequence[str]) -> int:
     chosen = _parser("check", "Run the short forms and compare their ratios with the stored ones.").parse_args(
         arguments
     )
+    leave_when_ended()
     stored, bad = read(STORED), []
     for name in names(chosen.names):
         if name not in stored:

@@ -27,6 +27,12 @@ def start(module: str, *arguments: str, site_packages: bool = True, **options: A
     return subprocess.Popen(command, stdin=subprocess.DEVNULL, **options)
 
 
+def environment_for(packages: Iterable[str] = (), added: Mapping[str, str] | None = None) -> dict[str, str]:
+    """This process's environment with `added`, for a child that imports from this project's folder and `packages`."""
+    search_path = os.pathsep.join(dict.fromkeys((PACKAGES, *packages)))
+    return {**os.environ, **(added or {}), "PYTHONPATH": search_path}
+
+
 def wait_or_kill(process: subprocess.Popen[bytes], patience_s: float) -> None:
     """Wait until the process has ended; kill it when that takes longer than `patience_s`. Blocks."""
     try:
@@ -56,14 +62,13 @@ class ChildProcess:
         **options: Any,
     ) -> None:
         """`packages`: folders to import from beside this project's. `environment` is added to this process's own."""
-        search_path = os.pathsep.join(dict.fromkeys((PACKAGES, *packages)))
         self.channel, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self.channel.setblocking(False)
         with theirs:
             try:
                 self.process = start(
                     module, *arguments, "--fd", str(theirs.fileno()), site_packages=site_packages,
-                    env={**os.environ, **(environment or {}), "PYTHONPATH": search_path},
+                    env=environment_for(packages, environment),
                     pass_fds=(theirs.fileno(), *pass_fds), **options,
                 )  # fmt: skip
             except OSError:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from functools import cache
 from typing import Any, NamedTuple
 
+from cocoro.distributions import may_add_to
+
 
 class Added(NamedTuple):
     """One value that a third party added."""
@@ -27,7 +29,9 @@ class EntryPoints(NamedTuple):
 @cache
 def added_to(group: str) -> EntryPoints:
     """Load the entry points of a group, once in a process. One that cannot be loaded does not disturb the others."""
-    from importlib.metadata import entry_points  # takes 40 ms to import, which most processes never need
+    if not may_add_to(group):
+        return EntryPoints((), ())
+    from importlib.metadata import entry_points  # takes 20 ms to import, which most processes never need
 
     added, faults = [], []
     for point in entry_points(group=group):

@@ -8,27 +8,26 @@ from __future__ import annotations
 
 import fcntl
 import os
-import random
+import re
 import time
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated
-
-import msgspec
-from msgspec import Meta
+from typing import NamedTuple
 
 from cocoro import private
 
 LOOK_S = 1.0
 """Upper bound for one look at a lock by another process, and for a new holder to write its name, s."""
 _HOLDER_BYTES = 4096
+_PLAIN = re.compile(rb'\{"name":"([a-z0-9_-]*)","pid":([0-9]{1,9})\}')
+"""A holder as nearly all are written; it is read without the module `json`."""
 
 
-class Holder(msgspec.Struct, frozen=True):
+class Holder(NamedTuple):
     """The process that holds a file."""
 
     name: str
-    pid: Annotated[int, Meta(ge=0, lt=2**31)]
+    pid: int
 
     @property
     def known(self) -> bool:
@@ -38,7 +37,6 @@ class Holder(msgspec.Struct, frozen=True):
 
 UNKNOWN = Holder("", 0)
 """A holder whose name and number cannot be read."""
-_DECODER = msgspec.json.Decoder(Holder)
 
 
 class HeldFile:
@@ -69,10 +67,10 @@ def hold(path: Path, name: str, *, named: bool = True) -> HeldFile | None:
             return None
         # A shared lock was free: another process only looks at the file (see `holder_of`) and is done in a moment.
         fcntl.flock(fd, fcntl.LOCK_UN)
-        time.sleep(random.uniform(0.0, 0.002))  # so that of two processes that try, one is first
+        time.sleep(os.urandom(1)[0] / 255 * 0.002)  # so that of two processes that try, one is first
     try:
         # Not truncated first: a full disk may have no room for new bytes, only for those of the last holder.
-        written = os.pwrite(fd, msgspec.json.encode(Holder(name, os.getpid())), 0)
+        written = os.pwrite(fd, _written(Holder(name, os.getpid())), 0)
         os.ftruncate(fd, written)
     except OSError as error:
         if named:
@@ -98,15 +96,34 @@ def holder_of(fd: int, patience_s: float = 0.0) -> Holder | None:
     name and number within `patience_s`."""
     deadline_s = time.monotonic() + patience_s
     while not _lock(fd, fcntl.LOCK_SH):
-        try:
-            found = _DECODER.decode(os.pread(fd, _HOLDER_BYTES, 0))
-        except (msgspec.MsgspecError, ValueError, RecursionError):
-            found = UNKNOWN
+        found = _read(os.pread(fd, _HOLDER_BYTES, 0))
         if (found.known and _lives(found.pid)) or time.monotonic() >= deadline_s:
             return found if found.known else UNKNOWN
         time.sleep(0.001)  # taken this moment: the holder is about to write its name, perhaps over the last one's
     fcntl.flock(fd, fcntl.LOCK_UN)
     return None
+
+
+def _written(by: Holder) -> bytes:
+    import json  # here and in `_read`: a command that finds no held file does without it
+
+    return json.dumps(by._asdict(), ensure_ascii=False, separators=(",", ":")).encode()
+
+
+def _read(data: bytes) -> Holder:
+    """What `_written` made; `UNKNOWN` when it is anything else."""
+    if plain := _PLAIN.fullmatch(data):
+        return Holder(plain[1].decode(), int(plain[2]))
+    import json
+
+    try:
+        found = json.loads(data)
+    except (ValueError, RecursionError):
+        return UNKNOWN
+    name, pid = (found.get("name"), found.get("pid")) if isinstance(found, dict) else (None, None)
+    if isinstance(name, str) and type(pid) is int and 0 <= pid < 2**31:
+        return Holder(name, pid)
+    return UNKNOWN
 
 
 def _lives(pid: int) -> bool:

@@ -178,6 +178,8 @@ class Node(Participant):
             publisher = Publisher(topic, topic.key(self.robot_name), self.bus, self.clock)
             self._publishers[topic.name] = publisher
             self.keep(publisher)
+            if topic.slow:
+                self.keep(self.bus.serve(publisher.key, publisher.serve_newest))
         return self._publishers[topic.name]
 
     def publish(self, topic: Topic[M], message: M, stamp_ns: int | None = None) -> M:

@@ -6,6 +6,7 @@ A service is a `cocoro.node.Node`, which also publishes and serves. The command 
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
 import msgspec
@@ -85,8 +86,23 @@ class Participant:
     def stream(self, topic: Topic[M], *, service: str | None = None) -> Stream[M]:
         return Stream(self.inbox(topic, service=service))
 
+    async def newest(self, topic: Topic[M], timeout_s: float) -> list[M]:
+        """The newest message of a slow topic, from each of its publishers that answers in time: for who has just joined
+        and would wait for the next. It is as unchecked as every reply."""
+        try:
+            replies = await self.bus.call(topic.key(self.robot_name), b"", timeout_s)
+        except CallTimeoutError:
+            return []
+        found = []
+        for reply in replies:
+            if reply.ok:
+                with suppress(msgspec.MsgspecError):
+                    found.append(msgspec.msgpack.decode(reply.payload, type=topic.type))
+        return found
+
     def on(self, topic: Topic[M], handler: Callable[[M], None], *, service: str | None = None) -> None:
-        """Calls `handler(message)` for each message."""
+        """Calls `handler(message)` for each message, alone, as a callback of the event loop. It must be short, and use
+        nothing that belongs to a thread: see `cocoro.lending`."""
         self.inbox(topic, service=service).add(lambda _key, message: handler(message))
 
     # --- requests ---------------------------------------------------------------------------------

@@ -7,8 +7,8 @@ from contextlib import suppress
 from pathlib import Path
 
 from cocoro import private
-from cocoro.bus.endpoints import default_run_dir
 from cocoro.checks import Check, bad, note, ok
+from cocoro.private import default_run_dir
 
 WIRE = "wire:"
 LATENCY_MS = 1

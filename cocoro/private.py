@@ -27,6 +27,7 @@ from cocoro.errors import ConfigError
 
 RUN_DIR = "COCORO_RUN_DIR"
 """Environment variable with the place of the run directory."""
+TEMPORARY = "/tmp"
 LINKS = 40
 """Links that are followed on one path; the kernel's own limit."""
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
@@ -207,3 +208,23 @@ def _refusal(path: Path, what: str | None, variable: str, error: OSError | None 
     if error is not None and full(error):
         return FullError(f"{place}: {what}; make room there, or choose another by {variable}")
     return ConfigError(f"{place}: {what}; put that right, or choose another by {variable}")
+
+
+def default_run_dir() -> Path:
+    """$COCORO_RUN_DIR, else `cocoro` in $XDG_RUNTIME_DIR, else a directory of this user in the place for temporary
+    files. Its content must be this user's alone."""
+    if explicit := os.environ.get(RUN_DIR):
+        return Path(explicit).absolute()
+    if runtime := os.environ.get("XDG_RUNTIME_DIR"):
+        return Path(runtime) / "cocoro"
+    return Path(_place_for_temporary_files()) / f"cocoro-{os.getuid()}"
+
+
+def _place_for_temporary_files() -> str:
+    """That of `tempfile`, which is slow to import and is asked only where it is not plain."""
+    plain = not any(os.environ.get(name) for name in ("TMPDIR", "TEMP", "TMP"))
+    if plain and Path(TEMPORARY).is_dir() and os.access(TEMPORARY, os.W_OK | os.X_OK):
+        return TEMPORARY
+    import tempfile
+
+    return tempfile.gettempdir()

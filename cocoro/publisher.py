@@ -7,8 +7,9 @@ from typing import Generic, TypeVar
 import msgspec
 import numpy as np
 
-from cocoro.bus.base import Bus
+from cocoro.bus.base import Bus, Payload
 from cocoro.clock import NS, Clock
+from cocoro.errors import CocoroError
 from cocoro.health import Rate
 from cocoro.messages import Message, TopicHealth
 from cocoro.topics import Topic
@@ -24,14 +25,17 @@ class Publisher(Generic[M]):
         self.key = key
         self.rate = Rate()
         self.newest_stamp_ns: int | None = None
+        self._type = topic.type
         self._raw = bus.publisher(key, topic.qos)
         self.incarnation = bus.new_incarnation()
         self._clock = clock
+        self._newest: bytes | None = None
+        """Encoded; kept of a slow topic alone."""
 
     def put(self, message: M, stamp_ns: int | None = None) -> M:
         """Publishes the message and returns it, completed in place. `stamp_ns` defaults to the message's own stamp, or
         to now when that is 0. Raises TypeError when the topic carries another type."""
-        if not isinstance(message, self.topic.type):
+        if not isinstance(message, self._type):
             raise TypeError(f"{self.topic.name} carries {self.topic.type.__name__}, not {type(message).__name__}")
         if stamp_ns is not None:
             message.stamp_ns = stamp_ns
@@ -41,8 +45,17 @@ class Publisher(Generic[M]):
         message.incarnation = self.incarnation
         self.rate.count += 1
         self.newest_stamp_ns = message.stamp_ns
-        self._raw.put(encode(message))
+        payload = _ENCODER.encode(message)
+        if self.topic.slow:
+            self._newest = payload
+        self._raw.put(payload)
         return message
+
+    async def serve_newest(self, _key: str, _question: Payload) -> bytes:
+        """Answers with the newest message. Raises CocoroError before the first."""
+        if self._newest is None:
+            raise CocoroError(f"{self.key}: nothing was published yet")
+        return self._newest
 
     def close(self) -> None:
         self._raw.close()

@@ -27,6 +27,10 @@ ANY = "*"
 _PER_SERVICE = "{service}"
 
 
+SLOW_HZ = 5.0
+"""Rate of topics, at most, whose newest message can be asked for (`Participant.newest`)."""
+
+
 @dataclass(frozen=True)
 class Topic(Generic[M]):
     """A kind of message that is published, under one key of each robot."""
@@ -46,6 +50,11 @@ class Topic(Generic[M]):
     """Recorders leave it out when this is False."""
     max_bytes: int = 65_536
     """A larger payload is rejected unread."""
+
+    @property
+    def slow(self) -> bool:
+        """Whether who joins would have to wait for the next message: such topics' newest can be asked for."""
+        return self.rate_hz is not None and self.rate_hz <= SLOW_HZ
 
     def __post_init__(self) -> None:
         if not self.publisher:

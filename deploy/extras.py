@@ -11,16 +11,19 @@ from cocoro.component import Component
 from cocoro.errors import ConfigError
 
 PROJECT = "cocoro-mesh"
-EXTRAS = ("operator", "robot", "sim", "view", "tables", "foxglove", "experiments", "dev")
+EXTRAS = ("operator", "robot", "sim", "view", "tables", "foxglove", "experiments", "bench", "dev")
 """The extras, from the smallest on; of several that have a library the first is advised."""
 NEEDED = {"rehearse": "sim", "experiment": "sim"}
 """The extra that a command needs as a whole, so that the first missing library does not lead to the next one."""
 MODULES = {
     "dynamixel-sdk": "dynamixel_sdk",
+    "dora-rs": "dora",
+    "eclipse-ecal": "ecal",
     "eclipse-zenoh": "zenoh",
     "foxglove-sdk": "foxglove",
     "opencv-python-headless": "cv2",
     "pyserial": "serial",
+    "pyzmq": "zmq",
     "rerun-sdk": "rerun",
 }
 """Names of the modules that are not named like their distributions."""

@@ -24,6 +24,8 @@ import msgspec
 
 from cocoro import private
 from cocoro.errors import CocoroError, RefusedError
+from cocoro.heap import keep_freed
+from cocoro.lending import LendingLoop
 from deploy.quit import quit_process
 from deploy.rundir import RunDir
 
@@ -87,8 +89,9 @@ def run(
     """Runs a process until a signal ends it; returns the exit code. Logging must be set up. A crash is logged with its
     traceback, or raised (`raise_crashes`) for a caller that reports it."""
     log = logging.getLogger(f"cocoro.{process}")
+    keep_freed()
     try:
-        with asyncio.Runner() as runner:
+        with asyncio.Runner(loop_factory=LendingLoop) as runner:
             return runner.run(_main(process, run_dir, profile, profile_name))
     except CocoroError as error:
         log.error("%s", error)

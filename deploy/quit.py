@@ -10,9 +10,12 @@ from __future__ import annotations
 import atexit
 import os
 import sys
-import threading
 from contextlib import suppress
-from typing import NoReturn
+
+TYPE_CHECKING = False
+"""As in `typing`, which takes 2 ms to import."""
+if TYPE_CHECKING:
+    from typing import NoReturn
 
 UNFLUSHED = 120
 """Python's exit code for output that could not be flushed."""
@@ -21,7 +24,8 @@ UNFLUSHED = 120
 def quit_process(code: int) -> NoReturn:
     """Ends the process with this exit code, after other non-daemon threads have ended, `atexit` functions have run and
     the output is flushed."""
-    threading._shutdown()  # type: ignore[attr-defined] # executors' threads are ended by no public call
+    if (threading := sys.modules.get("threading")) is not None:
+        threading._shutdown()  # executors' threads are ended by no public call
     atexit._run_exitfuncs()
     for stream in (sys.stdout, sys.stderr):
         try:

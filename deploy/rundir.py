@@ -9,29 +9,30 @@
 
 The folders and the files in them are this user's alone (see `cocoro.private`). Others are refused with a ConfigError;
 when the disk is full, what must be written raises FullError.
+
+`cocoro stop` and `cocoro status` look here first, so what takes long to import is imported where it is used.
 """
 
 from __future__ import annotations
 
-import json
 import os
 import select
 import signal
 from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager, suppress
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from typing import IO, Annotated, Any, Literal
-
-import msgspec
-from msgspec import Meta
+from typing import IO, TYPE_CHECKING, Any
 
 from cocoro import private
-from cocoro.bus.endpoints import ZenohConfig, default, default_run_dir
 from cocoro.bus.register import members
 from cocoro.errors import RefusedError
 from cocoro.held_file import HeldFile, Holder, hold, holder
+from cocoro.private import default_run_dir
+
+if TYPE_CHECKING:
+    from cocoro.bus.endpoints import ZenohConfig
+    from deploy.mesh_table import Mesh
 
 LOG_DIR = "COCORO_LOG_DIR"
 """Environment variable with a place for the logs that outlives the run directory."""
@@ -39,18 +40,8 @@ PROFILE_BYTES = 1024 * 1024
 """Upper bound of a profile's size."""
 KEPT_LOGS = 5
 """Logs of earlier starts that are kept, per process."""
-
-
-class Mesh(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The place where a robot's processes meet: a profile's `[mesh]` table. Without endpoints it is the run directory.
-    The fields are those of `cocoro.bus.endpoints.ZenohConfig`."""
-
-    mode: Literal["peer", "client", "router"] = "peer"
-    listen: tuple[str, ...] = ()
-    connect: tuple[str, ...] = ()
-    lease_s: Annotated[float, Meta(gt=0)] = 4.0
-    patience_s: Annotated[float, Meta(gt=0)] = 1.0
-    options: dict[str, Any] = {}
+START = "start one with `cocoro up sim`"
+"""What to do where no robot is up."""
 
 
 class RunDir:
@@ -137,6 +128,13 @@ class RunDir:
     def join_as(self, name: str, mesh: Mesh | None = None, *, frames: bool = False) -> ZenohConfig:
         """Configure a process called `name` to join the mesh of a profile (by default the last start's). `frames`: it
         publishes or reads frames, so it asks for shared memory."""
+        from dataclasses import replace
+
+        import msgspec
+
+        from cocoro.bus.endpoints import ZenohConfig, default
+        from deploy.mesh_table import Mesh
+
         if mesh is None:
             mesh = msgspec.convert(self.resolved().get("mesh", {}), Mesh)
         if not mesh.listen and not mesh.connect:
@@ -149,6 +147,8 @@ class RunDir:
 
     def resolved(self) -> dict[str, Any]:
         """The profile of the last start, as data; empty when there is none or it is damaged. Raises ConfigError."""
+        import json
+
         try:
             data = json.loads(private.read(self.profile_file, PROFILE_BYTES))
         except (FileNotFoundError, ValueError, RecursionError):

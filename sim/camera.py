@@ -7,12 +7,15 @@ does not depend on the number of frames before it. Motion blur is the exception:
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from cocoro.arrays import CodeArray, Float32Array, FloatArray, ImageArray
 from cocoro.errors import ConfigError
 from cocoro.messages import Frame
 from cocoro.robot import Robot
+from sim.memory import keep_freed_memory
 from sim.realism import Sensors
 from sim.render import Lighting, Renderer
 from sim.seeds import stream
@@ -78,7 +81,7 @@ class SimKinect:
         self._projector_offset_m = np.array(robot.kinect.projector_offset_m)
         self._coder = DepthCoder(robot)
         self._before: tuple[int, FloatArray] | None = None
-        _keep_freed_memory()
+        keep_freed_memory()
         if self._real:
             rng = stream(seed, "kinect")
             self._colour_noise = ByteNoise(rng, width * height, COLOUR_SIGMA)
@@ -91,6 +94,11 @@ class SimKinect:
 
     def __exit__(self, *_: object) -> None:
         self._renderer.close()
+
+    def expose(self, poses: FloatArray, camera_pose: FloatArray, stamp_ns: int, light: Lighting) -> Callable[[], Frame]:
+        """Expose a frame as `capture` does; the function that is returned gives it when it is to be delivered."""
+        frame = self.capture(poses, camera_pose, stamp_ns, light)
+        return lambda: frame
 
     def capture(self, poses: FloatArray, camera_pose: FloatArray, stamp_ns: int, light: Lighting) -> Frame:
         """Take the frame whose exposure has its middle at `stamp_ns`.
@@ -152,11 +160,3 @@ def moved(camera_pose: FloatArray, offset_m: FloatArray) -> FloatArray:
     pose = camera_pose.copy()
     pose[:3, 3] += camera_pose[:3, :3] @ offset_m
     return pose
-
-
-def _keep_freed_memory() -> None:
-    """Make glibc keep freed memory for the next frame. Returning it to the system and faulting in fresh pages 30 times
-    a second would cost as much as the depth picture. glibc raises its limit to the largest block that was freed; with
-    another C library this does nothing."""
-    largest = np.empty(31 * 1024 * 1024, np.uint8)
-    del largest

@@ -6,7 +6,6 @@ import tempfile
 from collections.abc import Mapping
 from math import cos, sin
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -31,10 +30,8 @@ WHEEL_GAIN = 0.2
 """Share of a wheel's lag that one step corrects."""
 
 
-class JointReading(NamedTuple):
-    angle_rad: float
-    speed_radps: float
-    torque_nm: float
+JointReading = tuple[float, float, float]
+"""Angle, rad; speed, rad/s; torque of the motor, N m."""
 
 
 class Mechanism:
@@ -106,7 +103,7 @@ class Mechanism:
         """Readings of the servo joints in the order of `joints`, then of the left and the right wheel."""
         states = self._bullet.getJointStates(self.body, self._read_indices)
         self._wheel_rad = [state[0] for state in states[-2:]]
-        return [JointReading(angle, speed, torque) for angle, speed, _, torque in states]
+        return [(angle, speed, torque) for angle, speed, _, torque in states]
 
     def root(self) -> tuple[Vec3, Quaternion]:
         """World position (m) and orientation (x, y, z, w) of the body frame."""

@@ -7,17 +7,19 @@ import time
 from collections.abc import Callable, Mapping
 from contextlib import AsyncExitStack, ExitStack
 from heapq import heappop, heappush
+from math import ceil
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Protocol, Self
 
 import msgspec
 from msgspec import Meta
 
 from cocoro import topics
+from cocoro.arrays import FloatArray
 from cocoro.clock import NS, Clock
 from cocoro.component import Implementation
 from cocoro.latch import ServiceLatch
-from cocoro.messages import BaseCommand, BaseState, ClockTick, LatchState, Message, ServoCommand
+from cocoro.messages import BaseCommand, BaseState, ClockTick, Frame, LatchState, Message, ServoCommand
 from cocoro.node import Node
 from cocoro.publisher import Publisher
 from cocoro.robot import Robot
@@ -26,15 +28,18 @@ from sim.component import SIM
 from sim.motion import MotionWriter
 from sim.random_scene import find_scene
 from sim.realism import BodyKind, BodyRealism, Sensors, body_of
-from sim.render import make_renderer
+from sim.render import Lighting, make_renderer
 from sim.render.choice import RendererChoice
 from sim.world import Motors, World, message_motors
 
 TICK_HZ = 120
 """Rate of the clock topic. The physics runs a whole number of steps between ticks."""
-FRAME_LATENCY_S = 0.020
+FRAME_LATENCY_S = 0.033
+"""Time from the middle of a frame's exposure to its delivery: half an exposure, read-out and transfer, as the driver of
+the hardware assumes (`least_age_s` of services/kinect/device.py)."""
 STATE_LATENCY_S = 0.005
-"""Latencies from stamp to publication, with real sensors."""
+"""Time from a state's stamp to its publication, with real sensors."""
+FRAME_LATENCY_NS = round(FRAME_LATENCY_S * NS)
 LATE_S = 0.05
 """When it is further behind real time than this, simulated time slips instead of catching up: a clock that hurries
 makes the others' messages late."""
@@ -67,22 +72,37 @@ class SimConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Time at which the forearm is bent, by 3 cm at the hand."""
     motion: str = ""
     """A file for the body's motion at each physics step (`sim.motion`); '' for none."""
+    camera_process: bool = False
+    """Draw the camera's pictures in a process of its own, while everything else goes on. The pictures are the same."""
+
+
+class SimCamera(Protocol):
+    """A camera that exposes a frame now and delivers it later. A context manager."""
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(self, *_: object) -> None: ...
+
+    def expose(self, poses: FloatArray, camera_pose: FloatArray, stamp_ns: int, light: Lighting) -> Callable[[], Frame]:
+        """See `SimKinect.expose`."""
 
 
 class _Outbox:
     """Holds messages back until their latency, by simulated time, is over."""
 
     def __init__(self) -> None:
-        self._waiting: list[tuple[int, int, Publisher[Any], Message]] = []
+        self._waiting: list[tuple[int, int, Publisher[Any], Message | Callable[[], Message]]] = []
         self._count = 0
 
-    def put(self, publisher: Publisher[Any], message: Message, due_ns: int) -> None:
+    def put(self, publisher: Publisher[Any], message: Message | Callable[[], Message], due_ns: int) -> None:
+        """Keep a message, or a function that gives it, until its time."""
         heappush(self._waiting, (due_ns, self._count, publisher, message))
         self._count += 1
 
     def flush(self, now_ns: int) -> None:
         while self._waiting and self._waiting[0][0] <= now_ns:
-            _, _, publisher, message = heappop(self._waiting)
+            _, _, publisher, waiting = heappop(self._waiting)
+            message = waiting if isinstance(waiting, Message) else waiting()
             publisher.put(message, message.stamp_ns)
 
 
@@ -104,10 +124,10 @@ class _Every:
 class Simulator:
     """Steps the world and exchanges its commands, states and frames with the mesh."""
 
-    def __init__(self, node: Node, config: SimConfig, world: World, kinect: SimKinect) -> None:
+    def __init__(self, node: Node, config: SimConfig, world: World, camera: SimCamera) -> None:
         self._config = config
         self._world = world
-        self._kinect = kinect
+        self._camera = camera
         self._clock = node.clock
         self._outbox = _Outbox()
         self._state_due = _Every(config.state_rate_hz)
@@ -115,7 +135,6 @@ class Simulator:
         self._truth_due = _Every(topics.TRUTH.rate_hz or 30.0)
         real = config.sensors == "real"
         self._state_latency_ns = round(STATE_LATENCY_S * NS) if real else 0
-        self._frame_latency_ns = round(FRAME_LATENCY_S * NS) if real else 0
         self._ticks = node.publisher(topics.CLOCK)
         self._truth = node.publisher(topics.TRUTH)
         self._states: tuple[tuple[Publisher[Any], Callable[[], Message]], ...] = ()
@@ -178,8 +197,8 @@ class Simulator:
             if self._truth_due.due(now_ns):
                 self._outbox.put(self._truth, world.truth(), now_ns)
             if self._frame_due.due(now_ns):
-                frame = self._kinect.capture(world.visual_poses(), world.camera_pose(), now_ns, world.light)
-                self._outbox.put(self._frames, frame, now_ns + self._frame_latency_ns)
+                frame = self._camera.expose(world.visual_poses(), world.camera_pose(), now_ns, world.light)
+                self._outbox.put(self._frames, frame, now_ns + FRAME_LATENCY_NS)
         self.publish_time()
         self._outbox.flush(world.time_ns)
         if self._motion is not None:
@@ -197,8 +216,8 @@ class Simulator:
 
 async def run(node: Node, config: SimConfig) -> None:
     """Simulate for ever, in real time or in the event loop's virtual time."""
-    with make_world(node.robot, config) as world, make_kinect(node.robot, config, world) as kinect:
-        simulator = Simulator(node, config, world, kinect)
+    with make_world(node.robot, config) as world, make_camera(node.robot, config, world) as camera:
+        simulator = Simulator(node, config, world, camera)
         async with AsyncExitStack() as stack:
             hardware = [await stack.enter_async_context(node.sibling(name)) for name in SIM.services]
             simulator.connect(*hardware)
@@ -226,6 +245,18 @@ def make_world(
         wear=body_of(robot, config.body, config.seed, config.bend_at_s),
         motors=motors,
     )
+
+
+def make_camera(robot: Robot, config: SimConfig, world: World) -> SimCamera:
+    """The camera that the configuration asks for, in this process or in its own."""
+    if not config.camera_process:
+        return make_kinect(robot, config, world)
+    from sim.camera_process.remote import RemoteKinect
+
+    return RemoteKinect(
+        robot, world.visuals, sensors=config.sensors, seed=config.seed, width=config.width, height=config.height,
+        renderer=config.renderer, slots=ceil(FRAME_LATENCY_S * config.frame_rate_hz) + 2,
+    )  # fmt: skip
 
 
 def make_kinect(robot: Robot, config: SimConfig, world: World) -> SimKinect:

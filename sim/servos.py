@@ -48,7 +48,10 @@ class Backlash:
     def follow(self, angle_rad: float) -> float:
         """Move the joint to `angle_rad`; returns the shaft's angle."""
         half = self._half_rad
-        self.shaft_rad = min(max(self.shaft_rad, angle_rad - half), angle_rad + half)
+        if self.shaft_rad < angle_rad - half:
+            self.shaft_rad = angle_rad - half
+        if self.shaft_rad > angle_rad + half:
+            self.shaft_rad = angle_rad + half
         return self.shaft_rad
 
 
@@ -58,6 +61,8 @@ class SimServo:
     def __init__(self, joint: Joint, angle_rad: float, backlash_rad: float = 0.0) -> None:
         self.joint = joint
         self.goal_count = joint.to_count(angle_rad)
+        self._goal = self.goal_count, joint.to_angle(self.goal_count)
+        """The goal in counts and in rad, since the drive is asked for at every step and the goal changes seldom."""
         self.speed_limit_radps = HOLD_SPEED_RADPS
         self.overloaded = False
         self._play = Backlash(backlash_rad, angle_rad)
@@ -137,13 +142,17 @@ class SimServo:
     def drive(self, speed_factor: float = 1.0) -> Drive:
         """The motor's target. The servo closes its loop on the measured shaft, so the joint stops up to half the
         backlash beside the goal."""
-        goal_rad = self.joint.to_angle(self.goal_count)
-        error_rad = goal_rad - self._play.shaft_rad
-        torque_nm = self.joint.torque_nm
-        if self.joint.compliance_deg:
-            share = abs(degrees(error_rad)) / self.joint.compliance_deg
+        joint = self.joint
+        if self.goal_count != self._goal[0]:
+            self._goal = self.goal_count, joint.to_angle(self.goal_count)
+        error_rad = self._goal[1] - self._play.shaft_rad
+        torque_nm = joint.torque_nm
+        if joint.compliance_deg:
+            share = abs(degrees(error_rad)) / joint.compliance_deg
             torque_nm *= min(max(share, PUNCH), 1.0)
-        speed_radps = min(self.speed_limit_radps * speed_factor, self.joint.max_speed_radps)
+        speed_radps = self.speed_limit_radps * speed_factor
+        if speed_radps > joint.max_speed_radps:
+            speed_radps = joint.max_speed_radps
         return Drive(self.angle_rad + error_rad, speed_radps, torque_nm)
 
     def _hold_here(self) -> None:

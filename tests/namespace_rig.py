@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
+from functools import cache
 from pathlib import Path
 from types import TracebackType
 
@@ -64,3 +66,13 @@ class Namespace:
 
 
 needs_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root can mount a file system")
+
+
+@cache
+def no_namespaces() -> str:
+    """The reason for which there are no namespaces to be had, or ''."""
+    if shutil.which("unshare") is None:
+        return "there is no unshare"
+    command = ["unshare", "--mount", "--net", "mount", "--make-rprivate", "/"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    return done.stderr.strip()

@@ -71,6 +71,8 @@ class RobotRig:
         self._services: dict[str, _Running] = {}
         self.operator = Node("operator", self.mesh.join(), self._clock, self._robot)
         self.tap = Tap(self.mesh.join(), self._robot.name)
+        if not record_steps:  # then nobody asks for them; those of a fetch are 70 MB
+            self.tap.leave_out(topics.FRAME)
         self.truths: list[Truth] = []
         self._base: list[BaseState] = []
         self._first = tuple(services)
@@ -89,7 +91,7 @@ class RobotRig:
         for name in list(self._services):
             await self.kill(name)
         await self.operator.__aexit__()
-        self.tap.forget()  # some 70 MB of frames for a fetch, which would wait for the garbage collector
+        self.tap.forget()  # what it keeps would wait for the garbage collector
 
     # --- services -----------------------------------------------------------------------------------
 

@@ -13,7 +13,7 @@ from wire_base import DEADMAN_NS, MS, PATIENCE_NS, SAFE, Bench, FakeService, gua
 
 from services.base import oi
 
-pytestmark = [pytest.mark.zenoh, pytest.mark.process]
+pytestmark = [pytest.mark.zenoh, pytest.mark.alone, pytest.mark.process]
 
 
 @pytest.fixture

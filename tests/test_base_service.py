@@ -23,7 +23,7 @@ from cocoro.testing import ServiceUnderTest
 from services.base.service import BaseConfig, BaseService
 from sim.wire.line import LineFault
 
-pytestmark = [pytest.mark.zenoh, pytest.mark.process]
+pytestmark = [pytest.mark.zenoh, pytest.mark.alone, pytest.mark.process]
 
 LONG_S = 30.0
 

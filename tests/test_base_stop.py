@@ -22,7 +22,7 @@ from cocoro.robot import Robot
 from cocoro.stop.record import prepare, read
 from cocoro.testing import ServiceUnderTest
 
-pytestmark = [pytest.mark.zenoh, pytest.mark.process]
+pytestmark = [pytest.mark.zenoh, pytest.mark.alone, pytest.mark.process]
 
 
 @pytest.fixture

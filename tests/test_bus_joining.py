@@ -14,10 +14,11 @@ from typing import Any
 import pytest
 from zenoh_rig import CHILD, PATIENCE_S, appears, changes, child, echo, left_in, local, scenario, who
 
-from cocoro.bus.endpoints import ZenohConfig, default, default_run_dir
+from cocoro.bus.endpoints import ZenohConfig, default
 from cocoro.bus.register import Membership, members
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.errors import ConfigError, MeshError
+from cocoro.private import default_run_dir
 
 # The register
 

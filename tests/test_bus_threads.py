@@ -10,7 +10,7 @@ from typing import TypeVarTuple
 
 from zenoh_rig import FRAME, PATIENCE_S
 
-from cocoro.bus.declared import SharedPool, read
+from cocoro.bus.declared import SHARED_FROM_BYTES, SharedPool, read
 from cocoro.bus.queues import OUTBOX_BYTES, Outbox, Ring
 from cocoro.bus.shared import POOL_BYTES
 
@@ -151,6 +151,13 @@ def test_a_pool_that_is_full_lets_samples_go_by_copy() -> None:
     assert not isinstance(pool.hold(FRAME), bytes)
 
 
+def test_a_small_sample_is_not_put_into_shared_memory() -> None:
+    pool = SharedPool()
+    small = bytes(SHARED_FROM_BYTES - 1)
+    assert pool.hold(small) is small
+    assert not isinstance(pool.hold(small + b"1"), bytes)
+
+
 def test_a_sample_whose_memory_was_taken_back_is_not_read() -> None:
     class Held:
         def is_valid(self) -> bool:
@@ -158,7 +165,7 @@ def test_a_sample_whose_memory_was_taken_back_is_not_read() -> None:
 
     class Payload:
         def to_bytes(self) -> bytes:
-            return b"half of one and half of another"
+            return b"half of one and half of another".ljust(SHARED_FROM_BYTES)
 
         def as_shm(self) -> Held:
             return Held()

@@ -41,7 +41,7 @@ pytestmark = pytest.mark.zenoh
 
 ROBOT = "calliope"
 KILLS = 5
-"""bench/capture.py does 20 and prints the figures."""
+"""`python -m bench capture kill --times 20` does 20 and prints the figures."""
 MISSING_S = 0.3
 PATIENCE_S = 60.0
 

@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from cocoro.errors import CocoroError, ConfigError
 from cocoro.topics import TOPICS
 from deploy.processes import stoppable
 from services.executive.tasks import TASKS, FetchTask, FollowTask, PutDownTask
+from sim.camera_process import start
 
 COMMANDS = (
     "up", "down", "status", "fetch", "follow", "park", "put-down", "stop", "estop", "reset", "cancel", "objects",
@@ -164,8 +166,12 @@ def test_the_topics_page_of_the_documentation_is_up_to_date(capsys: pytest.Captu
 
 @pytest.mark.process
 def test_help_imports_no_command() -> None:
+    """Where typer draws it, as on a narrow terminal; elsewhere it imports less."""
     code = "import sys; from apps.cli.main import main; main(['--help']); print(*sys.modules, file=sys.stderr)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
+    environment = os.environ | {"COLUMNS": "50"}
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT, env=environment
+    )
     modules = set(done.stderr.split())
     heavy = {"numpy", "zenoh", "psutil", "rich.live", "apps.cli.link", "apps.cli.status", "services.executive.skills"}
     assert heavy & modules == set()
@@ -248,6 +254,7 @@ def simulator(monkeypatch: pytest.MonkeyPatch) -> list[RehearsalRequest]:
         return RESULT | {"outcome": "failed" if request.task.label == "blue_can" else "done"}
 
     monkeypatch.setattr(rehearsing, "rehearse", run)
+    monkeypatch.setattr(start, "started_ahead", nullcontext)
     return asked
 
 
@@ -261,7 +268,7 @@ def test_every_option_of_rehearse_reaches_the_request(simulator: list[RehearsalR
         RehearsalRequest(
             task=FetchTask(label="red_can", bring=True), scene="paper", seed=3, sensors="real",
             latency={"perception": 0.1, "planning": 0.02}, lockstep=True,
-            width=320, height=240, frame_rate_hz=15.0, timeout_s=60.0,
+            width=320, height=240, frame_rate_hz=15.0, timeout_s=60.0, camera_process=True,
         )
     ]  # fmt: skip
 
@@ -312,6 +319,7 @@ def test_a_refused_rehearsal_exits_as_the_refused_task_would(
     assert main(["rehearse", "fetch", "grey_can"]) == code
 
 
+@pytest.mark.process
 @pytest.mark.sim
 def test_a_scene_with_an_error_is_bad_usage_too(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scene = tmp_path / "scene.toml"

@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 
 from apps.cli.main import main
+from bench.__main__ import WORDS
+from bench.entries import ENTRIES
 
 ROOT = Path(__file__).parents[1]
 TEXT = (ROOT / "CONTRIBUTING.md").read_text()
@@ -26,11 +28,12 @@ def test_links_and_paths_lead_to_files() -> None:
     assert missing == []
 
 
-def test_targets_of_make_and_modules_of_benches_exist() -> None:
+def test_targets_of_make_and_benches_exist() -> None:
     targets = set(re.findall(r"(?m)^(\w+):", (ROOT / "Makefile").read_text()))
     assert {command.split()[1] for command in COMMANDS if command.startswith("make ")} <= targets
-    benches = {command.split()[2] for command in COMMANDS if command.startswith("python -m")} - {"bench.NAME"}
-    assert all((ROOT / f"{bench.replace('.', '/')}.py").is_file() for bench in benches)
+    benches = {command.split()[3] for command in COMMANDS if command.startswith("python -m bench ")} - {"NAME"}
+    assert benches
+    assert benches <= {*ENTRIES, *WORDS}
 
 
 def test_commands_of_the_command_line_exist() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 from collections import Counter, defaultdict
 from collections.abc import Iterator
+from functools import cache
 from itertools import cycle
 from typing import Any
 
@@ -44,6 +45,12 @@ def is_good(topic: Topic[Any], payload: bytes) -> bool:
     return True
 
 
+@cache
+def too_large(topic: Topic[Any]) -> bytes:
+    """Made once: whoever keeps what was sent would keep each of them."""
+    return bytes(topic.max_bytes + 1)
+
+
 def spoilt(topic: Topic[Any], good: bytes, draw: random.Random) -> Iterator[bytes]:
     """Invalid payloads made from a valid one."""
     data = msgpack.unpackb(good)
@@ -52,7 +59,7 @@ def spoilt(topic: Topic[Any], good: bytes, draw: random.Random) -> Iterator[byte
     yield good[: draw.randrange(len(good))]
     yield msgpack.packb(replaced(data, draw.choice(list(leaves_in(data))), {"what": "is this"}))
     yield msgpack.packb([data])
-    yield bytes(topic.max_bytes + 1)
+    yield too_large(topic)
     for _ in range(3):
         flipped = bytearray(good)
         flipped[draw.randrange(min(len(good), 200))] ^= 1 << draw.randrange(8)
@@ -73,12 +80,13 @@ class Barrage:
         self._rig = rig
         self._draw = random.Random(seed)
         self._said: dict[str, bytes] = {}
-        self._ours: set[bytes] = set()
+        self._ours: set[int] = set()
+        """Hashes of what it sent."""
         self.sent: Counter[str] = Counter()
         rig.mesh.join().subscribe(f"{rig.operator.robot_name}/**", Qos.EVENT, self._hear, depth=1)
 
     def _hear(self, key: str, payload: bytes | memoryview) -> None:
-        if bytes(payload) not in self._ours:
+        if hash(bytes(payload)) not in self._ours:
             self._said[key.partition("/")[2]] = bytes(payload)
 
     async def fire(self) -> None:
@@ -86,7 +94,7 @@ class Barrage:
             good = self._said.get(topic.name)
             for payload in spoilt(topic, good, self._draw) if good is not None else (b"",):
                 await self._rig.operator.sleep(PERIOD_S)
-                self._ours.add(payload)
+                self._ours.add(hash(payload))
                 self._rig.mesh.publish(topic.key(self._rig.operator.robot_name), payload)
                 self.sent[topic.name] += 1
 

@@ -1,6 +1,6 @@
 """Faults at full speed, at random moments: the body stands within 0.3 s, by the truth at every step of the physics.
 
-Policies: docs/faults.md; two hundred of them: `python -m bench.faults`.
+Policies: docs/faults.md; two hundred of them: `python -m bench faults`.
 """
 
 from __future__ import annotations
@@ -10,8 +10,8 @@ from concurrent.futures import ProcessPoolExecutor
 
 import pytest
 
-from bench.fault_robot import full_speed_mps
-from bench.faults import HAPPENINGS, STAND_S, Trial, happening_of, run_trial
+from bench.fault_robot import STAND_S, full_speed_mps
+from bench.faults import HAPPENINGS, Trial, happening_of, run_trial
 from deploy.processes import hardware
 
 pytestmark = pytest.mark.sim
@@ -31,8 +31,7 @@ NUMBERS = [number for number in range(len(HAPPENINGS)) if telling(number)]
 
 @pytest.fixture(scope="module")
 def trials() -> dict[int, Trial]:
-    with ProcessPoolExecutor(2, multiprocessing.get_context("spawn")) as pool:
-        return dict(zip(NUMBERS, pool.map(run_trial, [SEED] * len(NUMBERS), NUMBERS), strict=True))
+    return {number: run_trial(SEED, number) for number in NUMBERS}
 
 
 @pytest.mark.parametrize("number", NUMBERS, ids=lambda number: happening_of(number)[0].name)
@@ -43,6 +42,8 @@ def test_whatever_happens_at_full_speed_the_robot_stands_in_time(trials: dict[in
     assert trial.stand_s > 0.1, "it was driving, and has a ramp"
 
 
-def test_a_trial_is_the_same_again(trials: dict[int, Trial]) -> None:
+@pytest.mark.process
+def test_a_trial_is_the_same_again_in_another_process(trials: dict[int, Trial]) -> None:
     number = NUMBERS[1]  # a short one
-    assert run_trial(SEED, number) == trials[number]
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+        assert pool.submit(run_trial, SEED, number).result() == trials[number]

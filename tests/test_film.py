@@ -192,6 +192,7 @@ def test_what_cannot_be_filmed_is_told_in_one_line(tmp_path: Path, capsys: pytes
         video.camera_of("")
 
 
+@pytest.mark.process
 @pytest.mark.sim
 def test_a_rehearsal_is_filmed_and_leaves_the_film_alone(
     run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

@@ -171,6 +171,7 @@ async def test_background_work_that_fails_degrades_its_node_and_nothing_else(cap
 async def test_a_node_that_ends_leaves_nothing_behind() -> None:
     mesh = Mesh()
     async with mesh.node("other") as other:
+        await settle()  # its first health message is out
         before = (len(asyncio.all_tasks()), len(mesh.mesh.subscriptions), len(mesh.mesh.servers))
         async with mesh.node("base") as node:
             node.ready()

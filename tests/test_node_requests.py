@@ -9,9 +9,10 @@ import pytest
 from node_rig import Mesh, answered
 
 from cocoro import topics
+from cocoro.bus.base import Payload
 from cocoro.clock import NS
 from cocoro.errors import CallTimeoutError, ConfigError, MeshError, RemoteError
-from cocoro.messages import CancelRequest, EstopReply, EstopRequest, TaskReply
+from cocoro.messages import CancelRequest, EstopReply, EstopRequest, Latch, TaskReply
 from cocoro.testing import in_virtual_time
 
 
@@ -124,3 +125,31 @@ async def test_all_services_can_be_called_at_once_and_each_answer_names_its_serv
         answers = await caller.call_all(topics.ESTOP.of("*"), EstopRequest(latched=True))
         assert {answer.service: answer.error for answer in answers} == {"base": "", "arm": "no"}
         assert [answer.reply.latch for answer in answers if answer.reply is not None] == ["latched"]
+
+
+@in_virtual_time
+async def test_the_newest_message_of_a_slow_topic_can_be_asked_for() -> None:
+    mesh = Mesh()
+    async with mesh.node("executive") as node, mesh.node("operator") as caller:
+        assert await caller.newest(topics.LATCH, 1.0) == []
+        node.publisher(topics.LATCH)
+        assert await caller.newest(topics.LATCH, 1.0) == [], "nothing was said yet"
+        for by in ("a", "b"):
+            said = node.publish(topics.LATCH, Latch(state="latched", by=by))
+        assert await caller.newest(topics.LATCH, 1.0) == [said]
+        assert {health.service for health in await caller.newest(topics.HEALTH.of("*"), 1.0)} == {
+            "executive",
+            "operator",
+        }
+        assert caller.now_ns() == 0, "nobody waited"
+
+
+@in_virtual_time
+async def test_who_answers_with_something_else_than_its_newest_message_is_not_heard() -> None:
+    async def garbage(_key: str, _question: Payload) -> bytes:
+        return b"\xc1"
+
+    mesh = Mesh()
+    async with mesh.node("operator") as caller:
+        mesh.mesh.join().serve(topics.LATCH.key(caller.robot_name), garbage)
+        assert await caller.newest(topics.LATCH, 1.0) == []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import cv2
+import msgspec
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -14,7 +15,7 @@ from cocoro.objects import Catalogue
 from cocoro.topics import FRAME
 from services.perception.config import PerceptionConfig
 from services.perception.core import PerceptionCore
-from services.perception.evidence import middle_depths_m
+from services.perception.evidence import FEW, middle_depths_m, surroundings
 from services.perception.image import RgbdImage
 from services.perception.region import ColourRegion
 from services.perception.registration import Registration
@@ -136,12 +137,34 @@ def test_a_regions_depth_is_the_same_alone_as_among_others() -> None:
             assert alone == pytest.approx(depth_m, abs=1e-7) or (alone is None and depth_m != depth_m)
 
 
+def test_the_pixels_around_many_regions_are_those_around_each() -> None:
+    image = RgbdImage.of(canvas_of_all(1).frame(), ROBOT)
+    image.register(np.array([(0, 0, 640, 480)]))
+    for seed in range(4):
+        picture = np.zeros((480, 640), dtype=np.uint16)
+        picture[60:300, 40:360] = patches((240, 320), seed, labels=30)
+        found = segments(picture, TABLE, 0, 6.0)
+        assert found is not None
+        assert len(found.start) > FEW
+        u, v, _, first, counts = surroundings(found, image)
+        every, missing = 0, 0
+        for region in range(len(found.start)):
+            alone = surroundings(found.among(np.arange(len(found.start)) == region), image)
+            some = slice(first[region], first[region] + counts[region])
+            together = set(zip(u[some].tolist(), v[some].tolist(), strict=True))
+            expected = set(zip(alone[0].tolist(), alone[1].tolist(), strict=True))
+            assert together <= expected
+            every, missing = every + len(expected), missing + len(expected - together)
+        # Where the surroundings of three regions meet, two of them have the pixel.
+        assert missing <= 0.15 * every, (missing, every)
+
+
 # --- the whole detector ---------------------------------------------------------------------------
 
 
-def detections(frame: Frame, catalogue: Catalogue) -> dict[str, Detection]:
+def detections(frame: Frame, catalogue: Catalogue, tilt: float = -0.3) -> dict[str, Detection]:
     core = PerceptionCore(ROBOT, PerceptionConfig(), catalogue)
-    around = [head_at(frame.stamp_ns + offset_ns, 0.1, -0.3) for offset_ns in (-10_000_000, 10_000_000)]
+    around = [head_at(frame.stamp_ns + offset_ns, 0.1, tilt) for offset_ns in (-10_000_000, 10_000_000)]
     message = core.step([*around, Sample(FRAME, frame)], frame.stamp_ns + 20_000_000)[0].message
     assert isinstance(message, Detections)
     return {one.label: one for one in message.detections}
@@ -161,3 +184,21 @@ def test_an_object_among_others_is_detected_as_it_is_alone(size: tuple[int, int]
             assert (seen.u_px, seen.v_px, seen.area_px) == (alone.u_px, alone.v_px, alone.area_px)
             assert (seen.depth_m, seen.note) == (alone.depth_m, alone.note)
             assert seen.position_m == pytest.approx(alone.position_m, abs=2e-4)
+
+
+def test_an_object_that_fills_the_whole_picture_has_no_outline_and_is_still_placed() -> None:
+    canvas = Canvas(wall_m=1.0)
+    canvas.colour[:] = np.round(200 * np.array(CATALOGUE["red_can"].rgb))
+    big = msgspec.structs.replace(CATALOGUE["red_can"], label="wall", radius_m=0.9, height_m=1.6)
+    found = detections(canvas.frame(), Catalogue((big,)), tilt=0.3)["wall"]
+    assert found.box_px == (0, 0, 640, 480)
+    assert found.depth_m == pytest.approx(1.0, abs=0.01)
+    assert found.position_m is not None
+
+
+@pytest.mark.parametrize("depth_m", [2.0, 2.5, 3.0])
+def test_in_a_small_picture_what_is_two_pixels_wide_is_still_seen(depth_m: float) -> None:
+    canvas = Canvas(160, 120)
+    canvas.rectangle("red_can", (80, 60), depth_m)
+    left, _, right, _ = detections(canvas.frame(), CATALOGUE)["red_can"].box_px
+    assert right - left == 2

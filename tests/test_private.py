@@ -96,13 +96,13 @@ WRITES: dict[str, tuple[Callable[[RunDir], None], tuple[str, ...]]] = {
     "make": (make, ()),
     "supervisor": (hold, ("supervisor",)),
     "claims": (claim, ("claims/executive",)),
-    "profile": (remember, (f".profile.json.{os.getpid()}",)),
+    "profile": (remember, (".profile.json.{pid}",)),
     "logs": (log, ("logs/supervisor.log",)),
     "errors": (errors, ("logs/supervisor.err",)),
     "register": (register, ("lock",)),
     "wire": (plug, ("wire",)),
 }
-"""Functions that write below the run directory, with the files that they write."""
+"""Functions that write below the run directory, with the files that they write; {pid} is this process's number."""
 LOOKS: tuple[Callable[[RunDir], object], ...] = (
     RunDir.supervisor,
     RunDir.claims,
@@ -111,6 +111,11 @@ LOOKS: tuple[Callable[[RunDir], object], ...] = (
     lambda run_dir: robots(run_dir.root),
 )
 """Functions that only read; their callers signal the processes and join the mesh that they find."""
+
+
+def here(files: tuple[str, ...]) -> tuple[str, ...]:
+    return tuple(name.format(pid=os.getpid()) for name in files)
+
 
 writes = pytest.mark.parametrize(("write", "files"), WRITES.values(), ids=WRITES)
 
@@ -122,7 +127,7 @@ def test_links_in_another_user_s_directory_are_not_followed(
 ) -> None:
     victim.chmod(0o777)  # he might even reach it himself
     with as_nobody():
-        for name in files or ("supervisor",):
+        for name in here(files) or ("supervisor",):
             planted = shared / "cocoro" / "robbie" / name
             planted.parent.mkdir(parents=True)
             planted.symlink_to(victim / "file")
@@ -155,7 +160,7 @@ def test_a_link_in_a_file_s_place_is_not_followed(
 ) -> None:
     """Even where nobody else can have put it; an old log is set aside, link or not."""
     run_dir = RunDir("robbie", shared / "cocoro")
-    for name in files:
+    for name in here(files):
         planted = run_dir.path / name
         planted.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         planted.symlink_to(victim / target)
@@ -243,7 +248,7 @@ def test_what_is_made_is_for_this_user_alone(shared: Path, monkeypatch: pytest.M
     """Without COCORO_RUN_DIR and XDG_RUNTIME_DIR the folders lie below the place for temporary files."""
     for variable in ("COCORO_RUN_DIR", "XDG_RUNTIME_DIR"):
         monkeypatch.delenv(variable, raising=False)
-    monkeypatch.setattr(tempfile, "tempdir", str(shared))
+    monkeypatch.setattr(private, "TEMPORARY", str(shared))
     run_dir = RunDir("robbie")
     assert run_dir.root == shared / f"cocoro-{os.getuid()}"
     for write, _ in WRITES.values():
@@ -290,12 +295,12 @@ def test_a_new_holder_is_not_taken_for_the_last_one_before_it_has_written_its_na
     """A process that looks in that moment waits for the name."""
     path, own = tmp_path / "executive", Holder("executive", os.getpid())
     if end == "its death":
-        path.write_bytes(msgspec.json.encode(Holder("executive", NO_PROCESS)))
+        path.write_bytes(msgspec.json.encode(Holder("executive", NO_PROCESS)._asdict()))
     else:
         held = held_file.hold(path, "executive")
         assert held is not None
         held.release()
     with path.open("rb") as new, path.open("rb") as reader:
         fcntl.flock(new, fcntl.LOCK_EX)
-        monkeypatch.setattr("time.sleep", lambda _: path.write_bytes(msgspec.json.encode(own)))
+        monkeypatch.setattr("time.sleep", lambda _: path.write_bytes(msgspec.json.encode(own._asdict())))
         assert holder_of(reader.fileno(), patience_s=60.0) == own

@@ -26,8 +26,9 @@ from cocoro.arrays import FloatArray
 from cocoro.objects import Catalogue
 from sim.camera import moved
 from sim.render import Images, Renderer, make_renderer
+from sim.render import gl as gl_module
 from sim.render.interface import Visual
-from sim.render.room import FLOOR_RGB, OTHER_TILE_RGB, walls
+from sim.render.room import FLOOR_RGB, OTHER_TILE_RGB, nearest_wall_m, walls
 from sim.render.views import lamp_tint
 
 pytestmark = pytest.mark.sim
@@ -190,3 +191,42 @@ def to_lab(rgb: FloatArray) -> FloatArray:
 
     pixel: FloatArray = cv2.cvtColor(rgb.astype(np.float32).reshape(1, 1, 3), cv2.COLOR_RGB2LAB)[0, 0].astype(float)
     return pixel
+
+
+# --- what is left out where it cannot be seen -----------------------------------------------------
+
+PLACES_IN_THE_ROOM = ((0.0, -0.2, 0.0), (7.5, 0.0, 0.0), (7.5, 0.3, 2.0), (-8.0, 0.2, 1.0), (0.0, 0.6, 0.4))
+"""x of the robot, m; tilt and pan of its head, rad."""
+
+
+def head_at(x_m: float, tilt_rad: float, pan_rad: float) -> FloatArray:
+    pose = head(tilt_rad, pan_rad)
+    pose[0, 3] += x_m
+    return pose
+
+
+@pytest.mark.parametrize("place", PLACES_IN_THE_ROOM)
+def test_no_wall_is_nearer_than_the_bound_of_the_nearest(gl: Renderer, place: tuple[float, float, float]) -> None:
+    pose = head_at(*place)
+    far = POSES.copy()
+    far[:, 2, 3] = -5.0  # the things are below the floor
+    seen = gl.render(far, pose, pose, Lamp()).depth_m
+    wall = np.abs(seen - floor_depth(CAMERA, pose)) > 0.05
+    assert wall.any()
+    assert nearest_wall_m(CAMERA, pose) <= seen[wall].min() + 1e-3
+    assert nearest_wall_m(CAMERA, pose) > 0.8 * seen[wall].min()
+
+
+@pytest.mark.parametrize("place", PLACES_IN_THE_ROOM)
+def test_walls_that_no_shadow_reaches_look_as_if_their_shadows_were_looked_up(
+    gl: Renderer, monkeypatch: pytest.MonkeyPatch, place: tuple[float, float, float]
+) -> None:
+    pose = head_at(*place)
+    quick = look(gl, pose, projector=True)
+    monkeypatch.setattr(gl_module, "_reaches_walls", lambda *_: True)
+    monkeypatch.setattr(gl_module, "PROJECTOR_REACH_M", np.inf)
+    whole = look(gl, pose, projector=True)
+    np.testing.assert_array_equal(quick.colour, whole.colour)
+    np.testing.assert_array_equal(np.abs(quick.depth_m), np.abs(whole.depth_m))
+    differs = np.signbit(quick.depth_m) != np.signbit(whole.depth_m)
+    assert not (differs & (whole.depth_m > -ROBOT.kinect.max_range_m)).any()

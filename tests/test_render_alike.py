@@ -160,7 +160,7 @@ def test_a_context_that_cannot_be_made_is_said_once(
     def refuse() -> None:
         raise Exception("eglInitialize failed")  # what glcontext raises is a plain Exception
 
-    monkeypatch.setattr(gl_module, "_context", refuse)
+    monkeypatch.setattr(gl_module, "context", refuse)
     with caplog.at_level(logging.WARNING):
         renderer = make_renderer([], CAMERA)
     renderer.close()

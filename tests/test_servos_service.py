@@ -23,7 +23,7 @@ from services.servos.line import STATE
 from services.servos.motion import LEAD_S, REACH_RAD
 from sim.wire.line import LineFault
 
-pytestmark = pytest.mark.zenoh
+pytestmark = [pytest.mark.zenoh, pytest.mark.alone]
 
 ELBOW = 5
 FOREVER_NS = 10**19

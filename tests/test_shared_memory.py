@@ -193,6 +193,7 @@ def test_the_doctor_names_a_run_directory_that_is_another_user_s(root: Path) -> 
 # --- without ------------------------------------------------------------------------------------------
 
 
+@pytest.mark.alone  # a large frame is dropped for a receiver that does not read for 25 ms
 @scenario
 async def test_frames_reach_a_receiver_without_shared_memory(directory: Path, needs_pool: None) -> None:
     """Frames arrive whole and in order beside a receiver with shared memory, from a publisher with it."""

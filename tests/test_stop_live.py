@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -12,10 +11,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from namespace_rig import no_namespaces
 from operator_shell import Shell
 
 from apps.cli import exits
-from bench.stop import SITUATIONS
+from bench.report import decode
+from bench.stop import SITUATIONS, TRUE
 from cocoro.stop.record import latch_dir, read
 from deploy.rundir import RunDir
 
@@ -25,26 +26,19 @@ ROOT = Path(__file__).parents[1]
 SMALL = ("--frames", "160x120@10")
 
 
-def no_namespaces() -> str:
-    """The reason for which there are no namespaces to be had, or ''."""
-    if shutil.which("unshare") is None:
-        return "there is no unshare"
-    command = ["unshare", "--mount", "--net", "mount", "--make-rprivate", "/"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    return done.stderr.strip()
-
-
 needs_namespaces = pytest.mark.skipif(bool(no_namespaces()), reason=f"no namespaces: {no_namespaces()}")
 
 
+@pytest.mark.alone
 @needs_namespaces
 @pytest.mark.parametrize("situation", SITUATIONS)
 def test_a_robot_at_full_speed_is_stopped_whatever_its_neighbours_do(situation: str) -> None:
-    command = [sys.executable, "-m", "bench.stop", situation, "--count", "2", "--any-time", "--json"]
+    command = [sys.executable, "-m", "bench", "stop", situation, "--count", "2", "--any-time", "--json"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
-    result = json.loads(done.stdout.splitlines()[-1])
-    assert (result["count"], result["faults"]) == (2, [])
+    stops = {figure.name: figure for figure in decode(done.stdout.encode(), "the bench's output").figures}
+    good = stops[f"{situation}: {TRUE}"]
+    assert (good.count, good.median) == (2, 100.0), done.stdout
 
 
 @pytest.fixture

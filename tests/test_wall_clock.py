@@ -207,6 +207,7 @@ def test_the_stepped_clock_steps_wall_time_alone(wall: WallClock) -> None:
 
 @pytest.mark.process
 @pytest.mark.zenoh
+@pytest.mark.alone
 def test_steps_of_the_wall_clock_disturb_no_drive_and_lengthen_no_deadman(wall: WallClock, tmp_path: Path) -> None:
     with driven(wall, tmp_path) as robot:
         robot.drive()
@@ -229,6 +230,7 @@ def test_steps_of_the_wall_clock_disturb_no_drive_and_lengthen_no_deadman(wall: 
 
 @pytest.mark.process
 @pytest.mark.zenoh
+@pytest.mark.alone
 def test_a_process_that_is_started_again_after_a_step_has_the_robot_s_time(wall: WallClock, tmp_path: Path) -> None:
     with driven(wall, tmp_path) as robot:
         fixed = (robot.run_dir.path / robot_time.FILE).read_bytes()

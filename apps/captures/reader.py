@@ -7,7 +7,7 @@
 Channels are identified by number: a key may have several. `capture.problems` lists the unreadable parts so far.
 
 The `mcap` package's readers stop at the first damage, know channels only from the summary, and copy every payload. They
-take 1.0 to 1.4 times as long for frames, 1.5 to 2.0 times for small messages (`python bench/capture_format.py files`).
+take 1.0 to 1.4 times as long for frames, 1.5 to 2.0 times for small messages (`python -m bench capture-format files`).
 """
 
 from __future__ import annotations

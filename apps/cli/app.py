@@ -23,7 +23,7 @@ def load(name: str) -> TyperCommand | TyperGroup:
         case "cancel" | "wait" | "rehearse":
             from apps.cli.task_commands import app
         case "status":
-            from apps.cli.status import app
+            from apps.cli.status_command import app
         case "objects":
             from apps.cli.objects import app
         case "snapshot":

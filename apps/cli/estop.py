@@ -136,11 +136,14 @@ def _by_mesh_too(
     troubles: list[str],
 ) -> tuple[list[StopResult], list[str], int]:
     """Stops on the mesh the robots in `only` (None: all); returns merged results, problems and the exit code."""
-    from apps.cli import estop_mesh
     from cocoro.errors import CocoroError, ConfigError
 
     try:
-        which = [one for one in estop_mesh.found(robot, profile) if only is None or one[0].robot in only]
+        which = []
+        if profile is not None or stops or _up(robot):
+            from apps.cli import estop_mesh  # slow to import
+
+            which = [one for one in estop_mesh.found(robot, profile) if only is None or one[0].robot in only]
         if not which and not stops:
             name = "no robot" if robot is None else f"no {robot}"
             return [], [*troubles, f"{name} is up on this machine: start one with `cocoro up sim`"], exits.NO_MESH
@@ -151,6 +154,13 @@ def _by_mesh_too(
     troubles = [*troubles, *map(str, errors)]
     code = exits.DONE if not errors else exits.FAILED if by_mesh or stops else exits.NO_MESH
     return [*_merged(stops, by_mesh)], troubles, code
+
+
+def _up(robot: str | None) -> bool:
+    """Whether this user has a robot on this machine, or this one."""
+    from deploy.rundir import RunDir, robots
+
+    return bool(robots()) if robot is None else RunDir(robot).populated
 
 
 def _merged(by_path: list[StopResult], by_mesh: list[StopResult]) -> list[StopResult]:

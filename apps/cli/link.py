@@ -9,14 +9,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from apps.cli.options import RobotChoice
+from apps.cli.choice import RobotChoice
 from cocoro.bus.base import Bus
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.errors import ConfigError, MeshError, choice_of
 from cocoro.participant import Answer, Participant
 from cocoro.topics import Request
 from deploy import robot_time
-from deploy.rundir import RunDir, robots
+from deploy.rundir import START, RunDir, robots
 
 if TYPE_CHECKING:
     from cocoro.objects import Catalogue
@@ -29,7 +29,6 @@ PERCEPTION = "perception"
 ROBOT_FILES = ("description", "measured")
 REPLAY, REPLAYED = "replay", "replayed"
 """Process that publishes a capture's messages, and the state of a service that it stands for."""
-START = "start one with `cocoro up sim`"
 
 
 class MeshLink(Participant):

@@ -19,8 +19,8 @@ from apps.cli.interrupt import elapsed, interrupt_event
 from apps.cli.options import JsonOption, RobotOption
 from apps.cli.output import print_json
 from apps.cli.terminal import folded, output_width
-from cocoro.bus.endpoints import default_run_dir
 from cocoro.errors import ConfigError, choice_of
+from cocoro.private import default_run_dir
 from deploy.processes import components
 from deploy.rundir import RunDir, folders
 

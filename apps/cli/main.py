@@ -1,7 +1,7 @@
 """`cocoro`: the operator's command, from its arguments to its exit code.
 
-`cocoro stop` takes a path that imports next to nothing; all other commands are in `app`. An error becomes one line
-on standard error that says what failed, where, and what to do.
+`cocoro stop`, `cocoro --help`, and `cocoro status` without a robot take paths that import next to nothing; all other
+commands are in `app`. An error becomes one line on standard error that says what failed, where, and what to do.
 """
 
 from __future__ import annotations
@@ -10,18 +10,25 @@ import errno
 import os
 import signal
 import sys
-import threading
 from contextlib import suppress
-from types import FrameType, TracebackType
-from typing import TYPE_CHECKING, NoReturn
 
 from apps.cli import exits, output
 from deploy.quit import quit_process
 
+TYPE_CHECKING = False
+"""As in `typing`, which takes 2 ms to import."""
 if TYPE_CHECKING:
+    import threading
     from sys import UnraisableHookArgs
+    from types import FrameType, TracebackType
+    from typing import NoReturn
 
 ESTOP = ("estop", "stop")
+HELP: tuple[list[str], ...] = ([], ["--help"], ["-h"])
+STATUS = (["status"], ["status", "--json"])
+"""Arguments that are answered before the libraries of the other commands are imported."""
+COMPLETES = "_COCORO_COMPLETE"
+"""Environment variable by which a shell asks for the completion of a word."""
 PACKAGES = ("apps", "cocoro", "services", "sim", "deploy")
 ADVICE = {
     errno.ENOSPC: "make room there, or choose another place",
@@ -57,7 +64,42 @@ def _run(arguments: list[str]) -> int:
 
         with output.going_on():
             return estop.main(arguments[0], arguments[1:])
+    if arguments in HELP and COMPLETES not in os.environ:
+        from apps.cli import help
+
+        if (text := help.text()) is not None:
+            print(text, end="\n" if arguments else "")  # as typer prints it
+            return exits.DONE if arguments else exits.USAGE
+    if arguments in STATUS:
+        return _status("--json" in arguments)
     return _command(arguments)
+
+
+def _status(as_json: bool) -> int:
+    """The command without other options. That no robot is up is known before anything is imported that asks one; then
+    MeshError is raised."""
+    from deploy.rundir import START, robots
+
+    if not robots():
+        from cocoro.errors import MeshError
+
+        raise MeshError(f"no robot is up on this machine: {START}")
+    import asyncio
+
+    from apps.cli.choice import RobotChoice
+    from apps.cli.status import show_status
+
+    _report_failures()
+    return asyncio.run(show_status(RobotChoice(), as_json))
+
+
+def _report_failures() -> None:
+    """Has the failures of threads and what libraries log reported as a command's own."""
+    import threading
+
+    if output.taken_over():
+        threading.excepthook = _thread_failed
+        output.log_to_stderr()
 
 
 def _command(arguments: list[str]) -> int:
@@ -65,8 +107,7 @@ def _command(arguments: list[str]) -> int:
 
     from apps.cli.app import app
 
-    if output.taken_over():
-        output.log_to_stderr()
+    _report_failures()
     try:
         get_command(app)(args=arguments, prog_name="cocoro")  # calling `app` would replace sys.excepthook
     except SystemExit as end:
@@ -171,7 +212,7 @@ def _full() -> str:
     """A directory of those that commands write to whose disk is full; a failed write does not name its file."""
     import tempfile
 
-    from cocoro.bus.endpoints import default_run_dir
+    from cocoro.private import default_run_dir
 
     for place in (default_run_dir(), ".", tempfile.gettempdir()):
         with suppress(OSError):
@@ -214,7 +255,6 @@ def run() -> NoReturn:
     """The process `cocoro`: runs the command and ends the process with its exit code."""
     sys.excepthook = _leave
     sys.unraisablehook = _unraisable
-    threading.excepthook = _thread_failed
     for number in (signal.SIGTERM, signal.SIGHUP):
         if signal.getsignal(number) == signal.SIG_DFL:  # nohup's SIG_IGN stays
             signal.signal(number, _as_interrupt)

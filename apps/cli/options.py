@@ -5,16 +5,17 @@ Every command file imports this one, and `cocoro --help` imports every command f
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from apps.cli import completions
-from cocoro.errors import ConfigError
+from apps.cli.choice import RobotChoice as RobotChoice
+from cocoro.errors import ConfigError, choice_of
 
 
 def name_option(*names: str, help: str) -> Any:
@@ -41,15 +42,6 @@ MeshOption = Annotated[
         autocompletion=completions.profiles,
     ),
 ]
-
-
-@dataclass(frozen=True)
-class RobotChoice:
-    """The robot that a command is for, from `--robot` and `--profile`; neither is needed when one robot is up here."""
-
-    robot: str | None = None
-    profile: str | None = None
-    """Reach it through the mesh of this profile, on another machine."""
 
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON, for scripts.")]
@@ -212,3 +204,23 @@ def latencies_of(texts: Iterable[str]) -> dict[str, float]:
         except ValueError:
             raise ConfigError(f"--latency {text}: write it as NAME=SECONDS, for example perception=0.5") from None
     return found
+
+
+def scene_of(scene: str) -> str:
+    """A scene's name unchanged; the path of a scene file made absolute. Raises ConfigError for an unknown name and a
+    missing file."""
+    if not scene.endswith(".toml") and os.sep not in scene:
+        from sim.scene_names import GENERATED, scene_names
+
+        return one_of("--scene", scene, (*scene_names(), *GENERATED))
+    if not Path(scene).is_file():
+        raise ConfigError(f"--scene {scene}: no such file; give a .toml file, or the name of a scene")
+    return str(Path(scene).resolve())
+
+
+def one_of(option: str, given: str, known: Iterable[str]) -> str:
+    """A value that is allowed, unchanged. Raises ConfigError for another."""
+    names = [*known]
+    if given not in names:
+        raise ConfigError(f"{option} {given}: {choice_of(given, names)}")
+    return given

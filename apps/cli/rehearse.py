@@ -12,14 +12,9 @@ from typing import Any
 
 import msgspec
 
-from apps.captures.export import video as films
-from apps.captures.reader import Capture
 from apps.cli import exits
-from apps.cli.export import film
-from apps.cli.options import frames_of, latencies_of
+from apps.cli.options import frames_of, latencies_of, scene_of
 from apps.cli.output import complain, print_json
-from apps.cli.running import scene_of
-from apps.cli.tasks import USAGE_REFUSALS
 from apps.cli.terminal import StatusLine
 from apps.rehearsal.progress import Tell, ignored
 from apps.rehearsal.request import RehearsalRequest
@@ -42,6 +37,10 @@ def rehearse(
     request = request_of(options, latency, frames)
     if video is None:
         return _run(request, as_json)
+    from apps.captures.export import video as films  # imports much
+    from apps.captures.reader import Capture
+    from apps.cli.export import film
+
     films.camera_of(camera)
     films.check(video)
     with nullcontext(request.record) if request.record is not None else _capture_beside(video) as record:
@@ -65,10 +64,16 @@ def _capture_beside(video: Path) -> Iterator[str]:
 
 
 def _run(request: RehearsalRequest, as_json: bool) -> int:
-    from apps.rehearsal.rehearse import rehearse as run  # imports the simulator, which is slow
+    # A fork of a process with one thread starts sooner, and small matrices gain nothing by threads.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    import sim.camera  # noqa: F401 # what both processes need is imported once
+    from sim.camera_process.start import started_ahead
 
+    request = msgspec.structs.replace(request, camera_process=True)
     try:
-        with _output_to_stderr() if as_json else nullcontext(), StatusLine(sys.stderr) as line:
+        with started_ahead(), _output_to_stderr() if as_json else nullcontext(), StatusLine(sys.stderr) as line:
+            from apps.rehearsal.rehearse import rehearse as run  # imports the simulator, which is slow
+
             tell: Tell = (lambda progress: line.show(str(progress))) if line.shown else ignored
             result: dict[str, Any] = run(request, tell)
     except CocoroError as error:
@@ -76,7 +81,7 @@ def _run(request: RehearsalRequest, as_json: bool) -> int:
         if refusal is None:
             raise
         complain(f"refused: {error}")
-        return exits.USAGE if refusal in USAGE_REFUSALS else exits.REFUSED
+        return exits.USAGE if refusal in exits.USAGE_REFUSALS else exits.REFUSED
     if as_json:
         print_json(result)
     else:

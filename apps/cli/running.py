@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterable
 from contextlib import closing
 from pathlib import Path
 from typing import IO, Annotated, Any, TextIO
@@ -32,11 +31,13 @@ from apps.cli.options import (
     frames_of,
     latencies_of,
     name_option,
+    one_of,
+    scene_of,
 )
 from apps.cli.output import going_on, print_json
 from cocoro import private
 from cocoro.bus import shared
-from cocoro.errors import CocoroError, ConfigError, choice_of
+from cocoro.errors import CocoroError, ConfigError
 from deploy import extras, launch, profiles
 from deploy.profiles import Profile
 from deploy.rundir import RunDir, Target, robots, targets
@@ -168,26 +169,6 @@ def model_of(file: Path | None, reach: str | None, adapt: bool = False) -> list[
     found = [] if file is None else [f"service.planning.model={json.dumps(str(file.resolve()))}"]
     found += [] if reach is None else [f"service.planning.reach={json.dumps(one_of('--reach', reach, REACHES))}"]
     return found + (["service.planning.adapt=true"] if adapt else [])
-
-
-def scene_of(scene: str) -> str:
-    """A scene's name unchanged; the path of a scene file made absolute. Raises ConfigError for an unknown name and a
-    missing file."""
-    if not scene.endswith(".toml") and os.sep not in scene:
-        from sim.scene_names import GENERATED, scene_names
-
-        return one_of("--scene", scene, (*scene_names(), *GENERATED))
-    if not Path(scene).is_file():
-        raise ConfigError(f"--scene {scene}: no such file; give a .toml file, or the name of a scene")
-    return str(Path(scene).resolve())
-
-
-def one_of(option: str, given: str, known: Iterable[str]) -> str:
-    """A value that is allowed, unchanged. Raises ConfigError for another."""
-    names = [*known]
-    if given not in names:
-        raise ConfigError(f"{option} {given}: {choice_of(given, names)}")
-    return given
 
 
 # --- up -------------------------------------------------------------------------------------------

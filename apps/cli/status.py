@@ -1,19 +1,20 @@
-"""`cocoro status`: the services that should run, their health, the task and the planner's reason."""
+"""What `cocoro status` shows: the services that should run, their health, the task and the planner's reason.
+
+Without options `apps/cli/main.py` calls it, so it does without the library that reads options.
+"""
 
 from __future__ import annotations
 
 import asyncio
-import sys
 from collections.abc import Iterator
 from functools import partial
 from typing import Any
 
 import msgspec
-import typer
 
 from apps.cli import exits
+from apps.cli.choice import RobotChoice
 from apps.cli.link import REPLAYED, MeshLink, joined, within
-from apps.cli.options import JsonOption, MeshOption, RobotChoice, RobotOption
 from apps.cli.output import print_json
 from apps.cli.terminal import Column, fields, print_table
 from cocoro.errors import ConfigError
@@ -30,14 +31,6 @@ COLUMNS = (
     "service", "state", Column("pid", 2, right=True), Column("cpu", right=True), Column("memory", right=True),
     Column("loop", 1, right=True), Column("", text=True),
 )  # fmt: skip
-
-app = typer.Typer()
-
-
-@app.command()
-def status(robot: RobotOption = None, profile: MeshOption = None, json: JsonOption = False) -> None:
-    """The running services, their health, the task and the planner's reason. Exit code 1 when a service is missing."""
-    sys.exit(asyncio.run(show_status(RobotChoice(robot, profile), json)))
 
 
 async def show_status(choice: RobotChoice, as_json: bool) -> int:
@@ -67,8 +60,21 @@ class Survey:
         alive = set(await self._link.alive())
         there = alive | self._link.replayed()
         wanted_news = {topic.name for topic in NEWS if topic.service in there}
+        asking = [asyncio.ensure_future(self._ask(topic)) for topic in (HEALTH.of("*"), *NEWS) if topic.slow]
         await within(HEALTH_S, lambda: there <= set(self._health) and wanted_news <= set(self._newest), self._changed)
+        for question in asking:
+            question.cancel()
+        await asyncio.gather(*asking, return_exceptions=True)
         return self._report(alive, there)
+
+    async def _ask(self, topic: Topic[Any]) -> None:
+        """Ask for messages that may not come of themselves for a second; one that came meanwhile is newer."""
+        for message in await self._link.newest(topic, HEALTH_S):
+            if isinstance(message, Health):
+                self._health.setdefault(message.service, message)
+            else:
+                self._newest.setdefault(topic.name, message)
+        self._changed.set()
 
     def _on_health(self, health: Health) -> None:
         self._health[health.service] = health

@@ -27,8 +27,6 @@ from deploy.contact import ProcessContact
 from deploy.processor import ProcessorWatch
 from services.executive.askers import asker_key
 
-USAGE_REFUSALS = ("unknown_label", "not_graspable", "bad_request")
-"""Refusals that are the operator's mistake, not the robot's state."""
 UNSETTLED_S = {"not_alive": 3.0, "estop": 10.0, "asker_gone": 3.0}
 """Longest time for which such a refusal is answered by another request: an executive that has just started may not have
 received every service's state, and a late one not this command's token. A stop that is known to be latched is not asked
@@ -304,7 +302,7 @@ class Follower:
     def _refused(self, reply: TaskReply) -> Result:
         result = {"task": self._task, "label": self._label, "outcome": "refused"}
         complain(f"refused: {reply.text}")
-        code = exits.USAGE if reply.refusal in USAGE_REFUSALS else exits.REFUSED
+        code = exits.USAGE if reply.refusal in exits.USAGE_REFUSALS else exits.REFUSED
         return code, result | {"reason": reply.refusal, "text": reply.text} | json_error(code, reply.text)
 
     def _outcome(self, state: TaskState) -> Result:

@@ -11,13 +11,11 @@ import time
 from contextlib import AsyncExitStack
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 from msgspec.structs import replace
 
-from apps.learning.collector import SampleCollector, collector
-from apps.pictures import draw, save_png
 from apps.rehearsal.command_periods import command_periods
 from apps.rehearsal.lockstep import LOCKSTEP_PLANNER, LOCKSTEP_SETTINGS, LockstepCycle, LockstepNode
 from apps.rehearsal.progress import RehearsalProgress, Tell, ignored
@@ -43,6 +41,9 @@ from sim.judge import Judge, PursuitJudge
 from sim.random_scene import find_scene
 from sim.realism import REALISM, body_of, wheel_scales
 from sim.trace import Trace
+
+if TYPE_CHECKING:
+    from apps.learning.collector import SampleCollector
 
 RECORDER = "capture"
 PROCESSES = ("sim", "perception", "planning", "executive")
@@ -132,6 +133,8 @@ class _Rehearsal:
             operator.on(topics.RECORDING.of(RECORDER), self._keep_recording)
             samples = request.task.samples
             if request.samples is not None and samples is not None:
+                from apps.learning.collector import collector
+
                 self._collector = collector(samples, Path(request.samples), robot, self._standing_height_m())
                 stack.enter_context(self._collector)
             task = asyncio.ensure_future(self._operate(operator))
@@ -176,7 +179,7 @@ class _Rehearsal:
         if name == "sim":
             world: dict[str, Any] = {
                 field: getattr(request, field)
-                for field in ("scene", "seed", "sensors", "body", "width", "height", "frame_rate_hz")
+                for field in ("scene", "seed", "sensors", "body", "width", "height", "frame_rate_hz", "camera_process")
             }
             world |= {"target": request.task.target, "bend_at_s": request.bend_s}
             return world | held
@@ -291,6 +294,8 @@ class _Rehearsal:
 
     def _take_picture(self) -> None:
         if self._frame is not None and self._request.picture is not None:
+            from apps.pictures import draw, save_png
+
             catalogue = Catalogue.load(Path(self._request.objects) if self._request.objects else None)
             save_png(draw(self._frame, self._seen, catalogue), Path(self._request.picture))
 

@@ -49,6 +49,8 @@ class RehearsalRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
     width: Annotated[int, Meta(ge=16, le=4096)] = 640
     height: Annotated[int, Meta(ge=16, le=4096)] = 480
     frame_rate_hz: Annotated[float, Meta(gt=0, le=120)] = 30.0
+    camera_process: bool = False
+    """Draw the camera's pictures in a process of its own, on another core. The result is the same."""
     timeout_s: Annotated[float, Meta(gt=0, le=3600)] | None = None
     """Time limit of the task, simulated seconds; None: the task's own."""
     picture: str | None = None

@@ -1,8 +1,9 @@
 """The interface to the mesh. Two implementations: `zenoh` (between processes) and `local` (one process, virtual time).
 One conformance suite (tests/test_bus_*.py) runs against both.
 
-A bus moves bytes between keys and calls back in the event loop's thread. Types, ages and sequence numbers are the
-node's. For keys and key expressions see `cocoro.keys`.
+A bus moves bytes between keys and calls back in the event loop's turn: alone, between two other callbacks of the loop.
+Handlers of samples may run in another thread than the loop's while the loop waits (`cocoro.lending`). Types, ages and
+sequence numbers are the node's. For keys and key expressions see `cocoro.keys`.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ log = logging.getLogger(__name__)
 
 Payload = bytes | memoryview
 OnSample = Callable[[str, Payload], None]
-"""Called with key and payload, in the loop's thread. The payload stays valid for as long as it is referenced."""
+"""Called with key and payload, in the loop's turn. The payload stays valid for as long as it is referenced."""
 OnAlive = Callable[[str, bool], None]
 """Called with the key of a liveliness token and whether it lives; first for every token that lives already."""
 Server = Callable[[str, Payload], Awaitable[bytes]]
@@ -90,8 +91,8 @@ class Bus(Protocol):
     def publisher(self, key: str, qos: Qos) -> RawPublisher: ...
 
     def subscribe(self, keyexpr: str, qos: Qos, handler: OnSample, *, depth: int) -> Subscription:
-        """Call `handler` in the loop with each sample, in order per key. At most `depth` samples per key wait for the
-        loop; beyond it the oldest is dropped and counted, but none with Qos.EVENT."""
+        """Call `handler` in the loop's turn with each sample, in order per key. At most `depth` samples per key wait
+        for the loop; beyond it the oldest is dropped and counted, but none with Qos.EVENT."""
 
     def listen(self, keyexpr: str, handler: OnBatch, every_s: float) -> Handle:
         """Receives all samples, in batches at most every `every_s`; nothing is dropped. Batches, because waking the

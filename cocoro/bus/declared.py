@@ -24,6 +24,8 @@ QOS: dict[Qos, dict[str, Any]] = {
 }
 """Express samples are sent at once, each in a packet of its own; others may share a packet with those that follow. A
 key that drops does so when a receiver does not read, after at most 1 ms; one that blocks is put by an `Outbox`."""
+SHARED_FROM_BYTES = 4096
+"""Smaller samples are never in shared memory: to copy them costs less."""
 POLICY = shm.Defragment(shm.GarbageCollect(safe=False))
 """Reclaims free memory, and memory that a stopped receiver still holds. When that receiver goes on, it finds its
 samples invalid (see `read`)."""
@@ -41,15 +43,15 @@ class SharedPool:
         if not self.trouble:
             try:
                 self._provider = shm.ShmProvider.default_backend(POOL_BYTES)
-                self.hold(b"warm")
+                self.hold(bytes(SHARED_FROM_BYTES))
             except zenoh.ZError as error:  # other processes have filled it since
                 self._provider = None
                 shared.drop_failed()
                 self.trouble = shared.obstacle(POOL_BYTES + PROCESS_BYTES) or str(error)
 
     def hold(self, data: bytes) -> zenoh.ZBytes | bytes:
-        """The data in shared memory; `data` itself when there is none, or no room."""
-        if self._provider is None:
+        """The data in shared memory; `data` itself when it is small, or there is no room."""
+        if self._provider is None or len(data) < SHARED_FROM_BYTES:
             return data
         try:
             buffer = self._provider.alloc(len(data), POLICY)
@@ -63,6 +65,8 @@ class SharedPool:
 def read(payload: zenoh.ZBytes) -> bytes | None:
     """The bytes of a sample; None when its shared memory was reclaimed before it was read."""
     data = payload.to_bytes()
+    if len(data) < SHARED_FROM_BYTES:
+        return data
     held = payload.as_shm()
     if held is not None and not held.is_valid():
         return None
@@ -142,8 +146,10 @@ class ZenohPublisher(Declared):
             self._put(data)
 
     def _put(self, data: bytes | zenoh.ZBytes) -> None:
-        with contextlib.suppress(zenoh.ZError):  # the session has ended
+        try:  # noqa: SIM105 # `suppress` takes longer than encoding a message does
             self._declaration.put(data)
+        except zenoh.ZError:  # the session has ended
+            pass
 
     def _undeclare(self) -> None:
         if self._outbox is not None:  # after the samples that wait there

@@ -10,14 +10,13 @@ from __future__ import annotations
 
 import os
 import re
-import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
 from cocoro.errors import ConfigError
-from cocoro.private import RUN_DIR
+from cocoro.private import RUN_DIR, default_run_dir
 
 LONGEST_SOCKET_PATH = 100
 """Bytes; the kernel takes 107 on Linux and 103 on macOS."""
@@ -77,13 +76,3 @@ def default(robot: str, name: str, run_dir: Path | None = None) -> ZenohConfig:
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", robot):
         raise ConfigError(f"robot name {robot!r}: use letters, digits, '_', '-' and '.', and begin with no sign")
     return ZenohConfig(name=name, directory=(run_dir or default_run_dir()) / robot)
-
-
-def default_run_dir() -> Path:
-    """$COCORO_RUN_DIR, else `cocoro` in $XDG_RUNTIME_DIR, else a directory of this user in the place for temporary
-    files. Its content must be this user's alone (see `cocoro.private`)."""
-    if explicit := os.environ.get(RUN_DIR):
-        return Path(explicit).absolute()
-    if runtime := os.environ.get("XDG_RUNTIME_DIR"):
-        return Path(runtime) / "cocoro"
-    return Path(tempfile.gettempdir()) / f"cocoro-{os.getuid()}"

@@ -1,6 +1,7 @@
 """Queues between the threads of zenoh and the event loop.
 
-- `Ring`: from any thread into the loop, which is woken once for all that waits. For subscriptions.
+- `Ring`: from any thread into the loop, which is woken once for all that waits, or lends its turn (`cocoro.lending`).
+  For subscriptions.
 - `Batches`: from any thread into the loop, which collects at intervals and is not woken. For a recorder.
 - `Outbox`: from the loop into a thread that sends, since sending without loss can block.
 """
@@ -14,6 +15,8 @@ from collections import deque
 from collections.abc import Callable
 from typing import Generic, TypeVar
 
+from cocoro.lending import LendingLoop
+
 log = logging.getLogger(__name__)
 T = TypeVar("T")
 
@@ -22,15 +25,24 @@ OUTBOX_BYTES = 64 * 1024 * 1024
 
 
 class Ring(Generic[T]):
-    """`push` from any thread; `deliver(key, item)` is called in the loop's thread, in order for each key.
+    """`push` from any other thread; `deliver(key, item)` is called in the loop's turn, in order for each key.
 
     With a `depth`, a key that has `depth` items waiting loses the oldest to the newest, counted in `skipped`.
     Without a depth nothing is lost, and the order holds over all keys.
     """
 
-    def __init__(self, loop: asyncio.AbstractEventLoop, deliver: Callable[[str, T], None], depth: int | None) -> None:
+    def __init__(
+        self,
+        loop: asyncio.AbstractEventLoop,
+        deliver: Callable[[str, T], None],
+        depth: int | None,
+        *,
+        borrows: bool = False,
+    ) -> None:
+        """`borrows`: deliver in the pushing thread while the loop waits, if the loop lends its turn."""
         self.skipped = 0
         self._loop = loop
+        self._lender = loop if borrows and isinstance(loop, LendingLoop) else None
         self._deliver: Callable[[str, T], None] | None = deliver
         self._depth = depth
         self._lock = threading.Lock()
@@ -38,7 +50,16 @@ class Ring(Generic[T]):
         self._woken = False
 
     def push(self, key: str, item: T) -> None:
-        if self._deliver is None:
+        deliver, lender = self._deliver, self._lender
+        if deliver is None:
+            return
+        if lender is not None and not self._waiting and lender.borrow():
+            try:
+                deliver(key, item)
+            except Exception as error:
+                self._failed(key, error)
+            finally:
+                lender.give_back()
             return
         with self._lock:
             place = key if self._depth is not None else ""
@@ -67,7 +88,10 @@ class Ring(Generic[T]):
                 try:
                     self._deliver(key, item)
                 except Exception as error:
-                    self._loop.call_exception_handler({"message": f"the reader of {key} failed", "exception": error})
+                    self._failed(key, error)
+
+    def _failed(self, key: str, error: Exception) -> None:
+        self._loop.call_exception_handler({"message": f"the reader of {key} failed", "exception": error})
 
     def close(self) -> None:
         """Drops what waits; nothing is delivered afterwards."""

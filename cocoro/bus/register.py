@@ -16,7 +16,6 @@ import errno
 import fcntl
 import os
 import re
-import secrets
 import stat
 import time
 from collections.abc import Iterator
@@ -103,7 +102,7 @@ def endpoint(directory: Path, member: Member) -> str:
 
 def new_identity() -> str:
     """16 random hexadecimal digits."""
-    return f"{secrets.randbits(63) | 1 << 63:016x}"  # zenoh takes no leading zeros
+    return f"{int.from_bytes(os.urandom(8)) | 1 << 63:016x}"  # zenoh takes no leading zeros
 
 
 @contextlib.contextmanager

@@ -1,7 +1,8 @@
 """The bus between processes, on zenoh. Nothing here blocks the event loop, and leaving the mesh never hangs.
 
-Zenoh calls back in its own threads. The callbacks only queue what arrives (`Ring`, `Batches`). The loop's thread
-copies the bytes out of (shared) memory, and only those of samples that were not replaced by newer ones.
+Zenoh calls back in its own threads. A callback takes the loop's turn while the loop waits; what arrives while the loop
+is busy is queued (`Ring`, `Batches`). In its turn the bytes are copied out of (shared) memory, and only those of
+samples that were not replaced by newer ones.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import secrets
 import threading
 from collections.abc import Callable
 from pathlib import Path
+from time import CLOCK_BOOTTIME, clock_gettime_ns
 from types import TracebackType
 from typing import TypeVar
 
@@ -26,7 +28,6 @@ from cocoro.bus.queues import Batches, Outbox, Ring
 from cocoro.bus.register import Membership, members, new_identity
 from cocoro.bus.session import LEAVE_S, Opened, close_session, exit_guard, in_thread, no_mesh, open_session, options
 from cocoro.bus.shared import COSTS
-from cocoro.clock import steady_ns
 from cocoro.errors import CallTimeoutError, MeshError
 from cocoro.private import FullError
 
@@ -149,24 +150,32 @@ class ZenohBus:
             else:
                 handler(key, data)
 
-        ring = Ring(self._loop, deliver, None if qos is Qos.EVENT else depth)
+        ring = Ring(self._loop, deliver, None if qos is Qos.EVENT else depth, borrows=True)
+
+        only = "" if "*" in keyexpr else keyexpr
+        push = ring.push
 
         def on_sample(sample: zenoh.Sample) -> None:
-            ring.push(str(sample.key_expr), sample.payload)
+            push(only or str(sample.key_expr), sample.payload)
 
         subscriber = self._session.declare_subscriber(keyexpr, Callback(on_sample, indirect=False))
         return self._keep(ZenohSubscription(subscriber, ring))
 
     def listen(self, keyexpr: str, handler: OnBatch, every_s: float) -> ZenohListening:
         def deliver(samples: list[tuple[zenoh.Sample, int]]) -> None:
-            found = ((str(sample.key_expr), read(sample.payload), received_ns) for sample, received_ns in samples)
-            handler([Received(key, data, at_ns) for key, data, at_ns in found if data is not None])
+            handler(
+                [
+                    Received(str(sample.key_expr), data, received_ns)
+                    for sample, received_ns in samples
+                    if (data := read(sample.payload)) is not None
+                ]
+            )
 
         batches = Batches(self._loop, deliver, every_s)
         push = batches.push
 
         def on_sample(sample: zenoh.Sample) -> None:
-            push((sample, steady_ns()))
+            push((sample, clock_gettime_ns(CLOCK_BOOTTIME)))  # `steady_ns`, without the call
 
         return self._keep(
             ZenohListening(self._session.declare_subscriber(keyexpr, Callback(on_sample, indirect=False)), batches)

@@ -1,7 +1,7 @@
 """Decodes MCAP records (https://mcap.dev/spec). Pure: no files, no policy.
 
 The `mcap` package decodes all records except those for which it is too slow: messages, a chunk's index of them, and a
-chunk's head. Each of these has its figure below, by `python bench/capture_format.py records`.
+chunk's head. Each of these has its figure below, by `python -m bench capture-format records`.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Writes one MCAP file. After each `flush` the operating system has everything that was added.
 
 The file is encoded here because the `mcap` package's writer takes 1.2 times (ideal sensors) to 1.8 times (real
-sensors) the processor time, 1.2 to 1.4 times without frames (`python bench/capture_format.py files`). It also has
+sensors) the processor time, 1.2 to 1.4 times without frames (`python -m bench capture-format files`). It also has
 one zstd level and mixes frames with small messages in one chunk.
 """
 

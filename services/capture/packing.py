@@ -2,10 +2,10 @@
 
 A frame is copied once, behind its message's head, so writing 1.54 MB needs up to 3.08 MB more memory at the peak,
 packed bytes included. In return a frame that is joined and packed as one piece takes 1.74 ms (3.26 ms with noisy
-sensors), against 1.99 ms (3.71 ms) when zstd gets head and payload one after the other (`python
-bench/capture_format.py records`).
+sensors), against 1.99 ms (3.71 ms) when zstd gets head and payload one after the other (`python -m
+bench capture-format records`).
 
-Compression is measured on frames of the simulated Kinect, 1.5 MB each, on one core (`python bench/capture.py
+Compression is measured on frames of the simulated Kinect, 1.5 MB each, on one core (`python -m bench capture
 frames`): zstd at level 1 makes ideal frames 25 times smaller in 1.0 ms and noisy ones 2.1 times in 2.1 ms; lz4 11
 times in 0.6 ms and 1.3 times in 0.9 ms. Both cost less than writing the bytes that they save.
 """

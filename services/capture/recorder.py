@@ -35,8 +35,6 @@ REPORT_S = 1.0
 """Period of the progress messages."""
 TRIES, RETRY_S = 10, 1.0
 """How often a service is asked for its configuration, and the pause before the next try."""
-FETCH_S = 0.02
-"""Period at which received messages are fetched. Each was stamped on arrival."""
 GROWTH_S = 60.0
 POLL_S = 0.1
 """Period of the checks for new faults and for steps of the wall clock."""
@@ -123,12 +121,16 @@ class Recorder:
     """Usage: `start`, then `report` until cancelled, `close` to stop receiving, and `end` after the sink has been
     closed."""
 
-    def __init__(self, node: Node, ledger: Ledger, sink: RecordingSink, log_clock: LogClock | None) -> None:
-        """Without `log_clock`, log times are the node's virtual time."""
+    def __init__(
+        self, node: Node, ledger: Ledger, sink: RecordingSink, log_clock: LogClock | None, fetch_s: float
+    ) -> None:
+        """Without `log_clock`, log times are the node's virtual time. `fetch_s` is the period at which received
+        messages, each stamped on arrival, are fetched and written: few long turns cost less than many short ones."""
         self._node = node
         self._ledger = ledger
         self._sink = sink
         self._log_clock = log_clock
+        self._fetch_s = fetch_s
         self._disturbed: tuple[DisturbedFile, ...] = ()
         self._handles: list[Handle] = []
         self._head = msgspec.msgpack.Decoder(MessageHead)
@@ -149,7 +151,7 @@ class Recorder:
             self._node.log.info("not recorded, as declared: %s", ", ".join(left_out))
         self._remember_run()
         # The bus drops nothing before this loop has fetched it; the sink limits what may wait.
-        self._handles.append(bus.listen(f"{robot}/**", self._on_batch, FETCH_S))
+        self._handles.append(bus.listen(f"{robot}/**", self._on_batch, self._fetch_s))
         self._handles.append(bus.watch_alive(f"{robot}/**", self._on_alive))
         self._handles.append(bus.declare_alive(recorder_key(robot, self._node.name)))
 
@@ -253,6 +255,7 @@ class Recorder:
             counts.count(head)
             self._put(counts, key, head.seq, head.stamp_ns, payload, None, arrival_ns)
             self._watch.see(key, payload, self._newest_ns)
+        self._sink.write()
 
     def _advance_clock(self, payload: Payload) -> None:
         """The recorder receives every key, so the clock needs no subscription."""

@@ -41,7 +41,7 @@ async def run(node: Node, config: CaptureConfig, log_clock: LogClock | None = No
         sink = DirectSink(make, config.flush_s)
     else:
         sink = ThreadedSink(make, round(config.memory_mb * MB), config.flush_s, config.sync_s)
-    recorder = Recorder(node, ledger, sink, log_clock)
+    recorder = Recorder(node, ledger, sink, log_clock, config.flush_s)
     try:
         recorder.start()
         node.ready()

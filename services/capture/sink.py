@@ -20,8 +20,6 @@ from services.capture.writer import CaptureWriter, sync
 
 log = logging.getLogger(__name__)
 
-POLL_S = 0.02
-"""Period at which the thread takes all queued messages, so that the loop never has to wake it."""
 RESERVE_BYTES = 16 * 1024 * 1024
 """Room for small messages when large ones have filled the queue."""
 
@@ -49,6 +47,9 @@ class RecordingSink(Protocol):
     def offer(self, message: QueuedMessage) -> bool:
         """Returns whether the message was taken; False when the queue is full. After a fault messages are taken and
         discarded."""
+
+    def write(self) -> None:
+        """Messages have been offered: write and flush them soon."""
 
     def remember(self, name: str, entries: Mapping[str, str]) -> None:
         """Write metadata of the run."""
@@ -86,6 +87,9 @@ class DirectSink:
                     self._writer.flush()
         return True
 
+    def write(self) -> None:
+        """Each message has been written already."""
+
     def remember(self, name: str, entries: Mapping[str, str]) -> None:
         if self._writer is not None and not self._fault:
             with self._guarded():
@@ -115,7 +119,8 @@ class DirectSink:
 
 
 class ThreadedSink:
-    """Queues messages, up to a limit, for a thread that writes them."""
+    """Queues messages, up to a limit, for a thread that writes and flushes them when `write` is called, and every
+    `flush_s`."""
 
     def __init__(
         self,
@@ -133,7 +138,8 @@ class ThreadedSink:
         self._done_bytes = 0  # written by the thread only, so no lock is needed
         self._fault = ""
         self._writer: CaptureWriter | None = None
-        self._closing = threading.Event()
+        self._closing = False
+        self._due = threading.Event()
         self._syncer = Syncer(sync_s, self._current)
         self._thread = threading.Thread(target=self._run, name="capture writer", daemon=True)
         self._thread.start()
@@ -148,6 +154,9 @@ class ThreadedSink:
         self._taken_bytes += size
         self._waiting.append(message)
         return True
+
+    def write(self) -> None:
+        self._due.set()
 
     def remember(self, name: str, entries: Mapping[str, str]) -> None:
         self._ask(lambda writer: writer.remember(name, entries))
@@ -167,7 +176,8 @@ class ThreadedSink:
         return () if self._writer is None else self._writer.deleted
 
     def close(self) -> None:
-        self._closing.set()
+        self._closing = True
+        self._due.set()
         self._thread.join()
         self._syncer.close()
 
@@ -178,13 +188,12 @@ class ThreadedSink:
         with _FaultReporter(self._failed):
             self._writer = writer = self._make(self._syncer.release)
             self._syncer.start()
-            flush_at_s = 0.0
             while True:
-                last = self._closing.wait(POLL_S)
+                self._due.wait(self._flush_s)
+                self._due.clear()
+                last = self._closing
                 self._write(writer)
-                if time.monotonic() >= flush_at_s:
-                    writer.flush()
-                    flush_at_s = time.monotonic() + self._flush_s
+                writer.flush()
                 if last:
                     writer.close()
                     return

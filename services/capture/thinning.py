@@ -76,6 +76,7 @@ class ThinningWriter(CaptureWriter):
         self._known_missing = missing
         self._robot = robot
         self._thinning = thinning
+        self._before_ns = round(thinning.before_s * NS)
         self._busy_limits = limits
         self._held: deque[_Held] = deque()
         self._held_bytes = 0
@@ -182,11 +183,12 @@ class ThinningWriter(CaptureWriter):
 
     def _hold(self, held: _Held) -> None:
         """Keep a message, and release what has waited for long enough."""
-        self._held.append(held)
+        waiting = self._held
+        waiting.append(held)
         self._held_bytes += held.size_bytes
-        oldest_ns = self._newest_ns - round(self._thinning.before_s * NS)
-        while self._held and (self._held[0].log_ns < oldest_ns or self._held_bytes > self._thinning.before_bytes):
-            held = self._held.popleft()
+        oldest_ns, most_bytes = self._newest_ns - self._before_ns, self._thinning.before_bytes
+        while waiting and (waiting[0].log_ns < oldest_ns or self._held_bytes > most_bytes):
+            held = waiting.popleft()
             self._held_bytes -= held.size_bytes
             self._let_go_of(held, keep=True)
 

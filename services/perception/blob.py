@@ -9,19 +9,24 @@ from __future__ import annotations
 
 from math import isnan
 
+import cv2
 import numpy as np
 
-from cocoro.arrays import BoolArray, FloatArray, IntArray
+from cocoro.arrays import BoolArray, CodeArray, FloatArray, IntArray
 from cocoro.objects import Catalogue
 from services.perception.colours import ColourTable
 from services.perception.config import PerceptionConfig
 from services.perception.evidence import evidence_of, middle_depths_m
 from services.perception.image import ImageSighting, OwnEvidence, RgbdImage
 from services.perception.pieces import OneObject, depth_of
-from services.perception.region import ColourRegion
+from services.perception.region import ColourRegion, components
 from services.perception.segments import Segments, segments
 from services.perception.shapes import Shapes
 from services.perception.sizes import SizeFit
+
+SMALL = 0.75
+"""Pictures of a smaller scale are small."""
+_AROUND = np.ones((3, 3), dtype=np.uint8)
 
 
 class BlobDetector:
@@ -36,7 +41,30 @@ class BlobDetector:
         min_area_px = self._config.min_area_px * image.scale**2
         layers = [segments(codes, layer.table, number, min_area_px) for number, layer in enumerate(self._table.layers)]
         regions = [layer for layer in layers if layer is not None]
+        if image.scale < SMALL:
+            regions += self._thin(codes, regions, image, min_area_px)
         return self._sightings(Segments.joined(regions), image, min_area_px) if regions else []
+
+    def _thin(self, codes: CodeArray, found: list[Segments], image: RgbdImage, min_area_px: float) -> list[Segments]:
+        """The regions of objects without any so far, thinner than opening lets pass, as a distant object is in a small
+        picture: what is beyond the outermost of its pixels counts as more of it."""
+        seen = {number for layer in found for number in layer.number.tolist()}
+        thin = []
+        for place, layer in enumerate(self._table.layers):
+            labels = layer.table.take(codes)
+            counts = np.bincount(labels.reshape(-1))
+            for label in (1 + np.flatnonzero(counts[1:] >= min_area_px)).tolist():
+                if label - 1 in seen:
+                    continue
+                mask = (labels == label).view(np.uint8)
+                left, top, width, height = cv2.boundingRect(mask)
+                opened = cv2.morphologyEx(mask[top : top + height, left : left + width], cv2.MORPH_OPEN, _AROUND)
+                parts = components(np.asarray(opened, dtype=np.uint8), (left, top), image, min_area_px)
+                if parts:
+                    masks, boxes = zip(*parts, strict=True)
+                    same = np.ones(len(parts), dtype=np.int64)
+                    thin.append(Segments.of_masks((label - 1) * same, place * same, masks, boxes))
+        return thin
 
     def _sightings(self, found: Segments, image: RgbdImage, min_area_px: float) -> list[ImageSighting]:
         """The objects among the regions of all colours, in the catalogue's order.

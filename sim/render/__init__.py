@@ -4,7 +4,7 @@
 PyBullet's TinyRenderer (about 100 ms per view, needs nothing).
 """
 
-from sim.render.choice import make_renderer
+from sim.render.choice import make_renderer, prepare
 from sim.render.interface import Images, Lighting, Renderer
 
-__all__ = ["Images", "Lighting", "Renderer", "make_renderer"]
+__all__ = ["Images", "Lighting", "Renderer", "make_renderer", "prepare"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Literal
 
 from cocoro.errors import ConfigError
@@ -18,6 +19,14 @@ MISSING_EGL = (
 )
 
 RendererChoice = Literal["auto", "moderngl", "tiny"]
+
+
+def prepare() -> None:
+    """Make what all renderers of a process share, in advance. `make_renderer` tells what is missing."""
+    with suppress(Exception):  # moderngl and glcontext raise plain Exception for a missing library
+        from sim.render.gl import context
+
+        context()
 
 
 def make_renderer(visuals: Sequence[Visual], camera: Camera, choice: RendererChoice = "auto") -> Renderer:

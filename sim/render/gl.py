@@ -17,11 +17,11 @@ import moderngl
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cocoro.arrays import FloatArray, ImageArray
+from cocoro.arrays import Float32Array, FloatArray, ImageArray
 from cocoro.robot import Camera
 from sim.render.interface import Images, Lighting, Visual
 from sim.render.meshes import floor_mesh, instanced_meshes, wall_mesh
-from sim.render.room import FLOOR_RGB, OTHER_TILE_RGB, TILE_M
+from sim.render.room import FLOOR_RGB, HALF_WIDTH_M, OTHER_TILE_RGB, TILE_M, WALL_PARTS_M, nearest_wall_m
 from sim.render.views import (
     PROJECTOR_BIAS_PER_M,
     PROJECTOR_NEAR_M,
@@ -38,6 +38,9 @@ LAMP_TEXELS = 512
 LAMP_HALF_WIDTH_M = 2.0
 """Half width of the cube in front of the camera that has shadows, 8 mm per texel. Everything outside is lit."""
 LAMP_AHEAD_M = 1.2
+PROJECTOR_REACH_M = 4.0
+"""Depth beyond which the depth camera does not see the projector's light, nor its shadows on the room's walls. The
+Kinect's range ends before."""
 
 
 class _Owned(Protocol):
@@ -59,7 +62,7 @@ class GlRenderer:
 
     def __init__(self, visuals: Sequence[Visual], camera: Camera) -> None:
         self.camera = camera
-        self._ctx = ctx = _context()
+        self._ctx = ctx = context()
         self._owned: list[_Owned] = []
         self._objects = instanced_meshes(ctx, visuals)
         self._floor, self._walls = floor_mesh(ctx), wall_mesh(ctx)
@@ -67,7 +70,9 @@ class GlRenderer:
 
         self._lambert = self._program("object", "object")
         self._tiles = self._program("floor", "floor")
+        self._unshaded = self._program("far", "far")
         self._metres = self._program("depth", "depth")
+        self._plain_metres = self._program("shadow", "plain_depth")
         self._shade = self._program("shadow", "shadow")
         _set(self._tiles, rgb=FLOOR_RGB, other_rgb=OTHER_TILE_RGB, tile_m=TILE_M)
 
@@ -91,10 +96,8 @@ class GlRenderer:
     ) -> Images:
         self.place(poses)
         self.draw(camera_pose, light, _floor_ahead(camera_pose))
-        self._draw_depth(depth_camera_pose, projector_pose)
-        colour = self.picture()
-        self._depth_target.read_into(self._depth_m, components=1, dtype="f4")
-        return Images(colour, self._depth_m)
+        self.draw_depth(depth_camera_pose, projector_pose)
+        return Images(self.picture(), self.metres())
 
     # --- a colour picture alone -------------------------------------------------------------------
 
@@ -126,11 +129,13 @@ class GlRenderer:
         on_floor = max(-direction[2], 0.0)
         _set(self._lambert, view=view, lamp=lamp, to_lamp=-direction, ambient=ambient, diffuse=diffuse)
         _set(self._tiles, view=view, lamp=lamp, ambient=ambient, diffuse=diffuse * on_floor)
+        _set(self._unshaded, view=view, to_lamp=-direction, ambient=ambient, diffuse=diffuse)
         self._lamp_map.depth.use(0)
         self._colour_target.use()
         self._colour_target.clear()
-        for mesh in (*self._objects, self._walls):
+        for mesh in self._objects:
             mesh.draw(self._lambert)
+        self._walls.draw(self._lambert if _reaches_walls(direction, shadows_about_m) else self._unshaded)
         self._floor.draw(self._tiles)
 
     def picture(self) -> ImageArray:
@@ -139,22 +144,36 @@ class GlRenderer:
         cv2.cvtColor(self._rgba, cv2.COLOR_RGBA2RGB, dst=self._rgb)
         return self._rgb
 
+    # --- a depth picture alone --------------------------------------------------------------------
+
+    def draw_depth(self, pose: FloatArray, projector_pose: FloatArray | None) -> None:
+        """Draw the depth picture; see `render`."""
+        view = self._projection @ rigid_inverse(pose)
+        _set(self._plain_metres, view=view)
+        lit = lit_walls = self._plain_metres
+        if projector_pose is not None:
+            self._draw_projector_map(projector_pose, float(np.linalg.norm(projector_pose[:3, 3] - pose[:3, 3])))
+            _set(self._metres, view=view)
+            lit = self._metres
+            if nearest_wall_m(self.camera, pose) < PROJECTOR_REACH_M:
+                lit_walls = lit
+        self._depth_target.use()
+        self._depth_target.clear(red=np.inf)
+        for mesh in (*self._objects, self._floor):
+            mesh.draw(lit)
+        self._walls.draw(lit_walls)
+
+    def metres(self) -> Float32Array:
+        """The newest depth picture, m, (height, width), which the next one overwrites."""
+        self._depth_target.read_into(self._depth_m, components=1, dtype="f4")
+        return self._depth_m
+
     def close(self) -> None:
         for thing in self._owned:
             thing.release()
         self._owned.clear()
 
     # --- passes -----------------------------------------------------------------------------------
-
-    def _draw_depth(self, pose: FloatArray, projector_pose: FloatArray | None) -> None:
-        if projector_pose is not None:
-            self._draw_projector_map(projector_pose, float(np.linalg.norm(projector_pose[:3, 3] - pose[:3, 3])))
-        view = rigid_inverse(pose)
-        _set(self._metres, view=self._projection @ view, axis=view[2], projecting=projector_pose is not None)
-        self._depth_target.use()
-        self._depth_target.clear(red=np.inf)
-        for mesh in (*self._objects, self._floor, self._walls):
-            mesh.draw(self._metres)
 
     def _draw_projector_map(self, pose: FloatArray, baseline_m: float) -> None:
         """Draw the depth seen from the projector. It stands beside the depth camera and looks the same way, so a row of
@@ -209,7 +228,7 @@ class GlRenderer:
 
 
 @cache
-def _context() -> moderngl.Context:
+def context() -> moderngl.Context:
     """The process's only OpenGL context, which all its renderers share."""
     create: Any = moderngl.create_context
     ctx: moderngl.Context = create(standalone=True, require=330, backend="egl", **LIBRARIES)
@@ -222,6 +241,15 @@ def _set(program: moderngl.Program, **values: ArrayLike) -> None:
     for name, value in values.items():
         uniform: Any = program[name]
         uniform.write(np.asarray(value, np.float32).tobytes())
+
+
+def _reaches_walls(direction: FloatArray, about_m: FloatArray) -> bool:
+    """Whether the cube that has shadows may contain a part of the walls, or of the ceiling if light comes from below.
+
+    `direction`: of the lamp's light, (3,); `about_m`: the middle of the cube, (3,).
+    """
+    corner_m = 3**0.5 * LAMP_HALF_WIDTH_M
+    return bool(direction[2] > 0 or np.abs(about_m[:2]).max() + corner_m > HALF_WIDTH_M - WALL_PARTS_M)
 
 
 def _floor_ahead(pose: FloatArray) -> FloatArray:

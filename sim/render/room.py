@@ -6,6 +6,10 @@ the room they are beyond the depth camera's range.
 
 from __future__ import annotations
 
+import numpy as np
+
+from cocoro.arrays import FloatArray
+from cocoro.robot import Camera
 from cocoro.units import Vec3
 from sim.render.interface import Visual
 
@@ -19,6 +23,8 @@ _SKIRTING_RGB: Vec3 = (0.40, 0.40, 0.40)
 _CEILING_RGB: Vec3 = (0.85, 0.85, 0.84)
 _THICK_M = 0.1
 _SKIRTING_M = 0.12
+WALL_PARTS_M = _THICK_M / 4
+"""How far the skirting boards stand out from the walls."""
 
 
 def walls() -> list[tuple[Visual, Vec3]]:
@@ -33,3 +39,18 @@ def walls() -> list[tuple[Visual, Vec3]]:
             size = (thick, long, height) if x else (long, thick, height)
             parts.append((Visual(name, "box", size, rgb), (x, y, height / 2)))
     return parts
+
+
+def nearest_wall_m(camera: Camera, pose: FloatArray) -> float:
+    """A lower bound of the depth at which the camera at `pose` (4, 4) sees walls and ceiling, m; infinite for none.
+
+    A ray's part along a world axis is linear in the pixel, so a plane is nearest in a corner of the picture.
+    """
+    right, bottom = camera.width - 0.5, camera.height - 0.5
+    rays = np.array([camera.ray(u, v) for u in (-0.5, right) for v in (-0.5, bottom)]) @ pose[:3, :3].T
+    inside = HALF_WIDTH_M - WALL_PARTS_M
+    gaps_m = np.array([(inside, inside, HEIGHT_M)]) - pose[:3, 3] * np.array([(1, 1, 1), (-1, -1, 0)])
+    towards = np.array([rays.max(axis=0), -rays.min(axis=0)])
+    towards[1, 2] = 0.0  # below is the floor
+    seen = towards > 0
+    return float(np.max([0.0, (np.maximum(gaps_m, 0.0)[seen] / towards[seen]).min()])) if seen.any() else float("inf")

@@ -1,0 +1,10 @@
+#version 330
+// See far.vert.glsl.
+
+flat in vec3 shade;
+
+out vec4 colour;
+
+void main() {
+    colour = vec4(shade, 1.0);
+}

@@ -1,0 +1,104 @@
+"""A record of a whole run of the tests, and their order in the next one.
+
+A pytest plugin. It does nothing unless `COCORO_TESTS_RECORD` names a folder; `deploy/test.sh` does that. Each run of
+pytest writes a file there: for each file of tests its wall time, its processor time (with that of the processes that it
+waited for) and the memory of pytest itself. The files that took longest in the last run come first, so that no worker
+is left with a long one at the end. `python -m bench tests` shows the record.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import time
+from collections import defaultdict
+from collections.abc import Generator
+from pathlib import Path
+
+import pytest
+
+FOLDER = "COCORO_TESTS_RECORD"
+"""Environment variable: the folder to write to. Beside it `last` is the folder of the last run."""
+LAST = "last"
+LONG = (
+    "faults_live", "readme", "stop_live", "faults_full", "capture_mesh", "wire_robot", "bus_leaving", "rehearse",
+    "faults_message", "cli_surroundings", "robot_faults", "faults_speed", "faults_silence", "faults_barrage",
+)  # fmt: skip
+"""Files that take long, without a record."""
+FIGURES = ("tests", "wall_s", "processor_s", "memory_mb")
+
+
+def processor_s() -> float:
+    """Processor time of this process and of those of its children that have ended, s."""
+    now = os.times()
+    return now.user + now.system + now.children_user + now.children_system
+
+
+def memory_mb() -> float:
+    """Resident memory of this process, MB."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize() / 1e6
+
+
+def wall_s_of(folder: Path) -> dict[str, float]:
+    """Wall time of each file of tests in a record; without one the long ones are guessed."""
+    found: dict[str, float] = defaultdict(float)
+    if not folder.is_dir():
+        return {f"tests/test_{name}.py": 1.0 for name in LONG}
+    for part in folder.glob("pytest-*.json"):
+        for file, figures in json.loads(part.read_text())["files"].items():
+            found[file] = max(found[file], figures["wall_s"])
+    return found
+
+
+class Record:
+    """With `--spread` the workers measure, and their reports carry it to the process that writes."""
+
+    def __init__(self, folder: Path, config: pytest.Config) -> None:
+        self._folder = folder
+        self._config = config
+        self._begun_s = time.monotonic()
+        self._before_s = processor_s()
+        self._files: dict[str, dict[str, float]] = defaultdict(lambda: dict.fromkeys(FIGURES, 0.0))
+
+    def begin(self) -> None:
+        """What was before is not counted: this process was forked."""
+        self._before_s = processor_s()
+
+    @pytest.hookimpl(trylast=True)
+    def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
+        took_s = wall_s_of(self._folder.parent / LAST)
+        items.sort(key=lambda item: -took_s.get(_file(item.nodeid), 0.0))  # of a file, and of equals, the order stays
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_makereport(self) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+        report = yield
+        before_s, self._before_s = self._before_s, processor_s()
+        report.__dict__["figures"] = {"processor_s": self._before_s - before_s, "memory_mb": memory_mb()}
+        return report
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        figures: dict[str, float] = report.__dict__.get("figures", {"processor_s": 0.0, "memory_mb": 0.0})
+        file = self._files[_file(report.nodeid)]
+        file["tests"] += report.when == "call"
+        file["wall_s"] += report.duration
+        file["processor_s"] += figures["processor_s"]
+        file["memory_mb"] = max(file["memory_mb"], figures["memory_mb"])
+
+    def pytest_sessionfinish(self) -> None:
+        self._folder.mkdir(parents=True, exist_ok=True)
+        written = {
+            "arguments": list(self._config.invocation_params.args),
+            "wall_s": time.monotonic() - self._begun_s,
+            "files": self._files,
+        }
+        (self._folder / f"pytest-{os.getpid()}.json").write_text(json.dumps(written))
+
+
+def _file(nodeid: str) -> str:
+    return nodeid.partition("::")[0]
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    if folder := os.environ.get(FOLDER):
+        config.pluginmanager.register(Record(Path(folder), config), "record of the run")
