@@ -42,11 +42,8 @@ class Entry(NamedTuple):
 
 ENTRIES: dict[str, Entry] = {
     "decoupling": Entry("decoupling", "suite"),
-<<<<<<< HEAD
     "fetch": Entry("fetch", "suite"),
-=======
     "mesh": Entry("mesh", "suite"),
->>>>>>> main
     "pixel": Entry("pixel", "suite"),
     "startup": Entry("startup", "suite"),
     "tests": Entry("own_tests", "suite"),
