@@ -37,8 +37,8 @@ class HeadConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Speed over floor that no picture has shown yet, with a camera that sees while it turns."""
     sweep_pan_rad: Positive = 2.6
     """The sweep looks so far to both sides."""
-    sweep_step_rad: Positive = 0.88
-    """Largest pan between two aims of the sweep; the camera sees 1.0 rad."""
+    sweep_step_rad: Positive = 0.66
+    """Largest pan between two aims of the sweep. The camera sees 1.0 rad, of which the edge does not count as seen."""
     sweep_tilts_rad: tuple[float, float] = (-0.45, -0.92)
     """For the floor from 0.7 m on, and from 0.2 to 1.2 m (the camera is 0.73 m high)."""
     middle_tilt_rad: float = -0.60

@@ -68,7 +68,9 @@ class Searching:
 
     BACK_M = 0.4
     PICTURES = 2
-    """Pictures of an aim before the head goes on; of a slow perception one."""
+    """Pictures of an aim, and scans of its floor, before the head goes on; of a slow perception one picture."""
+    SCANS_NS = 3 * NS // 10
+    """Time in which the scans of an aim must have come."""
     UNDER_WAY_NS = NS // 10
     """Greatest age of the picture that a slow perception takes next when it is done with another."""
     STEADY_NS = NS // 30
@@ -82,7 +84,7 @@ class Searching:
         self._sweep: Sweep | None = None
         self._glances: list[Glance] | None = None
         self._rests_since_ns: int | None = None
-        self._pictures = 0
+        self._pictures = self._scans = 0
         self._newest_ns: int | None = None
         """Stamp of the newest frame that was counted as a picture of the present aim."""
         self._checked_ns: int | None = None
@@ -169,6 +171,7 @@ class Searching:
             return False
         if self._rests_since_ns is None:
             self._rests_since_ns, self._pictures, self._newest_ns = snapshot.now_ns, 0, estimator.looked_ns
+            self._scans = estimator.seen.scans
         since_ns = self._rests_since_ns + self.STEADY_NS
         if estimator.looked_ns is not None and estimator.looked_ns != self._newest_ns:
             self._newest_ns = estimator.looked_ns
@@ -179,7 +182,9 @@ class Searching:
             under_way = heard_ns is not None and heard_ns >= since_ns + self.UNDER_WAY_NS
             done = under_way or self._pictures >= 1
         else:
-            done = self._pictures >= self.PICTURES
+            # Where the mount hides all floor, there is no scan to wait for.
+            scanned = estimator.seen.scans - self._scans >= self.PICTURES
+            done = self._pictures >= self.PICTURES and (scanned or snapshot.now_ns - since_ns > self.SCANS_NS)
         if done:
             self._rests_since_ns = None
         return done
