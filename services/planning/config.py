@@ -39,8 +39,8 @@ class HeadConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The sweep looks so far to both sides."""
     sweep_step_rad: Positive = 0.66
     """Largest pan between two aims of the sweep. The camera sees 1.0 rad, of which the edge does not count as seen."""
-    sweep_tilts_rad: tuple[float, float] = (-0.45, -0.92)
-    """For the floor from 0.7 m on, and from 0.2 to 1.2 m (the camera is 0.73 m high)."""
+    sweep_tilts_rad: tuple[float, float] = (-0.40, -0.92)
+    """For the floor from 0.75 m on, and from 0.2 to 1.2 m (the camera is 0.73 m high)."""
     middle_tilt_rad: float = -0.60
     middle_m: tuple[float, float] = (0.55, 1.0)
     """At the middle tilt the camera sees the floor from the first distance on. Floor nearer than the second belongs to
