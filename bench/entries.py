@@ -42,6 +42,7 @@ class Entry(NamedTuple):
 
 ENTRIES: dict[str, Entry] = {
     "decoupling": Entry("decoupling", "suite"),
+    "fetch": Entry("fetch", "suite"),
     "mesh": Entry("mesh", "suite"),
     "pixel": Entry("pixel", "suite"),
     "startup": Entry("startup", "suite"),

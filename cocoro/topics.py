@@ -158,7 +158,7 @@ DETECTIONS = Topic(
     "Known objects in one frame, stamped with the time of the frame. Older ones are not used.",
 )  # fmt: skip
 OBSTACLES = Topic(
-    "perception/obstacles", m.Obstacles, Qos.STATE, 10.0, 1.0,
+    "perception/obstacles", m.Obstacles, Qos.STATE, 10.0, 3.0,
     "Obstacles and free floor, from the depth image. Older ones are not entered in the map.",
     max_bytes=262_144,
 )  # fmt: skip

@@ -61,34 +61,62 @@ def test_it_never_looks_further_than_the_neck_turns(point: tuple[float, float, f
 
 
 def swept(pan: float) -> list[tuple[float, float]]:
-    """The directions of a head that goes 2 degrees a step during a sweep."""
-    sweep, tilt, looked = Sweep(CONFIG, pan), 0.0, [(pan, 0.0)]
-    for _ in range(2000):
-        goal_pan, goal_tilt = sweep.next(pan, tilt)
+    """The aims of a sweep, in order."""
+    sweep = Sweep(CONFIG, pan)
+    aims: list[tuple[float, float]] = []
+    for _ in range(100):
         if sweep.done:
-            return looked
-        pan += min(max(goal_pan - pan, -0.035), 0.035)
-        tilt += min(max(goal_tilt - tilt, -0.035), 0.035)
-        looked.append((pan, tilt))
+            return aims
+        aims.append(sweep.aim)
+        sweep.go_on()
     raise AssertionError("a sweep has an end")
 
 
 @pytest.mark.parametrize("start_pan", [-2.6, -0.4, 0.0, 0.4, 2.6])
-def test_a_sweep_sees_every_bearing_at_every_tilt_and_ends(start_pan: float) -> None:
-    looked = swept(start_pan)
-    half_view = ROBOT.kinect.horizontal_fov_rad / 2
-    for tilt in CONFIG.sweep_tilts_rad:
-        pans = [pan for pan, at in looked if abs(at - tilt) < 0.1]
-        for bearing in np.linspace(-2.6 - half_view, 2.6 + half_view, 40):
-            assert min(abs(bearing - pan) for pan in pans) <= half_view + 0.1
+def test_the_pictures_of_a_sweep_show_the_floor_in_every_direction_from_near_to_far(start_pan: float) -> None:
+    half_wide, half_high = ROBOT.kinect.horizontal_fov_rad / 2, ROBOT.kinect.vertical_fov_rad / 2
+    aims = swept(start_pan)
+    for bearing in np.linspace(-2.6 - half_wide, 2.6 + half_wide, 60):
+        tilts = [tilt for pan, tilt in aims if abs(bearing - pan) <= half_wide + 1e-9]
+        for below in np.arctan2(CAMERA.position({PAN: 0.0, TILT: 0.0})[2], np.linspace(0.25, 2.6, 20)):
+            assert min(abs(-below - tilt) for tilt in tilts) < half_high
+
+
+def test_a_sweep_looks_ahead_first_and_then_to_both_sides() -> None:
+    (first, ahead, other), near = [pan for pan, _ in swept(-0.4)][:3], CONFIG.sweep_step_rad
+    assert (first, -other) == (0.0, ahead)
+    assert -near <= ahead < 0.0
 
 
 def test_a_sweep_counts_its_own_progress() -> None:
     sweep = Sweep(CONFIG, 0.0)
     assert (sweep.share, sweep.done) == (0.0, False)
-    pan, tilt, shares = 0.0, 0.0, []
+    shares = []
     while not sweep.done:
-        pan, tilt = sweep.next(pan, tilt)
+        sweep.go_on()
         shares.append(sweep.share)
     assert shares == sorted(shares)
     assert sweep.share == 1.0
+
+
+@given(
+    near_m=st.floats(0.4, 0.8),
+    far_m=st.floats(0.9, 2.0),
+    bearing_rad=st.floats(-2.0, 2.0),
+    apart_rad=st.floats(-0.4, 0.4),
+)
+def test_one_picture_shows_two_places_that_are_near_enough_to_each_other(
+    near_m: float, far_m: float, bearing_rad: float, apart_rad: float
+) -> None:
+    far, near = place(far_m, bearing_rad, 0.06), place(near_m, bearing_rad + apart_rad, 0.0)
+    both = GAZE.at_both(far, [near], {PAN: 0.0, TILT: 0.0})
+    alone = GAZE.at(far, {PAN: 0.0, TILT: 0.0})
+    assert both == alone or all(in_picture(point, *both) for point in (far, near))
+
+
+def in_picture(point_m: tuple[float, float, float], pan: float, tilt: float) -> bool:
+    pose = CAMERA.pose({PAN: pan, TILT: tilt})
+    x, y, z = pose[:3, :3].T @ (np.array(point_m) - pose[:3, 3])
+    camera = ROBOT.camera
+    u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+    return bool(z > 0 and 0 <= u < camera.width and 0 <= v < camera.height)

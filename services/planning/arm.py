@@ -1,9 +1,8 @@
 """The arm's trajectories: unfolding, folding, and moving the hand to a pose, one step at a time.
 
-Between the parked pose and the space in front of the robot the arm passes two poses: unfolded in the plane that it
-parks in (the hand's thin side towards the camera mount), then swung to the front with the hand level, so that it passes
-over obstacles. References are commanded angles: feedback of the servos' coarse positions would add their steps to the
-motion.
+Between the parked pose and the space in front of the robot the arm passes one pose: unfolded in the plane that it parks
+in, with the hand level. From there it swings to the front, so that it passes over obstacles. References are commanded
+angles: feedback of the servos' coarse positions would add their steps to the motion.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from services.planning.config import ArmConfig
 from services.planning.reach import ARM, HandPose, Reacher
 
 ROLL = "wrist_roll"
-_OUT = {"shoulder": 1.9, "elbow": -2.3, "wrist_pitch": 0.4}
+OUT = {"shoulder": 1.9, "elbow": -2.3, "wrist_pitch": 0.4}
 """Unfolded: the hand points away from the arm base, level, 0.2 m up and 0.36 m out."""
 _SIDE_RAD = 0.6
 """Arm base angle beyond which the arm is in the plane that it parks in."""
@@ -89,7 +88,7 @@ class ArmController:
         if not self.folded(reference):
             pose = self._reacher.pose(reference)
             astray = self._is_astray(reference, pose)
-            out = all(abs(reference[name] - angle) < _NEAR_RAD for name, angle in _OUT.items())
+            out = all(abs(reference[name] - angle) < _NEAR_RAD for name, angle in OUT.items())
             if not out and pose.height_m < 0.15 and not astray:
                 rise = HandPose(
                     max(pose.radius_m, self._config.travel_radius_m),
@@ -99,13 +98,11 @@ class ArmController:
                 )
                 return self._cartesian(rise, self._config.hand_speed_mps, dt_s)._replace(arrived=False)
             if not out or abs(reference[ROLL] - self._roll_rad) > _NEAR_RAD:
-                return self._joints(_OUT | {ROLL: self._roll_rad}, dt_s)._replace(arrived=False)
-            return self._joints(_OUT | {"arm_base": self._park["arm_base"]}, dt_s)._replace(arrived=False)
+                return self._joints(OUT | {ROLL: self._roll_rad}, dt_s)._replace(arrived=False)
+            return self._joints(OUT | {"arm_base": self._park["arm_base"]}, dt_s)._replace(arrived=False)
         self._astray = False
         if abs(reference["arm_base"] - self._park["arm_base"]) > _NEAR_RAD:
-            return self._joints(_OUT | {"arm_base": self._park["arm_base"]}, dt_s)._replace(arrived=False)
-        if abs(reference[ROLL]) > _NEAR_RAD:
-            return self._joints(_OUT | {ROLL: 0.0}, dt_s)._replace(arrived=False)
+            return self._joints(OUT | {"arm_base": self._park["arm_base"]}, dt_s)._replace(arrived=False)
         return self._joints(self._park | {ROLL: 0.0}, dt_s)
 
     def reach(self, goal: HandPose, speed_mps: float, measured: Mapping[str, float], dt_s: float) -> ArmStep:
@@ -113,18 +110,16 @@ class ArmController:
         reference = self._sync(measured, dt_s)
         stage: dict[str, float] | None = None
         if self.folded(reference):
-            out = all(abs(reference[name] - angle) < _NEAR_RAD for name, angle in _OUT.items())
+            out = all(abs(reference[name] - angle) < _NEAR_RAD for name, angle in OUT.items())
             in_park_plane = reference["arm_base"] > self._park["arm_base"] - 0.2
             if not out and in_park_plane:
-                stage = _OUT | {ROLL: 0.0}
-            elif abs(reference[ROLL] - self._roll_rad) > _NEAR_RAD:
-                stage = _OUT | {ROLL: self._roll_rad}
+                stage = OUT | {ROLL: self._roll_rad}
             else:
-                stage = _OUT | {"arm_base": _FRONT_RAD}
+                stage = OUT | {"arm_base": _FRONT_RAD, ROLL: self._roll_rad}
         elif reference["arm_base"] > 0.35 and goal.azimuth_rad < 0.3:
-            stage = _OUT | {"arm_base": _FRONT_RAD, ROLL: self._roll_rad}
+            stage = OUT | {"arm_base": _FRONT_RAD, ROLL: self._roll_rad}
         elif self._is_astray(reference, self._reacher.pose(reference)):
-            stage = _OUT | {"arm_base": _FRONT_RAD, ROLL: self._roll_rad}
+            stage = OUT | {"arm_base": _FRONT_RAD, ROLL: self._roll_rad}
             self._astray = any(abs(reference[name] - angle) > _NEAR_RAD for name, angle in stage.items())
         if stage is None:
             return self._cartesian(goal, speed_mps, dt_s)

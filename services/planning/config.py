@@ -20,6 +20,10 @@ class MemoryConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Factor on the standard deviation of detections that are occluded or cut by the image's edge."""
     acceleration_mps2: Positive = 0.08
     """Expected acceleration of an object; the filter increases it for an object that moves."""
+    drift_rad_per_m: Positive = 0.06
+    """Standard deviation of odometry's heading per metre driven: of wheels whose sizes differ by 1.6 percent."""
+    drift_share: Positive = 0.015
+    """Standard deviation of odometry's distance, and of its turn, as a share of them."""
     velocity_fade_s: Positive = 0.8
     """Time constant with which the velocity of an unseen object decays."""
     gate_sigmas: Positive = 6.0
@@ -30,15 +34,19 @@ class MemoryConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 class HeadConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     sweep_speed_radps: Positive = 0.9
+    """Speed over floor that no picture has shown yet, with a camera that sees while it turns."""
     sweep_pan_rad: Positive = 2.6
-    sweep_ahead_rad: Positive = 1.05
-    """Pan to the first side before the sweep of the whole range."""
-    sweep_tilts_rad: tuple[float, float] = (-0.30, -0.92)
-    """For the floor from 0.9 m on, and from 0.2 to 1.2 m (the camera is 0.73 m high)."""
+    """The sweep looks so far to both sides."""
+    sweep_step_rad: Positive = 0.66
+    """Largest pan between two aims of the sweep. The camera sees 1.0 rad, of which the edge does not count as seen."""
+    sweep_tilts_rad: tuple[float, float] = (-0.40, -0.92)
+    """For the floor from 0.75 m on, and from 0.2 to 1.2 m (the camera is 0.73 m high)."""
     middle_tilt_rad: float = -0.60
     middle_m: tuple[float, float] = (0.55, 1.0)
     """At the middle tilt the camera sees the floor from the first distance on. Floor nearer than the second belongs to
     the near tilt of a sweep where both are needed."""
+    view_margin_rad: Positive = 0.08
+    """What is nearer to the picture's edge may be cut off."""
     view_rad: Positive = 0.38
     """Half of the width that a glance shows for certain; half of the camera's field of view is 0.5."""
     between_speed_radps: Positive = 2.5
@@ -67,6 +75,9 @@ class SearchConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Least unseen floor for which the robot goes to another place."""
     least_foot_m2: Positive = 0.0075
     """Least unseen floor at the feet of walls for which it goes to another place, once all other floor was seen."""
+    max_speed_mps: Positive = 0.35
+    max_turn_radps: Positive = 0.9
+    """On the way: a camera that turns faster does not correct the body's pose."""
     drive_mps: Positive = 0.2
     turn_radps: Positive = 0.7
     look_s: Positive = 5.0
@@ -76,10 +87,10 @@ class SearchConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class NavigationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    max_speed_mps: Positive = 0.35
-    max_turn_radps: Positive = 0.9
-    acceleration_mps2: Positive = 0.5
-    turn_acceleration_radps2: Positive = 2.5
+    max_speed_mps: Positive = 0.48
+    max_turn_radps: Positive = 1.6
+    acceleration_mps2: Positive = 1.0
+    turn_acceleration_radps2: Positive = 5.0
     turn_in_place_rad: Positive = 0.9
     """Above this heading error the robot turns on the spot first."""
     detour_speed_mps: Positive = 0.28
@@ -100,13 +111,16 @@ class NavigationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Time after which a place ahead that stays hidden counts as seen."""
     distance_tolerance_m: Positive = 0.012
     heading_tolerance_rad: Positive = 0.05
+    turn_gain_per_s: Positive = 3.0
+    coasting_mps: Positive = 0.3
+    """Below this speed the hand reaches out while the base still brakes."""
 
 
 class ArmConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    joint_speed_radps: Positive = 1.6
-    hand_speed_mps: Positive = 0.25
-    insert_speed_mps: Positive = 0.12
-    lift_speed_mps: Positive = 0.12
+    joint_speed_radps: Positive = 2.4
+    hand_speed_mps: Positive = 0.5
+    insert_speed_mps: Positive = 0.35
+    lift_speed_mps: Positive = 0.35
     damping: Positive = 0.02
     """Damping of the pseudo-inverse, m."""
     pitch_rad: float = -0.17
@@ -118,6 +132,9 @@ class ArmConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Nearer, the open claws would come down on the target; beyond, the arm does not reach it."""
     touch_radius_range_m: tuple[float, float] = (0.44, 0.56)
     """Range for touching: the hand comes from behind, so nothing comes down on the target."""
+    grasp_sigma_m: Positive = 0.016
+    """Standard deviation of a target's place up to which the hand reaches for it; with more it waits to see it again.
+    The open claws leave three times as much."""
     grasp_azimuth_range_rad: tuple[float, float] = (-0.45, 0.45)
     grasp_height_range_m: tuple[float, float] = (0.045, 0.30)
     retreat_radius_m: Positive = 0.37

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from math import atan2, cos, hypot, sin
+from collections.abc import Mapping, Sequence
+from math import atan2, ceil, cos, hypot, sin
 from typing import NamedTuple
 
 import numpy as np
@@ -24,6 +24,11 @@ class Gaze:
     def __init__(self, robot: Robot, config: HeadConfig) -> None:
         self._chain = robot.chain("camera")
         self._limits = [robot.joints[PAN].limits_rad, config.tilt_range_rad]
+        kinect = robot.kinect
+        self._half_view = (
+            kinect.horizontal_fov_rad / 2 - config.view_margin_rad,
+            kinect.vertical_fov_rad / 2 - config.view_margin_rad,
+        )
 
     def at(self, point_m: tuple[float, float, float], start: Mapping[str, float]) -> tuple[float, float]:
         """(pan, tilt), rad, within the limits, for a point (x, y, z), body frame, metres.
@@ -47,39 +52,52 @@ class Gaze:
         pan = (pan + np.pi) % (2 * np.pi) - np.pi
         return float(min(max(pan, pan_min), pan_max)), float(min(max(tilt, tilt_min), tilt_max))
 
+    def at_both(self, point_m: Vec3, others_m: Sequence[Vec3], start: Mapping[str, float]) -> tuple[float, float]:
+        """(pan, tilt), rad, for a picture that shows a point and, too, the first of the others that is near enough to
+        it."""
+        aim = self.at(point_m, start)
+        for other_m in others_m:
+            other = self.at(other_m, start)
+            if all(abs(b - a) / 2 <= half for a, b, half in zip(aim, other, self._half_view, strict=True)):
+                return (aim[0] + other[0]) / 2, (aim[1] + other[1]) / 2
+        return aim
+
 
 class Sweep:
-    """A fixed pattern over the whole pan range at two tilts, for the far and the near floor.
+    """Aims over the whole pan range at two tilts, for the far and the near floor. The head jumps from one to the next
+    and rests at each: a camera that turns blurs its picture, so a jump shows more in a second than a steady turn.
 
-    It begins ahead: a little to one side, all the way to the other, back at the near tilt, and last the rest of the
-    first side.
+    It begins ahead, then looks to the nearer side, to the other side and round it, round the first side, and last at
+    the near floor.
     """
 
     def __init__(self, config: HeadConfig, pan_rad: float) -> None:
-        self._config = config
         side = 1.0 if pan_rad >= 0 else -1.0
-        reach, ahead = side * config.sweep_pan_rad, side * config.sweep_ahead_rad
+        count = ceil(config.sweep_pan_rad / config.sweep_step_rad)
+        pans = [side * config.sweep_pan_rad * number / count for number in range(count + 1)]
         far, near = config.sweep_tilts_rad
-        self._corners = [(ahead, far), (-reach, far), (-reach, near), (reach, near), (reach, far), (ahead, far)]
-        self.swept = 0
-        """Number of corners reached."""
+        ahead, first, rest = pans[0], pans[1], pans[2:]
+        self._aims = [(ahead, config.middle_tilt_rad)]  # shows the floor that the robot would drive over first, too
+        self._aims += [(pan, far) for pan in (first, -first, *(-pan for pan in rest), *rest)]
+        self._aims += [(pan, near) for pan in (*reversed(pans), *(-pan for pan in pans[1:]))]
+        self._passed = 0
 
     @property
     def done(self) -> bool:
-        return self.swept >= len(self._corners)
+        return self._passed >= len(self._aims)
 
     @property
     def share(self) -> float:
-        return self.swept / len(self._corners)
+        return self._passed / len(self._aims)
 
-    def next(self, pan_rad: float, tilt_rad: float) -> tuple[float, float]:
-        """(pan, tilt), rad, to go to now."""
-        while not self.done:
-            pan, tilt = self._corners[self.swept]
-            if abs(pan - pan_rad) > 0.05 or abs(tilt - tilt_rad) > 0.05:
-                return pan, tilt
-            self.swept += 1
-        return self._corners[-1]
+    @property
+    def aim(self) -> tuple[float, float]:
+        """(pan, tilt), rad, to look at now; the last one when it is done."""
+        return self._aims[min(self._passed, len(self._aims) - 1)]
+
+    def go_on(self) -> None:
+        """Take the next aim: the present one was looked at."""
+        self._passed += 1
 
 
 class Glance(NamedTuple):

@@ -39,6 +39,8 @@ class Track:
     surprise: float = 1.0
     """Smoothed normalised innovation; above 1 the object moves more than expected."""
     outliers: list[FloatArray] = field(default_factory=list)
+    body: Pose2 = field(default_factory=Pose2)
+    """Where the robot was at the newest sighting, odometry frame."""
 
 
 class TargetMemory:
@@ -55,27 +57,41 @@ class TargetMemory:
     def forget(self, label: str) -> None:
         self._tracks.pop(label, None)
 
-    def see(self, label: str, position_m: FloatArray, distance_m: float, stamp_ns: int, *, doubtful: bool) -> None:
-        """Enter a sighting: the object's centre (3,), odometry frame, metres, at the frame's stamp."""
+    def see(
+        self,
+        label: str,
+        position_m: FloatArray,
+        distance_m: float,
+        stamp_ns: int,
+        *,
+        doubtful: bool,
+        body: Pose2 | None = None,
+    ) -> None:
+        """Enter a sighting: the object's centre (3,), odometry frame, metres, at the frame's stamp, seen from the
+        body's pose; None: the body has not moved since the last."""
         config = self._config
         sigma_m = config.sigma_m + config.sigma_per_m * distance_m
         if doubtful:
             sigma_m *= config.doubtful_factor
         track = self._tracks.get(label)
         if track is None or (stamp_ns - track.stamp_ns) / NS > config.forget_s:
-            self._tracks[label] = Track(position_m.copy(), stamp_ns, sigma_m)
+            self._tracks[label] = Track(position_m.copy(), stamp_ns, sigma_m, body=body or Pose2())
             return
+        body = body or track.body
         dt_s = (stamp_ns - track.stamp_ns) / NS
         if dt_s < 0:
             return
         predicted = self._moved(track, dt_s)
         off_m = float(np.linalg.norm(position_m - predicted))
-        spread_m = float(np.sqrt(track.covariance[0, 0] + (0.1 * dt_s) ** 2) + sigma_m)
+        drift_m = self._drift_m(track, body, predicted)
+        spread_m = float(np.sqrt(track.covariance[0, 0] + drift_m**2 + (0.1 * dt_s) ** 2) + sigma_m)
         if off_m > max(config.gate_sigmas * spread_m, config.gate_m):
-            self._outlier(label, track, position_m, stamp_ns, sigma_m, doubtful)
+            self._outlier(label, track, position_m, stamp_ns, sigma_m, body, doubtful)
             return
         track.outliers.clear()
+        track.covariance[0, 0] += drift_m**2
         self._update(track, predicted, position_m, dt_s, sigma_m)
+        track.body = body
         track.stamp_ns = stamp_ns
         track.sightings += 1
         if track.sightings >= _SURE:
@@ -93,6 +109,15 @@ class TargetMemory:
         ]
         for other in mistaken:
             del self._tracks[other]
+
+    def _drift_m(self, track: Track, body: Pose2, place_m: FloatArray) -> float:
+        """By how much odometry may have displaced a place (3,), odometry frame, m, since the object's newest sighting
+        (derived): an error of heading turns the place about the robot, and what was driven on in that heading."""
+        way = track.body.inverse().compose(body)
+        driven_m, away_m = hypot(way.x_m, way.y_m), hypot(place_m[0] - body.x_m, place_m[1] - body.y_m)
+        config = self._config
+        turn_rad = config.drift_rad_per_m * driven_m + config.drift_share * abs(way.yaw_rad)
+        return hypot(turn_rad * (away_m + driven_m / 2), config.drift_share * driven_m)
 
     def _update(self, track: Track, predicted: FloatArray, seen: FloatArray, dt_s: float, sigma_m: float) -> None:
         unseen_s = max(dt_s - max(self.sight_lag_s, 0.2), 0.0)
@@ -112,7 +137,14 @@ class TargetMemory:
         track.sigma_m = float(np.sqrt(track.covariance[0, 0]))
 
     def _outlier(
-        self, label: str, track: Track, position_m: FloatArray, stamp_ns: int, sigma_m: float, doubtful: bool
+        self,
+        label: str,
+        track: Track,
+        position_m: FloatArray,
+        stamp_ns: int,
+        sigma_m: float,
+        body: Pose2,
+        doubtful: bool,
     ) -> None:
         """A sighting far from the expected position: another object, or this one was moved."""
         if doubtful:
@@ -121,7 +153,7 @@ class TargetMemory:
             track.outliers.clear()
         track.outliers.append(position_m.copy())
         if len(track.outliers) >= _AGREE:
-            self._tracks[label] = Track(np.mean(track.outliers, axis=0), stamp_ns, sigma_m)
+            self._tracks[label] = Track(np.mean(track.outliers, axis=0), stamp_ns, sigma_m, body=body)
 
     def estimate(self, label: str, body: Pose2, now_ns: int) -> TargetEstimate | None:
         """The estimate of an object now, in the frame of the body's pose; None for an unknown one."""
@@ -132,12 +164,12 @@ class TargetMemory:
         if age_s > self._config.forget_s:
             del self._tracks[label]
             return None
-        position = self._moved(track, age_s)
+        position = self._now(track, age_s)
         return TargetEstimate(
             label=label,
             position_m=body.inverse().apply(position.tolist()),
             velocity_mps=(float(track.velocity_mps[0]), float(track.velocity_mps[1]), float(track.velocity_mps[2])),
-            sigma_m=float(hypot(track.sigma_m, 0.01 * age_s)),
+            sigma_m=float(hypot(track.sigma_m, 0.01 * age_s, self._drift_m(track, body, position))),
             age_s=age_s,
             odometry_position_m=(float(position[0]), float(position[1]), float(position[2])),
         )
@@ -152,7 +184,7 @@ class TargetMemory:
         track = self._tracks.get(label)
         if track is None or not self.sure(label) or abs(stamp_ns - track.stamp_ns) > within_s * NS:
             return None
-        x, y, z = self._moved(track, max((stamp_ns - track.stamp_ns) / NS, 0.0)).tolist()
+        x, y, z = self._now(track, max((stamp_ns - track.stamp_ns) / NS, 0.0)).tolist()
         return x, y, z
 
     def sightings(self, label: str) -> int:
@@ -167,6 +199,14 @@ class TargetMemory:
         labels = [label for label, track in sorted(self._tracks.items()) if track.sightings >= least]
         found = (self.estimate(label, body, now_ns) for label in labels)
         return tuple(estimate for estimate in found if estimate is not None)
+
+    def _now(self, track: Track, age_s: float) -> FloatArray:
+        """The position (3,) that counts `age_s` after the newest sighting. A velocity counts in full from twice its
+        standard deviation on, and not at all within one: two sightings of something that stands, by a slow
+        perception, would else send it away."""
+        power, noise = float(track.velocity_mps @ track.velocity_mps), 3.0 * float(track.covariance[1, 1])
+        weight = min(max((power / noise - 1.0) / 3.0, 0.0), 1.0)
+        return track.position_m + weight * (self._moved(track, age_s) - track.position_m)
 
     def _moved(self, track: Track, dt_s: float) -> FloatArray:
         """The position (3,) after `dt_s`. Beyond the usual lag the velocity decays: integral of v exp(-t / fade)."""

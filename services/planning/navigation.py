@@ -23,6 +23,9 @@ _REACTION_S = 0.25
 _BRAKING_SHARE = 0.6
 """Way of braking as a share of speed squared by acceleration: the half, and a fifth more."""
 
+_COAST_S = 0.04
+"""Time between a command and the pose that shows it."""
+
 
 @dataclass(frozen=True)
 class Offset:
@@ -64,6 +67,12 @@ class Driver:
     def moving(self) -> bool:
         return abs(self._speed_mps) > 1e-3 or abs(self._turn_radps) > 1e-3
 
+    @property
+    def coast_m(self) -> float:
+        """The way that the robot still drives when it brakes now."""
+        speed = abs(self._speed_mps)
+        return speed**2 / (2 * self._config.acceleration_mps2) + _COAST_S * speed
+
     def arrived(self, offset: Offset) -> bool:
         config = self._config
         return (
@@ -79,13 +88,14 @@ class Driver:
             speed = 0.0
         else:
             # Slow enough to brake within the remaining distance.
-            speed = copysign(min(config.max_speed_mps, sqrt(config.acceleration_mps2 * abs(ahead))), ahead)
+            speed = sqrt(abs(ahead) * config.acceleration_mps2 / _BRAKING_SHARE)
+            speed = copysign(min(config.max_speed_mps, speed), ahead)
         if abs(heading) > config.turn_in_place_rad:
             speed = 0.0
         elif ahead > 0:
             speed *= max(0.0, 1.0 - abs(heading) / config.turn_in_place_rad)
         arc = 2.0 * speed * sin(heading) / max(abs(ahead), 0.15) if ahead > 0 else 0.0
-        align = 1.8 * heading if abs(heading) > config.heading_tolerance_rad / 2 else 0.0
+        align = config.turn_gain_per_s * heading if abs(heading) > config.heading_tolerance_rad / 2 else 0.0
         turn = arc if abs(arc) > abs(align) else align
         return speed, min(max(turn, -config.max_turn_radps), config.max_turn_radps)
 

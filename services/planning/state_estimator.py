@@ -25,6 +25,7 @@ from services.planning.config import PlanningConfig
 from services.planning.floor_map import Solid, inside
 from services.planning.head import PAN, TILT, CameraTilt
 from services.planning.memory import TargetMemory
+from services.planning.perception_watch import PerceptionWatch
 from services.planning.pose_matching import PoseMatching
 from services.planning.seen_floor import SeenFloor
 from services.planning.seen_through import VIEW_BYTES, DepthView
@@ -32,58 +33,18 @@ from services.planning.surroundings import Surroundings
 from services.planning.turning import Turning
 
 _WAIT_FOR_ODOMETRY_NS = NS // 5
+_SLOW_S = 0.2
 _JUST_SEEN_S = 0.5
 """An object that a frame does not show, but which was seen so shortly before it, is still in it."""
 _STEADY_RADPS = 1.0
 """A camera that turns faster does not correct the body's pose."""
+_POSTURES = 256
+"""States of a network that are kept: 5 s, so that a slow perception's frames find theirs."""
 _GLIMPSE_NS = NS // 20
 """Time over which the camera's turn is measured."""
 FLOOR_M, FLOOR_PER_M = 0.040, 0.012
 """Height below which a point counts as floor for a tilted camera, and its growth per metre of distance: more than
 perception's limit, because a tilted camera is likely to be rolled a little, too."""
-
-
-class PerceptionWatch:
-    """Whether perception is late, by the arrival of its messages, however slow it is and even if it sees nothing."""
-
-    def __init__(self, least_s: float, periods: float) -> None:
-        """Give perception `least_s` for a message, or `periods` of its own periods where that is longer."""
-        self._least_ns = round(least_s * NS)
-        self._periods = periods
-        self._arrived_ns: int | None = None
-        self._gaps_ns: deque[int] = deque(maxlen=5)
-        self._blind_since_ns: int | None = None
-
-    def arrived(self, now_ns: int) -> None:
-        """Note that detections have arrived."""
-        if self._arrived_ns is not None and now_ns > self._arrived_ns:
-            self._gaps_ns.append(now_ns - self._arrived_ns)
-        self._arrived_ns = now_ns
-        self._blind_since_ns = None
-
-    def blind_s(self, now_ns: int) -> float | None:
-        """The time, s, as `StateEstimator.blind_s` gives it; since the first call where nothing has arrived yet."""
-        if self._arrived_ns is not None and 0 <= now_ns - self._arrived_ns <= self._patience_ns():
-            return None
-        if self._blind_since_ns is None or now_ns < self._blind_since_ns:
-            self._blind_since_ns = now_ns
-        return (now_ns - self._blind_since_ns) / NS
-
-    def unheard_s(self, now_ns: int) -> float:
-        """Time since the last arrival; since the first call of `blind_s` where nothing has arrived yet."""
-        since_ns = self._arrived_ns if self._arrived_ns is not None else self._blind_since_ns
-        return 0.0 if since_ns is None else max(now_ns - since_ns, 0) / NS
-
-    def age_s(self, now_ns: int) -> float:
-        """Time since the last arrival, less the extra time that a slow perception has."""
-        if self._arrived_ns is None or now_ns < self._arrived_ns:
-            return float("inf")
-        return max(now_ns - self._arrived_ns - (self._patience_ns() - self._least_ns), 0) / NS
-
-    def _patience_ns(self) -> int:
-        # The median is robust against one pause and against two messages together.
-        period_ns = sorted(self._gaps_ns)[len(self._gaps_ns) // 2] if self._gaps_ns else 0
-        return max(self._least_ns, round(self._periods * period_ns))
 
 
 class PostureSighting(NamedTuple):
@@ -125,7 +86,8 @@ class StateEstimator:
         """Known objects by the stamp of the frame that they were seen in."""
         self.sight_lag_s = 0.0
         """Smoothed age of a sighting when the next one arrives; small for a fast perception."""
-        self._looked_ns: int | None = None
+        self.looked_ns: int | None = None
+        """Stamp of the newest frame whose detections have arrived."""
         self._published_ns: dict[str, int] = {}
         """By topic, when its newest message was published."""
         self._sight = PerceptionWatch(robot.base.command_timeout_s, config.blind_periods)
@@ -163,11 +125,11 @@ class StateEstimator:
                 self.hand = message
         elif isinstance(message, Detections):
             self._waiting.append(message)
-            self._sight.arrived(now_ns)
-            if self._looked_ns is not None and message.stamp_ns > self._looked_ns:
-                lag_s = min(max((now_ns - self._looked_ns) / NS, 0.0), 5.0)
-                self.sight_lag_s += 0.3 * (lag_s - self.sight_lag_s)
-            self._looked_ns = message.stamp_ns
+            self._sight.arrived(now_ns, message.stamp_ns)
+            if self.looked_ns is not None and message.stamp_ns > self.looked_ns:
+                lag_s = min(max((now_ns - self.looked_ns) / NS, 0.0), 5.0)
+                self.sight_lag_s += (0.3 if self.sight_lag_s else 1.0) * (lag_s - self.sight_lag_s)
+            self.looked_ns = message.stamp_ns
         elif isinstance(message, Obstacles):
             self._floors.append(message)
         elif isinstance(message, Intent):
@@ -176,7 +138,7 @@ class StateEstimator:
     def _keep_posture(self, network: str, state: ServoState) -> None:
         joints, history = self._postures.get(network, ((), None))
         if history is None or joints != state.joints:
-            history = History(len(state.joints), capacity=64)
+            history = History(len(state.joints), capacity=_POSTURES)
             self._postures[network] = state.joints, history
         history.add(state.stamp_ns, state.position_rad, state.incarnation)
 
@@ -289,7 +251,7 @@ class StateEstimator:
             doubtful = detection.note != ""
             if detection.label in self._watched and not doubtful:
                 self._keep_sighting(detection, detections.stamp_ns)
-            self.memory.see(detection.label, place, distance_m, detections.stamp_ns, doubtful=doubtful)
+            self.memory.see(detection.label, place, distance_m, detections.stamp_ns, doubtful=doubtful, body=body)
             item = self._known.get(detection.label)
             if item is not None and self.memory.sure(detection.label):
                 x, y, z = place.tolist()
@@ -351,6 +313,16 @@ class StateEstimator:
     def blind_s(self, now_ns: int) -> float | None:
         """Time, s, for which perception has been later than it may be; None while it is not."""
         return self._sight.blind_s(now_ns)
+
+    @property
+    def heard_ns(self) -> int | None:
+        """When perception's last message arrived; None before the first."""
+        return self._sight.arrived_ns
+
+    @property
+    def slow_sight(self) -> bool:
+        """Whether perception is so slow that waiting for it costs more than acting on what is known."""
+        return self.sight_lag_s > _SLOW_S
 
     def unseen_s(self, now_ns: int) -> float:
         """Time, s, since perception's last message arrived."""

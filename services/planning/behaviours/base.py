@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from math import hypot
-from typing import Literal, Protocol
+from typing import ClassVar, Literal, Protocol
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from cocoro.core import Output
 from cocoro.frames import Pose2
 from cocoro.messages import BaseCommand, TargetEstimate
 from cocoro.robot import Robot
+from cocoro.units import Vec3
 from services.planning.arm import ArmController, ArmStep
 from services.planning.config import PlanningConfig
 from services.planning.floor_map import FloorMap
@@ -93,6 +94,17 @@ class Snapshot:
     def target(self, label: str) -> TargetEstimate | None:
         return self.estimator.memory.estimate(label, self.body, self.now_ns)
 
+    CONFIRMED: ClassVar[int] = 2
+    CLEAR_M: ClassVar[float] = 0.03
+
+    def confirmed(self, label: str) -> bool:
+        """Whether a target was seen repeatedly: one sighting may be a mistake."""
+        return self.estimator.memory.sightings(label) >= self.CONFIRMED
+
+    def clear(self, target: TargetEstimate) -> bool:
+        """Whether a target's place is known well enough to go there: its sighting was not cut off or hidden in part."""
+        return target.sigma_m < self.CLEAR_M
+
     def fields(self, label: str, ignore: tuple[tuple[float, float, float], ...] = ()) -> Fields:
         """Distance fields of the obstacles for body and arm on the way to a label; `ignore` has circles (x, y, radius),
         odometry frame, m, in which the map is ignored."""
@@ -134,8 +146,23 @@ class Snapshot:
     def still(self) -> ArmStep:
         return self.actuators.arm.hold(self.angles, self.dt_s)
 
-    def look_at(self, point_m: tuple[float, float, float]) -> tuple[float, float, float]:
-        pan, tilt = self.actuators.gaze.at(point_m, self.angles)
+    AHEAD_M: ClassVar[float] = 0.55
+
+    def floor_before(self, target: TargetEstimate) -> Vec3:
+        """Floor near the robot on the straight way to a target, body frame, m, which is looked at with the target."""
+        x, y, _ = target.position_m
+        share = min(self.AHEAD_M / max(planar_m(target), 1e-6), 1.0)
+        return share * x, share * y, 0.0
+
+    def at_rest(self, target: TargetEstimate) -> Vec3:
+        """Where a target will be, body frame, m, when the robot has braked."""
+        x, y, z = target.position_m
+        return x - self.actuators.driver.coast_m, y, z
+
+    def look_at(self, point_m: Vec3, *others_m: Vec3) -> tuple[float, float, float]:
+        """Aim of the head, with its speed, for a point in the body frame, m, and for a picture that also shows the
+        first of the others that is near enough."""
+        pan, tilt = self.actuators.gaze.at_both(point_m, others_m, self.angles)
         return pan, tilt, self.actuators.config.head.fixate_speed_radps
 
 

@@ -11,7 +11,7 @@ from cocoro.messages.actions import Approach, Carry
 from services.planning.arm import ArmStep
 from services.planning.behaviours.base import Actuators, Plan, Snapshot, hand_place
 from services.planning.course import Course, Move
-from services.planning.navigation import PREVIEW_S
+from services.planning.navigation import PREVIEW_S, offset_to
 from services.planning.reach import HandPose
 from services.planning.surroundings import Fields
 
@@ -72,6 +72,7 @@ class Approaching:
         self._back_off = BackOff()
         self._stalls = 0
         self._glance_since_ns: int | None = None
+        self._unsure_since_ns: int | None = None
 
     def step(self, snapshot: Snapshot) -> Plan:
         actuators, config = snapshot.actuators, snapshot.actuators.config
@@ -83,7 +84,7 @@ class Approaching:
         if target is None:
             return Plan(snapshot.stand(), snapshot.still(), f"{self._label} is unknown", None, "failed", "lost")
         fields = snapshot.fields(self._label)
-        head = snapshot.look_at(target.position_m)
+        head = snapshot.look_at(target.position_m, snapshot.floor_before(target))
         backing = self._back_off.step(snapshot, head)
         if backing is not None:
             return backing
@@ -103,7 +104,8 @@ class Approaching:
             return Plan(snapshot.stand(), snapshot.still(), why, head, "failed", "blocked")
         arm, move = self._ready_hand(snapshot, target, move, fields)
         if move.look_at is not None:
-            head = snapshot.look_at(snapshot.body.inverse().apply((*move.look_at, 0.0)))
+            place_m = snapshot.body.inverse().apply((*move.look_at, 0.0))
+            head = snapshot.look_at(place_m, target.position_m, snapshot.floor_before(target))
         if move.blocked:
             return Plan(snapshot.stand(), arm, move.why, head, "failed", "blocked")
         if arm.blocked:
@@ -111,10 +113,31 @@ class Approaching:
                 snapshot.stand(), arm, "the hand cannot get ready: its way is blocked", head, "failed", "blocked"
             )
         base = actuators.driver.command(move.speed_mps, move.turn_radps, snapshot.dt_s)
-        if move.arrived and snapshot.standing and arm.arrived:
+        there = move.arrived or (move.direct and actuators.ready_on_the_way and self._coasts_there(snapshot, target))
+        if there and self._unsure(snapshot, target):
+            return Plan(base, arm, "there; waiting to see where exactly it is", head, distance_m=move.left_m)
+        if there and arm.arrived and (actuators.ready_on_the_way or snapshot.standing):
             return Plan(base, arm, f"{self._label} is in reach", head, "done", distance_m=move.left_m)
         why = "there; waiting for base and hand to come to rest" if move.arrived else move.why
         return Plan(base, arm, why, head, distance_m=move.left_m)
+
+    UNSURE_S = 1.0
+
+    def _unsure(self, snapshot: Snapshot, target: TargetEstimate) -> bool:
+        """Whether the target must be seen again before the hand reaches for it; for a limited time, because the hand
+        may hide it."""
+        if target.sigma_m <= snapshot.actuators.config.arm.grasp_sigma_m:
+            return False
+        if self._unsure_since_ns is None:
+            self._unsure_since_ns = snapshot.now_ns
+        return snapshot.now_ns - self._unsure_since_ns < (self.UNSURE_S + 2 * snapshot.estimator.sight_lag_s) * NS
+
+    def _coasts_there(self, snapshot: Snapshot, target: TargetEstimate) -> bool:
+        """Whether the robot comes to rest at the target when it brakes now."""
+        driver, (x, y, _) = snapshot.actuators.driver, snapshot.at_rest(target)
+        base = snapshot.estimator.base
+        slow = base is not None and abs(base.speed_mps) < snapshot.actuators.config.navigation.coasting_mps
+        return slow and driver.arrived(offset_to((x, y), grasp_aim(snapshot.actuators)))
 
     MAX_STALLS = 2
 

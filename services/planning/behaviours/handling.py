@@ -1,4 +1,4 @@
-"""Handling behaviours: the base stands, arm and hand move."""
+"""Handling behaviours: the base stands or comes to rest, arm and hand move."""
 
 from __future__ import annotations
 
@@ -15,6 +15,8 @@ class Reaching:
     FREEZE_M = 0.08
     """Distance from which the hand hides the target, so that its last place is kept."""
     CLOSE_IN_M = 0.015
+    CLOSE_M = 0.02
+    """Rest of the way at which the claws begin to close: the target is between them."""
 
     def __init__(self, action: Reach, *, touching: bool = False) -> None:
         """`touching`: the target is only touched, so it may be nearer or further than one that is grasped."""
@@ -36,14 +38,14 @@ class Reaching:
         ):
             return Plan(snapshot.stand(), snapshot.still(), f"{self._label} is out of sight", None, "failed", "lost")
         if target is not None and not self._inserting:
-            why_not = actuators.reachability.why_not(target.position_m, touching=self._touching)
+            why_not = actuators.reachability.why_not(snapshot.at_rest(target), touching=self._touching)
             if why_not:
                 return Plan(snapshot.stand(), snapshot.still(), why_not, None, "failed", "unreachable")
         actuators.grip.open()
         grasp = self._frozen
         if grasp is None:
             assert target is not None
-            grasp = actuators.reachability.grasp(target.position_m)
+            grasp = actuators.reachability.grasp(snapshot.at_rest(target))
         head = snapshot.look_at(target.position_m) if target is not None else None
         closing_in = self._inserting
         if not closing_in:
@@ -56,6 +58,8 @@ class Reaching:
             arm = actuators.arm.reach(grasp.around, config.arm.insert_speed_mps, snapshot.angles, snapshot.dt_s)
             if arm.left < self.FREEZE_M:
                 self._frozen = grasp
+            if arm.left < self.CLOSE_M and not self._touching:
+                actuators.grip.close()  # the claws need longer than the hand
             why = "closing in on the target"
         plan = Plan(snapshot.stand(), arm, why, head, distance_m=arm.left)
         if arm.blocked:

@@ -8,6 +8,7 @@ import numpy as np
 
 from cocoro.clock import NS
 from cocoro.frames import Pose2
+from cocoro.messages import BaseCommand
 from cocoro.messages.actions import Explore, Idle, Park, Search
 from services.planning.behaviours.base import Plan, Snapshot, planar_m
 from services.planning.behaviours.driving import BackOff
@@ -59,14 +60,21 @@ class Parking:
 class Searching:
     """Looks where the target was last, then at the floor that can be seen from here and that this search has not seen:
     in its first look with a sweep over the whole surroundings. A target that shows up is looked at until it is
-    confirmed."""
+    confirmed; with a slow perception one clear sighting does, and the approach confirms it."""
 
     needs_sight = True
-    CONFIRMED = 2
     IN_VIEW_S = 0.2
     """Age of the newest sighting, beyond perception's own lag, up to which a target counts as in view."""
 
     BACK_M = 0.4
+    PICTURES = 2
+    """Pictures of an aim, and scans of its floor, before the head goes on; of a slow perception one picture."""
+    SCANS_NS = 3 * NS // 10
+    """Time in which the scans of an aim must have come."""
+    UNDER_WAY_NS = NS // 10
+    """Greatest age of the picture that a slow perception takes next when it is done with another."""
+    STEADY_NS = NS // 30
+    """Exposure of a picture, which begins only when the head rests."""
     CHECK_NS = NS // 5
     """Period at which it checks what is left to look at."""
 
@@ -76,6 +84,9 @@ class Searching:
         self._sweep: Sweep | None = None
         self._glances: list[Glance] | None = None
         self._rests_since_ns: int | None = None
+        self._pictures = self._scans = 0
+        self._newest_ns: int | None = None
+        """Stamp of the newest frame that was counted as a picture of the present aim."""
         self._checked_ns: int | None = None
         self._left_m2 = 0.0
         self._looked_at_ns: int | None = None
@@ -86,10 +97,11 @@ class Searching:
         config = snapshot.actuators.config.head
         target = snapshot.target(self._label)
         if target is not None:
-            head = snapshot.look_at(target.position_m)
+            head = snapshot.look_at(target.position_m, snapshot.floor_before(target))
             sightings = snapshot.estimator.memory.sightings(self._label)
             lag_s = snapshot.estimator.sight_lag_s
-            if sightings >= self.CONFIRMED and target.age_s < self.IN_VIEW_S + lag_s:
+            sure = snapshot.confirmed(self._label) or (snapshot.estimator.slow_sight and snapshot.clear(target))
+            if sure and target.age_s < self.IN_VIEW_S + lag_s:
                 return Plan(
                     snapshot.stand(),
                     snapshot.still(),
@@ -128,11 +140,11 @@ class Searching:
         # Even slow perception must see every direction twice while the view passes over it.
         slow = 0.4 / max(lag_s, 1e-3)
         if self._sweep is not None:
-            goal = self._sweep.next(pan, tilt)
-            head = (*goal, min(config.head.sweep_speed_radps, slow))
+            if self._pictured(snapshot, self._sweep.aim):
+                self._sweep.go_on()
             if not self._sweep.done:
                 why = f"sweeping for {self._label}: {self._sweep.share:.0%} done"
-                return Plan(snapshot.stand(), snapshot.still(), why, head)
+                return Plan(snapshot.stand(), snapshot.still(), why, (*self._sweep.aim, config.head.fixate_speed_radps))
             self._sweep, self._glances = None, []
         while self._glances:
             glance = self._glances[0]
@@ -150,6 +162,32 @@ class Searching:
         seen.looked_from(snapshot.body, *snapshot.stands_around)
         why = f"{self._label} is not to be seen from here"
         return Plan(snapshot.stand(), snapshot.still(), why, None, "failed", "not_found")
+
+    def _pictured(self, snapshot: Snapshot, aim: tuple[float, float]) -> bool:
+        """Whether enough pictures were taken since the head rests at an aim (pan, tilt), rad."""
+        estimator, angles = snapshot.estimator, snapshot.angles
+        if abs(aim[0] - angles[PAN]) > 0.05 or abs(aim[1] - angles[TILT]) > 0.05:
+            self._rests_since_ns = None
+            return False
+        if self._rests_since_ns is None:
+            self._rests_since_ns, self._pictures, self._newest_ns = snapshot.now_ns, 0, estimator.looked_ns
+            self._scans = estimator.seen.scans
+        since_ns = self._rests_since_ns + self.STEADY_NS
+        if estimator.looked_ns is not None and estimator.looked_ns != self._newest_ns:
+            self._newest_ns = estimator.looked_ns
+            self._pictures += estimator.looked_ns >= since_ns
+        if estimator.slow_sight:
+            # What perception works on now shows this aim; the result is not waited for.
+            heard_ns = estimator.heard_ns
+            under_way = heard_ns is not None and heard_ns >= since_ns + self.UNDER_WAY_NS
+            done = under_way or self._pictures >= 1
+        else:
+            # Where the mount hides all floor, there is no scan to wait for.
+            scanned = estimator.seen.scans - self._scans >= self.PICTURES
+            done = self._pictures >= self.PICTURES and (scanned or snapshot.now_ns - since_ns > self.SCANS_NS)
+        if done:
+            self._rests_since_ns = None
+        return done
 
     def _rested(self, snapshot: Snapshot, more_s: float) -> bool:
         """Whether the head has been at rest for long enough to see."""
@@ -242,7 +280,7 @@ class Exploring:
             move = move._replace(speed_mps=0.0, turn_radps=0.0)
         if move.look_at is not None:
             head = snapshot.look_at(snapshot.body.inverse().apply((*move.look_at, 0.0)))
-        base = actuators.driver.command(move.speed_mps, move.turn_radps, snapshot.dt_s)
+        base = self._drive(snapshot, move.speed_mps, move.turn_radps)
         why = f"going where {self._view.gain_m2:.2f} m2 of unseen floor can be seen: {move.why}"
         plan = Plan(base, arm, why, head, distance_m=move.left_m)
         if move.blocked:
@@ -261,7 +299,7 @@ class Exploring:
     def _turn(self, snapshot: Snapshot, bearing_rad: float, head: tuple[float, float, float]) -> Plan:
         arm = snapshot.actuators.arm.park(snapshot.angles, snapshot.dt_s)
         turn = 1.8 * bearing_rad if snapshot.actuators.arm.parked(snapshot.angles) else 0.0
-        base = snapshot.actuators.driver.command(0.0, turn, snapshot.dt_s)
+        base = self._drive(snapshot, 0.0, turn)
         plan = Plan(
             base, arm, f"turning to look where the camera's mount hides the floor: {bearing_rad:+.2f} rad", head
         )
@@ -269,11 +307,17 @@ class Exploring:
             plan.state = "done"
         return plan
 
+    @staticmethod
+    def _drive(snapshot: Snapshot, speed_mps: float, turn_radps: float) -> BaseCommand:
+        """A command on the same arc, slow enough that the scans on the way correct the body's pose."""
+        search = snapshot.actuators.config.search
+        excess = max(abs(speed_mps) / search.max_speed_mps, abs(turn_radps) / search.max_turn_radps, 1.0)
+        return snapshot.actuators.driver.command(speed_mps / excess, turn_radps / excess, snapshot.dt_s)
+
     def _in_view(self, snapshot: Snapshot) -> bool:
         target = snapshot.target(self._label)
         fresh_s = Searching.IN_VIEW_S + snapshot.estimator.sight_lag_s
-        sightings = snapshot.estimator.memory.sightings(self._label)
-        return target is not None and target.age_s < fresh_s and sightings >= Searching.CONFIRMED
+        return target is not None and target.age_s < fresh_s and snapshot.confirmed(self._label)
 
     def _worth_it(self, snapshot: Snapshot) -> bool:
         assert self._view is not None
