@@ -8,6 +8,8 @@ from pathlib import Path
 from bench.report import Chart, Figure, Result, number
 from bench.suite import ROOT, STORED, names, read
 
+LONG = 40
+"""Rows from which on a table is folded."""
 PAGE = ROOT / "docs" / "benchmarks.md"
 HEAD = """# Benchmarks
 
@@ -55,9 +57,11 @@ def section(result: Result) -> str:
         lines += map(_row, result.figures)
         lines.append("")
     for table in result.tables:
-        lines += [f"{table.title}:", "", f"| {' | '.join(table.head)} |", "| --- " * len(table.head) + "|"]
+        long = len(table.rows) > LONG
+        lines += [f"<details><summary>{table.title}</summary>" if long else f"{table.title}:", ""]
+        lines += [f"| {' | '.join(table.head)} |", "| --- " * len(table.head) + "|"]
         lines += [f"| {' | '.join(row)} |" for row in table.rows]
-        lines.append("")
+        lines += ["", "</details>", ""] if long else [""]
     lines += [f"- {note}" for note in result.notes]
     return "\n".join(lines).rstrip() + "\n"
 

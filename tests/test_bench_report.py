@@ -5,6 +5,7 @@ from __future__ import annotations
 from math import nan
 
 import pytest
+from msgspec.structs import replace
 
 from bench import page, suite
 from bench.entries import ENTRIES
@@ -15,6 +16,7 @@ from bench.report import (
     Report,
     Result,
     Series,
+    Table,
     decode,
     encode,
     number,
@@ -115,6 +117,12 @@ def test_the_page_states_command_machine_figures_and_what_was_missed() -> None:
     assert "2 cores of a processor" in text
     assert "| a / b | 2 | 1.9 to 2.1 | 3 | at most 1.5: **missed** |" in text
     assert "![a line](benchmarks-try-line.png)" in text
+
+
+def test_a_long_table_is_folded() -> None:
+    short, long = (Table("a table", ["n"], [[str(n)] for n in range(count)]) for count in (3, page.LONG + 1))
+    folded = ["<details>" in page.section(replace(result(), tables=[table])) for table in (short, long)]
+    assert folded == [False, True]
 
 
 def test_the_page_is_that_of_the_stored_results() -> None:

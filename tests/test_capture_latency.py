@@ -56,9 +56,7 @@ def test_each_stage_is_from_one_message_to_the_next_that_used_it(tmp_path: Path)
     # In the golden capture, of virtual time, detections come at once, and the planner steps at once.
     late = {DETECTIONS.name: 4.0, BASE_COMMAND.name: 7.0}
     told = found(golden(tmp_path / "late.mcap", lambda record: late.get(record.key.partition("/")[2], 0.0)))
-    assert medians(told) == pytest.approx(
-        {"perception": 4.0, "planning": 3.0, "pixel to motor": 7.0}, abs=0.001
-    )
+    assert medians(told) == pytest.approx({"perception": 4.0, "planning": 3.0, "pixel to motor": 7.0}, abs=0.001)
     assert (told.frames, told.seen) == (60, 60)
     assert 40 < told.used < 60, "the wheels are commanded in a part of the task"
 
