@@ -13,7 +13,7 @@ from cocoro.messages import BaseCommand
 from cocoro.robot import Robot
 from services.planning.config import PlanningConfig
 from services.planning.course import Course, Move
-from services.planning.navigation import Driver, offset_to
+from services.planning.navigation import GENTLE, Driver, offset_to
 from services.planning.surroundings import Surroundings
 
 ROBOT = Robot.load()
@@ -104,7 +104,7 @@ def test_a_wheel_that_cannot_go_faster_slows_the_other_and_the_arc_is_kept(
     driver = Driver(CONFIG, ROBOT.base)
     command = driver.command(0.0, 0.0, TICK_S)
     for _ in range(round(seconds / TICK_S)):
-        command = driver.command(speed, turn, TICK_S, brisk=True)
+        command = driver.command(speed, turn, TICK_S)
     fastest = max(abs(command.left_mps), abs(command.right_mps))
     assert fastest <= ROBOT.base.max_wheel_speed_mps + 1e-9
     asked_speed, asked_turn = driver._speed_mps, driver._turn_radps
@@ -162,3 +162,18 @@ def test_before_an_aim_near_an_obstacle_the_robot_goes_so_slowly_that_it_can_sto
 def test_at_the_stopping_speed_of_a_way_the_stopping_poses_end_with_it(way_m: float) -> None:
     driver = Driver(CONFIG, ROBOT.base)
     assert driver.stopping_poses(driver.stopping_mps(way_m), 0.0)[-1].x_m == pytest.approx(way_m)
+
+
+def test_a_gentle_way_speeds_up_and_turns_by_half_of_the_limits_and_brakes_by_all_of_them() -> None:
+    driver = Driver(CONFIG, ROBOT.base)
+    seconds = 0.0
+    while driver._speed_mps < 0.2:
+        driver.command(0.3, 9.0, TICK_S, pace=GENTLE)
+        seconds += TICK_S
+    assert seconds == pytest.approx(0.2 / (GENTLE * CONFIG.acceleration_mps2), abs=2 * TICK_S)
+    for _ in range(200):
+        driver.command(0.3, 9.0, TICK_S, pace=GENTLE)
+    assert driver._turn_radps == pytest.approx(GENTLE * CONFIG.max_turn_radps)
+    before_mps = driver._speed_mps
+    driver.command(0.0, 0.0, TICK_S, pace=GENTLE)
+    assert before_mps - driver._speed_mps == pytest.approx(CONFIG.acceleration_mps2 * TICK_S)

@@ -23,6 +23,9 @@ _REACTION_S = 0.25
 _BRAKING_SHARE = 0.6
 """Way of braking as a share of speed squared by acceleration: the half, and a fifth more."""
 
+GENTLE = 0.5
+"""Share of the limits for a way that needs care more than speed: round something, with something in the hand, or where
+the scans on the way correct the body's pose."""
 _COAST_S = 0.04
 """Time between a command and the pose that shows it."""
 
@@ -125,15 +128,17 @@ class Driver:
         braking = _BRAKING_SHARE / self._config.acceleration_mps2
         return (sqrt(_REACTION_S**2 + 4 * braking * max(way_m, 0.0)) - _REACTION_S) / (2 * braking)
 
-    def command(self, speed_mps: float, turn_radps: float, dt_s: float, *, brisk: bool = False) -> BaseCommand:
-        """Approach a speed and turn rate within the acceleration limits; `brisk`: within twice the limits, for pursuit.
-        When a wheel saturates, both wheels are scaled, which keeps the arc."""
+    def command(self, speed_mps: float, turn_radps: float, dt_s: float, *, pace: float = 1.0) -> BaseCommand:
+        """Approach a speed and turn rate within the acceleration limits. `pace` is the share of the limits that is used
+        to go faster and to turn; to go slower, all of them are. When a wheel saturates, both wheels are scaled, which
+        keeps the arc."""
         config = self._config
-        more = 2.0 if brisk else 1.0
-        self._speed_mps = _approach(self._speed_mps, speed_mps, more * config.acceleration_mps2 * dt_s)
-        limit = more * config.max_turn_radps
+        faster = abs(speed_mps) > abs(self._speed_mps) and speed_mps * self._speed_mps >= 0
+        most = config.acceleration_mps2 * (pace if faster else 1.0)
+        self._speed_mps = _approach(self._speed_mps, speed_mps, most * dt_s)
+        limit = pace * config.max_turn_radps
         turn_radps = min(max(turn_radps, -limit), limit)
-        self._turn_radps = _approach(self._turn_radps, turn_radps, config.turn_acceleration_radps2 * dt_s)
+        self._turn_radps = _approach(self._turn_radps, turn_radps, pace * config.turn_acceleration_radps2 * dt_s)
         half = self._turn_radps * self._separation_m / 2
         left, right = self._speed_mps - half, self._speed_mps + half
         excess = max(abs(left), abs(right)) / self._base.max_wheel_speed_mps

@@ -11,7 +11,7 @@ from cocoro.messages.actions import Approach, Carry
 from services.planning.arm import ArmStep
 from services.planning.behaviours.base import Actuators, Plan, Snapshot, hand_place
 from services.planning.course import Course, Move
-from services.planning.navigation import PREVIEW_S, offset_to
+from services.planning.navigation import GENTLE, PREVIEW_S, offset_to
 from services.planning.reach import HandPose
 from services.planning.surroundings import Fields
 
@@ -261,7 +261,7 @@ class Carrying:
             return Plan(snapshot.stand(), snapshot.still(), move.why, head, "failed", "blocked")
         if move.look_at is not None:
             head = snapshot.look_at(snapshot.body.inverse().apply((*move.look_at, 0.0)))
-        base = actuators.driver.command(move.speed_mps, move.turn_radps, snapshot.dt_s)
+        base = actuators.driver.command(move.speed_mps, move.turn_radps, snapshot.dt_s, pace=GENTLE)
         plan = Plan(base, snapshot.still(), f"carrying: {move.why}", head, distance_m=move.left_m)
         if move.arrived and snapshot.standing:
             plan.state, plan.why = "done", "at the place to put it down"

@@ -17,6 +17,7 @@ from services.planning.behaviours.base import Plan, Snapshot, planar_m
 from services.planning.behaviours.driving import BackOff
 from services.planning.config import FollowConfig
 from services.planning.course import Course, Move
+from services.planning.navigation import GENTLE
 from services.planning.surroundings import Fields
 
 _GLANCE_S = 0.6
@@ -81,8 +82,8 @@ class Following:
         else:
             self._course = None
             move = move._replace(speed_mps=0.0, why="near enough; something is in the way")
-        brisk = self._course is None
-        base = snapshot.actuators.driver.command(move.speed_mps, move.turn_radps, snapshot.dt_s, brisk=brisk)
+        pace = 1.0 if self._course is None else GENTLE
+        base = snapshot.actuators.driver.command(move.speed_mps, move.turn_radps, snapshot.dt_s, pace=pace)
         return Plan(base, arm, move.why, head, distance_m=abs(gap))
 
     # --- in sight ---------------------------------------------------------------------------------
@@ -161,7 +162,7 @@ class Following:
             self._looking_since_ns = None
             if move.look_at is not None:
                 head = self._look_down(snapshot, move)
-            base = snapshot.actuators.driver.command(move.speed_mps, move.turn_radps, snapshot.dt_s)
+            base = snapshot.actuators.driver.command(move.speed_mps, move.turn_radps, snapshot.dt_s, pace=GENTLE)
             return Plan(base, arm, f"lost it: {move.why}", head, distance_m=off_m)
         if self._looking_since_ns is None:
             self._looking_since_ns = snapshot.now_ns

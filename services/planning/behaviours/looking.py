@@ -15,6 +15,7 @@ from services.planning.behaviours.driving import BackOff
 from services.planning.course import Course
 from services.planning.floor_map import CELL_M
 from services.planning.head import PAN, TILT, Glance, Sweep, glances
+from services.planning.navigation import GENTLE
 from services.planning.seen_floor import Rest, Viewpoint, describe
 
 
@@ -312,7 +313,8 @@ class Exploring:
         """A command on the same arc, slow enough that the scans on the way correct the body's pose."""
         search = snapshot.actuators.config.search
         excess = max(abs(speed_mps) / search.max_speed_mps, abs(turn_radps) / search.max_turn_radps, 1.0)
-        return snapshot.actuators.driver.command(speed_mps / excess, turn_radps / excess, snapshot.dt_s)
+        driver = snapshot.actuators.driver
+        return driver.command(speed_mps / excess, turn_radps / excess, snapshot.dt_s, pace=GENTLE)
 
     def _in_view(self, snapshot: Snapshot) -> bool:
         target = snapshot.target(self._label)
