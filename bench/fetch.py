@@ -38,7 +38,7 @@ WAITS = {
     " nothing tips; floor that the arm swings over must have been seen; the arm's joints at 2.4 of 6 rad/s",
     "reach": "0.35 m/s along the hand's own axis, while the base comes to rest",
     "grasp": "claws at 1.2 of 6 rad/s (twice as fast, 8 of 9 grips slipped), then 0.25 s in which the grip must hold",
-    "lift": "0.35 m/s, straight up before inwards",
+    "lift": "0.25 m/s, straight up before inwards, so that the load does not leave the claws when it stops",
     "hold": "the task's own: what is lifted must stay held",
 }
 

@@ -120,7 +120,7 @@ class ArmConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     joint_speed_radps: Positive = 2.4
     hand_speed_mps: Positive = 0.5
     insert_speed_mps: Positive = 0.35
-    lift_speed_mps: Positive = 0.35
+    lift_speed_mps: Positive = 0.25
     damping: Positive = 0.02
     """Damping of the pseudo-inverse, m."""
     pitch_rad: float = -0.17
