@@ -11,6 +11,7 @@ Exit code 1 when a figure does not keep its bound, a bench failed, or a ratio fe
 from __future__ import annotations
 
 import argparse
+import os
 import signal
 import subprocess
 import sys
@@ -26,6 +27,8 @@ from bench import entries, page, suite
 from bench.ended import leave_when_ended
 from bench.report import Report, Result, encode, said, this_machine
 from cocoro.errors import CocoroError
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy; small matrices only wait for a second thread
 
 WORDS: dict[str, Callable[[Sequence[str]], int]] = {
     "suite": suite.run_suite,
