@@ -1,8 +1,9 @@
 """Runs the tests on forked workers: `pytest --spread`, as `make test` does.
 
 This process imports and collects all tests once and forks the workers, which share that memory and need no time for it:
-a process that collects by itself, as each worker of pytest-xdist does, takes 2.8 s of processor time and 199 MB for that.
-pytest-xdist also has no workers of unlike kinds, with a scheduling class and a network of their own. Each worker takes one file after another, so that what the tests of a file share is made once, and reports to this process.
+a process that collects by itself, as each worker of pytest-xdist does, takes 2.8 s of processor time and 199 MB for
+that. Nor has pytest-xdist workers of unlike kinds, with a scheduling class and a network of their own. Each worker
+takes one file after another, so that what the tests of a file share is made once, and reports to this process.
 
 - `others`: tests without the marker `zenoh`, on two workers that get only the processor time that is left (SCHED_IDLE,
   and a session of the least weight, since Linux shares the processor between sessions first), during all the rest.
