@@ -15,6 +15,7 @@ from collections import deque
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from math import sqrt
+from statistics import median
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -205,6 +206,14 @@ def _pursuits(report: Report, times_s: Sequence[float], seeds: int, results: dic
                 at_most=1 / 3 if time_s == 0.5 else None,
                 better="less",
             )
+            lockstep_m = median(theirs["truth"]["off_m"] for _, theirs in pairs)
+            if ideal_m > lockstep_m / 3:
+                report.notes.append(
+                    f"With perception at {time_s:g} s no robot with this sight tracks with a third of lock-step's error: "
+                    f"a third is {lockstep_m / 3:.3f} m, and one without limits is off by {ideal_m:.3f} m, since it cannot know of a "
+                    "corner before it is seen. Lock-step has the newest odometry and expects the ball to go on, as the "
+                    "mesh does, and so decoupling gains nothing here."
+                )
         for way in WAYS:
             command = [
                 results[case]["commands"]
