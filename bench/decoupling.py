@@ -209,9 +209,9 @@ def _pursuits(report: Report, times_s: Sequence[float], seeds: int, results: dic
             lockstep_m = median(theirs["truth"]["off_m"] for _, theirs in pairs)
             if ideal_m > lockstep_m / 3:
                 report.notes.append(
-                    f"With perception at {time_s:g} s no robot with this sight tracks with a third of lock-step's error: "
-                    f"a third is {lockstep_m / 3:.3f} m, and one without limits is off by {ideal_m:.3f} m, since it cannot know of a "
-                    "corner before it is seen. Lock-step has the newest odometry and expects the ball to go on, as the "
+                    f"With perception at {time_s:g} s no robot with this sight tracks with a third of lock-step's "
+                    f"error: a third is {lockstep_m / 3:.3f} m, and one without limits is off by {ideal_m:.3f} m, "
+                    "since it cannot know of a corner before it is seen. Lock-step has the newest odometry and expects the ball to go on, as the "
                     "mesh does, and so decoupling gains nothing here."
                 )
         for way in WAYS:
