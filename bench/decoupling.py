@@ -211,8 +211,8 @@ def _pursuits(report: Report, times_s: Sequence[float], seeds: int, results: dic
                 report.notes.append(
                     f"With perception at {time_s:g} s no robot with this sight tracks with a third of lock-step's "
                     f"error: a third is {lockstep_m / 3:.3f} m, and one without limits is off by {ideal_m:.3f} m, "
-                    "since it cannot know of a corner before it is seen. Lock-step has the newest odometry and expects the ball to go on, as the "
-                    "mesh does, and so decoupling gains nothing here."
+                    "since it cannot know of a corner before it is seen. Lock-step has the newest odometry and "
+                    "expects the ball to go on, as the mesh does, and so decoupling gains nothing here."
                 )
         for way in WAYS:
             command = [
