@@ -1,7 +1,5 @@
 """Measures the mesh over Unix sockets, tcp and routers: latencies, the CPU share of a camera, and the time to join.
 
-    python bench/bus.py [--pings N] [--seconds S]
-
 `python -m bench mesh` compares the way that a robot uses with other middleware. The figures depend on this machine and
 its load; compare within the table. Each ratio is to the first row.
 """
@@ -23,6 +21,7 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+from bench.report import Report, Table
 from cocoro.bus.base import Payload, Qos
 from cocoro.bus.endpoints import ZenohConfig
 from cocoro.bus.zenoh import ZenohBus
@@ -110,7 +109,7 @@ async def serve(way: Way, name: str) -> None:
 async def process(way: Way, name: str) -> AsyncIterator[None]:
     arguments = json.dumps([way.title, way.directory, way.ports, way.router, way.shared_memory, way.receiver_too])
     started = await asyncio.create_subprocess_exec(
-        sys.executable, __file__, "--serve", arguments, name, stdin=subprocess.PIPE
+        sys.executable, "-m", "bench.bus", "--serve", arguments, name, stdin=subprocess.PIPE
     )
     try:
         yield
@@ -191,7 +190,7 @@ def p99(values: list[float]) -> float:
     return statistics.quantiles(values, n=100)[98]
 
 
-async def measure(way: Way, pings: int, seconds: float, quick: bool = False) -> dict[str, float]:
+async def measure_way(way: Way, pings: int, seconds: float, quick: bool = False) -> dict[str, float]:
     row: dict[str, float] = {}
     async with (
         process(way, "router") if way.router else nothing(),
@@ -267,21 +266,20 @@ COLUMNS = {
 }
 
 
-def table(rows: dict[str, dict[str, float]]) -> None:
-    first = next(iter(rows.values()))
-    width = max(len(title) for title in rows)
-    print(" " * width, *(f"{heading:>14}" for heading, _ in COLUMNS.values()))
+def table(rows: dict[str, dict[str, float]]) -> Table:
+    first, made = next(iter(rows.values())), []
     for title, row in rows.items():
-        cells = []
+        cells = [title]
         for name, (_, form) in COLUMNS.items():
             cell = form.format(row[name]) if name in row else "-"
             if row is not first and name in row and first[name] > 0:
                 cell += f" x{row[name] / first[name]:.1f}"
-            cells.append(f"{cell:>14}")
-        print(f"{title:<{width}}", *cells)
+            cells.append(cell)
+        made.append(cells)
+    return Table("Ways into the mesh", ["way", *(heading for heading, _ in COLUMNS.values())], made)
 
 
-async def main(pings: int, seconds: float) -> None:
+async def _measure(pings: int, seconds: float, report: Report) -> None:
     with tempfile.TemporaryDirectory() as temporary:
         ways = [
             Way("peers, Unix sockets", directory=f"{temporary}/a"),
@@ -294,23 +292,23 @@ async def main(pings: int, seconds: float) -> None:
         rows = {}
         for way in ways:
             title = f"{way.title} ({'router' if way.router else 'peers'})" if way.title in rows else way.title
-            rows[title] = await measure(way, pings, seconds)
-        table(rows)
+            rows[title] = await measure_way(way, pings, seconds)
+            report.say(f"{title}: measured")
+        report.tables.append(table(rows))
         for members in (1, 8):
             took = await program_ms(f"{temporary}/m{members}", members)
-            print(
-                f"A program from its start to its end with one call in a mesh of {members} and us: "
-                f"median {statistics.median(took):.0f} ms, worst {max(took):.0f} ms"
-            )
+            report.value(f"a program from start to end, with one call in a mesh of {members} others", took, "ms")
 
 
-if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--pings", type=int, default=2000)
-    parser.add_argument("--seconds", type=float, default=6.0, help="of the camera's stream, for each row")
-    parser.add_argument("--serve", nargs=2, metavar=("WAY", "NAME"), help=argparse.SUPPRESS)
-    chosen = parser.parse_args()
-    if chosen.serve:
-        asyncio.run(serve(Way(*json.loads(chosen.serve[0])), chosen.serve[1]))
-    else:
-        asyncio.run(main(chosen.pings, chosen.seconds))
+    parser.add_argument("--seconds", type=float, default=6.0, help="of the camera's stream, for each row (6)")
+
+
+def measure(chosen: argparse.Namespace, report: Report) -> None:
+    pings, seconds = (200, 1.0) if chosen.short else (chosen.pings, chosen.seconds)
+    asyncio.run(_measure(pings, seconds, report))
+
+
+if __name__ == "__main__":  # the other process
+    asyncio.run(serve(Way(*json.loads(sys.argv[2])), sys.argv[3]))

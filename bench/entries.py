@@ -55,6 +55,7 @@ ENTRIES: dict[str, Entry] = {
     "capture-format": Entry("capture_format", "suite"),
     "live": Entry("live", "suite"),
     "alarms": Entry("alarms"),
+    "bus": Entry("bus"),
     "capture-damage": Entry("capture_damage"),
     "endings": Entry("endings"),
     "exports": Entry("exports"),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
-import re
+import time
 from contextlib import AsyncExitStack
 from functools import partial
 from itertools import pairwise
@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from apps.rehearsal.lockstep import LOCKSTEP_PLANNER, LOCKSTEP_SETTINGS, LockstepCycle, LockstepNode
-from bench.live import NAME, Operator, operator
+from bench.live import NAME, Fetched, Operator, operator
 from cocoro import topics
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.clock import FollowedClock
@@ -109,12 +109,12 @@ async def _fetch(cocoro: Operator, stack: AsyncExitStack) -> LiveRun:
         stamps.append(command.stamp_ns)
 
     node.on(topics.BASE_COMMAND, commanded)
+    begun_s = time.monotonic()
     said, _ = await asyncio.to_thread(process.communicate)
-    ended = len(stamps)
+    ended, seconds = len(stamps), time.monotonic() - begun_s
     await asyncio.sleep(HELD_S + 0.5)
-    line = said.partition("\nrecorded in ")[0].strip().splitlines()[-1:] or ["it said nothing"]
-    took = re.search(r" in ([0-9.]+) s", line[0])
     truth = judge.result()
+    fetched = Fetched(process.returncode, said, seconds, truth)
     periods = [(later - earlier) / 1e6 for earlier, later in pairwise(stamps[:ended])]
-    held = process.returncode == 0 and truth.held and not truth.knocked_over
-    return LiveRun(line[0], held, float(took[1]) if took else 0.0, periods)
+    held = fetched.code == 0 and truth.held and not truth.knocked_over
+    return LiveRun(fetched.last_line, held, fetched.task_s or 0.0, periods)
