@@ -46,7 +46,21 @@ def topic_of(role: Role) -> Topic[Detections]:
     return Topic(f"{role}/small", Detections, Qos.COMMAND, 1000.0, 1.0, "")
 
 
-class NodeWay(Way):
+class LoopWay(Way):
+    """What it sends, an event loop in a thread of its own sends."""
+
+    _loop: asyncio.AbstractEventLoop
+
+    def bounce(self, count: int) -> list[int]:
+        self.tally.begin(count, echo=True)
+        self._loop.call_soon_threadsafe(self.send_small)
+        return self.tally.wait()
+
+    def paced(self, count: int, hz: float, send: Callable[[], None]) -> None:
+        asyncio.run_coroutine_threadsafe(_paced(count, hz, send), self._loop).result()
+
+
+class NodeWay(LoopWay):
     """What services use: typed messages, stamped, numbered, encoded; decoded, checked and counted by the reader."""
 
     def open(self) -> None:
@@ -83,14 +97,6 @@ class NodeWay(Way):
         now_ns = self._clock.now_ns()
         frame = Frame(width=WIDTH, height=HEIGHT, colour=colour.data, depth=depth.data)
         self._frames.put(frame, now_ns)
-
-    def bounce(self, count: int) -> list[int]:
-        self.tally.begin(count, echo=True)
-        self._loop.call_soon_threadsafe(self.send_small)
-        return self.tally.wait()
-
-    def paced(self, count: int, hz: float, send: Callable[[], None]) -> None:
-        asyncio.run_coroutine_threadsafe(_paced(count, hz, send), self._loop).result()
 
     def close(self) -> None:
         asyncio.run_coroutine_threadsafe(self._stack.aclose(), self._loop).result()
@@ -146,7 +152,7 @@ class RawWay(Way):
         asyncio.run_coroutine_threadsafe(self._bus.close(), self._loop).result()
 
 
-class RawLoopWay(RawWay):
+class RawLoopWay(LoopWay, RawWay):
     """The same for a program with an event loop: the callback hands each sample to the loop."""
 
     def _callback(self, sample: zenoh.Sample) -> None:
@@ -154,11 +160,3 @@ class RawLoopWay(RawWay):
 
     def _arrive(self, sample: zenoh.Sample) -> None:
         super()._callback(sample)
-
-    def bounce(self, count: int) -> list[int]:
-        self.tally.begin(count, echo=True)
-        self._loop.call_soon_threadsafe(self.send_small)
-        return self.tally.wait()
-
-    def paced(self, count: int, hz: float, send: Callable[[], None]) -> None:
-        asyncio.run_coroutine_threadsafe(_paced(count, hz, send), self._loop).result()
