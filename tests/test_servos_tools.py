@@ -32,6 +32,9 @@ ROBOT = Robot.load()
 ELBOW = ROBOT.joints["elbow"]
 
 
+pytestmark = pytest.mark.zenoh  # each answer of the emulated wire must come within some real time
+
+
 @pytest.fixture
 def bench(tmp_path: Path) -> Iterator[ServoBench]:
     with ServoBench(tmp_path) as bench:
@@ -48,7 +51,6 @@ def told(text: str) -> None:
     pass
 
 
-@pytest.mark.zenoh  # a scan waits for 0.1 s of real time for each answer
 def test_a_scan_finds_servos_at_every_baud_rate(bench: ServoBench, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tools, "SCAN_S", 0.1)
     bench.put(4, {4: 16, 5: 250})  # 117647 baud is 115200 to a port, nearly
@@ -167,7 +169,6 @@ def test_the_tools_take_another_robots_files(
     assert "robot description" in capsys.readouterr().err
 
 
-@pytest.mark.zenoh  # a scan waits for 0.1 s of real time for each answer
 def test_a_scan_names_what_is_missing_and_writes_ports_where_it_is_told(
     bench: ServoBench, profile: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
