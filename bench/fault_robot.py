@@ -185,7 +185,7 @@ class FaultRobot:
 
     async def _do(self, what: str, rng: random.Random) -> None:
         if what == "estop":
-            await self.operator.call_all(topics.ESTOP.of("*"), EstopRequest(latched=True, by="bench"))
+            await self.operator.call_all(topics.ESTOP.of("*"), EstopRequest(by="bench"))
         elif what == "cancel":
             await self.operator.call(topics.CANCEL, CancelRequest())
         elif what == "flood":

@@ -16,7 +16,7 @@ from cocoro import topics
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.clock import FollowedClock
 from cocoro.errors import CocoroError
-from cocoro.messages import BaseCommand, BaseState, EstopRequest
+from cocoro.messages import BaseCommand, BaseState, ResetRequest
 from cocoro.node import Node
 from cocoro.robot import Robot
 from deploy.rundir import RunDir
@@ -90,7 +90,7 @@ class Driver:
 
     async def reset(self) -> None:
         for _ in range(20):
-            await self.node.call_all(topics.ESTOP.of("*"), EstopRequest(latched=False, by="bench"), 5.0)
+            await self.node.call_all(topics.RESET.of("*"), ResetRequest(by="bench"), 5.0)
             with suppress(TimeoutError):
                 async with asyncio.timeout(3.0):
                     await self.until(lambda state: state.latch == "released" and state.speed_mps > FULL_MPS)

@@ -18,7 +18,7 @@ import msgspec
 
 from cocoro.checks import Check
 from cocoro.errors import ConfigError
-from cocoro.topics import ESTOP, Request, Topic
+from cocoro.topics import STOPS, Request, Topic
 
 if TYPE_CHECKING:
     from cocoro.core import Core
@@ -103,8 +103,9 @@ class Component:
         if unknown := sorted(set(self.moves) - set(self.services)):
             raise ConfigError(f"component {self.name}: it moves {unknown[0]}, which is none of its services")
         served = {request.name for request in self.all_serves()}
-        if unstoppable := [service for service in self.moves if ESTOP.of(service).name not in served]:
-            raise ConfigError(f"component {self.name}: {unstoppable[0]} moves something, so it must serve ESTOP")
+        for service in self.moves:
+            if any(request.of(service).name not in served for request in STOPS):
+                raise ConfigError(f"component {self.name}: {service} moves something, so it must serve STOPS")
 
     def all_publishes(self) -> Iterator[Topic[Any]]:
         """The published topics, those with `{service}` resolved for each service."""

@@ -17,7 +17,7 @@ from contextlib import suppress
 
 from cocoro import topics
 from cocoro.clock import NS, is_fresh
-from cocoro.messages import EstopReply, EstopRequest, Latch, LatchState
+from cocoro.messages import EstopReply, EstopRequest, Latch, LatchState, ResetRequest
 from cocoro.node import Node
 from cocoro.stop.path import StopPoint, listen
 from cocoro.stop.record import LatchRecord
@@ -29,7 +29,8 @@ STOP_KEPT_S, RESET_KEPT_S = 0.15, 0.6
 
 
 class ServiceLatch:
-    """Keeps the latch of one service: serves `<service>/estop`, follows `executive/latch`, listens on the stop path.
+    """Keeps the latch of one service: serves `<service>/estop` and `<service>/reset`, follows
+    `executive/latch`, listens on the stop path.
 
     `changed(state, by)` is called in the event loop, before the answer to a request is sent. `halt()` is called in the
     stop path's thread as soon as a stop arrives there: it must stop what moves even if the event loop hangs, be brief,
@@ -63,7 +64,8 @@ class ServiceLatch:
             point = StopPoint(node.robot_name, node.name)
             node.keep(point)
             listen(point, self._stopped, self._keep_latched)
-        node.serve(topics.ESTOP.of(node.name), self._requested)
+        node.serve(topics.ESTOP.of(node.name), self._stop_requested)
+        node.serve(topics.RESET.of(node.name), self._reset_requested)
         if follows:
             node.on(topics.LATCH, self._on_latch)
 
@@ -109,13 +111,17 @@ class ServiceLatch:
 
     # --- the mesh -------------------------------------------------------------------------------------
 
-    async def _requested(self, request: EstopRequest) -> EstopReply:
-        if request.latched:
-            self._set("latched", request.by)
-        else:
-            self._reset_ns = self._node.now_ns()
-            self._set("released", request.by)
-        not_kept = await self._not_kept(STOP_KEPT_S if request.latched else RESET_KEPT_S)
+    async def _stop_requested(self, request: EstopRequest) -> EstopReply:
+        self._set("latched", request.by)
+        return await self._answer(STOP_KEPT_S)
+
+    async def _reset_requested(self, request: ResetRequest) -> EstopReply:
+        self._reset_ns = self._node.now_ns()
+        self._set("released", request.by)
+        return await self._answer(RESET_KEPT_S)
+
+    async def _answer(self, within_s: float) -> EstopReply:
+        not_kept = await self._not_kept(within_s)
         # Another request may have changed the state meanwhile.
         return EstopReply(service=self._node.name, latch=self.state, text=not_kept)
 

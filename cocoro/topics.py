@@ -239,7 +239,12 @@ OBJECTS = Request(
 )  # fmt: skip
 ESTOP = Request(
     "{service}/estop", m.EstopRequest, m.EstopReply,
-    "Latch or release the emergency stop; answered by each service that moves something, and by the executive.",
+    "Latch the emergency stop; answered by each service that moves something, and by the executive.",
+    timeout_s=1.0,
+)  # fmt: skip
+RESET = Request(
+    "{service}/reset", m.ResetRequest, m.EstopReply,
+    "Release the emergency stop; answered by the same services. A key of its own, since everybody may stop a robot.",
     timeout_s=1.0,
 )  # fmt: skip
 
@@ -262,4 +267,7 @@ ABOUT = Request(
     "The component, settings and versions of a service; answered by every service.",
 )  # fmt: skip
 
-REQUESTS: tuple[Request[Any, Any], ...] = (RUN, CANCEL, REPORT, OBJECTS, ESTOP, LEARNED, RECOVER, SERVOS, ABOUT)
+STOPS: tuple[Request[Any, Any], ...] = (ESTOP, RESET)
+"""What each service that moves something serves."""
+
+REQUESTS: tuple[Request[Any, Any], ...] = (RUN, CANCEL, REPORT, OBJECTS, *STOPS, LEARNED, RECOVER, SERVOS, ABOUT)

@@ -7,11 +7,11 @@ from cocoro.topics import (
     BASE_COMMAND,
     BASE_STATE,
     CLOCK,
-    ESTOP,
     FRAME,
     HAND_COMMAND,
     HAND_STATE,
     LATCH,
+    STOPS,
     TRUTH,
 )
 
@@ -24,7 +24,7 @@ SIM = Component(
     services=("kinect", *MOVES),
     reads=(BASE_COMMAND, ARM_COMMAND, HAND_COMMAND, LATCH),
     publishes=(FRAME, BASE_STATE, ARM_STATE, HAND_STATE, CLOCK, TRUTH),
-    serves=tuple(ESTOP.of(service) for service in MOVES),
+    serves=tuple(request.of(service) for service in MOVES for request in STOPS),
     moves=MOVES,
     frames="publishes",
     start_s=60.0,

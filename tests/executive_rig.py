@@ -19,6 +19,7 @@ from cocoro.messages import (
     Intent,
     LatchState,
     PlannerStatus,
+    ResetRequest,
     ServoState,
     TargetEstimate,
     TaskReply,
@@ -102,8 +103,10 @@ class Robot:
         return reply.task_id
 
     async def estop(self, latched: bool) -> EstopReply:
-        """Send a stop request to the executive alone."""
-        return await self.service.ask(topics.ESTOP.of("executive"), EstopRequest(latched=latched, by="test"))
+        """Stop or reset the executive alone."""
+        if latched:
+            return await self.service.ask(topics.ESTOP.of("executive"), EstopRequest(by="test"))
+        return await self.service.ask(topics.RESET.of("executive"), ResetRequest(by="test"))
 
     def state(self) -> TaskState:
         """The last published state of a task; empty before the first."""

@@ -21,6 +21,7 @@ from cocoro.messages import (
     BaseState,
     CancelRequest,
     EstopRequest,
+    ResetRequest,
     TaskReply,
     TaskState,
     TrueObject,
@@ -179,8 +180,10 @@ class RobotRig:
 
     async def estop(self, latched: bool) -> set[str]:
         """Press or reset the emergency stop; returns the services that acknowledged it."""
-        question = EstopRequest(latched=latched, by="test")
-        answers = await self.operator.call_all(topics.ESTOP.of("*"), question)
+        if latched:
+            answers = await self.operator.call_all(topics.ESTOP.of("*"), EstopRequest(by="test"))
+        else:
+            answers = await self.operator.call_all(topics.RESET.of("*"), ResetRequest(by="test"))
         wanted = "latched" if latched else "released"
         return {answer.service for answer in answers if answer.reply is not None and answer.reply.latch == wanted}
 

@@ -140,7 +140,7 @@ async def test_the_emergency_stop_is_answered_and_stops_at_once(bench: Bench) ->
     async with driven(bench) as base:
         await base.roll()
         asked_ns = time.monotonic_ns()
-        reply = await base.service.ask(topics.ESTOP.of("base"), EstopRequest(latched=True, by="test"))
+        reply = await base.service.ask(topics.ESTOP.of("base"), EstopRequest(by="test"))
         assert reply.latch == "latched"
         assert await base.wheels(0, 0) - asked_ns < PATIENCE_NS
         await base.state(lambda state: state.stopped_by == "estop")

@@ -17,7 +17,7 @@ from wire_base import PATIENCE_NS, Bench, FakeService, guarded
 
 from cocoro import topics
 from cocoro.clock import RealClock
-from cocoro.messages import EstopRequest
+from cocoro.messages import ResetRequest
 from cocoro.robot import Robot
 from cocoro.stop.record import prepare, read
 from cocoro.testing import ServiceUnderTest
@@ -131,7 +131,7 @@ async def test_service_and_guard_are_both_told_and_a_reset_releases_both(base: D
     await asyncio.to_thread(stopped_ns, base.name)
     base.release()  # the executive's word releases nothing
     await base.state(lambda state: state.latch == "latched")
-    reply = await base.service.ask(topics.ESTOP.of("base"), EstopRequest(latched=False, by="test"))
+    reply = await base.service.ask(topics.RESET.of("base"), ResetRequest(by="test"))
     assert reply.latch == "released"
     await base.wheels(200, 200)
     assert not read(latches / "base").latched

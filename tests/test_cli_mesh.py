@@ -36,13 +36,14 @@ from cocoro.messages import (
     ObjectsReply,
     ObjectsRequest,
     PlannerStatus,
+    ResetRequest,
     TaskReply,
     TaskRequest,
     TaskState,
 )
 from cocoro.node import Node
 from cocoro.robot import Robot
-from cocoro.topics import BASE_STATE, CANCEL, DETECTIONS, ESTOP, FRAME, LATCH, OBJECTS, PLAN, RUN, TASK
+from cocoro.topics import BASE_STATE, CANCEL, DETECTIONS, ESTOP, FRAME, LATCH, OBJECTS, PLAN, RESET, RUN, TASK
 from deploy.processes import stoppable
 from deploy.rundir import RunDir
 
@@ -81,10 +82,11 @@ async def robot(*services: str, without_latch: tuple[str, ...] = ()) -> AsyncIte
 def answering(node: Node, latch: str, text: str = "") -> None:
     """Serve the emergency stop with a fixed answer."""
 
-    async def answer(request: EstopRequest) -> EstopReply:
+    async def answer(request: EstopRequest | ResetRequest) -> EstopReply:
         return EstopReply(service=node.name, latch=latch, text=text)  # type: ignore[arg-type]
 
     node.serve(ESTOP.of(node.name), answer)
+    node.serve(RESET.of(node.name), answer)
 
 
 async def stop() -> StopResult:

@@ -153,7 +153,7 @@ def test_the_latch_still_latches_after_a_bad_word_on_it(spoil: Spoil) -> None:
             await rig.driving(0.2)
             send(rig, topics.LATCH, spoil(newest(rig, topics.LATCH)))
             pressed_s = rig.now_s
-            await rig.operator.call(topics.ESTOP.of("executive"), EstopRequest(latched=True, by="test"))
+            await rig.operator.call(topics.ESTOP.of("executive"), EstopRequest(by="test"))
             await rig.advance(1.5)
             states = [state for state in rig._base if state.latch == "latched"]
             assert states

@@ -10,7 +10,7 @@ from cocoro import topics
 from cocoro.bus.local import LocalMesh
 from cocoro.clock import NS, VirtualClock
 from cocoro.latch import ServiceLatch
-from cocoro.messages import EstopReply, EstopRequest, Latch, LatchState
+from cocoro.messages import EstopReply, EstopRequest, Latch, LatchState, ResetRequest
 from cocoro.node import Node
 from cocoro.robot import Robot
 from cocoro.testing import JumpingClock, in_virtual_time, settle
@@ -52,7 +52,9 @@ class Base:
         return self.latch.state
 
     async def ask(self, latched: bool) -> EstopReply:
-        return await self.operator.call(topics.ESTOP.of("base"), EstopRequest(latched=latched, by="operator"))
+        if latched:
+            return await self.operator.call(topics.ESTOP.of("base"), EstopRequest(by="operator"))
+        return await self.operator.call(topics.RESET.of("base"), ResetRequest(by="operator"))
 
 
 @in_virtual_time

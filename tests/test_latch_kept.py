@@ -18,7 +18,7 @@ from cocoro import topics
 from cocoro.bus.local import LocalMesh
 from cocoro.clock import RealClock
 from cocoro.latch import ServiceLatch
-from cocoro.messages import EstopReply, EstopRequest, Latch, LatchState
+from cocoro.messages import EstopReply, EstopRequest, Latch, LatchState, ResetRequest
 from cocoro.node import Node
 from cocoro.robot import Robot
 from cocoro.stop.record import prepare, read
@@ -54,7 +54,9 @@ class Base:
         return asking
 
     async def ask(self, latched: bool) -> EstopReply:
-        return await self.operator.call(topics.ESTOP.of("base"), EstopRequest(latched=latched, by="operator"))
+        if latched:
+            return await self.operator.call(topics.ESTOP.of("base"), EstopRequest(by="operator"))
+        return await self.operator.call(topics.RESET.of("base"), ResetRequest(by="operator"))
 
     async def latched(self) -> None:
         """Wait until it is."""
@@ -237,12 +239,10 @@ def test_a_disk_that_hangs_holds_up_no_answer_on_the_mesh(folder: Path, monkeypa
             await it.ask(latched=False)
             await it.kept()
             monkeypatch.setattr(os, "pwrite", hang)
-            question = EstopRequest(latched=True, by="operator")
-            reply = await it.operator.call(topics.ESTOP.of("base"), question, ROUND_S)
+            reply = await it.operator.call(topics.ESTOP.of("base"), EstopRequest(by="operator"), ROUND_S)
             assert reply.latch == "latched"
             assert "not written within" in reply.text
-            question = EstopRequest(latched=False, by="operator")
-            reply = await it.operator.call(topics.ESTOP.of("base"), question)
+            reply = await it.operator.call(topics.RESET.of("base"), ResetRequest(by="operator"))
             assert reply.latch == "released"
             assert "not written within" in reply.text
             go_on.set()

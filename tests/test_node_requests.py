@@ -122,7 +122,7 @@ async def test_all_services_can_be_called_at_once_and_each_answer_names_its_serv
 
         base.serve(topics.ESTOP.of("base"), latch)
         arm.serve(topics.ESTOP.of("arm"), fail)
-        answers = await caller.call_all(topics.ESTOP.of("*"), EstopRequest(latched=True))
+        answers = await caller.call_all(topics.ESTOP.of("*"), EstopRequest())
         assert {answer.service: answer.error for answer in answers} == {"base": "", "arm": "no"}
         assert [answer.reply.latch for answer in answers if answer.reply is not None] == ["latched"]
 

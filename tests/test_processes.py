@@ -82,11 +82,13 @@ def test_what_a_component_needs_it_hears_of_by_a_topic_that_it_reads() -> None:
 
 
 def test_a_component_that_moves_something_answers_the_emergency_stop() -> None:
-    with pytest.raises(ConfigError, match=r"component gripper: gripper moves something, so it must serve ESTOP"):
+    with pytest.raises(ConfigError, match=r"component gripper: gripper moves something, so it must serve STOPS"):
         Component(name="gripper", module="gripper", doc="", moves=("gripper",))
+    with pytest.raises(ConfigError, match=r"component gripper: gripper moves something, so it must serve STOPS"):
+        Component(name="gripper", module="gripper", doc="", moves=("gripper",), serves=(topics.ESTOP,))
     with pytest.raises(ConfigError, match=r"component gripper: it moves claw, which is none of its services"):
-        Component(name="gripper", module="gripper", doc="", moves=("claw",), serves=(topics.ESTOP,))
-    assert Component(name="gripper", module="gripper", doc="", moves=("gripper",), serves=(topics.ESTOP,)).moves
+        Component(name="gripper", module="gripper", doc="", moves=("claw",), serves=topics.STOPS)
+    assert Component(name="gripper", module="gripper", doc="", moves=("gripper",), serves=topics.STOPS).moves
 
 
 # --- what is derived ------------------------------------------------------------------------------

@@ -151,7 +151,7 @@ async def test_the_emergency_stop_holds_the_arm_where_it_is(bench: ServoBench) -
     async with moved(bench) as servos:
         servos.move("arm", elbow=2.5)
         await servos.state("arm", lambda state: angle(state, "elbow") > 0.3)
-        reply = await servos.service.ask(topics.ESTOP.of("arm"), EstopRequest(latched=True, by="test"))
+        reply = await servos.service.ask(topics.ESTOP.of("arm"), EstopRequest(by="test"))
         assert reply.latch == "latched"
         state = await servos.state("arm", lambda state: state.speed_radps[state.joints.index("elbow")] == 0.0)
         assert state.stopped_by == "estop"

@@ -91,7 +91,7 @@ async def stop(run_dir: RunDir, config: ZenohConfig, started_s: float) -> StopRe
 
 async def _ask(robot: str, bus: ZenohBus) -> dict[str, str]:
     """Sends one request to all services; returns those that are latched, each with why its latch is not on the disk."""
-    question = msgspec.msgpack.encode(EstopRequest(latched=True, by="operator"))
+    question = msgspec.msgpack.encode(EstopRequest(by="operator"))
     try:
         replies = await bus.call(ESTOP.of("*").key(robot), question, ROUND_S)
     except CallTimeoutError:

@@ -16,8 +16,8 @@ from apps.cli.link import Answer, joined
 from apps.cli.options import JsonOption, MeshOption, RobotChoice, RobotOption
 from apps.cli.output import complain, print_json
 from cocoro.errors import MeshError
-from cocoro.messages import EstopReply, EstopRequest
-from cocoro.topics import ESTOP
+from cocoro.messages import EstopReply, ResetRequest
+from cocoro.topics import RESET
 from deploy.processes import stoppable
 
 app = typer.Typer()
@@ -47,15 +47,15 @@ async def release(choice: RobotChoice, as_json: bool = False) -> int:
 
     The executive is asked first: when it refuses, everything stays latched.
     """
-    question = EstopRequest(latched=False, by="operator")
+    question = ResetRequest(by="operator")
     async with joined(choice) as link:
         alive = await link.alive()
         moving = {service for service in stoppable() if service in alive}
         if not moving:
             raise MeshError(f"no service that moves something is alive on {link.robot}: see `cocoro status`")
-        if "executive" in alive and _refused({"executive"}, await link.call_all(ESTOP.of("executive"), question)):
+        if "executive" in alive and _refused({"executive"}, await link.call_all(RESET.of("executive"), question)):
             return exits.REFUSED
-        answers = await link.call_all(ESTOP.of("*"), question)
+        answers = await link.call_all(RESET.of("*"), question)
         if _refused(moving, answers):
             return exits.REFUSED
     if as_json:

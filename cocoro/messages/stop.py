@@ -8,13 +8,20 @@ from cocoro.messages.common import LatchState, Message
 
 
 class EstopRequest(msgspec.Struct, kw_only=True):
-    """Latches or releases the emergency stop. Every service that moves something, and the executive, answer it."""
+    """Latches the emergency stop. Every service that moves something, and the executive, answer it."""
 
-    latched: bool
+    by: str = ""
+
+
+class ResetRequest(msgspec.Struct, kw_only=True):
+    """Releases the emergency stop. The same services answer it."""
+
     by: str = ""
 
 
 class EstopReply(msgspec.Struct, kw_only=True):
+    """The answer to both: the state of the service's latch after the request."""
+
     service: str
     latch: LatchState
     text: str = ""

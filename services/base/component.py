@@ -1,7 +1,7 @@
 """The declaration of the base: see `cocoro.component`."""
 
 from cocoro.component import Component
-from cocoro.topics import BASE_COMMAND, BASE_STATE, ESTOP, LATCH, RECOVER
+from cocoro.topics import BASE_COMMAND, BASE_STATE, LATCH, RECOVER, STOPS
 
 BASE = Component(
     name="base",
@@ -9,7 +9,7 @@ BASE = Component(
     doc="The Create: wheels, bumpers, cliffs, battery. Small, because a Create keeps driving when its driver dies.",
     reads=(BASE_COMMAND, LATCH),
     publishes=(BASE_STATE,),
-    serves=(RECOVER, ESTOP),
+    serves=(RECOVER, *STOPS),
     moves=("base",),
     hardware=True,
     restart="always",

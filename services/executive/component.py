@@ -5,7 +5,6 @@ from cocoro.topics import (
     ARM_STATE,
     BASE_STATE,
     CANCEL,
-    ESTOP,
     HAND_STATE,
     HEALTH,
     INTENT,
@@ -14,6 +13,7 @@ from cocoro.topics import (
     PLAN,
     REPORT,
     RUN,
+    STOPS,
     TASK,
 )
 
@@ -23,7 +23,7 @@ EXECUTIVE = Component(
     doc="Runs the tasks: fetch, park, put-down; keeps the emergency stop's latch.",
     reads=(BASE_STATE, ARM_STATE, HAND_STATE, PLAN, HEALTH),
     publishes=(INTENT, TASK, LATCH),
-    serves=(RUN, CANCEL, REPORT, OBJECTS, ESTOP),
+    serves=(RUN, CANCEL, REPORT, OBJECTS, *STOPS),
     needs=("base", "arm", "hand", "planning"),
     cpu_share=0.2,
 )
