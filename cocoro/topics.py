@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, Literal, TypeVar
 
 import msgspec
 
@@ -21,6 +21,10 @@ from cocoro.bus.base import Qos
 M = TypeVar("M", bound=m.Message)
 Q = TypeVar("Q", bound=msgspec.Struct)
 R = TypeVar("R", bound=msgspec.Struct)
+
+Right = Literal["see", "stop", "operate"]
+"""What a request asks for, hence who may send it where access is restricted: everybody sees and stops, operators
+operate."""
 
 ANY = "*"
 """Stands for every service where a service's name is expected."""
@@ -87,6 +91,7 @@ class Request(Generic[Q, R]):
     reply: type[R]
     doc: str
     timeout_s: float = 2.0
+    right: Right = "operate"
 
     @property
     def server(self) -> str:
@@ -232,15 +237,17 @@ CANCEL = Request(
 REPORT = Request(
     "executive/report", m.ReportRequest, m.TaskState,
     "The state of a task, running or ended; one without an id for a task that is not known.",
+    right="see",
 )  # fmt: skip
 OBJECTS = Request(
     "executive/objects", m.ObjectsRequest, m.ObjectsReply,
     "The known objects, and where each was seen last.",
+    right="see",
 )  # fmt: skip
 ESTOP = Request(
     "{service}/estop", m.EstopRequest, m.EstopReply,
     "Latch the emergency stop; answered by each service that moves something, and by the executive.",
-    timeout_s=1.0,
+    timeout_s=1.0, right="stop",
 )  # fmt: skip
 RESET = Request(
     "{service}/reset", m.ResetRequest, m.EstopReply,
@@ -265,6 +272,7 @@ SERVOS = Request(
 ABOUT = Request(
     "{service}/about", m.AboutRequest, m.AboutReply,
     "The component, settings and versions of a service; answered by every service.",
+    right="see",
 )  # fmt: skip
 
 STOPS: tuple[Request[Any, Any], ...] = (ESTOP, RESET)

@@ -1,0 +1,1 @@
+"""A site: several machines with roles, certificates and access rules."""

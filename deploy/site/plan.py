@@ -1,0 +1,267 @@
+"""A site's plan: one file, `site.toml`, that names hosts, robots, persons and their roles, and connects the hosts.
+
+name = "lab"
+
+[robot.calliope]
+profile = "sim"                        # a profile's name, or a path relative to this file
+
+[host.body]                            # a computer
+role = "robot"                         # it drives hardware (or simulates it)
+processes = ["capture", "sim"]         # those of the profile that run there
+listen = ["tls/10.77.0.1:7447"]        # where its gateway accepts the others
+
+[host.brain]
+role = "brain"                         # it sees, plans and runs tasks
+processes = ["perception", "planning", "executive"]
+
+[person.ada]
+role = "operator"                      # or "viewer", or "author"
+
+A host connects to all hosts that listen, or to those that its `connect` names. Where a site has several robots, each
+host names its own (`robot = "calliope"`), and a person may be limited to some (`robots = ["calliope"]`).
+"""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal, NamedTuple
+
+import msgspec
+from msgspec import Meta
+
+from cocoro.component import Component
+from cocoro.errors import ConfigError, choice_of, field_text
+from deploy import profiles
+from deploy.processes import COMPONENTS, components, hardware, named
+from deploy.profiles import Name, Profile
+
+FILE = "site.toml"
+HostRole = Literal["robot", "brain"]
+PersonRole = Literal["operator", "viewer", "author"]
+Role = HostRole | PersonRole
+Endpoint = Annotated[str, Meta(pattern=r"\Atls/(\[[0-9a-fA-F:]+\]|[A-Za-z0-9.-]+):[0-9]{1,5}\Z")]
+AN_ENDPOINT = "an endpoint is written as tls/ADDRESS:PORT"
+
+
+class RobotRow(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A robot of the site."""
+
+    profile: str
+
+
+class HostRow(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A computer of the site: a share of one robot's processes, and its gateway."""
+
+    role: HostRole
+    robot: Name = ""
+    """The robot whose processes it runs; the site's only one where it is left out."""
+    processes: Annotated[tuple[Name, ...], Meta(min_length=1)]
+    listen: tuple[Endpoint, ...] = ()
+    connect: tuple[Name, ...] | None = None
+    """The hosts that its gateway connects to; None stands for all others that listen."""
+
+
+class PersonRow(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A person, or a program that acts for one."""
+
+    role: PersonRole
+    robots: tuple[Name, ...] | None = None
+    """None stands for all."""
+
+
+class _File(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    name: Name
+    robot: Annotated[dict[Name, RobotRow], Meta(min_length=1)]
+    host: Annotated[dict[Name, HostRow], Meta(min_length=1)]
+    person: dict[Name, PersonRow] = {}
+
+
+class Site(NamedTuple):
+    """A site's plan, checked. Make it with `read`."""
+
+    name: str
+    path: Path
+    profiles: dict[str, Profile]
+    """The profile of each robot."""
+    hosts: dict[str, HostRow]
+    persons: dict[str, PersonRow]
+
+    @property
+    def folder(self) -> Path:
+        return self.path.parent
+
+    def role(self, name: str) -> Role:
+        """The role of a principal. Raises ConfigError for a name that the site does not have."""
+        row = self.hosts.get(name) or self.persons.get(name)
+        if row is None:
+            raise ConfigError(
+                f"site {self.name} has no host and no person {name!r}; {choice_of(name, self.principals)}"
+            )
+        return row.role
+
+    @property
+    def principals(self) -> tuple[str, ...]:
+        return (*self.hosts, *self.persons)
+
+    def host(self, name: str) -> HostRow:
+        """Raises ConfigError for a host that the site does not have."""
+        if name not in self.hosts:
+            raise ConfigError(f"site {self.name} has no host {name!r}; {choice_of(name, self.hosts)}")
+        return self.hosts[name]
+
+    def robots_of(self, name: str) -> tuple[str, ...]:
+        """The robots that a principal deals with."""
+        if name in self.hosts:
+            return (self.hosts[name].robot,)
+        robots = self.persons[name].robots
+        return tuple(self.profiles) if robots is None else robots
+
+    def listening(self, robot: str | None = None) -> tuple[str, ...]:
+        """The hosts that accept others, by default of all robots."""
+        return tuple(name for name, row in self.hosts.items() if row.listen and robot in (None, row.robot))
+
+    def connects(self, name: str) -> tuple[str, ...]:
+        """The hosts that a principal connects to: a person, to the listening ones of his robots."""
+        if name in self.persons:
+            return tuple(host for robot in self.robots_of(name) for host in self.listening(robot))
+        row = self.hosts[name]
+        if row.connect is not None:
+            return row.connect
+        order = tuple(self.hosts)
+        # Of two that listen the later one connects, so that each pair has one link.
+        return tuple(
+            host
+            for host in self.listening(row.robot)
+            if host != name and not (row.listen and order.index(host) > order.index(name))
+        )
+
+    def endpoints(self, name: str) -> tuple[str, ...]:
+        """Where a principal connects to."""
+        return tuple(endpoint for host in self.connects(name) for endpoint in self.hosts[host].listen)
+
+    def share(self, name: str) -> tuple[Component, ...]:
+        """The components that run on a host."""
+        return tuple(named(process) for process in self.host(name).processes)
+
+
+def read(where: Path) -> Site:
+    """Read a site's plan, from its file or the folder that holds it, and check it.
+
+    Raises ConfigError that names file, table and field, and what to do.
+    """
+    path = (where / FILE if where.is_dir() else where).resolve()
+    try:
+        data = tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ConfigError(f"there is no site {path}: write one, see docs/sites.md") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"site {path} cannot be read: {error}") from error
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"site {path}: {error}") from error
+    try:
+        file = msgspec.convert(data, _File)
+    except msgspec.ValidationError as error:
+        text = field_text(error, _File)
+        text = text.replace(f"Expected `str` matching regex {_pattern(Endpoint)!r}", AN_ENDPOINT)
+        text = text.replace(f"Expected `str` matching regex {_pattern(Name)!r}", profiles.A_NAME)
+        raise ConfigError(f"site {path}: {text}") from error
+    site = _resolved(file, path)
+    try:
+        _check(site)
+    except ConfigError as error:
+        raise ConfigError(f"site {path}: {error}") from error
+    return site
+
+
+def _pattern(kind: Any) -> str:
+    return str(next(meta.pattern for meta in kind.__metadata__ if meta.pattern))
+
+
+def _resolved(file: _File, path: Path) -> Site:
+    """The site with each robot's profile, and each host's robot filled in."""
+    found = {}
+    for robot, row in file.robot.items():
+        which = row.profile
+        if which.endswith(".toml") and not Path(which).is_absolute():
+            which = str(path.parent / which)
+        try:
+            found[robot] = msgspec.structs.replace(profiles.read(which), robot=robot)
+        except ConfigError as error:
+            raise ConfigError(f"site {path}, [robot.{robot}]: {error}") from error
+    only = next(iter(found)) if len(found) == 1 else ""
+    hosts = {name: row if row.robot else msgspec.structs.replace(row, robot=only) for name, row in file.host.items()}
+    return Site(file.name, path, found, hosts, file.person)
+
+
+def _check(site: Site) -> None:
+    """Raises ConfigError for a plan that contradicts itself."""
+    if both := sorted({*site.hosts} & {*site.persons}):
+        raise ConfigError(f"{both[0]} is a host and a person: give one of them another name")
+    for name, person in site.persons.items():
+        for robot in person.robots or ():
+            if robot not in site.profiles:
+                raise ConfigError(f"[person.{name}] robots: no robot {robot!r}; {choice_of(robot, site.profiles)}")
+        if any(name in one.services for one in components()):
+            raise ConfigError(f"[person.{name}]: a service has this name; an author's keys lie under his own name")
+    for name, host in site.hosts.items():
+        _check_host(site, name, host)
+    for robot, profile in site.profiles.items():
+        _check_shares(site, robot, profile)
+
+
+def _check_host(site: Site, name: str, host: HostRow) -> None:
+    where = f"[host.{name}]"
+    if not host.robot:
+        raise ConfigError(f"{where}: the site has several robots, so each host names its own: robot = ...")
+    if host.robot not in site.profiles:
+        raise ConfigError(f"{where} robot: no robot {host.robot!r}; {choice_of(host.robot, site.profiles)}")
+    for process in host.processes:
+        component = named(process)
+        if process not in site.profiles[host.robot].processes:
+            of = site.profiles[host.robot]
+            raise ConfigError(f"{where} processes: {process} is none of profile {of.name}'s: {', '.join(of.processes)}")
+        drives = {*component.services} & {*hardware()}
+        if drives and host.role != "robot":
+            raise ConfigError(f"{where} processes: {process} drives {sorted(drives)[0]}, so its host has role 'robot'")
+        if foreign := _foreign_key(component):
+            raise ConfigError(
+                f"{where} processes: {process} of a third party publishes {foreign}; on a site it may publish and serve"
+                f" only under its own services: {', '.join(component.services)}"
+            )
+    for other in host.connect or ():
+        if other == name or other not in site.hosts:
+            raise ConfigError(f"{where} connect: no other host {other!r}; {choice_of(other, site.hosts)}")
+        if not site.hosts[other].listen:
+            raise ConfigError(f"{where} connect: {other} does not listen; give it listen = ['tls/ADDRESS:PORT']")
+    for endpoint in host.listen:
+        if not 0 < int(endpoint.rpartition(":")[2]) < 65536:
+            raise ConfigError(f"{where} listen: {endpoint} has no port between 1 and 65535")
+
+
+def _foreign_key(component: Component) -> str:
+    """A key that a third party's component would publish or serve beyond its own services; '' when there is none."""
+    if component in COMPONENTS:
+        return ""
+    keys = [row.name for row in component.all_publishes()] + [row.name for row in component.all_serves()]
+    return next((key for key in keys if key.partition("/")[0] not in component.services), "")
+
+
+def _check_shares(site: Site, robot: str, profile: Profile) -> None:
+    hosts = {name: host for name, host in site.hosts.items() if host.robot == robot}
+    for process in profile.processes:
+        on = [name for name, host in hosts.items() if process in host.processes]
+        if len(on) != 1:
+            there = f"on {' and on '.join(on)}" if on else "on no host"
+            raise ConfigError(f"[robot.{robot}]: process {process} runs {there}; give it to one host's processes")
+    if len(hosts) > 1:
+        reached = {next(iter(hosts))}
+        links = [{name, other} for name in hosts for other in site.connects(name) if other in hosts]
+        for _ in hosts:
+            for link in links:
+                if reached & link:
+                    reached |= link
+        if missing := [name for name in hosts if name not in reached]:
+            raise ConfigError(
+                f"[robot.{robot}]: {missing[0]} and {min(reached)} are not connected: let one of them listen"
+            )

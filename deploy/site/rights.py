@@ -1,0 +1,122 @@
+"""What each principal of a site may do on the mesh: by its role, the topic table and the components' declarations.
+
+A host may do what the components that the plan puts there declare: so only the host that runs planning may command
+wheels and arms. A person may do what his role says:
+
+viewer    hears everything, asks what only looks, and stops.
+operator  a viewer who also gives tasks, resets, relaxes and calibrates.
+author    a viewer who also publishes and serves under a name of his own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+from cocoro.component import Component
+from cocoro.installed import all_requests
+from cocoro.keys import alive_key, matches, recorder_key
+from cocoro.topics import ABOUT, ANY, CLOCK, EXCHANGES, HEALTH, STEPS, TOPICS, TRUTH, Request, Right, Topic
+from deploy.site.plan import Role, Site
+from services.executive.askers import asker_key
+
+OF_PERSONS: dict[Role, tuple[Right, ...]] = {
+    "viewer": ("see", "stop"),
+    "operator": ("see", "stop", "operate"),
+    "author": ("see", "stop"),
+}
+"""The requests that a person of each role may send, by their `right`."""
+
+
+class Rights(NamedTuple):
+    """Sets of key expressions, by what may be done with their keys."""
+
+    puts: frozenset[str] = frozenset()
+    """Publish on them."""
+    hears: frozenset[str] = frozenset()
+    """Subscribe to them."""
+    never_hears: frozenset[str] = frozenset()
+    """Exceptions of `hears`."""
+    asks: frozenset[str] = frozenset()
+    """Send requests, and ask for a slow topic's newest message."""
+    answers: frozenset[str] = frozenset()
+    """Serve them."""
+    shows: frozenset[str] = frozenset()
+    """Declare liveliness tokens."""
+    watches: frozenset[str] = frozenset()
+    """Hear of liveliness tokens."""
+
+    def __or__(self, other: Rights) -> Rights:
+        """What both together may do; what one never hears is heard when the other hears it."""
+        both = Rights(*(mine | theirs for mine, theirs in zip(self, other, strict=True)))
+        heard = frozenset(key for key in both.never_hears if self.may_hear(key) or other.may_hear(key))
+        return both._replace(never_hears=both.never_hears - heard)
+
+    def may_hear(self, key: str) -> bool:
+        return key not in self.never_hears and any(matches(keyexpr, key) for keyexpr in self.hears)
+
+
+def rights(site: Site, name: str, robot: str) -> Rights:
+    """What a principal may do with a robot: nothing with one that is none of his. Raises ConfigError for a name that
+    the site does not have."""
+    role = site.role(name)
+    if robot not in site.robots_of(name):
+        return Rights()
+    if name in site.hosts:
+        return of_host(robot, site.share(name), simulated=site.profiles[robot].clock == "sim")
+    return of_person(robot, role, name)
+
+
+def of_host(robot: str, share: Iterable[Component], *, simulated: bool) -> Rights:
+    """What a host may do that runs these components of a robot."""
+    share = tuple(share)
+    puts: set[Topic[Any]] = set()
+    hears: set[str] = {CLOCK.key(robot)} if simulated else set()
+    answers: set[str] = set()
+    asks: set[str] = set()
+    shows: set[str] = set()
+    records = False
+    for component in share:
+        own: list[Topic[Any]] = [row.of(it) for it in component.services for row in (HEALTH, STEPS, EXCHANGES)]
+        puts |= {*component.all_publishes(), *own}
+        answers |= {row.key(robot) for row in component.all_serves()}
+        answers |= {ABOUT.of(service).key(robot) for service in component.services}
+        hears |= {_any(row).key(robot) for row in component.reads}
+        asks |= {_any(row).key(robot) for row in component.calls}
+        shows |= {alive_key(robot, service) for service in component.services}
+        if component.records:
+            records = True
+            hears.add(f"{robot}/**")
+            shows |= {recorder_key(robot, service) for service in component.services}
+    made_here = any(TRUTH in component.all_publishes() for component in share)
+    return Rights(
+        puts=frozenset(row.key(robot) for row in puts),
+        hears=frozenset(hears),
+        never_hears=frozenset() if made_here else frozenset({TRUTH.key(robot)}),
+        asks=frozenset(asks),
+        answers=frozenset(answers | {row.key(robot) for row in puts if row.slow}),
+        shows=frozenset(shows),
+        watches=frozenset({f"{robot}/**"} if records else {key(robot) for key in (alive_key, recorder_key, asker_key)}),
+    )
+
+
+def of_person(robot: str, role: Role, name: str) -> Rights:
+    """What a person may do with a robot."""
+    allowed = OF_PERSONS[role]
+    asks = {_any(row).key(robot) for row in all_requests() if row.right in allowed}
+    asks |= {_any(row).key(robot) for row in TOPICS if row.slow}
+    own = frozenset({f"{robot}/{name}/**"}) if role == "author" else frozenset()
+    shows = {asker_key(robot)} if "operate" in allowed else set()
+    return Rights(
+        puts=own,
+        hears=frozenset({f"{robot}/**"}),
+        asks=frozenset(asks) | own,
+        answers=own,
+        shows=frozenset(shows) | own,
+        watches=frozenset({f"{robot}/**"}),
+    )
+
+
+def _any(row: Topic[Any] | Request[Any, Any]) -> Topic[Any] | Request[Any, Any]:
+    """A per-service row for any service, others as they are."""
+    return row.of(ANY) if row.per_service else row

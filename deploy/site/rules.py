@@ -1,0 +1,191 @@
+"""Compiles a host's access rules for zenoh: who may do what on its gateway's links, which sizes and which rates.
+
+Everything is denied that no rule allows, in both directions of each link. A link is known by the common name of the
+certificate at its other end; all other processes of the same host, on Unix sockets, may do everything. A host that
+passes on what others send (because they connect to it) may do for its neighbours what these others may do: those rules
+hold against everybody else, and the host that passes on is trusted to have checked its own links.
+
+Interest (which keys somebody wants to hear or to be asked about) is told to every principal of a robot: zenoh compares
+the key expressions of declarations as they are, and `calliope/**` of a recorder is in no rule for a single key.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from functools import reduce
+from operator import or_
+from typing import Any, NamedTuple
+
+from cocoro.bus.base import Qos
+from cocoro.installed import all_requests, all_topics
+from cocoro.node import QUESTION_BYTES
+from cocoro.topics import ANY, Request, Topic
+from deploy.processes import components
+from deploy.site.plan import Site
+from deploy.site.rights import Rights, rights
+
+HEADROOM = 10.0
+"""A key may be published this many times as often as its nominal rate: a network that stalls delivers what waited all
+at once, and only a flood comes more often than that for long."""
+ASKED_HZ = 200.0
+"""A link may ask one request at most this often."""
+UNTABLED_HZ = 1000.0
+"""A key without a nominal rate, as those of an author, may be published at most this often. Events are not
+limited, since each of them counts."""
+ANSWER_BYTES = 8 * 1024 * 1024
+"""Upper bound of an answer: a learned model is the largest."""
+IN, OUT = "ingress", "egress"
+EVERYTHING = (
+    "put", "delete", "declare_subscriber", "query", "reply", "declare_queryable",
+    "liveliness_token", "liveliness_query", "declare_liveliness_subscriber",
+)  # fmt: skip
+LOCAL = "unixsock-stream"
+
+
+class Rule(NamedTuple):
+    """One allowed (or denied) kind of message on a principal's links, as zenoh has it."""
+
+    principal: str
+    flow: str
+    """`ingress`: it sends this here; `egress`: it gets this from here."""
+    messages: tuple[str, ...]
+    keys: tuple[str, ...]
+    allow: bool = True
+
+
+def compiled(site: Site, host: str, names: Mapping[str, Iterable[str]]) -> dict[str, Any]:
+    """The options of a host's router session, by path. `names` are the certificates' common names of each principal
+    that are admitted; one without any is kept out."""
+    rules = table(site, host)
+    admitted = {name: sorted(names.get(name, ())) for name in dict.fromkeys(rule.principal for rule in rules)}
+    admitted = {name: known for name, known in admitted.items() if known}
+    rows = [(f"{index}", rule) for index, rule in enumerate(rules) if rule.principal in admitted]
+    control = {
+        "enabled": True,
+        "default_permission": "deny",
+        "rules": [
+            {"id": LOCAL, "messages": EVERYTHING, "flows": [IN, OUT], "permission": "allow", "key_exprs": ["**"]},
+            *(
+                {
+                    "id": index,
+                    "messages": rule.messages,
+                    "flows": [rule.flow],
+                    "permission": "allow" if rule.allow else "deny",
+                    "key_exprs": rule.keys,
+                }
+                for index, rule in rows
+            ),
+        ],
+        "subjects": [
+            {"id": LOCAL, "link_protocols": [LOCAL]},
+            *({"id": name, "cert_common_names": known} for name, known in admitted.items()),
+        ],
+        "policies": [
+            {"rules": [LOCAL], "subjects": [LOCAL]},
+            *(
+                {"rules": [index for index, rule in rows if rule.principal == name], "subjects": [name]}
+                for name in admitted
+            ),
+        ],
+    }
+    robot = site.host(host).robot
+    return {
+        "access_control": control,
+        "low_pass_filter": _sizes(robot),
+        "downsampling": _rates(robot),
+    }
+
+
+def table(site: Site, host: str) -> list[Rule]:
+    """The rules that a host's gateway keeps, in the order of the plan."""
+    found = []
+    for name, may in neighbours(site, host).items():
+        interest = frozenset({f"{site.host(host).robot}/**"})
+        rows = (
+            (IN, ("put",), may.puts),
+            (OUT, ("declare_subscriber",), interest),
+            (IN, ("declare_subscriber",), may.hears),
+            (OUT, ("put",), may.hears),
+            (IN, ("query",), may.asks),
+            (OUT, ("reply", "declare_queryable"), may.asks),
+            (OUT, ("query",), interest),
+            (IN, ("reply", "declare_queryable"), may.answers),
+            (IN, ("liveliness_token",), may.shows),
+            (OUT, ("liveliness_query", "declare_liveliness_subscriber"), interest),
+            (IN, ("liveliness_query", "declare_liveliness_subscriber"), may.watches),
+            (OUT, ("liveliness_token",), may.watches),
+        )
+        found += [Rule(name, flow, messages, tuple(sorted(keys))) for flow, messages, keys in rows if keys]
+        if may.never_hears:
+            found.append(Rule(name, OUT, ("put",), tuple(sorted(may.never_hears)), allow=False))
+    return found
+
+
+def neighbours(site: Site, host: str) -> dict[str, Rights]:
+    """The principals at the other ends of a host's links, and what may come and go there: what they may do
+    themselves, and what those may do for whom they pass it on."""
+    mine = site.host(host)
+    direct = [name for name in site.principals if host in site.connects(name)] if mine.listen else []
+    direct += [name for name in site.connects(host) if name not in direct]
+    found = {}
+    for name in direct:
+        behind = _behind(site, name, host) if name in site.hosts else ()
+        found[name] = reduce(or_, (rights(site, one, mine.robot) for one in (name, *behind)))
+    return found
+
+
+def _behind(site: Site, name: str, host: str) -> tuple[str, ...]:
+    """The principals that reach a host by way of `name`."""
+    found: list[str] = []
+    waiting = [name]
+    while waiting:
+        at = waiting.pop()
+        joined = [one for one in site.principals if at in site.connects(one)]
+        if at in site.hosts:
+            joined += site.connects(at)
+        for one in joined:
+            if one not in (*found, name, host):
+                found.append(one)
+                waiting += [one] if one in site.hosts else []
+    return tuple(found)
+
+
+def _sizes(robot: str) -> list[dict[str, Any]]:
+    """Limits of sizes: a larger message is dropped where it arrives."""
+    by_size: dict[tuple[str, int], list[str]] = {}
+    for topic in all_topics():
+        by_size.setdefault(("put", topic.max_bytes), []).append(_key(topic, robot))
+    for request in all_requests():
+        by_size.setdefault(("query", QUESTION_BYTES), []).append(_key(request, robot))
+        by_size.setdefault(("reply", ANSWER_BYTES), []).append(_key(request, robot))
+    return [
+        {
+            "id": f"size {kind} {size}",
+            "link_protocols": ["tls"],
+            "flows": [IN],
+            "messages": [kind],
+            "key_exprs": sorted(keys),
+            "size_limit": size,
+        }
+        for (kind, size), keys in by_size.items()
+    ]
+
+
+def _rates(robot: str) -> list[dict[str, Any]]:
+    """Limits of rates: a message that follows the last of its key too soon is dropped where it arrives."""
+    services = [service for component in components() for service in component.services]
+    puts = []
+    for topic in all_topics():
+        freq = topic.rate_hz * HEADROOM if topic.rate_hz else UNTABLED_HZ
+        each = [topic.of(service) for service in services] if topic.per_service else [topic]
+        puts += [{"key_expr": row.key(robot), "freq": freq} for row in each if row.qos is not Qos.EVENT]
+    asked = [{"key_expr": _key(request, robot), "freq": ASKED_HZ} for request in all_requests()]
+    rows = (("put", puts), ("query", asked))
+    return [
+        {"id": f"rate {kind}", "link_protocols": ["tls"], "flows": [IN], "messages": [kind], "rules": rules}
+        for kind, rules in rows
+    ]
+
+
+def _key(row: Topic[Any] | Request[Any, Any], robot: str) -> str:
+    return (row.of(ANY) if row.per_service else row).key(robot)
