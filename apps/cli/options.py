@@ -46,6 +46,16 @@ MeshOption = Annotated[
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON, for scripts.")]
 
+SiteOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--site",
+        metavar="DIR",
+        envvar="COCORO_SITE",
+        help="The site's folder; by default $COCORO_SITE, or the current folder if it has a site.toml.",
+    ),
+]
+
 # --- profiles and the simulator -------------------------------------------------------------------
 
 ProfileArgument = Annotated[
