@@ -15,6 +15,7 @@ from cocoro.component import Component
 from cocoro.errors import ConfigError, choice_of
 from cocoro.installed import third_parties
 from cocoro.topics import ANY, Topic
+from deploy.site.component import GATEWAY
 from services.base.component import BASE
 from services.capture.component import CAPTURE
 from services.executive.component import EXECUTIVE
@@ -29,7 +30,7 @@ BACKOFF_LIMIT_S = 10.0
 SETTLED_S = 30.0
 """A process that has been ready for this long starts again without the waits of its earlier restarts."""
 
-COMPONENTS: tuple[Component, ...] = (SIM, KINECT, BASE, SERVOS, PERCEPTION, PLANNING, EXECUTIVE, CAPTURE, WIRE)
+COMPONENTS: tuple[Component, ...] = (SIM, KINECT, BASE, SERVOS, PERCEPTION, PLANNING, EXECUTIVE, CAPTURE, WIRE, GATEWAY)
 """The project's own."""
 
 

@@ -118,11 +118,11 @@ def test_help_stops_nothing(services: Services, capsys: pytest.CaptureFixture[st
     assert services.halted == []
 
 
-def test_a_profile_that_cannot_be_read_is_told_in_a_line(
-    services: Services, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["stop", "--profile", "/nowhere.toml"]) == exits.USAGE
-    assert capsys.readouterr().err.startswith("cocoro: ")
+def test_a_site_that_cannot_be_read_is_told_in_a_line(services: Services, capsys: pytest.CaptureFixture[str]) -> None:
+    services("base")
+    assert main(["stop", "--site", "/nowhere"]) == exits.FAILED
+    assert "cocoro: there is no site /nowhere" in capsys.readouterr().err
+    assert services.halted == ["base"], "the robots of this machine are stopped all the same"
 
 
 def test_where_the_kernel_does_not_list_its_sockets_the_mesh_is_asked_and_that_is_said(

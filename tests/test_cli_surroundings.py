@@ -210,6 +210,7 @@ WRITERS = {
     "export": ("{golden} --video {name}.mp4", "{capture} --foxglove {name}.mcap", "{capture} --csv {name}"),
     "capture repair": ("{capture} --out {name}.mcap",),
     "new service": ("nearest --into {name}",),
+    "pki init": ("--site {name}",),
     "objects learn": ("mug --from {picture} --size 0.08x0.1 --catalogue {name}.toml --picture {name}.png --yes",),
 }
 """Commands that write files without a robot."""

@@ -12,7 +12,7 @@ import typer
 from msgspec.structs import replace
 
 from apps.cli.link import MeshLink, joined
-from apps.cli.options import JsonOption, MeshOption, RobotChoice, RobotOption, SamplesOutOption
+from apps.cli.options import JsonOption, RobotChoice, RobotOption, SamplesOutOption, ThroughOption
 from apps.cli.output import print_json
 from apps.cli.progress import TaskDisplay, task_display
 from apps.cli.task_running import hands_on
@@ -42,11 +42,11 @@ def babble_arm(
     ] = 1000,
     out: SamplesOutOption = Path("arm.jsonl"),
     robot: RobotOption = None,
-    profile: MeshOption = None,
+    site: ThroughOption = None,
     json: JsonOption = False,
 ) -> None:
     """Move the arm about and look at the hand. Ctrl-C stops it; the same command continues, and no sample is lost."""
-    sys.exit(asyncio.run(collect(RobotChoice(robot, profile), BabbleArmTask(), samples, out, json)))
+    sys.exit(asyncio.run(collect(RobotChoice(robot, site), BabbleArmTask(), samples, out, json)))
 
 
 @babble.command("wheels")
@@ -59,12 +59,12 @@ def babble_wheels(
     ] = "red_can",
     out: SamplesOutOption = Path("wheels.jsonl"),
     robot: RobotOption = None,
-    profile: MeshOption = None,
+    site: ThroughOption = None,
     json: JsonOption = False,
 ) -> None:
     """Turn the wheels to and fro in front of a target. The robot needs half a metre around it. Ctrl-C stops it."""
     task = BabbleWheelsTask(label=target)
-    sys.exit(asyncio.run(collect(RobotChoice(robot, profile), task, trials, out, json)))
+    sys.exit(asyncio.run(collect(RobotChoice(robot, site), task, trials, out, json)))
 
 
 class BabbleDisplay:

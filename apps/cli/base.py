@@ -11,7 +11,7 @@ import typer
 
 from apps.cli import exits
 from apps.cli.link import joined, within
-from apps.cli.options import JsonOption, MeshOption, RobotChoice, RobotOption
+from apps.cli.options import JsonOption, RobotChoice, RobotOption, ThroughOption
 from apps.cli.output import complain, print_json, tell
 from cocoro.errors import MeshError
 from cocoro.messages import BaseState, RecoverRequest
@@ -28,17 +28,17 @@ app.add_typer(base, name="base")
 
 @base.callback()
 def show_base(
-    context: typer.Context, robot: RobotOption = None, profile: MeshOption = None, json: JsonOption = False
+    context: typer.Context, robot: RobotOption = None, site: ThroughOption = None, json: JsonOption = False
 ) -> None:
     """Show the base: mode, battery, bumpers, odometry; `recover` puts it back into its mode."""
     if context.invoked_subcommand is None:
-        sys.exit(asyncio.run(show(RobotChoice(robot, profile), json)))
+        sys.exit(asyncio.run(show(RobotChoice(robot, site), json)))
 
 
 @base.command()
-def recover(robot: RobotOption = None, profile: MeshOption = None, json: JsonOption = False) -> None:
+def recover(robot: RobotOption = None, site: ThroughOption = None, json: JsonOption = False) -> None:
     """Put a Create that left its mode (a cliff, a wheel drop, the charger) back into it."""
-    sys.exit(asyncio.run(recover_base(RobotChoice(robot, profile), json)))
+    sys.exit(asyncio.run(recover_base(RobotChoice(robot, site), json)))
 
 
 async def show(choice: RobotChoice, as_json: bool) -> int:

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class RobotChoice:
-    """The robot that a command is for, from `--robot` and `--profile`; neither is needed when one robot is up here."""
+    """The robot that a command is for, from `--robot` and `--site`; neither is needed when one robot is up here."""
 
     robot: str | None = None
-    profile: str | None = None
-    """Reach it through the mesh of this profile, on another machine."""
+    site: str | None = None
+    """Reach it on other machines, through a site: `NAME@DIR` or `DIR`."""

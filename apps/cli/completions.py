@@ -87,6 +87,21 @@ def joints() -> Iterable[str]:
     return Robot.load().joints
 
 
+@_names
+def roles() -> Iterable[str]:
+    from deploy.site.admitted import ROLES
+
+    return ROLES
+
+
+@_names
+def principals() -> Iterable[str]:
+    """Names that have a certificate of the site that is set."""
+    from deploy.site import admitted, place
+
+    return admitted.read(place.folder()).names
+
+
 def of(*names: str) -> Callable[[str], list[str]]:
     """A completion of the given names."""
     return _names(lambda: names)

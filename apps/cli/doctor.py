@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import closing
+from datetime import UTC, datetime
 from importlib import resources
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -33,6 +34,7 @@ from deploy import extras, profiles
 from deploy.processes import shared_bytes
 from deploy.profiles import Profile
 from deploy.rundir import RunDir
+from deploy.site import place
 
 RULES = Path("/etc/udev/rules.d/99-cocoro.rules")
 ENOUGH_GB = 1.0
@@ -97,6 +99,7 @@ def examine(profile: Profile) -> Iterator[Check]:
     yield from _disk(run_dir)
     yield from _mesh(profile, run_dir)
     yield from stop_checks(profile.robot)
+    yield from _site()
 
 
 def _robot(profile: Profile) -> tuple[Robot, Check | None]:
@@ -218,6 +221,16 @@ def _reachable(endpoint: str) -> Check:
             return ok("mesh", f"{endpoint} answers")
     except (OSError, ValueError) as error:
         return bad("mesh", f"{endpoint} does not answer ({error}): check its router and the address")
+
+
+def _site() -> Iterator[Check]:
+    """Whether the site's certificates are in order; nothing where no site is set."""
+    site = place.found()
+    if site is None:
+        return
+    from deploy.site.checks import certificate_checks
+
+    yield from certificate_checks(site, datetime.now(UTC))
 
 
 # --- the emergency stop -----------------------------------------------------------------------------

@@ -18,7 +18,7 @@ from apps.cli import exits
 from apps.cli.interrupt import interrupt_event
 from apps.cli.link import joined
 from apps.cli.listening import KeyListener, ReceivedPayload, keyexpr_of, nothing_on, takes_frames
-from apps.cli.options import JsonOption, KeyArgument, MeshOption, RobotChoice, RobotOption
+from apps.cli.options import JsonOption, KeyArgument, RobotChoice, RobotOption, ThroughOption
 from apps.cli.terminal import folded
 from cocoro.bus.base import Payload
 from cocoro.installed import topic_named
@@ -44,11 +44,11 @@ def echo(
     seconds: Annotated[float | None, typer.Option("--for", min=0.1, metavar="S", help="End after this time.")] = None,
     full: Annotated[bool, typer.Option("--full", help="Print all elements of long lists.")] = False,
     robot: RobotOption = None,
-    profile: MeshOption = None,
+    site: ThroughOption = None,
     json: JsonOption = False,
 ) -> None:
     """Messages of a key, decoded, of any type; one that a reader would reject is marked with the reason."""
-    sys.exit(asyncio.run(print_messages(RobotChoice(robot, profile), key, count, seconds, json, full)))
+    sys.exit(asyncio.run(print_messages(RobotChoice(robot, site), key, count, seconds, json, full)))
 
 
 async def print_messages(

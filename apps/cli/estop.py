@@ -11,32 +11,36 @@ import time
 from typing import TextIO
 
 from apps.cli import exits, output
-from apps.cli.output import complain, recent_complaints
+from apps.cli.output import recent_complaints
 from apps.cli.stop_asking import STOPPABLE, Asking, Point, StopResult
 
 EXECUTIVE = "executive"
 """The executive ends its task at a stop. It moves nothing itself, so the command does not wait for its answer."""
 ACKNOWLEDGE_S = 0.6
 """Longest wait for acknowledgements on the stop path; then the mesh is tried, too."""
+SITE = "COCORO_SITE"
+"""Environment variable with the site whose robots are stopped where none is on this machine."""
 KEPT_S = 0.3
 """Longest wait after that for the news that the latches are on the disk."""
 
 
 def main(command: str, arguments: list[str]) -> int:
-    robot, profile, as_json = None, None, False
+    robot, site, as_json = None, None, False
     if arguments:
         import argparse
 
         parser = argparse.ArgumentParser(
             prog=f"cocoro {command}",
             description="Latch the emergency stop: wheels, arm and hand hold still until `cocoro reset`. "
-            "Without --robot and --profile every robot on this machine is stopped, other users' robots, too.",
+            "Without --robot and --site every robot on this machine is stopped, other users' robots, too.",
             epilog="Exit code 0 when every service that moves something has acknowledged, 1 when one has not "
             "(it is named), 4 when no robot is there.",
         )
         parser.add_argument("--robot", metavar="NAME")
         parser.add_argument(
-            "--profile", metavar="FILE", help="reach a robot on another machine through the mesh of this profile"
+            "--site",
+            metavar="[NAME@]DIR",
+            help="stop the robots of the site in this folder, as NAME",
         )
         parser.add_argument("--json", action="store_true", help="print one JSON object for each robot")
         try:
@@ -44,23 +48,16 @@ def main(command: str, arguments: list[str]) -> int:
         except SystemExit as end:
             recent_complaints.append(f"wrong arguments: see `cocoro {command} --help`")  # argparse has printed more
             return end.code if isinstance(end.code, int) else exits.USAGE
-        robot, profile, as_json = options.robot, options.profile, options.json
-    if profile is not None:
-        from cocoro.errors import ConfigError
-        from deploy import profiles
-
-        try:
-            robot = robot or profiles.read(profile).robot
-        except ConfigError as error:
-            complain(str(error))
-            return exits.USAGE
+        robot, site, as_json = options.robot, options.site, options.json
     stops, troubles = by_path(robot)
+    if site is None and not stops:
+        site = os.environ.get(SITE) or None
     started_s = _process_start_s()
     code = exits.DONE
     try:
-        left_open = None if profile is not None or not stops else _left_open(robot, stops)
+        left_open = None if site is not None or not stops else _left_open(robot, stops)
         if left_open is None or left_open:
-            stops, troubles, code = _by_mesh_too(robot, profile, left_open, started_s, stops, troubles)
+            stops, troubles, code = _by_mesh_too(robot, site, left_open, started_s, stops, troubles)
     except Exception as error:  # whatever it is, the stops so far must be reported
         troubles.append(f"the mesh could not be asked: {type(error).__name__}: {error}")
         code = exits.FAILED
@@ -129,7 +126,7 @@ def _movers_first(service: str) -> tuple[int, str]:
 
 def _by_mesh_too(
     robot: str | None,
-    profile: str | None,
+    site: str | None,
     only: set[str] | None,
     started_s: float,
     stops: list[StopResult],
@@ -140,10 +137,10 @@ def _by_mesh_too(
 
     try:
         which = []
-        if profile is not None or stops or _up(robot):
+        if site is not None or stops or _up(robot):
             from apps.cli import estop_mesh  # slow to import
 
-            which = [one for one in estop_mesh.found(robot, profile) if only is None or one[0].robot in only]
+            which = [one for one in estop_mesh.found(robot, site) if only is None or one[0].robot in only]
         if not which and not stops:
             name = "no robot" if robot is None else f"no {robot}"
             return [], [*troubles, f"{name} is up on this machine: start one with `cocoro up sim`"], exits.NO_MESH

@@ -28,14 +28,12 @@ PATIENCE_S = 0.15
 """Longest wait, when joining the mesh, for members that do not answer (a stopped process, for example)."""
 
 
-def found(robot: str | None, profile: str | None) -> list[tuple[RunDir, ZenohConfig]]:
-    """The robots to be stopped, and how to reach each. Raises ConfigError for a profile that cannot be read."""
-    if profile is not None:
-        from deploy import profiles
+def found(robot: str | None, site: str | None) -> list[tuple[RunDir, ZenohConfig]]:
+    """The robots to be stopped, and how to reach each. Raises ConfigError for a site that cannot be used."""
+    if site is not None:
+        from deploy.site import access
 
-        read = profiles.read(profile)
-        run_dir = RunDir(robot or read.robot)
-        return [(run_dir, run_dir.join_as("operator", read.mesh))]
+        return access.ways(site, robot, "operator")
     here = robots() if robot is None else [run_dir for run_dir in (RunDir(robot),) if run_dir.populated]
     return [(run_dir, run_dir.join_as("operator")) for run_dir in here]
 
@@ -64,7 +62,9 @@ async def stop(run_dir: RunDir, config: ZenohConfig, started_s: float) -> StopRe
 
     `started_s` is the command's start on the monotonic clock. Raises MeshError when the mesh is not there.
     """
-    async with await ZenohBus.open(replace(config, patience_s=PATIENCE_S), expect_mesh=True) as bus:
+    async with await ZenohBus.open(
+        replace(config, patience_s=min(config.patience_s, PATIENCE_S)), expect_mesh=True
+    ) as bus:
         acknowledged: dict[str, float] = {}
         not_kept: dict[str, str] = {}
         asking_s = time.monotonic()

@@ -21,7 +21,7 @@ from apps.cli import exits
 from apps.cli.interrupt import interrupt_event
 from apps.cli.link import joined
 from apps.cli.listening import KeyListener, keyexpr_of, nothing_on, takes_frames
-from apps.cli.options import JsonOption, KeyArgument, MeshOption, RobotChoice, RobotOption
+from apps.cli.options import JsonOption, KeyArgument, RobotChoice, RobotOption, ThroughOption
 from apps.cli.output import print_json
 from apps.cli.terminal import Column, FittedTable, table
 from cocoro.bus.base import Payload
@@ -159,14 +159,14 @@ def hz(
     ] = 5.0,
     once: Annotated[bool, typer.Option("--once", help="Measure one window and end.")] = False,
     robot: RobotOption = None,
-    profile: MeshOption = None,
+    site: ThroughOption = None,
     json: JsonOption = False,
 ) -> None:
     """Rate, jitter and amount of data on a key, as it arrives here, over the last seconds.
 
     NOMINAL is the rate that is meant, in the robot's time; BY STAMP, the rate in that time, is judged against it.
     """
-    sys.exit(asyncio.run(show_rates(RobotChoice(robot, profile), key, window, once, json)))
+    sys.exit(asyncio.run(show_rates(RobotChoice(robot, site), key, window, once, json)))
 
 
 async def show_rates(choice: RobotChoice, text: str, window_s: float, once: bool, as_json: bool) -> int:

@@ -16,11 +16,11 @@ from apps.cli.options import (
     DescriptionOption,
     JsonOption,
     MeasuredOption,
-    MeshOption,
     ModelOutOption,
     RobotChoice,
     RobotOption,
     SendOption,
+    ThroughOption,
 )
 from apps.cli.terminal import StatusLine, table
 from apps.learning import lesson, study
@@ -51,7 +51,7 @@ def learn_arm(
     measured: MeasuredOption = None,
     send: SendOption = False,
     robot: RobotOption = None,
-    profile: MeshOption = None,
+    site: ThroughOption = None,
     json: JsonOption = False,
 ) -> None:
     """Learn the hand-eye map by every method, measure each on held-out samples, and write the best."""
@@ -60,7 +60,7 @@ def learn_arm(
     )
     print(text)
     if send:
-        send_model(RobotChoice(robot, profile), model, json)
+        send_model(RobotChoice(robot, site), model, json)
 
 
 @learn.command("wheels")
@@ -73,14 +73,14 @@ def learn_wheels(
     measured: MeasuredOption = None,
     send: SendOption = False,
     robot: RobotOption = None,
-    profile: MeshOption = None,
+    site: ThroughOption = None,
     json: JsonOption = False,
 ) -> None:
     """Learn the distance between the wheels."""
     model, text = learn_wheel_model(samples, into, Robot.load(description, measured), as_json=json)
     print(text)
     if send:
-        send_model(RobotChoice(robot, profile), model, json)
+        send_model(RobotChoice(robot, site), model, json)
 
 
 def learn_arm_model(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import replace
@@ -17,6 +18,7 @@ from cocoro.participant import Answer, Participant
 from cocoro.topics import Request
 from deploy import robot_time
 from deploy.rundir import START, RunDir, robots
+from deploy.site.place import SITE
 
 if TYPE_CHECKING:
     from cocoro.objects import Catalogue
@@ -95,6 +97,14 @@ class MeshLink(Participant):
         return {service for service, by in self.run_dir.claims().items() if by.name == REPLAY}
 
 
+def through_site(choice: RobotChoice) -> str | None:
+    """The site to go through: the chosen one, or that of $COCORO_SITE where no robot is up on this machine."""
+    if choice.site is not None:
+        return choice.site
+    given = os.environ.get(SITE)
+    return given if given and not robots() else None
+
+
 def find(choice: RobotChoice) -> RunDir:
     """The robot that a command is for. Raises MeshError when none is up, ConfigError when several are."""
     if choice.robot is not None:
@@ -113,12 +123,10 @@ async def joined(
 ) -> AsyncIterator[MeshLink]:
     """Joins the mesh of a robot. Raises MeshError when there is none. `frames`: the command reads frames, or all
     keys."""
-    if choice.profile is not None:
-        from deploy import profiles
+    if (through := through_site(choice)) is not None:
+        from deploy.site import access  # slow to import; only a site needs it
 
-        profile = profiles.read(choice.profile)
-        run_dir = RunDir(choice.robot or profile.robot)
-        config = run_dir.join_as("operator", profile.mesh)
+        run_dir, config = access.way(through, choice.robot, "operator")
     else:
         run_dir = find(choice)
         config = run_dir.join_as("operator")

@@ -20,6 +20,7 @@ ENVIRONMENT = {
     "COCORO_CAPTURE_DIR": "Folder of the captures.",
     "COCORO_LOG_DIR": "Folder of the logs, if it is not the run directory.",
     "COCORO_STATE_DIR": "Folder of the emergency stop's latch, which outlives a reboot.",
+    "COCORO_SITE": "Folder of the site; by default the current one if it has a site.toml.",
     "COCORO_LOG": "Level of the logs; `debug` also shows the traceback of an internal error.",
 }
 EXIT_CODES = {
@@ -49,7 +50,7 @@ def page() -> str:
         *_options(top, context),
         ".SS Options of many commands",
         *_item("--robot NAME", "Name of the robot; needed only when several are up on this machine."),
-        *_item("--profile PROFILE", "Reach a robot on another machine through the mesh of this profile."),
+        *_item("--site [NAME@]DIR", "Reach a robot on other machines through the site in this folder, as NAME."),
         *_item("--json", "Print JSON, for scripts; an error, too, on standard output."),
         *_item("-h, --help", "Show the help of a command and exit."),
         ".SH COMMANDS",

@@ -12,7 +12,7 @@ import typer
 
 from apps.cli import exits
 from apps.cli.link import joined
-from apps.cli.options import DescriptionOption, JsonOption, MeasuredOption, MeshOption, RobotChoice, RobotOption
+from apps.cli.options import DescriptionOption, JsonOption, MeasuredOption, RobotChoice, RobotOption, ThroughOption
 from apps.cli.output import print_json
 from apps.cli.snapshot import check
 from apps.cli.terminal import Column, print_table
@@ -26,11 +26,11 @@ app.add_typer(objects, name="objects")
 
 @objects.callback()
 def objects_callback(
-    context: typer.Context, robot: RobotOption = None, profile: MeshOption = None, json: JsonOption = False
+    context: typer.Context, robot: RobotOption = None, site: ThroughOption = None, json: JsonOption = False
 ) -> None:
     """The objects that the robot knows, and where it saw each last; `learn` adds one."""
     if context.invoked_subcommand is None:
-        sys.exit(asyncio.run(list_objects(RobotChoice(robot, profile), json)))
+        sys.exit(asyncio.run(list_objects(RobotChoice(robot, site), json)))
 
 
 @objects.command()
@@ -76,7 +76,7 @@ def learn(
     description: DescriptionOption = None,
     measured: MeasuredOption = None,
     robot: RobotOption = None,
-    profile: MeshOption = None,
+    site: ThroughOption = None,
     json: JsonOption = False,
 ) -> None:
     """Learn a new object's colours and size from one view: the object at --at or in --box, or the one that stands out.
@@ -94,7 +94,7 @@ def learn(
         check(picture)
     saving = learning.SaveOptions(catalogue, picture, yes, replace, add, json)
     camera_of = Robot.load(description, measured)
-    sys.exit(asyncio.run(learning.learn_object(RobotChoice(robot, profile), source, hints, saving, camera_of)))
+    sys.exit(asyncio.run(learning.learn_object(RobotChoice(robot, site), source, hints, saving, camera_of)))
 
 
 async def list_objects(choice: RobotChoice, as_json: bool) -> int:

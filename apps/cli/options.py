@@ -33,18 +33,27 @@ RobotOption = Annotated[
         help="Name of the robot; needed only when several are up on this machine.",
     ),
 ]
-MeshOption = Annotated[
+ThroughOption = Annotated[
     str | None,
     typer.Option(
-        "--profile",
-        metavar="PROFILE",
-        help="Reach a robot on another machine through the mesh of this profile.",
-        autocompletion=completions.profiles,
+        "--site",
+        metavar="[NAME@]DIR",
+        help="Reach a robot on other machines through the site in this folder, as NAME.",
     ),
 ]
 
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON, for scripts.")]
+
+SiteOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--site",
+        metavar="DIR",
+        envvar="COCORO_SITE",
+        help="The site's folder; by default $COCORO_SITE, or the current folder if it has a site.toml.",
+    ),
+]
 
 # --- profiles and the simulator -------------------------------------------------------------------
 

@@ -15,7 +15,7 @@ import typer
 from apps.cli import exits
 from apps.cli.interrupt import interrupt_event
 from apps.cli.link import joined
-from apps.cli.options import JsonOption, MeshOption, OnlyOption, RobotChoice, RobotOption, WithoutOption, name_option
+from apps.cli.options import JsonOption, OnlyOption, RobotChoice, RobotOption, ThroughOption, WithoutOption, name_option
 from apps.cli.output import complain, going_on, tell
 from apps.cli.terminal import StatusLine
 from cocoro.clock import FollowedClock
@@ -50,7 +50,7 @@ def record(
     ] = None,
     seconds: Annotated[float | None, typer.Option("--for", min=0.1, metavar="S", help="Stop after this time.")] = None,
     robot: RobotOption = None,
-    profile: MeshOption = None,
+    site: ThroughOption = None,
     json: JsonOption = False,
 ) -> None:
     """Record what travels on the mesh into MCAP files, until Ctrl-C. The robot's own recorder keeps running."""
@@ -58,7 +58,7 @@ def record(
         "folder": str(out.resolve()), "only": only or (), "without": without or (),
         "compression": compression, "jpeg_quality": jpeg, "per_occasion": False,
     }  # fmt: skip
-    sys.exit(asyncio.run(record_mesh(RobotChoice(robot, profile), settings, seconds, json)))
+    sys.exit(asyncio.run(record_mesh(RobotChoice(robot, site), settings, seconds, json)))
 
 
 async def record_mesh(

@@ -23,11 +23,11 @@ from apps.cli.options import (
     LatencyOption,
     ModelOption,
     ObjectsOption,
-    ProfileArgument,
     ReachOption,
     RobotOption,
     SceneOption,
     SetOption,
+    SiteOption,
     frames_of,
     latencies_of,
     name_option,
@@ -54,7 +54,13 @@ app = typer.Typer()
 
 @app.command()
 def up(
-    profile: ProfileArgument = "sim",
+    profile: Annotated[
+        str | None,
+        typer.Argument(
+            help="A profile's name (sim, robot, sim-wire, replay) or file; sim by default.",
+            autocompletion=completions.profiles,
+        ),
+    ] = None,
     detach: Annotated[bool, typer.Option("--detach", "-d", help="Return when the robot is up.")] = False,
     scene: SceneOption = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Simulator: seed of all random numbers.")] = None,
@@ -77,6 +83,11 @@ def up(
         bool,
         typer.Option("--unattended", help="No person is present: the robot's first start has the emergency stop set."),
     ] = False,
+    site: SiteOption = None,
+    host: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="Start the share of this host of the site, and its gateway."),
+    ] = None,
     json: JsonOption = False,
 ) -> None:
     """Start a robot's processes and stay until Ctrl-C (or, with --detach, until they are ready)."""
@@ -84,8 +95,8 @@ def up(
     if objects is not None:
         settings.insert(0, objects_of(objects))
     settings[:0] = model_of(model, reach, adapt)
-    read = profiles.read(profile, settings)
-    extras.require(f"cocoro up {profile}", read.rows())
+    read = profiles.read(profile or "sim", settings) if host is None else share_of(profile, site, host, settings)
+    extras.require(f"cocoro up {profile or ''}".strip(), read.rows())
     if json and not detach:
         raise ConfigError("--json says when the robot is up, so it needs --detach")
     if not detach:
@@ -122,6 +133,16 @@ def run(
 ) -> None:
     """Run one process in this terminal, on the mesh of the profile. Ctrl-C ends it."""
     sys.exit(run_process(process, profile, set_ or []))
+
+
+def share_of(profile: str | None, site: Path | None, host: str, settings: list[str]) -> Profile:
+    """The profile of a host's share. Raises ConfigError for a profile that is named beside, or a site that cannot be
+    used."""
+    from deploy.site import place, plan
+
+    if profile is not None:
+        raise ConfigError(f"--host {host}: its robot's profile is in the site's plan; leave {profile} out")
+    return plan.read(place.folder(site)).share_profile(host, settings)
 
 
 # --- options as settings of the profile -------------------------------------------------------------

@@ -13,7 +13,7 @@ import typer
 from apps.cli import estop as stopping
 from apps.cli import exits
 from apps.cli.link import Answer, joined
-from apps.cli.options import JsonOption, MeshOption, RobotChoice, RobotOption
+from apps.cli.options import JsonOption, RobotChoice, RobotOption, ThroughOption
 from apps.cli.output import complain, print_json
 from cocoro.errors import MeshError
 from cocoro.messages import EstopReply, ResetRequest
@@ -37,9 +37,9 @@ def estop(context: typer.Context) -> None:
 
 
 @app.command()
-def reset(robot: RobotOption = None, profile: MeshOption = None, json: JsonOption = False) -> None:
+def reset(robot: RobotOption = None, site: ThroughOption = None, json: JsonOption = False) -> None:
     """Release the emergency stop. The executive may refuse; the command then prints its reason."""
-    sys.exit(asyncio.run(release(RobotChoice(robot, profile), json)))
+    sys.exit(asyncio.run(release(RobotChoice(robot, site), json)))
 
 
 async def release(choice: RobotChoice, as_json: bool = False) -> int:

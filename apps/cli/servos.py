@@ -19,10 +19,10 @@ from apps.cli.options import (
     DescriptionOption,
     JsonOption,
     MeasuredOption,
-    MeshOption,
     ProfileOption,
     RobotChoice,
     RobotOption,
+    ThroughOption,
 )
 from apps.cli.output import complain, print_json, tell
 from apps.cli.terminal import StatusLine, print_table
@@ -85,26 +85,26 @@ app.add_typer(servos, name="servos")
 
 @servos.command()
 def clear(
-    joints: JointsArgument = None, robot: RobotOption = None, profile: MeshOption = None, json: JsonOption = False
+    joints: JointsArgument = None, robot: RobotOption = None, site: ThroughOption = None, json: JsonOption = False
 ) -> None:
     """Clear latched faults, such as an overload; the joints then hold where they are."""
-    sys.exit(asyncio.run(request(RobotChoice(robot, profile), "clear", joints or [], json)))
+    sys.exit(asyncio.run(request(RobotChoice(robot, site), "clear", joints or [], json)))
 
 
 @servos.command()
 def relax(
-    joints: JointsArgument = None, robot: RobotOption = None, profile: MeshOption = None, json: JsonOption = False
+    joints: JointsArgument = None, robot: RobotOption = None, site: ThroughOption = None, json: JsonOption = False
 ) -> None:
     """Make joints limp, so that they can be turned by hand. The arm sinks: hold it."""
-    sys.exit(asyncio.run(request(RobotChoice(robot, profile), "relax", joints or [], json)))
+    sys.exit(asyncio.run(request(RobotChoice(robot, site), "relax", joints or [], json)))
 
 
 @servos.command()
 def hold(
-    joints: JointsArgument = None, robot: RobotOption = None, profile: MeshOption = None, json: JsonOption = False
+    joints: JointsArgument = None, robot: RobotOption = None, site: ThroughOption = None, json: JsonOption = False
 ) -> None:
     """Make joints hold where they are."""
-    sys.exit(asyncio.run(request(RobotChoice(robot, profile), "hold", joints or [], json)))
+    sys.exit(asyncio.run(request(RobotChoice(robot, site), "hold", joints or [], json)))
 
 
 async def request(choice: RobotChoice, action: str, joints: list[str], as_json: bool = False) -> int:

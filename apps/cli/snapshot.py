@@ -12,7 +12,7 @@ import typer
 
 from apps.cli import exits
 from apps.cli.link import MeshLink, joined, within
-from apps.cli.options import JsonOption, MeshOption, RobotChoice, RobotOption
+from apps.cli.options import JsonOption, RobotChoice, RobotOption, ThroughOption
 from apps.cli.output import tell
 from cocoro.errors import ConfigError, MeshError
 from cocoro.messages import Detections, Frame
@@ -36,11 +36,11 @@ app = typer.Typer()
 def snapshot(
     out: Annotated[Path, typer.Argument(metavar="OUT.png", help="The picture's file.")],
     robot: RobotOption = None,
-    profile: MeshOption = None,
+    site: ThroughOption = None,
     json: JsonOption = False,
 ) -> None:
     """Write a picture of what the robot sees now, with its detections drawn in."""
-    sys.exit(asyncio.run(take_snapshot(RobotChoice(robot, profile), out, json)))
+    sys.exit(asyncio.run(take_snapshot(RobotChoice(robot, site), out, json)))
 
 
 async def take_snapshot(choice: RobotChoice, out: Path, as_json: bool = False) -> int:

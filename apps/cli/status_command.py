@@ -7,13 +7,13 @@ import sys
 
 import typer
 
-from apps.cli.options import JsonOption, MeshOption, RobotChoice, RobotOption
+from apps.cli.options import JsonOption, RobotChoice, RobotOption, ThroughOption
 from apps.cli.status import show_status
 
 app = typer.Typer()
 
 
 @app.command()
-def status(robot: RobotOption = None, profile: MeshOption = None, json: JsonOption = False) -> None:
+def status(robot: RobotOption = None, site: ThroughOption = None, json: JsonOption = False) -> None:
     """The running services, their health, the task and the planner's reason. Exit code 1 when a service is missing."""
-    sys.exit(asyncio.run(show_status(RobotChoice(robot, profile), json)))
+    sys.exit(asyncio.run(show_status(RobotChoice(robot, site), json)))

@@ -30,12 +30,12 @@ from apps.cli.options import (
     JsonOption,
     LatencyOption,
     MeasuredOption,
-    MeshOption,
     ModelOption,
     ObjectsOption,
     ReachOption,
     RobotChoice,
     RobotOption,
+    ThroughOption,
     TimeoutOption,
     name_option,
 )
@@ -67,14 +67,14 @@ def operate(
         Path | None, typer.Option(metavar="OUT.png", help="Write what the robot sees when it grasps.")
     ] = None,
     robot: RobotOption = None,
-    profile: MeshOption = None,
+    site: ThroughOption = None,
     json: JsonOption = False,
 ) -> None:
     """Ctrl-C cancels it on the robot, and so does every other end of the command: a closed terminal, a kill."""
     from apps.cli import task_running
     from cocoro.messages import TaskRequest
 
-    choice, request = RobotChoice(robot, profile), TaskRequest(task=task, timeout_s=timeout)
+    choice, request = RobotChoice(robot, site), TaskRequest(task=task, timeout_s=timeout)
     if not detach:
         sys.exit(asyncio.run(task_running.run(choice, request, json, snapshot)))
     if snapshot is not None:
@@ -224,22 +224,22 @@ TaskIdArgument = Annotated[
 
 @app.command()
 def cancel(
-    task: TaskIdArgument = "", robot: RobotOption = None, profile: MeshOption = None, json: JsonOption = False
+    task: TaskIdArgument = "", robot: RobotOption = None, site: ThroughOption = None, json: JsonOption = False
 ) -> None:
     """End the running task; the robot stands still."""
     from apps.cli import task_running
 
-    sys.exit(asyncio.run(task_running.cancel(RobotChoice(robot, profile), task, json)))
+    sys.exit(asyncio.run(task_running.cancel(RobotChoice(robot, site), task, json)))
 
 
 @app.command()
 def wait(
-    task: TaskIdArgument = "", robot: RobotOption = None, profile: MeshOption = None, json: JsonOption = False
+    task: TaskIdArgument = "", robot: RobotOption = None, site: ThroughOption = None, json: JsonOption = False
 ) -> None:
     """Follow a task to its end, and exit as its own command would have. Ctrl-C ends the waiting, not the task."""
     from apps.cli import task_running
 
-    sys.exit(asyncio.run(task_running.wait(RobotChoice(robot, profile), task, json)))
+    sys.exit(asyncio.run(task_running.wait(RobotChoice(robot, site), task, json)))
 
 
 def _command(name: str, shared: Shared) -> TyperCommand:

@@ -17,7 +17,7 @@ import typer
 from apps.cli import exits
 from apps.cli.interrupt import elapsed, interrupt_event
 from apps.cli.link import REPLAYED, MeshLink, joined, within
-from apps.cli.options import JsonOption, MeshOption, RobotChoice, RobotOption
+from apps.cli.options import JsonOption, RobotChoice, RobotOption, ThroughOption
 from apps.cli.output import print_json
 from apps.cli.status import expected, missing
 from apps.cli.top_view import Screen, print_report
@@ -46,7 +46,7 @@ def top(
     once: Annotated[bool, typer.Option("--once", help="Show it once; exit code 1 when something is missing.")] = False,
     every: Annotated[float, typer.Option(min=0.1, max=60.0, metavar="S", help="Time between updates.")] = 1.0,
     robot: RobotOption = None,
-    profile: MeshOption = None,
+    site: ThroughOption = None,
     json: JsonOption = False,
 ) -> None:
     """Services and topics, live: cpu, memory, rates against nominal, ages; what was skipped, lost, rejected.
@@ -56,7 +56,7 @@ def top(
     late to be obeyed. SKIPPED are messages that a newer one replaced because the reader was too slow, which is no
     loss.
     """
-    sys.exit(asyncio.run(show_top(RobotChoice(robot, profile), once, json, every)))
+    sys.exit(asyncio.run(show_top(RobotChoice(robot, site), once, json, every)))
 
 
 async def show_top(choice: RobotChoice, once: bool, as_json: bool, every_s: float) -> int:

@@ -22,7 +22,7 @@ from apps.cli import exits
 from apps.cli.export import progress_bar
 from apps.cli.interrupt import interrupt_event
 from apps.cli.link import MeshLink, joined
-from apps.cli.options import MeshOption, RobotChoice, RobotOption, capture_file
+from apps.cli.options import RobotChoice, RobotOption, ThroughOption, capture_file
 from cocoro.bus.base import Bus, Payload
 from cocoro.capture.conventions import CaptureError
 from cocoro.errors import ConfigError
@@ -67,13 +67,13 @@ def view(
         str | None, typer.Option("--connect", metavar="HOST[:PORT]", help="Send it to a viewer that runs there.")
     ] = None,
     robot: RobotOption = None,
-    profile: MeshOption = None,
+    site: ThroughOption = None,
 ) -> None:
     """Open Rerun on a capture, or live on the mesh. Needs the extra `view`."""
     target = Target(save=save, web=web, bind=bind, connect=connect)
     if file is not None:
         sys.exit(view_file(file, target, sim))
-    sys.exit(asyncio.run(view_mesh(RobotChoice(robot, profile), target, sim)))
+    sys.exit(asyncio.run(view_mesh(RobotChoice(robot, site), target, sim)))
 
 
 # --- a capture ------------------------------------------------------------------------------------

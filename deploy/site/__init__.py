@@ -1,1 +1,1 @@
-"""A site: several machines with roles, certificates and access rules."""
+"""A site: several machines and persons that share robots, with roles, certificates and access rules."""

@@ -24,6 +24,7 @@ host names its own (`robot = "calliope"`), and a person may be limited to some (
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -35,8 +36,9 @@ from cocoro.errors import ConfigError, choice_of, field_text
 from deploy import profiles
 from deploy.processes import COMPONENTS, components, hardware, named
 from deploy.profiles import Name, Profile
+from deploy.site.component import GATEWAY
+from deploy.site.place import PLAN
 
-FILE = "site.toml"
 HostRole = Literal["robot", "brain"]
 PersonRole = Literal["operator", "viewer", "author"]
 Role = HostRole | PersonRole
@@ -82,8 +84,9 @@ class Site(NamedTuple):
 
     name: str
     path: Path
+    sources: dict[str, str]
+    """The name or path of each robot's profile."""
     profiles: dict[str, Profile]
-    """The profile of each robot."""
     hosts: dict[str, HostRow]
     persons: dict[str, PersonRow]
 
@@ -140,6 +143,19 @@ class Site(NamedTuple):
         """Where a principal connects to."""
         return tuple(endpoint for host in self.connects(name) for endpoint in self.hosts[host].listen)
 
+    def share_profile(self, name: str, overrides: Iterable[str] = ()) -> Profile:
+        """The profile of a host's share: its robot's profile with this host's processes, and its gateway. Raises
+        ConfigError for a host that the site does not have, and as `profiles.read` does."""
+        row = self.host(name)
+        whole = profiles.read(self.sources[row.robot], overrides)
+        settings = {"site": str(self.folder), "host": name}
+        return msgspec.structs.replace(
+            whole,
+            robot=row.robot,
+            processes=(*row.processes, GATEWAY.name),
+            service={**whole.service, GATEWAY.name: settings},
+        )
+
     def share(self, name: str) -> tuple[Component, ...]:
         """The components that run on a host."""
         return tuple(named(process) for process in self.host(name).processes)
@@ -150,7 +166,7 @@ def read(where: Path) -> Site:
 
     Raises ConfigError that names file, table and field, and what to do.
     """
-    path = (where / FILE if where.is_dir() else where).resolve()
+    path = (where / PLAN if where.is_dir() else where).resolve()
     try:
         data = tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -180,18 +196,19 @@ def _pattern(kind: Any) -> str:
 
 def _resolved(file: _File, path: Path) -> Site:
     """The site with each robot's profile, and each host's robot filled in."""
-    found = {}
+    sources, found = {}, {}
     for robot, row in file.robot.items():
         which = row.profile
         if which.endswith(".toml") and not Path(which).is_absolute():
             which = str(path.parent / which)
+        sources[robot] = which
         try:
             found[robot] = msgspec.structs.replace(profiles.read(which), robot=robot)
         except ConfigError as error:
             raise ConfigError(f"site {path}, [robot.{robot}]: {error}") from error
     only = next(iter(found)) if len(found) == 1 else ""
     hosts = {name: row if row.robot else msgspec.structs.replace(row, robot=only) for name, row in file.host.items()}
-    return Site(file.name, path, found, hosts, file.person)
+    return Site(file.name, path, sources, found, hosts, file.person)
 
 
 def _check(site: Site) -> None:

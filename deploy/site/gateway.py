@@ -1,0 +1,184 @@
+"""The gateway: joins this host's share of a robot with the other hosts of its site.
+
+It is a member of the robot's private mesh on this machine, and a router with TLS links to the other hosts, which it
+admits by certificate and by the rules compiled from the site's plan (`deploy.site.rules`). When the plan or the
+admissions change, it opens its router anew, since zenoh's rules cannot change while it runs.
+
+Nothing on this machine needs it to live: the processes here stay connected with each other. What came from other hosts
+stops, as it does when the network is cut.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections import Counter
+from contextlib import AsyncExitStack
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from cocoro.bus.router import Link, Router
+from cocoro.component import Implementation
+from cocoro.errors import CocoroError, ConfigError
+from cocoro.node import Node
+from deploy.rundir import RunDir
+from deploy.site import admitted, credentials, place, plan
+from deploy.site.plan import Site
+from deploy.site.refusals import Refusal, Watch
+from deploy.site.rules import compiled
+
+LOOK_S = 1.0
+"""How often the gateway looks whether the plan or the admissions have changed."""
+TELL_S = 10.0
+"""A refusal that repeats is logged at its first time, and then counted and logged this often."""
+SHOWN = 3
+"""Refusals in health, the most frequent ones."""
+KINDS = 1000
+"""Different refusals that are counted apart."""
+
+log = logging.getLogger("cocoro.gateway")
+
+
+class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings of the gateway; `cocoro up --site DIR --host NAME` fills them in."""
+
+    site: str = ""
+    """The folder of the site."""
+    host: str = ""
+    """The name of this host there."""
+
+
+class Gateway:
+    """The gateway's work; `run` never returns."""
+
+    def __init__(self, node: Node, config: Config, directory: Path) -> None:
+        self._node = node
+        self._folder = Path(config.site)
+        self._host = config.host
+        self._directory = directory
+        self._links: dict[str, Link] = {}
+        self._refused: Counter[Refusal] = Counter()
+        self._untold: Counter[Refusal] = Counter()
+        self._loop = asyncio.get_running_loop()
+
+    async def run(self) -> None:
+        async with AsyncExitStack() as stack:
+            watch = Watch(self._on_refusal, lambda line: self._loop.call_soon_threadsafe(log.warning, "%s", line))
+            stack.callback(watch.close)
+            self._node.spawn(self._tell())
+            while True:
+                marks = self._marks()
+                site, options = self._read()
+                router = await Router.open(
+                    "gateway", self._directory, site.host(self._host).listen, site.endpoints(self._host), options
+                )
+                try:
+                    self._links = {link.zid: link for link in router.links()}
+                    router.watch(self._on_link)
+                    self._report()
+                    await self._until_changed(marks)
+                finally:
+                    await router.close()
+                log.info("the site's plan or its admissions have changed: the router is opened anew")
+
+    def _read(self) -> tuple[Site, dict[str, Any]]:
+        """The plan and the router's options. Raises ConfigError."""
+        site = plan.read(self._folder)
+        now = datetime.now(UTC)
+        known = admitted.read(site.folder)
+        mine = credentials.read(
+            site.folder / place.CREDENTIALS / self._host,
+            now,
+            name=self._host,
+            role=site.role(self._host),
+            authority=known.authority,
+        )
+        names = {name: known.common_names(name, now) for name in known.names}
+        return site, {**mine.options, **compiled(site, self._host, names)}
+
+    def _marks(self) -> tuple[object, ...]:
+        """What differs when a file of the site differs."""
+        mine = self._folder / place.CREDENTIALS / self._host
+        files = (self._folder / place.PLAN, self._folder / place.ADMITTED, mine / place.CERT)
+        found = []
+        for file in files:
+            try:
+                status = file.stat()
+                found.append((status.st_mtime_ns, status.st_ino, status.st_size))
+            except OSError:
+                found.append(None)
+        return tuple(found)
+
+    async def _until_changed(self, marks: tuple[object, ...]) -> None:
+        """Returns when the site's files have changed and can be read; a bad file changes nothing."""
+        while True:
+            await asyncio.sleep(LOOK_S)
+            now = self._marks()
+            if now != marks:
+                marks = now
+                try:
+                    self._read()
+                except CocoroError as error:
+                    self._node.degraded(f"the site has changed, but not for the better; the former stays: {error}")
+                    log.error("%s; the former rules stay", error)
+                else:
+                    return
+
+    # --- what it says ---------------------------------------------------------------------------------
+
+    def _on_link(self, link: Link, there: bool) -> None:
+        if there:
+            self._links[link.zid] = link
+        else:
+            self._links.pop(link.zid, None)
+        log.info("%s %s at %s", "linked with" if there else "lost the link with", link.who or "somebody", link.address)
+        self._report()
+
+    def _report(self) -> None:
+        linked = sorted({link.who.rpartition(".")[0] or link.who for link in self._links.values()})
+        self._node.ready(f"linked with {', '.join(linked)}" if linked else "no link to another host")
+
+    def _on_refusal(self, refusal: Refusal) -> None:
+        """Called in the thread that reads the log."""
+        self._loop.call_soon_threadsafe(self._count, refusal)
+
+    def _count(self, refusal: Refusal) -> None:
+        if refusal.who in self._links:
+            refusal = refusal._replace(who=self._links[refusal.who].who)
+        if refusal not in self._refused and len(self._refused) >= KINDS:
+            refusal = Refusal(refusal.who, "more of other kinds")
+        if not self._refused[refusal]:
+            log.warning("refused: %s", _said(refusal))
+        else:
+            self._untold[refusal] += 1
+        self._refused[refusal] += 1
+        self._node.faults = tuple(
+            f"refused {_said(one)}{f', {count} times' if count > 1 else ''}"
+            for one, count in self._refused.most_common(SHOWN)
+        )
+
+    async def _tell(self) -> None:
+        while True:
+            await asyncio.sleep(TELL_S)
+            untold, self._untold = self._untold, Counter()
+            for refusal, count in untold.items():
+                log.warning("refused %d times more: %s", count, _said(refusal))
+
+
+def _said(refusal: Refusal) -> str:
+    if not refusal.who:
+        return f"somebody who was not let in: {refusal.what}"
+    return f"{refusal.who}: {refusal.what}{f' on {refusal.key}' if refusal.key else ''}"
+
+
+async def run(node: Node, config: Config) -> None:
+    """Keeps the links for ever. Raises ConfigError for a site, host or credentials that cannot be used."""
+    if not config.site or not config.host:
+        raise ConfigError("the gateway needs a site and a host: start it with `cocoro up --site DIR --host NAME`")
+    await Gateway(node, config, RunDir(node.robot_name).path).run()
+
+
+implementation = Implementation(Config, run)
