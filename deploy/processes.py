@@ -15,7 +15,7 @@ from cocoro.component import Component
 from cocoro.errors import ConfigError, choice_of
 from cocoro.installed import third_parties
 from cocoro.topics import ANY, Topic
-from deploy.site.component import GATEWAY
+from deploy.site.component import GATEWAY, PREFIX, gateway_of
 from services.base.component import BASE
 from services.capture.component import CAPTURE
 from services.executive.component import EXECUTIVE
@@ -57,6 +57,8 @@ def named(name: str) -> Component:
     for component in COMPONENTS:  # spares the search for entry points
         if component.name == name:
             return component
+    if name.startswith(PREFIX):
+        return gateway_of(name.removeprefix(PREFIX))
     if name not in table():
         raise ConfigError(f"there is no process {name!r}; {choice_of(name, table())}")
     return table()[name]

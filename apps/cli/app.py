@@ -56,6 +56,8 @@ def load(name: str) -> TyperCommand | TyperGroup:
             from apps.cli.servos import app
         case "kinect":
             from apps.cli.kinect import app
+        case "site":
+            from apps.cli.site import app
         case "pki":
             from apps.cli.pki import app
         case "doctor":

@@ -33,7 +33,7 @@ def found(robot: str | None, site: str | None) -> list[tuple[RunDir, ZenohConfig
     if site is not None:
         from deploy.site import access
 
-        return access.ways(site, robot, "operator")
+        return [(way.run_dir, way.config) for way in access.ways(site, robot, "operator")]
     here = robots() if robot is None else [run_dir for run_dir in (RunDir(robot),) if run_dir.populated]
     return [(run_dir, run_dir.join_as("operator")) for run_dir in here]
 
@@ -62,9 +62,9 @@ async def stop(run_dir: RunDir, config: ZenohConfig, started_s: float) -> StopRe
 
     `started_s` is the command's start on the monotonic clock. Raises MeshError when the mesh is not there.
     """
-    async with await ZenohBus.open(
-        replace(config, patience_s=min(config.patience_s, PATIENCE_S)), expect_mesh=True
-    ) as bus:
+    near = config.directory is not None
+    config = replace(config, patience_s=PATIENCE_S if near else config.patience_s)
+    async with await ZenohBus.open(config, expect_mesh=True) as bus:
         acknowledged: dict[str, float] = {}
         not_kept: dict[str, str] = {}
         asking_s = time.monotonic()

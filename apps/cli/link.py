@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 from apps.cli.choice import RobotChoice
 from cocoro.bus.base import Bus
 from cocoro.bus.zenoh import ZenohBus
-from cocoro.errors import ConfigError, MeshError, choice_of
-from cocoro.participant import Answer, Participant
+from cocoro.errors import ConfigError, MeshError, RefusedError, choice_of
+from cocoro.participant import Answer, Participant, Q, R
 from cocoro.topics import Request
 from deploy import robot_time
 from deploy.rundir import START, RunDir, robots
@@ -29,6 +29,8 @@ __all__ = ["Answer", "MeshLink", "find", "joined", "within"]
 PERCEPTION = "perception"
 """The component that detects the known objects."""
 ROBOT_FILES = ("description", "measured")
+APART_S = 0.002
+"""Pause before a request to a site, whose gateways drop requests that follow each other too closely."""
 REPLAY, REPLAYED = "replay", "replayed"
 """Process that publishes a capture's messages, and the state of a service that it stands for."""
 
@@ -39,12 +41,23 @@ class MeshLink(Participant):
     onlooker = True
     frame_depth = depth = 64
 
-    def __init__(self, run_dir: RunDir, bus: Bus, private: bool = True) -> None:
-        """`private`: only processes of this machine can be in this mesh."""
+    def __init__(
+        self, run_dir: RunDir, bus: Bus, private: bool = True, refusal: Callable[[str], str] | None = None
+    ) -> None:
+        """`private`: only processes of this machine can be in this mesh. `refusal` says why a request on a key may not
+        be sent, as the site's rules have it."""
         super().__init__(bus, robot_time.clock(run_dir.path), run_dir.robot)
         self._private = private
+        self._refusal = refusal
         self.run_dir = run_dir
         self.robot = run_dir.robot
+
+    async def _ask(self, request: Request[Q, R], question: Q, timeout_s: float | None) -> list[Answer[R]]:
+        if self._refusal is not None and (why := self._refusal(request.key(self.robot_name))):
+            raise RefusedError(why)  # the gateway would drop it, and nobody would answer
+        if self._refusal is not None:
+            await asyncio.sleep(APART_S)
+        return await super()._ask(request, question, timeout_s)
 
     def described(self) -> Robot:
         """The robot by the files that it was started with, if they are on this machine; else the Calliope. Raises
@@ -126,8 +139,10 @@ async def joined(
     if (through := through_site(choice)) is not None:
         from deploy.site import access  # slow to import; only a site needs it
 
-        run_dir, config = access.way(through, choice.robot, "operator")
+        way = access.way(through, choice.robot, "operator")
+        run_dir, config, refusal = way.run_dir, way.config, way.refusal
     else:
+        refusal = None
         run_dir = find(choice)
         config = run_dir.join_as("operator")
         if config.directory is not None and not run_dir.populated:
@@ -138,7 +153,7 @@ async def joined(
     if patience_s is not None:
         config = replace(config, patience_s=patience_s)
     async with await ZenohBus.open(config, expect_mesh=True) as bus:
-        yield MeshLink(run_dir, bus, private=config.directory is not None)
+        yield MeshLink(run_dir, bus, private=config.directory is not None, refusal=refusal)
 
 
 async def within(timeout_s: float, condition: Callable[[], bool], changed: asyncio.Event) -> bool:

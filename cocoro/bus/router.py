@@ -1,5 +1,6 @@
-"""Joins the mesh of this machine with other machines: a zenoh session in router mode, a member of the directory as every
-process is, with links to other hosts beside.
+"""Joins the mesh of this machine with other machines: a zenoh session in router mode.
+
+It is a member of the directory as every process is, and has links to other hosts.
 
 Each process of this machine stays connected with each other directly, so the robot goes on without its router.
 """
@@ -54,8 +55,8 @@ class Router:
     async def open(
         cls, name: str, directory: Path, listen: Sequence[str], connect: Sequence[str], more: Mapping[str, Any]
     ) -> Router:
-        """Joins the mesh in `directory`, accepts others at `listen` and keeps trying to connect to `connect`. `more` are
-        zenoh's options for certificates and rules, by path. Raises ConfigError, MeshError, FullError."""
+        """Joins the mesh in `directory`, accepts others at `listen`, and keeps trying to connect to `connect`. `more`
+        are zenoh's options for certificates and rules, by path. Raises ConfigError, MeshError, FullError."""
         membership = Membership.register(directory, name)
         try:
             here = [*membership.listen, *listen]

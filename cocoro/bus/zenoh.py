@@ -112,7 +112,8 @@ class ZenohBus:
                 self._forget_gone(awaited)
         if awaited:
             log.warning("no answer within %g s from %s", self._config.patience_s, ", ".join(awaited.values()))
-        self.declare_alive(f"{MEMBER}/{identity}")
+        if self._config.mode != "client":  # nobody waits for a client
+            self.declare_alive(f"{MEMBER}/{identity}")
 
     def _forget_gone(self, awaited: dict[str, str]) -> None:
         """Stops waiting for members that have left."""

@@ -5,12 +5,14 @@ from __future__ import annotations
 import os
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import NamedTuple
 
 from cocoro.bus.endpoints import ZenohConfig
 from cocoro.errors import ConfigError, choice_of
 from deploy.rundir import RunDir
 from deploy.site import admitted, credentials, place, plan
 from deploy.site.plan import Site
+from deploy.site.rights import Rights, rights
 
 PATIENCE_S = 3.0
 """Longest wait for the mesh over a network."""
@@ -21,18 +23,33 @@ def chosen(given: str | None) -> str | None:
     return given or os.environ.get(place.SITE) or None
 
 
-def way(given: str, robot: str | None, command: str) -> tuple[RunDir, ZenohConfig]:
-    """The robot's folder on this machine, and how to join its mesh. `given` is `NAME@DIR` or `DIR`, `command` the name
+class Way(NamedTuple):
+    """How a person reaches a robot."""
+
+    run_dir: RunDir
+    """The robot's folder on this machine."""
+    config: ZenohConfig
+    who: str
+    """The person, with role and site, for error messages."""
+    rights: Rights
+
+    def refusal(self, key: str) -> str:
+        """Why the person may not send a request on this key (wildcards allowed); '' when he may."""
+        return "" if key in self.rights.asks or self.rights.may_ask(key) else f"{self.who} may not ask {key}"
+
+
+def way(given: str, robot: str | None, command: str) -> Way:
+    """The way to one robot. `given` is `NAME@DIR` or `DIR`, `command` the name
     in logs. Raises ConfigError for a site, a name or credentials that cannot be used, and where the robot must be
     chosen."""
     found = ways(given, robot, command)
     if len(found) > 1:
-        names = " or ".join(f"--robot {run_dir.robot}" for run_dir, _ in found)
+        names = " or ".join(f"--robot {one.run_dir.robot}" for one in found)
         raise ConfigError(f"the site has several robots; choose one: {names}")
     return found[0]
 
 
-def ways(given: str, robot: str | None, command: str) -> list[tuple[RunDir, ZenohConfig]]:
+def ways(given: str, robot: str | None, command: str) -> list[Way]:
     """As `way`, to one robot or, without a name, to each that the person deals with."""
     who, at, folder = given.rpartition("@")
     site = plan.read(Path(folder))
@@ -51,7 +68,8 @@ def ways(given: str, robot: str | None, command: str) -> list[tuple[RunDir, Zeno
         if not endpoints:
             raise ConfigError(f"site {site.name}: no host of {one} listens: give one listen = ['tls/ADDRESS:PORT']")
         config = ZenohConfig(command, mode="client", connect=endpoints, patience_s=PATIENCE_S, options=mine.options)
-        found.append((RunDir(one), config))
+        who = f"{name}, {role} of site {site.name},"
+        found.append(Way(RunDir(one), config, who, rights(site, name, one)))
     return found
 
 

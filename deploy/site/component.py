@@ -1,5 +1,7 @@
 """The declaration of the gateway: see `cocoro.component`."""
 
+from dataclasses import replace
+
 from cocoro.component import Component
 
 GATEWAY = Component(
@@ -13,3 +15,11 @@ GATEWAY = Component(
     rss_mb=120.0,
     libraries=("cryptography",),
 )
+
+PREFIX = f"{GATEWAY.name}-"
+
+
+def gateway_of(host: str) -> Component:
+    """The gateway of one host: each has a name of its own, since a robot has as many as it has hosts."""
+    name = f"{PREFIX}{host}"
+    return replace(GATEWAY, name=name, services=(name,), settings=GATEWAY.name)

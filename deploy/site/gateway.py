@@ -66,7 +66,7 @@ class Gateway:
 
     async def run(self) -> None:
         async with AsyncExitStack() as stack:
-            watch = Watch(self._on_refusal, lambda line: self._loop.call_soon_threadsafe(log.warning, "%s", line))
+            watch = Watch(self._on_refusal, lambda line: log.warning("%s", line))
             stack.callback(watch.close)
             self._node.spawn(self._tell())
             while True:
@@ -103,7 +103,7 @@ class Gateway:
         """What differs when a file of the site differs."""
         mine = self._folder / place.CREDENTIALS / self._host
         files = (self._folder / place.PLAN, self._folder / place.ADMITTED, mine / place.CERT)
-        found = []
+        found: list[object] = []
         for file in files:
             try:
                 status = file.stat()

@@ -36,7 +36,7 @@ from cocoro.errors import ConfigError, choice_of, field_text
 from deploy import profiles
 from deploy.processes import COMPONENTS, components, hardware, named
 from deploy.profiles import Name, Profile
-from deploy.site.component import GATEWAY
+from deploy.site.component import GATEWAY, gateway_of
 from deploy.site.place import PLAN
 
 HostRole = Literal["robot", "brain"]
@@ -44,6 +44,9 @@ PersonRole = Literal["operator", "viewer", "author"]
 Role = HostRole | PersonRole
 Endpoint = Annotated[str, Meta(pattern=r"\Atls/(\[[0-9a-fA-F:]+\]|[A-Za-z0-9.-]+):[0-9]{1,5}\Z")]
 AN_ENDPOINT = "an endpoint is written as tls/ADDRESS:PORT"
+
+
+LONGEST_HOST = 24
 
 
 class RobotRow(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -152,13 +155,13 @@ class Site(NamedTuple):
         return msgspec.structs.replace(
             whole,
             robot=row.robot,
-            processes=(*row.processes, GATEWAY.name),
+            processes=(*row.processes, gateway_of(name).name),
             service={**whole.service, GATEWAY.name: settings},
         )
 
     def share(self, name: str) -> tuple[Component, ...]:
-        """The components that run on a host."""
-        return tuple(named(process) for process in self.host(name).processes)
+        """The components that run on a host, its gateway among them."""
+        return (*(named(process) for process in self.host(name).processes), gateway_of(name))
 
 
 def read(where: Path) -> Site:
@@ -229,6 +232,8 @@ def _check(site: Site) -> None:
 
 def _check_host(site: Site, name: str, host: HostRow) -> None:
     where = f"[host.{name}]"
+    if len(name) > LONGEST_HOST:
+        raise ConfigError(f"{where}: a host's name has at most {LONGEST_HOST} characters, since its gateway's has 32")
     if not host.robot:
         raise ConfigError(f"{where}: the site has several robots, so each host names its own: robot = ...")
     if host.robot not in site.profiles:

@@ -14,7 +14,14 @@ from typing import NamedTuple
 
 import zenoh
 
-LEVELS = "zenoh::net::routing::interceptor::access_control=trace,zenoh_link_tls=warn,error"
+LEVELS = ",".join(
+    (
+        "zenoh::net::routing::interceptor::access_control=trace",
+        "zenoh_link_tls=warn",
+        "zenoh::net::routing::hat=off",  # its errors are about what was refused before
+        "error",
+    )
+)
 LONGEST_LINE = 4096
 VERDICTS = 9
 """When a session names a key for the first time, zenoh computes what it may do with it, one line for each kind of
@@ -22,10 +29,9 @@ message: nobody did any of that yet."""
 _READ_BYTES = 1 << 20
 _MATTERS = (b"unauthorized", b"caching permissions", b" WARN ", b" ERROR ")
 _THREAD = re.compile(rb"ThreadId\((\d+)\)")
-_BY_NAME = re.compile(rb"CertCommonName\(([^)]*)\).* is unauthorized to (.+?) \((ingress|egress)\)(?: on (\S+))?")
-_BY_ID = re.compile(
-    rb"access_control: (?:Using cached result: )?(\S+) .*?is unauthorized to (.+?) \((ingress|egress)\)(?: on (\S+))?"
-)
+_WHAT = rb"is unauthorized to (.+?) \((ingress|egress)\)(?: on (\S+))?"
+_BY_NAME = re.compile(rb"CertCommonName\(([^)]*)\).* " + _WHAT)
+_BY_ID = re.compile(rb"access_control: (?:Using cached result: )?(\S+) .*?" + _WHAT)
 _HANDSHAKE = re.compile(rb"zenoh_link_tls\S*: (.+)")
 
 
@@ -75,8 +81,8 @@ class Sifter:
                 return None
             del self._computed[thread[1]]
         match = _BY_NAME.search(line) or _BY_ID.search(line)
-        if match is None or match[3] == b"egress":  # what is kept from somebody, nobody did
-            return None
+        if match is None or match[3] == b"egress" or match[2].startswith(b"Undeclare"):
+            return None  # what is kept from somebody, nobody did; and who ends what was refused does nothing either
         who, what, key = (part.decode(errors="replace") if part else "" for part in (match[1], match[2], match[4]))
         return Refusal(who, what, key)
 

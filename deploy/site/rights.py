@@ -52,6 +52,9 @@ class Rights(NamedTuple):
         heard = frozenset(key for key in both.never_hears if self.may_hear(key) or other.may_hear(key))
         return both._replace(never_hears=both.never_hears - heard)
 
+    def may_ask(self, key: str) -> bool:
+        return any(matches(keyexpr, key) for keyexpr in self.asks)
+
     def may_hear(self, key: str) -> bool:
         return key not in self.never_hears and any(matches(keyexpr, key) for keyexpr in self.hears)
 
@@ -77,13 +80,14 @@ def of_host(robot: str, share: Iterable[Component], *, simulated: bool) -> Right
     shows: set[str] = set()
     records = False
     for component in share:
-        own: list[Topic[Any]] = [row.of(it) for it in component.services for row in (HEALTH, STEPS, EXCHANGES)]
+        nodes = {component.name, *component.services}
+        own: list[Topic[Any]] = [row.of(node) for node in nodes for row in (HEALTH, STEPS, EXCHANGES)]
         puts |= {*component.all_publishes(), *own}
         answers |= {row.key(robot) for row in component.all_serves()}
-        answers |= {ABOUT.of(service).key(robot) for service in component.services}
+        answers |= {ABOUT.of(node).key(robot) for node in nodes}
         hears |= {_any(row).key(robot) for row in component.reads}
         asks |= {_any(row).key(robot) for row in component.calls}
-        shows |= {alive_key(robot, service) for service in component.services}
+        shows |= {alive_key(robot, node) for node in nodes}
         if component.records:
             records = True
             hears.add(f"{robot}/**")

@@ -27,8 +27,8 @@ from deploy.site.rights import Rights, rights
 HEADROOM = 10.0
 """A key may be published this many times as often as its nominal rate: a network that stalls delivers what waited all
 at once, and only a flood comes more often than that for long."""
-ASKED_HZ = 200.0
-"""A link may ask one request at most this often."""
+ASKED_HZ = 1000.0
+"""A link may ask one request at most this often; what comes sooner after the last is dropped, without an answer."""
 UNTABLED_HZ = 1000.0
 """A key without a nominal rate, as those of an author, may be published at most this often. Events are not
 limited, since each of them counts."""
@@ -40,6 +40,8 @@ EVERYTHING = (
     "liveliness_token", "liveliness_query", "declare_liveliness_subscriber",
 )  # fmt: skip
 LOCAL = "unixsock-stream"
+ALL = ("**", "@cocoro/**")
+"""No wildcard matches a chunk with '@', as the tokens of the mesh's members have it: they stay on their machine."""
 
 
 class Rule(NamedTuple):
@@ -64,7 +66,7 @@ def compiled(site: Site, host: str, names: Mapping[str, Iterable[str]]) -> dict[
         "enabled": True,
         "default_permission": "deny",
         "rules": [
-            {"id": LOCAL, "messages": EVERYTHING, "flows": [IN, OUT], "permission": "allow", "key_exprs": ["**"]},
+            {"id": LOCAL, "messages": EVERYTHING, "flows": [IN, OUT], "permission": "allow", "key_exprs": ALL},
             *(
                 {
                     "id": index,

@@ -1,0 +1,95 @@
+"""Who may do what on which key of a robot: a site's access rules as one table that a person can check.
+
+It is made from the same rights and limits as zenoh's rules are (`deploy.site.rules`), key by key.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+from cocoro.bus.base import Qos
+from cocoro.installed import all_requests, all_topics
+from cocoro.keys import alive_key, matches, recorder_key
+from cocoro.node import QUESTION_BYTES
+from cocoro.topics import Request, Topic
+from deploy.site.plan import Site
+from deploy.site.rights import Rights, rights
+from deploy.site.rules import ASKED_HZ, HEADROOM, UNTABLED_HZ
+from services.executive.askers import asker_key
+
+TOPIC, REQUEST, TOKEN, OWN = "topic", "request", "token", "author's"
+VERBS = {
+    TOPIC: ("puts", "hears"),
+    REQUEST: ("asks", "answers"),
+    TOKEN: ("shows", "watches"),
+    OWN: ("puts", "hears", "asks", "answers", "shows", "watches"),
+}
+"""What can be done with each kind of key. A slow topic's newest message is asked for by who hears it."""
+
+
+class Row(NamedTuple):
+    """One key, and what each principal may do with it."""
+
+    key: str
+    """Without the robot's name."""
+    kind: str
+    may: dict[str, tuple[str, ...]]
+    """By principal: some of `puts`, `hears`, `asks`, `answers`, `shows`, `watches`; empty for nothing."""
+    max_bytes: int | None = None
+    max_hz: float | None = None
+    """Limits of a link from another host; None where there is none."""
+
+
+def matrix(site: Site, robot: str) -> list[Row]:
+    """The rows of a robot, in the order of the topic table; then requests, tokens, and the keys of authors."""
+    names = [name for name in site.principals if robot in site.robots_of(name)]
+    may = {name: rights(site, name, robot) for name in names}
+    services = [service for name in site.hosts if robot in site.robots_of(name) for service in _nodes(site, name)]
+    rows = [
+        Row(row.name, TOPIC, _may(may, row.key(robot), TOPIC), row.max_bytes, _rate(row))
+        for topic in all_topics()
+        for row in _each(topic, services)
+    ]
+    rows += [
+        Row(row.name, REQUEST, _may(may, row.key(robot), REQUEST), QUESTION_BYTES, ASKED_HZ)
+        for request in all_requests()
+        for row in _each(request, services)
+    ]
+    rows += [
+        Row(key.partition("/")[2], TOKEN, _may(may, key, TOKEN))
+        for key in (
+            *(alive_key(robot, service) for service in services),
+            *(recorder_key(robot, service) for service in services),
+            asker_key(robot, "asker"),
+        )
+    ]
+    authors = [name for name in names if site.role(name) == "author"]
+    rows += [Row(f"{name}/**", OWN, _may(may, f"{robot}/{name}/any", OWN), None, UNTABLED_HZ) for name in authors]
+    return [row for row in rows if any({"puts", "answers", "shows"} & {*verbs} for verbs in row.may.values())]
+
+
+def _nodes(site: Site, host: str) -> list[str]:
+    found = [node for one in site.share(host) for node in (*one.services, one.name)]
+    return list(dict.fromkeys(found))
+
+
+def _each(row: Any, services: Iterable[str]) -> list[Any]:
+    return [row.of(service) for service in services] if row.per_service else [row]
+
+
+def _may(may: dict[str, Rights], key: str, kind: str) -> dict[str, tuple[str, ...]]:
+    """What each may do with a key."""
+    found = {}
+    for name, theirs in may.items():
+        verbs = [verb for verb in VERBS[kind] if any(matches(keyexpr, key) for keyexpr in getattr(theirs, verb))]
+        if "hears" in verbs and key in theirs.never_hears:
+            verbs.remove("hears")
+        found[name] = tuple(verbs)
+    return found
+
+
+def _rate(row: Topic[Any] | Request[Any, Any]) -> float | None:
+    if not isinstance(row, Topic) or row.qos is Qos.EVENT:
+        return None
+    return row.rate_hz * HEADROOM if row.rate_hz else UNTABLED_HZ
