@@ -146,13 +146,11 @@ def problems(found: Site) -> list[str]:
             )
         if not newest.is_valid(now):
             missing.append(f"{name}'s certificate is revoked or has expired: cocoro pki renew {name}")
-        for endpoint in found.hosts[name].listen if name in found.hosts else ():
-            address = endpoint.removeprefix("tls/").rpartition(":")[0].strip("[]")
-            if address not in newest.addresses:
-                missing.append(
-                    f"{name} listens at {address}, which its certificate does not name: "
-                    f"cocoro pki renew {name} --address {address}"
-                )
+        missing += [
+            f"{name} listens at {at}, which its certificate does not name: cocoro pki renew {name} --address {at}"
+            for at in _addresses(found, name)
+            if at not in newest.addresses
+        ]
     missing += [
         f"{name} has a certificate, and is not in the plan" for name in known.names if name not in found.principals
     ]
@@ -163,12 +161,7 @@ def steps_of(found: Site) -> list[tuple[str, str, str]]:
     """The steps to a running site: where, what to run there, and why."""
     steps = [("authority", "cocoro pki init", "once: makes the key that signs all certificates; it stays here")]
     for name in found.principals:
-        row = found.hosts.get(name)
-        at = (
-            [f"--address {end.removeprefix('tls/').rpartition(':')[0].strip('[]')}" for end in row.listen]
-            if row
-            else []
-        )
+        at = [f"--address {address}" for address in _addresses(found, name)]
         command = " ".join(("cocoro pki issue", found.role(name), name, *at))
         steps.append(("authority", command, f"writes {place.CREDENTIALS}/{name}"))
     files = f"{place.PLAN} {place.ADMITTED}"
@@ -185,6 +178,12 @@ def steps_of(found: Site) -> list[tuple[str, str, str]]:
         for name, row in found.persons.items()
     ]
     return steps
+
+
+def _addresses(found: Site, name: str) -> list[str]:
+    """The addresses at which a principal listens, which its certificate must name."""
+    ends = found.hosts[name].listen if name in found.hosts else ()
+    return list(dict.fromkeys(end.removeprefix("tls/").rpartition(":")[0].strip("[]") for end in ends))
 
 
 def as_data(found: Site) -> dict[str, Any]:

@@ -26,7 +26,7 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar
 
 import msgspec
 from msgspec import Meta
@@ -39,6 +39,7 @@ from deploy.profiles import Name, Profile
 from deploy.site.component import GATEWAY, gateway_of
 from deploy.site.place import PLAN
 
+T = TypeVar("T", bound=msgspec.Struct)
 HostRole = Literal["robot", "brain"]
 PersonRole = Literal["operator", "viewer", "author"]
 Role = HostRole | PersonRole
@@ -77,9 +78,9 @@ class PersonRow(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
 
 class _File(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     name: Name
-    robot: Annotated[dict[Name, RobotRow], Meta(min_length=1)]
-    host: Annotated[dict[Name, HostRow], Meta(min_length=1)]
-    person: dict[Name, PersonRow] = {}
+    robot: Annotated[dict[Name, Any], Meta(min_length=1)]
+    host: Annotated[dict[Name, Any], Meta(min_length=1)]
+    person: dict[Name, Any] = {}
 
 
 class Site(NamedTuple):
@@ -179,18 +180,26 @@ def read(where: Path) -> Site:
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"site {path}: {error}") from error
     try:
-        file = msgspec.convert(data, _File)
-    except msgspec.ValidationError as error:
-        text = field_text(error, _File)
-        text = text.replace(f"Expected `str` matching regex {_pattern(Endpoint)!r}", AN_ENDPOINT)
-        text = text.replace(f"Expected `str` matching regex {_pattern(Name)!r}", profiles.A_NAME)
-        raise ConfigError(f"site {path}: {text}") from error
-    site = _resolved(file, path)
-    try:
+        site = _resolved(_converted(data, _File, ""), path)
         _check(site)
     except ConfigError as error:
         raise ConfigError(f"site {path}: {error}") from error
     return site
+
+
+def _converted(data: Any, kind: type[T], table: str) -> T:
+    """A table of the file as its type. Raises ConfigError that names table and field."""
+    try:
+        return msgspec.convert(data, kind)
+    except msgspec.ValidationError as error:
+        text = field_text(error, kind)
+        text = text.replace(f"Expected `str` matching regex {_pattern(Endpoint)!r}", AN_ENDPOINT)
+        text = text.replace(f"Expected `str` matching regex {_pattern(Name)!r}", profiles.A_NAME)
+        raise ConfigError(f"[{table}] {text}" if table else text) from error
+
+
+def _rows(tables: dict[str, Any], kind: type[T], table: str) -> dict[str, T]:
+    return {name: _converted(row, kind, f"{table}.{name}") for name, row in tables.items()}
 
 
 def _pattern(kind: Any) -> str:
@@ -200,7 +209,7 @@ def _pattern(kind: Any) -> str:
 def _resolved(file: _File, path: Path) -> Site:
     """The site with each robot's profile, and each host's robot filled in."""
     sources, found = {}, {}
-    for robot, row in file.robot.items():
+    for robot, row in _rows(file.robot, RobotRow, "robot").items():
         which = row.profile
         if which.endswith(".toml") and not Path(which).is_absolute():
             which = str(path.parent / which)
@@ -208,10 +217,13 @@ def _resolved(file: _File, path: Path) -> Site:
         try:
             found[robot] = msgspec.structs.replace(profiles.read(which), robot=robot)
         except ConfigError as error:
-            raise ConfigError(f"site {path}, [robot.{robot}]: {error}") from error
+            raise ConfigError(f"[robot.{robot}] {error}") from error
     only = next(iter(found)) if len(found) == 1 else ""
-    hosts = {name: row if row.robot else msgspec.structs.replace(row, robot=only) for name, row in file.host.items()}
-    return Site(file.name, path, sources, found, hosts, file.person)
+    hosts = {
+        name: row if row.robot else msgspec.structs.replace(row, robot=only)
+        for name, row in _rows(file.host, HostRow, "host").items()
+    }
+    return Site(file.name, path, sources, found, hosts, _rows(file.person, PersonRow, "person"))
 
 
 def _check(site: Site) -> None:

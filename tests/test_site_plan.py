@@ -1,0 +1,141 @@
+"""A site's plan: what it says, what it fills in, and what it refuses with what sentence."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from cocoro.errors import ConfigError
+from deploy.site import plan
+
+LAB = """
+name = "lab"
+[robot.calliope]
+profile = "sim"
+[host.body]
+role = "robot"
+processes = ["capture", "sim"]
+listen = ["tls/10.77.0.1:7447"]
+[host.brain]
+role = "brain"
+processes = ["perception", "planning", "executive"]
+[person.ada]
+role = "operator"
+[person.eve]
+role = "viewer"
+"""
+
+
+def read(folder: Path, text: str = LAB) -> plan.Site:
+    (folder / "site.toml").write_text(text, encoding="utf-8")
+    return plan.read(folder)
+
+
+def test_the_plan_of_the_documentation_can_be_read(tmp_path: Path) -> None:
+    assert plan.__doc__ is not None
+    text = plan.__doc__.partition("\n\n")[2].partition("\n\nA host connects")[0]
+    site = read(tmp_path, text)
+    assert (site.name, [*site.hosts], [*site.persons]) == ("lab", ["body", "brain"], ["ada"])
+
+
+def test_a_host_connects_to_all_that_listen_and_a_person_to_those_of_his_robots(tmp_path: Path) -> None:
+    site = read(tmp_path)
+    assert site.connects("brain") == ("body",)
+    assert site.connects("body") == ()
+    assert site.connects("ada") == ("body",)
+    assert site.endpoints("ada") == ("tls/10.77.0.1:7447",)
+
+
+def test_of_two_hosts_that_listen_the_later_one_connects(tmp_path: Path) -> None:
+    site = read(tmp_path, LAB.replace('role = "brain"', 'role = "brain"\nlisten = ["tls/10.77.0.2:7447"]'))
+    assert (site.connects("body"), site.connects("brain")) == ((), ("body",))
+
+
+def test_a_share_is_the_robots_profile_with_the_processes_of_one_host_and_its_gateway(tmp_path: Path) -> None:
+    site = read(tmp_path)
+    share = site.share_profile("brain", ["service.planning.latency_s=0.5"])
+    assert share.processes == ("perception", "planning", "executive", "gateway-brain")
+    assert share.service["gateway"] == {"site": str(tmp_path), "host": "brain"}
+    assert share.service["planning"]["latency_s"] == 0.5
+    assert share.clock == "sim"
+    assert "gateway-brain" in share.services()
+
+
+def test_two_robots_of_a_site_have_hosts_of_their_own(tmp_path: Path) -> None:
+    text = """
+name = "hall"
+[robot.a]
+profile = "sim"
+[robot.b]
+profile = "sim"
+[host.one]
+role = "robot"
+robot = "a"
+processes = ["capture", "sim", "perception", "planning", "executive"]
+listen = ["tls/10.77.0.1:7447"]
+[host.two]
+role = "robot"
+robot = "b"
+processes = ["capture", "sim", "perception", "planning", "executive"]
+listen = ["tls/10.77.0.2:7447"]
+[person.ada]
+role = "operator"
+[person.bo]
+role = "viewer"
+robots = ["b"]
+"""
+    site = read(tmp_path, text)
+    assert site.robots_of("ada") == ("a", "b")
+    assert site.connects("bo") == ("two",)
+    assert site.connects("two") == (), "hosts of different robots have nothing to say to each other"
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (('role = "brain"', 'role = "boss"'), r"\[host\.brain\] role: Invalid enum value .boss."),
+        (("10.77.0.1:7447", "10.77.0.1"), "an endpoint is written as tls/ADDRESS:PORT"),
+        (("tls/10.77.0.1:7447", "tcp/10.77.0.1:7447"), "an endpoint is written as tls/ADDRESS:PORT"),
+        (("7447", "77447"), "no port between 1 and 65535"),
+        (('"planning", ', ""), "process planning runs on no host; give it to one host's processes"),
+        (('"capture", "sim"', '"capture", "sim", "planning"'), "process planning runs on body and on brain"),
+        (('"capture", "sim"', '"capture", "sim", "kinect"'), "kinect is none of profile sim's"),
+        (('"capture", "sim"', '"capture", "simm"'), "there is no process 'simm'"),
+        (('role = "robot"', 'role = "brain"'), "sim drives arm, so its host has role 'robot'"),
+        (('listen = ["tls/10.77.0.1:7447"]', ""), "brain and body are not connected: let one of them listen"),
+        (('role = "brain"', 'role = "brain"\nconnect = ["boddy"]'), "no other host 'boddy'; .*did you mean body"),
+        (('role = "brain"', 'role = "brain"\nconnect = ["brain"]'), "no other host 'brain'"),
+        (("[person.ada]", "[person.brain]"), "brain is a host and a person"),
+        (("[person.ada]", "[person.planning]"), "a service has this name"),
+        (('role = "viewer"', 'role = "viewer"\nrobots = ["caliope"]'), "no robot 'caliope'; .*did you mean calliope"),
+        (('profile = "sim"', 'profile = "simm"'), "there is no profile 'simm'"),
+        (("[host.body]", f"[host.{'b' * 25}]"), "at most 24 characters"),
+        (('name = "lab"', ""), "missing required field `name`"),
+        (('name = "lab"', "name = 3"), "name"),
+    ],
+)  # fmt: skip
+def test_a_plan_that_contradicts_itself_is_refused_with_what_to_do(
+    change: tuple[str, str], told: str, tmp_path: Path
+) -> None:
+    assert change[0] in LAB
+    with pytest.raises(ConfigError, match=told) as error:
+        read(tmp_path, LAB.replace(*change))
+    assert str(tmp_path / "site.toml") in str(error.value)
+
+
+def test_files_that_are_no_plan_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"there is no site .*site\.toml: write one, see docs/sites\.md"):
+        plan.read(tmp_path)
+    for damage in (b"name = ", b"\xff\xfe", b"[host]\n" * 100):
+        (tmp_path / "site.toml").write_bytes(damage)
+        with pytest.raises(ConfigError, match=r"site .*site\.toml"):
+            plan.read(tmp_path)
+
+
+def test_names_that_the_site_does_not_have_are_told_with_those_that_it_has(tmp_path: Path) -> None:
+    site = read(tmp_path)
+    with pytest.raises(ConfigError, match=r"site lab has no host 'brian'; .*did you mean brain"):
+        site.host("brian")
+    with pytest.raises(ConfigError, match=r"site lab has no host and no person 'adda'; .*did you mean ada"):
+        site.role("adda")
