@@ -9,6 +9,22 @@ from pathlib import Path
 NOW = datetime(2031, 5, 1, 12, 0, tzinfo=UTC)
 DAY = timedelta(days=1)
 ADDRESS = "10.77.0.1"
+LAB = """
+name = "lab"
+[robot.calliope]
+profile = "sim"
+[host.body]
+role = "robot"
+processes = ["capture", "sim"]
+listen = ["tls/10.77.0.1:7447"]
+[host.brain]
+role = "brain"
+processes = ["perception", "planning", "executive"]
+[person.ada]
+role = "operator"
+[person.eve]
+role = "viewer"
+"""
 
 
 def context(folder: Path | None, *, server: bool, ca: Path | None = None) -> ssl.SSLContext:

@@ -5,26 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from site_rig import LAB
 
 from cocoro.errors import ConfigError
 from deploy.site import plan
-
-LAB = """
-name = "lab"
-[robot.calliope]
-profile = "sim"
-[host.body]
-role = "robot"
-processes = ["capture", "sim"]
-listen = ["tls/10.77.0.1:7447"]
-[host.brain]
-role = "brain"
-processes = ["perception", "planning", "executive"]
-[person.ada]
-role = "operator"
-[person.eve]
-role = "viewer"
-"""
 
 
 def read(folder: Path, text: str = LAB) -> plan.Site:
@@ -94,7 +78,7 @@ robots = ["b"]
 @pytest.mark.parametrize(
     ("change", "told"),
     [
-        (('role = "brain"', 'role = "boss"'), r"\[host\.brain\] role: Invalid enum value .boss."),
+        (('role = "brain"', 'role = "boss"'), r"\[host\.brain\] role: unknown value 'boss'; known are robot, brain"),
         (("10.77.0.1:7447", "10.77.0.1"), "an endpoint is written as tls/ADDRESS:PORT"),
         (("tls/10.77.0.1:7447", "tcp/10.77.0.1:7447"), "an endpoint is written as tls/ADDRESS:PORT"),
         (("7447", "77447"), "no port between 1 and 65535"),

@@ -63,7 +63,7 @@ class Router:
             config = ZenohConfig(name, mode="router", listen=tuple(here), lease_s=LEASE_S)
             chosen = options(config, membership.member.identity, here, [*membership.connect, *connect])
             chosen |= {
-                "connect/timeout_ms": 0,
+                "connect/timeout_ms": -1,
                 "connect/exit_on_failure": False,
                 "connect/retry": {
                     "period_init_ms": RETRY_MS[0],

@@ -1,0 +1,190 @@
+"""Who may do what: rights by role and by what runs where, and the rules for zenoh that are compiled from them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from site_rig import LAB
+
+from cocoro.component import Component
+from cocoro.errors import ConfigError
+from cocoro.installed import all_requests, all_topics
+from cocoro.keys import matches
+from cocoro.topics import BASE_COMMAND, ESTOP, RESET, RUN, SERVOS, TRUTH, Topic
+from deploy import processes
+from deploy.site import plan
+from deploy.site.matrix import matrix
+from deploy.site.rights import rights
+from deploy.site.rules import IN, OUT, Rule, compiled, neighbours, table
+
+ROBOT = "calliope"
+AUTHOR = '[person.bob]\nrole = "author"\n'
+
+
+@pytest.fixture
+def lab(tmp_path: Path) -> plan.Site:
+    (tmp_path / "site.toml").write_text(LAB + AUTHOR, encoding="utf-8")
+    return plan.read(tmp_path)
+
+
+def may_put(site: plan.Site, key: str) -> set[str]:
+    """The principals that may publish on a key."""
+    return {name for name in site.principals if any(matches(own, key) for own in rights(site, name, ROBOT).puts)}
+
+
+def may_ask(site: plan.Site, key: str) -> set[str]:
+    return {name for name in site.principals if rights(site, name, ROBOT).may_ask(key)}
+
+
+def may_hear(site: plan.Site, key: str) -> set[str]:
+    return {name for name in site.principals if rights(site, name, ROBOT).may_hear(key)}
+
+
+# --- rights ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("topic", all_topics(), ids=lambda topic: topic.name)
+def test_only_the_host_of_its_publisher_may_publish_a_topic(topic: Topic[Any], lab: plan.Site) -> None:
+    for host, row in lab.hosts.items():
+        here = [processes.named(name) for name in row.processes]
+        ours = [row for one in here for row in one.all_publishes() if row.name == topic.name]
+        if not topic.per_service:
+            assert (host in may_put(lab, topic.key(ROBOT))) == bool(ours)
+    assert may_put(lab, topic.of("planning").key(ROBOT) if topic.per_service else topic.key(ROBOT)) <= {*lab.hosts}
+
+
+def test_wheels_are_commanded_by_the_host_of_planning_alone(lab: plan.Site) -> None:
+    assert may_put(lab, BASE_COMMAND.key(ROBOT)) == {"brain"}
+
+
+def test_everybody_stops_and_operators_alone_operate(lab: plan.Site) -> None:
+    persons = {"ada", "eve", "bob"}
+    assert may_ask(lab, ESTOP.of("base").key(ROBOT)) == may_ask(lab, ESTOP.of("*").key(ROBOT)) == persons
+    for request in all_requests():
+        asking = may_ask(lab, (request.of("base") if request.per_service else request).key(ROBOT))
+        if request.right == "operate":
+            assert asking == {"ada"}, request.name
+        else:
+            assert asking >= persons, request.name
+    assert {request.name for request in (RUN, RESET, SERVOS)} <= {
+        request.name for request in all_requests() if request.right == "operate"
+    }
+
+
+def test_the_truth_is_heard_where_it_is_made_and_by_persons_and_by_no_other_host(lab: plan.Site) -> None:
+    assert may_hear(lab, TRUTH.key(ROBOT)) == {"body", "ada", "eve", "bob"}
+
+
+def test_a_recorder_on_another_host_hears_everything_but_the_truth(tmp_path: Path) -> None:
+    text = LAB.replace('"capture", ', "").replace('"executive"]', '"executive", "capture"]')
+    (tmp_path / "site.toml").write_text(text, encoding="utf-8")
+    site = plan.read(tmp_path)
+    assert rights(site, "brain", ROBOT).may_hear("calliope/anything/at/all")
+    assert not rights(site, "brain", ROBOT).may_hear(TRUTH.key(ROBOT))
+    denied = [rule for rule in table(site, "body") if not rule.allow]
+    assert denied == [Rule("brain", OUT, ("put",), (TRUTH.key(ROBOT),), allow=False)]
+
+
+def test_an_author_publishes_and_serves_under_his_own_name_alone(lab: plan.Site) -> None:
+    assert may_put(lab, "calliope/bob/painting") == {"bob"}
+    assert rights(lab, "bob", ROBOT).puts == {"calliope/bob/**"}
+    assert rights(lab, "bob", ROBOT).answers == {"calliope/bob/**"}
+
+
+def test_a_third_partys_component_publishes_under_its_own_services_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bad = Component(name="painter", module="painter", doc="", publishes=(BASE_COMMAND,))
+    monkeypatch.setattr(processes, "table", lambda: {"painter": bad})
+    text = LAB.replace('"capture", "sim"', '"capture", "sim", "painter"')
+    (tmp_path / "site.toml").write_text(text.replace('profile = "sim"', 'profile = "own.toml"'), encoding="utf-8")
+    (tmp_path / "own.toml").write_text(
+        'robot = "calliope"\nclock = "sim"\n'
+        'processes = ["capture", "sim", "perception", "planning", "executive", "painter"]\n',
+        encoding="utf-8",
+    )
+    with pytest.raises(ConfigError, match="painter of a third party publishes base/command"):
+        plan.read(tmp_path)
+
+
+def test_who_has_nothing_to_do_with_a_robot_may_do_nothing_with_it(lab: plan.Site) -> None:
+    assert not any(rights(lab, "ada", "other"))
+
+
+# --- rules ----------------------------------------------------------------------------------------
+
+
+def allows(site: plan.Site, host: str, name: str, flow: str, message: str, key: str) -> bool:
+    """Whether a host's rules let a message of a key pass on a principal's link."""
+    found = [
+        rule
+        for rule in table(site, host)
+        if rule.principal == name and rule.flow == flow and message in rule.messages
+        if any(matches(own, key) for own in rule.keys)
+    ]
+    return bool(found) and all(rule.allow for rule in found)
+
+
+def test_rules_are_kept_where_a_message_comes_in_and_where_it_goes_out(lab: plan.Site) -> None:
+    wheels = BASE_COMMAND.key(ROBOT)
+    assert allows(lab, "body", "brain", IN, "put", wheels)
+    assert allows(lab, "brain", "body", OUT, "put", wheels)
+    assert not allows(lab, "body", "ada", IN, "put", wheels)
+    assert not allows(lab, "brain", "body", IN, "put", wheels), "nobody behind the body may command wheels either"
+    assert allows(lab, "brain", "body", IN, "query", RUN.key(ROBOT)), "the body passes the operator's requests on"
+    assert allows(lab, "body", "ada", IN, "query", RUN.key(ROBOT))
+    assert not allows(lab, "body", "eve", IN, "query", RUN.key(ROBOT))
+
+
+def test_a_host_keeps_rules_for_those_who_link_with_it_and_for_nobody_else(lab: plan.Site) -> None:
+    assert set(neighbours(lab, "body")) == {"brain", "ada", "eve", "bob"}
+    assert set(neighbours(lab, "brain")) == {"body"}
+
+
+def test_what_is_given_to_zenoh_denies_by_default_and_names_the_admitted_certificates(lab: plan.Site) -> None:
+    names = {"brain": ("brain.1", "brain.2"), "ada": ("ada.3",), "mallory": ("mallory.1",)}
+    control = compiled(lab, "body", names)["access_control"]
+    assert (control["enabled"], control["default_permission"]) == (True, "deny")
+    subjects = {subject["id"]: subject for subject in control["subjects"]}
+    assert subjects["brain"]["cert_common_names"] == ["brain.1", "brain.2"]
+    assert set(subjects) == {"unixsock-stream", "brain", "ada"}, (
+        "eve has no certificate, and mallory is not in the plan"
+    )
+    known = {rule["id"] for rule in control["rules"]}
+    used = [rule for policy in control["policies"] for rule in policy["rules"]]
+    assert sorted(used) == sorted(known), "each rule is somebody's, once"
+
+
+def test_sizes_and_rates_are_those_of_the_table(lab: plan.Site) -> None:
+    options = compiled(lab, "body", {})
+    sizes = {
+        key: row["size_limit"]
+        for row in options["low_pass_filter"]
+        for key in row["key_exprs"]
+        if row["messages"] == ["put"]
+    }
+    assert all(sizes[(row.of("*") if row.per_service else row).key(ROBOT)] == row.max_bytes for row in all_topics())
+    rates = {rule["key_expr"]: rule["freq"] for row in options["downsampling"] for rule in row["rules"]}
+    assert rates[BASE_COMMAND.key(ROBOT)] == 500.0
+    assert "calliope/executive/task" not in rates, "no event is ever dropped for coming too soon"
+
+
+# --- the table for people -------------------------------------------------------------------------
+
+
+def test_the_table_says_what_the_rules_say(lab: plan.Site) -> None:
+    verbs = {"puts": (IN, "put"), "asks": (IN, "query"), "answers": (IN, "reply"), "shows": (IN, "liveliness_token")}
+    for row in matrix(lab, ROBOT):
+        for name in set(row.may) - {"body"}:
+            for verb, (flow, message) in verbs.items():
+                if row.kind in ("request", "token") or verb == "puts":
+                    key = f"{ROBOT}/{row.key.replace('**', 'any')}"
+                    assert (verb in row.may[name]) == allows(lab, "body", name, flow, message, key), (row.key, name)
+
+
+def test_the_table_has_a_row_for_each_key_that_somebody_publishes_or_serves(lab: plan.Site) -> None:
+    keys = {row.key for row in matrix(lab, ROBOT)}
+    assert {"base/command", "sim/truth", "executive/run", "base/estop", "planning/alive", "bob/**"} <= keys
+    assert "servos/about" not in keys, "no host of this site has the real servos"

@@ -1,0 +1,295 @@
+"""What this project builds on in zenoh's router mode. A new version of zenoh that changes one of these is noticed here.
+
+One router with mutual TLS, access rules, limits of sizes and rates; a peer on a Unix socket as the processes of a host
+are; clients with certificates. All on this machine.
+"""
+
+from __future__ import annotations
+
+import json
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zenoh
+
+from deploy.site import authority, credentials, place
+
+pytestmark = pytest.mark.zenoh
+
+LOCAL = "unixsock-stream"
+EVERYTHING = [
+    "put", "delete", "declare_subscriber", "query", "reply", "declare_queryable",
+    "liveliness_token", "liveliness_query", "declare_liveliness_subscriber",
+]  # fmt: skip
+PATIENCE_S = 10.0
+SECOND_S = 1.0
+
+
+def until(condition: Callable[[], object], what: str) -> None:
+    deadline_s = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < deadline_s, what
+        time.sleep(0.005)
+
+
+def opened(mode: str, listen: list[str], connect: list[str], more: dict[str, Any]) -> zenoh.Session:
+    options = {
+        "mode": mode,
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "listen/endpoints": listen,
+        "connect/endpoints": connect,
+        "connect/timeout_ms": 2000 if mode == "client" else -1,
+        "scouting/delay": 0,
+        "transport/shared_memory/enabled": False,
+        **more,
+    }
+    config = zenoh.Config()
+    for path, value in options.items():
+        config.insert_json5(path, json.dumps(value))
+    return zenoh.open(config)
+
+
+class Room:
+    """A router between a peer on a Unix socket and clients with certificates."""
+
+    def __init__(self, folder: Path, options: dict[str, Any]) -> None:
+        self.folder = folder
+        self.heard: list[str] = []
+        self._lock = threading.Lock()
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            port = probe.getsockname()[1]
+        self.endpoint = f"tls/127.0.0.1:{port}"
+        end = f"{LOCAL}/{folder}/peer.sock"
+        self.peer = opened("peer", [end], [], {})
+        self.router = opened("router", [self.endpoint], [end], {**self.tls("router"), **options})
+        until(lambda: self.router.info.peers_zid(), "the router is linked with the peer")
+        self._sessions = [self.router, self.peer]
+
+    def hear(self) -> None:
+        """Have the peer hear everything."""
+        self.subscriber = self.peer.declare_subscriber("r/**", self._on_sample)
+
+    def _on_sample(self, sample: zenoh.Sample) -> None:
+        with self._lock:
+            self.heard.append(str(sample.key_expr))
+
+    def tls(self, name: str) -> dict[str, Any]:
+        folder = self.folder / place.CREDENTIALS / name
+        return credentials.read(folder, datetime.now(UTC)).options
+
+    def client(self, name: str) -> zenoh.Session:
+        session = opened("client", [], [self.endpoint], self.tls(name))
+        self._sessions.insert(0, session)
+        return session
+
+    def heard_from(self, client: zenoh.Session, key: str) -> int:
+        """How often a key was heard by the peer, counted when what the client sent last has arrived."""
+        mark = f"r/mark/{time.monotonic_ns()}"
+        client.put(mark, b"")
+        until(lambda: mark in self.heard, f"{mark} arrives")
+        return self.heard.count(key)
+
+    def close(self) -> None:
+        for session in self._sessions:
+            session.close()  # type: ignore[no-untyped-call]
+
+
+@pytest.fixture
+def issued(tmp_path: Path) -> Path:
+    now = datetime.now(UTC)
+    authority.init(tmp_path, now)
+    authority.issue(tmp_path, "robot", "router", now, addresses=["127.0.0.1"])
+    for name in ("ada", "eve"):
+        authority.issue(tmp_path, "operator", name, now)
+    return tmp_path
+
+
+@pytest.fixture
+def room(issued: Path, request: pytest.FixtureRequest) -> Iterator[Room]:
+    made = Room(issued, getattr(request, "param", {}))
+    made.hear()
+    yield made
+    made.close()
+
+
+def allowing(*rules: tuple[str, list[str], list[str], list[str]], default: str = "deny") -> dict[str, Any]:
+    """Access control: `rules` are the certificate's name, flows, messages and keys that it allows."""
+    made = [
+        {"id": f"{index}", "permission": "allow", "flows": flows, "messages": messages, "key_exprs": keys}
+        for index, (_, flows, messages, keys) in enumerate(rules)
+    ]
+    local = {"id": "local", "permission": "allow", "flows": ["ingress", "egress"], "messages": EVERYTHING}
+    return {
+        "access_control": {
+            "enabled": True,
+            "default_permission": default,
+            "rules": [{**local, "key_exprs": ["**"]}, *made],
+            "subjects": [
+                {"id": "local", "link_protocols": [LOCAL]},
+                *({"id": f"s{index}", "cert_common_names": [rule[0]]} for index, rule in enumerate(rules)),
+            ],
+            "policies": [
+                {"rules": ["local"], "subjects": ["local"]},
+                *({"rules": [f"{index}"], "subjects": [f"s{index}"]} for index in range(len(rules))),
+            ],
+        }
+    }
+
+
+ADA_PUTS = ("ada.1", ["ingress"], ["put"], ["r/open", "r/mark/*"])
+
+
+@pytest.mark.parametrize("room", [allowing(ADA_PUTS)], indirect=True)
+def test_a_router_denies_by_default_and_knows_who_sends_by_the_certificates_name(room: Room) -> None:
+    ada, eve = room.client("ada"), room.client("eve")
+    eve.put("r/open", b"")
+    ada.put("r/open", b"")
+    ada.put("r/closed", b"")
+    assert room.heard_from(ada, "r/open") == 1
+    assert "r/closed" not in room.heard
+    names = {link.auth_identifier for link in room.router.info.links()}
+    assert {"ada.1", "eve.1"} <= names, "a link tells the certificate's name"
+
+
+@pytest.mark.parametrize(
+    "room", [allowing(ADA_PUTS, ("ada.1", ["ingress"], ["declare_subscriber"], ["r/told"]))], indirect=True
+)
+def test_rules_are_needed_in_both_directions(room: Room) -> None:
+    ada = room.client("ada")
+    got: list[str] = []
+    with ada.declare_subscriber("r/told", lambda sample: got.append(str(sample.key_expr))):
+        assert room.heard_from(ada, "r/told") == 0
+        room.peer.put("r/told", b"")
+        assert room.heard_from(ada, "r/told") == 1
+    assert got == [], "it may subscribe, and nothing may go out to it"
+
+
+@pytest.mark.parametrize(
+    "room",
+    [allowing(ADA_PUTS, ("ada.1", ["ingress", "egress"], ["declare_subscriber", "put"], ["r/one", "r/two/*"]))],
+    indirect=True,
+)
+def test_a_wildcard_subscription_passes_only_where_a_rule_includes_all_of_it(room: Room) -> None:
+    ada = room.client("ada")
+    got: list[str] = []
+    with (
+        ada.declare_subscriber("r/**", lambda sample: got.append(f"all {sample.key_expr}")),
+        ada.declare_subscriber("r/two/*", lambda sample: got.append(f"two {sample.key_expr}")),
+    ):
+        room.heard_from(ada, "r/one")
+        room.peer.put("r/one", b"")
+        room.peer.put("r/two/x", b"")
+        until(lambda: "two r/two/x" in got, "it arrives")
+    assert "all r/one" not in got, "the wide one was refused"
+
+
+@pytest.mark.parametrize("room", [allowing(("ada.1", ["ingress", "egress"], EVERYTHING, ["**"]))], indirect=True)
+def test_no_wildcard_of_a_rule_covers_a_key_with_a_verbatim_chunk(room: Room) -> None:
+    ada = room.client("ada")
+    with ada.liveliness().declare_token("@own/token"), ada.liveliness().declare_token("r/token"):
+        until(lambda: list(room.peer.liveliness().get("r/token", timeout=SECOND_S)), "the other token is known")
+        assert not list(room.peer.liveliness().get("@own/token", timeout=SECOND_S))
+
+
+LIMITS = {
+    "low_pass_filter": [
+        {"id": "size", "link_protocols": ["tls"], "flows": ["ingress"], "messages": ["put"], "key_exprs": ["r/small"],
+         "size_limit": 100_000}
+    ],
+    "downsampling": [
+        {"id": "rate", "link_protocols": ["tls"], "flows": ["ingress"], "messages": ["put"],
+         "rules": [{"key_expr": "r/slow", "freq": 0.01}]}
+    ],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("room", [LIMITS], indirect=True)
+def test_sizes_and_rates_are_limited_where_a_message_comes_in(room: Room) -> None:
+    ada = room.client("ada")
+    ada.put("r/small", bytes(1_500_000))
+    ada.put("r/small", bytes(90_000))
+    for _ in range(20):
+        ada.put("r/slow", b"")
+        ada.put("r/fast", b"")
+    assert room.heard_from(ada, "r/small") == 1
+    assert room.heard.count("r/slow") == 1, "one in a hundred seconds"
+    assert room.heard.count("r/fast") == 20, "other keys are not slowed down"
+
+
+@pytest.mark.parametrize(
+    "room",
+    [allowing(ADA_PUTS) | {"adminspace": {"enabled": True, "permissions": {"read": True, "write": True}}}],
+    indirect=True,
+)
+def test_rules_cannot_change_while_a_router_runs(room: Room) -> None:
+    """If this fails, the gateway need not open its router anew when the site changes."""
+    ada = room.client("ada")
+    place = f"@/{room.router.zid()}/router/config/access_control"
+    room.peer.put(f"{place}/default_permission", json.dumps("allow"))
+    room.peer.put(f"{place}/enabled", json.dumps(False))
+    room.peer.put("r/after", b"")
+    ada.put("r/closed", b"")
+    room.heard_from(ada, "r/open")
+    assert "r/closed" not in room.heard
+
+
+def test_plugins_do_not_load_and_nothing_says_so(tmp_path: Path) -> None:
+    session = opened("router", [], [], {"plugins/storage_manager": {"__required__": True}})
+    try:
+        assert not list(session.get(f"@/{session.zid()}/router/status/plugins/**", timeout=0.2))
+    finally:
+        session.close()  # type: ignore[no-untyped-call]
+
+
+def test_a_router_opens_without_those_whom_it_connects_to_and_finds_them_later(issued: Path) -> None:
+    room = Room(issued, {})
+    room.close()
+    retry = {"connect/retry": {"period_init_ms": 50, "period_max_ms": 100, "period_increase_factor": 2}}
+    early = opened("router", [], [room.endpoint], {**room.tls("ada"), **retry})
+    late = opened("router", [room.endpoint], [], room.tls("router"))
+    until(lambda: [link.auth_identifier for link in early.info.links()] == ["router.1"], "it finds the other")
+    early.close()  # type: ignore[no-untyped-call]
+    late.close()  # type: ignore[no-untyped-call]
+
+
+def test_two_cliques_of_peers_joined_by_two_routers_hear_everything_once(issued: Path) -> None:
+    room = Room(issued, {})
+    end = f"{LOCAL}/{issued}/far.sock"
+    far = opened("peer", [end], [], {})
+    gateway = opened("router", [], [end, room.endpoint], room.tls("ada"))
+    got: list[str] = []
+    try:
+        with far.declare_subscriber("r/**", lambda sample: got.append(str(sample.key_expr))):
+            until(lambda: room.peer.declare_publisher("r/x").matching_status.matching, "the far peer is known")
+            for key in ("r/x", "r/y", "r/end"):
+                room.peer.put(key, b"")
+            until(lambda: "r/end" in got, "it arrives")
+            assert got == ["r/x", "r/y", "r/end"]
+    finally:
+        for session in (gateway, far):
+            session.close()  # type: ignore[no-untyped-call]
+        room.close()
+
+
+def test_who_has_no_good_certificate_is_not_let_in(issued: Path, tmp_path: Path) -> None:
+    room = Room(issued, {})
+    now = datetime.now(UTC)
+    (foreign := tmp_path / "foreign").mkdir(mode=0o700)
+    authority.init(foreign, now)
+    authority.issue(foreign, "operator", "ada", now)
+    stranger = credentials.read(foreign / place.CREDENTIALS / "ada", now).options
+    none = {"transport/link/tls/root_ca_certificate": room.tls("ada")["transport/link/tls/root_ca_certificate"]}
+    try:
+        for options in (stranger, none):
+            with pytest.raises(zenoh.ZError):
+                opened("client", [], [room.endpoint], {**options, "connect/timeout_ms": 500})
+    finally:
+        room.close()
