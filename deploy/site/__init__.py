@@ -1,1 +1,1 @@
-"""A site: several machines and persons that share robots. Its folder, its certificates, and who has which."""
+"""A site: several machines and persons that share robots, with roles, certificates and access rules."""
