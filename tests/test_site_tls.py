@@ -28,11 +28,8 @@ def session(options: dict[str, Any], **more: Any) -> Iterator[zenoh.Session]:
     config = zenoh.Config()
     for path, value in {"scouting/multicast/enabled": False, **options, **more}.items():
         config.insert_json5(path, json.dumps(value))
-    opened = zenoh.open(config)
-    try:
+    with zenoh.open(config) as opened:
         yield opened
-    finally:
-        opened.close()
 
 
 @pytest.fixture(scope="module")
@@ -57,9 +54,8 @@ def endpoint(sites: Path) -> Iterator[str]:
     with session(
         options, **{"mode": "router", "listen/endpoints": [endpoint, endpoint.replace(HERE, BESIDE)]}
     ) as robot:
-        asked = robot.declare_queryable("word", lambda query: query.reply("word", WORD))
+        robot.declare_queryable("word", lambda query: query.reply("word", WORD))
         yield endpoint
-        asked.undeclare()
 
 
 def word(folder: Path, endpoint: str, address: str = HERE) -> str:
