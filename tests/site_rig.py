@@ -5,6 +5,7 @@ from __future__ import annotations
 import ssl
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import Any
 
 NOW = datetime(2031, 5, 1, 12, 0, tzinfo=UTC)
 DAY = timedelta(days=1)
@@ -61,7 +62,5 @@ def handshake(server: ssl.SSLContext, client: ssl.SSLContext, address: str = ADD
 
 
 def _common_name(end: ssl.SSLObject) -> str:
-    certificate = end.getpeercert()
-    assert certificate is not None
-    subject = certificate["subject"]
-    return next(value for ((key, value),) in subject if key == "commonName")
+    certificate: Any = end.getpeercert()
+    return next(str(value) for ((key, value),) in certificate["subject"] if key == "commonName")

@@ -268,7 +268,8 @@ def test_two_cliques_of_peers_joined_by_two_routers_hear_everything_once(issued:
     got: list[str] = []
     try:
         with far.declare_subscriber("r/**", lambda sample: got.append(str(sample.key_expr))):
-            until(lambda: room.peer.declare_publisher("r/x").matching_status.matching, "the far peer is known")
+            publisher = room.peer.declare_publisher("r/x")
+            until(lambda: publisher.matching_status.matching, "the far peer is known")  # type: ignore[attr-defined]
             for key in ("r/x", "r/y", "r/end"):
                 room.peer.put(key, b"")
             until(lambda: "r/end" in got, "it arrives")

@@ -37,7 +37,7 @@ AddressOption = Annotated[
 
 
 @pki.command()
-def init(site: SiteOption = None, as_json: JsonOption = False) -> None:
+def init(site: SiteOption = None, json: JsonOption = False) -> None:
     """Make the authority that issues the certificates of a site; once, on one machine."""
     from deploy.site import authority
 
@@ -50,7 +50,7 @@ def init(site: SiteOption = None, as_json: JsonOption = False) -> None:
         "expires": _iso(expires),
     }
     tell(
-        as_json,
+        json,
         data,
         f"{key.parent}: the authority, until {expires:%Y-%m-%d}. Whoever has {key} can become any machine of the site: "
         f"leave it on this machine, and keep a copy in a safe.\nNext: cocoro pki issue ROLE NAME",
@@ -69,14 +69,14 @@ def issue(
     days: DaysOption = place.DAYS,
     address: AddressOption = None,
     site: SiteOption = None,
-    as_json: JsonOption = False,
+    json: JsonOption = False,
 ) -> None:
     """Issue the certificate of a machine or person that has none."""
     from deploy.site import admitted, authority
 
     asked = admitted.role_of(role), admitted.named(name)
     now = _now()
-    _tell_issued(authority.issue(place.folder(site), *asked, now, addresses=address or (), days=days), now, as_json)
+    _tell_issued(authority.issue(place.folder(site), *asked, now, addresses=address or (), days=days), now, json)
 
 
 @pki.command()
@@ -85,35 +85,35 @@ def renew(
     days: DaysOption = place.DAYS,
     address: AddressOption = None,
     site: SiteOption = None,
-    as_json: JsonOption = False,
+    json: JsonOption = False,
 ) -> None:
     """Issue the next certificate of a name, with a new key. The former one stays valid until it expires."""
     from deploy.site import admitted, authority
 
     now, named = _now(), admitted.named(name)
-    _tell_issued(authority.renew(place.folder(site), named, now, addresses=address or None, days=days), now, as_json)
+    _tell_issued(authority.renew(place.folder(site), named, now, addresses=address or None, days=days), now, json)
 
 
 @pki.command()
-def revoke(name: NameArgument, site: SiteOption = None, as_json: JsonOption = False) -> None:
+def revoke(name: NameArgument, site: SiteOption = None, json: JsonOption = False) -> None:
     """Revoke all certificates of a name. A machine of the site refuses them when it has got the new admitted.toml."""
     from deploy.site import admitted, authority
 
     folder = place.folder(site)
     revoked = [each.common_name for each in authority.revoke(folder, admitted.named(name))]
     text = f"{', '.join(revoked)}: revoked. Copy {folder / place.ADMITTED} to every machine of the site now"
-    tell(as_json, {"revoked": revoked, "admitted": str(folder / place.ADMITTED)}, text)
+    tell(json, {"revoked": revoked, "admitted": str(folder / place.ADMITTED)}, text)
 
 
 @pki.command("list")
-def list_certificates(site: SiteOption = None, as_json: JsonOption = False) -> None:
+def list_certificates(site: SiteOption = None, json: JsonOption = False) -> None:
     """The certificates of the site: name, role, generation, expiry, and whether they are revoked."""
     from apps.cli.terminal import Column, print_table
     from deploy.site import admitted
 
     now, folder = _now(), place.folder(site)
     found = admitted.read(folder).certificate
-    if as_json:
+    if json:
         print_json([_row(each, now) for each in found])
     elif not found:
         print(f"no certificates in {folder / place.ADMITTED}: `cocoro pki issue ROLE NAME` issues one")
