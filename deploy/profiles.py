@@ -5,7 +5,7 @@ clock = "sim"                     # or "real"
 processes = ["sim", "perception", "planning", "executive"]
 objects = "objects.toml"          # known objects instead of the project's own; relative to this file
 
-[mesh]                            # see deploy.mesh_table.Mesh; on one machine it may be left out
+[mesh]                            # see deploy.mesh_table.Mesh; it may be left out
 [service.sim]                     # the settings of that component, and for any component:
 latency_s = 0.0                   #   added to every step, as if its computation took longer
 record_steps = false              #   publish the inputs and outputs of each step

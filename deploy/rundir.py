@@ -132,18 +132,13 @@ class RunDir:
 
         import msgspec
 
-        from cocoro.bus.endpoints import ZenohConfig, default
+        from cocoro.bus.endpoints import default
         from deploy.mesh_table import Mesh
 
         if mesh is None:
             mesh = msgspec.convert(self.resolved().get("mesh", {}), Mesh)
-        if not mesh.listen and not mesh.connect:
-            ours = default(self.robot, name, self.root)
-            return replace(
-                ours, lease_s=mesh.lease_s, patience_s=mesh.patience_s, shared_memory=frames, options=mesh.options
-            )
-        fields = msgspec.structs.asdict(mesh)
-        return ZenohConfig(name=name, shared_memory=frames, **fields)
+        ours = default(self.robot, name, self.root)
+        return replace(ours, shared_memory=frames, **msgspec.structs.asdict(mesh))
 
     def resolved(self) -> dict[str, Any]:
         """The profile of the last start, as data; empty when there is none or it is damaged. Raises ConfigError."""

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import socket
 import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -62,56 +60,6 @@ def test_who_demands_gl_where_there_is_none_is_told_in_a_line(shell: Shell) -> N
     line = one_line(told)
     assert line.startswith("sim ended (exit code 2) at its start: the moderngl renderer cannot run here")
     assert "apt install libegl1 libgl1 libgl1-mesa-dri" in line
-
-
-# --- an occupied place --------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def occupied() -> Iterator[str]:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        yield f"tcp/127.0.0.1:{server.getsockname()[1]}"
-
-
-@pytest.mark.parametrize("detach", [(), ("--detach",)])
-def test_an_occupied_port_is_named_in_a_line(shell: Shell, occupied: str, detach: tuple[str, ...]) -> None:
-    told = shell("up", shell.profile("good", extra=f'[mesh]\nlisten = ["{occupied}"]\n'), *detach)
-    assert told.returncode == exits.USAGE
-    line = one_line(told)
-    assert line.startswith(f"mesh of supervisor at {occupied}: another process listens there already; ")
-    assert "[mesh]" in line
-
-
-def test_a_component_whose_port_is_occupied_says_so_in_its_log_and_ends(shell: Shell, occupied: str) -> None:
-    profile = shell.profile("good", extra=f'[mesh]\nlisten = ["{occupied}"]\n')
-    told = shell("run", "good", "--profile", profile)
-    assert told.returncode == exits.USAGE
-    last = told.stderr.splitlines()[-1]
-    assert f" ERROR   good: mesh of good at {occupied}: another process listens there already; " in last
-    assert "[mesh]" in last
-    assert "Traceback" not in told.stderr
-
-
-def test_where_no_router_answers_it_is_named_in_a_line(shell: Shell) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        endpoint = f"tcp/127.0.0.1:{server.getsockname()[1]}"
-    told = shell("up", shell.profile("good", extra=f'[mesh]\nmode = "client"\nconnect = ["{endpoint}"]\n'))
-    assert told.returncode == exits.USAGE
-    assert one_line(told).startswith(f"no mesh at {endpoint}: no router answers there")
-
-
-def test_a_run_directory_that_cannot_be_is_named_in_a_line(shell: Shell, tmp_path: Path) -> None:
-    profile = shell.profile("good")
-    place = tmp_path / "a file"
-    place.touch()
-    told = subprocess.run(
-        [sys.executable, "-m", "apps.cli.main", "up", profile],
-        env=shell.env | {"COCORO_RUN_DIR": str(place)}, capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    assert told.returncode == exits.USAGE
-    assert one_line(told).startswith(
-        f"run directory {place}: Not a directory; put that right, or choose another by COCORO_RUN_DIR"
-    )
 
 
 # --- an unreadable scene ------------------------------------------------------------------------------

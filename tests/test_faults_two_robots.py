@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import socket
 from contextlib import AsyncExitStack
 from pathlib import Path
 from typing import Any
@@ -14,9 +13,7 @@ from robot_rig import HALTED_MPS, RobotRig
 from spelled import asked
 
 from cocoro import topics
-from cocoro.bus.endpoints import ZenohConfig
 from cocoro.bus.local import LocalMesh
-from cocoro.bus.zenoh import ZenohBus
 from cocoro.messages import TaskState
 from cocoro.testing import in_virtual_time
 from cocoro.topics import Topic
@@ -82,26 +79,14 @@ async def test_an_emergency_stop_of_one_robot_is_acknowledged_by_its_own_service
         assert (await other.ask("park")).accepted
 
 
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
-
-
 @pytest.mark.process
 @pytest.mark.zenoh
-def test_two_robots_behind_one_router_each_do_their_own(tmp_path: Path) -> None:
+def test_two_robots_on_one_machine_each_do_their_own(tmp_path: Path) -> None:
     async def scenario() -> None:
-        endpoint = f"tcp/127.0.0.1:{free_port()}"
-        mesh = f'[mesh]\nmode = "client"\nconnect = ["{endpoint}"]\n'
         small: dict[str, Any] = {"width": 160, "height": 120, "frame_rate_hz": 15.0}
         async with AsyncExitStack() as stack:
-            await stack.enter_async_context(
-                await ZenohBus.open(ZenohConfig(name="router", mode="router", listen=(endpoint,)))
-            )
             robots: list[LiveRobot] = [
-                await stack.enter_async_context(live(tmp_path, name=name, mesh=mesh, **small)) for name in (ONE, OTHER)
+                await stack.enter_async_context(live(tmp_path, name=name, **small)) for name in (ONE, OTHER)
             ]
             one, other = robots
             began_s = other.now_s

@@ -122,14 +122,10 @@ def test_a_profiles_own_files_are_found_from_anywhere(tmp_path: Path, monkeypatc
     assert profiles.read("./mine.toml").measured == str(tmp_path / "measured.toml")
 
 
-def test_it_meets_in_the_run_directory_unless_it_says_where(short_path: Path) -> None:
-    here = RunDir("r", short_path).join_as("planning", profiles.read("sim").mesh)
-    assert (here.directory, here.name) == (short_path / "r", "planning")
-    routed = written(
-        short_path, 'robot = "r"\nprocesses = ["sim"]\n[mesh]\nmode = "client"\nconnect = ["tls/base:7447"]'
-    )
-    away = RunDir("r", short_path).join_as("planning", profiles.read(routed).mesh)
-    assert (away.directory, away.mode, away.connect) == (None, "client", ("tls/base:7447",))
+def test_it_meets_in_the_run_directory_with_its_own_patience(short_path: Path) -> None:
+    patient = written(short_path, 'robot = "r"\nprocesses = ["sim"]\n[mesh]\nlease_s = 7.0')
+    here = RunDir("r", short_path).join_as("planning", profiles.read(patient).mesh)
+    assert (here.directory, here.name, here.lease_s) == (short_path / "r", "planning", 7.0)
 
 
 def test_a_profile_survives_being_written_and_read_as_json() -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.util
 import os
 import shutil
-import socket
 import sys
 import time
 from collections.abc import Iterable, Iterator, Mapping
@@ -97,7 +96,6 @@ def examine(profile: Profile) -> Iterator[Check]:
     yield _clock(profile)
     yield _shared_memory(profile, claims)
     yield from _disk(run_dir)
-    yield from _mesh(profile, run_dir)
     yield from stop_checks(profile.robot)
     yield from _site()
 
@@ -177,7 +175,7 @@ def _priority() -> Iterator[Check]:
 def _clock(profile: Profile) -> Check:
     if time.time() < EARLIEST_S:
         return bad("clock", f"it shows {time.strftime('%Y')}, which is wrong: set it, or enable systemd-timesyncd")
-    if profile.mesh.connect and not SYNCHRONISED.exists():
+    if place.found() is not None and not SYNCHRONISED.exists():
         return note("clock", "not known to be synchronised; the clocks of a robot's machines must agree to 0.1 s")
     return ok("clock", time.strftime("%Y-%m-%d %H:%M:%S"))
 
@@ -202,25 +200,6 @@ def _disk(run_dir: RunDir) -> Iterator[Check]:
         free_gb = shutil.disk_usage(there).free / 1e9
         text = f"{path}, {free_gb:.1f} GB free"
         yield ok(what, text) if free_gb >= ENOUGH_GB else bad(what, f"{text}: free some space")
-
-
-def _mesh(profile: Profile, run_dir: RunDir) -> Iterator[Check]:
-    mesh = profile.mesh
-    if not mesh.listen and not mesh.connect:
-        yield ok("mesh", f"on this machine, in {run_dir.path}")
-    for endpoint in mesh.connect:
-        yield _reachable(endpoint)
-    for endpoint in mesh.listen:
-        yield ok("mesh", f"listens at {endpoint}")
-
-
-def _reachable(endpoint: str) -> Check:
-    host, _, port = endpoint.partition("/")[2].partition("#")[0].rpartition(":")
-    try:
-        with socket.create_connection((host.strip("[]"), int(port)), timeout=2.0):
-            return ok("mesh", f"{endpoint} answers")
-    except (OSError, ValueError) as error:
-        return bad("mesh", f"{endpoint} does not answer ({error}): check its router and the address")
 
 
 def _site() -> Iterator[Check]:

@@ -47,7 +47,7 @@ _SOURCE = re.compile(r" at /\S+\.rs:\d+\.?")
 
 def no_mesh(config: ZenohConfig) -> MeshError:
     if config.mode == "client":
-        return MeshError(f"no mesh at {config.where}: no router answers there; start it, or correct the [mesh] table")
+        return MeshError(f"no mesh at {config.where}: no router answers there: is it up, and is the network?")
     return MeshError(f"no mesh at {config.where}: start one with `cocoro up`")
 
 
@@ -131,7 +131,7 @@ def _open(config: ZenohConfig, chosen: dict[str, Any]) -> zenoh.Session:
             raise no_mesh(config) from error
         what = _SOURCE.sub("", str(error))
         if "Address already in use" in what:
-            what = "another process listens there already; end that one, or choose another endpoint in the [mesh] table"
+            what = "another process listens there already; end that one, or choose another endpoint"
         raise MeshError(f"mesh of {config.name} at {', '.join(config.listen) or config.where}: {what}") from error
 
 

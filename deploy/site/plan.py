@@ -174,7 +174,7 @@ def read(where: Path) -> Site:
     try:
         data = tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise ConfigError(f"there is no site {path}: write one, see docs/sites.md") from None
+        raise ConfigError(f"there is no site {path}: write one; `cocoro site --help` says more") from None
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"site {path} cannot be read: {error}") from error
     except tomllib.TOMLDecodeError as error:
