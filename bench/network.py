@@ -1,7 +1,7 @@
 """Measures the emulated network of hosts (sim/network): delays, jitter, loss, throughput, and zenoh after a cut.
 
-Delays are compared with those that were asked for, one way, by the steady clock that all hosts share. Shares of a core are
-those of the switch, which forwards the packets. Runs as root.
+Delays are compared with those that were asked for, one way, by the steady clock that all hosts share. Shares of a core
+are those of the switch, which forwards the packets. Runs as root.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ def _delays(network: Network, count: int, report: Report) -> None:
     for settings in asked:
         network.links().set(**{"jitter_ms": 0.0, "distribution": "uniform", **settings})
         jitters, wanted_ms = "jitter_ms" in settings, float(settings["delay_ms"])
-        spans = [_one_direction_ms(pair) for _ in range(count)]
+        spans = [_one_way_ms(pair) for _ in range(count)]
         errors = [span - wanted_ms for span in spans]
         words = ", ".join(f"{key} {value}" for key, value in settings.items())
         if not jitters:
@@ -96,7 +96,7 @@ def _delays(network: Network, count: int, report: Report) -> None:
         end.close()
 
 
-def _one_direction_ms(pair: Pair) -> float:
+def _one_way_ms(pair: Pair) -> float:
     begun_ns = time.monotonic_ns()
     pair.sender.send(bytes(SMALL_BYTES))
     pair.receiver.recv(CHUNK)
