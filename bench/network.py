@@ -105,7 +105,8 @@ def _one_way_ms(pair: Pair) -> float:
     pair.sender.send(bytes(SMALL_BYTES))
     _, [(_, _, stamp)], _, _ = pair.receiver.recvmsg(SMALL_BYTES, 64)
     seconds, ns = struct.unpack("=qq", stamp)
-    return (seconds * 10**9 + ns - begun_ns) / 1e6
+    came_ns: int = seconds * 10**9 + ns
+    return (came_ns - begun_ns) / 1e6
 
 
 def _loss(network: Network, count: int, report: Report) -> None:

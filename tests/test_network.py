@@ -213,6 +213,36 @@ def test_the_reason_is_told_where_there_is_no_network_to_be_had(monkeypatch: pyt
         obstacle.cache_clear()
 
 
+def test_a_network_made_by_hand_obeys_lines_and_runs_commands_on_its_hosts() -> None:
+    if why := obstacle():
+        pytest.skip(why)
+    command = [sys.executable, "-m", "sim.network", "base", "brain"]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1) as process:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        first, second, _ = (process.stdout.readline().split() for _ in range(3))
+        assert [first[:2], second[:2]] == [["base", "10.77.0.1"], ["brain", "10.77.0.2"]]
+        told = subprocess.run([second[2], "sh", "-c", "hostname; pwd"], capture_output=True, text=True, check=True)
+        assert told.stdout.split() == ["brain", str(Path.cwd())]
+
+        def said(*lines: str) -> str:
+            assert process.stdin is not None
+            assert process.stdout is not None
+            process.stdin.write("\n".join([*lines, ""]))
+            return process.stdout.readline()
+
+        send = "import socket; socket.socket(socket.AF_INET, socket.SOCK_DGRAM).sendto(b'', ('brain', 5000))"
+        assert said("set base brain delay_ms=60e3", "counts").startswith("0 delivered")
+        subprocess.run([first[2], sys.executable, "-c", send], check=True)
+        wait_for(lambda: "1 underway" in said("counts base brain"))
+        assert "1 cut" in said("cut base", "heal", "counts")
+        assert "moon" in said("cut moon")
+        assert "loss" in said("set loss=7")
+        assert "'stop'" in said("stop")
+        process.stdin.close()
+        assert process.wait() == 0
+
+
 FAMILY = ["sh", "-c", "setsid sleep 1000 & echo $!; exec sleep 1000"]
 
 

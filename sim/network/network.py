@@ -80,13 +80,15 @@ class Link:
 
 class Host:
     """A computer of the network: a network, a host name, `/dev/shm` and COCORO directories of its own. The rest of the
-    file system, users and processes are those of this machine."""
+    file system, users and processes are those of this machine. This process is not on it: zenoh sessions and all else
+    that makes sockets in threads of its own need a process on the host."""
 
     def __init__(self, name: str, address: str, namespaces: Sequence[int], folder: Path) -> None:
         self.name = name
         self.address = address
         self._namespaces = tuple(namespaces)
         folder.mkdir(mode=0o700)
+        self.folder = folder
         self.env = {}
         """What `run` adds to the environment of this process."""
         for variable, place in (("RUN", "run"), ("STATE", "state"), ("CAPTURE", "captures")):
@@ -118,11 +120,10 @@ class Host:
 
     @property
     def prefix(self) -> list[str]:
-        """Words before a command line that have it run on the host, for those who cannot use `run`. COCORO directories
-        are in `env`."""
+        """Words before a command line that have it run on the host, for those who cannot use `run`."""
         spaces = zip(("net", "mount", "uts"), self._namespaces, strict=True)
         options = [f"--{kind}=/proc/{os.getpid()}/fd/{space}" for kind, space in spaces]
-        return ["nsenter", *options, f"--wd={Path.cwd()}", "--"]
+        return ["nsenter", *options, "--wd=.", "--", "env", *(f"{k}={v}" for k, v in self.env.items())]
 
     def end(self) -> None:
         """Ask what `run` has started to end, and kill what does not."""
@@ -177,14 +178,18 @@ class Network:
         self._channel, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with theirs:
             self._switch = child.start(
-                "sim.network", str(theirs.fileno()), site_packages=False,
+                "sim.network.switch", str(theirs.fileno()), site_packages=False,
                 env=child.environment_for(), pass_fds=(theirs.fileno(),),
             )  # fmt: skip
         try:
             self._channel.send(json.dumps(self._plan | {"hosts": addresses, "folder": str(self._folder)}).encode())
             kinds = len(linux.KINDS)
-            reply, spaces, _, _ = socket.recv_fds(self._channel, 65536, kinds * len(addresses))
-            self._read(reply)
+            room = kinds * len(addresses)
+            reply, spaces, _, _ = socket.recv_fds(self._channel, 65536, room, socket.MSG_CMSG_CLOEXEC)
+            try:
+                self._read(reply)
+            except ValueError as error:
+                raise CocoroError(f"no network of hosts here: {error}") from error
             for number, (name, address) in enumerate(addresses.items()):
                 own = spaces[number * kinds : (number + 1) * kinds]
                 self._hosts[name] = Host(name, address, own, self._folder / name)

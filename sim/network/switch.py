@@ -1,7 +1,8 @@
 """The switch: a process that carries IP packets between the devices of hosts, and obeys its owner's socket.
 
+`python -m sim.network.switch FD`, where FD is its end of a socket pair with the owner, `sim/network/network.py`.
 Requests and replies are JSON, a datagram each. When the owner closes its end, or dies, the switch kills what still runs
-in the hosts and ends, and nothing of the network is left.
+on the hosts and ends, and nothing of the network is left.
 """
 
 from __future__ import annotations
@@ -10,7 +11,9 @@ import json
 import os
 import select
 import shutil
+import signal
 import socket
+import sys
 import time
 from collections.abc import Sequence
 from contextlib import suppress
@@ -33,6 +36,7 @@ class Switch:
     ) -> None:
         """`devices` and `addresses`: of the hosts, in one order, by which requests name them."""
         self._owner = owner
+        self._sources = [owner.fileno(), *devices]
         self._mtu = mtu
         self._directions = {
             (a, b): Direction(f"{seed} {addresses[a]} {addresses[b]}")
@@ -40,7 +44,6 @@ class Switch:
             for b in range(len(devices))
             if a != b
         }
-        self._devices = devices
         self._targets: dict[int, dict[bytes, tuple[Direction, int]]] = {
             device: {
                 socket.inet_aton(addresses[b]): (self._directions[a, b], devices[b])
@@ -55,13 +58,12 @@ class Switch:
     def run(self) -> None:
         """Carry packets until the owner closes its end."""
         control = self._owner.fileno()
-        sources = [control, *self._devices]
         while True:
             wait_s = None
             if self._busy:
                 next_ns = min(direction.next_ns for direction in self._busy)
                 wait_s = None if next_ns == inf else max(0.0, (next_ns - time.monotonic_ns()) / 1e9)
-            ready, _, _ = select.select(sources, (), (), wait_s)
+            ready, _, _ = select.select(self._sources, (), (), wait_s)
             for source in ready:
                 if source != control:
                     self._read(source)
@@ -75,7 +77,10 @@ class Switch:
         for _ in range(BATCH):
             try:
                 packet = read(device, self._mtu)
-            except OSError:  # no more, or the device is down
+            except BlockingIOError:
+                return
+            except OSError:  # a process on the host has removed the device
+                self._sources.remove(device)
                 return
             target = targets.get(packet[16:20]) if packet[0] >> 4 == 4 else None
             if target is None:
@@ -158,3 +163,8 @@ def serve(owner: socket.socket) -> None:
     finally:
         linux.kill_all([host.namespaces[0] for host in made], but=(os.getpid(), os.getppid()))
         shutil.rmtree(folder, ignore_errors=True)
+
+
+if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the owner, whose end ends this process
+    serve(socket.socket(fileno=int(sys.argv[1])))
