@@ -81,6 +81,16 @@ def make_host(name: str, address: str, mtu: int, names: Path | None = None) -> M
     with suppress(OSError):  # a kernel without IPv6; the switch forwards IPv4 only
         Path("/proc/sys/net/ipv6/conf/default/disable_ipv6").write_text("1")
     device = os.open("/dev/net/tun", os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
+    try:
+        _set_up(device, address, mtu)
+    except OSError:
+        os.close(device)
+        raise
+    spaces = [os.open(f"/proc/thread-self/ns/{kind}", os.O_RDONLY | os.O_CLOEXEC) for kind in KINDS]
+    return Made(device, tuple(spaces))
+
+
+def _set_up(device: int, address: str, mtu: int) -> None:
     fcntl.ioctl(device, _SET_TUN, _request(DEVICE, struct.pack("=H", _TUN | _NO_HEADER)))
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as control:
 
@@ -93,8 +103,6 @@ def make_host(name: str, address: str, mtu: int, names: Path | None = None) -> M
         tell(_SET_QUEUE, struct.pack("=i", DEVICE_PACKETS))
         for name_of_device in (DEVICE, "lo"):
             tell(_SET_FLAGS, struct.pack("=H", _UP_AND_RUNNING), name_of_device)
-    spaces = [os.open(f"/proc/thread-self/ns/{kind}", os.O_RDONLY | os.O_CLOEXEC) for kind in KINDS]
-    return Made(device, tuple(spaces))
 
 
 def _request(device: str, value: bytes) -> bytes:
