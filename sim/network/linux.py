@@ -122,12 +122,16 @@ def enter(namespaces: Collection[int]) -> None:
         _check(_libc.setns(descriptor, kind), "setns")
 
 
-def be_punctual() -> None:
-    """Wake this process to the microsecond, and before those that it forwards for: a real network does not wait for the
-    processors of its hosts."""
-    _libc.prctl(_TIMER_SLACK, 1, 0, 0, 0)
+def run_first(pid: int) -> None:
+    """Have a process run before those that it forwards for: a real network does not wait for the processors of its
+    hosts."""
     with suppress(OSError):  # not allowed in some containers
-        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
+        os.sched_setscheduler(pid, os.SCHED_RR, os.sched_param(1))
+
+
+def be_punctual() -> None:
+    """Wake this process to the microsecond also where it may not run first."""
+    _libc.prctl(_TIMER_SLACK, 1, 0, 0, 0)
 
 
 def kill_all(networks: Collection[int], but: Collection[int]) -> None:

@@ -181,6 +181,7 @@ class Network:
                 "sim.network.switch", str(theirs.fileno()), site_packages=False,
                 env=child.environment_for(), pass_fds=(theirs.fileno(),),
             )  # fmt: skip
+        linux.run_first(self._switch.pid)
         try:
             self._channel.send(json.dumps(self._plan | {"hosts": addresses, "folder": str(self._folder)}).encode())
             kinds = len(linux.KINDS)
