@@ -65,6 +65,7 @@ ENTRIES: dict[str, Entry] = {
     "hardware-faults": Entry("hardware_faults"),
     "idle": Entry("idle"),
     "installs": Entry("installs"),
+    "network": Entry("network"),
     "pursuit": Entry("pursuit"),
     "readme": Entry("readme"),
     "rehearsals": Entry("rehearsals"),

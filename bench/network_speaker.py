@@ -1,0 +1,108 @@
+"""A zenoh session on a host of an emulated network, for `bench/network.py` and tests.
+
+`python -m bench.network_speaker router|client ENDPOINT LEASE_S LIFE_S`. The router listens and puts a message with a
+number on `tick`, at most fifty times a second. The client subscribes to it and prints the time of the steady clock and
+the number; for each line of its standard input it asks the router's `echo` and prints the reply. Both have the
+project's options of a session, print `ready` first, and end after LIFE_S.
+"""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+from itertools import count
+from typing import Any
+
+import zenoh
+
+from cocoro.bus.endpoints import ZenohConfig
+from cocoro.bus.session import open_session, options
+from sim.network.network import Host
+
+PERIOD_S = 0.02
+IDENTITIES = {"router": "a1", "client": "b2"}
+
+
+def opened(mode: str, endpoint: str, lease_s: float) -> zenoh.Session:
+    if mode == "router":
+        config = ZenohConfig("router", mode="router", listen=(endpoint,), lease_s=lease_s)
+    else:
+        config = ZenohConfig("client", mode="client", connect=(endpoint,), lease_s=lease_s, patience_s=10.0)
+    chosen = options(config, IDENTITIES[mode], [*config.listen], [*config.connect])
+    return open_session(config, chosen).session
+
+
+def route(session: zenoh.Session) -> None:
+    session.declare_queryable("echo", lambda query: query.reply("echo", str(query.parameters)))
+    print("ready", flush=True)
+    for number in count():
+        session.put("tick", str(number))
+        time.sleep(PERIOD_S)
+
+
+def listen(session: zenoh.Session) -> None:
+    session.declare_subscriber("tick", lambda tick: print(time.monotonic(), tick.payload.to_string(), flush=True))
+    print("ready", flush=True)
+    for line in sys.stdin:
+        for reply in session.get(f"echo?{line.strip()}", timeout=10.0):
+            print("reply", reply.ok.payload.to_string() if reply.ok else "", flush=True)
+
+
+class Speaker:
+    """The process of a speaker, from outside."""
+
+    def __init__(self, host: Host, mode: str, endpoint: str, lease_s: float = 4.0, life_s: int = 60) -> None:
+        """Starts it and waits until it is ready. Who waits for a speaker fails when its life is over."""
+        argv = [sys.executable, "-m", "bench.network_speaker", mode, endpoint, str(lease_s), str(life_s)]
+        self._process: subprocess.Popen[Any] = host.run(
+            argv, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1
+        )
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._input, self._output = self._process.stdin, self._process.stdout
+        self._line("ready")
+
+    def _line(self, *first: str) -> list[str]:
+        """The words of the next line that begins with one of `first`, or with a number where none is given."""
+        for line in self._output:
+            words: list[str] = line.split()
+            if words[0] in first or (not first and words[0][0].isdigit()):
+                return words
+        raise RuntimeError("the speaker has ended")
+
+    def tick(self) -> tuple[float, int]:
+        """When the client printed the next message, s, and its number. Waits for it."""
+        when, number = self._line()
+        return float(when), int(number)
+
+    def tick_from(self, number: int) -> int:
+        """The first message whose number is at least `number`."""
+        while (found := self.tick()[1]) < number:
+            pass
+        return found
+
+    def heard_after(self, when_s: float) -> float:
+        """When the client printed its first message later than `when_s`."""
+        while (found_s := self.tick()[0]) <= when_s:
+            pass
+        return found_s
+
+    def ask(self, word: str) -> str:
+        """The router's answer, by the client."""
+        self._input.write(f"{word}\n")
+        return self._line("reply")[1]
+
+    def close(self) -> None:
+        self._input.close()
+        self._process.kill()
+        self._process.wait()
+        self._output.close()
+
+
+if __name__ == "__main__":
+    mode, endpoint, lease_s, life_s = sys.argv[1:]
+    signal.alarm(int(life_s))
+    with opened(mode, endpoint, float(lease_s)) as session:
+        (route if mode == "router" else listen)(session)
