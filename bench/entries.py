@@ -71,6 +71,7 @@ ENTRIES: dict[str, Entry] = {
     "rehearsals": Entry("rehearsals"),
     "rooms": Entry("rooms"),
     "servos": Entry("servos"),
+    "site": Entry("site"),
     "starved": Entry("starved"),
     "stop": Entry("stop"),
     "stop-restarts": Entry("stop_restarts"),
