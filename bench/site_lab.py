@@ -27,7 +27,7 @@ from cocoro.robot import Robot
 from deploy.profiles import read as read_profile
 from deploy.rundir import RunDir
 from deploy.site import authority, place
-from deploy.site.plan import Role
+from deploy.site.roles import Role
 from sim.judge import HELD_S, Judge, Verdict
 from sim.network.network import Host, Network
 from sim.random_scene import find_scene

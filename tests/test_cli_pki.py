@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from site_rig import LAB
 
 from apps.cli import exits, pki
 from apps.cli.main import main
@@ -255,3 +256,15 @@ def test_doctor_says_nothing_of_sites_without_one_and_names_a_damaged_one(
     (lab / "admitted.toml").write_text("authority = 1\n")
     state, text = checks(lab, NOW)["site"]
     assert (state, "authority" in text) == ("bad", True)
+
+
+def test_a_certificate_has_the_role_and_the_addresses_of_the_plan(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "site.toml").write_text(LAB, encoding="utf-8")
+    at = ("--site", str(tmp_path))
+    assert main(["pki", "init", *at]) == exits.DONE
+    assert main(["pki", "issue", "robot", "body", *at]) == exits.DONE
+    assert "at 10.77.0.1" in capsys.readouterr().out
+    assert main(["pki", "issue", "operator", "eve", *at]) == exits.USAGE
+    assert "eve is viewer by " in capsys.readouterr().err

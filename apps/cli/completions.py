@@ -89,7 +89,7 @@ def joints() -> Iterable[str]:
 
 @_names
 def roles() -> Iterable[str]:
-    from deploy.site.admitted import ROLES
+    from deploy.site.roles import ROLES
 
     return ROLES
 

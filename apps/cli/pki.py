@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -10,6 +11,7 @@ import typer
 from apps.cli import completions
 from apps.cli.options import JsonOption, SiteOption
 from apps.cli.output import print_json, tell
+from cocoro.errors import ConfigError
 from deploy.site import place
 
 if TYPE_CHECKING:
@@ -31,7 +33,8 @@ AddressOption = Annotated[
     typer.Option(
         "--address",
         metavar="ADDRESS",
-        help="IP address or name at which others connect to this machine. Repeatable. `renew` keeps the former ones.",
+        help="IP address or name at which others connect to this machine. Repeatable. By default those of the plan; "
+        "`renew` keeps the former ones.",
     ),
 ]
 
@@ -75,8 +78,9 @@ def issue(
     from deploy.site import admitted, authority
 
     asked = admitted.role_of(role), admitted.named(name)
-    now = _now()
-    _tell_issued(authority.issue(place.folder(site), *asked, now, addresses=address or (), days=days), now, json)
+    folder, now = place.folder(site), _now()
+    addresses = _planned(folder, *asked) if address is None else address
+    _tell_issued(authority.issue(folder, *asked, now, addresses=addresses, days=days), now, json)
 
 
 @pki.command()
@@ -123,6 +127,19 @@ def list_certificates(site: SiteOption = None, json: JsonOption = False) -> None
             Column("days left", right=True), Column("state"), Column("addresses", 1),
         )  # fmt: skip
         print_table(columns, [_cells(each, now) for each in found])
+
+
+def _planned(folder: Path, role: str, name: str) -> tuple[str, ...]:
+    """The addresses at which a name listens by the site's plan, if there is one. Raises ConfigError when the plan gives
+    it another role."""
+    from deploy.site import plan
+
+    if not (folder / place.PLAN).is_file():
+        return ()
+    site = plan.read(folder)
+    if name in site.principals and site.role(name) != role:
+        raise ConfigError(f"{name} is {site.role(name)} by {folder / place.PLAN}, not {role}")
+    return site.addresses(name)
 
 
 def _tell_issued(issued: Issued, now: datetime, as_json: bool) -> None:

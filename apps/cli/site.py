@@ -148,7 +148,7 @@ def problems(found: Site) -> list[str]:
             missing.append(f"{name}'s certificate is revoked or has expired: cocoro pki renew {name}")
         missing += [
             f"{name} listens at {at}, which its certificate does not name: cocoro pki renew {name} --address {at}"
-            for at in _addresses(found, name)
+            for at in found.addresses(name)
             if at not in newest.addresses
         ]
     missing += [
@@ -161,7 +161,7 @@ def steps_of(found: Site) -> list[tuple[str, str, str]]:
     """The steps to a running site: where, what to run there, and why."""
     steps = [("authority", "cocoro pki init", "once: makes the key that signs all certificates; it stays here")]
     for name in found.principals:
-        at = [f"--address {address}" for address in _addresses(found, name)]
+        at = [f"--address {address}" for address in found.addresses(name)]
         command = " ".join(("cocoro pki issue", found.role(name), name, *at))
         steps.append(("authority", command, f"writes {place.CREDENTIALS}/{name}"))
     files = f"{place.PLAN} {place.ADMITTED}"
@@ -178,12 +178,6 @@ def steps_of(found: Site) -> list[tuple[str, str, str]]:
         for name, row in found.persons.items()
     ]
     return steps
-
-
-def _addresses(found: Site, name: str) -> list[str]:
-    """The addresses at which a principal listens, which its certificate must name."""
-    ends = found.hosts[name].listen if name in found.hosts else ()
-    return list(dict.fromkeys(end.removeprefix("tls/").rpartition(":")[0].strip("[]") for end in ends))
 
 
 def as_data(found: Site) -> dict[str, Any]:

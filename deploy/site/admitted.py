@@ -11,7 +11,7 @@ import tomllib
 from collections.abc import Iterable
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Literal, get_args
+from typing import Annotated
 
 import msgspec
 from msgspec import Meta
@@ -20,9 +20,8 @@ from cocoro.errors import ConfigError, choice_of, field_text
 from deploy.profiles import A_NAME, Name
 from deploy.site import files
 from deploy.site.place import ADMITTED
+from deploy.site.roles import ROLES, Role
 
-Role = Literal["robot", "brain", "operator", "viewer", "author"]
-ROLES: tuple[Role, ...] = get_args(Role)
 Time = Annotated[datetime, Meta(tz=True)]
 HEAD = "# Who has a certificate of this site. `cocoro pki` writes this file; copy it to every machine of the site.\n"
 DAY_S = 86_400

@@ -30,8 +30,9 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from cocoro.errors import ConfigError, RefusedError
 from deploy.site import admitted, files
-from deploy.site.admitted import Admitted, Certificate, Role
+from deploy.site.admitted import Admitted, Certificate
 from deploy.site.place import ADMITTED, AUTHORITY, CA_CERT, CA_KEY, CERT, CREDENTIALS, DAYS, KEY
+from deploy.site.roles import Role
 
 AUTHORITY_DAYS = 3650
 SKEW = timedelta(hours=1)

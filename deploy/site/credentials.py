@@ -21,9 +21,10 @@ from cryptography.x509.oid import NameOID
 
 from cocoro.errors import ConfigError
 from deploy.site import files
-from deploy.site.admitted import Role, named, role_of
+from deploy.site.admitted import named, role_of
 from deploy.site.authority import fingerprint
 from deploy.site.place import CA_CERT, CERT, KEY
+from deploy.site.roles import Role
 
 TLS = "transport/link/tls"
 COPY = "copy the whole folder again from the machine that issues"

@@ -26,7 +26,7 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, TypeVar
+from typing import Annotated, Any, NamedTuple, TypeVar
 
 import msgspec
 from msgspec import Meta
@@ -38,11 +38,9 @@ from deploy.processes import COMPONENTS, components, hardware, named
 from deploy.profiles import Name, Profile
 from deploy.site.component import GATEWAY, gateway_of
 from deploy.site.place import PLAN
+from deploy.site.roles import HostRole, PersonRole, Role
 
 T = TypeVar("T", bound=msgspec.Struct)
-HostRole = Literal["robot", "brain"]
-PersonRole = Literal["operator", "viewer", "author"]
-Role = HostRole | PersonRole
 Endpoint = Annotated[str, Meta(pattern=r"\Atls/(\[[0-9a-fA-F:]+\]|[A-Za-z0-9.-]+):[0-9]{1,5}\Z")]
 AN_ENDPOINT = "an endpoint is written as tls/ADDRESS:PORT"
 
@@ -110,6 +108,11 @@ class Site(NamedTuple):
     @property
     def principals(self) -> tuple[str, ...]:
         return (*self.hosts, *self.persons)
+
+    def addresses(self, name: str) -> tuple[str, ...]:
+        """The addresses at which a principal listens, which its certificate must name."""
+        ends = self.hosts[name].listen if name in self.hosts else ()
+        return tuple(dict.fromkeys(end.removeprefix("tls/").rpartition(":")[0].strip("[]") for end in ends))
 
     def host(self, name: str) -> HostRow:
         """Raises ConfigError for a host that the site does not have."""

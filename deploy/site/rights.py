@@ -17,7 +17,8 @@ from cocoro.component import Component
 from cocoro.installed import all_requests
 from cocoro.keys import alive_key, matches, recorder_key
 from cocoro.topics import ABOUT, ANY, CLOCK, EXCHANGES, HEALTH, STEPS, TOPICS, TRUTH, Request, Right, Topic
-from deploy.site.plan import Role, Site
+from deploy.site.plan import Site
+from deploy.site.roles import Role
 from services.executive.askers import asker_key
 
 OF_PERSONS: dict[Role, tuple[Right, ...]] = {
