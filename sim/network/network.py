@@ -18,6 +18,7 @@ import subprocess
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
@@ -125,11 +126,15 @@ class Host:
         return ["nsenter", *options, "--wd=.", "--", "env", *(f"{k}={v}" for k, v in self.env.items())]
 
     def end(self) -> None:
-        """Ask what `run` has started to end, and kill what does not."""
+        """Ask what `run` has started to end, kill what does not, and close the pipes to it."""
         for process in self._processes:
             process.terminate()
         for process in self._processes:
             child.wait_or_kill(process, END_S)
+            for pipe in (process.stdin, process.stdout, process.stderr):
+                with suppress(BrokenPipeError):  # what nobody has read
+                    if pipe is not None:
+                        pipe.close()
         self._processes.clear()
 
     def close(self) -> None:
