@@ -22,6 +22,7 @@ from cocoro.bus.session import open_session, options
 from sim.network.network import Host
 
 PERIOD_S = 0.02
+PATIENCE_S = 60.0
 IDENTITIES = {"router": "a1", "client": "b2"}
 
 
@@ -29,7 +30,7 @@ def opened(mode: str, endpoint: str, lease_s: float) -> zenoh.Session:
     if mode == "router":
         config = ZenohConfig("router", mode="router", listen=(endpoint,), lease_s=lease_s)
     else:
-        config = ZenohConfig("client", mode="client", connect=(endpoint,), lease_s=lease_s, patience_s=10.0)
+        config = ZenohConfig("client", mode="client", connect=(endpoint,), lease_s=lease_s, patience_s=PATIENCE_S)
     chosen = options(config, IDENTITIES[mode], [*config.listen], [*config.connect])
     return open_session(config, chosen).session
 
@@ -46,15 +47,16 @@ def listen(session: zenoh.Session) -> None:
     session.declare_subscriber("tick", lambda tick: print(time.monotonic(), tick.payload.to_string(), flush=True))
     print("ready", flush=True)
     for line in sys.stdin:
-        for reply in session.get(f"echo?{line.strip()}", timeout=10.0):
+        for reply in session.get(f"echo?{line.strip()}", timeout=PATIENCE_S):
             print("reply", reply.ok.payload.to_string() if reply.ok else "", flush=True)
 
 
 class Speaker:
     """The process of a speaker, from outside."""
 
-    def __init__(self, host: Host, mode: str, endpoint: str, lease_s: float = 4.0, life_s: int = 60) -> None:
-        """Starts it and waits until it is ready. Who waits for a speaker fails when its life is over."""
+    def __init__(self, host: Host, mode: str, endpoint: str, lease_s: float = 4.0, life_s: int = 300) -> None:
+        """Starts it and waits until it is ready; it is ended with the network. Who waits for a speaker fails when
+        its life is over."""
         argv = [sys.executable, "-m", "bench.network_speaker", mode, endpoint, str(lease_s), str(life_s)]
         self._process: subprocess.Popen[Any] = host.run(
             argv, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1
@@ -93,12 +95,6 @@ class Speaker:
         """The router's answer, by the client."""
         self._input.write(f"{word}\n")
         return self._line("reply")[1]
-
-    def close(self) -> None:
-        self._input.close()
-        self._process.kill()
-        self._process.wait()
-        self._output.close()
 
 
 if __name__ == "__main__":

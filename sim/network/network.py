@@ -15,10 +15,10 @@ import re
 import shutil
 import socket
 import subprocess
-import tempfile
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
@@ -126,11 +126,15 @@ class Host:
         return ["nsenter", *options, "--wd=.", "--", "env", *(f"{k}={v}" for k, v in self.env.items())]
 
     def end(self) -> None:
-        """Ask what `run` has started to end, and kill what does not."""
+        """Ask what `run` has started to end, kill what does not, and close the pipes to it."""
         for process in self._processes:
             process.terminate()
         for process in self._processes:
             child.wait_or_kill(process, END_S)
+            for pipe in (process.stdin, process.stdout, process.stderr):
+                with suppress(BrokenPipeError):  # what nobody has read
+                    if pipe is not None:
+                        pipe.close()
         self._processes.clear()
 
     def close(self) -> None:
@@ -166,15 +170,10 @@ class Network:
         self._plan = {"mtu": mtu, "seed": seed}
         self._lock = threading.Lock()
         self._hosts: dict[str, Host] = {}
+        self._folder: Path | None = None
 
     def __enter__(self) -> Network:
-        # Its paths must leave room for those of sockets, which take 107 bytes at most.
-        self._folder = Path(tempfile.mkdtemp(prefix="cocoro-", dir=min(tempfile.gettempdir(), "/tmp", key=len)))
         addresses = {name: f"{NETWORK}.{number}" for number, name in enumerate(self._names, 1)}
-        lines = [f"{address} {name}\n" for name, address in addresses.items()]
-        names = self._folder / "hosts"
-        names.write_text("127.0.0.1 localhost\n::1 localhost\n" + "".join(lines))
-        names.chmod(0o644)
         self._channel, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with theirs:
             self._switch = child.start(
@@ -183,17 +182,17 @@ class Network:
             )  # fmt: skip
         linux.run_first(self._switch.pid)
         try:
-            self._channel.send(json.dumps(self._plan | {"hosts": addresses, "folder": str(self._folder)}).encode())
+            self._channel.send(json.dumps(self._plan | {"hosts": addresses}).encode())
             kinds = len(linux.KINDS)
             room = kinds * len(addresses)
             reply, spaces, _, _ = socket.recv_fds(self._channel, 65536, room, socket.MSG_CMSG_CLOEXEC)
             try:
-                self._read(reply)
+                folder = self._folder = Path(self._read(reply))
             except ValueError as error:
                 raise CocoroError(f"no network of hosts here: {error}") from error
             for number, (name, address) in enumerate(addresses.items()):
                 own = spaces[number * kinds : (number + 1) * kinds]
-                self._hosts[name] = Host(name, address, own, self._folder / name)
+                self._hosts[name] = Host(name, address, own, folder / name)
         except BaseException:
             self.__exit__()
             raise
@@ -210,7 +209,8 @@ class Network:
                     host.kill_all()
             for host in self._hosts.values():
                 host.close()
-            shutil.rmtree(self._folder, ignore_errors=True)
+            if self._folder is not None:
+                shutil.rmtree(self._folder, ignore_errors=True)
 
     def host(self, name: str) -> Host:
         return self._hosts[name]

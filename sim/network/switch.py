@@ -14,6 +14,7 @@ import shutil
 import signal
 import socket
 import sys
+import tempfile
 import time
 from collections.abc import Sequence
 from contextlib import suppress
@@ -143,28 +144,36 @@ class Switch:
 
 
 def serve(owner: socket.socket) -> None:
-    """Make the hosts that the first request describes, answer with their namespaces, and carry packets."""
-    plan = json.loads(owner.recv(REQUEST_BYTES))
-    folder = Path(plan["folder"])
+    """Make the hosts that the first request describes, answer with their folder and namespaces, and carry packets."""
+    request = owner.recv(REQUEST_BYTES)
+    if not request:
+        return
+    plan, made = json.loads(request), list[linux.Made]()
+    # Its paths must leave room for those of sockets, which take 107 bytes at most.
+    folder = Path(tempfile.mkdtemp(prefix="cocoro-", dir=min(tempfile.gettempdir(), "/tmp", key=len)))
     try:
-        made = [
-            linux.in_thread(partial(linux.make_host, name, address, plan["mtu"], folder / "hosts"))
-            for name, address in plan["hosts"].items()
-        ]
+        names = folder / "hosts"
+        lines = [f"{address} {name}\n" for name, address in plan["hosts"].items()]
+        names.write_text("127.0.0.1 localhost\n::1 localhost\n" + "".join(lines))
+        names.chmod(0o644)
+        for name, address in plan["hosts"].items():
+            made.append(linux.in_thread(partial(linux.make_host, name, address, plan["mtu"], names)))
+        linux.be_punctual()
+        switch = Switch(owner, [host.device for host in made], [*plan["hosts"].values()], plan["mtu"], plan["seed"])
+        socket.send_fds(
+            owner, [json.dumps(str(folder)).encode()], [space for host in made for space in host.namespaces]
+        )
+        switch.run()
+    except ConnectionError:
+        pass  # the owner has ended
     except OSError as error:
         owner.send(json.dumps({"error": str(error)}).encode())
-        return
-    spaces = [space for host in made for space in host.namespaces]
-    linux.be_punctual()
-    switch = Switch(owner, [host.device for host in made], [*plan["hosts"].values()], plan["mtu"], plan["seed"])
-    socket.send_fds(owner, [b"null"], spaces)
-    try:
-        switch.run()
     finally:
         linux.kill_all([host.namespaces[0] for host in made], but=(os.getpid(), os.getppid()))
         shutil.rmtree(folder, ignore_errors=True)
 
 
 if __name__ == "__main__":
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the owner, whose end ends this process
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)  # these are for the owner, whose end ends this process
     serve(socket.socket(fileno=int(sys.argv[1])))
