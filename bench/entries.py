@@ -72,6 +72,7 @@ ENTRIES: dict[str, Entry] = {
     "rooms": Entry("rooms"),
     "servos": Entry("servos"),
     "site": Entry("site"),
+    "site-cuts": Entry("site_cuts"),
     "starved": Entry("starved"),
     "stop": Entry("stop"),
     "stop-restarts": Entry("stop_restarts"),
