@@ -73,6 +73,7 @@ ENTRIES: dict[str, Entry] = {
     "servos": Entry("servos"),
     "site": Entry("site"),
     "site-cuts": Entry("site_cuts"),
+    "site-latency": Entry("site_latency"),
     "starved": Entry("starved"),
     "stop": Entry("stop"),
     "stop-restarts": Entry("stop_restarts"),

@@ -1,0 +1,108 @@
+"""The time on the way from host to host: `python -m bench site-latency`.
+
+A wheel command from a Node on the brain's host to a Node on the robot's, by both hosts' gateways, with mutual TLS,
+access rules and all limits; beside it, in turns in the same processes, raw zenoh over TLS straight from one program to
+the other. The same for frames, the other way.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from bench.report import Report
+from bench.site_lab import ROBOT, Lab, lab
+from bench.trials import number_of, sized
+from cocoro.errors import ConfigError
+from deploy.rundir import RunDir
+from deploy.site import place, plan
+from deploy.site.component import gateway_of
+from sim.network.network import Host, obstacle
+
+RAW_PORT = 7448
+FRAME_HZ = 5.0
+COMMAND_HZ = 50.0
+PATIENCE_S = 60.0
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--count", type=number_of, help="commands each way (1500)")
+    parser.add_argument("--delay-ms", type=float, default=0.0, help="of the network, each way (0)")
+
+
+def gateways(site: Lab) -> None:
+    """Starts the gateways of both hosts alone, without the robot."""
+    for host in (site.body, site.brain):
+        share = plan.read(site.site_of(host)).share_profile(host.name)
+        name = gateway_of(host.name).name
+        run_dir = RunDir(ROBOT, host.folder / "run")
+        run_dir.make()
+        run_dir.remember(msgspec.json.encode(msgspec.structs.replace(share, processes=(name,))))
+        log = (host.folder / f"{name}.log").open("wb")
+        host.run([sys.executable, "-m", "deploy.launch", name, "--run-dir", run_dir.path], stderr=log)
+
+
+def speaker(site: Lab, host: Host, more: dict[str, Any]) -> subprocess.Popen[str]:
+    given = {
+        "robot": ROBOT,
+        "run": str(host.folder / "run"),
+        "raw": f"tls/{site.body.address}:{RAW_PORT}",
+        "credentials": str(site.site_of(host) / place.CREDENTIALS / host.name),
+        **more,
+    }
+    argv = [sys.executable, "-m", "bench.site_speaker", host.name, json.dumps(given)]
+    return host.run(argv, stdout=subprocess.PIPE, text=True)
+
+
+def high(times: Sequence[float]) -> float:
+    """The 99th percentile."""
+    return sorted(times)[int(0.99 * (len(times) - 1))]
+
+
+def measure(chosen: argparse.Namespace, report: Report) -> None:
+    if why := obstacle():
+        raise ConfigError(f"there can be no network of hosts here: {why}")
+    commands = sized(chosen, chosen.count, 1500, 200)
+    seconds = commands / COMMAND_HZ
+    more = {"commands": commands, "frames": round(seconds * FRAME_HZ), "frame_hz": FRAME_HZ, "seconds": seconds}
+    took: dict[str, list[float]] = {}
+    with tempfile.TemporaryDirectory(prefix="site") as name, lab(Path(name)) as site:
+        site.network.links().set(delay_ms=chosen.delay_ms)
+        gateways(site)
+        ends = [speaker(site, host, more) for host in (site.body, site.brain)]
+        for end in ends:
+            said, _ = end.communicate(timeout=PATIENCE_S + seconds)
+            found = json.loads(said)
+            took |= {name: [ns / 1e6 for ns in times] for name, times in found.items() if times}
+    for what, sent in (("command", commands), ("frame", more["frames"])):
+        node, raw = took.get(f"node {what}", []), took.get(f"raw {what}", [])
+        if not node or not raw:
+            raise ConfigError(f"no {what} came through: {', '.join(sorted(took)) or 'nothing at all'}")
+        report.value(f"a {what} from host to host, Node to Node", node, "ms")
+        report.value(f"a {what} from host to host, raw zenoh over TLS", raw, "ms")
+        report.value(f"a {what}, Node to Node, 99 of 100", [high(node)], "ms")
+        report.value(f"a {what}, raw, 99 of 100", [high(raw)], "ms")
+        bound = 1.3 if what == "command" else None
+        report.ratio(
+            f"a {what}: Node / raw, median", *_blocks(node, raw, statistics.median), at_most=bound, better="less"
+        )
+        report.ratio(f"a {what}: Node / raw, 99 of 100", *_blocks(node, raw, high), at_most=bound, better="less")
+        report.share(f"{what}s that came, Node to Node", len(node), sent)
+
+
+def _blocks(node: list[float], raw: list[float], kind: Any) -> tuple[list[float], list[float]]:
+    """A figure of each of up to five equal blocks of both series, which were taken in turns."""
+    count = max(1, min(5, len(node) // 100, len(raw) // 100))
+    return tuple(  # type: ignore[return-value]
+        [kind(times[at * len(times) // count : (at + 1) * len(times) // count]) for at in range(count)]
+        for times in (node, raw)
+    )
