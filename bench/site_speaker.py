@@ -106,7 +106,7 @@ async def speak(role: str, options: dict[str, Any]) -> dict[str, list[int]]:
             else:
                 raw_frames.put(stamped(pixels))
         await asyncio.sleep(max(0.0, begun_s + options["seconds"] - time.monotonic()) + SETTLE_S)
-        heard.undeclare()
+        heard.undeclare()  # type: ignore[no-untyped-call]
     raw.close()  # type: ignore[no-untyped-call]
     return took
 
