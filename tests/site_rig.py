@@ -7,6 +7,33 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
+HALL = """
+name = "hall"
+[robot.a]
+profile = "sim"
+[robot.b]
+profile = "sim"
+[host.hub]
+role = "hub"
+listen = ["tls/10.77.0.9:7447"]
+[host.one]
+role = "robot"
+robot = "a"
+processes = ["capture", "sim", "perception", "planning", "executive"]
+[host.two]
+role = "robot"
+robot = "b"
+processes = ["capture", "sim"]
+[host.mind]
+role = "brain"
+robot = "b"
+processes = ["perception", "planning", "executive"]
+[person.ada]
+role = "operator"
+[person.bo]
+role = "viewer"
+robots = ["b"]
+"""
 NOW = datetime(2031, 5, 1, 12, 0, tzinfo=UTC)
 DAY = timedelta(days=1)
 ADDRESS = "10.77.0.1"

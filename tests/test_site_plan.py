@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from site_rig import LAB
+from site_rig import HALL, LAB
 
 from cocoro.errors import ConfigError
 from deploy.site import plan
@@ -123,3 +123,28 @@ def test_names_that_the_site_does_not_have_are_told_with_those_that_it_has(tmp_p
         site.host("brian")
     with pytest.raises(ConfigError, match=r"site lab has no host and no person 'adda'; .*did you mean ada"):
         site.role("adda")
+
+
+def test_a_hub_joins_the_hosts_of_all_robots_and_the_persons(tmp_path: Path) -> None:
+    site = read(tmp_path, HALL)
+    assert {name: site.connects(name) for name in site.principals} == {
+        "hub": (), "one": ("hub",), "two": ("hub",), "mind": ("hub",), "ada": ("hub",), "bo": ("hub",),
+    }  # fmt: skip
+    assert site.robots_of("hub") == ("a", "b")
+    share = site.share_profile("hub")
+    assert (share.robot, share.processes) == ("hub", ("gateway-hub",))
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (('role = "hub"', 'role = "hub"\nprocesses = ["sim"]'), "a hub has its gateway alone"),
+        (('listen = ["tls/10.77.0.9:7447"]', ""), "a hub listens"),
+        (("[host.hub]", "[host.a]"), "a robot has this name"),
+        (('role = "robot"\nrobot = "a"', 'role = "robot"'), "each host names its own"),
+        (('role = "brain"', 'role = "brain"\nconnect = []'), "are not connected"),
+    ],
+)
+def test_a_hub_that_cannot_work_is_refused(change: tuple[str, str], told: str, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=told):
+        read(tmp_path, HALL.replace(*change))

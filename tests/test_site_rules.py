@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from site_rig import LAB
+from site_rig import HALL, LAB
 
 from cocoro.component import Component
 from cocoro.errors import ConfigError
@@ -188,3 +188,21 @@ def test_the_table_has_a_row_for_each_key_that_somebody_publishes_or_serves(lab:
     keys = {row.key for row in matrix(lab, ROBOT)}
     assert {"base/command", "sim/truth", "executive/run", "base/estop", "planning/alive", "bob/**"} <= keys
     assert "servos/about" not in keys, "no host of this site has the real servos"
+
+
+# --- a hub ----------------------------------------------------------------------------------------
+
+
+def test_a_hub_keeps_the_robots_apart_and_does_nothing_itself(tmp_path: Path) -> None:
+    (tmp_path / "site.toml").write_text(HALL, encoding="utf-8")
+    site = plan.read(tmp_path)
+    assert set(neighbours(site, "hub")) == {"one", "two", "mind", "ada", "bo"}
+    assert allows(site, "hub", "mind", IN, "put", "b/base/command")
+    assert not allows(site, "hub", "mind", IN, "put", "a/base/command")
+    assert allows(site, "hub", "ada", IN, "query", "a/executive/run")
+    assert not allows(site, "hub", "bo", OUT, "put", "a/base/state")
+    assert not any(rights(site, "hub", robot) != rights(site, "bo", "a") for robot in ("a", "b")), "no rights at all"
+    assert allows(site, "two", "hub", IN, "put", "b/base/command"), "the hub passes on what the mind commands"
+    assert not allows(site, "one", "hub", IN, "put", "a/base/command"), "and nobody commands the other one's wheels"
+    keys = {key for row in compiled(site, "hub", {})["low_pass_filter"] for key in row["key_exprs"]}
+    assert "*/base/command" in keys

@@ -64,7 +64,7 @@ def ways(given: str, robot: str | None, command: str) -> list[Way]:
     )
     found = []
     for one in theirs if robot is None else (robot,):
-        endpoints = tuple(end for host in site.listening(one) for end in site.hosts[host].listen)
+        endpoints = tuple(end for host in site.entrances(one) for end in site.hosts[host].listen)
         if not endpoints:
             raise ConfigError(f"site {site.name}: no host of {one} listens: give one listen = ['tls/ADDRESS:PORT']")
         config = ZenohConfig(command, mode="client", connect=endpoints, patience_s=PATIENCE_S, options=mine.options)

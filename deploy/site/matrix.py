@@ -45,7 +45,9 @@ def matrix(site: Site, robot: str) -> list[Row]:
     """The rows of a robot, in the order of the topic table; then requests, tokens, and the keys of authors."""
     names = [name for name in site.principals if robot in site.robots_of(name)]
     may = {name: rights(site, name, robot) for name in names}
-    services = [service for name in site.hosts if robot in site.robots_of(name) for service in _nodes(site, name)]
+    hosts = [name for name in site.hosts if robot in site.robots_of(name) and not site.is_hub(name)]
+    names = [name for name in names if not site.is_hub(name)]
+    services = [service for name in hosts for service in _nodes(site, name)]
     rows = [
         Row(row.name, TOPIC, _may(may, row.key(robot), TOPIC), row.max_bytes, _rate(row))
         for topic in all_topics()

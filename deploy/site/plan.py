@@ -55,12 +55,13 @@ class RobotRow(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
 
 class HostRow(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A computer of the site: a share of one robot's processes, and its gateway."""
+    """A computer of the site: a share of one robot's processes, and its gateway. A hub has its gateway alone, to which
+    the hosts of all robots and the persons connect."""
 
     role: HostRole
     robot: Name = ""
-    """The robot whose processes it runs; the site's only one where it is left out."""
-    processes: Annotated[tuple[Name, ...], Meta(min_length=1)]
+    """The robot whose processes it runs; the site's only one where it is left out. A hub has none."""
+    processes: tuple[Name, ...] = ()
     listen: tuple[Endpoint, ...] = ()
     connect: tuple[Name, ...] | None = None
     """The hosts that its gateway connects to; None stands for all others that listen."""
@@ -123,18 +124,27 @@ class Site(NamedTuple):
     def robots_of(self, name: str) -> tuple[str, ...]:
         """The robots that a principal deals with."""
         if name in self.hosts:
-            return (self.hosts[name].robot,)
+            return tuple(self.profiles) if self.is_hub(name) else (self.hosts[name].robot,)
         robots = self.persons[name].robots
         return tuple(self.profiles) if robots is None else robots
 
-    def listening(self, robot: str | None = None) -> tuple[str, ...]:
-        """The hosts that accept others, by default of all robots."""
-        return tuple(name for name, row in self.hosts.items() if row.listen and robot in (None, row.robot))
+    def is_hub(self, name: str) -> bool:
+        return name in self.hosts and self.hosts[name].role == "hub"
+
+    def listening(self, robot: str) -> tuple[str, ...]:
+        """The hosts that accept others who deal with a robot: its own, and hubs."""
+        return tuple(name for name, row in self.hosts.items() if row.listen and robot in self.robots_of(name))
+
+    def entrances(self, robot: str) -> tuple[str, ...]:
+        """The hosts by which a person reaches a robot: the hubs where there are any, else the robot's that listen."""
+        hosts = self.listening(robot)
+        return tuple(name for name in hosts if self.is_hub(name)) or hosts
 
     def connects(self, name: str) -> tuple[str, ...]:
-        """The hosts that a principal connects to: a person, to the listening ones of his robots."""
+        """The hosts that a principal connects to."""
         if name in self.persons:
-            return tuple(host for robot in self.robots_of(name) for host in self.listening(robot))
+            found = (host for robot in self.robots_of(name) for host in self.entrances(robot))
+            return tuple(dict.fromkeys(found))
         row = self.hosts[name]
         if row.connect is not None:
             return row.connect
@@ -142,8 +152,10 @@ class Site(NamedTuple):
         # Of two that listen the later one connects, so that each pair has one link.
         return tuple(
             host
-            for host in self.listening(row.robot)
-            if host != name and not (row.listen and order.index(host) > order.index(name))
+            for host in dict.fromkeys(host for robot in self.robots_of(name) for host in self.listening(robot))
+            if host != name
+            and (self.is_hub(host) or not self.is_hub(name))
+            and not (row.listen and self.is_hub(host) == self.is_hub(name) and order.index(host) > order.index(name))
         )
 
     def endpoints(self, name: str) -> tuple[str, ...]:
@@ -154,8 +166,11 @@ class Site(NamedTuple):
         """The profile of a host's share: its robot's profile with this host's processes, and its gateway. Raises
         ConfigError for a host that the site does not have, and as `profiles.read` does."""
         row = self.host(name)
-        whole = profiles.read(self.sources[row.robot], overrides)
         settings = {"site": str(self.folder), "host": name}
+        if self.is_hub(name):
+            gateway = gateway_of(name).name
+            return Profile(name=f"hub of {self.name}", robot=name, processes=(gateway,), service={"gateway": settings})
+        whole = profiles.read(self.sources[row.robot], overrides)
         return msgspec.structs.replace(
             whole,
             robot=row.robot,
@@ -223,7 +238,7 @@ def _resolved(file: _File, path: Path) -> Site:
             raise ConfigError(f"[robot.{robot}] {error}") from error
     only = next(iter(found)) if len(found) == 1 else ""
     hosts = {
-        name: row if row.robot else msgspec.structs.replace(row, robot=only)
+        name: row if row.robot or row.role == "hub" else msgspec.structs.replace(row, robot=only)
         for name, row in _rows(file.host, HostRow, "host").items()
     }
     return Site(file.name, path, sources, found, hosts, _rows(file.person, PersonRow, "person"))
@@ -249,9 +264,18 @@ def _check_host(site: Site, name: str, host: HostRow) -> None:
     where = f"[host.{name}]"
     if len(name) > LONGEST_HOST:
         raise ConfigError(f"{where}: a host's name has at most {LONGEST_HOST} characters, since its gateway's has 32")
-    if not host.robot:
+    if host.role == "hub":
+        if host.robot or host.processes:
+            raise ConfigError(f"{where}: a hub has its gateway alone: leave robot and processes out")
+        if not host.listen:
+            raise ConfigError(f"{where}: a hub listens: give it listen = ['tls/ADDRESS:PORT']")
+        if name in site.profiles:
+            raise ConfigError(f"{where}: a robot has this name; give the hub another")
+    elif not host.processes:
+        raise ConfigError(f"{where}: name its processes, those of the profile that run there: processes = [...]")
+    elif not host.robot:
         raise ConfigError(f"{where}: the site has several robots, so each host names its own: robot = ...")
-    if host.robot not in site.profiles:
+    elif host.robot not in site.profiles:
         raise ConfigError(f"{where} robot: no robot {host.robot!r}; {choice_of(host.robot, site.profiles)}")
     for process in host.processes:
         component = named(process)
@@ -292,9 +316,10 @@ def _check_shares(site: Site, robot: str, profile: Profile) -> None:
             there = f"on {' and on '.join(on)}" if on else "on no host"
             raise ConfigError(f"[robot.{robot}]: process {process} runs {there}; give it to one host's processes")
     if len(hosts) > 1:
+        joined = {name: host for name, host in site.hosts.items() if robot in site.robots_of(name)}
         reached = {next(iter(hosts))}
-        links = [{name, other} for name in hosts for other in site.connects(name) if other in hosts]
-        for _ in hosts:
+        links = [{name, other} for name in joined for other in site.connects(name)]
+        for _ in joined:
             for link in links:
                 if reached & link:
                     reached |= link

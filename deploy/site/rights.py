@@ -61,10 +61,10 @@ class Rights(NamedTuple):
 
 
 def rights(site: Site, name: str, robot: str) -> Rights:
-    """What a principal may do with a robot: nothing with one that is none of his. Raises ConfigError for a name that
-    the site does not have."""
+    """What a principal may do with a robot: nothing with one that is none of his. A hub does nothing but pass on.
+    Raises ConfigError for a name that the site does not have."""
     role = site.role(name)
-    if robot not in site.robots_of(name):
+    if robot not in site.robots_of(name) or role == "hub":
         return Rights()
     if name in site.hosts:
         return of_host(robot, site.share(name), simulated=site.profiles[robot].clock == "sim")

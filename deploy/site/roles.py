@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal, get_args
 
-HostRole = Literal["robot", "brain"]
+HostRole = Literal["robot", "brain", "hub"]
 PersonRole = Literal["operator", "viewer", "author"]
-Role = Literal["robot", "brain", "operator", "viewer", "author"]
+Role = Literal["robot", "brain", "hub", "operator", "viewer", "author"]
 ROLES: tuple[Role, ...] = get_args(Role)

@@ -90,7 +90,7 @@ def compiled(site: Site, host: str, names: Mapping[str, Iterable[str]]) -> dict[
             ),
         ],
     }
-    robot = site.host(host).robot
+    robot = "*" if site.is_hub(host) else site.host(host).robot
     return {
         "access_control": control,
         "low_pass_filter": _sizes(robot),
@@ -102,7 +102,7 @@ def table(site: Site, host: str) -> list[Rule]:
     """The rules that a host's gateway keeps, in the order of the plan."""
     found = []
     for name, may in neighbours(site, host).items():
-        interest = frozenset({f"{site.host(host).robot}/**"})
+        interest = frozenset(f"{robot}/**" for robot in _shared(site, host, name))
         rows = (
             (IN, ("put",), may.puts),
             (OUT, ("declare_subscriber",), interest),
@@ -132,8 +132,14 @@ def neighbours(site: Site, host: str) -> dict[str, Rights]:
     found = {}
     for name in direct:
         behind = _behind(site, name, host) if name in site.hosts else ()
-        found[name] = reduce(or_, (rights(site, one, mine.robot) for one in (name, *behind)))
+        robots = _shared(site, host, name)
+        found[name] = reduce(or_, (rights(site, one, robot) for one in (name, *behind) for robot in robots))
     return found
+
+
+def _shared(site: Site, host: str, name: str) -> tuple[str, ...]:
+    """The robots that both deal with."""
+    return tuple(robot for robot in site.robots_of(host) if robot in site.robots_of(name))
 
 
 def _behind(site: Site, name: str, host: str) -> tuple[str, ...]:
