@@ -147,6 +147,6 @@ def test_a_hostile_name_is_refused(name: str) -> None:
 
 
 def test_a_role_that_is_none_is_answered_by_those_that_are() -> None:
-    assert [admitted.role_of(role) for role in ROLES] == ["robot", "brain", "operator", "viewer", "author"]
+    assert [admitted.role_of(role) for role in ROLES] == ["robot", "brain", "hub", "operator", "viewer", "author"]
     with pytest.raises(ConfigError, match="did you mean viewer"):
         admitted.role_of("viewr")

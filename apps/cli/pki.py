@@ -65,7 +65,7 @@ def issue(
     role: Annotated[
         str,
         typer.Argument(
-            metavar="ROLE", autocompletion=completions.roles, help="robot, brain, operator, viewer or author."
+            metavar="ROLE", autocompletion=completions.roles, help="robot, brain, hub, operator, viewer or author."
         ),
     ],
     name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the machine or person: base, ada.")],
