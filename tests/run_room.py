@@ -1,0 +1,75 @@
+"""Which file of tests a worker may begin, so that the memory of all tests that run stays within a budget.
+
+Some files start a whole robot, or two, as processes; others compute in the worker alone. A file waits, and a worker
+takes a later one meanwhile, as long as there is no room for it. What a test needed in the last run is known from the
+record (`tests/run_memory.py`); without a record its markers tell what it may need.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pytest
+from run_memory import MEMORY
+
+BUDGET_MB = 740.0
+"""For what the tests that run at a time do not share. Pytest and its workers share 200 MB more."""
+LEAST_MB = 40.0
+"""A worker alone: what it has written to of the memory that it shared at first."""
+GUESSED_MB = (({"zenoh", "sim", "process"}, 420.0), ({"sim"}, 150.0))
+"""Markers of tests, and what those need that have all of them. The first: the processes of a robot."""
+URGENT = ("alone", "beside")
+"""Kinds of tests (`tests/run_spread.py`) by which the whole run gets longer when they wait."""
+
+
+def needs_mb(jobs: Iterable[list[pytest.Item]], folder: Path | None) -> list[float]:
+    """Memory that each job needs, by the record in a folder if there is one."""
+    known: dict[str, float] | None = None
+    if folder is not None and (file := folder / MEMORY).is_file():
+        known = json.loads(file.read_text()).get("own_mb")
+    return [max(_need_mb(item, known) for item in job) for job in jobs]
+
+
+def _need_mb(item: pytest.Item, known: dict[str, float] | None) -> float:
+    if known is not None:
+        return max(known.get(item.nodeid, 0.0), LEAST_MB)  # the looks have missed what took a moment
+    marks = {mark.name for mark in item.iter_markers()}
+    return next((mb for needed, mb in GUESSED_MB if needed <= marks), LEAST_MB)
+
+
+@dataclass
+class Room:
+    """The jobs of each kind that wait, as (number, memory in MB), and what those that run need."""
+
+    waiting: dict[str, list[tuple[int, float]]]
+    budget_mb: float = BUDGET_MB
+    runs: dict[int, tuple[str, float]] = field(default_factory=dict)
+    """By worker: the kind, and the need of its job."""
+
+    def next_for(self, idle: Iterable[tuple[int, str]]) -> tuple[int, int] | None:
+        """The next of the idle workers (each with its kind) that gets a job, and the job's number.
+
+        Urgent kinds come first. One of them that waits for room only because of others lets no more of these begin.
+        """
+        kept_mb = 0.0
+        for worker, kind in sorted(idle, key=lambda one: one[1] not in URGENT):
+            jobs = self.waiting[kind]
+            taken_mb = sum(mb for _, mb in self.runs.values())
+            job = next((job for job in jobs if taken_mb + kept_mb + job[1] <= self.budget_mb), None)
+            if job is None and jobs and not self.runs:
+                job = jobs[0]  # which is over the budget by itself
+            if job is not None:
+                jobs.remove(job)
+                self.runs[worker] = kind, job[1]
+                return worker, job[0]
+            if kind in URGENT and jobs:
+                urgent_mb = sum(mb for of, mb in self.runs.values() if of in URGENT)
+                fitting = (mb for _, mb in jobs if urgent_mb + mb <= self.budget_mb)
+                kept_mb = max(kept_mb, next(fitting, 0.0))
+        return None
+
+    def ended(self, worker: int) -> None:
+        self.runs.pop(worker, None)

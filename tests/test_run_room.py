@@ -1,0 +1,70 @@
+"""Which file of tests begins, by the memory that it needs."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+from run_memory import MEMORY
+from run_room import LEAST_MB, Room, needs_mb
+
+ROBOT, SMALL = 420.0, 40.0
+
+
+def item(name: str, *markers: str) -> Any:
+    return SimpleNamespace(nodeid=name, iter_markers=lambda: [SimpleNamespace(name=marker) for marker in markers])
+
+
+def orders(room: Room, *idle: tuple[int, str]) -> list[tuple[int, int]]:
+    """Worker and job of all that begin now."""
+    left, found = list(idle), []
+    while (order := room.next_for(left)) is not None:
+        found.append(order)
+        left = [one for one in left if one[0] != order[0]]
+    return found
+
+
+def test_without_a_record_a_file_needs_what_its_most_demanding_test_may_need(tmp_path: Path) -> None:
+    small, computes = [item("a"), item("b", "process")], [item("c"), item("d", "sim")]
+    robot = [item("e", "zenoh"), item("f", "sim", "zenoh", "process")]
+    for folder in (None, tmp_path):
+        least, more, most = needs_mb([small, computes, robot], folder)
+        assert LEAST_MB == least < more < most
+
+
+def test_with_a_record_a_file_needs_what_its_most_demanding_test_needed(tmp_path: Path) -> None:
+    (tmp_path / MEMORY).write_text(json.dumps({"own_mb": {"a": 300.0, "b": 100.0, "c": 1.0}}))
+    jobs = [[item("b"), item("a")], [item("b")], [item("c")], [item("new", "sim")]]
+    assert needs_mb(jobs, tmp_path) == [300.0, 100.0, LEAST_MB, LEAST_MB]
+
+
+def test_a_second_robot_waits_and_what_is_small_begins_meanwhile() -> None:
+    room = Room({"beside": [(0, ROBOT), (1, ROBOT), (2, SMALL)], "others": [(0, SMALL)]}, budget_mb=700.0)
+    assert orders(room, (7, "others"), (8, "beside"), (9, "beside")) == [(8, 0), (9, 2), (7, 0)]
+    room.ended(9)
+    assert orders(room, (9, "beside")) == []
+    room.ended(8)
+    assert orders(room, (8, "beside"), (9, "beside")) == [(8, 1)]
+
+
+def test_what_makes_the_run_longer_when_it_waits_gets_the_room_that_others_leave() -> None:
+    waiting = {"beside": [(0, ROBOT)], "others": [(0, 200.0), (1, 200.0), (2, SMALL)]}
+    room = Room(waiting, budget_mb=600.0)
+    assert orders(room, (1, "others"), (2, "others")) == [(1, 0), (2, 1)]
+    assert orders(room, (3, "beside")) == []
+    room.ended(1)
+    assert orders(room, (1, "others"), (3, "beside")) == [], "a small one would keep the robot from its room"
+    room.ended(2)
+    assert orders(room, (1, "others"), (2, "others"), (3, "beside")) == [(3, 0), (1, 2)]
+
+
+def test_what_needs_more_than_there_is_begins_when_nothing_else_runs() -> None:
+    room = Room({"beside": [(0, 900.0)], "others": [(0, SMALL)]}, budget_mb=600.0)
+    room.runs[5] = "others", SMALL
+    assert orders(room, (8, "beside")) == []
+    room.ended(5)
+    assert orders(room, (5, "others"), (8, "beside")) == [(8, 0)]
+    room.ended(8)
+    assert orders(room, (5, "others"), (8, "beside")) == [(5, 0)]
