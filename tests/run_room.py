@@ -8,15 +8,19 @@ record (`tests/run_memory.py`); without a record its markers tell what it may ne
 from __future__ import annotations
 
 import json
+from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 from run_memory import MEMORY
 
-BUDGET_MB = 740.0
-"""For what the tests that run at a time do not share. Pytest and its workers share 200 MB more."""
+BUDGET_MB = 780.0
+"""For what the tests that run at a time do not share. Pytest and its workers share 150 MB more, and libraries."""
+LARGE_MB = 400.0
+"""The tests of a file that need more are a job of their own, so that the rest fits beside more."""
 LEAST_MB = 40.0
 """A worker alone: what it has written to of the memory that it shared at first."""
 GUESSED_MB = (({"zenoh", "sim", "process"}, 420.0), ({"sim"}, 150.0))
@@ -25,12 +29,26 @@ URGENT = ("alone", "beside")
 """Kinds of tests (`tests/run_spread.py`) by which the whole run gets longer when they wait."""
 
 
-def needs_mb(jobs: Iterable[list[pytest.Item]], folder: Path | None) -> list[float]:
-    """Memory that each job needs, by the record in a folder if there is one."""
+class Job(NamedTuple):
+    """Tests of one file, which a worker runs in one go."""
+
+    items: list[pytest.Item]
+    need_mb: float
+
+
+def jobs_of(items: Iterable[pytest.Item], folder: Path | None) -> list[Job]:
+    """The tests by file and by what they need, in their order. The record is in the folder, if there is one."""
     known: dict[str, float] | None = None
     if folder is not None and (file := folder / MEMORY).is_file():
         known = json.loads(file.read_text()).get("own_mb")
-    return [max(_need_mb(item, known) for item in job) for job in jobs]
+    found: dict[tuple[Path, bool], list[pytest.Item]] = defaultdict(list)
+    needs_mb: dict[tuple[Path, bool], float] = defaultdict(float)
+    for item in items:
+        need_mb = _need_mb(item, known)
+        part = item.path, need_mb > LARGE_MB
+        found[part].append(item)
+        needs_mb[part] = max(needs_mb[part], need_mb)
+    return [Job(of_part, needs_mb[part]) for part, of_part in found.items()]
 
 
 def _need_mb(item: pytest.Item, known: dict[str, float] | None) -> float:

@@ -33,7 +33,6 @@ import socket
 import struct
 import subprocess
 import traceback
-from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from functools import cache
@@ -42,7 +41,7 @@ from typing import Any
 
 import pytest
 from run_memory import memory_mb
-from run_room import Room, needs_mb
+from run_room import Job, Room, jobs_of
 
 WORKERS = {"others": 2, "alone": 1, "beside": 2}
 GROWN_MB = 80.0
@@ -66,12 +65,11 @@ def kind_of(item: pytest.Item) -> str:
     return "beside" if item.get_closest_marker("alone") is None else "alone"
 
 
-def jobs_of(items: Iterable[pytest.Item]) -> dict[str, list[list[pytest.Item]]]:
-    """The tests by kind and file, in their order."""
-    jobs: dict[str, dict[Path, list[pytest.Item]]] = {kind: defaultdict(list) for kind in WORKERS}
+def jobs_by_kind(items: Iterable[pytest.Item], record: Path | None = None) -> dict[str, list[Job]]:
+    by_kind: dict[str, list[pytest.Item]] = {kind: [] for kind in WORKERS}
     for item in items:
-        jobs[kind_of(item)][item.path].append(item)
-    return {kind: list(files.values()) for kind, files in jobs.items()}
+        by_kind[kind_of(item)].append(item)
+    return {kind: jobs_of(of_kind, record) for kind, of_kind in by_kind.items()}
 
 
 @dataclass
@@ -106,7 +104,7 @@ class Spread:
     def __init__(self, config: pytest.Config) -> None:
         self._config = config
         self._workers: dict[int, Worker] = {}
-        self._jobs: dict[str, list[list[pytest.Item]]] = {}
+        self._jobs: dict[str, list[Job]] = {}
         self._room = Room({})
         self._checks = -1
         """The process that checks types meanwhile, until its end."""
@@ -116,10 +114,11 @@ class Spread:
     def pytest_runtestloop(self, session: pytest.Session) -> bool | None:
         if session.testsfailed or self._config.option.collectonly:
             return None  # pytest itself says so
-        self._jobs = jobs_of(session.items)
         record = self._config.pluginmanager.getplugin("record of the run")
-        last = None if record is None else record.last
-        self._room = Room({kind: list(enumerate(needs_mb(jobs, last))) for kind, jobs in self._jobs.items()})
+        self._jobs = jobs_by_kind(session.items, None if record is None else record.last)
+        self._room = Room(
+            {kind: [(number, job.need_mb) for number, job in enumerate(jobs)] for kind, jobs in self._jobs.items()}
+        )
         with contextlib.suppress(KeyError, ProcessLookupError):
             self._checks = os.pidfd_open(int(os.environ.pop(CHECKS)))
             self._room.runs[self._checks] = "checks", CHECKS_MB
@@ -175,7 +174,7 @@ class Spread:
         while (order := self._room.next_for((fd, worker.kind) for fd, worker in idle.items())) is not None:
             worker = idle.pop(order[0])
             worker.idle = False
-            worker.left = [item.nodeid for item in self._jobs[worker.kind][order[1]]]
+            worker.left = [item.nodeid for item in self._jobs[worker.kind][order[1]].items]
             with contextlib.suppress(BrokenPipeError):  # it has just died, which is told when its reports end
                 os.write(worker.orders, _NUMBER.pack(order[1]))
         for worker in idle.values():
@@ -279,7 +278,7 @@ class Teller:
         self.tell("report", data)
 
 
-def work(config: pytest.Config, name: str, kind: str, orders: int, jobs: list[list[pytest.Item]], writer: int) -> None:
+def work(config: pytest.Config, name: str, kind: str, orders: int, jobs: list[Job], writer: int) -> None:
     """Runs one file after another, as ordered."""
     os.setsid()  # Ctrl-C comes from the process that forked, once
     if kind == "others":
@@ -305,7 +304,7 @@ def work(config: pytest.Config, name: str, kind: str, orders: int, jobs: list[li
         teller.tell("idle")
         if not (number := os.read(orders, _NUMBER.size)):
             return
-        items = jobs[_NUMBER.unpack(number)[0]]
+        items = jobs[_NUMBER.unpack(number)[0]].items
         try:
             for item, after in zip(items, [*items[1:], None], strict=True):
                 config.hook.pytest_runtest_protocol(item=item, nextitem=after)

@@ -8,13 +8,15 @@ from types import SimpleNamespace
 from typing import Any
 
 from run_memory import MEMORY
-from run_room import LEAST_MB, Room, needs_mb
+from run_room import LARGE_MB, LEAST_MB, Room, jobs_of
 
 ROBOT, SMALL = 420.0, 40.0
 
 
 def item(name: str, *markers: str) -> Any:
-    return SimpleNamespace(nodeid=name, iter_markers=lambda: [SimpleNamespace(name=marker) for marker in markers])
+    """What a test has that matters here; its name begins with its file."""
+    marks = [SimpleNamespace(name=marker) for marker in markers]
+    return SimpleNamespace(nodeid=name, path=Path(name.partition("::")[0]), iter_markers=lambda: marks)
 
 
 def orders(room: Room, *idle: tuple[int, str]) -> list[tuple[int, int]]:
@@ -27,17 +29,27 @@ def orders(room: Room, *idle: tuple[int, str]) -> list[tuple[int, int]]:
 
 
 def test_without_a_record_a_file_needs_what_its_most_demanding_test_may_need(tmp_path: Path) -> None:
-    small, computes = [item("a"), item("b", "process")], [item("c"), item("d", "sim")]
-    robot = [item("e", "zenoh"), item("f", "sim", "zenoh", "process")]
+    items = [item("a.py::a"), item("a.py::b", "process"), item("b.py::c"), item("b.py::d", "sim")]
+    robot = item("c.py::e", "sim", "zenoh", "process")
     for folder in (None, tmp_path):
-        least, more, most = needs_mb([small, computes, robot], folder)
-        assert LEAST_MB == least < more < most
+        small, computes, live = jobs_of([*items, robot], folder)
+        assert (small.items, computes.items, live.items) == (items[:2], items[2:], [robot])
+        assert LEAST_MB == small.need_mb < computes.need_mb < live.need_mb
 
 
 def test_with_a_record_a_file_needs_what_its_most_demanding_test_needed(tmp_path: Path) -> None:
-    (tmp_path / MEMORY).write_text(json.dumps({"own_mb": {"a": 300.0, "b": 100.0, "c": 1.0}}))
-    jobs = [[item("b"), item("a")], [item("b")], [item("c")], [item("new", "sim")]]
-    assert needs_mb(jobs, tmp_path) == [300.0, 100.0, LEAST_MB, LEAST_MB]
+    (tmp_path / MEMORY).write_text(json.dumps({"own_mb": {"a::a": 300.0, "a::b": 100.0, "c::a": 1.0}}))
+    jobs = jobs_of([item("a::b"), item("a::a"), item("c::a"), item("new::a", "sim")], tmp_path)
+    assert [job.need_mb for job in jobs] == [300.0, LEAST_MB, LEAST_MB]
+
+
+def test_the_large_tests_of_a_file_are_a_job_of_their_own(tmp_path: Path) -> None:
+    needs = {"a::a": 300.0, "a::b": LARGE_MB + 50, "a::c": 100.0, "a::d": LARGE_MB + 10}
+    (tmp_path / MEMORY).write_text(json.dumps({"own_mb": needs}))
+    jobs = jobs_of([item(name) for name in needs], tmp_path)
+    assert [([one.nodeid for one in job.items], job.need_mb) for job in jobs] == [
+        (["a::a", "a::c"], 300.0), (["a::b", "a::d"], LARGE_MB + 50),
+    ]  # fmt: skip
 
 
 def test_a_second_robot_waits_and_what_is_small_begins_meanwhile() -> None:
