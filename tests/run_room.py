@@ -70,24 +70,33 @@ class Room:
     def next_for(self, idle: Iterable[tuple[int, str]]) -> tuple[int, int] | None:
         """The next of the idle workers (each with its kind) that gets a job, and the job's number.
 
-        Urgent kinds come first. One of them that waits for room only because of others lets no more of these begin.
+        Urgent kinds come first, and others leave them the room for what they begin next.
         """
-        kept_mb = 0.0
+        idle = list(idle)
+        free_mb = self.budget_mb - sum(mb for _, mb in self.runs.values())
+        kept_mb = self._kept_mb({kind for _, kind in idle})
         for worker, kind in sorted(idle, key=lambda one: one[1] not in URGENT):
-            jobs = self.waiting[kind]
-            taken_mb = sum(mb for _, mb in self.runs.values())
-            job = next((job for job in jobs if taken_mb + kept_mb + job[1] <= self.budget_mb), None)
+            jobs, most_mb = self.waiting[kind], free_mb - (0.0 if kind in URGENT else kept_mb)
+            job = next((job for job in jobs if job[1] <= most_mb), None)
             if job is None and jobs and not self.runs:
                 job = jobs[0]  # which is over the budget by itself
             if job is not None:
                 jobs.remove(job)
                 self.runs[worker] = kind, job[1]
                 return worker, job[0]
-            if kind in URGENT and jobs:
-                urgent_mb = sum(mb for of, mb in self.runs.values() if of in URGENT)
-                fitting = (mb for _, mb in jobs if urgent_mb + mb <= self.budget_mb)
-                kept_mb = max(kept_mb, next(fitting, 0.0))
         return None
+
+    def _kept_mb(self, idle_kinds: set[str]) -> float:
+        """Room for the next urgent job: it begins when the smallest of those that run ends, or now."""
+        runs = {kind: [mb for of, mb in self.runs.values() if of == kind] for kind in URGENT}
+        for kind in URGENT:
+            if runs[kind] or kind in idle_kinds:
+                ends_mb = 0.0 if kind in idle_kinds else min(runs[kind])
+                rest_mb = sum(map(sum, runs.values())) - ends_mb
+                return next(
+                    (max(mb - ends_mb, 0.0) for _, mb in self.waiting[kind] if rest_mb + mb <= self.budget_mb), 0.0
+                )
+        return 0.0
 
     def ended(self, worker: int) -> None:
         self.runs.pop(worker, None)

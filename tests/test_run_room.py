@@ -72,6 +72,19 @@ def test_what_makes_the_run_longer_when_it_waits_gets_the_room_that_others_leave
     assert orders(room, (1, "others"), (2, "others"), (3, "beside")) == [(3, 0), (1, 2)]
 
 
+def test_others_leave_room_for_the_long_file_that_comes_next() -> None:
+    waiting = {"beside": [(0, ROBOT), (1, 100.0), (2, SMALL)], "others": [(0, 200.0), (1, 200.0), (2, SMALL)]}
+    room = Room(waiting, budget_mb=600.0)
+    room.runs[1] = room.runs[2] = "others", 150.0
+    assert orders(room, (3, "beside"), (4, "beside")) == [(3, 1), (4, 2)], "small ones meanwhile"
+    room.ended(1)
+    assert orders(room, (1, "others")) == [], "the room for the robot, when the smaller one ends"
+    room.ended(4)
+    assert orders(room, (1, "others"), (4, "beside")) == [], "its room is still taken"
+    room.ended(2)
+    assert orders(room, (1, "others"), (2, "others"), (4, "beside")) == [(4, 0), (1, 2)]
+
+
 def test_what_needs_more_than_there_is_begins_when_nothing_else_runs() -> None:
     room = Room({"beside": [(0, 900.0)], "others": [(0, SMALL)]}, budget_mb=600.0)
     room.runs[5] = "others", SMALL
