@@ -8,7 +8,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from run_memory import MEMORY
-from run_room import LARGE_MB, LEAST_MB, Room, jobs_of
+from run_room import LARGE_MB, LEAST_MB, TWO_ROBOTS, Room, jobs_of
 
 ROBOT, SMALL = 420.0, 40.0
 
@@ -16,7 +16,9 @@ ROBOT, SMALL = 420.0, 40.0
 def item(name: str, *markers: str) -> Any:
     """What a test has that matters here; its name begins with its file."""
     marks = [SimpleNamespace(name=marker) for marker in markers]
-    return SimpleNamespace(nodeid=name, path=Path(name.partition("::")[0]), iter_markers=lambda: marks)
+    closest = {marker: marker for marker in markers}.get
+    path = Path(name.partition("::")[0])
+    return SimpleNamespace(nodeid=name, path=path, iter_markers=lambda: marks, get_closest_marker=closest)
 
 
 def orders(room: Room, *idle: tuple[int, str]) -> list[tuple[int, int]]:
@@ -30,11 +32,17 @@ def orders(room: Room, *idle: tuple[int, str]) -> list[tuple[int, int]]:
 
 def test_without_a_record_a_file_needs_what_its_most_demanding_test_may_need(tmp_path: Path) -> None:
     items = [item("a.py::a"), item("a.py::b", "process"), item("b.py::c"), item("b.py::d", "sim")]
-    robot = item("c.py::e", "sim", "zenoh", "process")
+    robot, robots = (item(f"{file}::e", "sim", "zenoh", "process") for file in ("c.py", TWO_ROBOTS))
     for folder in (None, tmp_path):
-        small, computes, live = jobs_of([*items, robot], folder)
-        assert (small.items, computes.items, live.items) == (items[:2], items[2:], [robot])
-        assert LEAST_MB == small.need_mb < computes.need_mb < live.need_mb
+        jobs = jobs_of([*items, robot, robots], folder)
+        assert [job.items for job in jobs] == [items[:2], items[2:], [robot], [robots]]
+        needs_mb = [job.need_mb for job in jobs]
+        assert needs_mb[0] == LEAST_MB
+        assert needs_mb == sorted(set(needs_mb))
+
+
+def test_the_file_with_two_robots_is_there() -> None:
+    assert (Path(__file__).parent / TWO_ROBOTS).is_file()
 
 
 def test_with_a_record_a_file_needs_what_its_most_demanding_test_needed(tmp_path: Path) -> None:
