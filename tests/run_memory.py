@@ -23,9 +23,15 @@ from pathlib import Path
 from typing import NamedTuple
 
 LOOK_S = 0.5
+LEAST_MB = 40.0
+"""A worker alone: what it has written to of the memory that it shared at first. No test counts as needing less."""
 SHOWN = 12
 """Largest processes that are named."""
+LAST = "last"
+"""Beside the folder of a run: that of the run before."""
 MEMORY = "memory.json"
+KEPT = 0.9
+"""Share of what a test needed in the run before that counts at least: a look may miss the moment that needs most."""
 RUNNING = "running-"
 """Before the number of a worker: the file that has the test that it runs."""
 _FIELD = re.compile(rb"^(Pss|Private_Clean|Private_Dirty):\s+(\d+) kB", re.MULTILINE)
@@ -63,6 +69,9 @@ class Watch:
         self.largest: list[tuple[str, float, str]] = []
         self.own_mb: dict[str, float] = defaultdict(float)
         """By test."""
+        if (before := folder.parent / LAST / MEMORY).is_file():
+            needed_mb = json.loads(before.read_text()).get("own_mb", {})
+            self.own_mb |= {test: round(KEPT * mb, 1) for test, mb in needed_mb.items() if KEPT * mb > LEAST_MB}
         self._begun_s = time.monotonic()
 
     def look(self) -> None:

@@ -17,11 +17,10 @@ from collections.abc import Generator
 from pathlib import Path
 
 import pytest
-from run_memory import RUNNING
+from run_memory import LAST, RUNNING
 
 FOLDER = "COCORO_TESTS_RECORD"
 """Environment variable: the folder to write to. Beside it `last` is the folder of the last run."""
-LAST = "last"
 LONG = (
     "faults_live", "readme", "stop_live", "faults_full", "capture_mesh", "wire_robot", "bus_leaving", "rehearse",
     "faults_message", "cli_surroundings", "robot_faults", "faults_speed", "faults_silence", "faults_barrage",

@@ -7,8 +7,8 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from run_memory import MEMORY
-from run_room import LARGE_MB, LEAST_MB, TWO_ROBOTS, Room, jobs_of
+from run_memory import LEAST_MB, MEMORY, Watch
+from run_room import LARGE_MB, TWO_ROBOTS, Room, jobs_of
 
 ROBOT, SMALL = 420.0, 40.0
 
@@ -49,6 +49,14 @@ def test_with_a_record_a_file_needs_what_its_most_demanding_test_needed(tmp_path
     (tmp_path / MEMORY).write_text(json.dumps({"own_mb": {"a::a": 300.0, "a::b": 100.0, "c::a": 1.0}}))
     jobs = jobs_of([item("a::b"), item("a::a"), item("c::a"), item("new::a", "sim")], tmp_path)
     assert [job.need_mb for job in jobs] == [300.0, LEAST_MB, LEAST_MB]
+    (robot,) = jobs_of([item("new::b", "zenoh", "sim", "process")], tmp_path)
+    assert robot.need_mb > LARGE_MB, "it has not run"
+
+
+def test_what_a_test_needed_before_fades_when_it_needs_less(tmp_path: Path) -> None:
+    (tmp_path / "last").mkdir()
+    (tmp_path / "last" / MEMORY).write_text(json.dumps({"own_mb": {"a::a": 300.0, "a::b": LEAST_MB + 1}}))
+    assert Watch(tmp_path / "new").own_mb == {"a::a": 270.0}
 
 
 def test_the_large_tests_of_a_file_are_a_job_of_their_own(tmp_path: Path) -> None:
