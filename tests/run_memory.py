@@ -3,9 +3,9 @@
 They are those whose environment names the folder (`COCORO_TESTS_RECORD`). Memory that several processes share is
 counted in parts (proportional set size, proc_pid_smaps(5)), so that the sum has each page once. `memory.json` in the
 folder gets the largest processes of the look with the largest sum, of every look the sum and its parts by the file of
-tests for which a process runs, and for every test the most that was not shared with processes of others. A worker
-writes which test it runs (`running-PID`, `tests/run_record.py`), and what a test starts inherits the variable
-`PYTEST_CURRENT_TEST`. What begins and ends between two looks is not seen.
+tests for which a process runs, and for every test the most that it needed: what its worker does not share with other
+workers, and the processes that it started. A worker writes which test it runs (`running-PID`, `tests/run_record.py`),
+and what a test starts inherits the variable `PYTEST_CURRENT_TEST`. What begins and ends between two looks is not seen.
 """
 
 from __future__ import annotations
@@ -53,6 +53,8 @@ class Seen(NamedTuple):
     title: str
     memory: Memory
     test: str
+    worker: bool
+    """It runs tests itself, and shares with the other workers what none of them needs more for."""
 
 
 class Watch:
@@ -92,14 +94,14 @@ class Watch:
                     started = _TEST.search(environment)
                     test = started[1].decode() if started else ""
                 now[name, born] = test
-                found.append(Seen(_title(process), memory_mb(process), test or self._runs(name)))
+                found.append(Seen(_title(process), memory_mb(process), test or self._runs(name), worker=not test))
         self._ours = now
         total_mb, at_s = sum(seen.memory.part for seen in found), time.monotonic() - self._begun_s
         parts: dict[str, float] = defaultdict(float)
         own_mb: dict[str, float] = defaultdict(float)
         for seen in found:
             parts[seen.test.partition("::")[0] or seen.title] += round(seen.memory.part, 1)
-            own_mb[seen.test] += seen.memory.own
+            own_mb[seen.test] += seen.memory.own if seen.worker else seen.memory.part
         for test, size_mb in own_mb.items():
             self.own_mb[test] = max(self.own_mb[test], round(size_mb, 1))
         self.looks.append((round(at_s, 1), round(total_mb, 1), parts))
