@@ -71,7 +71,7 @@ def _over_time(looks: list[tuple[float, float, dict[str, float]]]) -> list[list[
     rows = []
     for part, (_, total_mb, parts) in sorted(highest.items()):
         largest = sorted(parts.items(), key=lambda one: -one[1])[:NAMED]
-        words = ", ".join(f"{Path(name.split()[0]).name} {size:.0f}" for name, size in largest)
+        words = ", ".join(f"{Path(name.partition(' -')[0]).name} {size:.0f}" for name, size in largest)
         rows.append([f"{part * SLICE_S:.0f}", f"{total_mb:.0f}", words])
     return rows
 
