@@ -17,6 +17,8 @@ from bench.report import Report, Table
 ROOT = Path(__file__).parent.parent
 RECORD = ROOT / "out" / "tests" / "last"
 SHOWN = 25
+SLICE_S, NAMED = 15.0, 5
+"""Memory over time: seconds of a row, and how many files of tests it names."""
 WALL_S, MEMORY_MB = 360.0, 1000.0
 """Upper bounds, on two cores that do nothing else."""
 
@@ -53,8 +55,25 @@ def measure(chosen: Namespace, report: Report) -> None:
         summed["memory_mb"] = max(figures["memory_mb"] for figures in others.values())
         rows.append([f"{len(others)} others", *_row(summed)])
     report.tables.append(Table("files of tests", ["file", "tests", "wall, s", "processor, s", "pytest, MB"], rows))
-    largest = [[name, f"{size:.0f}"] for name, size in memory["largest"]]
-    report.tables.append(Table(f"processes at the peak, after {memory['at_s']:.0f} s", ["process", "MB"], largest))
+    largest = [[name, test, f"{size:.0f}"] for name, size, test in memory["largest"]]
+    peak = f"processes at the peak, after {memory['at_s']:.0f} s"
+    report.tables.append(Table(peak, ["process", "for the test", "MB"], largest))
+    report.tables.append(Table("memory over time", ["from, s", "MB", "most of it for"], _over_time(memory["looks"])))
+
+
+def _over_time(looks: list[tuple[float, float, dict[str, float]]]) -> list[list[str]]:
+    """The look with the largest sum of each `SLICE_S`, and for which files of tests the memory was."""
+    highest: dict[int, tuple[float, float, dict[str, float]]] = {}
+    for look in looks:
+        part = int(look[0] // SLICE_S)
+        if part not in highest or highest[part][1] < look[1]:
+            highest[part] = look
+    rows = []
+    for part, (_, total_mb, parts) in sorted(highest.items()):
+        largest = sorted(parts.items(), key=lambda one: -one[1])[:NAMED]
+        words = ", ".join(f"{Path(name.partition(' -')[0]).name} {size:.0f}" for name, size in largest)
+        rows.append([f"{part * SLICE_S:.0f}", f"{total_mb:.0f}", words])
+    return rows
 
 
 def _sum(files: dict[str, dict[str, float]], name: str) -> float:

@@ -39,7 +39,7 @@ else
     trap 'kill $memory $types 2>/dev/null; rm -f "$said"' EXIT
     trap 'exit 130' INT TERM # after pytest has ended, which hears Ctrl-C, too
     begun=$SECONDS
-    check pytest -rs --spread
+    COCORO_TESTS_CHECKS=$types check pytest -rs --spread
     wait $types || unclean+=("types or import rules")
     cat "$said"
     kill $memory

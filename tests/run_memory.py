@@ -1,8 +1,11 @@
 """Watches the memory of all processes of a run of the tests: `python tests/run_memory.py FOLDER`, until SIGTERM.
 
 They are those whose environment names the folder (`COCORO_TESTS_RECORD`). Memory that several processes share is
-counted in parts (proportional set size, proc_pid_smaps(5)). The largest sum of all looks is written to `memory.json`
-in the folder. What begins and ends between two looks is not seen.
+counted in parts (proportional set size, proc_pid_smaps(5)), so that the sum has each page once. `memory.json` in the
+folder gets the largest processes of the look with the largest sum, of every look the sum and its parts by the file of
+tests for which a process runs, and for every test the most that it needed: what its worker does not share with other
+workers, and the processes that it started. A worker writes which test it runs (`running-PID`, `tests/run_record.py`),
+and what a test starts inherits the variable `PYTEST_CURRENT_TEST`. What begins and ends between two looks is not seen.
 """
 
 from __future__ import annotations
@@ -14,53 +17,116 @@ import resource
 import signal
 import sys
 import time
+from collections import defaultdict
 from contextlib import suppress
 from pathlib import Path
+from typing import NamedTuple
 
 LOOK_S = 0.5
+LEAST_MB = 40.0
+"""A worker alone: what it has written to of the memory that it shared at first. No test counts as needing less."""
 SHOWN = 12
 """Largest processes that are named."""
-_PSS = re.compile(rb"^Pss:\s+(\d+) kB", re.MULTILINE)
+LAST = "last"
+"""Beside the folder of a run: that of the run before."""
+MEMORY = "memory.json"
+KEPT = 0.9
+"""Share of what a test needed in the run before that counts at least: a look may miss the moment that needs most."""
+RUNNING = "running-"
+"""Before the number of a worker: the file that has the test that it runs."""
+_FIELD = re.compile(rb"^(Pss|Private_Clean|Private_Dirty):\s+(\d+) kB", re.MULTILINE)
+_TEST = re.compile(rb"(?:^|\0)PYTEST_CURRENT_TEST=([^\0]+) \(\w+\)")
+
+
+class Memory(NamedTuple):
+    """The memory of a process, MB."""
+
+    part: float
+    """What it shares is counted in parts."""
+    own: float
+    """What it does not share."""
+
+
+class Seen(NamedTuple):
+    """A process at one look."""
+
+    title: str
+    memory: Memory
+    test: str
+    worker: bool
+    """It runs tests itself, and shares with the other workers what none of them needs more for."""
 
 
 class Watch:
     """The processes whose environment has a mark."""
 
-    def __init__(self, mark: str) -> None:
-        self._mark = mark.encode()
-        self._ours: dict[tuple[int, str], bool] = {}
-        self.peak_mb, self.at_s, self.looks = 0.0, 0.0, 0
-        self.largest: list[tuple[str, float]] = []
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._mark = f"COCORO_TESTS_RECORD={folder}".encode()
+        self._ours: dict[tuple[str, str], str] = {}
+        """By number and time of birth: the test that started it, or nothing."""
+        self.peak_mb, self.at_s = 0.0, 0.0
+        self.looks: list[tuple[float, float, dict[str, float]]] = []
+        """Time in s, sum in MB, and its parts by the file of tests."""
+        self.largest: list[tuple[str, float, str]] = []
+        self.own_mb: dict[str, float] = defaultdict(float)
+        """By test."""
+        if (before := folder.parent / LAST / MEMORY).is_file():
+            needed_mb = json.loads(before.read_text()).get("own_mb", {})
+            self.own_mb |= {test: round(KEPT * mb, 1) for test, mb in needed_mb.items() if KEPT * mb > LEAST_MB}
         self._begun_s = time.monotonic()
 
     def look(self) -> None:
         """Sum the memory of all that run now."""
-        now: dict[tuple[int, str], bool] = {}
-        found: list[tuple[str, float]] = []
+        now: dict[tuple[str, str], str] = {}
+        found: list[Seen] = []
         for name in os.listdir("/proc"):  # noqa: PTH208 # many times a minute
             if not name.isdigit() or int(name) == os.getpid():
                 continue
             with suppress(OSError, IndexError):
                 process = Path("/proc") / name
                 born = process.joinpath("stat").read_text(errors="replace").rpartition(")")[2].split()[19]
-                known = (int(name), born)
-                now[known] = self._ours.get(known) or self._mark in process.joinpath("environ").read_bytes()
-                if now[known]:
-                    found.append((_title(process), _memory_mb(process)))
+                test = self._ours.get((name, born), "")
+                if not test:
+                    environment = process.joinpath("environ").read_bytes()
+                    if self._mark not in environment and (name, born) not in self._ours:
+                        continue
+                    started = _TEST.search(environment)
+                    test = started[1].decode() if started else ""
+                now[name, born] = test
+                found.append(Seen(_title(process), memory_mb(process), test or self._runs(name), worker=not test))
         self._ours = now
-        self.looks += 1
-        total_mb = sum(size for _, size in found)
+        total_mb, at_s = sum(seen.memory.part for seen in found), time.monotonic() - self._begun_s
+        parts: dict[str, float] = defaultdict(float)
+        own_mb: dict[str, float] = defaultdict(float)
+        for seen in found:
+            parts[seen.test.partition("::")[0] or seen.title] += round(seen.memory.part, 1)
+            own_mb[seen.test] += seen.memory.own if seen.worker else seen.memory.part
+        for test, size_mb in own_mb.items():
+            self.own_mb[test] = max(self.own_mb[test], round(size_mb, 1))
+        self.looks.append((round(at_s, 1), round(total_mb, 1), parts))
         if total_mb > self.peak_mb:
-            self.peak_mb, self.at_s = total_mb, time.monotonic() - self._begun_s
-            self.largest = sorted(found, key=lambda one: -one[1])[:SHOWN]
+            self.peak_mb, self.at_s = total_mb, at_s
+            largest = sorted(found, key=lambda one: -one.memory.part)[:SHOWN]
+            self.largest = [(seen.title, round(seen.memory.part, 1), seen.test) for seen in largest]
+
+    def _runs(self, number: str) -> str:
+        try:
+            return (self._folder / f"{RUNNING}{number}").read_text()
+        except OSError:
+            return ""
 
 
-def _memory_mb(process: Path) -> float:
+def memory_mb(process: Path) -> Memory:
+    """The memory of the process with this folder in /proc."""
     try:
-        match = _PSS.search(process.joinpath("smaps_rollup").read_bytes())
-        return int(match[1]) * 1024 / 1e6 if match else 0.0
+        found = dict(_FIELD.findall(process.joinpath("smaps_rollup").read_bytes()))
+        sizes = {name: int(size) * 1024 / 1e6 for name, size in found.items()}
+        own_mb = sizes.get(b"Private_Clean", 0.0) + sizes.get(b"Private_Dirty", 0.0)
+        return Memory(sizes.get(b"Pss", 0.0), own_mb)
     except PermissionError:  # a process of another user: what is shared is counted whole
-        return int(process.joinpath("statm").read_text().split()[1]) * resource.getpagesize() / 1e6
+        whole_mb = int(process.joinpath("statm").read_text().split()[1]) * resource.getpagesize() / 1e6
+        return Memory(whole_mb, whole_mb)
 
 
 def _title(process: Path) -> str:
@@ -70,15 +136,15 @@ def _title(process: Path) -> str:
 
 def main() -> None:
     folder = Path(sys.argv[1])
-    watch = Watch(f"COCORO_TESTS_RECORD={folder}")
+    watch = Watch(folder)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit())
     try:
         while True:
             watch.look()
             time.sleep(LOOK_S)
     finally:
-        written = {"peak_mb": watch.peak_mb, "at_s": watch.at_s, "looks": watch.looks, "largest": watch.largest}
-        folder.joinpath("memory.json").write_text(json.dumps(written))
+        written = {"peak_mb": watch.peak_mb, "at_s": watch.at_s, "largest": watch.largest, "looks": watch.looks}
+        folder.joinpath(MEMORY).write_text(json.dumps(written | {"own_mb": watch.own_mb}))
 
 
 if __name__ == "__main__":

@@ -17,10 +17,10 @@ from collections.abc import Generator
 from pathlib import Path
 
 import pytest
+from run_memory import LAST, RUNNING
 
 FOLDER = "COCORO_TESTS_RECORD"
 """Environment variable: the folder to write to. Beside it `last` is the folder of the last run."""
-LAST = "last"
 LONG = (
     "faults_live", "readme", "stop_live", "faults_full", "capture_mesh", "wire_robot", "bus_leaving", "rehearse",
     "faults_message", "cli_surroundings", "robot_faults", "faults_speed", "faults_silence", "faults_barrage",
@@ -56,10 +56,16 @@ class Record:
 
     def __init__(self, folder: Path, config: pytest.Config) -> None:
         self._folder = folder
+        folder.mkdir(parents=True, exist_ok=True)
         self._config = config
         self._begun_s = time.monotonic()
         self._before_s = processor_s()
         self._files: dict[str, dict[str, float]] = defaultdict(lambda: dict.fromkeys(FIGURES, 0.0))
+
+    @property
+    def last(self) -> Path:
+        """The folder of the last run's record, if there was one."""
+        return self._folder.parent / LAST
 
     def begin(self) -> None:
         """What was before is not counted: this process was forked."""
@@ -67,8 +73,12 @@ class Record:
 
     @pytest.hookimpl(trylast=True)
     def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
-        took_s = wall_s_of(self._folder.parent / LAST)
+        took_s = wall_s_of(self.last)
         items.sort(key=lambda item: -took_s.get(_file(item.nodeid), 0.0))  # of a file, and of equals, the order stays
+
+    def pytest_runtest_logstart(self, nodeid: str) -> None:
+        """For `tests/run_memory.py`, which looks from outside."""
+        (self._folder / f"{RUNNING}{os.getpid()}").write_text(nodeid)
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_makereport(self) -> Generator[None, pytest.TestReport, pytest.TestReport]:
@@ -86,7 +96,6 @@ class Record:
         file["memory_mb"] = max(file["memory_mb"], figures["memory_mb"])
 
     def pytest_sessionfinish(self) -> None:
-        self._folder.mkdir(parents=True, exist_ok=True)
         written = {
             "arguments": list(self._config.invocation_params.args),
             "wall_s": time.monotonic() - self._begun_s,

@@ -10,11 +10,13 @@ takes one file after another, so that what the tests of a file share is made onc
 - `alone`: tests that measure real time closely, one by one.
 - `beside`: after them the other tests with `zenoh`, on two workers, since they wait more than they compute.
 
+The process that forks gives a worker its next file, the longest for which there is memory (`run_room.py`).
+
 Each worker has a network of its own, so that an emergency stop of its tests reaches no robot of another one. Where
 that is not allowed (only root may), the third kind has one worker.
 
-A worker that has grown by `GROWN_MB` ends after its file, and another one takes its place. When one dies, the test that
-it ran fails, and so do the others of its file that it had not begun.
+A worker that has more than `GROWN_MB` of its own ends after its file, and another one takes its place. When one dies,
+the test that it ran fails, and so do the others of its file that it had not begun.
 """
 
 from __future__ import annotations
@@ -31,7 +33,6 @@ import socket
 import struct
 import subprocess
 import traceback
-from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from functools import cache
@@ -39,10 +40,16 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from run_record import memory_mb
+from run_memory import memory_mb
+from run_room import Job, Room, jobs_of
 
 WORKERS = {"others": 2, "alone": 1, "beside": 2}
-GROWN_MB = 100.0
+GROWN_MB = 80.0
+"""Memory that it does not share: what it has made, and what it has written to of the memory that it shared at first."""
+CHECKS = "COCORO_TESTS_CHECKS"
+"""Environment variable: the process that checks types and import rules meanwhile."""
+CHECKS_MB = 660.0
+"""What mypy takes without its cache."""
 NEW_NETWORK = 0x40000000
 """CLONE_NEWNET, see unshare(2)."""
 SET_FLAGS, UP, RUNNING = 0x8914, 0x1, 0x40
@@ -58,12 +65,11 @@ def kind_of(item: pytest.Item) -> str:
     return "beside" if item.get_closest_marker("alone") is None else "alone"
 
 
-def jobs_of(items: Iterable[pytest.Item]) -> dict[str, list[list[pytest.Item]]]:
-    """The tests by kind and file, in their order."""
-    jobs: dict[str, dict[Path, list[pytest.Item]]] = {kind: defaultdict(list) for kind in WORKERS}
+def jobs_by_kind(items: Iterable[pytest.Item], record: Path | None = None) -> dict[str, list[Job]]:
+    by_kind: dict[str, list[pytest.Item]] = {kind: [] for kind in WORKERS}
     for item in items:
-        jobs[kind_of(item)][item.path].append(item)
-    return {kind: list(files.values()) for kind, files in jobs.items()}
+        by_kind[kind_of(item)].append(item)
+    return {kind: jobs_of(of_kind, record) for kind, of_kind in by_kind.items()}
 
 
 @dataclass
@@ -74,10 +80,22 @@ class Worker:
     pid: int
     reports: int
     """The pipe from which its messages are read."""
+    orders: int
+    """The pipe to which the number of its next file is written; its end ends the worker."""
+    idle: bool = False
     left: list[str] = field(default_factory=list)
     """The tests of its file that have not ended; it runs the first."""
     data: bytearray = field(default_factory=bytearray)
     grown: bool = False
+
+    def close(self) -> None:
+        os.close(self.reports)
+        self.order_no_more()
+
+    def order_no_more(self) -> None:
+        if self.orders >= 0:
+            os.close(self.orders)
+            self.orders = -1
 
 
 class Spread:
@@ -86,16 +104,24 @@ class Spread:
     def __init__(self, config: pytest.Config) -> None:
         self._config = config
         self._workers: dict[int, Worker] = {}
-        self._queues: dict[str, int] = {}
-        self._jobs: dict[str, list[list[pytest.Item]]] = {}
+        self._jobs: dict[str, list[Job]] = {}
+        self._room = Room({})
+        self._checks = -1
+        """The process that checks types meanwhile, until its end."""
         self._forked = 0
 
     @pytest.hookimpl(tryfirst=True)
     def pytest_runtestloop(self, session: pytest.Session) -> bool | None:
         if session.testsfailed or self._config.option.collectonly:
             return None  # pytest itself says so
-        self._jobs = jobs_of(session.items)
-        self._queues = {kind: _queue(len(jobs)) for kind, jobs in self._jobs.items()}
+        record = self._config.pluginmanager.getplugin("record of the run")
+        self._jobs = jobs_by_kind(session.items, None if record is None else record.last)
+        self._room = Room(
+            {kind: [(number, job.need_mb) for number, job in enumerate(jobs)] for kind, jobs in self._jobs.items()}
+        )
+        with contextlib.suppress(KeyError, ProcessLookupError):
+            self._checks = os.pidfd_open(int(os.environ.pop(CHECKS)))
+            self._room.runs[self._checks] = "checks", CHECKS_MB
         may_be_alone()  # found out once for all
         Path(self._config._tmp_path_factory.getbasetemp()).mkdir(exist_ok=True)  # type: ignore[attr-defined]
         gc.collect()
@@ -120,16 +146,17 @@ class Spread:
             self._fork(kind)
 
     def _fork(self, kind: str) -> None:
-        reader, writer = os.pipe()
+        (reader, writer), (orders, to_order) = os.pipe(), os.pipe()
         self._forked += 1
         pid = os.fork()
         if pid == 0:
             code = 1
             try:
                 os.close(reader)
+                os.close(to_order)
                 for other in self._workers.values():
-                    os.close(other.reports)
-                work(self._config, f"{kind}-{self._forked}", kind, self._queues[kind], self._jobs[kind], writer)
+                    other.close()
+                work(self._config, f"{kind}-{self._forked}", kind, orders, self._jobs[kind], writer)
                 code = 0
             except KeyboardInterrupt:
                 pass
@@ -138,13 +165,33 @@ class Spread:
             finally:
                 os._exit(code)
         os.close(writer)
-        self._workers[reader] = Worker(kind, pid, reader)
+        os.close(orders)
+        self._workers[reader] = Worker(kind, pid, reader, to_order)
+
+    def _order(self) -> None:
+        """Give idle workers what they may begin, and end those for which there is nothing left."""
+        idle = {fd: worker for fd, worker in self._workers.items() if worker.idle}
+        while (order := self._room.next_for((fd, worker.kind) for fd, worker in idle.items())) is not None:
+            worker = idle.pop(order[0])
+            worker.idle = False
+            worker.left = [item.nodeid for item in self._jobs[worker.kind][order[1]].items]
+            with contextlib.suppress(BrokenPipeError):  # it has just died, which is told when its reports end
+                os.write(worker.orders, _NUMBER.pack(order[1]))
+        for worker in idle.values():
+            if not self._room.waiting[worker.kind]:
+                worker.order_no_more()
 
     # --- what they report -------------------------------------------------------------------------
 
     def _listen(self, session: pytest.Session, goes_on: Callable[[], bool]) -> None:
         while goes_on():
-            for fd in select.select([*self._workers], [], [])[0]:
+            watched = [*self._workers, *([self._checks] if self._checks >= 0 else [])]
+            for fd in select.select(watched, [], [])[0]:
+                if fd == self._checks:
+                    self._room.ended(fd)
+                    os.close(fd)
+                    self._checks = -1
+                    continue
                 worker = self._workers[fd]
                 data = os.read(fd, 1 << 20)
                 worker.data += data
@@ -154,11 +201,13 @@ class Spread:
                     self._ended(worker)
                 if session.shouldfail:
                     raise session.Failed(session.shouldfail)
+            self._order()
 
     def _take(self, worker: Worker, message: tuple[str, Any]) -> None:
         what, content = message
-        if what == "file":
-            worker.left = content
+        if what == "idle":
+            worker.idle = True
+            self._room.ended(worker.reports)
         elif what == "report":
             hook = self._config.hook
             hook.pytest_runtest_logreport(
@@ -173,7 +222,8 @@ class Spread:
 
     def _ended(self, worker: Worker) -> None:
         del self._workers[worker.reports]
-        os.close(worker.reports)
+        self._room.ended(worker.reports)
+        worker.close()
         status = os.waitstatus_to_exitcode(os.waitpid(worker.pid, 0)[1])
         for place, nodeid in enumerate(worker.left):
             what = "while this test ran" if place == 0 else "before this test"
@@ -193,14 +243,6 @@ class Spread:
                 os.kill(worker.pid, signal.SIGKILL)
             os.close(pid_fd)
             os.waitpid(worker.pid, 0)
-
-
-def _queue(count: int) -> int:
-    """A pipe from which each of several processes reads the number of its next job; at its end there is none."""
-    reader, writer = os.pipe()
-    os.write(writer, b"".join(map(_NUMBER.pack, range(count))))
-    os.close(writer)
-    return reader
 
 
 def _messages(data: bytearray) -> Iterator[tuple[str, Any]]:
@@ -236,8 +278,8 @@ class Teller:
         self.tell("report", data)
 
 
-def work(config: pytest.Config, name: str, kind: str, queue: int, jobs: list[list[pytest.Item]], writer: int) -> None:
-    """Runs one file after another."""
+def work(config: pytest.Config, name: str, kind: str, orders: int, jobs: list[Job], writer: int) -> None:
+    """Runs one file after another, as ordered."""
     os.setsid()  # Ctrl-C comes from the process that forked, once
     if kind == "others":
         step_back()
@@ -257,10 +299,12 @@ def work(config: pytest.Config, name: str, kind: str, queue: int, jobs: list[lis
     temporary._basetemp.mkdir(mode=0o700)
     if (record := plugins.getplugin("record of the run")) is not None:
         record.begin()
-    libc, at_first_mb = ctypes.CDLL(None), memory_mb()
-    while number := os.read(queue, _NUMBER.size):
-        items = jobs[_NUMBER.unpack(number)[0]]
-        teller.tell("file", [item.nodeid for item in items])
+    libc = ctypes.CDLL(None)
+    while True:
+        teller.tell("idle")
+        if not (number := os.read(orders, _NUMBER.size)):
+            return
+        items = jobs[_NUMBER.unpack(number)[0]].items
         try:
             for item, after in zip(items, [*items[1:], None], strict=True):
                 config.hook.pytest_runtest_protocol(item=item, nextitem=after)
@@ -270,7 +314,7 @@ def work(config: pytest.Config, name: str, kind: str, queue: int, jobs: list[lis
             raise
         gc.collect()
         libc.malloc_trim(0)  # gives back to the system what the allocator has kept
-        if memory_mb() > at_first_mb + GROWN_MB:
+        if memory_mb(Path("/proc/self")).own > GROWN_MB:
             teller.tell("grown")
             return
 

@@ -10,9 +10,9 @@ from collections.abc import Sequence
 import msgspec
 import numpy as np
 import pytest
+import scipy  # whose parts are loaded by the workers that need them
 from pictures import CAMERA, ROBOT, Lamp, profile, stripe
 from robot_rig import RobotRig
-from scipy.spatial.transform import Rotation
 
 import sim.service
 from cocoro.arrays import FloatArray
@@ -111,7 +111,7 @@ def test_ideal_depth_reads_back_within_half_a_step() -> None:
 def test_an_ideal_frame_asks_for_no_projector_a_real_one_for_the_kinects_own() -> None:
     painted = Painted()
     pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_euler("z", 90, degrees=True).as_matrix()
+    pose[:3, :3] = scipy.spatial.transform.Rotation.from_euler("z", 90, degrees=True).as_matrix()
     shoot(kinect(painted, "ideal"), 0, pose)
     shoot(kinect(painted, "real"), 0, pose)
     none, projector = painted.projected
@@ -195,7 +195,7 @@ def test_a_still_camera_and_a_first_frame_are_sharp() -> None:
 
 def test_a_moving_camera_is_blurred_but_not_after_a_gap_or_a_step_back_in_time() -> None:
     turned = np.eye(4)
-    turned[:3, :3] = Rotation.from_rotvec([0.0, 16 / CAMERA.fx, 0.0]).as_matrix()
+    turned[:3, :3] = scipy.spatial.transform.Rotation.from_rotvec([0.0, 16 / CAMERA.fx, 0.0]).as_matrix()
 
     def peak(stamps: tuple[int, int]) -> float:
         camera = kinect(Painted(stripe(160)))

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 from run_record import wall_s_of
-from run_spread import WORKERS, jobs_of
+from run_spread import WORKERS, jobs_by_kind
 
 from bench.own_tests import RECORD
 
@@ -92,9 +92,9 @@ def test_the_run_leaves_a_record(ran: tuple[Path, subprocess.CompletedProcess[st
 
 def test_a_test_is_in_one_job(request: pytest.FixtureRequest) -> None:
     items = request.session.items
-    jobs = jobs_of(items)
+    jobs = jobs_by_kind(items)
     assert set(jobs) == set(WORKERS)
-    placed = [item.nodeid for files in jobs.values() for file in files for item in file]
+    placed = [item.nodeid for of_kind in jobs.values() for job in of_kind for item in job.items]
     assert sorted(placed) == sorted(item.nodeid for item in items)
 
 

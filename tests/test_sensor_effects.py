@@ -6,8 +6,8 @@ from math import log2
 
 import numpy as np
 import pytest
+import scipy  # whose parts are loaded by the workers that need them
 from pictures import CAMERA, ROBOT, Lamp, profile, stripe
-from scipy.spatial.transform import Rotation
 
 from cocoro.arrays import FloatArray
 from sim.camera import COLOUR_SIGMA, EXPOSURE_S
@@ -115,7 +115,10 @@ def test_the_blur_is_what_the_renderer_would_have_seen_over_the_exposure() -> No
 
     def turned(share: float) -> FloatArray:
         pose = middle.copy()
-        pose[:3, :3] = middle[:3, :3] @ Rotation.from_rotvec(share * np.array([0.01, 0.05, 0.01])).as_matrix()
+        pose[:3, :3] = (
+            middle[:3, :3]
+            @ scipy.spatial.transform.Rotation.from_rotvec(share * np.array([0.01, 0.05, 0.01])).as_matrix()
+        )
         return pose
 
     shares = (np.arange(64) + 0.5) / 64 - 0.5
@@ -129,7 +132,7 @@ def test_the_blur_is_what_the_renderer_would_have_seen_over_the_exposure() -> No
 
 def test_the_exposure_is_a_share_of_the_time_between_frames() -> None:
     before, now = np.eye(4), np.eye(4)
-    now[:3, :3] = Rotation.from_rotvec([0.0, 0.06, 0.0]).as_matrix()
+    now[:3, :3] = scipy.spatial.transform.Rotation.from_rotvec([0.0, 0.06, 0.0]).as_matrix()
     motion = motion_between(before, now, EXPOSURE_S / (1 / 15))
     np.testing.assert_allclose(motion.rotation_rad, [0.0, 0.03, 0.0], atol=1e-12)
 

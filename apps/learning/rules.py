@@ -6,7 +6,6 @@ from collections.abc import Iterable
 
 import numpy as np
 import scipy
-from scipy.spatial import KDTree
 
 from cocoro.arrays import BoolArray, FloatArray, IntArray
 from cocoro.learning.network import HyperplaneRbf
@@ -58,7 +57,7 @@ def inliers(places_m: FloatArray, limit_m: float = NEIGHBOUR_M) -> BoolArray:
     """
     if len(places_m) < 2:
         return np.ones(len(places_m), dtype=np.bool_)
-    nearest = np.asarray(KDTree(places_m).query(places_m, k=2)[0])[:, 1]
+    nearest = np.asarray(scipy.spatial.KDTree(places_m).query(places_m, k=2)[0])[:, 1]
     return np.asarray(nearest <= max(limit_m, SPARSE_FACTOR * float(np.median(nearest))))
 
 

@@ -10,7 +10,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy  # loads its parts when they are needed: `scipy.spatial` takes 16 MB, and OpenGL does without
 
 from cocoro.arrays import BoolArray, Float32Array, FloatArray, ImageArray
 from cocoro.robot import Camera
@@ -67,7 +67,7 @@ class TinyRenderer:
         light: Lighting,
         projector_pose: FloatArray | None = None,
     ) -> Images:
-        quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
+        quaternions = scipy.spatial.transform.Rotation.from_matrix(poses[:, :3, :3]).as_quat()
         for body, pose, quaternion in zip(self._bodies, poses, quaternions, strict=True):
             self._bullet.resetBasePositionAndOrientation(body, pose[:3, 3], quaternion)
         colour, _ = self._view(self.camera, camera_pose, light)

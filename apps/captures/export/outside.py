@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from math import cos, radians, sin, tan
 
 import numpy as np
-from scipy.ndimage import gaussian_filter1d
+import scipy  # loads its parts when they are needed
 
 from apps.captures.export.stage import recorded_stage
 from apps.captures.export.story import Story, read
@@ -106,7 +106,7 @@ class CameraPath:
         return count / max(len(looks), 1)
 
     def _smooth(self, values: FloatArray, deviation_s: float) -> FloatArray:
-        smooth: FloatArray = gaussian_filter1d(values, deviation_s / self._step_s, axis=0, mode="nearest")
+        smooth: FloatArray = scipy.ndimage.gaussian_filter1d(values, deviation_s / self._step_s, axis=0, mode="nearest")
         return smooth
 
 

@@ -1,0 +1,107 @@
+"""Which file of tests a worker may begin, so that the memory of all tests that run stays within a budget.
+
+Some files start a whole robot, or two, as processes; others compute in the worker alone. A file waits, and a worker
+takes a later one meanwhile, as long as there is no room for it. What a test needed in the last run is known from the
+record (`tests/run_memory.py`); without a record its markers tell what it may need.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import defaultdict
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+from run_memory import LEAST_MB, MEMORY
+
+BUDGET_MB = 820.0
+"""For what the tests that run at a time need. Pytest and its workers share 130 MB more."""
+LARGE_MB = 400.0
+"""The tests of a file that need more are a job of their own, so that the rest fits beside more."""
+GUESSED_MB = (({"zenoh", "sim", "process"}, 500.0), ({"sim"}, 230.0))
+"""Markers of tests, and what those need that have all of them. The first: the processes of a robot."""
+TWO_ROBOTS = "test_faults_two_robots.py"
+TWO_ROBOTS_MB = 740.0
+URGENT = ("alone", "beside")
+"""Kinds of tests (`tests/run_spread.py`) by which the whole run gets longer when they wait."""
+
+
+class Job(NamedTuple):
+    """Tests of one file, which a worker runs in one go."""
+
+    items: list[pytest.Item]
+    need_mb: float
+
+
+def jobs_of(items: Iterable[pytest.Item], folder: Path | None) -> list[Job]:
+    """The tests by file and by what they need, in their order. The record is in the folder, if there is one."""
+    known: dict[str, float] | None = None
+    if folder is not None and (file := folder / MEMORY).is_file():
+        known = json.loads(file.read_text()).get("own_mb")
+    found: dict[tuple[Path, bool], list[pytest.Item]] = defaultdict(list)
+    needs_mb: dict[tuple[Path, bool], float] = defaultdict(float)
+    for item in items:
+        need_mb = _need_mb(item, known)
+        part = item.path, need_mb > LARGE_MB
+        found[part].append(item)
+        needs_mb[part] = max(needs_mb[part], need_mb)
+    return [Job(of_part, needs_mb[part]) for part, of_part in found.items()]
+
+
+def _need_mb(item: pytest.Item, known: dict[str, float] | None) -> float:
+    if known is not None and item.nodeid in known:
+        return max(known[item.nodeid], LEAST_MB)
+    if item.path.name == TWO_ROBOTS and item.get_closest_marker("zenoh"):
+        return TWO_ROBOTS_MB
+    marks = {mark.name for mark in item.iter_markers()}
+    guesses = (
+        GUESSED_MB if known is None else GUESSED_MB[:1]
+    )  # what the looks have missed took a moment, as no robot does
+    return next((mb for needed, mb in guesses if needed <= marks), LEAST_MB)
+
+
+@dataclass
+class Room:
+    """The jobs of each kind that wait, as (number, memory in MB), and what those that run need."""
+
+    waiting: dict[str, list[tuple[int, float]]]
+    budget_mb: float = BUDGET_MB
+    runs: dict[int, tuple[str, float]] = field(default_factory=dict)
+    """By worker: the kind, and the need of its job."""
+
+    def next_for(self, idle: Iterable[tuple[int, str]]) -> tuple[int, int] | None:
+        """The next of the idle workers (each with its kind) that gets a job, and the job's number.
+
+        Urgent kinds come first, and others leave them the room for what they begin next.
+        """
+        idle = list(idle)
+        free_mb = self.budget_mb - sum(mb for _, mb in self.runs.values())
+        kept_mb = self._kept_mb({kind for _, kind in idle})
+        for worker, kind in sorted(idle, key=lambda one: one[1] not in URGENT):
+            jobs, most_mb = self.waiting[kind], free_mb - (0.0 if kind in URGENT else kept_mb)
+            job = next((job for job in jobs if job[1] <= most_mb), None)
+            if job is None and jobs and not self.runs:
+                job = jobs[0]  # which is over the budget by itself
+            if job is not None:
+                jobs.remove(job)
+                self.runs[worker] = kind, job[1]
+                return worker, job[0]
+        return None
+
+    def _kept_mb(self, idle_kinds: set[str]) -> float:
+        """Room for the next urgent job: it begins when the smallest of those that run ends, or now."""
+        runs = {kind: [mb for of, mb in self.runs.values() if of == kind] for kind in URGENT}
+        for kind in URGENT:
+            if runs[kind] or kind in idle_kinds:
+                ends_mb = 0.0 if kind in idle_kinds else min(runs[kind])
+                rest_mb = sum(map(sum, runs.values())) - ends_mb
+                return next(
+                    (max(mb - ends_mb, 0.0) for _, mb in self.waiting[kind] if rest_mb + mb <= self.budget_mb), 0.0
+                )
+        return 0.0
+
+    def ended(self, worker: int) -> None:
+        self.runs.pop(worker, None)

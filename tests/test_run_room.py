@@ -1,0 +1,111 @@
+"""Which file of tests begins, by the memory that it needs."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+from run_memory import LEAST_MB, MEMORY, Watch
+from run_room import LARGE_MB, TWO_ROBOTS, Room, jobs_of
+
+ROBOT, SMALL = 420.0, 40.0
+
+
+def item(name: str, *markers: str) -> Any:
+    """What a test has that matters here; its name begins with its file."""
+    marks = [SimpleNamespace(name=marker) for marker in markers]
+    closest = {marker: marker for marker in markers}.get
+    path = Path(name.partition("::")[0])
+    return SimpleNamespace(nodeid=name, path=path, iter_markers=lambda: marks, get_closest_marker=closest)
+
+
+def orders(room: Room, *idle: tuple[int, str]) -> list[tuple[int, int]]:
+    """Worker and job of all that begin now."""
+    left, found = list(idle), []
+    while (order := room.next_for(left)) is not None:
+        found.append(order)
+        left = [one for one in left if one[0] != order[0]]
+    return found
+
+
+def test_without_a_record_a_file_needs_what_its_most_demanding_test_may_need(tmp_path: Path) -> None:
+    items = [item("a.py::a"), item("a.py::b", "process"), item("b.py::c"), item("b.py::d", "sim")]
+    robot, robots = (item(f"{file}::e", "sim", "zenoh", "process") for file in ("c.py", TWO_ROBOTS))
+    for folder in (None, tmp_path):
+        jobs = jobs_of([*items, robot, robots], folder)
+        assert [job.items for job in jobs] == [items[:2], items[2:], [robot], [robots]]
+        needs_mb = [job.need_mb for job in jobs]
+        assert needs_mb[0] == LEAST_MB
+        assert needs_mb == sorted(set(needs_mb))
+
+
+def test_the_file_with_two_robots_is_there() -> None:
+    assert (Path(__file__).parent / TWO_ROBOTS).is_file()
+
+
+def test_with_a_record_a_file_needs_what_its_most_demanding_test_needed(tmp_path: Path) -> None:
+    (tmp_path / MEMORY).write_text(json.dumps({"own_mb": {"a::a": 300.0, "a::b": 100.0, "c::a": 1.0}}))
+    jobs = jobs_of([item("a::b"), item("a::a"), item("c::a"), item("new::a", "sim")], tmp_path)
+    assert [job.need_mb for job in jobs] == [300.0, LEAST_MB, LEAST_MB]
+    (robot,) = jobs_of([item("new::b", "zenoh", "sim", "process")], tmp_path)
+    assert robot.need_mb > LARGE_MB, "it has not run"
+
+
+def test_what_a_test_needed_before_fades_when_it_needs_less(tmp_path: Path) -> None:
+    (tmp_path / "last").mkdir()
+    (tmp_path / "last" / MEMORY).write_text(json.dumps({"own_mb": {"a::a": 300.0, "a::b": LEAST_MB + 1}}))
+    assert Watch(tmp_path / "new").own_mb == {"a::a": 270.0}
+
+
+def test_the_large_tests_of_a_file_are_a_job_of_their_own(tmp_path: Path) -> None:
+    needs = {"a::a": 300.0, "a::b": LARGE_MB + 50, "a::c": 100.0, "a::d": LARGE_MB + 10}
+    (tmp_path / MEMORY).write_text(json.dumps({"own_mb": needs}))
+    jobs = jobs_of([item(name) for name in needs], tmp_path)
+    assert [([one.nodeid for one in job.items], job.need_mb) for job in jobs] == [
+        (["a::a", "a::c"], 300.0), (["a::b", "a::d"], LARGE_MB + 50),
+    ]  # fmt: skip
+
+
+def test_a_second_robot_waits_and_what_is_small_begins_meanwhile() -> None:
+    room = Room({"beside": [(0, ROBOT), (1, ROBOT), (2, SMALL)], "others": [(0, SMALL)]}, budget_mb=700.0)
+    assert orders(room, (7, "others"), (8, "beside"), (9, "beside")) == [(8, 0), (9, 2), (7, 0)]
+    room.ended(9)
+    assert orders(room, (9, "beside")) == []
+    room.ended(8)
+    assert orders(room, (8, "beside"), (9, "beside")) == [(8, 1)]
+
+
+def test_what_makes_the_run_longer_when_it_waits_gets_the_room_that_others_leave() -> None:
+    waiting = {"beside": [(0, ROBOT)], "others": [(0, 200.0), (1, 200.0), (2, SMALL)]}
+    room = Room(waiting, budget_mb=600.0)
+    assert orders(room, (1, "others"), (2, "others")) == [(1, 0), (2, 1)]
+    assert orders(room, (3, "beside")) == []
+    room.ended(1)
+    assert orders(room, (1, "others"), (3, "beside")) == [], "a small one would keep the robot from its room"
+    room.ended(2)
+    assert orders(room, (1, "others"), (2, "others"), (3, "beside")) == [(3, 0), (1, 2)]
+
+
+def test_others_leave_room_for_the_long_file_that_comes_next() -> None:
+    waiting = {"beside": [(0, ROBOT), (1, 100.0), (2, SMALL)], "others": [(0, 200.0), (1, 200.0), (2, SMALL)]}
+    room = Room(waiting, budget_mb=600.0)
+    room.runs[1] = room.runs[2] = "others", 150.0
+    assert orders(room, (3, "beside"), (4, "beside")) == [(3, 1), (4, 2)], "small ones meanwhile"
+    room.ended(1)
+    assert orders(room, (1, "others")) == [], "the room for the robot, when the smaller one ends"
+    room.ended(4)
+    assert orders(room, (1, "others"), (4, "beside")) == [], "its room is still taken"
+    room.ended(2)
+    assert orders(room, (1, "others"), (2, "others"), (4, "beside")) == [(4, 0), (1, 2)]
+
+
+def test_what_needs_more_than_there_is_begins_when_nothing_else_runs() -> None:
+    room = Room({"beside": [(0, 900.0)], "others": [(0, SMALL)]}, budget_mb=600.0)
+    room.runs[5] = "others", SMALL
+    assert orders(room, (8, "beside")) == []
+    room.ended(5)
+    assert orders(room, (5, "others"), (8, "beside")) == [(8, 0)]
+    room.ended(8)
+    assert orders(room, (5, "others"), (8, "beside")) == [(5, 0)]
