@@ -12,7 +12,7 @@ from typing import TextIO
 
 from apps.cli import exits, output
 from apps.cli.output import recent_complaints
-from apps.cli.stop_asking import STOPPABLE, Asking, Point, StopResult
+from apps.cli.stop_asking import STOPPABLE, Asking, Point, StopResult, movers_first
 
 EXECUTIVE = "executive"
 """The executive ends its task at a stop. It moves nothing itself, so the command does not wait for its answer."""
@@ -103,13 +103,13 @@ def _left_open(robot: str | None, stops: list[StopResult]) -> set[str]:
 def _stop_of(uid: int, robot: str, points: list[Point], started_s: float) -> StopResult:
     there = {point.service for point in points}
     silent = {point.service for point in points if point.latched_ns is None}
-    acknowledged = sorted(there - silent, key=_movers_first)
+    acknowledged = sorted(there - silent, key=movers_first)
     missing = silent - {EXECUTIVE}
     latched_s = [point.latched_ns / 1e9 for point in points if point.latched_ns is not None]
     return StopResult(
         robot,
         tuple(acknowledged),
-        tuple(sorted(missing, key=_movers_first)),
+        tuple(sorted(missing, key=movers_first)),
         tuple(service for service in STOPPABLE if service not in there),
         max(latched_s, default=time.monotonic()) - started_s,
         tuple(dict.fromkeys(point.why_not_kept for point in points if point.kept is False)),
@@ -117,11 +117,6 @@ def _stop_of(uid: int, robot: str, points: list[Point], started_s: float) -> Sto
         None if uid == os.getuid() else uid,
         {point.service: point.latched_ns for point in points if point.latched_ns is not None},
     )
-
-
-def _movers_first(service: str) -> tuple[int, str]:
-    """Sort key: services that move something first."""
-    return STOPPABLE.index(service) if service in STOPPABLE else len(STOPPABLE), service
 
 
 def _by_mesh_too(
@@ -170,8 +165,8 @@ def _merged(by_path: list[StopResult], by_mesh: list[StopResult]) -> list[StopRe
             missing = {*one.missing, *other.missing} - acknowledged
             absent = tuple(name for name in one.absent if name not in acknowledged | missing)
             one = one._replace(
-                acknowledged=tuple(sorted(acknowledged, key=_movers_first)),
-                missing=tuple(sorted(missing, key=_movers_first)),
+                acknowledged=tuple(sorted(acknowledged, key=movers_first)),
+                missing=tuple(sorted(missing, key=movers_first)),
                 absent=absent,
                 seconds=max(one.seconds, other.seconds),
                 not_kept=(*one.not_kept, *other.not_kept),

@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import msgspec
 
-from apps.cli.stop_asking import STOPPABLE, StopResult
+from apps.cli.stop_asking import STOPPABLE, StopResult, movers_first
 from cocoro.bus.endpoints import ZenohConfig
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.errors import CallTimeoutError, CocoroError, MeshError
@@ -86,7 +86,9 @@ async def stop(run_dir: RunDir, config: ZenohConfig, started_s: float) -> StopRe
         absent = tuple(service for service in waiting if service not in living)
         took_s = took_s if missing else max(acknowledged.values(), default=took_s)
         why_not_kept = tuple(f"{service}: {text}" for service, text in not_kept.items() if text)
-        return StopResult(run_dir.robot, tuple(acknowledged), missing, absent, took_s, why_not_kept)
+        return StopResult(
+            run_dir.robot, tuple(sorted(acknowledged, key=movers_first)), missing, absent, took_s, why_not_kept
+        )
 
 
 async def _ask(robot: str, bus: ZenohBus) -> dict[str, str]:

@@ -153,7 +153,11 @@ async def joined(
     if patience_s is not None:
         config = replace(config, patience_s=patience_s)
     async with await ZenohBus.open(config, expect_mesh=True) as bus:
-        yield MeshLink(run_dir, bus, private=config.directory is not None, refusal=refusal)
+        link = MeshLink(run_dir, bus, private=config.directory is not None, refusal=refusal)
+        if refusal is not None and not await link.alive():
+            why = "is it up there, or has your certificate been revoked?"
+            raise MeshError(f"nothing of {link.robot} is heard at {config.where}: {why}")
+        yield link
 
 
 async def within(timeout_s: float, condition: Callable[[], bool], changed: asyncio.Event) -> bool:

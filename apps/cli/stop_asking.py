@@ -48,6 +48,11 @@ _PATIENCE_S = 0.1
 _MOST_BYTES = 1 << 18
 
 
+def movers_first(service: str) -> tuple[int, str]:
+    """Sort key: services that move something first."""
+    return STOPPABLE.index(service) if service in STOPPABLE else len(STOPPABLE), service
+
+
 class StopResult(NamedTuple):
     """Result of stopping one robot."""
 
