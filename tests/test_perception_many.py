@@ -55,13 +55,14 @@ def one_by_one(picture: NDArray[np.uint16], min_area_px: float) -> set[Region]:
     return found
 
 
-def all_at_once(found: Segments | None) -> set[Region]:
+def all_at_once(found: Segments | None, width: int) -> set[Region]:
     regions: set[Region] = set()
     if found is not None:
         for i, number in enumerate(found.number.tolist()):
             pixels = slice(found.start[i], found.start[i] + found.area_px[i])
             left, top, right, bottom = found.bounds[i].tolist()
-            at = frozenset(zip(found.v[pixels].tolist(), found.u[pixels].tolist(), strict=True))
+            rows, columns = np.divmod(found.runs.at[pixels], width)
+            at = frozenset(zip(rows.tolist(), columns.tolist(), strict=True))
             regions.add((number, int(found.area_px[i]), (left, top, right, bottom), at))
     return regions
 
@@ -71,7 +72,7 @@ def test_the_regions_of_all_objects_are_those_of_each_one(size: tuple[int, int])
     seen = 0
     for seed in range(25):
         picture = patches(size, seed)
-        regions = all_at_once(segments(picture, TABLE, 0, 6.0))
+        regions = all_at_once(segments(picture, TABLE, 0, 6.0), size[1])
         expected = one_by_one(picture, 6.0)
         assert {region[:3] for region in regions} == {region[:3] for region in expected}
         if len(expected) < 8:  # of more than eight the equal ones may be others
@@ -88,7 +89,8 @@ def test_what_is_left_of_a_region_by_its_core_is_what_opening_left() -> None:
         mask = found.mask(region, (left, top, right, bottom))
         pixels = slice(found.start[region], found.start[region] + found.area_px[region])
         core = np.zeros_like(mask)
-        core[found.v[pixels] - top, found.u[pixels] - left] = found.core[pixels]
+        rows, columns = np.divmod(found.runs.at[pixels], 160)
+        core[rows - top, columns - left] = found.core[pixels]
         np.testing.assert_array_equal(cv2.dilate(core, AROUND), mask)
 
 
@@ -129,7 +131,7 @@ def test_a_regions_depth_is_the_same_alone_as_among_others() -> None:
         found = segments(labels, TABLE, 0, 6.0)
         assert found is not None
         image.register(np.array([(0, 0, 640, 480)]))
-        depths = middle_depths_m(found, image.codes_at(found.u, found.v), image)
+        depths = middle_depths_m(found, image)
         for region, depth_m in enumerate(depths.tolist()):
             left, top, right, bottom = found.bounds[region].tolist()
             box = image.clip((left, top, right, bottom), ColourRegion.margin_px(image))
@@ -146,13 +148,12 @@ def test_the_pixels_around_many_regions_are_those_around_each() -> None:
         found = segments(picture, TABLE, 0, 6.0)
         assert found is not None
         assert len(found.start) > FEW
-        u, v, _, first, counts = surroundings(found, image)
+        at, _, first, counts = surroundings(found, image)
         every, missing = 0, 0
         for region in range(len(found.start)):
             alone = surroundings(found.among(np.arange(len(found.start)) == region), image)
             some = slice(first[region], first[region] + counts[region])
-            together = set(zip(u[some].tolist(), v[some].tolist(), strict=True))
-            expected = set(zip(alone[0].tolist(), alone[1].tolist(), strict=True))
+            together, expected = set(at[some].tolist()), set(alone[0].tolist())
             assert together <= expected
             every, missing = every + len(expected), missing + len(expected - together)
         # Where the surroundings of three regions meet, two of them have the pixel.
