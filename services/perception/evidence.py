@@ -10,14 +10,12 @@ from numpy.typing import NDArray
 
 from cocoro.arrays import BoolArray, Float32Array, FloatArray, ImageArray, IntArray
 from services.perception.image import Evidence, RgbdImage
-from services.perception.region import MIN_DEPTH_PIXELS, MIN_DEPTH_SHARE, ColourRegion, depth_doubt_m, ring_px
+from services.perception.region import MIN_DEPTH_PIXELS, MIN_DEPTH_SHARE, depth_doubt_m, ring_px
 from services.perception.runs import spread_out
 from services.perception.segments import Segments
 
-MAX_SURFACE_POINTS = 96
-MAX_RAYS = 36
-FEW = 12
-"""The pixels around so many regions are found sooner for each region by itself than in the image."""
+MAX_SURFACE_POINTS, MAX_OUTLINE_RAYS, MAX_FREE_RAYS = 48, 36, 24
+"""More pieces of evidence place an object hardly better, and the time of many objects grows with them."""
 SMOOTHED_DOUBT = 0.7
 """Standard deviation of a surface point's depth, the mean of up to nine pixels, relative to that of one pixel. The mean
 does not reduce what neighbours have in common: quantisation, and the grain of the sensor's pattern."""
@@ -54,14 +52,13 @@ def _middle(found: Segments) -> tuple[IntArray, IntArray]:
     runs = found.runs
     left, top, right, bottom = found.bounds.T
     across, down = (right - left) // 4, (bottom - top) // 4
-    left, top, right, bottom = (
-        np.repeat(bound, found.run_count) for bound in (left + across, top + down, right - across, bottom - down)
-    )
+    middle = np.stack([left + across, top + down, right - across, bottom - down])
+    left, top, right, bottom = middle.repeat(found.run_count, axis=1)
     begin = np.maximum(runs.left, left)
     length = np.minimum(runs.left + runs.length, right) - begin
     length[(runs.row < top) | (runs.row >= bottom)] = 0
     np.maximum(length, 0, out=length)
-    own = np.repeat(np.repeat(np.arange(len(found.number)), found.run_count), length)
+    own = np.arange(len(found.number)).repeat(found.run_count).repeat(length)
     return own, spread_out(runs.first + begin - runs.left, length)
 
 
@@ -86,12 +83,12 @@ def evidence_of(found: Segments, depth_m: FloatArray, reach_m: FloatArray, image
         (on_surface / (SMOOTHED_DOUBT * depth_doubt_m(depth)))[None], own * width + within, (count, width)
     )
     # Rays: along the edge, and around it.
-    own_edge, within_edge, picked = _spread(edge_first, edges, MAX_RAYS)
+    own_edge, within_edge, picked = _spread(edge_first, edges, MAX_OUTLINE_RAYS)
     inside = at.take(edge.take(picked))
     at_beside, depth_beside, first, counts = surroundings(found, image)
-    own_beside, within_beside, beside = _spread(first, counts, MAX_RAYS)
-    met = np.minimum(edges, MAX_RAYS)
-    rays = met + np.minimum(counts, MAX_RAYS)
+    own_beside, within_beside, beside = _spread(first, counts, MAX_FREE_RAYS)
+    met = np.minimum(edges, MAX_OUTLINE_RAYS)
+    rays = met + np.minimum(counts, MAX_FREE_RAYS)
     width = max(int(rays.max()), 1)  # without any ray, one of fill
     place = np.concatenate([own_edge * width + within_edge, own_beside * width + met[own_beside] + within_beside])
     free_to = depth_beside.take(beside)
@@ -116,9 +113,8 @@ def _spread(first: IntArray, available: IntArray, at_most: int) -> tuple[IntArra
     """Evenly chosen members, at most so many, of each of n groups of consecutive numbers, `available` from `first` on:
     each one's group, how manieth it is in it, and its number; shape (m,)."""
     taken = np.minimum(available, at_most)
-    ends = np.cumsum(taken)
-    group = np.repeat(np.arange(len(first)), taken)
-    within = np.arange(len(group)) - np.repeat(ends - taken, taken)
+    group = np.arange(len(first)).repeat(taken)
+    within = spread_out(np.zeros_like(taken), taken)
     return group, within, first[group] + within * available[group] // taken[group]
 
 
@@ -155,56 +151,26 @@ def surroundings(found: Segments, image: RgbdImage) -> tuple[IntArray, Float32Ar
     """Places in the flattened image and depths, m, of the pixels around regions, as in `ColourRegion.surroundings`,
     that have a depth, and where each region's begin among them and how many it has. Pixels around two regions are of
     both."""
-    if len(found.number) <= FEW:
-        parts = [_around_one(found, region, image) for region in range(len(found.number))]
-    else:
-        layers = np.unique(found.layer).tolist()
-        parts = [_around(found, np.flatnonzero(found.layer == layer), image) for layer in layers]
-    at, owner = (np.concatenate(each) for each in zip(*parts, strict=True))
+    # All regions in one picture, one below the other.
+    margin = ring_px(image) + 1
+    left, top, right, bottom = found.bounds.T
+    width = int((right - left).max()) + 2 * margin
+    height = bottom - top + 2 * margin
+    down, across = height.cumsum() - height + margin - top, margin - left
+    picture = np.zeros((int(height.sum()), width), dtype=np.uint8)
+    runs = found.runs
+    moved = (down * width + across).repeat(found.run_count)
+    picture.reshape(-1)[spread_out(runs.row * width + runs.left + moved, runs.length)] = 1
+    around = np.flatnonzero(_dilated(picture, 2 * ring_px(image) + 1) != _dilated(picture, 3))
+    row = around // width
+    own = np.arange(len(height)).repeat(height).take(row)
+    v, u = row - down.take(own), around - row * width - across.take(own)
+    at = v * image.width + u
     codes = image.codes_at(at)
-    order = np.argsort(owner, kind="stable")
-    order = order[codes.take(order) < image.no_depth_code]
-    counts = np.bincount(owner.take(order), minlength=len(found.number))
-    return at.take(order), image.registered_depth_m.take(codes.take(order)), np.cumsum(counts) - counts, counts
-
-
-def _around_one(found: Segments, region: int, image: RgbdImage) -> tuple[IntArray, NDArray[np.uint8]]:
-    """`_around` for one region."""
-    left, top, right, bottom = found.bounds[region].tolist()
-    left, top, right, bottom = box = image.clip((left, top, right, bottom), ColourRegion.margin_px(image))
-    mask = found.mask(region, box)
-    at = np.flatnonzero(_dilated(mask, 2 * ring_px(image) + 1) != _dilated(mask, 3))
-    v = at // (right - left)
-    return (v + top) * image.width + (at - v * (right - left)) + left, np.full(len(at), region, dtype=np.uint8)
-
-
-def _around(found: Segments, regions: IntArray, image: RgbdImage) -> tuple[IntArray, NDArray[np.uint8]]:
-    """The pixels around regions of one layer, by their index in the flattened image, and each one's region."""
-    own = found.among(np.isin(np.arange(len(found.number)), regions))
-    named = np.zeros((image.height, image.width), dtype=np.uint8)
-    names = np.arange(1, 1 + len(regions), dtype=np.uint8)
-    named.reshape(-1)[own.runs.at] = np.repeat(names, own.area_px)
-    ring = 2 * ring_px(image) + 1
-    outer, inner = _dilated(named, ring), _dilated(named, 3)
-    at = np.flatnonzero(outer != inner)
-    owner = outer.reshape(-1).take(at)
-    if _may_touch(own.bounds, ring):
-        # Of two regions the greater number wins; once more with the numbers in reverse.
-        reverse = np.negative(named)
-        outer2, inner2 = np.negative(_dilated(reverse, ring)), np.negative(_dilated(reverse, 3))
-        again = np.flatnonzero((outer2 != inner2) & (outer2 != outer))
-        at, owner = np.concatenate([at, again]), np.concatenate([owner, outer2.reshape(-1).take(again)])
-        order = np.argsort(at, kind="stable")
-        at, owner = at.take(order), owner.take(order)
-    return at, regions.take(owner.astype(np.intp) - 1).astype(np.uint8)
-
-
-def _may_touch(bounds: IntArray, within_px: int) -> bool:
-    """Whether any two of the boxes (n, 4) are less than so many pixels apart."""
-    left, top, right, bottom = bounds.T
-    beside = (left[:, None] - within_px < right) & (left < right[:, None] + within_px)
-    above = (top[:, None] - within_px < bottom) & (top < bottom[:, None] + within_px)
-    return bool(np.count_nonzero(beside & above) > len(bounds))
+    within = (u >= 0) & (u < image.width) & (v >= 0) & (v < image.height)
+    known = np.flatnonzero(within & (codes < image.no_depth_code))
+    counts = np.bincount(own.take(known), minlength=len(height))
+    return at.take(known), image.registered_depth_m.take(codes.take(known)), counts.cumsum() - counts, counts
 
 
 def _dilated(named: ImageArray, size: int) -> ImageArray:

@@ -15,14 +15,16 @@ from services.perception.rays import Rays
 from services.perception.shapes import Shapes, Solids
 
 ITERATIONS = 12
-SETTLED_M = 5e-4
+SETTLED_M = 1e-3
 """A fit ends when a step moves it by less: what is left to go is then a small part of that."""
 PRIOR = np.eye(3) / 0.05**2
 """Inverse covariance of the first guess, 1/m2: it may be 5 cm off and decides only what the evidence leaves open."""
 RAY_DOUBT_M, RAY_DOUBT_RAD = 0.001, 0.002
 """Standard deviation of the outline: a constant, and about a pixel at the object's distance."""
+INSET_RAD = 0.002
+"""How far inside the true outline the outermost pixels found are on average: a pixel at 640 x 480."""
 MANY = 32
-COARSE, COARSE_ITERATIONS, COARSE_SETTLED_M = 4, 4, 1e-3
+COARSE, COARSE_ITERATIONS, COARSE_SETTLED_M = 4, 4, 2e-3
 """So many fits go most of the way by every fourth piece of evidence, in so many steps at most: that takes a quarter of the
 time. Of fewer fits the calls take the time, not the numbers."""
 KEPT = 0.7
@@ -68,38 +70,39 @@ class _Fits:
         self._rays = Rays(self._solids, rays, evidence.free_to_m)
         self._points = (turn @ evidence.points_m.reshape(3, -1)).reshape(evidence.points_m.shape)
         self._points += self._eye
-        ray_certainty = 1 / (RAY_DOUBT_M + RAY_DOUBT_RAD * (guess @ rotation[:, 2]))
+        depth = guess @ rotation[:, 2]
+        self._inset = np.maximum(evidence.side, 0) * (INSET_RAD * depth).astype(np.float32)[:, None]
+        ray_certainty = 1 / (RAY_DOUBT_M + RAY_DOUBT_RAD * depth)
         of_rays = np.abs(evidence.side) * ray_certainty.astype(np.float32)[:, None]
         self._certainty = np.concatenate([evidence.certainty, of_rays], axis=1)
         self._certainty2 = self._certainty * self._certainty * np.float32(HUBER)
 
     def settle(self, iterations: int, settled_m: float) -> tuple[FloatArray, FloatArray]:
-        """Step until each fit settles, at most so many times. Returns how far each moved in all, m, (n, 3), and its
-        mean misfit, (n,)."""
+        """Step until each fit moves by less than `settled_m`, at most so many times. Returns how far each moved in all,
+        m, (n, 3), and its mean misfit, (n,)."""
         moved, misfit = np.zeros_like(self.moved), np.zeros(len(self.moved))
         left, going = np.arange(len(moved)), np.ones(len(moved), dtype=np.bool_)
-        for iteration in range(iterations):
+        for _ in range(iterations):
             move = self._move()
-            self.moved[going] += move[going]
-            settled = going & ((np.abs(move).max(axis=1) < settled_m) | (iteration == iterations - 1))
-            misfit[left[settled]] = self._misfit(settled)
-            going &= ~settled
+            move[~going] = 0.0
+            self.moved += move
+            going &= np.abs(move).max(axis=1) >= settled_m
             remaining = np.count_nonzero(going)
             if not remaining:
                 break
             if len(left) >= MANY and remaining < KEPT * len(left):
-                moved[left] = self.moved
+                moved[left], misfit[left] = self.moved, self._misfit()
                 left = left[going]
                 self._keep(going)
                 going = np.ones(remaining, dtype=np.bool_)
-        moved[left] = self.moved
+        moved[left], misfit[left] = self.moved, self._misfit()
         return moved, misfit
 
-    def _misfit(self, chosen: BoolArray) -> FloatArray:
-        """Mean misfit of some of the fits before the last step, (m,)."""
-        size = self._size[chosen]
+    def _misfit(self) -> FloatArray:
+        """Mean misfit before the last step, (n,)."""
+        size = self._size
         loss = np.where(size < HUBER, 0.5 * size * size, HUBER * (size - 0.5 * HUBER))
-        misfit: FloatArray = loss.sum(axis=1) / self._count[chosen]
+        misfit: FloatArray = loss.sum(axis=1) / self._count
         return misfit
 
     def _move(self) -> FloatArray:
@@ -107,17 +110,18 @@ class _Fits:
         moved = self.moved.T[:, :, None].astype(np.float32)
         offsets = np.concatenate([self._points - moved, self._rays.nearest(self._eye - moved)], axis=2)
         distance, along = self._solids.gradient(offsets)
-        # A ray that meets the shape is no evidence, nor is a free one that does not.
+        # A ray of the outline that is well inside the shape is no evidence, nor is a free one outside of it.
         missed = distance[:, -self._side.shape[1] :]
         missed *= self._side
+        missed += self._inset
         np.maximum(missed, 0, out=missed)
         missed *= self._side
         self._size = np.abs(distance) * self._certainty
         weight = self._certainty2 / np.maximum(self._size, np.float32(HUBER))
         weight *= distance != 0
         weighted = (along * weight).transpose(1, 0, 2)
-        curvature = (weighted @ along.transpose(1, 2, 0)).astype(np.float64) + PRIOR
-        pull = (weighted @ distance[:, :, None]).astype(np.float64) - PRIOR @ self.moved[:, :, None]
+        curvature = weighted @ along.transpose(1, 2, 0) + PRIOR
+        pull = weighted @ distance[:, :, None] - PRIOR @ self.moved[:, :, None]
         move: FloatArray = np.linalg.solve(curvature, pull)[..., 0]
         return move
 
@@ -125,6 +129,6 @@ class _Fits:
         """Go on with some of the fits only, (n,)."""
         self._solids = self._solids.of(going)
         self._rays = self._rays.of(self._solids, going)
-        for name in ("moved", "_count", "_side", "_certainty", "_certainty2"):
+        for name in ("moved", "_count", "_side", "_inset", "_certainty", "_certainty2"):
             setattr(self, name, getattr(self, name)[going])
         self._points, self._eye = self._points[:, going], self._eye[:, going]

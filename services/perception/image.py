@@ -16,8 +16,9 @@ from services.perception.registration import NO_DATA, PixelBox, Registration, re
 
 __all__ = ["Detector", "Evidence", "ImageSighting", "OwnEvidence", "PixelBox", "RgbdImage"]
 
-_BOX_COSTS_PX = 30, 8000
-"""A box is registered in the time of a wider one with so many columns and pixels more."""
+_BOX_IS_WIDER_PX, _PIXEL_COSTS, _BOXES_COST_PX = 30, 2.3, 20000
+"""Boxes are registered separately in the time of one box with so many times their pixels, each box so much wider, and so
+many pixels more."""
 
 
 class RgbdImage:
@@ -90,14 +91,15 @@ class RgbdImage:
         """Compute the depth at the colour pixels of boxes, shape (n, 4), for `depth_m` and `codes_at`."""
         left, top = boxes[:, :2].min(axis=0).tolist()
         right, bottom = boxes[:, 2:].max(axis=0).tolist()
-        separately = int(((boxes[:, 2] - boxes[:, 0] + _BOX_COSTS_PX[0]) * (boxes[:, 3] - boxes[:, 1])).sum())
-        if separately + _BOX_COSTS_PX[1] * len(boxes) < (right - left) * (bottom - top):
+        separately = int(((boxes[:, 2] - boxes[:, 0] + _BOX_IS_WIDER_PX) * (boxes[:, 3] - boxes[:, 1])).sum())
+        if _PIXEL_COSTS * separately + _BOXES_COST_PX < (right - left) * (bottom - top):
+            self._registered = self._registration.codes_in_boxes(self.raw_depth, boxes)
             self._registered_boxes = [(a, b, c, d) for a, b, c, d in boxes.tolist()]
         else:
-            self._registered_boxes = [(left, top, right, bottom)]
-        self._registered = np.full(self.raw_depth.shape, NO_DATA, dtype=np.uint16)
-        for box in self._registered_boxes:
-            self._registered[box[1] : box[3], box[0] : box[2]] = self._registration.codes(self.raw_depth, box)
+            self._registered = np.full(self.raw_depth.shape, NO_DATA, dtype=np.uint16)
+            box = left, top, right, bottom
+            self._registered[top:bottom, left:right] = self._registration.codes(self.raw_depth, box)
+            self._registered_boxes = [box]
 
     def codes_at(self, at: IntArray) -> CodeArray:
         """Codes of the depth at colour pixels by their places in the flattened image; those of no data outside of

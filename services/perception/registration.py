@@ -15,6 +15,7 @@ import numpy as np
 from cocoro.arrays import CodeArray, Float32Array, IntArray
 from cocoro.robot import Camera, Robot
 from cocoro.units import Vec3
+from services.perception.runs import spread_out
 
 PixelBox = tuple[int, int, int, int]
 """left, top, right, bottom, px; right and bottom are exclusive."""
@@ -87,6 +88,35 @@ class Registration:
             place += start[: len(part)]
             out[row : row + _ROWS].reshape(-1)[place] = part
         return out[:, most + left - first : most + right - first]
+
+    def codes_in_boxes(self, raw_depth: CodeArray, boxes: IntArray) -> CodeArray:
+        """`codes` for boxes (n, 4), in the shape of the image; `NO_DATA` or another code beside them. For some small
+        boxes of a large image; all pixels cost less in one box."""
+        if not self._sideways:
+            out = np.full(raw_depth.shape, NO_DATA, dtype=np.uint16)
+            for left, top, right, bottom in boxes.tolist():
+                box = left, top, right, bottom
+                out[top:bottom, left:right] = self.codes_generally(raw_depth, box)
+            return out
+        # As for one box, row by row; of boxes that overlap, the last one has all that comes from farthest away.
+        height, width = raw_depth.shape
+        most, to_left = self._most_px, self._offset_m[0] < 0
+        left, top, right, bottom = boxes[boxes[:, 2 if to_left else 0].argsort(kind="stable")].T
+        rows = bottom - top
+        first = left if to_left else np.maximum(left - most, 0)
+        count = ((np.minimum(right + most, width) if to_left else right) - first).repeat(rows)
+        row = spread_out(top, rows)
+        pixels = spread_out(row * width + first.repeat(rows), count)
+        beyond = (row * most + (most if to_left else 0)).repeat(count)  # each row has room beyond the image's edge
+        if not to_left:
+            pixels, beyond = pixels[::-1], beyond[::-1]
+        codes = raw_depth.reshape(-1).take(pixels)
+        place = np.asarray(cv2.LUT(codes, self._shift_table)).reshape(-1).view(np.int64)
+        place += pixels
+        place += beyond
+        wide = np.full((height, width + most), NO_DATA, dtype=np.uint16)
+        wide.reshape(-1)[place] = codes
+        return np.ascontiguousarray(wide[:, most:] if to_left else wide[:, :width])
 
     def codes_generally(self, raw_depth: CodeArray, box: PixelBox) -> CodeArray:
         """`codes` for any offset between the cameras; takes several times as long."""

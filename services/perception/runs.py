@@ -42,7 +42,7 @@ class Runs:
     @property
     def first(self) -> IntArray:
         """Each run's first pixel among those of all runs."""
-        return np.cumsum(self.length) - self.length
+        return self.length.cumsum() - self.length
 
     @cached_property
     def at(self) -> IntArray:
@@ -60,7 +60,6 @@ def run_ends(picture: ImageArray) -> tuple[IntArray, IntArray]:
 
 def spread_out(first: IntArray, count: IntArray) -> IntArray:
     """The numbers from each of `first` on, so many as `count` tells, shape (sum of the counts,)."""
-    ends = np.cumsum(count)
-    numbers = np.repeat(first - (ends - count), count)
+    numbers = (first - count.cumsum() + count).repeat(count)
     numbers += np.arange(len(numbers))
     return numbers

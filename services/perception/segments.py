@@ -48,7 +48,7 @@ class Segments:
     @classmethod
     def of_runs(cls, number: IntArray, layer: IntArray, runs: Runs, first: IntArray, core: BoolArray) -> Segments:
         """The regions whose runs begin at `first`, (n,)."""
-        run_count = np.diff(first, append=len(runs.length))
+        run_count = _counts(first, len(runs.length))
         area = np.add.reduceat(runs.length, first)
         right = runs.left + runs.length
         bounds = np.stack(
@@ -112,13 +112,13 @@ class Segments:
     @cached_property
     def start(self) -> IntArray:
         """Index of a region's first pixel, shape (n,)."""
-        return np.cumsum(self.area_px) - self.area_px
+        return self.area_px.cumsum() - self.area_px
 
     def counted(self, pixels: IntArray) -> tuple[IntArray, IntArray]:
         """Of some pixels by their ascending indices: each region's first one among them, and its number of them,
         (n,)."""
         first = np.searchsorted(pixels, self.start)
-        return first, np.diff(first, append=len(pixels))
+        return first, _counts(first, len(pixels))
 
     def mask(self, region: int, box: PixelBox) -> ImageArray:
         """The region's pixels in a box that contains it: 1 inside, 0 outside; shape (bottom - top, right - left)."""
@@ -160,7 +160,7 @@ def segments(codes: CodeArray, table: ImageArray, layer: int, min_area_px: float
     area = np.add.reduceat(end - begin, first)
     kept = _largest(number, np.where(area >= min_area_px, area, 0))
     if not kept.all():
-        counts = np.diff(first, append=len(begin))
+        counts = _counts(first, len(begin))
         runs_kept, counts = np.repeat(kept, counts), counts[kept]
         begin, end, number, first = begin[runs_kept], end[runs_kept], number[kept], np.cumsum(counts) - counts
     if not len(number):
@@ -168,6 +168,14 @@ def segments(codes: CodeArray, table: ImageArray, layer: int, min_area_px: float
     inside = core.reshape(-1).take(spread_out(begin, end - begin)) != 0
     runs = Runs.of(begin, end, opened.shape[1], (left - 1, top), codes.shape[1])
     return Segments.of_runs(number, np.full(len(number), layer), runs, first, inside)
+
+
+def _counts(first: IntArray, total: int) -> IntArray:
+    """The sizes of groups that begin at `first` and follow one another up to `total`."""
+    counts = np.empty_like(first)
+    np.subtract(first[1:], first[:-1], out=counts[:-1])
+    counts[-1] = total - first[-1]
+    return counts
 
 
 def _framed(picture: ImageArray) -> ImageArray:
