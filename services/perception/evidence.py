@@ -6,7 +6,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from cocoro.arrays import BoolArray, Float32Array, FloatArray, ImageArray, IntArray
 from services.perception.image import Evidence, RgbdImage

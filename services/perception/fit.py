@@ -9,26 +9,20 @@ from __future__ import annotations
 
 import numpy as np
 
-from cocoro.arrays import BoolArray, Float32Array, FloatArray
+from cocoro.arrays import FloatArray
 from services.perception.image import Evidence
 from services.perception.rays import Rays
 from services.perception.shapes import Shapes, Solids
 
 ITERATIONS = 12
-SETTLED_M = 1e-3
-"""A fit ends when a step moves it by less: what is left to go is then a small part of that."""
+SETTLED_M = 2e-3
+"""A fit ends when a step moves it by less: most fits then are within a tenth of it."""
 PRIOR = np.eye(3) / 0.05**2
 """Inverse covariance of the first guess, 1/m2: it may be 5 cm off and decides only what the evidence leaves open."""
 RAY_DOUBT_M, RAY_DOUBT_RAD = 0.001, 0.002
 """Standard deviation of the outline: a constant, and about a pixel at the object's distance."""
 INSET_RAD = 0.002
 """How far inside the true outline the outermost pixels found are on average: a pixel at 640 x 480."""
-MANY = 32
-COARSE, COARSE_ITERATIONS, COARSE_SETTLED_M = 4, 4, 2e-3
-"""So many fits go most of the way by every fourth piece of evidence, in so many steps at most: that takes a quarter of the
-time. Of fewer fits the calls take the time, not the numbers."""
-KEPT = 0.7
-"""The fits that have settled are left out when less than this share of them goes on."""
 HUBER = 1.5
 
 
@@ -40,12 +34,7 @@ def fit_centres(
 
     `pose` is the camera's pose in the body frame, 4 x 4; `start` the first guesses, m, shape (n, 3).
     """
-    rotation, guess = pose[:3, :3], start - pose[:3, 3]
-    fits = _Fits(shapes, evidence, rotation, guess)
-    if len(start) >= MANY:
-        nearby = _Fits(shapes, evidence.every(COARSE), rotation, guess)
-        fits.moved = nearby.settle(COARSE_ITERATIONS, COARSE_SETTLED_M)[0]
-    moved, misfit = fits.settle(ITERATIONS, SETTLED_M)
+    moved, misfit = _Fits(shapes, evidence, pose[:3, :3], start - pose[:3, 3]).settle()
     wandered = (moved * moved).sum(axis=1) >= 4 * shapes.reach_m**2
     moved[wandered] = 0.0
     return start + moved, misfit
@@ -77,26 +66,18 @@ class _Fits:
         self._certainty = np.concatenate([evidence.certainty, of_rays], axis=1)
         self._certainty2 = self._certainty * self._certainty * np.float32(HUBER)
 
-    def settle(self, iterations: int, settled_m: float) -> tuple[FloatArray, FloatArray]:
-        """Step until each fit moves by less than `settled_m`, at most so many times. Returns how far each moved in all,
-        m, (n, 3), and its mean misfit, (n,)."""
-        moved, misfit = np.zeros_like(self.moved), np.zeros(len(self.moved))
-        left, going = np.arange(len(moved)), np.ones(len(moved), dtype=np.bool_)
-        for _ in range(iterations):
+    def settle(self) -> tuple[FloatArray, FloatArray]:
+        """Step until each fit settles, and then leave it. Returns how far each moved in all, m, (n, 3), and its mean
+        misfit, (n,)."""
+        going = np.ones(len(self.moved), dtype=np.bool_)
+        for _ in range(ITERATIONS):
             move = self._move()
             move[~going] = 0.0
             self.moved += move
-            going &= np.abs(move).max(axis=1) >= settled_m
-            remaining = np.count_nonzero(going)
-            if not remaining:
+            going &= np.abs(move).max(axis=1) >= SETTLED_M
+            if not going.any():
                 break
-            if len(left) >= MANY and remaining < KEPT * len(left):
-                moved[left], misfit[left] = self.moved, self._misfit()
-                left = left[going]
-                self._keep(going)
-                going = np.ones(remaining, dtype=np.bool_)
-        moved[left], misfit[left] = self.moved, self._misfit()
-        return moved, misfit
+        return self.moved, self._misfit()
 
     def _misfit(self) -> FloatArray:
         """Mean misfit before the last step, (n,)."""
@@ -124,11 +105,3 @@ class _Fits:
         pull = weighted @ distance[:, :, None] - PRIOR @ self.moved[:, :, None]
         move: FloatArray = np.linalg.solve(curvature, pull)[..., 0]
         return move
-
-    def _keep(self, going: BoolArray) -> None:
-        """Go on with some of the fits only, (n,)."""
-        self._solids = self._solids.of(going)
-        self._rays = self._rays.of(self._solids, going)
-        for name in ("moved", "_count", "_side", "_inset", "_certainty", "_certainty2"):
-            setattr(self, name, getattr(self, name)[going])
-        self._points, self._eye = self._points[:, going], self._eye[:, going]

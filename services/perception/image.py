@@ -17,8 +17,8 @@ from services.perception.registration import NO_DATA, PixelBox, Registration, re
 __all__ = ["Detector", "Evidence", "ImageSighting", "OwnEvidence", "PixelBox", "RgbdImage"]
 
 _BOX_IS_WIDER_PX, _PIXEL_COSTS, _BOXES_COST_PX = 30, 2.3, 20000
-"""Boxes are registered separately in the time of one box with so many times their pixels, each box so much wider, and so
-many pixels more."""
+"""Boxes are registered separately in the time of one box with so many times their pixels, each box so much wider, and
+so many pixels more."""
 
 
 class RgbdImage:
@@ -135,11 +135,6 @@ class Evidence:
             return self
         values = (getattr(self, field.name) for field in fields(self))
         return Evidence(*(value[:, objects] if value.ndim == 3 else value[objects] for value in values))
-
-    def every(self, step: int) -> Evidence:
-        """A part of the evidence: every so manieth point and ray."""
-        values = (getattr(self, field.name) for field in fields(self))
-        return Evidence(*(value[..., ::step] if value.ndim > 1 else value for value in values))
 
 
 class OwnEvidence(NamedTuple):

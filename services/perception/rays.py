@@ -1,15 +1,15 @@
 """Where rays from the camera come nearest to upright shapes, or go deepest into them, in closed form.
 
-A ray's points are told by the way along it from the point beside the shape's axis, measured across the shape: from above
-for a cylinder, in all directions for a sphere. There the ray is deepest inside the cylinder's side. Where the lid is
-nearer than the side, it goes on towards the middle height until both are equally far, but not beyond the side.
+A ray's points are told by the way along it, measured across the shape: from above for a cylinder, in all directions for
+a sphere. A ray is deepest inside of the side where it is nearest to the axis. Where the lid is nearer than the side, it
+goes deeper towards the middle height, until both are equally far, but not beyond the side.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from cocoro.arrays import BoolArray, Float32Array
+from cocoro.arrays import Float32Array
 from services.perception.shapes import Solids
 
 _TINY = np.float32(1e-9)
@@ -45,14 +45,6 @@ class Rays:
         np.minimum(further, np.sqrt(np.maximum(solids.radius * solids.radius - off_axis2, 0)), out=further)
         beside_axis -= np.copysign(further, height * self._directions[2])
         np.minimum(beside_axis, self._free_to, out=beside_axis)
-        points = beside_axis * self._directions
+        points: Float32Array = beside_axis * self._directions
         points += camera
         return points
-
-    def of(self, solids: Solids, chosen: BoolArray) -> Rays:
-        """The rays of some of the shapes, (n,), whose surfaces are `solids`."""
-        some = Rays.__new__(Rays)
-        some._solids = solids
-        some._directions, some._across = self._directions[:, chosen], self._across[:, chosen]
-        some._free_to, some._slope = self._free_to[chosen], self._slope[chosen]
-        return some

@@ -60,6 +60,6 @@ def run_ends(picture: ImageArray) -> tuple[IntArray, IntArray]:
 
 def spread_out(first: IntArray, count: IntArray) -> IntArray:
     """The numbers from each of `first` on, so many as `count` tells, shape (sum of the counts,)."""
-    numbers = (first - count.cumsum() + count).repeat(count)
+    numbers: IntArray = (first - count.cumsum() + count).repeat(count)
     numbers += np.arange(len(numbers))
     return numbers

@@ -60,18 +60,13 @@ class Solids:
 
     def __init__(self, shapes: Shapes) -> None:
         self.radius: Float32Array = shapes.radius_m.astype(np.float32)[:, None]
-        self.half_height: Float32Array = np.where(shapes.sphere, NO_LID_M, shapes.height_m / 2).astype(np.float32)[:, None]
+        self.half_height: Float32Array = np.where(shapes.sphere, NO_LID_M, shapes.height_m / 2).astype(np.float32)[
+            :, None
+        ]
         """Both m, (n, 1)."""
         self.across: Float32Array = np.ones((3, len(shapes), 1), dtype=np.float32)
         """1 for the directions in which the radius is measured, 0 for others, (3, n, 1)."""
         self.across[2, :, 0] = shapes.sphere
-
-    def of(self, chosen: BoolArray) -> Solids:
-        """The surfaces of some of the objects, (n,)."""
-        some = Solids.__new__(Solids)
-        some.radius, some.half_height = self.radius[chosen], self.half_height[chosen]
-        some.across = self.across[:, chosen]
-        return some
 
     def distance(self, offsets_m: Float32Array) -> Float32Array:
         """Signed distances of points from the surfaces, m, negative inside, shape (n, k), by their offsets from the
