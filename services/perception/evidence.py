@@ -32,14 +32,15 @@ def middle_depths_m(found: Segments, image: RgbdImage) -> FloatArray:
     known = np.flatnonzero(of_middle < image.no_depth_code)
     own, of_middle = own.take(known), of_middle.take(known)
     in_middle = np.bincount(own, minlength=len(area))
-    # Codes rise with the depth.
-    by_region = np.sort((own.astype(np.int32) << 11) + of_middle)
+    # By region, then by code, and codes rise with the depth: to sort numbers of 16 bits twice takes half of the time.
+    by_code = np.argsort(of_middle, kind="stable")
+    by_region = of_middle.take(by_code.take(np.argsort(own.astype(np.uint16).take(by_code), kind="stable")))
     first = np.cumsum(in_middle) - in_middle
     depth_m = np.full(len(area), np.nan)
     usual = np.flatnonzero((data >= enough) & (in_middle >= enough / 2))
     low, high = first[usual] + (in_middle[usual] - 1) // 2, first[usual] + in_middle[usual] // 2
     table = image.registered_depth_m
-    depth_m[usual] = (table[by_region[low] & 2047] + table[by_region[high] & 2047]) / np.float32(2)
+    depth_m[usual] = (table[by_region[low]] + table[by_region[high]]) / np.float32(2)
     for region in np.flatnonzero((data >= enough) & (in_middle < enough / 2)).tolist():
         pixels = table[codes[found.start[region] : found.start[region] + area[region]]]
         depth_m[region] = np.median(pixels[np.isfinite(pixels)])
@@ -157,18 +158,21 @@ def surroundings(found: Segments, image: RgbdImage) -> tuple[IntArray, Float32Ar
     height = bottom - top + 2 * margin
     down, across = height.cumsum() - height + margin - top, margin - left
     picture = np.zeros((int(height.sum()), width), dtype=np.uint8)
-    runs = found.runs
     moved = (down * width + across).repeat(found.run_count)
-    picture.reshape(-1)[spread_out(runs.row * width + runs.left + moved, runs.length)] = 1
-    around = np.flatnonzero(_dilated(picture, 2 * ring_px(image) + 1) != _dilated(picture, 3))
-    row = around // width
-    own = np.arange(len(height)).repeat(height).take(row)
-    v, u = row - down.take(own), around - row * width - across.take(own)
-    at = v * image.width + u
+    picture.reshape(-1)[spread_out(found.runs.row * width + found.runs.left + moved, found.runs.length)] = 1
+    around = _dilated(picture, 2 * ring_px(image) + 1) != _dilated(picture, 3)
+    own = np.arange(len(height)).repeat(height)
+    v = np.arange(len(own)) - down.take(own)
+    beyond = (left < margin) | (top < margin) | (right > image.width - margin) | (bottom > image.height - margin)
+    if beyond.any():
+        u = np.arange(width) - across[:, None]
+        around &= ((u >= 0) & (u < image.width)).take(own, axis=0) & ((v >= 0) & (v < image.height))[:, None]
+    pixels = np.flatnonzero(around)
+    row = pixels // width
+    at = pixels + (v * image.width - across.take(own) - np.arange(len(own)) * width).take(row)
     codes = image.codes_at(at)
-    within = (u >= 0) & (u < image.width) & (v >= 0) & (v < image.height)
-    known = np.flatnonzero(within & (codes < image.no_depth_code))
-    counts = np.bincount(own.take(known), minlength=len(height))
+    known = np.flatnonzero(codes < image.no_depth_code)
+    counts = np.bincount(own.take(row.take(known)), minlength=len(height))
     return at.take(known), image.registered_depth_m.take(codes.take(known)), counts.cumsum() - counts, counts
 
 

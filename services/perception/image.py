@@ -144,8 +144,9 @@ class OwnEvidence(NamedTuple):
     number: int
 
 
-@dataclass(frozen=True)
-class ImageSighting:
+class ImageSighting(NamedTuple):
+    """A known object in the image."""
+
     label: str
     u_px: float
     v_px: float
