@@ -151,28 +151,30 @@ def surroundings(found: Segments, image: RgbdImage) -> tuple[IntArray, Float32Ar
     """Places in the flattened image and depths, m, of the pixels around regions, as in `ColourRegion.surroundings`,
     that have a depth, and where each region's begin among them and how many it has. Pixels around two regions are of
     both."""
-    # All regions in one picture, one below the other.
+    # All regions in one picture, side by side.
     margin = ring_px(image) + 1
     left, top, right, bottom = found.bounds.T
-    width = int((right - left).max()) + 2 * margin
-    height = bottom - top + 2 * margin
-    down, across = height.cumsum() - height + margin - top, margin - left
-    picture = np.zeros((int(height.sum()), width), dtype=np.uint8)
+    widths = right - left + 2 * margin
+    height, width = int((bottom - top).max()) + 2 * margin, int(widths.sum())
+    across, down = widths.cumsum() - widths + margin - left, margin - top
+    picture = np.zeros((height, width), dtype=np.uint8)
     moved = (down * width + across).repeat(found.run_count)
     picture.reshape(-1)[spread_out(found.runs.row * width + found.runs.left + moved, found.runs.length)] = 1
     around = _dilated(picture, 2 * ring_px(image) + 1) != _dilated(picture, 3)
-    own = np.arange(len(height)).repeat(height)
-    v = np.arange(len(own)) - down.take(own)
-    beyond = (left < margin) | (top < margin) | (right > image.width - margin) | (bottom > image.height - margin)
-    if beyond.any():
-        u = np.arange(width) - across[:, None]
-        around &= ((u >= 0) & (u < image.width)).take(own, axis=0) & ((v >= 0) & (v < image.height))[:, None]
+    own = np.arange(len(widths)).repeat(widths)
+    u = np.arange(width) - across.take(own)
+    if min(left.min(), top.min(), image.width - right.max(), image.height - bottom.max()) < margin:
+        v = np.arange(height)[:, None] - down
+        around &= (u >= 0) & (u < image.width) & ((v >= 0) & (v < image.height)).take(own, axis=1)
     pixels = np.flatnonzero(around)
     row = pixels // width
-    at = pixels + (v * image.width - across.take(own) - np.arange(len(own)) * width).take(row)
+    column = pixels - row * width
+    at = row * image.width + (u - down.take(own) * image.width).take(column)
     codes = image.codes_at(at)
     known = np.flatnonzero(codes < image.no_depth_code)
-    counts = np.bincount(own.take(row.take(known)), minlength=len(height))
+    own = own.take(column.take(known))
+    known = known.take(np.argsort(own, kind="stable"))
+    counts = np.bincount(own, minlength=len(widths))
     return at.take(known), image.registered_depth_m.take(codes.take(known)), counts.cumsum() - counts, counts
 
 

@@ -141,6 +141,8 @@ def _displaced(
     areas = (right - left) * (bottom - top)
     together = common >= SAME_PLACE * (np.add.outer(areas, areas) - common)
     lost = [False] * len(sightings)
+    if np.count_nonzero(together) == len(sightings):  # each with itself
+        return lost
     for one, other in np.argwhere(np.triu(together, 1)).tolist():
         if pieces[one] and pieces[other]:
             fewer = min(pieces[one], pieces[other])
