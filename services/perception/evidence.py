@@ -140,6 +140,7 @@ def _smoothed_m(
 ) -> tuple[Float32Array, BoolArray]:
     """Depth at pixels, m: the mean of a square of 3 x 3 around each, of what is within `window_m` of `near_m`; and
     whether the pixel itself is. All of shape (m,)."""
+    # Beyond the image's sides a square goes on in the next row, where hardly anything is as far away.
     square = np.add.outer((-image.width, 0, image.width), (-1, 0, 1)).reshape(-1, 1)
     depth = image.registered_depth_m.take(image.codes_at(at + square))
     near = np.abs(depth - near_m) < window_m
