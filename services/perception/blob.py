@@ -63,7 +63,7 @@ class BlobDetector:
                 if parts:
                     masks, boxes = zip(*parts, strict=True)
                     same = np.ones(len(parts), dtype=np.int64)
-                    thin.append(Segments.of_masks((label - 1) * same, place * same, masks, boxes))
+                    thin.append(Segments.of_masks((label - 1) * same, place * same, masks, boxes, image.width))
         return thin
 
     def _sightings(self, found: Segments, image: RgbdImage, min_area_px: float) -> list[ImageSighting]:
@@ -74,7 +74,7 @@ class BlobDetector:
         one.
         """
         image.register(_with_margin(found.bounds, image))
-        depth_m = middle_depths_m(found, image.codes_at(found.u, found.v), image)
+        depth_m = middle_depths_m(found, image)
         fit = SizeFit(self._shapes.of(found.number), image.camera, self._config, min_area_px)
         diagonal_px = np.hypot(*(found.bounds[:, 2:] - found.bounds[:, :2]).T)
         alone = np.bincount(found.number)[found.number] == 1
@@ -90,7 +90,9 @@ class BlobDetector:
                 numbers, regions = np.array(list(others)), list(others.values())
                 layers = np.array([self._table.layer_of[number] for number in others])
                 parts.append(
-                    Segments.of_masks(numbers, layers, [each.mask for each in regions], [each.box for each in regions])
+                    Segments.of_masks(
+                        numbers, layers, [each.mask for each in regions], [each.box for each in regions], image.width
+                    )
                 )
                 of_others = np.array([depth_of(region) for region in regions])
                 fit = SizeFit(self._shapes.of(numbers), image.camera, self._config, min_area_px)
@@ -117,7 +119,6 @@ class BlobDetector:
     def _told(self, found: Segments, depth_m: FloatArray, hidden: BoolArray, image: RgbdImage) -> list[ImageSighting]:
         """The sightings of objects that are these regions, in the catalogue's order. `depth_m` are the regions' depths,
         m, NaN without, and `hidden` is whether something may hide a part of them, shape (n,)."""
-        u_px, v_px = (np.add.reduceat(each, found.start, dtype=np.int64) / found.area_px for each in (found.u, found.v))
         left, top, right, bottom = found.bounds.T
         cut = (left <= 1) | (top <= 1) | (right >= image.width - 1) | (bottom >= image.height - 1)
         deep = ~np.isnan(depth_m)
@@ -128,7 +129,7 @@ class BlobDetector:
             )
             for number, region in enumerate(np.flatnonzero(deep).tolist()):
                 evidence[region] = OwnEvidence(all_evidence, number)
-        columns = (u_px, v_px, found.area_px, found.bounds, depth_m, cut, hidden)
+        columns = (*found.centre_px.T, found.area_px, found.bounds, depth_m, cut, hidden)
         numbers = found.number.tolist()
         rows = list(zip(*(column.tolist() for column in columns), evidence, strict=True))
         sightings = []
