@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cocoro.arrays import BoolArray, CodeArray, Float32Array, FloatArray, ImageArray, IntArray
+from cocoro.arrays import BoolArray, CodeArray, Float32Array, FloatArray, ImageArray, IntArray, median
 from services.perception.image import Evidence, RgbdImage
 from services.perception.region import MIN_DEPTH_PIXELS, MIN_DEPTH_SHARE, ColourRegion, depth_doubt_m, ring_px
 from services.perception.segments import Segments
@@ -50,7 +50,7 @@ def middle_depths_m(found: Segments, codes: CodeArray, image: RgbdImage) -> Floa
     depth_m[usual] = (table[by_region[low] & 2047] + table[by_region[high] & 2047]) / np.float32(2)
     for region in np.flatnonzero((data >= enough) & (in_middle < enough / 2)).tolist():
         pixels = table[codes[found.start[region] : found.start[region] + area[region]]]
-        depth_m[region] = np.median(pixels[np.isfinite(pixels)])
+        depth_m[region] = median(pixels[np.isfinite(pixels)])
     return depth_m
 
 
@@ -146,7 +146,7 @@ def surroundings(found: Segments, image: RgbdImage) -> tuple[IntArray, IntArray,
     if len(found.start) <= FEW:
         parts = [_around_one(found, region, image) for region in range(len(found.start))]
     else:
-        layers = np.unique(found.layer).tolist()
+        layers = sorted(set(found.layer.tolist()))
         parts = [_around(found, np.flatnonzero(found.layer == layer), image) for layer in layers]
     at, owner = (np.concatenate(each) for each in zip(*parts, strict=True))
     v = at // image.width
