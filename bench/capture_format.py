@@ -44,7 +44,7 @@ from services.capture.keys import QueuedMessage, info_of
 from services.capture.packing import QUICK, Packer
 from services.capture.writer import CaptureWriter, FileLimits
 from services.executive.tasks import FetchTask
-from sim.realism import Sensors
+from sim.kinds import Sensors
 
 SMALL_BYTES = 64 * 1024
 MEMORY = Path("/dev/shm")

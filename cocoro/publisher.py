@@ -26,6 +26,7 @@ class Publisher(Generic[M]):
         self.rate = Rate()
         self.newest_stamp_ns: int | None = None
         self._type = topic.type
+        self._slow = topic.slow
         self._raw = bus.publisher(key, topic.qos)
         self.incarnation = bus.new_incarnation()
         self._clock = clock
@@ -46,7 +47,7 @@ class Publisher(Generic[M]):
         self.rate.count += 1
         self.newest_stamp_ns = message.stamp_ns
         payload = _ENCODER.encode(message)
-        if self.topic.slow:
+        if self._slow:
             self._newest = payload
         self._raw.put(payload)
         return message

@@ -19,13 +19,13 @@ from apps.cli.main import PACKAGES, main
 from apps.cli.options import frames_of, latencies_of
 from apps.cli.running import overrides
 from apps.cli.terminal import table
+from apps.rehearsal import ahead
 from apps.rehearsal import rehearse as rehearsing
 from apps.rehearsal.request import RehearsalRequest
 from cocoro.errors import CocoroError, ConfigError
 from cocoro.topics import TOPICS
 from deploy.processes import stoppable
 from services.executive.tasks import TASKS, FetchTask, FollowTask, PutDownTask
-from sim.camera_process import start
 
 COMMANDS = (
     "up", "down", "status", "fetch", "follow", "park", "put-down", "stop", "estop", "reset", "cancel", "objects",
@@ -254,7 +254,7 @@ def simulator(monkeypatch: pytest.MonkeyPatch) -> list[RehearsalRequest]:
         return RESULT | {"outcome": "failed" if request.task.label == "blue_can" else "done"}
 
     monkeypatch.setattr(rehearsing, "rehearse", run)
-    monkeypatch.setattr(start, "started_ahead", nullcontext)
+    monkeypatch.setattr(ahead, "begun_ahead", nullcontext)
     return asked
 
 

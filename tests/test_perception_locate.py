@@ -12,7 +12,7 @@ from services.perception.image import ImageSighting
 from services.perception.localise import Localiser, first_guesses
 from services.perception.rays import Rays
 from services.perception.shapes import Shapes, Solids
-from sim.realism import Sensors
+from sim.kinds import Sensors
 from sim.scene import Light
 
 pytestmark = pytest.mark.sim

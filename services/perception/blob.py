@@ -52,7 +52,8 @@ class BlobDetector:
         thin = []
         for place, layer in enumerate(self._table.layers):
             labels = layer.table.take(codes)
-            counts = np.bincount(labels.reshape(-1))
+            # Most pixels have no object's colour, and are not counted.
+            counts = np.bincount(labels[labels != 0], minlength=1)
             for label in (1 + np.flatnonzero(counts[1:] >= min_area_px)).tolist():
                 if label - 1 in seen:
                     continue
@@ -85,7 +86,7 @@ class BlobDetector:
         parts = [found.among(simple)] if simple.any() else []
         depth_m, hidden = depth_m[simple], hidden[simple]
         if not simple.all():
-            others = self._one_by_one(found, np.unique(found.number[~simple]), image, min_area_px)
+            others = self._one_by_one(found, sorted(set(found.number[~simple].tolist())), image, min_area_px)
             if others:
                 numbers, regions = np.array(list(others)), list(others.values())
                 layers = np.array([self._table.layer_of[number] for number in others])
@@ -102,11 +103,11 @@ class BlobDetector:
         return self._told(Segments.joined(parts), depth_m, hidden, image) if parts else []
 
     def _one_by_one(
-        self, found: Segments, numbers: IntArray, image: RgbdImage, min_area_px: float
+        self, found: Segments, numbers: list[int], image: RgbdImage, min_area_px: float
     ) -> dict[int, ColourRegion]:
         """The region of each of the objects with these numbers that is seen."""
         seen = {}
-        for number in numbers.tolist():
+        for number in numbers:
             regions = np.flatnonzero(found.number == number)
             largest_first = regions[np.argsort(-found.area_px[regions], kind="stable")].tolist()
             parts = [_region(found, region, image) for region in largest_first]

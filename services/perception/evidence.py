@@ -7,7 +7,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from cocoro.arrays import BoolArray, Float32Array, FloatArray, ImageArray, IntArray
+from cocoro.arrays import BoolArray, Float32Array, FloatArray, ImageArray, IntArray, median
 from services.perception.image import Evidence, RgbdImage
 from services.perception.region import MIN_DEPTH_PIXELS, MIN_DEPTH_SHARE, depth_doubt_m, ring_px
 from services.perception.runs import spread_out
@@ -43,7 +43,7 @@ def middle_depths_m(found: Segments, image: RgbdImage) -> FloatArray:
     depth_m[usual] = (table[by_region[low]] + table[by_region[high]]) / np.float32(2)
     for region in np.flatnonzero((data >= enough) & (in_middle < enough / 2)).tolist():
         pixels = table[codes[found.start[region] : found.start[region] + area[region]]]
-        depth_m[region] = np.median(pixels[np.isfinite(pixels)])
+        depth_m[region] = median(pixels[np.isfinite(pixels)])
     return depth_m
 
 

@@ -159,7 +159,7 @@ class Approaching:
         """Whether there is room for the arm to unfold while the robot turns and drives on."""
         assert self._course is not None
         x, y, _ = target.position_m
-        on_the_way = snapshot.actuators.driver.preview((x, y), grasp_aim(snapshot.actuators))
+        on_the_way = snapshot.actuators.driver.preview((x, y), grasp_aim(snapshot.actuators), self.UNFOLD_S)
         ahead = [Pose2(0.25), Pose2(0.5), *on_the_way[: round(self.UNFOLD_S / PREVIEW_S) : 4]]
         return all(self._course.roomy(snapshot.body.compose(pose), fields) for pose in ahead)
 
