@@ -1,12 +1,11 @@
 """Packs messages as they are in a capture.
 
 A large payload is packed where it is, and its message's head is put before it afterwards (`behind_start`). To join both
-first takes 4% more time for a frame of noisy sensors and its size in memory; when zstd gets them one after the other it
-takes 14% more than joined (`python -m bench capture-format records`).
+first takes a frame's size in memory, and some more time (`python -m bench capture-format records`).
 
 Compression is measured on frames of the simulated Kinect, 1.5 MB each, on one core (`python -m bench capture
 frames`): zstd at level 1 makes ideal frames 25 times smaller in 1.0 ms and noisy ones 2.1 times in 2.1 ms; lz4 11
-times in 0.6 ms and 1.3 times in 0.9 ms. Both cost less than writing the bytes that they save.
+times in 0.6 ms and 1.3 times in 0.9 ms. docs/captures.md compares recorders with each.
 """
 
 from __future__ import annotations
