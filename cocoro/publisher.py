@@ -26,12 +26,12 @@ class Publisher(Generic[M]):
         self.rate = Rate()
         self.newest_stamp_ns: int | None = None
         self._type = topic.type
-        self._slow = topic.slow
         self._raw = bus.publisher(key, topic.qos)
         self.incarnation = bus.new_incarnation()
         self._clock = clock
         self._newest: bytes | None = None
-        """Encoded; kept of a slow topic alone."""
+        """Encoded; kept of a topic whose newest message can be asked for."""
+        self._keeps = topic.askable
 
     def put(self, message: M, stamp_ns: int | None = None) -> M:
         """Publishes the message and returns it, completed in place. `stamp_ns` defaults to the message's own stamp, or
@@ -47,7 +47,7 @@ class Publisher(Generic[M]):
         self.rate.count += 1
         self.newest_stamp_ns = message.stamp_ns
         payload = _ENCODER.encode(message)
-        if self._slow:
+        if self._keeps:
             self._newest = payload
         self._raw.put(payload)
         return message

@@ -14,11 +14,11 @@ from typing import Any
 import pytest
 from places import in_short_folder
 
-from apps.cli import app, listed, stop_asking, task_commands
+from apps.cli import app, listed, stop_asking, task_commands, terminal
 from apps.cli.main import PACKAGES, main
 from apps.cli.options import frames_of, latencies_of
 from apps.cli.running import overrides
-from apps.cli.terminal import table
+from apps.cli.terminal import Column, table
 from apps.rehearsal import ahead
 from apps.rehearsal import rehearse as rehearsing
 from apps.rehearsal.request import RehearsalRequest
@@ -151,6 +151,15 @@ def test_a_latency_that_is_none_shows_how_it_is_written(text: str) -> None:
 
 def test_a_table_lines_up() -> None:
     assert table(("name", "n"), [("a", "1"), ("long", "22")]) == "NAME  N\na     1\nlong  22\n"
+
+
+@pytest.mark.parametrize("width", [13, 14, 100])
+def test_a_table_that_needs_no_fitting_is_what_the_library_draws(width: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    columns = ("name", Column("n", right=True), Column("", text=True))
+    rows = [("a", "1", ""), ("long", "22", "as [b]"), ("", "", "x"), ("", "", "")]
+    ours = table(columns, rows, width)
+    monkeypatch.setattr(terminal, "_plain_table", lambda *_: None)
+    assert ours == table(columns, rows, width)
 
 
 def test_topics_as_data_has_every_row(capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,47 +2,33 @@
 
 from __future__ import annotations
 
-import asyncio
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from apps.cli.choice import RobotChoice
-from cocoro.bus.base import Bus
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.errors import ConfigError, MeshError, choice_of
-from cocoro.participant import Answer, Participant
+from cocoro.participant import Answer
 from cocoro.topics import Request
-from deploy import robot_time
 from deploy.rundir import START, RunDir, robots
+from deploy.survey import REPLAY, Onlooker
 
 if TYPE_CHECKING:
     from cocoro.objects import Catalogue
     from cocoro.robot import Robot
 
-__all__ = ["Answer", "MeshLink", "find", "joined", "within"]
+__all__ = ["Answer", "MeshLink", "find", "joined"]
 
 PERCEPTION = "perception"
 """The component that detects the known objects."""
 ROBOT_FILES = ("description", "measured")
-REPLAY, REPLAYED = "replay", "replayed"
-"""Process that publishes a capture's messages, and the state of a service that it stands for."""
 
 
-class MeshLink(Participant):
+class MeshLink(Onlooker):
     """An operator's participant of the mesh. Make it with `joined`."""
-
-    onlooker = True
-    frame_depth = depth = 64
-
-    def __init__(self, run_dir: RunDir, bus: Bus, private: bool = True) -> None:
-        """`private`: only processes of this machine can be in this mesh."""
-        super().__init__(bus, robot_time.clock(run_dir.path), run_dir.robot)
-        self._private = private
-        self.run_dir = run_dir
-        self.robot = run_dir.robot
 
     def described(self) -> Robot:
         """The robot by the files that it was started with, if they are on this machine; else the Calliope. Raises
@@ -82,18 +68,6 @@ class MeshLink(Participant):
     def refused(self, answer: Answer[Any]) -> str:
         return f"{answer.service}: {answer.error}"
 
-    def unheard(self, service: str) -> str:
-        """The state of a service without a liveliness token: `replayed` when a replay publishes its messages, `not
-        alive` when no process of this machine is it, else `no contact`, which a living process may be without."""
-        by = self.run_dir.claimant(service)
-        if by is not None and by.name == REPLAY:
-            return REPLAYED
-        return "not alive" if self._private and by is None else "no contact"
-
-    def replayed(self) -> set[str]:
-        """The services whose messages a replay of this machine publishes."""
-        return {service for service, by in self.run_dir.claims().items() if by.name == REPLAY}
-
 
 def find(choice: RobotChoice) -> RunDir:
     """The robot that a command is for. Raises MeshError when none is up, ConfigError when several are."""
@@ -131,15 +105,3 @@ async def joined(
         config = replace(config, patience_s=patience_s)
     async with await ZenohBus.open(config, expect_mesh=True) as bus:
         yield MeshLink(run_dir, bus, private=config.directory is not None)
-
-
-async def within(timeout_s: float, condition: Callable[[], bool], changed: asyncio.Event) -> bool:
-    """Waits until a condition holds, checking it whenever `changed` is set; returns whether it holds in the end."""
-    try:
-        async with asyncio.timeout(timeout_s):
-            while not condition():
-                changed.clear()
-                await changed.wait()
-    except TimeoutError:
-        pass
-    return condition()
