@@ -52,7 +52,7 @@ from cocoro.node import Node
 from cocoro.robot import Robot
 from services.capture.packing import Compression, Packer
 from services.executive.tasks import FetchTask
-from sim.realism import Sensors
+from sim.kinds import Sensors
 
 PARTS = ("traffic", "reexecute", "kill", "frames", "again")
 SHORT_PARTS = PARTS[:-1]

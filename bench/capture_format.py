@@ -41,10 +41,10 @@ from cocoro.clock import NS
 from cocoro.errors import CocoroError
 from services.capture import file, packing
 from services.capture.keys import QueuedMessage, info_of
-from services.capture.packing import QUICK, Packer
+from services.capture.packing import QUICK, Packer, behind_start
 from services.capture.writer import CaptureWriter, FileLimits
 from services.executive.tasks import FetchTask
-from sim.realism import Sensors
+from sim.kinds import Sensors
 
 SMALL_BYTES = 64 * 1024
 MEMORY = Path("/dev/shm")
@@ -271,15 +271,23 @@ def _frames(name: str, frames: list[bytes], comparison: Comparison, report: Repo
     def joined() -> None:
         for frame in frames:
             raw = b"".join((head, frame))
-            zlib.crc32(raw)
+            mcap.crc32(raw)
             packer.compress(raw)
+
+    def behind() -> None:
+        for frame in frames:
+            mcap.crc32(frame, mcap.crc32(head))
+            behind_start(head, packer.compress(frame))
 
     def in_pieces() -> None:
         for frame in frames:
-            zlib.crc32(frame, zlib.crc32(head))
+            mcap.crc32(frame, mcap.crc32(head))
             stream = packer.compressobj(size=len(head) + len(frame))
             _ = [stream.compress(head), stream.compress(frame), stream.flush()]
 
-    together, apart = turns(comparison.times, joined=_spent(joined), pieces=_spent(in_pieces))
+    together, after, apart = turns(
+        comparison.times, joined=_spent(joined), behind=_spent(behind), pieces=_spent(in_pieces)
+    )
     report.value(f"{name}: joined and packed, each", [each / len(frames) for each in together], "ms")
+    report.ratio(f"{name}: packed, then put behind its head / joined and packed", after, together, better="less")
     report.ratio(f"{name}: packed in pieces / joined and packed", apart, together, better="more")

@@ -20,6 +20,7 @@ from bench.perception_plain import Found, PaperNumpy, PlainOpenCV, memory_pass
 from bench.perception_scene import PAN, PERIOD_NS, TILT, Scene, scene
 from bench.report import Chart, Report, Series, spread, timed, turns
 from cocoro.core import Sample
+from cocoro.heap import keep_freed
 from cocoro.messages import Detections, Frame, Obstacles, ServoState
 from cocoro.robot import Robot
 from cocoro.topics import ARM_STATE, FRAME
@@ -100,6 +101,7 @@ def check(method: str, found: Sequence[Found], shown: Scene, robot: Robot, *, pl
 def measure(chosen: Namespace, report: Report) -> None:
     """Measure every number of objects; see the module."""
     cv2.setNumThreads(1)
+    keep_freed()  # as a service's process does
     robot = Robot.load()
     rounds = 8 if chosen.short else 60
     lines: dict[str, list[tuple[float, float, float, float]]] = {}

@@ -33,7 +33,7 @@ from cocoro.clock import NS
 from cocoro.kinematics import turn_z
 from cocoro.robot import Robot
 from sim.camera import SimKinect
-from sim.realism import Sensors
+from sim.kinds import Sensors
 from sim.render import make_renderer
 from sim.scene import load_scene
 from sim.world import World

@@ -15,10 +15,9 @@ from typing import Any
 def main() -> None:
     request: dict[str, Any] = json.loads(sys.argv[1])
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    import sim.camera  # noqa: F401 # what both processes need is imported once
-    from sim.camera_process.start import started_ahead
+    from apps.rehearsal.ahead import begun_ahead
 
-    with started_ahead() if request["camera_process"] else nullcontext():
+    with begun_ahead() if request["camera_process"] else nullcontext():
         from apps.rehearsal.rehearse import rehearse
         from apps.rehearsal.request import RehearsalRequest
 

@@ -91,7 +91,7 @@ def main() -> None:
         (GlRenderer, ("place", "draw", "draw_depth"), DRAWING),
         (SimKinect, ("capture",), EFFECTS),
         (World, ("step",), PHYSICS),
-        (World, ("visual_poses", "camera_pose", "truth", "base_state", "servo_state"), BODY),
+        (World, ("view", "truth", "base_state", "servo_state"), BODY),
         (PerceptionCore, ("step",), PERCEPTION),
         (PlanningCore, ("step",), PLANNING),
     ):

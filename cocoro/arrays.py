@@ -17,3 +17,11 @@ MaskArray = NDArray[np.uint8]
 """A mask as OpenCV takes it: rows x columns of 0 and 255."""
 CodeArray = NDArray[np.uint16]
 """Raw depth: rows x columns of the Kinect's 11-bit codes."""
+
+
+def median(values: FloatArray | Float32Array) -> float:
+    """The median of numbers, of any shape; there is at least one, and none is NaN. It equals `np.median`, which takes
+    several times as long and, the first time, imports NumPy's masked arrays: 10 ms."""
+    ordered = np.sort(values, axis=None)
+    count = ordered.size
+    return float((ordered[(count - 1) // 2] + ordered[count // 2]) / ordered.dtype.type(2))

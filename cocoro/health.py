@@ -74,20 +74,29 @@ class LoopMeter:
         self._last_ns = now_ns
 
     def health(self) -> LoopHealth:
-        import numpy as np  # slow to import; operators' commands import this module for `Rate`
-
-        periods, steps = np.array(self.periods_ms), np.array(self.steps_ms)
+        periods, steps = sorted(self.periods_ms), sorted(self.steps_ms)
         self.periods_ms.clear()
         self.steps_ms.clear()
-        median = float(np.median(periods)) if periods.size else 0.0
+        mean_ms = sum(periods) / len(periods) if periods else 0.0
         return LoopHealth(
             name=self.name,
-            rate_hz=1e3 / float(periods.mean()) if periods.size and periods.mean() > 0 else 0.0,
-            period_median_ms=median,
-            period_p99_ms=float(np.percentile(periods, 99)) if periods.size else 0.0,
-            step_median_ms=float(np.median(steps)) if steps.size else 0.0,
+            rate_hz=1e3 / mean_ms if mean_ms > 0 else 0.0,
+            period_median_ms=quantile(periods, 0.5),
+            period_p99_ms=quantile(periods, 0.99),
+            step_median_ms=quantile(steps, 0.5),
             overruns=self.overruns,
         )
+
+
+def quantile(ordered: list[float], share: float) -> float:
+    """The number below which a share of sorted numbers lies, linearly interpolated; 0 when there are none. It needs no
+    NumPy, which operators' commands do not import, and whose own imports masked arrays."""
+    if not ordered:
+        return 0.0
+    place = share * (len(ordered) - 1)
+    low = int(place)
+    high = min(low + 1, len(ordered) - 1)
+    return ordered[low] + (place - low) * (ordered[high] - ordered[low])
 
 
 class ProcessMeter:

@@ -1,4 +1,7 @@
-"""Rigid-body kinematics of a tree of links, from the robot description (see `robot.py`)."""
+"""Rigid-body kinematics of a tree of links, from the robot description (see `robot.py`).
+
+Products are taken by `dot`: of two matrices this small, `@` takes three times as long to give the same numbers.
+"""
 
 from __future__ import annotations
 
@@ -44,7 +47,11 @@ class Link:
 def turn_z(angle_rad: float) -> FloatArray:
     """Rotation about z as a transform (4, 4)."""
     c, s = cos(angle_rad), sin(angle_rad)
-    return np.array((c, -s, 0.0, 0.0, s, c, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0)).reshape(4, 4)
+    turn = _HERE.copy()  # and filled in: several times as fast as an array of 16 numbers
+    turn[0, 0] = turn[1, 1] = c
+    turn[0, 1] = -s
+    turn[1, 0] = s
+    return turn
 
 
 def cross(a: FloatArray, b: FloatArray) -> FloatArray:
@@ -76,9 +83,9 @@ class Chain:
         """Transform (4, 4), metres, from the tip's frame to the root's. `angles_rad` has every joint of the chain."""
         total = _HERE
         for fixed, joint, offset in self._steps:
-            total = total @ fixed
+            total = total.dot(fixed)
             if joint is not None:
-                total = total @ turn_z(angles_rad[joint] + offset)
+                total = total.dot(turn_z(angles_rad[joint] + offset))
         return total if total is not _HERE else total.copy()
 
     def position(self, angles_rad: Mapping[str, float]) -> FloatArray:
@@ -93,10 +100,10 @@ class Chain:
         columns: dict[str, tuple[FloatArray, FloatArray]] = {}
         total = _HERE
         for fixed, joint, offset in self._steps:
-            total = total @ fixed
+            total = total.dot(fixed)
             if joint is not None:
                 columns[joint] = (total[:3, 2].copy(), total[:3, 3].copy())
-                total = total @ turn_z(angles_rad[joint] + offset)
+                total = total.dot(turn_z(angles_rad[joint] + offset))
         tip = total[:3, 3]
         wanted = tuple(joints) if joints is not None else self.joints
         jac = np.zeros((6, len(wanted)))
@@ -132,6 +139,6 @@ class Tree:
         """Transforms (4, 4), metres, from the frame of each link on the way to the tips to the root's, by link name."""
         poses: dict[str, FloatArray] = {self._root: _HERE.copy()}
         for name, parent, fixed, joint, offset in self._steps:
-            pose = poses[parent] @ fixed
-            poses[name] = pose if joint is None else pose @ turn_z(angles_rad[joint] + offset)
+            pose = poses[parent].dot(fixed)
+            poses[name] = pose if joint is None else pose.dot(turn_z(angles_rad[joint] + offset))
         return poses

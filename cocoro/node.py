@@ -178,7 +178,7 @@ class Node(Participant):
             publisher = Publisher(topic, topic.key(self.robot_name), self.bus, self.clock)
             self._publishers[topic.name] = publisher
             self.keep(publisher)
-            if topic.slow:
+            if topic.askable:
                 self.keep(self.bus.serve(publisher.key, publisher.serve_newest))
         return self._publishers[topic.name]
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Iterator
+from functools import lru_cache
 from importlib import resources
 from math import pi
 from pathlib import Path
@@ -106,28 +107,7 @@ class Catalogue:
     @classmethod
     def from_text(cls, text: str, where: str) -> Catalogue:
         """Read a catalogue's text; `where` it is from, for messages. Raises ConfigError like `load`."""
-        try:
-            rows = msgspec.convert(tomllib.loads(text), _CatalogueFile).object
-        except tomllib.TOMLDecodeError as error:
-            raise ConfigError(f"known objects {where}: {error}") from error
-        except msgspec.ValidationError as error:
-            raise ConfigError(f"known objects {where}: {error}; it must be a list of [[object]] tables") from error
-        objects: list[ObjectSpec] = []
-        for number, row in enumerate(rows, start=1):
-            table = f"[[object]] {number} ({row.get('label', 'no label')})"
-            try:
-                known = msgspec.convert(row, ObjectSpec)
-            except msgspec.ValidationError as error:
-                raise ConfigError(f"known objects {where}: {table}: {field_text(error, ObjectSpec)}") from error
-            for earlier in objects:
-                if known.label == earlier.label:
-                    raise ConfigError(f"known objects {where}: {table}: label: an earlier object has it already")
-                if known.marker and earlier.marker:
-                    raise ConfigError(f"known objects {where}: {table}: marker: {earlier.label} is the marker already")
-            objects.append(known)
-        if not objects:
-            raise ConfigError(f"known objects {where}: it has no [[object]]")
-        return cls(tuple(objects))
+        return cls(_objects_of(text, where))
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -161,3 +141,31 @@ class Catalogue:
 def own_text() -> str:
     """The text of the project's own catalogue."""
     return resources.files("cocoro").joinpath(DEFAULT_FILE).read_text()
+
+
+@lru_cache(maxsize=8)
+def _objects_of(text: str, where: str) -> tuple[ObjectSpec, ...]:
+    """The objects of a catalogue's text, as `Catalogue.from_text`. A text that was read before is not read again: the
+    services and the scene of a rehearsal read the same one."""
+    try:
+        rows = msgspec.convert(tomllib.loads(text), _CatalogueFile).object
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"known objects {where}: {error}") from error
+    except msgspec.ValidationError as error:
+        raise ConfigError(f"known objects {where}: {error}; it must be a list of [[object]] tables") from error
+    objects: list[ObjectSpec] = []
+    for number, row in enumerate(rows, start=1):
+        table = f"[[object]] {number} ({row.get('label', 'no label')})"
+        try:
+            known = msgspec.convert(row, ObjectSpec)
+        except msgspec.ValidationError as error:
+            raise ConfigError(f"known objects {where}: {table}: {field_text(error, ObjectSpec)}") from error
+        for earlier in objects:
+            if known.label == earlier.label:
+                raise ConfigError(f"known objects {where}: {table}: label: an earlier object has it already")
+            if known.marker and earlier.marker:
+                raise ConfigError(f"known objects {where}: {table}: marker: {earlier.label} is the marker already")
+        objects.append(known)
+    if not objects:
+        raise ConfigError(f"known objects {where}: it has no [[object]]")
+    return tuple(objects)

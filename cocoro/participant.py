@@ -87,8 +87,8 @@ class Participant:
         return Stream(self.inbox(topic, service=service))
 
     async def newest(self, topic: Topic[M], timeout_s: float) -> list[M]:
-        """The newest message of a slow topic, from each of its publishers that answers in time: for who has just joined
-        and would wait for the next. It is as unchecked as every reply."""
+        """The newest message of an `askable` topic, from each of its publishers that answers in time: for who has just
+        joined and would wait for the next. It is as unchecked as every reply."""
         try:
             replies = await self.bus.call(topic.key(self.robot_name), b"", timeout_s)
         except CallTimeoutError:

@@ -30,7 +30,8 @@ class Publisher(Generic[M]):
         self.incarnation = bus.new_incarnation()
         self._clock = clock
         self._newest: bytes | None = None
-        """Encoded; kept of a slow topic alone."""
+        """Encoded; kept of a topic whose newest message can be asked for."""
+        self._keeps = topic.askable
 
     def put(self, message: M, stamp_ns: int | None = None) -> M:
         """Publishes the message and returns it, completed in place. `stamp_ns` defaults to the message's own stamp, or
@@ -46,7 +47,7 @@ class Publisher(Generic[M]):
         self.rate.count += 1
         self.newest_stamp_ns = message.stamp_ns
         payload = _ENCODER.encode(message)
-        if self.topic.slow:
+        if self._keeps:
             self._newest = payload
         self._raw.put(payload)
         return message

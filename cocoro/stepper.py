@@ -110,11 +110,50 @@ class Host(Protocol):
     def publish(self, topic: Topic[M], message: M) -> M: ...
 
 
+class Wake(asyncio.Event):
+    """An event that one task can await until a deadline, too."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._waiting: asyncio.Future[None] | None = None
+        """Of `until`."""
+
+    def set(self) -> None:
+        super().set()
+        if self._waiting is not None:
+            _after_others(asyncio.get_running_loop(), self._waiting)
+
+    async def until(self, deadline_s: float) -> bool:
+        """Wait for a deadline of the event loop's time (True) or to be set before (False). What is sent at the same
+        time is received before."""
+        loop = asyncio.get_running_loop()
+        self._waiting = waiting = loop.create_future()
+        timer = loop.call_at(deadline_s, _after_others, loop, waiting)
+        if self.is_set():
+            _after_others(loop, waiting)
+        try:
+            await waiting
+        finally:
+            self._waiting = None
+            timer.cancel()
+        return loop.time() >= deadline_s
+
+
+def _after_others(loop: asyncio.AbstractEventLoop, waiting: asyncio.Future[None]) -> None:
+    """Finish a future, and so give its task its turn, after what is sent in this turn of the loop was received."""
+    loop.call_soon(loop.call_soon, _finish, waiting)
+
+
+def _finish(waiting: asyncio.Future[None]) -> None:
+    if not waiting.done():
+        waiting.set_result(None)
+
+
 class Stepper:
     """Collects a core's inputs; each call is one step: take the inputs, compute, publish, record."""
 
     def __init__(self, host: Host, core: Core, name: str) -> None:
-        self.wake = asyncio.Event()
+        self.wake = Wake()
         """Set when a triggering topic arrives."""
         self._host = host
         self._core = core
@@ -179,11 +218,13 @@ async def drive(step: Stepper, schedule: Schedule, clock: Clock, meter: LoopMete
             deadlines.restart(now_ns)
 
 
-async def _wait(clock: Clock, wake: asyncio.Event, deadline_ns: int) -> bool:
+async def _wait(clock: Clock, wake: Wake, deadline_ns: int) -> bool:
     """Waits for a deadline (True) or an earlier wake (False)."""
     if clock.now_ns() >= deadline_ns:
         await asyncio.sleep(0)  # a core that is too slow for its rate must leave other tasks their turn
         return True
+    if clock.virtual:  # the loop's own time, without the tasks that another clock needs
+        return await wake.until(deadline_ns / NS)
     timer = asyncio.ensure_future(clock.sleep_until(deadline_ns))
     waker = asyncio.ensure_future(wake.wait())
     try:

@@ -32,7 +32,7 @@ _PER_SERVICE = "{service}"
 
 
 SLOW_HZ = 5.0
-"""Rate of topics, at most, whose newest message can be asked for (`Participant.newest`)."""
+"""Rate of topics, at most, whose newest message can be asked for (`Participant.newest`); some others' can be, too."""
 
 
 @dataclass(frozen=True)
@@ -54,11 +54,18 @@ class Topic(Generic[M]):
     """Recorders leave it out when this is False."""
     max_bytes: int = 65_536
     """A larger payload is rejected unread."""
+    shown: bool = False
+    """Its newest message can be asked for though it is fast: `cocoro status` shows it."""
 
     @property
     def slow(self) -> bool:
-        """Whether who joins would have to wait for the next message: such topics' newest can be asked for."""
+        """Whether who joins would have to wait for the next message."""
         return self.rate_hz is not None and self.rate_hz <= SLOW_HZ
+
+    @property
+    def askable(self) -> bool:
+        """Whether its newest message can be asked for."""
+        return self.slow or self.shown
 
     def __post_init__(self) -> None:
         if not self.publisher:
@@ -134,6 +141,7 @@ FRAME = Topic(
 BASE_STATE = Topic(
     "base/state", m.BaseState, Qos.STATE, 50.0, 0.15,
     "Odometry, bumpers, battery. The older it is the slower the planner drives; beyond its age it stops the base.",
+    shown=True,
 )  # fmt: skip
 BASE_COMMAND = Topic(
     "base/command", m.BaseCommand, Qos.COMMAND, 50.0, 0.15,
@@ -170,6 +178,7 @@ OBSTACLES = Topic(
 PLAN = Topic(
     "planning/status", m.PlannerStatus, Qos.STATE, 50.0, 0.5,
     "What the planner does, and the reason. Beyond its age the running task fails.",
+    shown=True,
 )  # fmt: skip
 HAND_SAMPLES = Topic(
     "planning/hand-samples", m.HandSample, Qos.EVENT, None, 1.0,

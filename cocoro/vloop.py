@@ -47,10 +47,10 @@ class _Timer(asyncio.TimerHandle):
 
     order: int
 
-    def __lt__(self, other: object) -> bool:
-        if isinstance(other, _Timer):
-            return (self.when(), self.order) < (other.when(), other.order)
-        return NotImplemented
+    _when: float
+
+    def __lt__(self, other: _Timer) -> bool:  # type: ignore[override] # the heap has no others; it asks this most
+        return self._when < other._when or (self._when == other._when and self.order < other.order)
 
 
 class VirtualTimeLoop(asyncio.SelectorEventLoop):

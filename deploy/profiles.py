@@ -28,6 +28,7 @@ from cocoro.component import Component
 from cocoro.errors import ConfigError, choice_of, field_text
 from deploy.mesh_table import Mesh
 from deploy.processes import named, needs
+from deploy.site.component import PREFIX
 
 C = TypeVar("C")
 Name = Annotated[str, Meta(pattern=r"\A[a-z0-9][a-z0-9_-]{0,31}\Z")]
@@ -82,6 +83,11 @@ class Profile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     def services(self) -> tuple[str, ...]:
         """The services that are alive when all components are ready."""
         return tuple(service for row in self.rows() for service in row.services)
+
+    @property
+    def shared(self) -> bool:
+        """Whether this is one host's share of a robot, joined with others by a gateway."""
+        return any(name.startswith(PREFIX) for name in self.processes)
 
     def launch(self, process: str) -> Launch:
         """The settings that every component has. Raises ConfigError as `config` does."""

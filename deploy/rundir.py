@@ -2,6 +2,7 @@
 
     <run>/<robot>/profile.json     the resolved profile of the last start
                   clock.json       the robot's time (see deploy.robot_time)
+                  survey.sock      where the supervisor answers `cocoro status` (see deploy.survey)
                   supervisor       held by the supervisor (see cocoro.held_file)
                   claims/<service> held by the process that is that service
                   logs/            one file per process, of the last starts (or in $COCORO_LOG_DIR/<robot>)
@@ -154,6 +155,11 @@ class RunDir:
         """Writes the profile of this start, for the processes that it starts and for commands. Raises ConfigError,
         FullError."""
         private.write(self.profile_file, profile)
+
+    @property
+    def survey_socket(self) -> Path:
+        """Where the supervisor answers `cocoro status`."""
+        return self.path / "survey.sock"
 
     @property
     def populated(self) -> bool:

@@ -34,6 +34,7 @@ from deploy.profiles import Profile, from_data
 from deploy.quit import quit_process
 from deploy.rundir import RunDir
 from deploy.supervised_process import StartError, SupervisedProcess
+from deploy.survey import Onlooker, SurveyServer
 
 STOPPED, MISCONFIGURED, REFUSED = 0, 2, 3
 """Exit codes, as for every command."""
@@ -106,11 +107,14 @@ class Supervisor:
                         by_service[service].on_alive(service, alive)
 
                 bus.watch_alive(alive_key(self._profile.robot), on_alive)
+                survey = SurveyServer(Onlooker(self._run_dir, bus, private=not self._profile.shared))
+                await survey.open()
                 detecting = asyncio.ensure_future(self._sleep_detector.keep())
                 try:
                     code = await self._start_and_keep()
                 finally:
                     detecting.cancel()
+                    survey.close()
                     service_manager.notify("STOPPING=1")
                     for child in reversed(self._children):
                         await child.stop()

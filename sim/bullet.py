@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from typing import Any
@@ -54,6 +54,12 @@ class Bullet:
             value = partial(value, physicsClientId=self.client)
         self.__dict__[name] = value
         return value
+
+    @staticmethod
+    def raw(name: str) -> Callable[..., Any]:
+        """A function of `pybullet` that is not bound to this client: `client` is its last argument."""
+        function: Callable[..., Any] = getattr(pybullet, name)
+        return function
 
     def close(self) -> None:
         """Free the world. May be called twice."""

@@ -15,8 +15,8 @@ from cocoro.arrays import CodeArray, Float32Array, FloatArray, ImageArray
 from cocoro.errors import ConfigError
 from cocoro.messages import Frame
 from cocoro.robot import Robot
+from sim.kinds import Sensors
 from sim.memory import keep_freed_memory
-from sim.realism import Sensors
 from sim.render import Lighting, Renderer
 from sim.seeds import stream
 from sim.sensor_effects import (

@@ -28,7 +28,10 @@ REST_LAG_RAD = 0.0005
 obstacle, while the wheel still does not creep."""
 WHEEL_GAIN = 0.2
 """Share of a wheel's lag that one step corrects."""
-
+JOINT_GAIN = 0.1
+"""Share of a joint's way to its goal that one step covers, within its speed limit; PyBullet's default."""
+NO_LIMIT_RADPS = -1.0
+"""PyBullet's value for a motor without a speed limit."""
 
 JointReading = tuple[float, float, float]
 """Angle, rad; speed, rad/s; torque of the motor, N m."""
@@ -41,6 +44,8 @@ class Mechanism:
         self, bullet: Bullet, robot: Robot, model: RobotModel, start: Start, angles_rad: Mapping[str, float]
     ) -> None:
         self._bullet = bullet
+        self._set_motor = bullet.raw("setJointMotorControl2")
+        self._position_control: int = bullet.POSITION_CONTROL
         half_turn = start.yaw_rad / 2
         with tempfile.TemporaryDirectory(prefix="cocoro-") as folder:
             self.body: int = bullet.loadURDF(
@@ -69,14 +74,8 @@ class Mechanism:
         self._prepare(model, angles_rad)
 
     def drive(self, joint: str, drive: Drive) -> None:
-        self._bullet.setJointMotorControl2(
-            self.body,
-            self._motors[joint],
-            self._bullet.POSITION_CONTROL,
-            targetPosition=drive.target_rad,
-            force=drive.max_torque_nm,
-            maxVelocity=drive.max_speed_radps,
-        )
+        target_rad, max_speed_radps, max_torque_nm = drive
+        self._control(self._motors[joint], target_rad, 0.0, max_torque_nm, JOINT_GAIN, 1.0, max_speed_radps)
 
     def spin(self, left_radps: float, right_radps: float, dt_s: float) -> None:
         """Turn the wheels at these speeds for the next step, as a controller with encoders does: the lag of one step is
@@ -88,16 +87,24 @@ class Mechanism:
                 lag *= 0.95
             goal = self._wheel_rad[number] + lag
             self._wheel_goal_rad[number] = goal + speed_radps * dt_s
-            self._bullet.setJointMotorControl2(
-                self.body,
-                self._wheels[number],
-                self._bullet.POSITION_CONTROL,
-                targetPosition=goal,
-                targetVelocity=speed_radps,
-                positionGain=WHEEL_GAIN,
-                velocityGain=1.0,
-                force=WHEEL_TORQUE_NM,
-            )
+            self._control(self._wheels[number], goal, speed_radps, WHEEL_TORQUE_NM, WHEEL_GAIN, 1.0, NO_LIMIT_RADPS)
+
+    def _control(
+        self,
+        motor: int,
+        target_rad: float,
+        target_radps: float,
+        max_torque_nm: float,
+        position_gain: float,
+        velocity_gain: float,
+        max_speed_radps: float,
+    ) -> None:
+        """Give a motor its target. By place and without the wrapper of `Bullet`: by name takes twice as long, and this
+        is called several times in each step."""
+        self._set_motor(
+            self.body, motor, self._position_control, target_rad, target_radps, max_torque_nm, position_gain,
+            velocity_gain, max_speed_radps, self._bullet.client,
+        )  # fmt: skip
 
     def read(self) -> list[JointReading]:
         """Readings of the servo joints in the order of `joints`, then of the left and the right wheel."""
@@ -114,9 +121,10 @@ class Mechanism:
     def root_pose(self) -> FloatArray:
         """World pose of the body frame, (4, 4)."""
         position, orientation = self._bullet.getBasePositionAndOrientation(self.body)
-        pose = np.eye(4)
+        pose = np.zeros((4, 4))
         pose[:3, :3] = rotation(orientation)
         pose[:3, 3] = np.array(position) - pose[:3, :3] @ self._root_offset
+        pose[3, 3] = 1.0
         return pose
 
     def link_poses(self) -> FloatArray:

@@ -9,15 +9,14 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from math import exp, radians, sqrt
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from cocoro.arrays import FloatArray
 from cocoro.robot import Robot
+from sim.kinds import BodyKind, Sensors
 from sim.seeds import stream
-
-Sensors = Literal["ideal", "real"]
 
 
 @dataclass(frozen=True)
@@ -72,8 +71,6 @@ class Wander:
         self.values = self._keep * self.values + self._add * self._draws.standard_normal(self.values.size)
         return self.values
 
-
-BodyKind = Literal["nominal", "worn"]
 
 LENGTH_M = 0.005
 """Largest error of each length of the arm's links."""

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cocoro.arrays import CodeArray, Float32Array, FloatArray, ImageArray
+from cocoro.arrays import CodeArray, Float32Array, FloatArray, ImageArray, median
 from cocoro.robot import Camera, Robot
 
 NO_DATA = 2047
@@ -200,4 +200,4 @@ def _longest_path(first: FloatArray, last: FloatArray, camera: Camera) -> float:
 def _median_depth(depth_m: Float32Array) -> float:
     """Median depth of a coarse grid of pixels, clipped to 0.3 to 100 m."""
     grid = np.abs(depth_m[::16, ::16])
-    return float(np.clip(np.median(grid), 0.3, 100.0))
+    return float(np.clip(np.float32(median(grid)), 0.3, 100.0))

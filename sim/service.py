@@ -25,9 +25,10 @@ from cocoro.publisher import Publisher
 from cocoro.robot import Robot
 from sim.camera import SimKinect
 from sim.component import SIM
+from sim.kinds import BodyKind, Sensors
 from sim.motion import MotionWriter
 from sim.random_scene import find_scene
-from sim.realism import BodyKind, BodyRealism, Sensors, body_of
+from sim.realism import BodyRealism, body_of
 from sim.render import Lighting, make_renderer
 from sim.render.choice import RendererChoice
 from sim.world import Motors, World, message_motors
@@ -197,7 +198,7 @@ class Simulator:
             if self._truth_due.due(now_ns):
                 self._outbox.put(self._truth, world.truth(), now_ns)
             if self._frame_due.due(now_ns):
-                frame = self._camera.expose(world.visual_poses(), world.camera_pose(), now_ns, world.light)
+                frame = self._camera.expose(*world.view(), now_ns, world.light)
                 self._outbox.put(self._frames, frame, now_ns + FRAME_LATENCY_NS)
         self.publish_time()
         self._outbox.flush(world.time_ns)

@@ -72,6 +72,8 @@ class SimServo:
         """How far the joint's angle exceeds the shaft's because it has slipped."""
         self._speed_radps = 0.0
         self._torque_nm = 0.0
+        self._strain_nm = OVERLOAD_SHARE * joint.torque_nm
+        """Torque from which on the servo strains."""
         self._valid_until_ns: int | None = None
         self._straining_since_ns: int | None = None
 
@@ -132,7 +134,7 @@ class SimServo:
         self._speed_radps = speed_radps
         self._torque_nm = torque_nm
         self._play.follow(angle_rad - self.slip_rad)
-        if abs(torque_nm) < OVERLOAD_SHARE * self.joint.torque_nm:
+        if -self._strain_nm < torque_nm < self._strain_nm:
             self._straining_since_ns = None
         elif self._straining_since_ns is None:
             self._straining_since_ns = now_ns

@@ -16,9 +16,10 @@ from cocoro.robot import Robot
 from sim.base import Bumper, MobileBase
 from sim.bullet import Bullet
 from sim.contacts import ContactPair, bumper, collisions, touching_pairs
+from sim.kinds import Sensors
 from sim.mechanism import Mechanism
 from sim.model import build_model
-from sim.realism import REALISM, BodyRealism, Sensors, Wander, Wear, wheel_scales
+from sim.realism import REALISM, BodyRealism, Wander, Wear, wheel_scales
 from sim.render.interface import Visual
 from sim.scene import Light, Scene
 from sim.seeds import stream
@@ -261,14 +262,14 @@ class World:
         """Everything to draw except the room."""
         return self._visuals
 
+    def view(self) -> tuple[FloatArray, FloatArray]:
+        """`visual_poses` and `camera_pose` now: the links' poses, of which both are made, are computed once."""
+        links = self._mechanism.link_poses()
+        return self._visual_poses(links), self._link_pose(links, "camera")
+
     def visual_poses(self) -> FloatArray:
         """World poses of `visuals` now, in their order, (n, 4, 4)."""
-        links = self._mechanism.link_poses()
-        poses = np.empty((len(self._visuals), 4, 4))
-        on_robot = len(self._carriers)
-        np.matmul(links[self._carriers], self._offsets, out=poses[:on_robot])
-        poses[on_robot:] = self._stage.poses()
-        return poses
+        return self._visual_poses(self._mechanism.link_poses())
 
     def camera_pose(self) -> FloatArray:
         """World pose of the camera, (4, 4); its frame is x right, y down, z forward."""
@@ -276,11 +277,21 @@ class World:
 
     def link_pose(self, link: str) -> FloatArray:
         """World pose of a link of the robot description, (4, 4)."""
-        carrier, offset = self._model.carried[link]
-        pose: FloatArray = self._mechanism.link_poses()[self._mechanism.index[carrier]] @ offset
-        return pose
+        return self._link_pose(self._mechanism.link_poses(), link)
 
     # --- inside -------------------------------------------------------------------------------------
+
+    def _visual_poses(self, links: FloatArray) -> FloatArray:
+        poses = np.empty((len(self._visuals), 4, 4))
+        on_robot = len(self._carriers)
+        np.matmul(links[self._carriers], self._offsets, out=poses[:on_robot])
+        poses[on_robot:] = self._stage.poses()
+        return poses
+
+    def _link_pose(self, links: FloatArray, link: str) -> FloatArray:
+        carrier, offset = self._model.carried[link]
+        pose: FloatArray = links[self._mechanism.index[carrier]] @ offset
+        return pose
 
     def _place_visuals(self) -> None:
         rows = self._model.visuals()
@@ -317,7 +328,8 @@ class World:
             self._bullet.getContactPoints(), self._mechanism.body, self._mechanism.link_names, self._names
         )
         self._contacts.append(pairs)
-        pressed, before = bumper(on_chassis, self._mechanism.root_pose()), self._pressed
+        before = self._pressed
+        pressed = bumper(on_chassis, self._mechanism.root_pose()) if on_chassis else Bumper()
         self._base.bumper = Bumper(pressed.left or before.left, pressed.right or before.right)
         self._pressed = pressed
 

@@ -15,7 +15,7 @@ from cocoro.topics import ARM_STATE, FRAME
 from services.perception.config import PerceptionConfig
 from services.perception.core import PerceptionCore
 from sim.camera import SimKinect
-from sim.realism import Sensors
+from sim.kinds import Sensors
 from sim.render import make_renderer
 from sim.render.interface import Visual
 from sim.scene import Light

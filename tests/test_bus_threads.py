@@ -6,13 +6,19 @@ import asyncio
 import threading
 from collections.abc import Callable
 from contextvars import Context
+from pathlib import Path
 from typing import TypeVarTuple
 
-from zenoh_rig import FRAME, PATIENCE_S
+import zenoh
+from zenoh.handlers import Callback
+from zenoh_rig import FRAME, PATIENCE_S, appears, local, scenario
 
+from cocoro.bus.base import Qos
 from cocoro.bus.declared import SHARED_FROM_BYTES, SharedPool, read
+from cocoro.bus.foreign import keep_thread_state
 from cocoro.bus.queues import OUTBOX_BYTES, Outbox, Ring
 from cocoro.bus.shared import POOL_BYTES
+from cocoro.bus.zenoh import ZenohBus
 
 Args = TypeVarTuple("Args")
 
@@ -160,14 +166,47 @@ def test_a_small_sample_is_not_put_into_shared_memory() -> None:
 
 def test_a_sample_whose_memory_was_taken_back_is_not_read() -> None:
     class Held:
+        valid = True
+
         def is_valid(self) -> bool:
-            return False
+            return self.valid
+
+        def __bytes__(self) -> bytes:
+            self.valid = False
+            return b"half of one and half of another".ljust(SHARED_FROM_BYTES)
 
     class Payload:
-        def to_bytes(self) -> bytes:
-            return b"half of one and half of another".ljust(SHARED_FROM_BYTES)
+        def __len__(self) -> int:
+            return SHARED_FROM_BYTES
 
         def as_shm(self) -> Held:
             return Held()
 
     assert read(Payload()) is None  # type: ignore[arg-type]
+
+
+@scenario
+async def test_a_thread_of_zenoh_keeps_its_state_from_one_message_to_the_next(directory: Path) -> None:
+    calls, all_came, loop = threading.local(), asyncio.Event(), asyncio.get_running_loop()
+    counted: dict[int, list[int]] = {}
+
+    def on_sample(_: zenoh.Sample) -> None:
+        keep_thread_state()
+        calls.count = getattr(calls, "count", 0) + 1
+        counted.setdefault(threading.get_ident(), []).append(calls.count)
+        if sum(map(len, list(counted.values()))) == 100:
+            loop.call_soon_threadsafe(all_came.set)
+
+    async with (
+        await ZenohBus.open(local(directory, "one", shared_memory=False)) as one,
+        await ZenohBus.open(local(directory, "other", shared_memory=False)) as other,
+    ):
+        subscriber = one._session.declare_subscriber("robot/x", Callback(on_sample, indirect=False))
+        one.declare_alive("robot/one")
+        await appears(other, "robot/one")
+        publisher = other.publisher("robot/x", Qos.EVENT)
+        for _ in range(100):
+            publisher.put(b"x")
+        await all_came.wait()
+        subscriber.undeclare()  # type: ignore[no-untyped-call]
+    assert all(counts == list(range(1, len(counts) + 1)) for counts in counted.values())

@@ -21,7 +21,7 @@ from cocoro.messages import Frame
 from cocoro.robot import Camera
 from cocoro.vloop import run_virtual
 from sim.camera import SimKinect, moved
-from sim.realism import Sensors
+from sim.kinds import Sensors
 from sim.render import Images, Lighting, Renderer, make_renderer
 from sim.render.choice import RendererChoice
 from sim.render.interface import Visual

@@ -141,3 +141,10 @@ def test_frames_are_delivered_in_order_and_one_read_out_after_their_exposure(sen
     assert stamps_ns == sorted(stamps_ns)
     assert min(ages_s) >= FRAME_LATENCY_S
     assert max(ages_s) <= FRAME_LATENCY_S + 1 / 120 + 1e-6  # the simulator publishes at its ticks
+
+
+@pytest.mark.process
+def test_the_command_of_a_rehearsal_imports_no_numpy_before_it_has_set_its_threads() -> None:
+    """With NumPy's threads it could not fork the camera's process."""
+    program = "import sys, apps.cli.rehearse; sys.exit('numpy' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", program], timeout=100).returncode == 0

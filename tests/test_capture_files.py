@@ -6,6 +6,7 @@ import errno
 import json
 import os
 import shutil
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -24,13 +25,15 @@ from apps.captures.mcap_reading import unpack
 from apps.captures.reader import Capture
 from apps.captures.rewrite import rewrite
 from cocoro.capture.conventions import CaptureError
+from cocoro.capture.mcap import MESSAGE_HEAD
 from cocoro.capture.types import Alive, LossyFrame, NotReadableError, schema_of
 from cocoro.errors import ConfigError
 from cocoro.messages import BaseState, Detections, Frame, Message, PlannerStatus
 from cocoro.topics import TOPICS
+from services.capture.file import LARGE_BYTES
 from services.capture.folder import captures, make_room
 from services.capture.keys import KeyFilter, lossy
-from services.capture.packing import COMPRESSIONS, Compression, Packer
+from services.capture.packing import COMPRESSIONS, Compression, Packer, message_head
 from services.capture.writer import FileLimits, Missing
 
 BIG = msgspec.msgpack.encode(frame(7, 320, 240))
@@ -61,6 +64,20 @@ def test_every_compression_gives_back_what_it_was_given(compression: Compression
         name, packed = Packer(compression).pack(raw)
         assert unpack(name, packed, len(raw)) == raw
         assert len(packed) <= len(raw)
+
+
+@pytest.mark.parametrize("level", [0, 1, 3, 19])
+@pytest.mark.parametrize("size", [LARGE_BYTES, 2 * LARGE_BYTES, 2 * LARGE_BYTES + 1, 20 * LARGE_BYTES])
+@pytest.mark.parametrize("before", [(), (b"records" * 1000,), (bytes(LARGE_BYTES),)])
+def test_a_large_message_is_packed_with_what_stands_before_it(level: int, size: int, before: tuple[bytes, ...]) -> None:
+    packer = Packer("zstd", level)
+    for payload in (bytes(range(256)) * (size // 256) + bytes(size % 256), os.urandom(size // 2) * 2):
+        packed = packer.message(3, 7, 11, 13, payload, before)
+        raw = unpack(packed.compression, packed.data, packed.raw_bytes)
+        assert raw == b"".join((*before, message_head(3, 7, 11, 13, len(payload)), payload))
+        assert packed.raw_bytes == len(raw)
+        assert packed.crc == zlib.crc32(raw)
+        assert raw[packed.message_at + MESSAGE_HEAD.size :] == payload
 
 
 def test_the_mcap_library_reads_it_as_a_whole_indexed_file(tmp_path: Path) -> None:

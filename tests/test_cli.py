@@ -14,18 +14,18 @@ from typing import Any
 import pytest
 from places import in_short_folder
 
-from apps.cli import app, listed, stop_asking, task_commands
+from apps.cli import app, listed, stop_asking, task_commands, terminal
 from apps.cli.main import PACKAGES, main
 from apps.cli.options import frames_of, latencies_of
 from apps.cli.running import overrides
-from apps.cli.terminal import table
+from apps.cli.terminal import Column, table
+from apps.rehearsal import ahead
 from apps.rehearsal import rehearse as rehearsing
 from apps.rehearsal.request import RehearsalRequest
 from cocoro.errors import CocoroError, ConfigError
 from cocoro.topics import TOPICS
 from deploy.processes import stoppable
 from services.executive.tasks import TASKS, FetchTask, FollowTask, PutDownTask
-from sim.camera_process import start
 
 COMMANDS = (
     "up", "down", "status", "fetch", "follow", "park", "put-down", "stop", "estop", "reset", "cancel", "objects",
@@ -153,6 +153,15 @@ def test_a_table_lines_up() -> None:
     assert table(("name", "n"), [("a", "1"), ("long", "22")]) == "NAME  N\na     1\nlong  22\n"
 
 
+@pytest.mark.parametrize("width", [13, 14, 100])
+def test_a_table_that_needs_no_fitting_is_what_the_library_draws(width: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    columns = ("name", Column("n", right=True), Column("", text=True))
+    rows = [("a", "1", ""), ("long", "22", "as [b]"), ("", "", "x"), ("", "", "")]
+    ours = table(columns, rows, width)
+    monkeypatch.setattr(terminal, "_plain_table", lambda *_: None)
+    assert ours == table(columns, rows, width)
+
+
 def test_topics_as_data_has_every_row(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["topics", "--json"]) == 0
     assert [row["topic"] for row in json.loads(capsys.readouterr().out)] == [topic.name for topic in TOPICS]
@@ -254,7 +263,7 @@ def simulator(monkeypatch: pytest.MonkeyPatch) -> list[RehearsalRequest]:
         return RESULT | {"outcome": "failed" if request.task.label == "blue_can" else "done"}
 
     monkeypatch.setattr(rehearsing, "rehearse", run)
-    monkeypatch.setattr(start, "started_ahead", nullcontext)
+    monkeypatch.setattr(ahead, "begun_ahead", nullcontext)
     return asked
 
 

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from apps.cli import estop_mesh, exits, objects, safety, snapshot, status
+from apps.cli.link import joined
 from apps.cli.options import RobotChoice
 from apps.cli.stop_asking import StopResult
 from cocoro.bus.endpoints import default
@@ -44,6 +45,7 @@ from cocoro.messages import (
 from cocoro.node import Node
 from cocoro.robot import Robot
 from cocoro.topics import BASE_STATE, CANCEL, DETECTIONS, ESTOP, FRAME, LATCH, OBJECTS, PLAN, RESET, RUN, TASK
+from deploy import survey
 from deploy.processes import stoppable
 from deploy.rundir import RunDir
 
@@ -168,27 +170,28 @@ def test_when_the_executive_refuses_a_reset_everything_stays_latched(
     assert "executive does not release the emergency stop: a servo is overloaded" in capsys.readouterr().err
 
 
+async def _tell(calliope: FakeRobot) -> None:
+    nodes = calliope.nodes
+    async for _ in nodes["base"].every(50.0):
+        nodes["base"].publish(
+            BASE_STATE, BaseState(odometry_m=(0, 0), odometry_yaw_rad=0, speed_mps=0, turn_rate_radps=0)
+        )
+        nodes["executive"].publish(LATCH, Latch(state="released", by="operator"))
+        nodes["planning"].publish(PLAN, PlannerStatus(behaviour="approach", why="red_can is 1.2 m away"))
+        nodes["executive"].publish(
+            TASK, TaskState(task_id="1", task="fetch", label="red_can", phase="approach", elapsed_s=3.0)
+        )
+
+
 def test_status_tells_of_services_task_and_plan(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run_dir = RunDir("calliope")
     run_dir.make()
     profile = {"name": "robot", "robot": "calliope", "processes": ["base", "planning", "executive", "perception"]}
     run_dir.profile_file.write_text(json.dumps(profile))
 
-    async def tell(calliope: FakeRobot) -> None:
-        nodes = calliope.nodes
-        async for _ in nodes["base"].every(50.0):
-            nodes["base"].publish(
-                BASE_STATE, BaseState(odometry_m=(0, 0), odometry_yaw_rad=0, speed_mps=0, turn_rate_radps=0)
-            )
-            nodes["executive"].publish(LATCH, Latch(state="released", by="operator"))
-            nodes["planning"].publish(PLAN, PlannerStatus(behaviour="approach", why="red_can is 1.2 m away"))
-            nodes["executive"].publish(
-                TASK, TaskState(task_id="1", task="fetch", label="red_can", phase="approach", elapsed_s=3.0)
-            )
-
     async def scenario(as_json: bool) -> int:
         async with robot("base", "planning", "executive") as calliope:
-            calliope.nodes["base"].spawn(tell(calliope))
+            calliope.nodes["base"].spawn(_tell(calliope))
             return await status.show_status(ANY, as_json)
 
     assert asyncio.run(scenario(as_json=False)) == exits.FAILED  # perception should run, and does not
@@ -211,6 +214,57 @@ def test_status_tells_of_services_task_and_plan(root: Path, capsys: pytest.Captu
         "base": True, "planning": True, "executive": True, "perception": False,
     }  # fmt: skip
     assert report["plan"]["behaviour"] == "approach"
+
+
+def test_the_supervisor_tells_what_the_command_would_find(root: Path) -> None:
+    run_dir = RunDir("calliope")
+    run_dir.make()
+
+    async def scenario() -> None:
+        async with (
+            robot("base", "planning", "executive") as calliope,
+            await ZenohBus.open(run_dir.join_as("supervisor")) as bus,
+            joined(ANY) as link,
+        ):
+            calliope.nodes["base"].spawn(_tell(calliope))
+            server = survey.SurveyServer(survey.Onlooker(run_dir, bus))
+            await server.open()
+            found = await survey.Survey(link).take(set(await link.alive()))
+            told = await asyncio.to_thread(status.told_by_supervisor, run_dir)
+            assert told is not None
+            assert told.keys() == found.keys()
+            for known in (told, found):
+                assert {one["service"]: one["state"] for one in known["services"]} == dict.fromkeys(
+                    ("base", "executive", "planning"), "ready"
+                )
+                assert (known["task"]["phase"], known["latch"]["by"]) == ("approach", "operator")
+                assert (known["plan"]["behaviour"], known["recording"]) == ("approach", None)
+                assert known["base"]["charging"] is False
+            server.close()
+            assert not run_dir.survey_socket.exists()
+            assert await asyncio.to_thread(status.told_by_supervisor, run_dir) is None
+
+    asyncio.run(scenario())
+
+
+@pytest.mark.parametrize("answer", [b"", b"{", b"[]"])
+def test_a_supervisor_that_tells_no_report_is_no_answer(root: Path, answer: bytes) -> None:
+    run_dir = RunDir("calliope")
+    run_dir.make()
+
+    async def say(_: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        writer.write(answer)
+        writer.close()
+
+    async def scenario() -> None:
+        async with await asyncio.start_unix_server(say, run_dir.survey_socket):
+            assert await asyncio.to_thread(status.told_by_supervisor, run_dir) is None
+
+    asyncio.run(scenario())
+
+
+def test_the_state_of_a_replayed_service_has_one_name() -> None:
+    assert status.REPLAYED == survey.REPLAYED
 
 
 def test_objects_are_listed_with_where_they_were_seen(root: Path, capsys: pytest.CaptureFixture[str]) -> None:

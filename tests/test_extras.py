@@ -16,7 +16,7 @@ from deploy.rundir import RunDir
 ROOT = Path(__file__).parent.parent
 REQUIRES = [
     "numpy>=2.2",
-    'opencv-python-headless>=4.11; extra == "operator"',
+    'opencv-python-headless>=4.13; extra == "operator"',
     'cocoro-mesh[operator]; extra == "robot"',
     'cocoro-mesh[robot]; extra == "sim"',
     'scipy>=1.15; extra == "robot"',

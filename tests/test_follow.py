@@ -46,6 +46,30 @@ def test_a_distance_that_is_only_remembered_is_not_kept() -> None:
     assert company.verdict(12.0)
 
 
+def test_a_distance_that_no_newer_sighting_can_correct_is_kept() -> None:
+    company = Company()
+    for step in range(120):
+        company.note(0.1, 1.05 + step % 10 * STEP_S, step * STEP_S)  # as with a perception that takes a second
+    assert company.share(12.0) > 0.9
+    kept(company, 12.0, 24.0, off_m=0.1, age_s=1.05 + FRESH_S + 0.1)
+    assert company.share(24.0) == pytest.approx(0.5, abs=0.05)
+
+
+@pytest.mark.sim
+def test_a_ball_that_turns_a_corner_stays_in_sight_of_a_perception_that_takes_a_second() -> None:
+    result = rehearse(
+        RehearsalRequest(
+            task=FollowTask(label="blue_ball", for_s=13.0), scene="follow", latency={"perception": 1.0},
+            width=160, height=120, frame_rate_hz=15.0,
+        )
+    )  # fmt: skip
+    assert (result["outcome"], result["reason"]) == ("done", "")
+    truth = result["truth"]
+    assert truth["contacts"] == 0
+    assert truth["lost_s"] <= 1.0
+    assert truth["near_share"] > 0.9
+
+
 WALL = """
 [[object]]
 label = "blue_ball"

@@ -10,8 +10,9 @@ from perception_scenes import CATALOGUE, MS, ROBOT, STAMP_NS, Scene, Thing, bloc
 from services.perception.config import PerceptionConfig
 from services.perception.image import ImageSighting
 from services.perception.localise import Localiser, first_guesses
+from services.perception.rays import Rays
 from services.perception.shapes import Shapes, Solids
-from sim.realism import Sensors
+from sim.kinds import Sensors
 from sim.scene import Light
 
 pytestmark = pytest.mark.sim
@@ -261,6 +262,26 @@ def test_a_can_is_inside_within_its_radius_and_half_height() -> None:
     assert (surface.distance(offsets_from_centre(outside)) > 0).all()
     corner = offsets_from_centre(np.array([[0.043, 0.0, 0.06 + 0.01]]))
     assert surface.distance(corner).item() == pytest.approx(np.hypot(0.01, 0.01), abs=1e-6)
+
+
+@pytest.mark.parametrize("label", ["red_can", "yellow_ball"])
+def test_where_a_ray_is_deepest_in_a_shape_is_where_small_steps_along_it_find_it(label: str) -> None:
+    draws = np.random.default_rng(5)
+    surface = Solids(Shapes([CATALOGUE[label]]))
+    camera = np.array([-1.0, 0.2, 0.4])
+    aims = draws.uniform(-0.05, 0.05, (400, 3)) - camera
+    free_to = np.full((1, 400), np.inf, dtype=np.float32)
+    free_to[0, ::4] = draws.uniform(0.9, 1.1, 100)
+    directions, eye = offsets_from_centre(aims), offsets_from_centre(camera[None])
+    found = surface.distance(Rays(surface, directions, free_to).nearest(eye))[0]
+    steps = np.minimum(np.linspace(0.8, 1.2, 4001)[:, None], free_to)
+    along = [surface.distance((eye + step * directions).astype(np.float32))[0] for step in steps]
+    deepest = np.min(along, axis=0)
+    meets = deepest < 0
+    assert 100 < np.count_nonzero(meets) < 390
+    np.testing.assert_allclose(found[meets], deepest[meets], atol=1e-4)  # the length of a step
+    assert (found[~meets] > 0).all()
+    assert (found[~meets] < 1.5 * deepest[~meets] + 1e-4).mean() > 0.9
 
 
 def test_the_first_guess_pushes_the_surface_inwards_by_the_radius() -> None:

@@ -72,8 +72,9 @@ class Arm:
                 break
         return step
 
-    def reach(self, goal: HandPose, speed_mps: float = 0.25) -> ArmStep:
-        return self.go(lambda: self.controller.reach(goal, speed_mps, self.angles, TICK_S))
+    def reach(self, goal: HandPose, speed_mps: float = 0.25, swing_radps: float | None = None) -> ArmStep:
+        reach = self.controller.reach
+        return self.go(lambda: reach(goal, speed_mps, self.angles, TICK_S, swing_radps=swing_radps))
 
     def park(self) -> ArmStep:
         return self.go(lambda: self.controller.park(self.angles, TICK_S))
@@ -226,6 +227,18 @@ def test_the_arm_moves_smoothly_and_no_faster_than_it_may() -> None:
     speeds = np.abs(np.diff(path, axis=0)) / TICK_S
     assert speeds.max() <= 2.5 + 1e-6
     assert (np.array([step.speed_radps for step in arm.steps]) >= speeds - 1e-6).all(), "the servos may keep up"
+
+
+@pytest.mark.parametrize("swing_radps", [None, 1.2])
+def test_the_swing_to_the_front_may_be_slowed_and_nothing_else_is(swing_radps: float | None) -> None:
+    arm = Arm(dict(PARKED))
+    arm.reach(HandPose(0.37, 0.0, 0.2, CONFIG.arm.pitch_rad), swing_radps=swing_radps)
+    swings, lifts = (
+        np.abs(np.diff([angles[name] for angles in arm.path])) / TICK_S for name in ("arm_base", "wrist_pitch")
+    )
+    folded = np.array([angles["arm_base"] > 0.5 for angles in arm.path[1:]])
+    assert swings[folded].max() == pytest.approx(swing_radps or CONFIG.arm.joint_speed_radps, abs=0.01)
+    assert lifts.max() > 2.0
 
 
 def test_an_arm_that_is_held_up_is_not_left_behind() -> None:

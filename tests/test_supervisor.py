@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 from collections.abc import Iterator
@@ -11,6 +12,8 @@ from pathlib import Path
 
 import pytest
 from operator_shell import PATIENCE_S, Shell
+
+from apps.cli import exits
 
 pytestmark = pytest.mark.process
 
@@ -43,6 +46,18 @@ def test_detached_it_stays_up_until_down_and_a_further_down_is_no_error(shell: S
     assert (down.returncode, down.stdout) == (0, "robbie is down\n")
     again = shell("down")
     assert (again.returncode, again.stdout) == (0, "nothing was up\n")
+
+
+def test_it_tells_the_robots_state_until_it_ends(shell: Shell) -> None:
+    shell("up", shell.profile("good"), "--detach")
+    assert shell.run_dir.survey_socket.is_socket()
+    told = shell("status", "--json")
+    assert (told.returncode, told.stderr) == (0, "")
+    services = {one["service"]: one["state"] for one in json.loads(told.stdout)["services"]}
+    assert services == {"good": "ready"}
+    shell("down")
+    assert not shell.run_dir.survey_socket.exists()
+    assert shell("status").returncode == exits.NO_MESH
 
 
 def test_a_crash_at_the_start_shows_the_logs_end_and_stops_everything(shell: Shell) -> None:

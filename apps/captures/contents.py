@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import zlib
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -140,7 +139,7 @@ class Disk:
     def checksum(self, start: int, end: int) -> int:
         crc = 0
         for at in range(start, end, 4 * NEAR_BYTES):
-            crc = zlib.crc32(self.read(at, min(4 * NEAR_BYTES, end - at)), crc)
+            crc = mcap.crc32(self.read(at, min(4 * NEAR_BYTES, end - at)), crc)
         return crc
 
 
@@ -186,7 +185,7 @@ def unpacked(content: bytes, strict: bool) -> tuple[bytes | memoryview, int]:
     taken = start + head.packed_bytes
     if strict and (not raw or taken != len(record)):
         raise DamageError("its stated lengths disagree")
-    if head.crc != zlib.crc32(raw) and (strict or head.crc != 0):  # 0: no checksum, which recorders never write
+    if head.crc != mcap.crc32(raw) and (strict or head.crc != 0):  # 0: no checksum, which recorders never write
         raise DamageError("its checksum is wrong")
     return raw, taken
 

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import struct
-import zlib
 from io import BytesIO
 
 import lz4.frame
@@ -12,7 +11,7 @@ import zstandard
 from mcap.exceptions import EndOfFile
 from mcap.records import Attachment, AttachmentIndex, Footer
 
-from cocoro.capture.mcap import PREFIX, Bytes, DamageError, ExactStream, footer_crc, parsed
+from cocoro.capture.mcap import PREFIX, Bytes, DamageError, ExactStream, crc32, footer_crc, parsed
 
 KNOWN = ("", "zstd", "lz4")
 """A chunk's compression, as its head names it."""
@@ -45,7 +44,7 @@ def attachment(content: Bytes, strict: bool) -> Attachment:
     found, taken = parsed(Attachment, content)
     view = memoryview(content)
     (crc,) = struct.unpack("<I", view[taken - 4 : taken])
-    if crc != zlib.crc32(view[: taken - 4]) and (strict or crc != 0):
+    if crc != crc32(view[: taken - 4]) and (strict or crc != 0):
         raise DamageError(f"the checksum of the attachment {found.name!r} is wrong")
     return found
 

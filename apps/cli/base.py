@@ -10,12 +10,13 @@ import msgspec
 import typer
 
 from apps.cli import exits
-from apps.cli.link import joined, within
+from apps.cli.link import joined
 from apps.cli.options import JsonOption, RobotChoice, RobotOption, ThroughOption
 from apps.cli.output import complain, print_json, tell
 from cocoro.errors import MeshError
 from cocoro.messages import BaseState, RecoverRequest
 from cocoro.topics import BASE_STATE, HEALTH, RECOVER
+from deploy.survey import within
 
 WAIT_S = 2.5
 """Longest wait for the base's state and health."""

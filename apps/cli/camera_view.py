@@ -14,7 +14,7 @@ import numpy as np
 
 from apps.appearance.learn import LearnedObject, ObjectView
 from apps.appearance.size import outline_of
-from apps.cli.link import PERCEPTION, MeshLink, joined, within
+from apps.cli.link import PERCEPTION, MeshLink, joined
 from apps.cli.options import RobotChoice
 from apps.pictures import colour_of, describe, draw
 from cocoro.arrays import ImageArray
@@ -26,6 +26,7 @@ from cocoro.objects import Catalogue
 from cocoro.robot import Robot
 from cocoro.topics import ARM_STATE, FRAME
 from deploy import processes
+from deploy.survey import within
 from services.kinect.picture import load
 
 FRAME_S = 5.0

@@ -91,11 +91,11 @@ def _left_open(robot: str | None, stops: list[StopResult]) -> set[str]:
     """Names of this user's robots that have a running service which the stop path did not stop."""
     own = {stop.robot: stop for stop in stops if stop.owner is None}
     left_open = {stop.robot for stop in own.values() if stop.missing}
-    from deploy.rundir import RunDir, robots  # slow to import; by now every stop has been sent
+    from deploy.rundir import RunDir, folders  # slow to import; by now every stop has been sent
 
-    for run_dir in robots() if robot is None else [RunDir(robot)]:
-        stopped = own[run_dir.robot].acknowledged if run_dir.robot in own else ()
-        if ({*STOPPABLE} & {*run_dir.claims()}) - {*stopped}:
+    for run_dir in folders() if robot is None else [RunDir(robot)]:
+        unstopped = {*STOPPABLE} - {*(own[run_dir.robot].acknowledged if run_dir.robot in own else ())}
+        if unstopped and unstopped & {*run_dir.claims()}:
             left_open.add(run_dir.robot)
     return left_open
 

@@ -14,43 +14,35 @@ from apps.cli.choice import RobotChoice
 from cocoro.bus.base import Bus
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.errors import ConfigError, MeshError, RefusedError, choice_of
-from cocoro.participant import Answer, Participant, Q, R
+from cocoro.participant import Answer, Q, R
 from cocoro.topics import Request
-from deploy import robot_time
 from deploy.rundir import START, RunDir, robots
 from deploy.site.place import SITE
+from deploy.survey import REPLAY, Onlooker
 
 if TYPE_CHECKING:
     from cocoro.objects import Catalogue
     from cocoro.robot import Robot
 
-__all__ = ["Answer", "MeshLink", "find", "joined", "within"]
+__all__ = ["Answer", "MeshLink", "find", "joined"]
 
 PERCEPTION = "perception"
 """The component that detects the known objects."""
 ROBOT_FILES = ("description", "measured")
 APART_S = 0.002
 """Pause before a request to a site, whose gateways drop requests that follow each other too closely."""
-REPLAY, REPLAYED = "replay", "replayed"
-"""Process that publishes a capture's messages, and the state of a service that it stands for."""
 
 
-class MeshLink(Participant):
+class MeshLink(Onlooker):
     """An operator's participant of the mesh. Make it with `joined`."""
-
-    onlooker = True
-    frame_depth = depth = 64
 
     def __init__(
         self, run_dir: RunDir, bus: Bus, private: bool = True, refusal: Callable[[str], str] | None = None
     ) -> None:
         """`private`: only processes of this machine can be in this mesh. `refusal` says why a request on a key may not
         be sent, as the site's rules have it."""
-        super().__init__(bus, robot_time.clock(run_dir.path), run_dir.robot)
-        self._private = private
+        super().__init__(run_dir, bus, private)
         self._refusal = refusal
-        self.run_dir = run_dir
-        self.robot = run_dir.robot
 
     async def _ask(self, request: Request[Q, R], question: Q, timeout_s: float | None) -> list[Answer[R]]:
         if self._refusal is not None and (why := self._refusal(request.key(self.robot_name))):
@@ -96,18 +88,6 @@ class MeshLink(Participant):
 
     def refused(self, answer: Answer[Any]) -> str:
         return f"{answer.service}: {answer.error}"
-
-    def unheard(self, service: str) -> str:
-        """The state of a service without a liveliness token: `replayed` when a replay publishes its messages, `not
-        alive` when no process of this machine is it, else `no contact`, which a living process may be without."""
-        by = self.run_dir.claimant(service)
-        if by is not None and by.name == REPLAY:
-            return REPLAYED
-        return "not alive" if self._private and by is None else "no contact"
-
-    def replayed(self) -> set[str]:
-        """The services whose messages a replay of this machine publishes."""
-        return {service for service, by in self.run_dir.claims().items() if by.name == REPLAY}
 
 
 def through_site(choice: RobotChoice) -> str | None:
@@ -158,15 +138,3 @@ async def joined(
             why = "is it up there, or has your certificate been revoked?"
             raise MeshError(f"nothing of {link.robot} is heard at {config.where}: {why}")
         yield link
-
-
-async def within(timeout_s: float, condition: Callable[[], bool], changed: asyncio.Event) -> bool:
-    """Waits until a condition holds, checking it whenever `changed` is set; returns whether it holds in the end."""
-    try:
-        async with asyncio.timeout(timeout_s):
-            while not condition():
-                changed.clear()
-                await changed.wait()
-    except TimeoutError:
-        pass
-    return condition()

@@ -77,17 +77,21 @@ def _run(arguments: list[str]) -> int:
 
 def _status(as_json: bool) -> int:
     """The command without other options. That no robot is up is known before anything is imported that asks one; then
-    MeshError is raised."""
+    MeshError is raised. The supervisor of the one that is up is asked before anything is imported that joins a mesh."""
     from deploy.rundir import START, robots
 
-    if not robots() and not os.environ.get("COCORO_SITE"):
+    up = robots()
+    if not up and not os.environ.get("COCORO_SITE"):
         from cocoro.errors import MeshError
 
         raise MeshError(f"no robot is up on this machine: {START}")
+    from apps.cli.status import show_status, show_told
+
+    if len(up) == 1 and (code := show_told(up[0], as_json)) is not None:
+        return code
     import asyncio
 
     from apps.cli.choice import RobotChoice
-    from apps.cli.status import show_status
 
     _report_failures()
     return asyncio.run(show_status(RobotChoice(), as_json))

@@ -64,14 +64,13 @@ def _capture_beside(video: Path) -> Iterator[str]:
 
 
 def _run(request: RehearsalRequest, as_json: bool) -> int:
-    # A fork of a process with one thread starts sooner, and small matrices gain nothing by threads.
+    # A fork of a process with one thread starts sooner, and small matrices gain nothing by threads. NumPy reads it.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    import sim.camera  # noqa: F401 # what both processes need is imported once
-    from sim.camera_process.start import started_ahead
+    from apps.rehearsal.ahead import begun_ahead
 
     request = msgspec.structs.replace(request, camera_process=True)
     try:
-        with started_ahead(), _output_to_stderr() if as_json else nullcontext(), StatusLine(sys.stderr) as line:
+        with begun_ahead(), _output_to_stderr() if as_json else nullcontext(), StatusLine(sys.stderr) as line:
             from apps.rehearsal.rehearse import rehearse as run  # imports the simulator, which is slow
 
             tell: Tell = (lambda progress: line.show(str(progress))) if line.shown else ignored

@@ -22,7 +22,6 @@ from apps.captures.reader import Capture
 from apps.captures.replay import SIMULATOR, Replay, heard_as, played_keys, refuse_if_alive, services_of
 from apps.cli import exits
 from apps.cli.capture import check_span
-from apps.cli.link import REPLAY
 from apps.cli.options import CaptureArgument, FromOption, OnlyOption, ToOption
 from apps.cli.terminal import StatusLine
 from cocoro.bus.zenoh import ZenohBus
@@ -31,6 +30,7 @@ from cocoro.errors import ConfigError, RefusedError
 from cocoro.keys import alive_key, service_of
 from deploy import processes, profiles
 from deploy.rundir import RunDir, robots
+from deploy.survey import REPLAY
 
 SHOW_S = 0.1
 JUMP_S = 5.0

@@ -11,12 +11,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from apps.cli import exits
-from apps.cli.link import MeshLink, joined, within
+from apps.cli.link import MeshLink, joined
 from apps.cli.options import JsonOption, RobotChoice, RobotOption, ThroughOption
 from apps.cli.output import tell
 from cocoro.errors import ConfigError, MeshError
 from cocoro.messages import Detections, Frame
 from cocoro.topics import DETECTIONS, FRAME
+from deploy.survey import within
 
 if TYPE_CHECKING:
     from cocoro.objects import Catalogue

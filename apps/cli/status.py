@@ -1,31 +1,34 @@
-"""What `cocoro status` shows: the services that should run, their health, the task and the planner's reason.
+"""`cocoro status`: shows the services that should run, their health, the task and the planner's reason.
 
-Without options `apps/cli/main.py` calls it, so it does without the library that reads options.
+A robot's supervisor knows all that and is asked for it. Where none answers, the command joins the mesh and collects it
+(`deploy.survey`). Without options `apps/cli/main.py` calls it, so it does without the library that reads options, and
+the first way imports little.
 """
 
 from __future__ import annotations
 
-import asyncio
-from collections.abc import Iterator
-from functools import partial
-from typing import Any
-
-import msgspec
+import _socket as socket  # the module of that name makes enumerations and takes 2 ms to import
+import json
+from types import SimpleNamespace
 
 from apps.cli import exits
-from apps.cli.choice import RobotChoice
-from apps.cli.link import REPLAYED, MeshLink, joined, within
 from apps.cli.output import print_json
 from apps.cli.terminal import Column, fields, print_table
-from cocoro.errors import ConfigError
-from cocoro.messages import Health, Message, Recording, TaskState
-from cocoro.topics import BASE_STATE, HEALTH, LATCH, PLAN, RECORDING, TASK, Topic
-from deploy import profiles
 
-RECORDER = RECORDING.of("capture")
-NEWS: tuple[Topic[Any], ...] = (PLAN, TASK, LATCH, BASE_STATE, RECORDER)
-HEALTH_S = 2.5
-"""Longest wait for the health of every live service; each publishes it once a second of the robot's time."""
+TYPE_CHECKING = False
+"""As in `typing`, which takes 2 ms to import."""
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from typing import Any
+
+    from apps.cli.choice import RobotChoice
+    from deploy.rundir import RunDir
+
+REPLAYED = "replayed"
+"""As in `deploy.survey`, which is slow to import; a test compares them."""
+ANSWER_S = 3.5
+"""Longest wait for the supervisor's answer. It waits itself for `deploy.survey.HEALTH_S` where a service is silent."""
+PIECE_BYTES = 65536
 
 COLUMNS = (
     "service", "state", Column("pid", 2, right=True), Column("cpu", right=True), Column("memory", right=True),
@@ -33,10 +36,41 @@ COLUMNS = (
 )  # fmt: skip
 
 
+def show_told(run_dir: RunDir, as_json: bool) -> int | None:
+    """Prints the report of the robot's supervisor and returns the exit code; None when it does not answer."""
+    report = told_by_supervisor(run_dir)
+    return None if report is None else _show(report, as_json)
+
+
+def told_by_supervisor(run_dir: RunDir) -> dict[str, Any] | None:
+    """The report of the robot's supervisor; None when it does not answer."""
+    pieces = []
+    try:
+        line = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_CLOEXEC)
+        try:
+            line.settimeout(ANSWER_S)
+            line.connect(str(run_dir.survey_socket))
+            while piece := line.recv(PIECE_BYTES):
+                pieces.append(piece)
+        finally:
+            line.close()
+        report = json.loads(b"".join(pieces))
+    except (OSError, ValueError):
+        return None
+    return report if isinstance(report, dict) else None
+
+
 async def show_status(choice: RobotChoice, as_json: bool) -> int:
-    """Prints the report and returns the exit code. Raises MeshError when the robot's mesh is not there."""
+    """Collects and prints the report and returns the exit code. Raises MeshError when the robot's mesh is not there."""
+    from apps.cli.link import joined
+    from deploy.survey import Survey
+
     async with joined(choice) as link:
-        report = await Survey(link).take()
+        report = await Survey(link).take(set(await link.alive()))
+    return _show(report, as_json)
+
+
+def _show(report: dict[str, Any], as_json: bool) -> int:
     if as_json:
         print_json(report)
     else:
@@ -44,86 +78,9 @@ async def show_status(choice: RobotChoice, as_json: bool) -> int:
     return exits.FAILED if missing(report) else exits.DONE
 
 
-class Survey:
-    """Collects the health of every live service and the newest state of task, plan, latch and base."""
-
-    def __init__(self, link: MeshLink) -> None:
-        self._link = link
-        self._health: dict[str, Health] = {}
-        self._newest: dict[str, Message] = {}
-        self._changed = asyncio.Event()
-
-    async def take(self) -> dict[str, Any]:
-        self._link.inbox(HEALTH.of("*")).add(lambda _key, health: self._on_health(health))
-        for topic in NEWS:
-            self._link.inbox(topic).add(partial(self._on_news, topic.name))
-        alive = set(await self._link.alive())
-        there = alive | self._link.replayed()
-        wanted_news = {topic.name for topic in NEWS if topic.service in there}
-        asking = [asyncio.ensure_future(self._ask(topic)) for topic in (HEALTH.of("*"), *NEWS) if topic.slow]
-        await within(HEALTH_S, lambda: there <= set(self._health) and wanted_news <= set(self._newest), self._changed)
-        for question in asking:
-            question.cancel()
-        await asyncio.gather(*asking, return_exceptions=True)
-        return self._report(alive, there)
-
-    async def _ask(self, topic: Topic[Any]) -> None:
-        """Ask for messages that may not come of themselves for a second; one that came meanwhile is newer."""
-        for message in await self._link.newest(topic, HEALTH_S):
-            if isinstance(message, Health):
-                self._health.setdefault(message.service, message)
-            else:
-                self._newest.setdefault(topic.name, message)
-        self._changed.set()
-
-    def _on_health(self, health: Health) -> None:
-        self._health[health.service] = health
-        self._changed.set()
-
-    def _on_news(self, topic: str, _key: str, message: Message) -> None:
-        self._newest[topic] = message
-        self._changed.set()
-
-    def _report(self, alive: set[str], there: set[str]) -> dict[str, Any]:
-        resolved = self._link.run_dir.resolved()
-        names = list(dict.fromkeys([*expected(resolved), *sorted(there)]))
-        return {
-            "robot": self._link.robot,
-            "profile": resolved.get("name", ""),
-            "services": [
-                {"service": name, "alive": name in alive, "state": self._state(name, name in alive)}
-                | ({"health": msgspec.to_builtins(self._health[name])} if name in self._health else {})
-                for name in names
-            ],
-            "task": self._newest_of(TASK.name),
-            "plan": self._newest_of(PLAN.name),
-            "latch": self._newest_of(LATCH.name),
-            "base": self._newest_of(BASE_STATE.name),
-            "recording": self._newest_of(RECORDER.name),
-        }
-
-    def _state(self, service: str, alive: bool) -> str:
-        if not alive:
-            return self._link.unheard(service)
-        if service in self._health:
-            return self._health[service].state
-        return REPLAYED if service in self._link.replayed() else "no report"
-
-    def _newest_of(self, topic: str) -> Any:
-        return msgspec.to_builtins(self._newest[topic]) if topic in self._newest else None
-
-
 def missing(report: dict[str, Any]) -> bool:
     """Whether a service of a report is missing: it is not alive, and no replay stands for it."""
     return not all(service["alive"] or service["state"] == REPLAYED for service in report["services"])
-
-
-def expected(resolved: dict[str, Any]) -> tuple[str, ...]:
-    """Services that should be alive by `resolved`, the profile of the robot's last start."""
-    try:
-        return profiles.from_data(resolved, resolved.get("name", "")).services() if resolved else ()
-    except ConfigError:  # a component has been uninstalled since
-        return ()
 
 
 def _print(report: dict[str, Any]) -> None:
@@ -166,18 +123,18 @@ def _facts(report: dict[str, Any]) -> Iterator[tuple[str, str]]:
     if (base := report["base"]) is not None:
         yield "battery", f"{100 * base['battery_fraction']:.0f}%{', charging' if base['charging'] else ''}"
     if report["task"] is not None:
-        yield "task", _task(msgspec.convert(report["task"], TaskState))
+        yield "task", _task(SimpleNamespace(**report["task"]))
     if (plan := report["plan"]) is not None:
         yield "planner", ": ".join(filter(None, (plan["behaviour"], plan["why"])))
         yield "reaches with", plan["model"]
     if (told := report["recording"]) is not None:
-        recording = msgspec.convert(told, Recording)
+        recording = SimpleNamespace(**told)
         yield "records", recording.fault or f"{recording.occasion or 'nothing that happens'}, in {recording.file}"
         yield "space", space(recording)
 
 
-def space(recording: Recording) -> str:
-    """Room left for captures, and the time for which it lasts."""
+def space(recording: Any) -> str:
+    """Room left for captures, and the time for which it lasts; of a `Recording`."""
     if recording.fault:
         return ""
     rate = recording.rate_bytes_per_s
@@ -188,7 +145,7 @@ def space(recording: Recording) -> str:
     return f"{recording.free_bytes / 1e9:.1f} GB left{hours}{kept}"
 
 
-def _task(task: TaskState) -> str:
+def _task(task: Any) -> str:
     if not task.task_id:
         return "none yet"
     name = f"{task.task} {task.label}".strip()

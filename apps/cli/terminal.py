@@ -6,7 +6,6 @@ goes into a second line of its row.
 
 from __future__ import annotations
 
-import shutil
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from io import StringIO
@@ -47,13 +46,41 @@ def table(columns: Sequence[str | Column], rows: Iterable[Sequence[str]], width:
 
     `width` is that of standard output's terminal by default, unlimited where it is none.
     """
-    from rich.console import Console
-
     if width is None:
         width = output_width()
+    rows = [tuple(row) for row in rows]
+    if (plain := _plain_table(_columns(columns), rows, width)) is not None:
+        return plain
+    from rich.console import Console
+
     out = StringIO()
     Console(file=out, width=width, force_terminal=False, color_system=None).print(FittedTable(columns, rows))
     return "".join(f"{line.rstrip()}\n" for line in out.getvalue().splitlines())
+
+
+def _columns(columns: Sequence[str | Column]) -> list[Column]:
+    return [Column(column) if isinstance(column, str) else column for column in columns]
+
+
+def _plain_table(columns: Sequence[Column], rows: Sequence[Sequence[str]], width: int) -> str | None:
+    """The table, without the library that draws it, where nothing is to be fitted: it is not wider than `width`, and
+    each character of its cells takes one column."""
+    lines = [tuple(column.head.upper() for column in columns), *rows]
+    if not all(cell.isascii() and cell.isprintable() for line in lines for cell in line):
+        return None
+    widths = [max(len(line[number]) for line in lines) for number in range(len(columns))]
+    if sum(widths) + GAP * (len(widths) - 1) > width:
+        return None
+    return "".join(
+        (" " * GAP)
+        .join(
+            cell.rjust(room) if column.right else cell.ljust(room)
+            for cell, room, column in zip(line, widths, columns, strict=True)
+        )
+        .rstrip()
+        + "\n"
+        for line in lines
+    )
 
 
 def fields(pairs: Iterable[tuple[str, str]]) -> str:
@@ -65,16 +92,22 @@ def fields(pairs: Iterable[tuple[str, str]]) -> str:
 
 def folded(head: str, text: str, width: int | None = None) -> list[str]:
     """The lines of `head` and `text`, folded to the terminal's width below the text's beginning."""
+    room = max((output_width() if width is None else width) - len(head), 10)
+    if len(text) <= room:
+        return [head + text]
     from textwrap import wrap
 
-    room = max((output_width() if width is None else width) - len(head), 10)
-    first, *rest = (wrap(text, room, break_on_hyphens=False) if len(text) > room else []) or [text]
+    first, *rest = wrap(text, room, break_on_hyphens=False) or [text]
     return [head + first, *(" " * len(head) + line for line in rest)]
 
 
 def output_width() -> int:
     """Columns of the terminal that is standard output; PLAIN_WIDTH when it is none."""
-    return shutil.get_terminal_size().columns if sys.stdout.isatty() else PLAIN_WIDTH
+    if not sys.stdout.isatty():
+        return PLAIN_WIDTH
+    import shutil  # slow to import
+
+    return shutil.get_terminal_size().columns
 
 
 class FittedTable:
@@ -87,7 +120,7 @@ class FittedTable:
         from rich.text import Text
 
         self._fold = fold
-        self._columns = [Column(column) if isinstance(column, str) else column for column in columns]
+        self._columns = _columns(columns)
         self._rows = [[cell if isinstance(cell, Text) else Text(cell) for cell in row] for row in rows]
         self._natural = [
             max(len(column.head), *(row[number].cell_len for row in self._rows)) if self._rows else len(column.head)

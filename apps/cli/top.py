@@ -16,10 +16,10 @@ import typer
 
 from apps.cli import exits
 from apps.cli.interrupt import elapsed, interrupt_event
-from apps.cli.link import REPLAYED, MeshLink, joined, within
+from apps.cli.link import MeshLink, joined
 from apps.cli.options import JsonOption, RobotChoice, RobotOption, ThroughOption
 from apps.cli.output import print_json
-from apps.cli.status import expected, missing
+from apps.cli.status import missing
 from apps.cli.top_view import Screen, print_report
 from cocoro.component import Component
 from cocoro.errors import CocoroError
@@ -30,6 +30,7 @@ from cocoro.topics import BASE_STATE, CLOCK, HEALTH, LATCH, PLAN, TASK, Topic
 from deploy import processes
 from deploy.processor import ProcessorUse, ProcessorWatch
 from deploy.rates import meant_hz
+from deploy.survey import REPLAYED, expected, within
 
 FIRST_S = 2.5
 """Longest wait for the health of every live service; each publishes it once a second of the robot's time."""

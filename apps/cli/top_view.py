@@ -8,9 +8,9 @@ from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.text import Text
 
-from apps.cli.link import REPLAYED
 from apps.cli.status import said
 from apps.cli.terminal import PLAIN_WIDTH, Column, FittedTable
+from deploy.survey import REPLAYED
 
 SLOW, STALLED = 0.85, 0.4
 """Shares of the nominal rate: one below SLOW, or as far above 1, is yellow, one below STALLED red."""

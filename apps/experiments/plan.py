@@ -11,7 +11,7 @@ from apps.experiments.lessons import load_robot
 from apps.experiments.runs import ExperimentRun
 from cocoro.robot import Robot
 from services.executive.tasks import BabbleArmTask, BabbleWheelsTask
-from sim.realism import BodyKind, Sensors
+from sim.kinds import BodyKind, Sensors
 
 
 class ExperimentSettings(msgspec.Struct, frozen=True, kw_only=True):

@@ -8,7 +8,7 @@ import msgspec
 from msgspec import Meta
 
 from services.executive.tasks import TASKS
-from sim.realism import BodyKind, Sensors
+from sim.kinds import BodyKind, Sensors
 
 
 class RehearsalRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -64,13 +64,11 @@ class SharedPool:
 
 def read(payload: zenoh.ZBytes) -> bytes | None:
     """The bytes of a sample; None when its shared memory was reclaimed before it was read."""
-    data = payload.to_bytes()
-    if len(data) < SHARED_FROM_BYTES:
-        return data
-    held = payload.as_shm()
-    if held is not None and not held.is_valid():
-        return None
-    return data
+    held = payload.as_shm() if len(payload) >= SHARED_FROM_BYTES else None
+    if held is None:
+        return payload.to_bytes()
+    data = bytes(held)  # `to_bytes` clears the memory before it copies
+    return data if held.is_valid() else None
 
 
 class Declared:

@@ -41,8 +41,10 @@ class LocalMesh:
         hit = self._matching.get(key)
         if hit is None:
             hit = self._matching[key] = [s for s in self.subscriptions if matches(s.keyexpr, key)]
-        for subscription in hit:
-            subscription.offer(key, payload)
+        if self.transport_s > 0:
+            asyncio.get_running_loop().call_later(self.transport_s, _offer, hit, key, payload)
+        else:
+            _offer(hit, key, payload)
 
     def changed(self) -> None:
         """Call it when a subscription was added or removed."""
@@ -70,22 +72,21 @@ class LocalSubscription:
         mesh.subscriptions.append(self)
         mesh.changed()
 
-    def offer(self, key: str, payload: bytes) -> None:
-        loop = asyncio.get_running_loop()
-        if self._mesh.transport_s > 0:
-            loop.call_later(self._mesh.transport_s, self._arrive, key, payload)
-        else:
-            self._arrive(key, payload)
-
-    def _arrive(self, key: str, payload: bytes) -> None:
+    def arrive(self, key: str, payload: bytes) -> bool:
+        """A sample is there. Returns whether none waited, so that `drain` must be called."""
         place = key if self._depth is not None else ""
         ring = self._waiting.get(place)
         if ring is None:
-            ring = self._waiting[place] = deque(maxlen=self._depth)
-            asyncio.get_running_loop().call_soon(self._drain, place)
+            self._waiting[place] = deque(((key, payload),), maxlen=self._depth)
+            return True
         if len(ring) == self._depth:
             self.skipped += 1
         ring.append((key, payload))
+        return False
+
+    def drain(self, key: str) -> None:
+        """Hand over what waits with a sample of this key."""
+        self._drain(key if self._depth is not None else "")
 
     def _drain(self, place: str) -> None:
         for key, payload in self._waiting.pop(place, ()):
@@ -103,6 +104,18 @@ class LocalSubscription:
         if self in self._mesh.subscriptions:
             self._mesh.subscriptions.remove(self)
             self._mesh.changed()
+
+
+def _offer(subscriptions: list[LocalSubscription], key: str, payload: bytes) -> None:
+    """A sample arrives at all of its subscriptions, which hand it over in the loop's next turn, one after the other."""
+    woken = [subscription for subscription in subscriptions if subscription.arrive(key, payload)]
+    if woken:
+        asyncio.get_running_loop().call_soon(_drain, woken, key)
+
+
+def _drain(subscriptions: list[LocalSubscription], key: str) -> None:
+    for subscription in subscriptions:
+        subscription.drain(key)
 
 
 class LocalListening(LocalSubscription):

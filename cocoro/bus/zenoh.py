@@ -24,6 +24,7 @@ from zenoh.handlers import Callback
 from cocoro.bus.base import OnAlive, OnBatch, OnSample, Qos, Received, Reply, Server, answer
 from cocoro.bus.declared import QOS, Declared, SharedPool, ZenohListening, ZenohPublisher, ZenohSubscription, read
 from cocoro.bus.endpoints import ZenohConfig
+from cocoro.bus.foreign import keep_thread_state
 from cocoro.bus.queues import Batches, Outbox, Ring
 from cocoro.bus.register import Membership, members, new_identity
 from cocoro.bus.session import LEAVE_S, Opened, close_session, exit_guard, in_thread, no_mesh, open_session, options
@@ -157,6 +158,7 @@ class ZenohBus:
         push = ring.push
 
         def on_sample(sample: zenoh.Sample) -> None:
+            keep_thread_state()
             push(only or str(sample.key_expr), sample.payload)
 
         subscriber = self._session.declare_subscriber(keyexpr, Callback(on_sample, indirect=False))
@@ -176,6 +178,7 @@ class ZenohBus:
         push = batches.push
 
         def on_sample(sample: zenoh.Sample) -> None:
+            keep_thread_state()
             push((sample, clock_gettime_ns(CLOCK_BOOTTIME)))  # `steady_ns`, without the call
 
         return self._keep(

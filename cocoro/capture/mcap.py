@@ -7,7 +7,6 @@ chunk's head. Each of these has its figure below, by `python -m bench capture-fo
 from __future__ import annotations
 
 import struct
-import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from io import BytesIO
@@ -17,6 +16,11 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC
+
+try:
+    from zlib_ng.zlib_ng import crc32 as crc32  # of a frame of 1.5 MB in 0.03 ms; Python's takes 0.36 ms
+except ImportError:  # there is no wheel of it for this machine
+    from zlib import crc32 as crc32
 
 
 class DamageError(Exception):
@@ -83,7 +87,8 @@ def parsed(kind: type[K], content: Bytes) -> tuple[K, int]:
 
 def footer_crc(summary: bytes, summary_start: int, offsets_start: int) -> int:
     head = PREFIX.pack(Opcode.FOOTER, _FOOTER_FIELDS.size) + struct.pack("<QQ", summary_start, offsets_start)
-    return zlib.crc32(head, zlib.crc32(summary))
+    crc: int = crc32(head, crc32(summary))
+    return crc
 
 
 # --- by hand --------------------------------------------------------------------------------------

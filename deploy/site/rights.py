@@ -99,7 +99,7 @@ def of_host(robot: str, share: Iterable[Component], *, simulated: bool) -> Right
         hears=frozenset(hears),
         never_hears=frozenset() if made_here else frozenset({TRUTH.key(robot)}),
         asks=frozenset(asks),
-        answers=frozenset(answers | {row.key(robot) for row in puts if row.slow}),
+        answers=frozenset(answers | {row.key(robot) for row in puts if row.askable}),
         shows=frozenset(shows),
         watches=frozenset({f"{robot}/**"} if records else {key(robot) for key in (alive_key, recorder_key, asker_key)}),
     )
@@ -109,7 +109,7 @@ def of_person(robot: str, role: Role, name: str) -> Rights:
     """What a person may do with a robot."""
     allowed = OF_PERSONS[role]
     asks = {_any(row).key(robot) for row in all_requests() if row.right in allowed}
-    asks |= {_any(row).key(robot) for row in TOPICS if row.slow}
+    asks |= {_any(row).key(robot) for row in TOPICS if row.askable}
     own = frozenset({f"{robot}/{name}/**"}) if role == "author" else frozenset()
     shows = {asker_key(robot)} if "operate" in allowed else set()
     return Rights(

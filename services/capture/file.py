@@ -10,7 +10,6 @@ from __future__ import annotations
 import json
 import os
 import struct
-import zlib
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -163,7 +162,7 @@ class CaptureFile:
         if chunk.parts:
             raw = b"".join(chunk.parts)
             name, packed = self._packer.pack_small(raw)
-            head = mcap.ChunkHead(chunk.start_ns, chunk.end_ns, len(raw), zlib.crc32(raw), name, len(packed))
+            head = mcap.ChunkHead(chunk.start_ns, chunk.end_ns, len(raw), mcap.crc32(raw), name, len(packed))
             self._write_chunk(head, packed, chunk.places)
 
     def metadata(self, name: str, entries: Mapping[str, str]) -> None:

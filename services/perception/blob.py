@@ -52,7 +52,8 @@ class BlobDetector:
         thin = []
         for place, layer in enumerate(self._table.layers):
             labels = layer.table.take(codes)
-            counts = np.bincount(labels.reshape(-1))
+            # Most pixels have no object's colour, and are not counted.
+            counts = np.bincount(labels[labels != 0], minlength=1)
             for label in (1 + np.flatnonzero(counts[1:] >= min_area_px)).tolist():
                 if label - 1 in seen:
                     continue
@@ -63,7 +64,7 @@ class BlobDetector:
                 if parts:
                     masks, boxes = zip(*parts, strict=True)
                     same = np.ones(len(parts), dtype=np.int64)
-                    thin.append(Segments.of_masks((label - 1) * same, place * same, masks, boxes))
+                    thin.append(Segments.of_masks((label - 1) * same, place * same, masks, boxes, image.width))
         return thin
 
     def _sightings(self, found: Segments, image: RgbdImage, min_area_px: float) -> list[ImageSighting]:
@@ -74,7 +75,7 @@ class BlobDetector:
         one.
         """
         image.register(_with_margin(found.bounds, image))
-        depth_m = middle_depths_m(found, image.codes_at(found.u, found.v), image)
+        depth_m = middle_depths_m(found, image)
         fit = SizeFit(self._shapes.of(found.number), image.camera, self._config, min_area_px)
         diagonal_px = np.hypot(*(found.bounds[:, 2:] - found.bounds[:, :2]).T)
         alone = np.bincount(found.number)[found.number] == 1
@@ -85,12 +86,14 @@ class BlobDetector:
         parts = [found.among(simple)] if simple.any() else []
         depth_m, hidden = depth_m[simple], hidden[simple]
         if not simple.all():
-            others = self._one_by_one(found, np.unique(found.number[~simple]), image, min_area_px)
+            others = self._one_by_one(found, sorted(set(found.number[~simple].tolist())), image, min_area_px)
             if others:
                 numbers, regions = np.array(list(others)), list(others.values())
                 layers = np.array([self._table.layer_of[number] for number in others])
                 parts.append(
-                    Segments.of_masks(numbers, layers, [each.mask for each in regions], [each.box for each in regions])
+                    Segments.of_masks(
+                        numbers, layers, [each.mask for each in regions], [each.box for each in regions], image.width
+                    )
                 )
                 of_others = np.array([depth_of(region) for region in regions])
                 fit = SizeFit(self._shapes.of(numbers), image.camera, self._config, min_area_px)
@@ -100,11 +103,11 @@ class BlobDetector:
         return self._told(Segments.joined(parts), depth_m, hidden, image) if parts else []
 
     def _one_by_one(
-        self, found: Segments, numbers: IntArray, image: RgbdImage, min_area_px: float
+        self, found: Segments, numbers: list[int], image: RgbdImage, min_area_px: float
     ) -> dict[int, ColourRegion]:
         """The region of each of the objects with these numbers that is seen."""
         seen = {}
-        for number in numbers.tolist():
+        for number in numbers:
             regions = np.flatnonzero(found.number == number)
             largest_first = regions[np.argsort(-found.area_px[regions], kind="stable")].tolist()
             parts = [_region(found, region, image) for region in largest_first]
@@ -117,7 +120,6 @@ class BlobDetector:
     def _told(self, found: Segments, depth_m: FloatArray, hidden: BoolArray, image: RgbdImage) -> list[ImageSighting]:
         """The sightings of objects that are these regions, in the catalogue's order. `depth_m` are the regions' depths,
         m, NaN without, and `hidden` is whether something may hide a part of them, shape (n,)."""
-        u_px, v_px = (np.add.reduceat(each, found.start, dtype=np.int64) / found.area_px for each in (found.u, found.v))
         left, top, right, bottom = found.bounds.T
         cut = (left <= 1) | (top <= 1) | (right >= image.width - 1) | (bottom >= image.height - 1)
         deep = ~np.isnan(depth_m)
@@ -128,7 +130,7 @@ class BlobDetector:
             )
             for number, region in enumerate(np.flatnonzero(deep).tolist()):
                 evidence[region] = OwnEvidence(all_evidence, number)
-        columns = (u_px, v_px, found.area_px, found.bounds, depth_m, cut, hidden)
+        columns = (*found.centre_px.T, found.area_px, found.bounds, depth_m, cut, hidden)
         numbers = found.number.tolist()
         rows = list(zip(*(column.tolist() for column in columns), evidence, strict=True))
         sightings = []

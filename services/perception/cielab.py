@@ -13,6 +13,12 @@ from cocoro.objects import LabBox, ObjectSpec
 Lab = Float32Array
 
 
+def prepare() -> None:
+    """Make OpenCV's tables for `lab_of` in advance: the first conversion of a process makes them, in 0.1 s without the
+    interpreter. Others wait for it."""
+    lab_of(np.zeros((1, 3), dtype=np.uint8))
+
+
 def lab_of(colour: ImageArray) -> Lab:
     """8-bit sRGB (..., 3) to CIELAB (D65) (..., 3): L 0 to 100, a and b about -128 to 127."""
     flat = np.ascontiguousarray(colour).reshape(1, -1, 3).astype(np.float32) / np.float32(255)

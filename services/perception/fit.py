@@ -9,25 +9,20 @@ from __future__ import annotations
 
 import numpy as np
 
-from cocoro.arrays import BoolArray, Float32Array, FloatArray
+from cocoro.arrays import FloatArray
 from services.perception.image import Evidence
+from services.perception.rays import Rays
 from services.perception.shapes import Shapes, Solids
 
 ITERATIONS = 12
-SETTLED_M = 3e-4
+SETTLED_M = 2e-3
+"""A fit ends when a step moves it by less: most fits then are within a tenth of it."""
 PRIOR = np.eye(3) / 0.05**2
 """Inverse covariance of the first guess, 1/m2: it may be 5 cm off and decides only what the evidence leaves open."""
-COARSE_STEPS = np.linspace(-1.0, 1.0, 5, dtype=np.float32)[:, None, None]
-FINE_STEPS = np.linspace(-0.1875, 0.1875, 3, dtype=np.float32)[:, None, None]
-"""Places along a ray where the point nearest to the shape is looked for, as shares of the shape's reach."""
 RAY_DOUBT_M, RAY_DOUBT_RAD = 0.001, 0.002
 """Standard deviation of the outline: a constant, and about a pixel at the object's distance."""
-MANY = 32
-COARSE, COARSE_ITERATIONS, COARSE_SETTLED_M = 3, 4, 1e-3
-"""So many fits go most of the way by every third piece of evidence, in so many steps at most, until the centre settles
-to a millimetre: that takes a third of the time. Of fewer fits the calls take the time, not the numbers."""
-KEPT = 0.7
-"""The fits that have settled are left out when less than this share of them goes on."""
+INSET_RAD = 0.002
+"""How far inside the true outline the outermost pixels found are on average: a pixel at 640 x 480."""
 HUBER = 1.5
 
 
@@ -39,13 +34,8 @@ def fit_centres(
 
     `pose` is the camera's pose in the body frame, 4 x 4; `start` the first guesses, m, shape (n, 3).
     """
-    rotation, guess = pose[:3, :3], start - pose[:3, 3]
-    fits = _Fits(shapes, evidence, rotation, guess)
-    if len(start) >= MANY:
-        nearby = _Fits(shapes, evidence.every(COARSE), rotation, guess)
-        fits.moved = nearby.settle(COARSE_ITERATIONS, COARSE_SETTLED_M)[0]
-    moved, misfit = fits.settle(ITERATIONS, SETTLED_M)
-    wandered = np.linalg.norm(moved, axis=1) >= 2 * shapes.reach_m
+    moved, misfit = _Fits(shapes, evidence, pose[:3, :3], start - pose[:3, 3]).settle()
+    wandered = (moved * moved).sum(axis=1) >= 4 * shapes.reach_m**2
     moved[wandered] = 0.0
     return start + moved, misfit
 
@@ -61,98 +51,57 @@ class _Fits:
         """`rotation` (3, 3) turns the camera's axes into the body's; `guess` (n, 3) is relative to the camera."""
         self._solids = Solids(shapes)
         self._side = evidence.side
-        self._free_to = evidence.free_to_m
         self._count = evidence.count
         self.moved = np.zeros_like(guess)
         self._eye = -guess.T[:, :, None].astype(np.float32)
         turn = rotation.astype(np.float32)
-        self._rays = (turn @ evidence.rays.reshape(3, -1)).reshape(evidence.rays.shape)
-        points = (turn @ evidence.points_m.reshape(3, -1)).reshape(evidence.points_m.shape)
-        points += self._eye
-        self._at = np.concatenate([points, self._rays], axis=2)
-        ray_certainty = 1 / (RAY_DOUBT_M + RAY_DOUBT_RAD * (guess @ rotation[:, 2]))
+        rays = (turn @ evidence.rays.reshape(3, -1)).reshape(evidence.rays.shape)
+        self._rays = Rays(self._solids, rays, evidence.free_to_m)
+        self._points = (turn @ evidence.points_m.reshape(3, -1)).reshape(evidence.points_m.shape)
+        self._points += self._eye
+        depth = guess @ rotation[:, 2]
+        self._inset = np.maximum(evidence.side, 0) * (INSET_RAD * depth).astype(np.float32)[:, None]
+        ray_certainty = 1 / (RAY_DOUBT_M + RAY_DOUBT_RAD * depth)
         of_rays = np.abs(evidence.side) * ray_certainty.astype(np.float32)[:, None]
         self._certainty = np.concatenate([evidence.certainty, of_rays], axis=1)
         self._certainty2 = self._certainty * self._certainty * np.float32(HUBER)
-        x, y, z = self._rays
-        length2 = np.maximum(x * x + y * y + z * z, np.float32(1e-9))
-        reach = shapes.reach_m.astype(np.float32)[:, None] / np.sqrt(length2)
-        self._depth = -(x * self._eye[0] + y * self._eye[1] + z * self._eye[2]) / length2
-        self._search(COARSE_STEPS * reach)
-        self._steps = FINE_STEPS * reach
 
-    def _search(self, steps: Float32Array) -> None:
-        """Find the point in each ray's free part that is nearest to the shape, or deepest in it, among those at
-        `steps`, (s, n, rays), from the last one."""
-        depths = self._depth + steps
-        np.minimum(depths, self._free_to, out=depths)
-        points = depths * self._rays[:, None]
-        points += self._from_centre()[:, None]
-        distance = self._solids.distance(points)
-        best, self._depth = distance[0], depths[0]
-        for other, depth in zip(distance[1:], depths[1:], strict=True):
-            nearer = other < best
-            best = np.where(nearer, other, best)
-            self._depth = np.where(nearer, depth, self._depth)
-
-    def _from_centre(self) -> Float32Array:
-        """The camera relative to the shapes' centres, m, shape (3, n, 1)."""
-        return self._eye - self.moved.T[:, :, None].astype(np.float32)
-
-    def settle(self, iterations: int, settled_m: float) -> tuple[FloatArray, FloatArray]:
-        """Step until each fit moves by less than `settled_m`, at most so many times. Returns how far each moved in all,
-        m, (n, 3), and its mean misfit, (n,)."""
-        moved, misfit = np.zeros_like(self.moved), np.zeros(len(self.moved))
-        left, going = np.arange(len(moved)), np.ones(len(moved), dtype=np.bool_)
-        for iteration in range(iterations):
+    def settle(self) -> tuple[FloatArray, FloatArray]:
+        """Step until each fit settles, and then leave it. Returns how far each moved in all, m, (n, 3), and its mean
+        misfit, (n,)."""
+        going = np.ones(len(self.moved), dtype=np.bool_)
+        for _ in range(ITERATIONS):
             move = self._move()
-            self.moved[going] += move[going]
-            settled = going & ((np.abs(move).max(axis=1) < settled_m) | (iteration == iterations - 1))
-            misfit[left[settled]] = self._misfit(settled)
-            going &= ~settled
-            remaining = np.count_nonzero(going)
-            if not remaining:
+            move[~going] = 0.0
+            self.moved += move
+            going &= np.abs(move).max(axis=1) >= SETTLED_M
+            if not going.any():
                 break
-            if len(left) >= MANY and remaining < KEPT * len(left):
-                moved[left] = self.moved
-                left = left[going]
-                self._keep(going)
-                going = np.ones(remaining, dtype=np.bool_)
-        moved[left] = self.moved
-        return moved, misfit
+        return self.moved, self._misfit()
 
-    def _misfit(self, chosen: BoolArray) -> FloatArray:
-        """Mean misfit of some of the fits before the last step, (m,)."""
-        size = self._size[chosen]
+    def _misfit(self) -> FloatArray:
+        """Mean misfit before the last step, (n,)."""
+        size = self._size
         loss = np.where(size < HUBER, 0.5 * size * size, HUBER * (size - 0.5 * HUBER))
-        misfit: FloatArray = loss.sum(axis=1) / self._count[chosen]
+        misfit: FloatArray = loss.sum(axis=1) / self._count
         return misfit
 
     def _move(self) -> FloatArray:
         """The step that each fit should make, m, (n, 3)."""
-        self._search(self._steps)
-        ends = self._at[:, :, -self._depth.shape[1] :]
-        np.multiply(self._depth, self._rays, out=ends)
-        ends += self._eye
-        distance, along = self._solids.gradient(self._at - self.moved.T[:, :, None].astype(np.float32))
-        # A ray that meets the shape is no evidence, nor is a free one that does not.
+        moved = self.moved.T[:, :, None].astype(np.float32)
+        offsets = np.concatenate([self._points - moved, self._rays.nearest(self._eye - moved)], axis=2)
+        distance, along = self._solids.gradient(offsets)
+        # A ray of the outline that is well inside the shape is no evidence, nor is a free one outside of it.
         missed = distance[:, -self._side.shape[1] :]
         missed *= self._side
+        missed += self._inset
         np.maximum(missed, 0, out=missed)
         missed *= self._side
         self._size = np.abs(distance) * self._certainty
         weight = self._certainty2 / np.maximum(self._size, np.float32(HUBER))
         weight *= distance != 0
         weighted = (along * weight).transpose(1, 0, 2)
-        curvature = (weighted @ along.transpose(1, 2, 0)).astype(np.float64) + PRIOR
-        pull = (weighted @ distance[:, :, None]).astype(np.float64) - PRIOR @ self.moved[:, :, None]
+        curvature = weighted @ along.transpose(1, 2, 0) + PRIOR
+        pull = weighted @ distance[:, :, None] - PRIOR @ self.moved[:, :, None]
         move: FloatArray = np.linalg.solve(curvature, pull)[..., 0]
         return move
-
-    def _keep(self, going: BoolArray) -> None:
-        """Go on with some of the fits only, (n,)."""
-        self._solids = self._solids.of(going)
-        for name in ("moved", "_count", "_side", "_certainty", "_certainty2", "_free_to", "_depth"):
-            setattr(self, name, getattr(self, name)[going])
-        for name in ("_at", "_rays", "_eye", "_steps"):
-            setattr(self, name, getattr(self, name)[:, going])

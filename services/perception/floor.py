@@ -114,14 +114,18 @@ def _cells(points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     point in each, m, shape (n,). `points` has shape (k, 3), m."""
     if not len(points):
         return np.zeros((0, 2)), np.zeros(0), np.zeros(0)
-    numbers, inverse, counts = np.unique(
-        np.floor(points[:, :2] / CELL_M).astype(np.int64), axis=0, return_inverse=True, return_counts=True
-    )
-    heights, lowest = np.zeros(len(numbers)), np.full(len(numbers), np.inf)
-    np.maximum.at(heights, inverse.reshape(-1), points[:, 2])
-    np.minimum.at(lowest, inverse.reshape(-1), points[:, 2])
-    enough = np.flatnonzero(counts >= _MIN_POINTS)[:_MOST_CELLS]
-    return np.asarray((numbers[enough] + 0.5) * CELL_M, dtype=np.float64), heights[enough], lowest[enough]
+    cells = np.floor(points[:, :2] / CELL_M).astype(np.int64)
+    # By x, then by y: one number for each cell, since NumPy's `unique` of rows takes ten times as long.
+    place = cells - cells.min(axis=0)
+    key = place[:, 0] * (1 + place[:, 1].max()) + place[:, 1]
+    order = np.argsort(key, kind="stable")
+    key = key[order]
+    start = np.flatnonzero(np.append(True, key[1:] != key[:-1]))
+    enough = np.flatnonzero(np.diff(np.append(start, len(key))) >= _MIN_POINTS)[:_MOST_CELLS]
+    heights = points[order, 2]
+    highest, lowest = np.maximum.reduceat(heights, start), np.minimum.reduceat(heights, start)
+    centres = (cells[order[start[enough]]] + 0.5) * CELL_M
+    return np.asarray(centres, dtype=np.float64), highest[enough], lowest[enough]
 
 
 def _free(

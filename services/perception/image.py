@@ -8,18 +8,17 @@ from math import sqrt
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cocoro.arrays import CodeArray, Float32Array, ImageArray, IntArray
 from cocoro.messages import Frame
 from cocoro.robot import Camera, Robot
-from services.perception.registration import PixelBox, Registration, registration
+from services.perception.registration import NO_DATA, PixelBox, Registration, registration
 
 __all__ = ["Detector", "Evidence", "ImageSighting", "OwnEvidence", "PixelBox", "RgbdImage"]
 
-PixelArray = NDArray[np.int32] | NDArray[np.int64]
-_BOX_COSTS_PX = 30, 8000
-"""A box is registered in the time of a wider one with so many columns and pixels more."""
+_BOX_IS_WIDER_PX, _PIXEL_COSTS, _BOXES_COST_PX = 30, 2.3, 20000
+"""Boxes are registered separately in the time of one box with so many times their pixels, each box so much wider, and
+so many pixels more."""
 
 
 class RgbdImage:
@@ -56,7 +55,7 @@ class RgbdImage:
 
     @property
     def registered_depth_m(self) -> Float32Array:
-        """Depth of each code of `codes_at`, m, shape (2048,); NaN for those without data."""
+        """Depth of each code of `codes_at`, m, shape (65536,); NaN for those without data."""
         return self._registration.table
 
     @property
@@ -92,18 +91,20 @@ class RgbdImage:
         """Compute the depth at the colour pixels of boxes, shape (n, 4), for `depth_m` and `codes_at`."""
         left, top = boxes[:, :2].min(axis=0).tolist()
         right, bottom = boxes[:, 2:].max(axis=0).tolist()
-        separately = int(((boxes[:, 2] - boxes[:, 0] + _BOX_COSTS_PX[0]) * (boxes[:, 3] - boxes[:, 1])).sum())
-        if separately + _BOX_COSTS_PX[1] * len(boxes) < (right - left) * (bottom - top):
+        separately = int(((boxes[:, 2] - boxes[:, 0] + _BOX_IS_WIDER_PX) * (boxes[:, 3] - boxes[:, 1])).sum())
+        if _PIXEL_COSTS * separately + _BOXES_COST_PX < (right - left) * (bottom - top):
+            self._registered = self._registration.codes_in_boxes(self.raw_depth, boxes)
             self._registered_boxes = [(a, b, c, d) for a, b, c, d in boxes.tolist()]
         else:
-            self._registered_boxes = [(left, top, right, bottom)]
-        self._registered = np.empty(self.raw_depth.shape, dtype=np.uint16)
-        for box in self._registered_boxes:
-            self._registered[box[1] : box[3], box[0] : box[2]] = self._registration.codes(self.raw_depth, box)
+            self._registered = np.full(self.raw_depth.shape, NO_DATA, dtype=np.uint16)
+            box = left, top, right, bottom
+            self._registered[top:bottom, left:right] = self._registration.codes(self.raw_depth, box)
+            self._registered_boxes = [box]
 
-    def codes_at(self, columns: PixelArray, rows: PixelArray) -> CodeArray:
-        """Codes of the depth at colour pixels within registered boxes, shape of `columns` and `rows`."""
-        codes: CodeArray = self._registered.reshape(-1).take(rows * self.width + columns)
+    def codes_at(self, at: IntArray) -> CodeArray:
+        """Codes of the depth at colour pixels by their places in the flattened image; those of no data outside of
+        registered boxes. Places before the first pixel and after the last one count as these."""
+        codes: CodeArray = self._registered.reshape(-1).take(at, mode="clip")
         return codes
 
 
@@ -130,13 +131,10 @@ class Evidence:
 
     def of(self, objects: list[int]) -> Evidence:
         """The evidence of some of the objects."""
+        if objects == list(range(len(self.count))):
+            return self
         values = (getattr(self, field.name) for field in fields(self))
         return Evidence(*(value[:, objects] if value.ndim == 3 else value[objects] for value in values))
-
-    def every(self, step: int) -> Evidence:
-        """A part of the evidence: every so manieth point and ray."""
-        values = (getattr(self, field.name) for field in fields(self))
-        return Evidence(*(value[..., ::step] if value.ndim > 1 else value for value in values))
 
 
 class OwnEvidence(NamedTuple):
@@ -146,8 +144,9 @@ class OwnEvidence(NamedTuple):
     number: int
 
 
-@dataclass(frozen=True)
-class ImageSighting:
+class ImageSighting(NamedTuple):
+    """A known object in the image."""
+
     label: str
     u_px: float
     v_px: float

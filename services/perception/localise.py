@@ -134,12 +134,15 @@ def _displaced(
     """For each sighting whether another one with evidence shows the same place and fits better, by the mean misfit per
     piece of evidence (n,) (half the squared residual over its standard deviation, by Huber's loss), that of the pixel
     count (n,), and the number of pieces (n,)."""
-    boxes = np.array([sighting.box_px for sighting in sightings], dtype=np.float64)
-    low, high = boxes[:, None, :2], boxes[:, None, 2:]
-    common = np.maximum(np.minimum(high, boxes[:, 2:]) - np.maximum(low, boxes[:, :2]), 0.0).prod(axis=2)
-    areas = (boxes[:, 2:] - boxes[:, :2]).prod(axis=1)
-    together = common >= SAME_PLACE * (areas[:, None] + areas - common)
+    left, top, right, bottom = np.array([sighting.box_px for sighting in sightings]).T
+    across = np.minimum.outer(right, right) - np.maximum.outer(left, left)
+    down = np.minimum.outer(bottom, bottom) - np.maximum.outer(top, top)
+    common = np.maximum(across, 0) * np.maximum(down, 0)
+    areas = (right - left) * (bottom - top)
+    together = common >= SAME_PLACE * (np.add.outer(areas, areas) - common)
     lost = [False] * len(sightings)
+    if np.count_nonzero(together) == len(sightings):  # each with itself
+        return lost
     for one, other in np.argwhere(np.triu(together, 1)).tolist():
         if pieces[one] and pieces[other]:
             fewer = min(pieces[one], pieces[other])

@@ -8,7 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from cocoro.arrays import BoolArray, Float32Array, MaskArray
+from cocoro.arrays import BoolArray, Float32Array, MaskArray, median
 from services.perception.image import PixelBox, RgbdImage
 
 MIN_DEPTH_PIXELS = 6
@@ -83,7 +83,7 @@ class ColourRegion:
         middle[top + down : bottom - down, left + across : right - across] = True
         middle &= inside
         window = middle if np.count_nonzero(middle) >= enough / 2 else inside
-        return float(np.median(self.depth[window]))
+        return median(self.depth[window])
 
     @cached_property
     def surroundings(self) -> BoolArray:

@@ -9,17 +9,21 @@ from __future__ import annotations
 from functools import lru_cache
 from math import ceil, floor
 
+import cv2
 import numpy as np
 
 from cocoro.arrays import CodeArray, Float32Array, IntArray
 from cocoro.robot import Camera, Robot
 from cocoro.units import Vec3
+from services.perception.runs import spread_out
 
 PixelBox = tuple[int, int, int, int]
 """left, top, right, bottom, px; right and bottom are exclusive."""
 _ROWS = 48
 NO_DATA = 2047
 """The depth code that stands for no data."""
+CODES = 65536
+"""Number of codes of two bytes. Those above `NO_DATA` stand for no data, too."""
 
 
 @lru_cache(maxsize=8)
@@ -37,17 +41,19 @@ class Registration:
         self._camera: Camera = robot.camera.scaled(width, height)
         self._offset_m = offset_m
         self._nearest_m = robot.kinect.min_range_m
-        self._depth: Float32Array = robot.depth_m(np.arange(NO_DATA + 1, dtype=np.uint16))
+        self._depth: Float32Array = robot.depth_m(np.arange(CODES, dtype=np.uint16))
         self.table: Float32Array = self._depth + np.float32(self._offset_m[2])
-        """Depth in the colour camera's frame of each code, m, shape (2048,); NaN without data."""
+        """Depth in the colour camera's frame of each code, m, shape (65536,); NaN without data."""
         ox, oy, oz = self._offset_m
         self._sideways = oy == 0.0 and oz == 0.0
         known = np.isfinite(self._depth)
         self.no_data = int(np.count_nonzero(known))
         """The least code that stands for no data; so do all greater ones."""
         shift_px = self._camera.fx * ox / np.where(known, self._depth, np.inf)
-        self._shift: IntArray = np.rint(shift_px).astype(np.int64)
-        self._most_px = int(np.abs(self._shift).max())
+        shift: IntArray = np.rint(shift_px).astype(np.int64)
+        self._most_px = int(np.abs(shift).max())
+        self._shift_table = shift.view(np.float64)
+        """How far each code's pixels move, px, as integers that OpenCV, whose tables hold none of 64 bits, copies."""
 
     def depth_m(self, codes: CodeArray) -> Float32Array:
         """Depth of registered codes, m, in their shape; NaN without data."""
@@ -55,8 +61,8 @@ class Registration:
 
     def codes(self, raw_depth: CodeArray, box: PixelBox) -> CodeArray:
         """The depth codes at the colour pixels of a box, shape (bottom - top, right - left): of the point that the
-        colour pixel shows; `NO_DATA` without data, in an infrared shadow, and in cracks between moved pixels.
-        `raw_depth` is the depth camera's image, shape (height, width)."""
+        colour pixel shows; `NO_DATA` or more without data, in an infrared shadow, and in cracks between moved
+        pixels. `raw_depth` is the depth camera's image, shape (height, width)."""
         return self._moved_sideways(raw_depth, box) if self._sideways else self.codes_generally(raw_depth, box)
 
     def _moved_sideways(self, raw_depth: CodeArray, box: PixelBox) -> CodeArray:
@@ -75,14 +81,42 @@ class Registration:
         out = np.full((bottom - top, width), NO_DATA, dtype=np.uint16)
         step = 1 if to_left else -1
         # Some rows at a time, which stay in the processor's cache.
-        start = columns[::step] + np.arange(0, _ROWS * width, width)[:, None]
+        start = columns[::step] + np.arange(0, min(_ROWS, bottom - top) * width, width)[:, None]
         for row in range(0, bottom - top, _ROWS):
-            raw = raw_depth[top + row : min(top + row + _ROWS, bottom), first:last]
-            part = np.ascontiguousarray(np.minimum(raw, NO_DATA)[:, ::step])
-            place = self._shift.take(part)
+            part = np.ascontiguousarray(raw_depth[top + row : min(top + row + _ROWS, bottom), first:last][:, ::step])
+            place = np.asarray(cv2.LUT(part, self._shift_table)).view(np.int64)
             place += start[: len(part)]
             out[row : row + _ROWS].reshape(-1)[place] = part
         return out[:, most + left - first : most + right - first]
+
+    def codes_in_boxes(self, raw_depth: CodeArray, boxes: IntArray) -> CodeArray:
+        """`codes` for boxes (n, 4), in the shape of the image; `NO_DATA` or another code beside them. For some small
+        boxes of a large image; all pixels cost less in one box."""
+        if not self._sideways:
+            out = np.full(raw_depth.shape, NO_DATA, dtype=np.uint16)
+            for left, top, right, bottom in boxes.tolist():
+                box = left, top, right, bottom
+                out[top:bottom, left:right] = self.codes_generally(raw_depth, box)
+            return out
+        # As for one box, row by row; of boxes that overlap, the last one has all that comes from farthest away.
+        height, width = raw_depth.shape
+        most, to_left = self._most_px, self._offset_m[0] < 0
+        left, top, right, bottom = boxes[boxes[:, 2 if to_left else 0].argsort(kind="stable")].T
+        rows = bottom - top
+        first = left if to_left else np.maximum(left - most, 0)
+        count = ((np.minimum(right + most, width) if to_left else right) - first).repeat(rows)
+        row = spread_out(top, rows)
+        pixels = spread_out(row * width + first.repeat(rows), count)
+        beyond = (row * most + (most if to_left else 0)).repeat(count)  # each row has room beyond the image's edge
+        if not to_left:
+            pixels, beyond = pixels[::-1], beyond[::-1]
+        codes = raw_depth.reshape(-1).take(pixels)
+        place = np.asarray(cv2.LUT(codes, self._shift_table)).reshape(-1).view(np.int64)
+        place += pixels
+        place += beyond
+        wide = np.full((height, width + most), NO_DATA, dtype=np.uint16)
+        wide.reshape(-1)[place] = codes
+        return np.ascontiguousarray(wide[:, most:] if to_left else wide[:, :width])
 
     def codes_generally(self, raw_depth: CodeArray, box: PixelBox) -> CodeArray:
         """`codes` for any offset between the cameras; takes several times as long."""

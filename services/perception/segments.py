@@ -7,98 +7,130 @@ holds one pixel of every third row and column, so those pixels alone tell where 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cocoro.arrays import BoolArray, CodeArray, ImageArray, IntArray
+from cocoro.arrays import BoolArray, CodeArray, FloatArray, ImageArray, IntArray
 from services.perception.registration import PixelBox
+from services.perception.runs import Runs, run_ends, spread_out
 
 STEP_PX = 3
 MOST_OF_ONE = 8
 """Number of regions of one object that are looked at, the largest ones."""
+SHORT_PX = 1 << 20
+"""Parts of a smaller picture are numbered by 16 bits, which takes less time: of parts made of squares of 3 x 3 pixels,
+with a row or column between two of them, it has at most one for each 16 pixels."""
 _AROUND = np.ones((3, 3), dtype=np.uint8)
 
 
 @dataclass(frozen=True)
 class Segments:
-    """The n regions of a layer's objects, after opening, and their k pixels, region by region and row by row."""
+    """The n regions of a layer's objects, after opening, and their m runs and k pixels, region by region and row by
+    row."""
 
     number: IntArray
     """The object's number in the catalogue, shape (n,)."""
-    start: IntArray
-    """Index of a region's first pixel, shape (n,)."""
+    layer: IntArray
+    """The layer of the object's colours, shape (n,)."""
     area_px: IntArray
     """Number of pixels, shape (n,)."""
     bounds: IntArray
     """Left, top, right, bottom, px; right and bottom are exclusive; shape (n, 4)."""
-    u: NDArray[np.int32]
-    v: NDArray[np.int32]
-    """Each pixel's column and row in the image, shape (k,)."""
+    centre_px: FloatArray
+    """Mean column and row of the pixels, shape (n, 2)."""
+    run_count: IntArray
+    """Number of runs, shape (n,)."""
+    runs: Runs
     core: BoolArray
     """Whether all pixels around a pixel belong to the region, too; shape (k,)."""
 
-    layer: IntArray
-    """The layer of the object's colours, shape (n,)."""
+    @classmethod
+    def of_runs(cls, number: IntArray, layer: IntArray, runs: Runs, first: IntArray, core: BoolArray) -> Segments:
+        """The regions whose runs begin at `first`, (n,)."""
+        run_count = _counts(first, len(runs.length))
+        area = np.add.reduceat(runs.length, first)
+        right = runs.left + runs.length
+        bounds = np.stack(
+            [
+                np.minimum.reduceat(runs.left, first),
+                runs.row.take(first),
+                np.maximum.reduceat(right, first),
+                runs.row.take(first + run_count - 1) + 1,
+            ],
+            axis=1,
+        )
+        twice = runs.length * np.stack([runs.left + right - 1, 2 * runs.row])
+        centre = np.add.reduceat(twice, first, axis=1) / (2 * area)
+        return cls(number, layer, area, bounds, centre.T, run_count, runs, core)
 
     @classmethod
     def of_masks(
-        cls, number: IntArray, layer: IntArray, masks: Sequence[ImageArray], boxes: Sequence[PixelBox]
+        cls,
+        number: IntArray,
+        layer: IntArray,
+        masks: Sequence[ImageArray],
+        boxes: Sequence[PixelBox],
+        image_width: int,
     ) -> Segments:
-        """The regions of objects with these numbers and layers, (n,), by their masks, non-zero inside, and the masks'
+        """The regions of objects with these numbers and layers, (n,), by their masks, 1 inside, and the masks'
         boxes."""
-        pixels = [np.nonzero(mask) for mask in masks]
-        core = np.concatenate(
-            [np.asarray(cv2.erode(mask, _AROUND))[at] != 0 for mask, at in zip(masks, pixels, strict=True)]
-        )
-        u, v = (
-            [(at[1 - axis] + box[axis]).astype(np.int32) for at, box in zip(pixels, boxes, strict=True)]
-            for axis in (0, 1)
-        )
-        bounds = [(x.min(), y.min(), x.max() + 1, y.max() + 1) for x, y in zip(u, v, strict=True)]
-        area = np.array([len(x) for x in u])
-        return cls(
-            number, np.cumsum(area) - area, area, np.array(bounds), np.concatenate(u), np.concatenate(v), core, layer
-        )
+        parts, cores = [], []
+        for mask, (left, top, _, _) in zip(masks, boxes, strict=True):
+            framed = _framed(mask)
+            parts.append(Runs.of(*run_ends(framed), framed.shape[1], (left - 1, top), image_width))
+            cores.append(np.asarray(cv2.erode(mask, _AROUND))[mask != 0] != 0)
+        counts = np.array([len(runs.length) for runs in parts])
+        return cls.of_runs(number, layer, Runs.joined(parts), np.cumsum(counts) - counts, np.concatenate(cores))
 
     @classmethod
     def joined(cls, parts: Sequence[Segments]) -> Segments:
         """The regions of all parts, of which there is at least one."""
         if len(parts) == 1:
             return parts[0]
-        whole = cls(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(cls)))
-        return replace(whole, start=np.cumsum(whole.area_px) - whole.area_px)
+        arrays = {
+            name: np.concatenate([getattr(part, name) for part in parts])
+            for name in ("number", "layer", "area_px", "bounds", "centre_px", "run_count", "core")
+        }
+        return cls(**arrays, runs=Runs.joined([part.runs for part in parts]))
 
     def among(self, chosen: BoolArray) -> Segments:
         """Some of the regions, by `chosen`, (n,)."""
         if chosen.all():
             return self
-        pixels = np.repeat(chosen, self.area_px)
-        area = self.area_px[chosen]
         return Segments(
             self.number[chosen],
-            np.cumsum(area) - area,
-            area,
-            self.bounds[chosen],
-            self.u[pixels],
-            self.v[pixels],
-            self.core[pixels],
             self.layer[chosen],
+            self.area_px[chosen],
+            self.bounds[chosen],
+            self.centre_px[chosen],
+            self.run_count[chosen],
+            self.runs.among(np.repeat(chosen, self.run_count)),
+            self.core[np.repeat(chosen, self.area_px)],
         )
 
-    @property
-    def own(self) -> IntArray:
-        """Each pixel's region, shape (k,)."""
-        return np.repeat(np.arange(len(self.area_px)), self.area_px)
+    @cached_property
+    def start(self) -> IntArray:
+        """Index of a region's first pixel, shape (n,)."""
+        return self.area_px.cumsum() - self.area_px
+
+    def counted(self, pixels: IntArray) -> tuple[IntArray, IntArray]:
+        """Of some pixels by their ascending indices: each region's first one among them, and its number of them,
+        (n,)."""
+        first = np.searchsorted(pixels, self.start)
+        return first, _counts(first, len(pixels))
 
     def mask(self, region: int, box: PixelBox) -> ImageArray:
         """The region's pixels in a box that contains it: 1 inside, 0 outside; shape (bottom - top, right - left)."""
         left, top, right, bottom = box
         mask = np.zeros((bottom - top, right - left), dtype=np.uint8)
-        pixels = slice(self.start[region], self.start[region] + self.area_px[region])
-        mask[self.v[pixels] - top, self.u[pixels] - left] = 1
+        first = int(self.run_count[:region].sum())
+        runs = self.runs.among(slice(first, first + int(self.run_count[region])))
+        mask.reshape(-1)[spread_out((runs.row - top) * (right - left) + runs.left - left, runs.length)] = 1
         return mask
 
 
@@ -109,51 +141,51 @@ def segments(codes: CodeArray, table: ImageArray, layer: int, min_area_px: float
     if rect is None:
         return None
     left, top, right, bottom = rect
-    labels = table.take(codes[top:bottom, left:right])
+    labels = np.asarray(cv2.LUT(codes[top:bottom, left:right], table), dtype=np.uint8)
     _close(labels, rect, codes.shape)
     # Where the least and the greatest label around a pixel are equal, all are.
     least, greatest = cv2.erode(labels, _AROUND), cv2.dilate(labels, _AROUND)
-    core = cv2.bitwise_and(least, cv2.compare(least, greatest, cv2.CMP_EQ))
+    core = _framed(np.asarray(cv2.bitwise_and(least, cv2.compare(least, greatest, cv2.CMP_EQ)), dtype=np.uint8))
     opened = np.asarray(cv2.dilate(core, _AROUND), dtype=np.uint8)
-    count, connected = cv2.connectedComponents(opened, connectivity=8, ltype=cv2.CV_32S)
+    opened[:, 0] = opened[:, -1] = 0
+    short = opened.size < SHORT_PX
+    count, parts = cv2.connectedComponents(opened, connectivity=8, ltype=cv2.CV_16U if short else cv2.CV_32S)
     if count < 2:
         return None
-    parts: NDArray[np.int32] = np.asarray(connected, dtype=np.int32)
-    at = np.flatnonzero(opened != 0)
-    order, start, area = _grouped(parts.reshape(-1).take(at), count)
-    label = opened.reshape(-1).take(at.take(order))
-    mixed = np.flatnonzero(np.minimum.reduceat(label, start) != np.maximum.reduceat(label, start))
-    if len(mixed):
-        _split(parts, opened, (1 + mixed).tolist(), count)
-        each, again = np.unique(parts.reshape(-1).take(at), return_inverse=True)
-        order, start, area = _grouped(again + 1, 1 + len(each))
-        label = opened.reshape(-1).take(at.take(order))
-    number = label.take(start).astype(np.int64) - 1
+    parts = np.asarray(parts)
+    begin, end = run_ends(opened)
+    label, part = opened.reshape(-1).take(begin), parts.reshape(-1).take(begin)
+    order, first = _grouped(label, part)
+    if len(first) != count - 1:  # some parts are of several objects, which touch
+        often = np.bincount(part.take(order.take(first)))
+        _split(parts, opened, np.flatnonzero(often > 1).tolist(), count)
+        order, first = _grouped(label, parts.reshape(-1).take(begin))
+    begin, end = begin.take(order), end.take(order)
+    number = label.take(order.take(first)).astype(np.int64) - 1
+    area = np.add.reduceat(end - begin, first)
     kept = _largest(number, np.where(area >= min_area_px, area, 0))
     if not kept.all():
-        order, number = order[np.repeat(kept, area)], number[kept]
-        area = area[kept]
-        start = np.cumsum(area) - area
-    if not len(area):
+        counts = _counts(first, len(begin))
+        runs_kept, counts = np.repeat(kept, counts), counts[kept]
+        begin, end, number, first = begin[runs_kept], end[runs_kept], number[kept], np.cumsum(counts) - counts
+    if not len(number):
         return None
-    pixels = at.take(order)
-    place = pixels.astype(np.int32)
-    v = place // (right - left)
-    u = place - v * (right - left)
-    u += left
-    v += top
-    # Within a region pixels are row by row.
-    bounds = np.stack(
-        [
-            np.minimum.reduceat(u, start),
-            v.take(start),
-            np.maximum.reduceat(u, start) + 1,
-            v.take(start + area - 1) + 1,
-        ],
-        axis=1,
-    ).astype(np.int64)
-    inside = np.asarray(core).reshape(-1).take(pixels) != 0
-    return Segments(number, start, area, bounds, u, v, inside, np.full(len(area), layer))
+    inside = core.reshape(-1).take(spread_out(begin, end - begin)) != 0
+    runs = Runs.of(begin, end, opened.shape[1], (left - 1, top), codes.shape[1])
+    return Segments.of_runs(number, np.full(len(number), layer), runs, first, inside)
+
+
+def _counts(first: IntArray, total: int) -> IntArray:
+    """The sizes of groups that begin at `first` and follow one another up to `total`."""
+    counts = np.empty_like(first)
+    np.subtract(first[1:], first[:-1], out=counts[:-1])
+    counts[-1] = total - first[-1]
+    return counts
+
+
+def _framed(picture: ImageArray) -> ImageArray:
+    """The picture with a column of background at either side, so that no run goes on in the next row."""
+    return np.asarray(cv2.copyMakeBorder(picture, 0, 0, 1, 1, cv2.BORDER_CONSTANT, value=0), dtype=np.uint8)
 
 
 def _where(codes: CodeArray, table: ImageArray) -> PixelBox | None:
@@ -161,16 +193,15 @@ def _where(codes: CodeArray, table: ImageArray) -> PixelBox | None:
     height, width = codes.shape
     # The first and the last two pixels of a row count as a square of three, since opening ignores what is beyond.
     first_row, first_column = (0 if size % STEP_PX == 1 else 1 for size in (height, width))
-    seen = table.take(codes[first_row::STEP_PX, first_column::STEP_PX])
-    rows = np.flatnonzero(np.bitwise_or.reduce(seen, axis=1))
-    if not len(rows):
+    seen = cv2.LUT(np.ascontiguousarray(codes[first_row::STEP_PX, first_column::STEP_PX]), table)
+    left, top, columns, rows = cv2.boundingRect(seen)
+    if not rows:
         return None
-    columns = np.flatnonzero(np.bitwise_or.reduce(seen, axis=0))
     return (
-        max(first_column + STEP_PX * int(columns[0]) - STEP_PX, 0),
-        max(first_row + STEP_PX * int(rows[0]) - STEP_PX, 0),
-        min(first_column + STEP_PX * int(columns[-1]) + STEP_PX + 1, width),
-        min(first_row + STEP_PX * int(rows[-1]) + STEP_PX + 1, height),
+        max(first_column + STEP_PX * left - STEP_PX, 0),
+        max(first_row + STEP_PX * top - STEP_PX, 0),
+        min(first_column + STEP_PX * (left + columns) + 1, width),
+        min(first_row + STEP_PX * (top + rows) + 1, height),
     )
 
 
@@ -188,15 +219,17 @@ def _close(labels: ImageArray, rect: PixelBox, shape: tuple[int, ...]) -> None:
         labels[-1] = 0
 
 
-def _grouped(parts: NDArray[np.int32] | IntArray, count: int) -> tuple[IntArray, IntArray, IntArray]:
-    """The order that sorts pixels by their part, 1 to `count` - 1, and each part's first place in it and length."""
-    keys = parts.astype(np.uint16) if count <= 65536 else parts  # short ones are sorted faster
-    order = np.argsort(keys, kind="stable")
-    start = np.searchsorted(keys.take(order), np.arange(1, count + 1))
-    return order, start[:-1], np.diff(start)
+def _grouped(label: ImageArray, part: NDArray[Any]) -> tuple[IntArray, IntArray]:
+    """The order that sorts runs by their labels, then by their connected parts, and where in it each part of a label
+    begins."""
+    by_part = np.argsort(part, kind="stable")
+    order = by_part.take(np.argsort(label.take(by_part), kind="stable"))
+    label, part = label.take(order), part.take(order)
+    changes = np.flatnonzero((part[1:] != part[:-1]) | (label[1:] != label[:-1]))
+    return order, np.append(0, changes + 1)
 
 
-def _split(parts: NDArray[np.int32], labels: ImageArray, mixed: list[int], count: int) -> None:
+def _split(parts: NDArray[Any], labels: ImageArray, mixed: list[int], count: int) -> None:
     """Give each object's share of the parts that several objects' regions make together, where they touch, numbers of
     their own, from `count` on."""
     for part in mixed:

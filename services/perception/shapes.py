@@ -59,39 +59,27 @@ class Solids:
     """The surfaces of n objects, to measure points against."""
 
     def __init__(self, shapes: Shapes) -> None:
-        self._radius = shapes.radius_m.astype(np.float32)[:, None]
-        self._half = np.where(shapes.sphere, NO_LID_M, shapes.height_m / 2).astype(np.float32)[:, None]
-        self._across = np.ones((3, len(shapes), 1), dtype=np.float32)
-        self._across[2, :, 0] = shapes.sphere
-        """Directions in which the radius is measured."""
-
-    def of(self, chosen: BoolArray) -> Solids:
-        """The surfaces of some of the objects, (n,)."""
-        some = Solids.__new__(Solids)
-        some._radius, some._half, some._across = self._radius[chosen], self._half[chosen], self._across[:, chosen]
-        return some
+        self.radius: Float32Array = shapes.radius_m.astype(np.float32)[:, None]
+        self.half_height: Float32Array = np.where(shapes.sphere, NO_LID_M, shapes.height_m / 2).astype(np.float32)[
+            :, None
+        ]
+        """Both m, (n, 1)."""
+        self.across: Float32Array = np.ones((3, len(shapes), 1), dtype=np.float32)
+        """1 for the directions in which the radius is measured, 0 for others, (3, n, 1)."""
+        self.across[2, :, 0] = shapes.sphere
 
     def distance(self, offsets_m: Float32Array) -> Float32Array:
-        """Signed distances of points from the surfaces, m, negative inside, shape (n, k) or (s, n, k), by their offsets
-        from the centres, z up, m, shape (3, n, k) or (3, s, n, k)."""
-        across = offsets_m * (self._across if offsets_m.ndim == 3 else self._across[:, None])
-        across *= across
-        beside = np.sqrt(np.add.reduce(across, axis=0))
-        beside -= self._radius
-        above = np.abs(offsets_m[2])
-        above -= self._half
-        radial, vertical = np.maximum(beside, 0), np.maximum(above, 0)
-        distance: Float32Array = np.sqrt(radial * radial + vertical * vertical)
-        distance += np.minimum(np.maximum(beside, above), 0)
-        return distance
+        """Signed distances of points from the surfaces, m, negative inside, shape (n, k), by their offsets from the
+        centres, z up, m, shape (3, n, k)."""
+        return self.gradient(offsets_m)[0]
 
     def gradient(self, offsets_m: Float32Array) -> tuple[Float32Array, Float32Array]:
         """`distance` for offsets (3, n, k), and its gradient along x, y and z, shape (3, n, k)."""
-        along = offsets_m * self._across
+        along = offsets_m * self.across
         planar = np.sqrt(np.add.reduce(along * along, axis=0))
-        beside = planar - self._radius
+        beside = planar - self.radius
         above = np.abs(offsets_m[2])
-        above -= self._half
+        above -= self.half_height
         # Outside, the distances from side and lid that are positive count; inside, the nearer one of both.
         radial = beside * (beside >= np.minimum(above, 0))
         vertical = above * (above > np.minimum(beside, 0))

@@ -105,8 +105,17 @@ class ArmController:
             return self._joints(OUT | {"arm_base": self._park["arm_base"]}, dt_s)._replace(arrived=False)
         return self._joints(self._park | {ROLL: 0.0}, dt_s)
 
-    def reach(self, goal: HandPose, speed_mps: float, measured: Mapping[str, float], dt_s: float) -> ArmStep:
-        """One step of the hand towards a pose in front of the robot; a folded arm is unfolded first."""
+    def reach(
+        self,
+        goal: HandPose,
+        speed_mps: float,
+        measured: Mapping[str, float],
+        dt_s: float,
+        *,
+        swing_radps: float | None = None,
+    ) -> ArmStep:
+        """One step of the hand towards a pose in front of the robot; a folded arm is unfolded first. It swings to the
+        front at `swing_radps` or, by default, as fast as it may."""
         reference = self._sync(measured, dt_s)
         stage: dict[str, float] | None = None
         if self.folded(reference):
@@ -124,7 +133,9 @@ class ArmController:
         if stage is None:
             return self._cartesian(goal, speed_mps, dt_s)
         left_m = float(np.linalg.norm(self._reacher.point(goal) - self._reacher.position(reference)))
-        return self._joints(stage, dt_s)._replace(arrived=False, left=left_m)
+        return self._joints(stage, dt_s, swing_radps if "arm_base" in stage else None)._replace(
+            arrived=False, left=left_m
+        )
 
     def towards(
         self, goals: Mapping[str, float], speed_radps: float, measured: Mapping[str, float], dt_s: float

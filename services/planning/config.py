@@ -118,6 +118,9 @@ class NavigationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 class ArmConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     joint_speed_radps: Positive = 2.4
+    swing_radps: Positive = 1.8
+    """Speed at which the arm swings to the front while the base drives fast: a swing that ends abruptly while the
+    wheels brake as hard as they can makes them slip."""
     hand_speed_mps: Positive = 0.5
     insert_speed_mps: Positive = 0.35
     lift_speed_mps: Positive = 0.25

@@ -2,7 +2,8 @@
 
 Paths are planned on the floor map for the round body with the arm folded. On the last stretch the hand is extended, so
 the arm's footprint must be free too. `guarded` checks every wheel command: the robot must be able to stop before it
-reaches an obstacle.
+reaches an obstacle. Where that blocks every drive because the robot stands within an obstacle's margin, it first leaves
+the margin (`services/planning/escape.py`).
 """
 
 from __future__ import annotations
@@ -18,12 +19,16 @@ from cocoro.clock import NS
 from cocoro.frames import Pose2, wrap_rad
 from cocoro.robot import Robot
 from services.planning.config import PlanningConfig
+from services.planning.escape import Escape
 from services.planning.navigation import Driver, Offset, offset_to
 from services.planning.surroundings import Fields, Surroundings, placed
 
 _HEADINGS = 48
 _REPLAN_NS = NS // 2
 _LOOKAHEAD_M = 0.35
+_WAITING_RADPS = 0.05
+_CHORD = np.linspace(0.0, 1.0, 18)[1:]
+"""Places along the straight way to a place ahead, as shares: 2 cm apart at the most."""
 
 
 class Move(NamedTuple):
@@ -86,6 +91,7 @@ class Course:
         self._planned_ns: int | None = None
         self._stuck_since_ns: int | None = None
         self._last_stretch = False
+        self._escape = Escape(self._body_m, self._config.clearance_m)
 
     def step(
         self,
@@ -105,6 +111,9 @@ class Course:
         near_enough = self._arrive_m is not None and hypot(x - self._aim_m[0], y - self._aim_m[1]) < self._arrive_m
         if (near_enough or driver.arrived(offset)) and self._serves(body):
             return Move(0.0, 0.0, abs(offset.ahead_m), "there", True, arrived=True)
+        leaving = self._leave(abs(offset.ahead_m), body, fields, driver, now_ns)
+        if leaving is not None:
+            return leaving
         if self._planned_ns is None or now_ns - self._planned_ns >= _REPLAN_NS:
             self._planned_ns = now_ns
             self._plan(target_m, body, around, fields, driver, offset)
@@ -114,7 +123,7 @@ class Course:
             ahead = placed(np.array([[pose.x_m, pose.y_m] for pose in driver.preview((x, y), self._aim_m)]), body)
             move = Move(speed, turn, abs(offset.ahead_m), why, self._last_stretch)
         else:
-            move, ahead = self._along(self._detour, body, target_m, driver)
+            move, ahead = self._along(self._detour, body, fields, driver)
         return self._watch(move, ahead, body, around, fields, driver, now_ns)
 
     # --- planning ---------------------------------------------------------------------------------
@@ -233,9 +242,7 @@ class Course:
 
     # --- driving ----------------------------------------------------------------------------------
 
-    def _along(
-        self, detour: Detour, body: Pose2, target_m: tuple[float, float], driver: Driver
-    ) -> tuple[Move, FloatArray]:
+    def _along(self, detour: Detour, body: Pose2, fields: Fields, driver: Driver) -> tuple[Move, FloatArray]:
         config = self._config
         path = np.array(detour.path)
         gaps = np.hypot(path[:, 0] - body.x_m, path[:, 1] - body.y_m)
@@ -248,17 +255,33 @@ class Course:
                 # The last stretch begins here, whatever the next plan finds.
                 self._detour, self._last_stretch = None, True
             return Move(0.0, 1.8 * turn, left_m, f"{turn:+.2f} rad to turn before the last stretch", False), rest
-        ahead = np.hypot(rest[:, 0] - body.x_m, rest[:, 1] - body.y_m)
-        beyond = np.flatnonzero(ahead >= _LOOKAHEAD_M)
-        point = rest[int(beyond[0])] if beyond.size else np.array([detour.before.x_m, detour.before.y_m])
+        point, round_corner = self._ahead(rest, detour, body, fields)
         heading = wrap_rad(atan2(point[1] - body.y_m, point[0] - body.x_m) - body.yaw_rad)
         way_m = left_m + 0.05 * max(len(rest) - 2, 0) if len(rest) > 2 else left_m
         speed = min(config.detour_speed_mps, (config.acceleration_mps2 * left_m) ** 0.5)
+        if round_corner:
+            speed = min(speed, driver.stopping_mps(hypot(point[0] - body.x_m, point[1] - body.y_m)))
         if abs(heading) > 0.6:
             speed = 0.0
         else:
             speed *= 1.0 - abs(heading) / 0.6
         return Move(speed, 1.8 * heading, way_m, f"{way_m:.2f} m to go around what is in the way", False), rest
+
+    def _ahead(self, rest: FloatArray, detour: Detour, body: Pose2, fields: Fields) -> tuple[FloatArray, bool]:
+        """The place on a path to steer to, as far ahead as the straight way to it cuts no corner, and whether a corner
+        keeps it nearer than the look-ahead."""
+        away = np.hypot(rest[:, 0] - body.x_m, rest[:, 1] - body.y_m)
+        beyond = np.flatnonzero(away >= _LOOKAHEAD_M)
+        end = np.array([[detour.before.x_m, detour.before.y_m]])
+        points = rest[: int(beyond[0]) + 1] if beyond.size else np.concatenate([rest, end])
+        here = np.array([body.x_m, body.y_m])
+        chords = here + _CHORD[None, :, None] * (points - here)[:, None, :]
+        clearance = fields.body.at(chords.reshape(-1, 2)).reshape(len(points), len(_CHORD)).min(axis=1)
+        least_m = min(self._body_m + self._config.clearance_m / 2, self._clearance_m(body, fields))
+        clear = np.flatnonzero(clearance >= least_m)
+        last = len(points) - 1
+        chosen = int(clear[-1]) if clear.size else min(1, last)
+        return points[chosen], chosen < last
 
     def _watch(
         self,
@@ -287,8 +310,12 @@ class Course:
         careful = self.careful(move, body, fields, driver)
         if careful.speed_mps == 0.0 and move.speed_mps != 0.0 and self._planned_ns is not None:
             self._planned_ns = min(self._planned_ns, now_ns - _REPLAN_NS // 2)
+        held = careful.speed_mps == 0.0 and move.speed_mps != 0.0 and abs(careful.turn_radps) < _WAITING_RADPS
+        self._escape.held(
+            held, body, fields.body, around.unseen, lambda turn: self._may_turn(turn, body, fields), now_ns
+        )  # fmt: skip
         move = careful
-        waiting = move.speed_mps == 0.0 and abs(move.turn_radps) < 0.05
+        waiting = move.speed_mps == 0.0 and abs(move.turn_radps) < _WAITING_RADPS
         if not waiting:
             self._stuck_since_ns = None
         elif self._stuck_since_ns is None:
@@ -325,3 +352,32 @@ class Course:
         now_m = float(field.at(placed(self._arm, body)).min())
         then_m = float(field.at(placed(self._arm, poses[-1])).min())
         return then_m < min(self._config.hand_half_width_m * 0.7, now_m)
+
+    # --- out of a margin --------------------------------------------------------------------------
+
+    def _leave(self, left_m: float, body: Pose2, fields: Fields, driver: Driver, now_ns: int) -> Move | None:
+        """One step on the way out of a margin; None when there is none, or it has ended. Then the course plans anew."""
+        if not self._escape.under_way:
+            return None
+        speed, turn = self._escape.drive(body)
+        move = Move(speed, turn, left_m, "too near to an obstacle: leaving its margin", False)
+        if self.guarded(move, body, fields, driver) or self._escape.over(body, fields.body, now_ns):
+            self._escape.end()
+            self._detour, self._planned_ns = None, None
+            return None
+        self._stuck_since_ns = None
+        return move
+
+    def _may_turn(self, turn_rad: float, body: Pose2, fields: Fields) -> bool:
+        """Whether the extended arm meets nothing while the robot turns on the spot; the body is round."""
+        if not self._arm_out or not len(self._arm):
+            return True
+        now_m = float(fields.arm.at(placed(self._arm, body)).min())
+        turns = np.linspace(0.0, turn_rad, max(2, round(abs(turn_rad) / 0.1)))
+        poses = [Pose2(body.x_m, body.y_m, body.yaw_rad + float(turned)) for turned in turns]
+        least_m = min(float(fields.arm.at(placed(self._arm, pose)).min()) for pose in poses)
+        return least_m >= min(self._config.hand_half_width_m * 0.7, now_m)
+
+    @staticmethod
+    def _clearance_m(body: Pose2, fields: Fields) -> float:
+        return float(fields.body.at(np.array([[body.x_m, body.y_m]]))[0])

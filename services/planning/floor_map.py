@@ -199,8 +199,9 @@ class FloorMap:
         """Add evidence to the cells of points (n, 2), once per cell."""
         index = self._index(points_m)
         index = index[((index >= 0) & (index < SIZE)).all(axis=1)]
-        flat = np.unique(index[:, 0] * SIZE + index[:, 1])
+        flat = index[:, 0] * SIZE + index[:, 1]
         cells = self._evidence.reshape(-1)
+        # A cell that has several points is written several times, with the same value.
         cells[flat] = np.clip(cells[flat] + evidence, _LEAST, _MOST)
         self._looked.reshape(-1)[flat] = True
 

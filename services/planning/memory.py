@@ -50,11 +50,17 @@ class TargetMemory:
         self.sight_lag_s = 0.0
         """Usual age of a sighting when the next one arrives. Up to that age an object goes on as it went; only one that
         should have been seen again loses its velocity."""
+        self._estimates: dict[str, TargetEstimate] = {}
+        """What was told for `_asked`, since one step asks for the same objects several times."""
+        self._asked: tuple[Pose2, int, float] | None = None
+        """The body's pose, the time and `sight_lag_s`."""
 
     def clear(self) -> None:
+        self._estimates.clear()
         self._tracks.clear()
 
     def forget(self, label: str) -> None:
+        self._estimates.clear()
         self._tracks.pop(label, None)
 
     def see(
@@ -69,6 +75,7 @@ class TargetMemory:
     ) -> None:
         """Enter a sighting: the object's centre (3,), odometry frame, metres, at the frame's stamp, seen from the
         body's pose; None: the body has not moved since the last."""
+        self._estimates.clear()
         config = self._config
         sigma_m = config.sigma_m + config.sigma_per_m * distance_m
         if doubtful:
@@ -160,6 +167,18 @@ class TargetMemory:
         track = self._tracks.get(label)
         if track is None:
             return None
+        asked = (body, now_ns, self.sight_lag_s)
+        if asked != self._asked:
+            self._asked = asked
+            self._estimates.clear()
+        if label not in self._estimates:
+            estimate = self._estimate(label, track, body, now_ns)
+            if estimate is None:
+                return None
+            self._estimates[label] = estimate
+        return self._estimates[label]
+
+    def _estimate(self, label: str, track: Track, body: Pose2, now_ns: int) -> TargetEstimate | None:
         age_s = max((now_ns - track.stamp_ns) / NS, 0.0)
         if age_s > self._config.forget_s:
             del self._tracks[label]

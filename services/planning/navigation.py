@@ -8,8 +8,8 @@ phi is replaced by the bearing error phi - phi_aim, and rho by the distance stil
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from math import asin, atan2, copysign, hypot, sin, sqrt
+from typing import NamedTuple
 
 from cocoro.description import Base
 from cocoro.frames import Pose2, wrap_rad
@@ -30,8 +30,7 @@ _COAST_S = 0.04
 """Time between a command and the pose that shows it."""
 
 
-@dataclass(frozen=True)
-class Offset:
+class Offset(NamedTuple):
     """The rest of a drive."""
 
     ahead_m: float
@@ -102,10 +101,10 @@ class Driver:
         turn = arc if abs(arc) > abs(align) else align
         return speed, min(max(turn, -config.max_turn_radps), config.max_turn_radps)
 
-    def preview(self, target_m: tuple[float, float], aim_m: tuple[float, float]) -> list[Pose2]:
-        """The poses along the arc in the present body frame, every `PREVIEW_S` for at most 20 s."""
+    def preview(self, target_m: tuple[float, float], aim_m: tuple[float, float], for_s: float = 20.0) -> list[Pose2]:
+        """The poses along the arc in the present body frame, every `PREVIEW_S` for at most so long."""
         poses = [Pose2()]
-        for _ in range(round(20.0 / PREVIEW_S)):
+        for _ in range(round(for_s / PREVIEW_S)):
             x, y, _z = poses[-1].inverse().apply((*target_m, 0.0))
             offset = offset_to((x, y), aim_m)
             if self.arrived(offset):

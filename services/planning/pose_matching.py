@@ -142,7 +142,7 @@ class Lines:
         away = np.where(ways @ self._ways.T < _SAME_SIDE, np.inf, x**2 + y**2)
         nearest = away.argmin(axis=1)
         near = away[np.arange(n), nearest] < within_m**2
-        for number in np.unique(nearest[near]).tolist():
+        for number in sorted(set(nearest[near].tolist())):
             if number not in self._known:
                 self._known[number] = self._line(number)
             line = self._known[number]

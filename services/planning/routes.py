@@ -21,7 +21,7 @@ class Routes:
         self, floor: FloorMap, field: ClearanceField, start_m: tuple[float, float], radius_m: float, comfort_m: float
     ) -> None:
         """Cells nearer than `radius_m` to an obstacle are closed, nearer than `comfort_m` they cost more. Cells around
-        the start are always open, so that the robot can leave."""
+        the start are open where they are no nearer to an obstacle than the start, so that the robot can leave."""
         self._floor = floor
         cost = np.where(
             field.metres >= radius_m, 1.0 + 3.0 * np.clip((comfort_m - field.metres) / comfort_m, 0.0, 1.0), np.inf
@@ -33,7 +33,8 @@ class Routes:
             return
         row, column = start
         here = (slice(max(row - 4, 0), row + 5), slice(max(column - 4, 0), column + 5))
-        cost[here] = np.where(np.isfinite(cost[here]), cost[here], 6.0)
+        leave_m = min(float(field.metres[start]), radius_m - CELL_M / 2)
+        cost[here] = np.where(np.isfinite(cost[here]) | (field.metres[here] < leave_m), cost[here], 6.0)
         start_at = np.array([row * SIZE + column])
         distance, predecessors = scipy.sparse.csgraph.dijkstra(
             _graph(cost), directed=False, indices=start_at, return_predecessors=True

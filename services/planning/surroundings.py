@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cocoro.arrays import FloatArray
+from cocoro.arrays import BoolArray, FloatArray
 from cocoro.clock import NS
 from cocoro.frames import Pose2
 from cocoro.messages import TargetEstimate
@@ -81,7 +81,7 @@ class Surroundings:
             if item.label != self._marker
         )
 
-    def unseen(self, places_m: FloatArray) -> FloatArray:
+    def unseen(self, places_m: FloatArray) -> BoolArray:
         """Mark the places (n, 2), odometry frame, m, that were not seen yet; returns shape (n,)."""
         looked = self.floor.looked_at()
         hidden = []

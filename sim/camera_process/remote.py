@@ -18,8 +18,8 @@ from cocoro.messages import Frame
 from cocoro.robot import Robot
 from sim.camera_process.start import take
 from sim.camera_process.wire import MESSAGE_BYTES, Exposure, Setup, Taken, memory_bytes, slots_of
+from sim.kinds import Sensors
 from sim.memory import keep_freed_memory
-from sim.realism import Sensors
 from sim.render.choice import RendererChoice
 from sim.render.interface import Lighting, Visual
 

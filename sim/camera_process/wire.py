@@ -13,7 +13,7 @@ import numpy as np
 
 from cocoro.arrays import FloatArray, ImageArray
 from cocoro.units import Vec3
-from sim.realism import Sensors
+from sim.kinds import Sensors
 from sim.render.choice import RendererChoice
 from sim.render.interface import Visual
 

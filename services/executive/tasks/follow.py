@@ -14,7 +14,8 @@ from services.executive.tasks.steps import TargetLabel, find
 WITHIN_M = 0.4
 """A robot that is off its distance by less is with the object."""
 FRESH_S = 1.0
-"""Age of the newest sighting up to which the distance counts as known."""
+"""Age of the newest sighting up to which the distance counts as known, beyond the age that a sighting has when it
+arrives."""
 CATCH_UP_S = 10.0
 """Longest time to come to the distance first that does not count against the pursuit."""
 SHARE = 0.5
@@ -31,11 +32,14 @@ class Company:
         self._began_s: float | None = None
         self._from_s: float | None = None
         self._last_s = 0.0
+        self._youngest_s = float("inf")
+        """The least age of a sighting so far: about the time that perception takes."""
         self.with_s = 0.0
 
     def note(self, off_m: float | None, age_s: float, now_s: float) -> None:
         """Note how far off its distance it is, and how old that knowledge is."""
-        near = off_m is not None and off_m <= WITHIN_M and age_s <= FRESH_S
+        self._youngest_s = min(self._youngest_s, age_s)
+        near = off_m is not None and off_m <= WITHIN_M and age_s <= FRESH_S + self._youngest_s
         if self._began_s is None:
             self._began_s = self._last_s = now_s
         if self._from_s is None and (near or now_s - self._began_s > CATCH_UP_S):

@@ -159,7 +159,7 @@ class Approaching:
         """Whether there is room for the arm to unfold while the robot turns and drives on."""
         assert self._course is not None
         x, y, _ = target.position_m
-        on_the_way = snapshot.actuators.driver.preview((x, y), grasp_aim(snapshot.actuators))
+        on_the_way = snapshot.actuators.driver.preview((x, y), grasp_aim(snapshot.actuators), self.UNFOLD_S)
         ahead = [Pose2(0.25), Pose2(0.5), *on_the_way[: round(self.UNFOLD_S / PREVIEW_S) : 4]]
         return all(self._course.roomy(snapshot.body.compose(pose), fields) for pose in ahead)
 
@@ -208,6 +208,9 @@ class Approaching:
         if arm.folded(reference) and not self._room_ahead(snapshot, target, fields):
             move = _waiting(move, "unfolding the arm here, where there is room")
         actuators.grip.open()
+        base = snapshot.estimator.base
+        fast = base is not None and abs(base.speed_mps) > actuators.config.navigation.coasting_mps
+        swing_radps = config.swing_radps if fast else None
         if move.left_m < config.descend_at_m and abs(move.turn_radps) < 0.4:
             goal = actuators.reachability.grasp(target.position_m).behind
             low, high = config.grasp_azimuth_range_rad
@@ -216,12 +219,13 @@ class Approaching:
             if abs(have.azimuth_rad - goal.azimuth_rad) > 0.12 and have.height_m > config.travel_height_m - 0.03:
                 # The hand moves high over obstacles beside the target, then comes down at its place.
                 goal = goal._replace(radius_m=config.travel_radius_m, height_m=config.travel_height_m)
-            step = arm.reach(goal, config.hand_speed_mps, angles, dt_s)
+            step = arm.reach(goal, config.hand_speed_mps, angles, dt_s, swing_radps=swing_radps)
             late = move.left_m < 0.10 and not step.arrived and step.left > 0.03
             # The hand must be behind the target before the target is between the fingers.
             return step, _waiting(move, "waiting for the hand") if late and not move.arrived else move
         goal = HandPose(config.travel_radius_m, 0.0, config.travel_height_m, config.pitch_rad)
-        return arm.reach(goal, config.hand_speed_mps, angles, dt_s)._replace(arrived=False), move
+        step = arm.reach(goal, config.hand_speed_mps, angles, dt_s, swing_radps=swing_radps)
+        return step._replace(arrived=False), move
 
 
 class Carrying:

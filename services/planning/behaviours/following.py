@@ -26,6 +26,10 @@ _LOOK_S = 1.5
 """Time for which it looks at the place where the target must be, before that counts as lost."""
 _AHEAD_S = 3.0
 """Time for which a lost target is thought to have gone on as it went."""
+_SLOW_S = 1.1
+"""Lag of the sight from which it keeps further away: what turns would leave the picture before it is known to."""
+_FURTHER_M = 0.25
+"""By so much at the most."""
 _NO_NEED_M = 0.10
 """A gap below this needs no way."""
 
@@ -70,8 +74,10 @@ class Following:
         fade_s = snapshot.actuators.config.memory.velocity_fade_s
         self._velocity_mps = target.velocity_mps
         self._counted_s = fade_s + snapshot.estimator.sight_lag_s  # the memory lets a lost target run out by so much
-        gap = planar_m(target) - config.distance_m
-        move = self._straight(target, snapshot, config)
+        off_m = abs(planar_m(target) - config.distance_m)
+        wanted_m = config.distance_m + self._further_m(target, snapshot)
+        gap = planar_m(target) - wanted_m
+        move = self._straight(target, snapshot, config, wanted_m)
         if self._free(snapshot, move, gap, fields):
             self._course = None
         elif gap > _NO_NEED_M:
@@ -84,19 +90,25 @@ class Following:
             move = move._replace(speed_mps=0.0, why="near enough; something is in the way")
         pace = 1.0 if self._course is None else GENTLE
         base = snapshot.actuators.driver.command(move.speed_mps, move.turn_radps, snapshot.dt_s, pace=pace)
-        return Plan(base, arm, move.why, head, distance_m=abs(gap))
+        return Plan(base, arm, move.why, head, distance_m=off_m)
 
     # --- in sight ---------------------------------------------------------------------------------
 
     @staticmethod
-    def _straight(target: TargetEstimate, snapshot: Snapshot, config: FollowConfig) -> Move:
+    def _further_m(target: TargetEstimate, snapshot: Snapshot) -> float:
+        """What a slow sight adds to the distance to a target that moves."""
+        speed_mps = hypot(target.velocity_mps[0], target.velocity_mps[1])
+        return min(speed_mps * max(snapshot.estimator.sight_lag_s - _SLOW_S, 0.0), _FURTHER_M)
+
+    @staticmethod
+    def _straight(target: TargetEstimate, snapshot: Snapshot, config: FollowConfig, wanted_m: float) -> Move:
         x, y, _ = target.position_m
         distance, bearing = hypot(x, y), atan2(y, x)
         vx, vy, _ = snapshot.body.inverse().rotate(target.velocity_mps)
         # Velocity along and across the line of sight.
         along = (vx * x + vy * y) / max(distance, 0.2)
         across = (x * vy - y * vx) / max(distance, 0.2)
-        gap = distance - config.distance_m
+        gap = distance - wanted_m
         speed = (along + config.gain_per_s * gap) * max(cos(bearing), 0.0)
         speed = min(max(speed, -0.25), config.max_speed_mps)
         turn = config.turn_gain_per_s * bearing + across / max(distance, 0.3)
