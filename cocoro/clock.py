@@ -44,7 +44,11 @@ def is_fresh(stamp_ns: int, now_ns: int, max_age_s: float) -> bool:
 class Clock(Protocol):
     @property
     def virtual(self) -> bool:
-        """Whether time is the event loop's own, so that every run is the same."""
+        """Whether time goes on with the event loop's own, so that every run is the same."""
+
+    @property
+    def of_loop(self) -> bool:
+        """Whether times are those of the event loop: it never jumps, and a deadline is one of the loop's timers."""
 
     @property
     def epoch(self) -> int:
@@ -107,6 +111,7 @@ class RealClock(_OwnTime):
     """
 
     virtual = False
+    of_loop = False
     SLICE_S = 1.0
     """Waits are cut into slices of this length: this clock counts a suspension, the event loop's timers do not."""
 
@@ -132,6 +137,7 @@ class VirtualClock(_OwnTime):
     """The running event loop's own time, for `vloop.VirtualTimeLoop`."""
 
     virtual = True
+    of_loop = True
 
     def now_ns(self) -> int:
         return round(asyncio.get_running_loop().time() * NS)
@@ -179,6 +185,7 @@ class FollowedClock:
     """
 
     virtual = False
+    of_loop = False
     STANDS_NS = NS
     """Without a tick for this much real time the clock stands: the slowest simulator ticks more often."""
     LEAP_NS = NS // 10

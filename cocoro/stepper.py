@@ -223,7 +223,7 @@ async def _wait(clock: Clock, wake: Wake, deadline_ns: int) -> bool:
     if clock.now_ns() >= deadline_ns:
         await asyncio.sleep(0)  # a core that is too slow for its rate must leave other tasks their turn
         return True
-    if clock.virtual:  # the loop's own time, without the tasks that another clock needs
+    if clock.of_loop:  # without the tasks that another clock needs
         return await wake.until(deadline_ns / NS)
     timer = asyncio.ensure_future(clock.sleep_until(deadline_ns))
     waker = asyncio.ensure_future(wake.wait())

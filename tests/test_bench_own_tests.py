@@ -35,7 +35,14 @@ def test_files_are_summed_over_the_parts_of_a_run(tmp_path: Path, monkeypatch: p
     part(tmp_path, "2", a=slow, b=quick)
     (tmp_path / "seconds").write_text("12\n")
     (tmp_path / "memory.json").write_text(
-        json.dumps({"peak_mb": 800.0, "at_s": 3.0, "looks": 5, "largest": [["x", 500.0]]})
+        json.dumps(
+            {
+                "peak_mb": 800.0,
+                "at_s": 3.0,
+                "looks": [[1.0, 700.0, {"tests/a.py - one": 650.0}], [3.0, 800.0, {"tests/b.py": 500.0, "rest": 90.0}]],
+                "largest": [["x", 500.0, "tests/b.py"]],
+            }
+        )
     )
     report = measured(tmp_path, monkeypatch)
     found = {figure.name: figure for figure in report.figures}
@@ -43,9 +50,10 @@ def test_files_are_summed_over_the_parts_of_a_run(tmp_path: Path, monkeypatch: p
     assert found["memory of all their processes, at its peak"].median == 800.0
     assert all(figure.kept for figure in report.figures)
     assert found["processor time of the tests and of what they waited for"].median == 8.0
-    files, largest = report.tables
+    files, largest, over_time = report.tables
     assert files.rows == [["a.py", "3", "10.0", "7.5", "90"], ["b.py", "2", "1.0", "0.5", "90"]]
-    assert largest.rows == [["x", "500"]]
+    assert largest.rows == [["x", "tests/b.py", "500"]]
+    assert over_time.rows == [["0", "800", "b.py 500, rest 90"]]
 
 
 def test_a_run_that_took_too_long_or_too_much_memory_misses_its_bounds(
@@ -53,7 +61,7 @@ def test_a_run_that_took_too_long_or_too_much_memory_misses_its_bounds(
 ) -> None:
     part(tmp_path, "1", a={"tests": 1, "wall_s": 1.0, "processor_s": 1.0, "memory_mb": 1.0})
     (tmp_path / "seconds").write_text("361\n")
-    (tmp_path / "memory.json").write_text(json.dumps({"peak_mb": 1001.0, "at_s": 3.0, "looks": 5, "largest": []}))
+    (tmp_path / "memory.json").write_text(json.dumps({"peak_mb": 1001.0, "at_s": 3.0, "looks": [], "largest": []}))
     missed = [figure.name for figure in measured(tmp_path, monkeypatch).figures if not figure.kept]
     assert missed == ["all tests", "memory of all their processes, at its peak"]
 

@@ -36,6 +36,8 @@ async def settle() -> None:
 class JumpingClock(VirtualClock):
     """Follows the loop's virtual time, and can jump: back, as the clock of a restarted simulator, or ahead."""
 
+    of_loop = False
+
     def __init__(self) -> None:
         self.epoch = 0
         self._offset_ns = 0
