@@ -294,3 +294,63 @@ def test_who_has_no_good_certificate_is_not_let_in(issued: Path, tmp_path: Path)
                 opened("client", [], [room.endpoint], {**options, "connect/timeout_ms": 500})
     finally:
         room.close()
+
+
+def test_a_router_asks_for_user_and_password(issued: Path) -> None:
+    words = issued / "words"
+    words.write_text("robot:right\n", encoding="utf-8")
+    good = {"transport/auth/usrpwd/user": "robot", "transport/auth/usrpwd/password": "right"}
+    bad = {**good, "transport/auth/usrpwd/password": "wrong"}
+    endpoint = f"{LOCAL}/{issued}/router.sock"
+    router = opened("router", [endpoint], [], {**good, "transport/auth/usrpwd/dictionary_file": str(words)})
+    try:
+        opened("client", [], [endpoint], good).close()  # type: ignore[no-untyped-call]
+        for options in (bad, {}):
+            with pytest.raises(zenoh.ZError):
+                opened("client", [], [endpoint], {**options, "connect/timeout_ms": 500})
+    finally:
+        router.close()  # type: ignore[no-untyped-call]
+
+
+def by_interface(name: str) -> dict[str, Any]:
+    """Rules that allow everything to whoever comes by a network interface."""
+    options = allowing(("-", ["ingress", "egress"], EVERYTHING, ["**"]))
+    options["access_control"]["subjects"][1] = {"id": "s0", "interfaces": [name]}
+    return options
+
+
+@pytest.mark.parametrize(("room", "heard"), [(by_interface("lo"), 1), (by_interface("eth9"), 0)], indirect=["room"])
+def test_rules_can_be_those_of_an_interface(room: Room, heard: int) -> None:
+    ada = room.client("ada")
+    ada.put("r/x", b"")
+    if heard:
+        assert room.heard_from(ada, "r/x") == 1
+    else:
+        assert not list(ada.liveliness().get("r/**", timeout=SECOND_S))
+        assert room.heard == []
+
+
+def test_peers_pass_nothing_on_so_that_all_of_a_region_must_be_connected(tmp_path: Path) -> None:
+    """Peers a and c are connected with b, and not with each other. An option that let peers pass messages on is gone."""
+    with pytest.raises(zenoh.ZError, match="unknown key"):
+        zenoh.Config().insert_json5("routing/peer/mode", json.dumps("linkstate"))
+    ends = {name: f"{LOCAL}/{tmp_path}/{name}.sock" for name in "abc"}
+    a = opened("peer", [ends["a"]], [], {})
+    b = opened("peer", [ends["b"]], [ends["a"]], {})
+    c = opened("peer", [ends["c"]], [ends["b"]], {})
+    got: list[str] = []
+    try:
+        with (
+            a.declare_subscriber("r/**", lambda sample: got.append(f"a {sample.key_expr}")),
+            b.declare_subscriber("r/**", lambda sample: got.append(f"b {sample.key_expr}")),
+        ):
+            publisher = c.declare_publisher("r/x")
+            until(lambda: publisher.matching_status.matching, "b is known")  # type: ignore[attr-defined]
+            publisher.put(b"")
+            until(lambda: "b r/x" in got, "b hears it")
+            b.put("r/end", b"")
+            until(lambda: "a r/end" in got, "a hears b")
+            assert "a r/x" not in got
+    finally:
+        for session in (c, b, a):
+            session.close()  # type: ignore[no-untyped-call]
