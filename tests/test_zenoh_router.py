@@ -331,7 +331,7 @@ def test_rules_can_be_those_of_an_interface(room: Room, heard: int) -> None:
 
 
 def test_peers_pass_nothing_on_so_that_all_of_a_region_must_be_connected(tmp_path: Path) -> None:
-    """Peers a and c are connected with b, and not with each other. An option that let peers pass messages on is gone."""
+    """Peers a and c are connected with b, not with each other. An option that let peers pass messages on is gone."""
     with pytest.raises(zenoh.ZError, match="unknown key"):
         zenoh.Config().insert_json5("routing/peer/mode", json.dumps("linkstate"))
     ends = {name: f"{LOCAL}/{tmp_path}/{name}.sock" for name in "abc"}
