@@ -57,6 +57,7 @@ ENTRIES: dict[str, Entry] = {
     "alarms": Entry("alarms"),
     "bus": Entry("bus"),
     "capture-damage": Entry("capture_damage"),
+    "clocks": Entry("clocks"),
     "endings": Entry("endings"),
     "exports": Entry("exports"),
     "faults": Entry("faults"),

@@ -3,7 +3,7 @@
 Nothing that decides reads the wall clock: it can be set, and then ages and deadlines would be wrong. The real clock
 counts the time since the machine was started, the followed clock the simulator's ticks. A followed clock can jump back
 (the simulator was restarted, a replay went back): that begins a new epoch, in which ages, histories and deadlines begin
-anew. The real clock has one epoch for ever.
+anew. The real clock has one epoch, but where a site's gateway sets it back before the robot's processes have started.
 """
 
 from __future__ import annotations
@@ -11,6 +11,8 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
+from array import array
+from collections.abc import Sequence
 from math import exp
 from typing import NamedTuple, Protocol
 
@@ -104,33 +106,53 @@ class _OwnTime:
 
 
 class RealClock(_OwnTime):
-    """`steady_ns` plus an offset to wall time that is read once: the robot's clock when there is no simulator.
+    """`steady_ns` plus an offset to wall time: the robot's clock when there is no simulator.
 
     So stamps read as wall time, and setting the wall clock later changes nothing. All processes of a robot on a machine
-    use the same offset: see `deploy.robot_time`.
+    use the same offset: see `deploy.robot_time`. Where several machines share a robot, it is slewed while they run, so
+    that their clocks agree: see `deploy.site.timekeeping`.
     """
 
     virtual = False
     of_loop = False
     SLICE_S = 1.0
     """Waits are cut into slices of this length: this clock counts a suspension, the event loop's timers do not."""
+    HELD_NS = NS // 1000
+    """When the offset is slewed back, by less than this, time stands until it has caught up, and does not go back. By
+    more than this it is set only before a robot's processes have started; that begins a new epoch."""
 
-    def __init__(self, offset_ns: int | None = None) -> None:
-        """`offset_ns`: wall time minus `steady_ns`; measured now by default."""
-        self.offset_ns = wall_offset_ns() if offset_ns is None else offset_ns
+    def __init__(self, offset: int | Sequence[int] | None = None) -> None:
+        """`offset`: wall time minus `steady_ns` in nanoseconds, or a cell whose first item that is, now and later;
+        measured now by default."""
+        if offset is None:
+            offset = wall_offset_ns()
+        self._cell: Sequence[int] = array("q", (offset,)) if isinstance(offset, int) else offset
+        self.epoch = 0
+        self._newest_ns = 0
+
+    @property
+    def offset_ns(self) -> int:
+        return self._cell[0]
 
     def now_ns(self) -> int:
         # `steady_ns`, without the call: this is asked for each message.
-        return time.clock_gettime_ns(time.CLOCK_BOOTTIME) + self.offset_ns
+        now_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME) + self._cell[0]
+        if now_ns < self._newest_ns:
+            if self._newest_ns - now_ns < self.HELD_NS:
+                return self._newest_ns
+            self.epoch += 1
+        self._newest_ns = now_ns
+        return now_ns
 
     def latest_ns(self) -> int | None:
-        return steady_ns() + self.offset_ns
+        return self.now_ns()
 
     async def sleep_until(self, when_ns: int) -> bool:
+        epoch = self.epoch
         await asyncio.sleep(0)
-        while (left_ns := when_ns - self.now_ns()) > 0:  # noqa: ASYNC110 # time itself is what is waited for
+        while (left_ns := when_ns - self.now_ns()) > 0 and self.epoch == epoch:  # noqa: ASYNC110 # time itself is waited for
             await asyncio.sleep(min(left_ns / NS, self.SLICE_S))
-        return True
+        return self.epoch == epoch
 
 
 class VirtualClock(_OwnTime):

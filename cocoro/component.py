@@ -77,6 +77,8 @@ class Component:
     restart: Restart = "on-failure"
     backoff_s: float = 0.5
     """Delay before the first restart; doubled for each further one, up to `deploy.processes.BACKOFF_LIMIT_S`."""
+    first: bool = False
+    """Where the robot's time is real, the other processes are started when it is ready."""
     start_s: float = 30.0
     """Time until it must be ready."""
     stop_s: float = 5.0

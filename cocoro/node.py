@@ -190,7 +190,7 @@ class Node(Participant):
 
     def serve(self, request: Request[Q, R], handler: Callable[[Q], Awaitable[R]]) -> None:
         """Answers a request. When the handler raises CocoroError, the caller gets its text. Question and answer are
-        also published, for recorders."""
+        also published, for recorders, unless the request's row says otherwise."""
         decoder = msgspec.msgpack.Decoder(request.request)
 
         async def answer(_key: str, payload: Payload) -> bytes:
@@ -209,7 +209,8 @@ class Node(Participant):
                 raise CocoroError(exchange.error) from error
             finally:
                 exchange.took_ms = 0.0 if self._process is None else (time.perf_counter() - started) * 1e3
-                self.publish(EXCHANGES.of(self.name), exchange)
+                if request.recorded:
+                    self.publish(EXCHANGES.of(self.name), exchange)
 
         self.keep(self.bus.serve(request.key(self.robot_name), answer))
 

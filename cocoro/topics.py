@@ -99,6 +99,8 @@ class Request(Generic[Q, R]):
     doc: str
     timeout_s: float = 2.0
     right: Right = "operate"
+    recorded: bool = True
+    """Questions and answers are published for recorders, unless this is False."""
 
     @property
     def server(self) -> str:
@@ -224,6 +226,10 @@ EXCHANGES = Topic(
     "{service}/requests", m.Exchange, Qos.EVENT, None, 1.0,
     "Every request to a service, with its answer, for recorders.", max_bytes=4 * 1024 * 1024,
 )  # fmt: skip
+OFFSET = Topic(
+    "{service}/offset", m.ClockOffset, Qos.STATE, 1.0, 3.0,
+    "How far a host's clock is off that of the host that keeps its robot's time, from the host's gateway.",
+)  # fmt: skip
 RECORDING = Topic(
     "{service}/recording", m.Recording, Qos.STATE, 1.0, 3.0,
     "The state of a recorder: its file, what it dropped, why it stopped.",
@@ -232,7 +238,7 @@ RECORDING = Topic(
 TOPICS: tuple[Topic[Any], ...] = (
     FRAME, BASE_STATE, BASE_COMMAND, ARM_STATE, ARM_COMMAND, HAND_STATE, HAND_COMMAND,
     DETECTIONS, OBSTACLES, PLAN, HAND_SAMPLES, WHEEL_TRIALS, MODEL, INTENT, TASK, LATCH, CLOCK, TRUTH,
-    HEALTH, STEPS, EXCHANGES, RECORDING,
+    HEALTH, STEPS, EXCHANGES, OFFSET, RECORDING,
 )  # fmt: skip
 
 RUN = Request(
@@ -283,8 +289,13 @@ ABOUT = Request(
     "The component, settings and versions of a service; answered by every service.",
     right="see",
 )  # fmt: skip
+TIME = Request(
+    "{service}/time", m.TimeRequest, m.TimeReply,
+    "The robot's time on a host, from its gateway; hosts and persons compare their clocks by it.",
+    timeout_s=1.0, right="see", recorded=False,
+)  # fmt: skip
 
 STOPS: tuple[Request[Any, Any], ...] = (ESTOP, RESET)
 """What each service that moves something serves."""
 
-REQUESTS: tuple[Request[Any, Any], ...] = (RUN, CANCEL, REPORT, OBJECTS, *STOPS, LEARNED, RECOVER, SERVOS, ABOUT)
+REQUESTS: tuple[Request[Any, Any], ...] = (RUN, CANCEL, REPORT, OBJECTS, *STOPS, LEARNED, RECOVER, SERVOS, ABOUT, TIME)

@@ -1,7 +1,7 @@
 """The run directory: one folder per robot with the state of its processes on this machine.
 
     <run>/<robot>/profile.json     the resolved profile of the last start
-                  clock.json       the robot's time (see deploy.robot_time)
+                  clock            the robot's time (see deploy.robot_time)
                   survey.sock      where the supervisor answers `cocoro status` (see deploy.survey)
                   supervisor       held by the supervisor (see cocoro.held_file)
                   claims/<service> held by the process that is that service

@@ -64,6 +64,7 @@ class Supervisor:
         self._on_up = on_up
         self._report_to_people = report
         self._children: list[SupervisedProcess] = []
+        self._firsts = [row for row in profile.rows() if row.first] if profile.clock == "real" else []
         self._stop = asyncio.Event()
         self._unshared = ""
         """Why not all frames fit into shared memory, as found before the processes were started."""
@@ -83,7 +84,7 @@ class Supervisor:
             self._unshared = shared.obstacle(shared_bytes(self._profile.rows()))
             self._run_dir.remember(msgspec.json.format(msgspec.json.encode(self._profile)))
             self._prepare_latches()
-            robot_time.fix(self._run_dir.path)
+            robot_time.fix(self._run_dir.path, settable=bool(self._firsts))
             with _signals(self._on_signal):
                 return await self._run()
         finally:
@@ -123,8 +124,16 @@ class Supervisor:
             os.close(reader_fd)
         return code
 
+    async def _start(self) -> None:
+        """Starts all processes, after those that the robot's time waits for. Raises StartError."""
+        first = [child for child in self._children if child.row in self._firsts]
+        await asyncio.gather(*(child.start() for child in first))
+        if first and robot_time.origin(self._run_dir.path) == robot_time.ALONE:
+            self._report("the robot's time here is this machine's own: the host that keeps it did not answer")
+        await asyncio.gather(*(child.start() for child in self._children if child not in first))
+
     async def _start_and_keep(self) -> int:
-        starting = asyncio.gather(*(child.start() for child in self._children))
+        starting = asyncio.ensure_future(self._start())
         stopping = asyncio.ensure_future(self._stop.wait())
         await asyncio.wait((starting, stopping), return_when=asyncio.FIRST_COMPLETED)
         stopping.cancel()

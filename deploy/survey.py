@@ -19,11 +19,12 @@ import msgspec
 
 from cocoro.bus.base import Bus
 from cocoro.errors import CocoroError, ConfigError
-from cocoro.messages import Health, Message
+from cocoro.messages import ClockOffset, Health, Message
 from cocoro.participant import Participant
-from cocoro.topics import BASE_STATE, HEALTH, LATCH, PLAN, RECORDING, TASK, Topic
+from cocoro.topics import ANY, BASE_STATE, HEALTH, LATCH, OFFSET, PLAN, RECORDING, TASK, Topic
 from deploy import profiles, robot_time
 from deploy.rundir import RunDir
+from deploy.site.component import PREFIX
 
 REPLAY, REPLAYED = "replay", "replayed"
 """Process that publishes a capture's messages, and the state of a service that it stands for."""
@@ -72,18 +73,26 @@ class Survey:
         self._listens = listens
         self._health: dict[str, Health] = {}
         self._newest: dict[str, Message] = {}
+        self._offsets: dict[str, ClockOffset] = {}
         self._changed = asyncio.Event()
         if listens:
             onlooker.inbox(HEALTH.of("*")).add(lambda _key, health: self._on_health(health))
             for topic in NEWS:
                 onlooker.inbox(topic).add(partial(self._on_news, topic.name))
+            onlooker.on(OFFSET.of(ANY), self._on_offset)
 
     async def take(self, alive: set[str]) -> dict[str, Any]:
         """The report, once all services of `alive` have told their part, or the time for that is over."""
         there = alive | self._onlooker.replayed()
         wanted_news = {topic.name for topic in NEWS if topic.service in there}
-        asking = [asyncio.ensure_future(self._ask(topic)) for topic in (HEALTH.of("*"), *NEWS)]
-        await within(HEALTH_S, lambda: there <= set(self._health) and wanted_news <= set(self._newest), self._changed)
+        gateways = {name.removeprefix(PREFIX) for name in alive if name.startswith(PREFIX)}
+        topics = (HEALTH.of("*"), *NEWS, *([OFFSET.of(ANY)] if gateways else []))
+        asking = [asyncio.ensure_future(self._ask(topic)) for topic in topics]
+        await within(
+            HEALTH_S,
+            lambda: there <= set(self._health) and wanted_news <= set(self._newest) and gateways <= set(self._offsets),
+            self._changed,
+        )
         for question in asking:
             question.cancel()
         await asyncio.gather(*asking, return_exceptions=True)
@@ -95,6 +104,8 @@ class Survey:
             for message in await self._onlooker.newest(topic, HEALTH_S):
                 if isinstance(message, Health):
                     self._health.setdefault(message.service, message)
+                elif isinstance(message, ClockOffset):
+                    self._offsets.setdefault(message.host, message)
                 else:
                     self._newest.setdefault(topic.name, message)
             self._changed.set()
@@ -104,6 +115,10 @@ class Survey:
 
     def _on_health(self, health: Health) -> None:
         self._health[health.service] = health
+        self._changed.set()
+
+    def _on_offset(self, offset: ClockOffset) -> None:
+        self._offsets[offset.host] = offset
         self._changed.set()
 
     def _on_news(self, topic: str, _key: str, message: Message) -> None:
@@ -121,6 +136,7 @@ class Survey:
                 | ({"health": msgspec.to_builtins(self._health[name])} if name in self._health else {})
                 for name in names
             ],
+            "clocks": [msgspec.to_builtins(self._offsets[host]) for host in sorted(self._offsets)],
             "task": self._newest_of(TASK),
             "plan": self._newest_of(PLAN),
             "latch": self._newest_of(LATCH),

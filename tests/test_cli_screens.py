@@ -98,7 +98,7 @@ def report() -> dict[str, Any]:
     ]  # fmt: skip
     task = TaskState(task_id="1", task="fetch", label="red_can", phase="search", text=SENTENCE)
     return {
-        "robot": "calliope", "profile": "sim", "machine": {"cores": 2, "cpu_share": 0.5}, "clock": None,
+        "robot": "calliope", "profile": "sim", "clocks": [], "machine": {"cores": 2, "cpu_share": 0.5}, "clock": None,
         "task": msgspec.to_builtins(task),
         "plan": msgspec.to_builtins(PlannerStatus(behaviour="search", why=SENTENCE)), "latch": None, "recording": None,
         "base": msgspec.to_builtins(BaseState((0.0, 0.0), 0.0, 0.0, 0.0)), "services": services, "topics": listed,

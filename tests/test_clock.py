@@ -97,6 +97,39 @@ def test_the_real_clock_reads_as_wall_time_and_sleeps_until_its_time() -> None:
 
 
 @pytest.mark.usefixtures("real_time")
+def test_an_offset_that_is_slewed_back_holds_the_time_and_never_turns_it_back() -> None:
+    async def main() -> None:
+        cell = [1_000 * NS]
+        clock = RealClock(cell)
+        seen = [clock.now_ns()]
+        for _ in range(100):
+            cell[0] -= 10_000
+            await asyncio.sleep(5e-6)
+            seen.append(clock.now_ns())
+        assert seen == sorted(seen)
+        await asyncio.sleep(1.0)
+        assert clock.now_ns() == 1_000 * NS - 1_000_000 + cocoro.clock.steady_ns(), "it has caught up"
+        assert clock.epoch == 0
+
+    run_virtual(main())
+
+
+@pytest.mark.usefixtures("real_time")
+def test_an_offset_that_is_set_back_begins_an_epoch_and_wakes_who_waits() -> None:
+    async def main() -> None:
+        cell = [3_600 * NS]
+        clock = RealClock(cell)
+        waiting = await started(clock.sleep_until(clock.now_ns() + 5 * NS))
+        cell[0] = 0
+        assert not await waiting
+        assert loop_s() <= RealClock.SLICE_S
+        assert clock.now_ns() == cocoro.clock.steady_ns()
+        assert clock.epoch == 1
+
+    run_virtual(main())
+
+
+@pytest.mark.usefixtures("real_time")
 @pytest.mark.parametrize("step_s", [-36_000.0, -0.49, -0.01, 0.01, 0.3, 36_000.0])
 def test_a_step_of_the_wall_clock_changes_nothing(step_s: float) -> None:
     async def main() -> None:

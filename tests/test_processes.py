@@ -21,6 +21,7 @@ from cocoro.messages import Message
 from cocoro.topics import REQUESTS, TOPICS, Topic
 from deploy import processes, profiles
 from deploy.processes import COMPONENTS
+from deploy.site.component import GATEWAY
 
 NODES = (topics.HEALTH, topics.STEPS, topics.EXCHANGES)
 """Published by every node, whatever runs in it."""
@@ -72,7 +73,9 @@ def test_every_request_is_served_by_a_component() -> None:
     served = {one.name for component in COMPONENTS for one in component.all_serves()}
     for request in REQUESTS:
         if request is not topics.ABOUT:  # by every node
-            assert request.name in served or any(request.of(name).name in served for name in processes.stoppable())
+            assert request.name in served or any(
+                request.of(name).name in served for name in (*processes.stoppable(), GATEWAY.name)
+            )
 
 
 def test_what_a_component_needs_it_hears_of_by_a_topic_that_it_reads() -> None:

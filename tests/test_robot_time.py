@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+import os
 import time
 from pathlib import Path
 
-import msgspec
 import pytest
 
 from cocoro.clock import NS, wall_offset_ns
 from deploy import robot_time
-from deploy.robot_time import FILE, RobotTime
+from deploy.robot_time import COMPARED, FILE, OWN, SETTABLE
 
 
 def step_wall_clock(monkeypatch: pytest.MonkeyPatch, seconds: float) -> None:
@@ -43,7 +43,7 @@ def test_the_next_start_of_the_robot_reads_the_wall_clock_again(
     assert measured_here(robot_time.clock(tmp_path).offset_ns)
 
 
-@pytest.mark.parametrize("content", [None, b"", b"{", b"[]", b'{"boot": "x"}', b'{"boot": 1, "offset_ns": 2}'])
+@pytest.mark.parametrize("content", [None, b"", b"{", bytes(15), bytes(16), bytes(16) + b"x", bytes(9000)])
 def test_who_finds_nothing_that_can_be_read_measures_its_own_and_writes_nothing(
     tmp_path: Path, content: bytes | None
 ) -> None:
@@ -55,11 +55,51 @@ def test_who_finds_nothing_that_can_be_read_measures_its_own_and_writes_nothing(
 
 def test_an_offset_from_another_boot_is_none(tmp_path: Path) -> None:
     robot_time.fix(tmp_path)
-    there = msgspec.json.decode((tmp_path / FILE).read_bytes(), type=RobotTime)
-    for boot in ("", there.boot + "x"):
-        wrong = msgspec.structs.replace(there, boot=boot, offset_ns=there.offset_ns + 10 * NS)
-        (tmp_path / FILE).write_bytes(msgspec.json.encode(wrong))
+    robot_time.setting(tmp_path).correct(10 * NS)
+    file = tmp_path / FILE
+    there = file.read_bytes()
+    assert robot_time.clock(tmp_path).offset_ns == 10 * NS
+    for wrong in (there[:16], there + b"x"):
+        fresh = tmp_path / "fresh"
+        fresh.write_bytes(wrong)
+        fresh.replace(file)
         assert measured_here(robot_time.clock(tmp_path).offset_ns)
+
+
+def test_clocks_that_were_made_before_see_a_correction(tmp_path: Path) -> None:
+    fixed = robot_time.fix(tmp_path, settable=True)
+    others = [robot_time.clock(tmp_path) for _ in range(2)]
+    setting = robot_time.setting(tmp_path)
+    assert setting.settable
+    assert robot_time.origin(tmp_path) == SETTABLE
+    setting.correct(setting.offset_ns + 3 * NS)
+    setting.begin(COMPARED)
+    assert {clock.offset_ns for clock in (fixed, *others)} == {setting.offset_ns}
+    assert not robot_time.setting(tmp_path).settable
+    assert robot_time.origin(tmp_path) == COMPARED
+
+
+def test_a_robot_s_time_is_its_own_unless_a_gateway_may_set_it(tmp_path: Path) -> None:
+    assert robot_time.origin(tmp_path) == OWN, "without a file"
+    robot_time.fix(tmp_path)
+    assert robot_time.origin(tmp_path) == OWN
+    assert not robot_time.setting(tmp_path).settable
+
+
+def test_a_gateway_without_a_file_fixes_the_time(tmp_path: Path) -> None:
+    setting = robot_time.setting(tmp_path)
+    assert measured_here(setting.offset_ns)
+    assert robot_time.clock(tmp_path).offset_ns == setting.offset_ns
+
+
+@pytest.mark.process
+def test_another_process_sees_a_correction(tmp_path: Path) -> None:
+    clock = robot_time.fix(tmp_path)
+    if (child := os.fork()) == 0:
+        robot_time.setting(tmp_path).correct(7 * NS)
+        os._exit(0)
+    os.waitpid(child, 0)
+    assert clock.offset_ns == 7 * NS
 
 
 def test_a_robot_that_was_never_up_here_has_no_folder_and_still_a_clock(tmp_path: Path) -> None:

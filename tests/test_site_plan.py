@@ -46,6 +46,15 @@ def test_a_share_is_the_robots_profile_with_the_processes_of_one_host_and_its_ga
     assert "gateway-brain" in share.services()
 
 
+def test_the_first_host_of_the_robot_s_hardware_keeps_its_time(tmp_path: Path) -> None:
+    assert [read(tmp_path).keeper(host) for host in ("body", "brain")] == ["body", "body"]
+
+
+def test_a_share_s_gateway_has_the_profile_s_settings(tmp_path: Path) -> None:
+    share = read(tmp_path).share_profile("brain", ["service.gateway.clock_limit_ms=10.0"])
+    assert share.service["gateway"] == {"site": str(tmp_path), "host": "brain", "clock_limit_ms": 10.0}
+
+
 def test_two_robots_of_a_site_have_hosts_of_their_own(tmp_path: Path) -> None:
     text = """
 name = "hall"

@@ -12,11 +12,24 @@ from cocoro.component import Component
 from cocoro.errors import ConfigError
 from cocoro.installed import all_requests, all_topics
 from cocoro.keys import matches
-from cocoro.topics import BASE_COMMAND, ESTOP, RESET, RUN, SERVOS, TRUTH, Topic
+from cocoro.topics import (
+    BASE_COMMAND,
+    BASE_STATE,
+    ESTOP,
+    HEALTH,
+    INTENT,
+    OFFSET,
+    RESET,
+    RUN,
+    SERVOS,
+    TIME,
+    TRUTH,
+    Topic,
+)  # fmt: skip
 from deploy import processes
 from deploy.site import plan
 from deploy.site.matrix import matrix
-from deploy.site.rights import rights
+from deploy.site.rights import of_clocks, rights
 from deploy.site.rules import IN, OUT, Rule, compiled, neighbours, table
 
 ROBOT = "calliope"
@@ -188,6 +201,37 @@ def test_the_table_has_a_row_for_each_key_that_somebody_publishes_or_serves(lab:
     keys = {row.key for row in matrix(lab, ROBOT)}
     assert {"base/command", "sim/truth", "executive/run", "base/estop", "planning/alive", "bob/**"} <= keys
     assert "servos/about" not in keys, "no host of this site has the real servos"
+
+
+# --- clocks ---------------------------------------------------------------------------------------
+
+
+def test_hosts_and_persons_ask_any_gateway_for_the_time(lab: plan.Site) -> None:
+    assert may_ask(lab, TIME.of("gateway-body").key(ROBOT)) == {*lab.principals}
+    assert may_hear(lab, OFFSET.of("gateway-brain").key(ROBOT)) >= {"ada", "eve", "bob"}
+    assert may_put(lab, OFFSET.of("gateway-brain").key(ROBOT)) == {"brain"}
+
+
+def test_a_host_with_a_wrong_clock_passes_on_only_what_says_so(lab: plan.Site) -> None:
+    only = of_clocks(lab, ROBOT)
+    kept = table(lab, "brain", only=only)
+    assert {rule.principal for rule in kept} == {rule.principal for rule in table(lab, "brain")}
+
+    def passes(flow: str, message: str, key: str) -> bool:
+        found = [rule for rule in kept if rule.flow == flow and message in rule.messages and rule.allow]
+        return any(matches(keyexpr, key) for rule in found for keyexpr in rule.keys)
+
+    for flow in (IN, OUT):
+        for command in (INTENT, BASE_COMMAND, BASE_STATE, TRUTH):
+            assert not passes(flow, "put", command.key(ROBOT))
+        assert not passes(flow, "reply", RUN.key(ROBOT))
+        assert not passes(flow, "liveliness_token", f"{ROBOT}/executive/alive")
+    assert passes(IN, "reply", TIME.of("gateway-body").key(ROBOT))
+    assert passes(OUT, "query", TIME.of("gateway-body").key(ROBOT))
+    assert passes(OUT, "put", OFFSET.of("gateway-brain").key(ROBOT))
+    assert passes(OUT, "put", HEALTH.of("gateway-brain").key(ROBOT))
+    assert passes(IN, "declare_subscriber", f"{ROBOT}/**"), "the recorder's interest; its messages are held back"
+    assert compiled(lab, "brain", {"body": ["body.1"]}, only=only)["access_control"]["enabled"]
 
 
 # --- a hub ----------------------------------------------------------------------------------------

@@ -329,8 +329,8 @@ def topic(name: str, **more: Any) -> dict[str, Any]:
 
 def screen(*, services: Sequence[Any] = (), topics: Sequence[Any] = (), **more: Any) -> str:
     report: dict[str, Any] = {
-        "robot": "calliope", "profile": "sim", "machine": {"cores": 2, "cpu_share": 0.25}, "clock": None, "task": None,
-        "plan": None, "latch": None, "base": None, "services": services, "topics": topics,
+        "robot": "calliope", "profile": "sim", "machine": {"cores": 2, "cpu_share": 0.25}, "clock": None,
+        "clocks": [], "task": None, "plan": None, "latch": None, "base": None, "services": services, "topics": topics,
     }  # fmt: skip
     console = Console(width=200, color_system="standard", force_terminal=True)
     with console.capture() as capture:

@@ -120,9 +120,9 @@ async def joined(
         from deploy.site import access  # slow to import; only a site needs it
 
         way = access.way(through, choice.robot, "operator")
-        run_dir, config, refusal = way.run_dir, way.config, way.refusal
+        run_dir, config, refusal, keeper = way.run_dir, way.config, way.refusal, way.keeper
     else:
-        refusal = None
+        refusal, keeper = None, ""
         run_dir = find(choice)
         config = run_dir.join_as("operator")
         if config.directory is not None and not run_dir.populated:
@@ -137,4 +137,8 @@ async def joined(
         if refusal is not None and not await link.alive():
             why = "is it up there, or has your certificate been revoked?"
             raise MeshError(f"nothing of {link.robot} is heard at {config.where}: {why}")
+        if keeper:
+            from deploy.site import asking
+
+            link.clock = await asking.time_of(link, keeper) or link.clock
         yield link

@@ -25,7 +25,6 @@ from cocoro.installed import unrecorded
 from cocoro.messages import Recording
 from cocoro.node import Node
 from cocoro.topics import RECORDING
-from deploy import robot_time
 from services.capture.component import CAPTURE
 from services.capture.writer import describe_disturbance
 
@@ -78,7 +77,7 @@ async def record_mesh(
         print(f"not recorded, as declared: {', '.join(left_out)}", file=sys.stderr)
     async with joined(choice, frames=True) as link:
         resolved = link.run_dir.resolved()
-        clock = FollowedClock() if resolved.get("clock") == "sim" else robot_time.clock(link.run_dir.path)
+        clock = FollowedClock() if resolved.get("clock") == "sim" else link.clock
         robot = link.described()
         name = f"record-{os.getpid()}"
         async with Node(

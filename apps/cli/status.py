@@ -14,6 +14,7 @@ from types import SimpleNamespace
 from apps.cli import exits
 from apps.cli.output import print_json
 from apps.cli.terminal import Column, fields, print_table
+from deploy.site import clock_words
 
 TYPE_CHECKING = False
 """As in `typing`, which takes 2 ms to import."""
@@ -122,6 +123,8 @@ def _facts(report: dict[str, Any]) -> Iterator[tuple[str, str]]:
         yield "emergency stop", f"{latch['state']}{f' by {name}' if (name := latch['by']) else ''}"
     if (base := report["base"]) is not None:
         yield "battery", f"{100 * base['battery_fraction']:.0f}%{', charging' if base['charging'] else ''}"
+    if clocks := said_of_clocks(report["clocks"]):
+        yield "clocks", clocks
     if report["task"] is not None:
         yield "task", _task(SimpleNamespace(**report["task"]))
     if (plan := report["plan"]) is not None:
@@ -131,6 +134,11 @@ def _facts(report: dict[str, Any]) -> Iterator[tuple[str, str]]:
         recording = SimpleNamespace(**told)
         yield "records", recording.fault or f"{recording.occasion or 'nothing that happens'}, in {recording.file}"
         yield "space", space(recording)
+
+
+def said_of_clocks(offsets: list[dict[str, Any]]) -> str:
+    """The clocks of a site's hosts; '' where there is no site."""
+    return "; ".join(filter(None, (clock_words.said(SimpleNamespace(**one)) for one in offsets)))
 
 
 def space(recording: Any) -> str:

@@ -25,8 +25,8 @@ from cocoro.component import Component
 from cocoro.errors import CocoroError
 from cocoro.installed import topic_named
 from cocoro.keys import matches
-from cocoro.messages import Health, Message, TopicHealth
-from cocoro.topics import BASE_STATE, CLOCK, HEALTH, LATCH, PLAN, TASK, Topic
+from cocoro.messages import ClockOffset, Health, Message, TopicHealth
+from cocoro.topics import ANY, BASE_STATE, CLOCK, HEALTH, LATCH, OFFSET, PLAN, TASK, Topic
 from deploy import processes
 from deploy.processor import ProcessorUse, ProcessorWatch
 from deploy.rates import meant_hz
@@ -98,6 +98,7 @@ class MeshWatch:
         self._health: dict[str, Health] = {}
         self._heard_s: dict[str, float] = {}
         self._news: dict[str, Message] = {}
+        self._offsets: dict[str, ClockOffset] = {}
         self._before: dict[tuple[str, str, str], int] = {}
         """Counts of the last report, by reader, key and name of the count."""
         self._loops: dict[str, tuple[float, int, float]] = {}
@@ -109,6 +110,7 @@ class MeshWatch:
         link.inbox(HEALTH.of("*")).add(lambda _key, health: self._on_health(health))
         for what, topic in NEWS.items():
             link.inbox(topic).add(partial(self._on_news, what))
+        link.on(OFFSET.of(ANY), self._on_offset)
         link.watch_alive(self._on_alive)
 
     async def first(self) -> None:
@@ -125,6 +127,9 @@ class MeshWatch:
         self._health[health.service] = health
         self._heard_s[health.service] = time.monotonic()
         self._changed.set()
+
+    def _on_offset(self, offset: ClockOffset) -> None:
+        self._offsets[offset.host] = offset
 
     def _on_news(self, what: str, _key: str, message: Message) -> None:
         self._news[what] = message
@@ -158,6 +163,7 @@ class MeshWatch:
             "profile": resolved.get("name", ""),
             "machine": self._machine(),
             **{what: msgspec.to_builtins(self._news.get(what)) for what in NEWS},
+            "clocks": [msgspec.to_builtins(self._offsets[host]) for host in sorted(self._offsets)],
             "services": [self._service(name, rows.get(name)) for name in ordered],
             "topics": self._topics(),
         }

@@ -8,7 +8,7 @@ from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.text import Text
 
-from apps.cli.status import said
+from apps.cli.status import said, said_of_clocks
 from apps.cli.terminal import PLAIN_WIDTH, Column, FittedTable
 from deploy.survey import REPLAYED
 
@@ -64,19 +64,23 @@ def render(report: dict[str, Any], screen: Console | None = None) -> RenderableT
     """The whole report; for a `screen` only topics that have a rate or a problem, as many as have room on it."""
     topics, hidden = report["topics"], list[Text]()
     words = report["machine"].get("starved", "")
-    starved = [Text(words, BAD)] if words else []  # folded: the end of the sentence says who takes the processor
+    notes = [Text(words, BAD)] if words else []  # folded: the end of the sentence says who takes the processor
+    if clocks := said_of_clocks(report["clocks"]):
+        notes.append(
+            Text(f"clocks: {clocks}", BAD if any(one["state"] == "refused" for one in report["clocks"]) else "")
+        )
     needed = len(report["services"]) + len(topics) + 2 * OTHER_LINES
     services = _services(report["services"], fold=screen is None or screen.height > needed)
     if screen is None:
         room = len(topics)
     else:
-        fixed = Group(*starved, services)
+        fixed = Group(*notes, services)
         room = max(screen.height - len(screen.render_lines(fixed, pad=False)) - OTHER_LINES, 1)
     if room < len(topics):
         topics = sorted(filter(_is_busy, topics), key=lambda topic: not _is_troubled(topic))[:room]
         more = len(report["topics"]) - len(topics)
         hidden = [Text(f"(a higher terminal shows {more} more; so does --once)", FAINT)]
-    return Group(_headline(report), *starved, Text(), services, Text(), _topics(topics), *hidden)
+    return Group(_headline(report), *notes, Text(), services, Text(), _topics(topics), *hidden)
 
 
 def _is_busy(topic: dict[str, Any]) -> bool:

@@ -82,6 +82,39 @@ class Exchange(Message):
     took_ms: FiniteNonNegative = 0.0
 
 
+class TimeRequest(msgspec.Struct, kw_only=True):
+    pass
+
+
+class TimeReply(msgspec.Struct, kw_only=True):
+    """The robot's time on the answering host, when the question arrived and when the answer left."""
+
+    received_ns: int
+    answered_ns: int
+
+
+class ClockOffset(Message):
+    """A host's clock compared with that of the host that keeps its robot's time."""
+
+    host: str
+    keeper: str
+    """The host that keeps the time; this one itself where it does."""
+    state: Literal["keeps", "waits", "follows", "refused", "shown"]
+    """`waits`: not compared yet; `follows`: corrected; `refused`: too uncertain or too far off, so what this host says
+    is not passed on; `shown`: the robot's time is the simulator's, and nothing is corrected."""
+    ahead_s: Finite | None = None
+    """This host's time minus the keeper's; None before the first answer."""
+    uncertainty_s: Finite | None = None
+    """The true difference is within this of `ahead_s`."""
+    gains_ppm: Finite | None = None
+    """How much faster this machine's steady clock runs than the keeper's time; None before it was observed for long
+    enough."""
+    round_trip_s: Finite | None = None
+    """Of the exchange that the comparison rests on."""
+    unanswered: Count = 0
+    """Questions without an answer."""
+
+
 class AboutRequest(msgspec.Struct, kw_only=True):
     pass
 

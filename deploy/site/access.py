@@ -32,6 +32,8 @@ class Way(NamedTuple):
     who: str
     """The person, with role and site, for error messages."""
     rights: Rights
+    keeper: str
+    """The host that keeps the robot's time; '' where that is the simulator's."""
 
     def refusal(self, key: str) -> str:
         """Why the person may not send a request on this key (wildcards allowed); '' when he may."""
@@ -69,7 +71,8 @@ def ways(given: str, robot: str | None, command: str) -> list[Way]:
             raise ConfigError(f"site {site.name}: no host of {one} listens: give one listen = ['tls/ADDRESS:PORT']")
         config = ZenohConfig(command, mode="client", connect=endpoints, patience_s=PATIENCE_S, options=mine.options)
         who = f"{name}, {role} of site {site.name},"
-        found.append(Way(RunDir(one), config, who, rights(site, name, one)))
+        keeper = "" if site.profiles[one].clock == "sim" else site.keeper_of(one)
+        found.append(Way(RunDir(one), config, who, rights(site, name, one), keeper))
     return found
 
 

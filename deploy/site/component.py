@@ -3,11 +3,16 @@
 from dataclasses import replace
 
 from cocoro.component import Component
+from cocoro.topics import OFFSET, TIME
 
 GATEWAY = Component(
     name="gateway",
     module="deploy.site.gateway",
     doc="Joins this host's share of a robot with the other hosts of its site, by certificates and access rules.",
+    publishes=(OFFSET,),
+    serves=(TIME,),
+    calls=(TIME,),
+    first=True,
     restart="always",
     backoff_s=0.1,
     nice=-5,

@@ -2,7 +2,8 @@
 
 It is a member of the robot's private mesh on this machine, and a router with TLS links to the other hosts, which it
 admits by certificate and by the rules compiled from the site's plan (`deploy.site.rules`). When the plan or the
-admissions change, it opens its router anew, since zenoh's rules cannot change while it runs.
+admissions change, or this host's clock becomes wrong or right, it opens its router anew, since zenoh's rules cannot
+change while it runs. It also corrects this host's time (`deploy.site.timekeeping`).
 
 Nothing on this machine needs it to live: the processes here stay connected with each other. What came from other hosts
 stops, as it does when the network is cut.
@@ -16,28 +17,38 @@ from collections import Counter
 from contextlib import AsyncExitStack
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
+from msgspec import Meta
 
 from cocoro.bus.router import Link, Router
 from cocoro.component import Implementation
 from cocoro.errors import CocoroError, ConfigError
 from cocoro.node import Node
+from cocoro.topics import ARM_STATE, BASE_STATE, FRAME, HAND_STATE
+from deploy import robot_time
 from deploy.rundir import RunDir
 from deploy.site import admitted, credentials, place, plan
 from deploy.site.plan import Site
 from deploy.site.refusals import Refusal, Watch
+from deploy.site.rights import of_clocks
 from deploy.site.rules import compiled
+from deploy.site.timekeeping import Timekeeping, tell_time
 
 LOOK_S = 1.0
-"""How often the gateway looks whether the plan or the admissions have changed."""
+"""How often the gateway looks whether the plan, the admissions or the trust in this host's clock have changed."""
 TELL_S = 10.0
 """A refusal that repeats is logged at its first time, and then counted and logged this often."""
 SHOWN = 3
 """Refusals in health, the most frequent ones."""
 KINDS = 1000
 """Different refusals that are counted apart."""
+MEASURED = (FRAME, BASE_STATE, ARM_STATE, HAND_STATE)
+"""What is fused by its time stamps."""
+MEASURES_MS, ELSE_MS = 5.0, 40.0
+"""By how much the clock may be off of a host that measures, and of another one, whose clock only says how old commands
+are; docs/sites.md says where the limits come from."""
 
 log = logging.getLogger("cocoro.gateway")
 
@@ -49,6 +60,8 @@ class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """The folder of the site."""
     host: str = ""
     """The name of this host there."""
+    clock_limit_ms: Annotated[float, Meta(gt=0)] | None = None
+    """A host whose clock may be off by more is refused; None: `MEASURES_MS` or `ELSE_MS`, by what it does."""
 
 
 class Gateway:
@@ -56,6 +69,7 @@ class Gateway:
 
     def __init__(self, node: Node, config: Config, directory: Path) -> None:
         self._node = node
+        self._config = config
         self._folder = Path(config.site)
         self._host = config.host
         self._directory = directory
@@ -63,26 +77,43 @@ class Gateway:
         self._refused: Counter[Refusal] = Counter()
         self._untold: Counter[Refusal] = Counter()
         self._loop = asyncio.get_running_loop()
+        self._timekeeping = Timekeeping(
+            node,
+            config.host,
+            robot_time.setting(directory),
+            corrects=not node.clock.needs_ticks,
+        )
+        self._begun = False
+        """Whether this host's time has been compared, so that other processes may start."""
 
     async def run(self) -> None:
+        tell_time(self._node, robot_time.clock(self._directory).now_ns)
         async with AsyncExitStack() as stack:
             watch = Watch(self._on_refusal, lambda line: log.warning("%s", line))
             stack.callback(watch.close)
             self._node.spawn(self._tell())
             while True:
-                marks = self._marks()
+                marks, refused = self._marks(), self._timekeeping.refused
                 site, options = self._read()
+                self._timekeeping.follow(site.keeper(self._host), self._clock_limit_s(site))
                 router = await Router.open(
                     "gateway", self._directory, site.host(self._host).listen, site.endpoints(self._host), options
                 )
                 try:
                     self._links = {link.zid: link for link in router.links()}
                     router.watch(self._on_link)
+                    await self._begin()
                     self._report()
-                    await self._until_changed(marks)
+                    await self._until_changed(marks, refused)
                 finally:
                     await router.close()
-                log.info("the site's plan or its admissions have changed: the router is opened anew")
+                log.info("the site or the trust in this host's clock has changed: the router is opened anew")
+
+    async def _begin(self) -> None:
+        if not self._begun:
+            await self._timekeeping.begin()
+            self._begun = True
+            self._node.spawn(self._timekeeping.run())
 
     def _read(self) -> tuple[Site, dict[str, Any]]:
         """The plan and the router's options. Raises ConfigError."""
@@ -97,7 +128,14 @@ class Gateway:
             authority=known.authority,
         )
         names = {name: known.common_names(name, now) for name in known.names}
-        return site, {**mine.options, **compiled(site, self._host, names)}
+        only = of_clocks(site, site.host(self._host).robot) if self._timekeeping.refused else None
+        return site, {**mine.options, **compiled(site, self._host, names, only=only)}
+
+    def _clock_limit_s(self, site: Site) -> float:
+        if self._config.clock_limit_ms is not None:
+            return self._config.clock_limit_ms / 1e3
+        measures = any({*MEASURED} & {*one.all_publishes()} for one in site.share(self._host))
+        return (MEASURES_MS if measures else ELSE_MS) / 1e3
 
     def _marks(self) -> tuple[object, ...]:
         """What differs when a file of the site differs."""
@@ -112,10 +150,13 @@ class Gateway:
                 found.append(None)
         return tuple(found)
 
-    async def _until_changed(self, marks: tuple[object, ...]) -> None:
-        """Returns when the site's files have changed and can be read; a bad file changes nothing."""
-        while True:
+    async def _until_changed(self, marks: tuple[object, ...], refused: bool) -> None:
+        """Returns when the site's files have changed and can be read, or the trust in this host's clock has changed; a
+        bad file changes nothing."""
+        while self._timekeeping.refused == refused:
             await asyncio.sleep(LOOK_S)
+            if refused:
+                self._report()
             now = self._marks()
             if now != marks:
                 marks = now
@@ -138,8 +179,14 @@ class Gateway:
         self._report()
 
     def _report(self) -> None:
+        if not self._begun:
+            return
         linked = sorted({link.who.rpartition(".")[0] or link.who for link in self._links.values()})
-        self._node.ready(f"linked with {', '.join(linked)}" if linked else "no link to another host")
+        text = f"linked with {', '.join(linked)}" if linked else "no link to another host"
+        if trouble := self._timekeeping.trouble:
+            self._node.degraded(f"{trouble}; {text}")
+        else:
+            self._node.ready(text)
 
     def _on_refusal(self, refusal: Refusal) -> None:
         """Called in the thread that reads the log."""

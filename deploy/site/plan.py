@@ -140,6 +140,16 @@ class Site(NamedTuple):
         hosts = self.listening(robot)
         return tuple(name for name in hosts if self.is_hub(name)) or hosts
 
+    def keeper(self, host: str) -> str:
+        """The host whose clock is the time of a host's robot: the first that drives its hardware, or its first one. A
+        hub keeps its own."""
+        return host if self.is_hub(host) else self.keeper_of(self.hosts[host].robot)
+
+    def keeper_of(self, robot: str) -> str:
+        """The host whose clock is a robot's time."""
+        of_robot = [name for name, row in self.hosts.items() if row.robot == robot]
+        return next((name for name in of_robot if self.hosts[name].role == "robot"), of_robot[0])
+
     def connects(self, name: str) -> tuple[str, ...]:
         """The hosts that a principal connects to."""
         if name in self.persons:
@@ -171,6 +181,7 @@ class Site(NamedTuple):
             gateway = gateway_of(name).name
             return Profile(name=f"hub of {self.name}", robot=name, processes=(gateway,), service={"gateway": settings})
         whole = profiles.read(self.sources[row.robot], overrides)
+        settings = {**whole.service.get(GATEWAY.name, {}), **settings}
         return msgspec.structs.replace(
             whole,
             robot=row.robot,

@@ -16,7 +16,22 @@ from typing import Any, NamedTuple
 from cocoro.component import Component
 from cocoro.installed import all_requests
 from cocoro.keys import alive_key, matches, recorder_key
-from cocoro.topics import ABOUT, ANY, CLOCK, EXCHANGES, HEALTH, STEPS, TOPICS, TRUTH, Request, Right, Topic
+from cocoro.topics import (
+    ABOUT,
+    ANY,
+    CLOCK,
+    EXCHANGES,
+    HEALTH,
+    OFFSET,
+    STEPS,
+    TIME,
+    TOPICS,
+    TRUTH,
+    Request,
+    Right,
+    Topic,
+)
+from deploy.site.component import gateway_of
 from deploy.site.plan import Site
 from deploy.site.roles import Role
 from services.executive.askers import asker_key
@@ -52,6 +67,11 @@ class Rights(NamedTuple):
         both = Rights(*(mine | theirs for mine, theirs in zip(self, other, strict=True)))
         heard = frozenset(key for key in both.never_hears if self.may_hear(key) or other.may_hear(key))
         return both._replace(never_hears=both.never_hears - heard)
+
+    def narrowed(self, keys: Iterable[str]) -> Rights:
+        """Those of these keys that the rights are for, and no others."""
+        kept = Rights(*(frozenset(key for key in keys if any(matches(one, key) for one in mine)) for mine in self))
+        return kept._replace(never_hears=self.never_hears)
 
     def may_ask(self, key: str) -> bool:
         return any(matches(keyexpr, key) for keyexpr in self.asks)
@@ -103,6 +123,14 @@ def of_host(robot: str, share: Iterable[Component], *, simulated: bool) -> Right
         shows=frozenset(shows),
         watches=frozenset({f"{robot}/**"} if records else {key(robot) for key in (alive_key, recorder_key, asker_key)}),
     )
+
+
+def of_clocks(site: Site, robot: str) -> frozenset[str]:
+    """The keys of a robot that pass a gateway even when its host's clock is wrong: those by which clocks are compared
+    and by which everybody sees why it is refused."""
+    nodes = [gateway_of(name).name for name, row in site.hosts.items() if row.robot == robot]
+    rows = [row.of(node) for node in nodes for row in (TIME, OFFSET, HEALTH)]
+    return frozenset({*(row.key(robot) for row in rows), *(alive_key(robot, node) for node in nodes)})
 
 
 def of_person(robot: str, role: Role, name: str) -> Rights:

@@ -55,10 +55,12 @@ class Rule(NamedTuple):
     allow: bool = True
 
 
-def compiled(site: Site, host: str, names: Mapping[str, Iterable[str]]) -> dict[str, Any]:
+def compiled(
+    site: Site, host: str, names: Mapping[str, Iterable[str]], *, only: frozenset[str] | None = None
+) -> dict[str, Any]:
     """The options of a host's router session, by path. `names` are the certificates' common names of each principal
-    that are admitted; one without any is kept out."""
-    rules = table(site, host)
+    that are admitted; one without any is kept out. `only`: as in `table`."""
+    rules = table(site, host, only=only)
     admitted = {name: sorted(names.get(name, ())) for name in dict.fromkeys(rule.principal for rule in rules)}
     admitted = {name: known for name, known in admitted.items() if known}
     rows = [(f"{index}", rule) for index, rule in enumerate(rules) if rule.principal in admitted]
@@ -98,15 +100,17 @@ def compiled(site: Site, host: str, names: Mapping[str, Iterable[str]]) -> dict[
     }
 
 
-def table(site: Site, host: str) -> list[Rule]:
-    """The rules that a host's gateway keeps, in the order of the plan."""
+def table(site: Site, host: str, *, only: frozenset[str] | None = None) -> list[Rule]:
+    """The rules that a host's gateway keeps, in the order of the plan. `only`: the keys that pass, where that is not
+    all that the rights are for; interest in others may still be told."""
     found = []
-    for name, may in neighbours(site, host).items():
+    for name, full in neighbours(site, host).items():
+        may = full if only is None else full.narrowed(only)
         interest = frozenset(f"{robot}/**" for robot in _shared(site, host, name))
         rows = (
             (IN, ("put",), may.puts),
             (OUT, ("declare_subscriber",), interest),
-            (IN, ("declare_subscriber",), may.hears),
+            (IN, ("declare_subscriber",), full.hears),
             (OUT, ("put",), may.hears),
             (IN, ("query",), may.asks),
             (OUT, ("reply", "declare_queryable"), may.asks),
@@ -114,7 +118,7 @@ def table(site: Site, host: str) -> list[Rule]:
             (IN, ("reply", "declare_queryable"), may.answers),
             (IN, ("liveliness_token",), may.shows),
             (OUT, ("liveliness_query", "declare_liveliness_subscriber"), interest),
-            (IN, ("liveliness_query", "declare_liveliness_subscriber"), may.watches),
+            (IN, ("liveliness_query", "declare_liveliness_subscriber"), full.watches),
             (OUT, ("liveliness_token",), may.watches),
         )
         found += [Rule(name, flow, messages, tuple(sorted(keys))) for flow, messages, keys in rows if keys]
