@@ -104,7 +104,9 @@ def install_parts(folder: Path) -> None:
     about = folder / "parts-1.0.dist-info"
     about.mkdir()
     (about / "METADATA").write_text("Metadata-Version: 2.1\nName: parts\nVersion: 1.0\n")
-    rows = "".join(f"{name} = parts:{name}\n" for name in ("good", "pair", "dies", "mute", "slow", "deaf", "once", "loops"))
+    rows = "".join(
+        f"{name} = parts:{name}\n" for name in ("good", "pair", "dies", "mute", "slow", "deaf", "once", "loops")
+    )
     (about / "entry_points.txt").write_text(f"[cocoro.components]\n{rows}")
 
 

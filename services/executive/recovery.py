@@ -1,7 +1,7 @@
 """What becomes of a running task when a service dies or contact with it is lost: the policies, and the waiting.
 
-The robot stands, arm and hand hold what they hold, until the service is back; then the interrupted step begins anew from
-where that is safe. A network link that is cut looks the same from here: the tokens of all services beyond it drop.
+The robot stands, arm and hand hold what they hold, until the service is back; then the interrupted step begins anew
+from where that is safe. A network link that is cut looks the same from here: the tokens of all services beyond it drop.
 """
 
 from __future__ import annotations
@@ -129,13 +129,14 @@ class Recovery:
             self._away -= 1
 
     async def cut_off(self, within_s: float) -> bool:
-        """Wait until all services are heard again; whether any was lost shortly before or within this time that is not
-        on this machine, as far as is known."""
+        """Whether a service is not heard that is not on this machine, as far as is known, now or after this time. If
+        so, returns when all are heard again."""
         await asyncio.sleep(within_s)
-        cut = any(not self._node.contact.lives(service) for service in self._unheard.keys() - self._dead)
+        if all(self._node.contact.lives(service) for service in self._unheard.keys() - self._dead):
+            return False
         while self._unheard:  # noqa: ASYNC110 # ended by `_wait`
             await asyncio.sleep(LOOK_S)
-        return cut
+        return True
 
     def lost(self, service: str) -> None:
         """A needed service's token dropped."""
