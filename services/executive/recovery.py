@@ -115,8 +115,16 @@ class Recovery:
             back = "they are" if many else "it is"
             return f"waiting for {names}, which died; {back} back in a moment"
         if self._unheard:
-            return next(iter(self._unheard.values()))
+            return self._why
         return "going on in a moment" if self._skills.paused else ""
+
+    @property
+    def _why(self) -> str:
+        """What is known of the services that are not heard: the same of all, or of the first."""
+        whys = list(self._unheard.values())
+        if all(why == f"lost contact with {service}" for service, why in self._unheard.items()):
+            return f"lost contact with {', '.join(sorted(self._unheard))}"
+        return whys[0]
 
     @contextmanager
     def away(self) -> Iterator[None]:
@@ -208,7 +216,7 @@ class Recovery:
                 elif service not in self._dead and contact.dead(service):
                     self._note(service, f"{service} died")
             if self._unheard and self._over():
-                self._end(f"not_alive: {next(iter(self._unheard.values()))}")
+                self._end(f"not_alive: {self._why}")
                 return
             ready = not self._unheard and not self._away
             if ready and (not self._skills.paused or self._skills.settled(SETTLE_S) or self._over()):
