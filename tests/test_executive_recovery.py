@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import takewhile
 from pathlib import Path
 
 import pytest
@@ -18,9 +19,10 @@ from deploy.contact import ProcessContact
 from deploy.processes import hardware
 from deploy.rundir import RunDir
 from services.executive.askers import asker_key
-from services.executive.recovery import policy, strictest
+from services.executive.recovery import Resume, policy, strictest
 
 SERVICES = (*hardware(), "perception", "planning")
+PAGE = Path(__file__).parents[1] / "docs/faults.md"
 
 
 class Processes:
@@ -68,22 +70,34 @@ class Strangers(Action, frozen=True, tag="strangers"):
     """A third party's."""
 
 
-@pytest.mark.parametrize(
-    ("service", "name", "resume"),
-    [
-        ("perception", "search", "again"), ("planning", "search", "again"), ("planning", "explore", "again"),
-        ("perception", "approach", "find"), ("planning", "go-to", "find"), ("base", "follow", "find"),
-        ("perception", "reach", "approach"), ("planning", "reach", "approach"),
-        ("planning", "grasp", "again"), ("perception", "lift", "again"),
-        ("planning", "carry", "holding"), ("planning", "place", "holding"), ("hand", "place", "holding"),
-        ("perception", "place", "on"), ("kinect", "place", "on"),
-        ("planning", "babble-arm", "never"), ("planning", "touch", "never"), ("perception", "touch", "again"),
-    ],
-)  # fmt: skip
-def test_the_policy_of_a_service_and_an_action(service: str, name: str, resume: str) -> None:
-    fields = {"place_m": (0.0, 0.0), "distance_m": 0.5, "first": 0, "count": 1}
-    known = {key: value for key, value in fields.items() if key in ACTIONS.kind(name).__struct_fields__}
-    assert policy(service, action(name, "red_can", **known)) == resume
+WORDS: dict[str, Resume] = {
+    "begins anew": "again", "finds the object first": "find", "finds and approaches it first": "approach",
+    "if the hand holds something": "holding", "goes on meanwhile": "on", "fails at once": "never",
+}  # fmt: skip
+FIELDS = {"place_m": (0.0, 0.0), "distance_m": 0.5, "first": 0, "count": 1}
+
+
+def made(name: str) -> Action:
+    return action(name, "red_can", **{k: v for k, v in FIELDS.items() if k in ACTIONS.kind(name).__struct_fields__})
+
+
+def test_the_page_tells_the_policy_of_every_service_and_action() -> None:
+    lines = PAGE.read_text().splitlines()
+    head = next(number for number, line in enumerate(lines) if line.startswith("| action | perception"))
+    columns = [cell.split(", ") for cell in _cells(lines[head])[1:]]
+    assert {service for column in columns for service in column} == set(SERVICES)
+    told = set()
+    for line in takewhile(lambda line: line.startswith("|"), lines[head + 2 :]):
+        names, *rules = _cells(line)
+        for name in names.split(", "):
+            told.add(name)
+            for column, rule in zip(columns, rules, strict=True):
+                assert {policy(service, made(name)) for service in column} == {WORDS[rule]}, (name, column)
+    assert told == {*ACTIONS.own} - {"idle"}
+
+
+def _cells(line: str) -> list[str]:
+    return [cell.strip() for cell in line.strip("|").split("|")]
 
 
 def test_of_several_lost_services_the_strictest_decides_and_of_a_strangers_action_nothing_is_known() -> None:
@@ -204,6 +218,31 @@ def test_one_that_hangs_and_is_killed_has_the_time_of_a_restart_from_then_on(pro
             await it.service.advance(5.0)
             processes.restart(it, "perception")
             assert (await it.outcome()).outcome == "done"
+
+    scenario()
+
+
+@pytest.mark.parametrize("ready_after_s", [25.0, None])
+def test_a_new_process_that_is_slow_to_start_has_three_times_as_long(
+    ready_after_s: float | None, processes: Processes
+) -> None:
+    @in_virtual_time
+    async def scenario() -> None:
+        async with robot(contact=processes.contact) as it:
+            it.script = {"search": ["never", "done"]}
+            await it.begin()
+            it.holding = True
+            await it.phase("search")
+            await processes.kill(it, "perception")
+            path = processes.run_dir.path / "claims" / "perception"
+            processes.start("perception")
+            path.write_text('{"name": "perception", "pid": 1}')  # another process, which lives
+            if ready_after_s is not None:
+                await it.service.advance(ready_after_s)
+                it.service.others_live("perception")
+            state = await it.outcome()
+            assert state.reason == ("" if ready_after_s is not None else "not_alive: perception died")
+            assert ready_after_s is not None or state.elapsed_s > 30.0
 
     scenario()
 

@@ -41,6 +41,8 @@ LOOK_S = 0.02
 SETTLE_S = 0.5
 """Time for which a planner must say that it could move before a task goes on. A new planner needs half of it to feel
 what the hand holds."""
+STARTING = 3
+"""For a service whose new process is there, but not ready yet, it waits so many times as long."""
 STANDING_CLOCK = 3
 """A wait is at most so many times as long by the machine's clock as by the robot's, which may stand."""
 
@@ -196,12 +198,15 @@ class Recovery:
         self._began_ns, self._began_s = self._node.now_ns(), asyncio.get_running_loop().time()
 
     def _over(self) -> bool:
-        """Whether it was waited for long enough: by the robot's time, for a starved machine restarts slowly."""
+        """Whether it was waited for long enough: by the robot's time, for a starved machine is slow."""
+        dead = self._unheard.keys() & self._dead
         wait_s = self._config.contact_s
+        if dead and all(self._node.contact.starting(service) for service in dead):
+            wait_s *= STARTING
         if asyncio.get_running_loop().time() - self._began_s >= STANDING_CLOCK * wait_s:
             return True
         # Where a simulator makes the time, a dead part of it means that the world has ended.
-        gone = self._node.clock.stands and bool(self._unheard.keys() & self._dead)
+        gone = self._node.clock.stands and bool(dead)
         return gone or self._node.now_ns() - self._began_ns >= wait_s * NS
 
     async def _wait(self) -> None:
