@@ -27,7 +27,7 @@ from bench.site_lab import BRAIN, FRAMES, Lab, lab
 from bench.trials import Runs, number_of, sized
 from cocoro import topics
 from cocoro.clock import NS
-from cocoro.errors import ConfigError
+from cocoro.errors import CocoroError, ConfigError
 from cocoro.messages import TaskState
 from cocoro.node import Node
 from deploy.rundir import Target
@@ -93,9 +93,15 @@ class _Watch:
                 await self._news.wait()
         return self._states[-1]
 
-    async def moment(self, phase: str, rng: random.Random) -> str:
-        """Wait until a random moment of a phase; returns the phase that it really is then."""
-        await self.until(lambda state: state.phase == phase)
+    async def moment(self, phase: str, rng: random.Random, fetching: asyncio.Future[tuple[int, str, float]]) -> str:
+        """Wait until a random moment of a phase; returns the phase that it really is then. Raises CocoroError when the
+        command ends before."""
+        came = asyncio.ensure_future(self.until(lambda state: state.phase == phase))
+        await asyncio.wait((came, fetching), return_when=asyncio.FIRST_COMPLETED)
+        if not came.done():
+            came.cancel()
+            raise CocoroError(fetching.result()[1].strip())
+        came.result()
         await asyncio.sleep(rng.uniform(0.0, PHASES[phase]))
         self._blow_ns = time.monotonic_ns()
         return self._states[-1].phase
@@ -122,7 +128,7 @@ async def _local(number: int, how: str, rng: random.Random) -> Trial:
         async with robot_up(cocoro, "sim", "paper", Path(name), *sized_frames) as robot:
             watch = _Watch(robot.node, Path(name) / "motion")
             fetching = asyncio.create_task(asyncio.to_thread(cocoro, "fetch", LABEL))
-            phase = await watch.moment(phase, rng)
+            phase = await watch.moment(phase, rng, fetching)
             target = Target(cocoro.run_dir.path / "claims" / victim)
             target.signal(signal.SIGKILL if how == "kill" else signal.SIGSTOP)
             target.close()
@@ -137,7 +143,7 @@ async def _cut(site: Lab, motion: Path, phase: str, rng: random.Random) -> Trial
         fetching = asyncio.create_task(
             asyncio.to_thread(site.command, site.desk, "fetch", LABEL, *site.as_person("ada"))
         )
-        phase = await watch.moment(phase, rng)
+        phase = await watch.moment(phase, rng, fetching)
         site.network.cut(BRAIN, for_s=CUT_S)
         trial = await watch.result("cut", phase, CUT_S)
         code, said, _ = await fetching
@@ -168,8 +174,11 @@ def measure(chosen: argparse.Namespace, report: Report) -> None:
                         trial = asyncio.run(_cut(site, motion, [*PHASES][number % len(PHASES)], rng))
             else:
                 trial = asyncio.run(_local(number, chosen.how, rng))
-        except TimeoutError:
-            report.notes.append(f"trial {number}: the task did not come to the phase, or to its end")
+        except (TimeoutError, CocoroError) as error:
+            report.notes.append(
+                f"trial {number} is none: {error or 'the task did not come to the phase, or to its end'}"
+            )
+            report.say(report.notes[-1])
             continue
         runs.add(trial.well, f"{number}: {trial.line}", [str(trial.truth)])
         stood.append(trial.stand_s)
