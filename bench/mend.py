@@ -3,8 +3,8 @@
 Each trial starts a robot of real processes and hits it once, in the phases of a fetch in turn, at a random moment of
 the phase. The fetch must end `done` with the can held, nothing else touched, by the simulator's truth; the body must
 stand 0.3 s after the blow and until the service or the link is back. `--how kill`: SIGKILL to perception and planning
-in turn. `stop`: SIGSTOP; the supervisor kills what hangs. `cut`: the link between body and brain of a site of three
-hosts, for 5 s; needs root, for network namespaces.
+in turn, with `--profile sim-wire` to base and servos. `stop`: SIGSTOP; the supervisor kills what hangs. `cut`: the link
+between body and brain of a site of three hosts, for 5 s; needs root, for network namespaces.
 """
 
 from __future__ import annotations
@@ -39,7 +39,8 @@ from sim.random_scene import find_scene
 LABEL = "red_can"
 PHASES = {"search": 0.6, "approach": 2.5, "reach": 0.8, "grasp": 0.3, "lift": 0.8, "hold": 2.0}
 """The phases of a fetch, and the latest moment in each for a blow, s of the machine."""
-VICTIMS = ("perception", "planning")
+VICTIMS = {"sim": ("perception", "planning"), "sim-wire": ("base", "arm")}
+"""By profile; the process of 'arm' drives all servos. The simulator is not among them: the world ends with it."""
 CUT_S = 5.0
 PATIENCE_S = 180.0
 
@@ -120,12 +121,12 @@ class _Watch:
         return Trial(what, phase, state, self._judge.result(), round(stand_s, 4), tuple(kept))
 
 
-async def _local(number: int, how: str, rng: random.Random) -> Trial:
+async def _local(number: int, how: str, profile: str, rng: random.Random) -> Trial:
     phase = [*PHASES][number % len(PHASES)]
-    victim = VICTIMS[(number // len(PHASES)) % len(VICTIMS)]
+    victim = VICTIMS[profile][(number // len(PHASES)) % len(VICTIMS[profile])]
     sized_frames = [f"service.sim.{name}={value}" for name, value in FRAMES.items()]
     with operator() as cocoro, tempfile.TemporaryDirectory(prefix="mend") as name:
-        async with robot_up(cocoro, "sim", "paper", Path(name), *sized_frames) as robot:
+        async with robot_up(cocoro, profile, "paper", Path(name), *sized_frames) as robot:
             watch = _Watch(robot.node, Path(name) / "motion")
             fetching = asyncio.create_task(asyncio.to_thread(cocoro, "fetch", LABEL))
             phase = await watch.moment(phase, rng, fetching)
@@ -155,6 +156,8 @@ async def _cut(site: Lab, motion: Path, phase: str, rng: random.Random) -> Trial
 def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--count", type=number_of, help="trials, each with a robot that is started for it (12)")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--first", type=int, default=0, help="the number of the first trial")
+    parser.add_argument("--profile", choices=VICTIMS, default="sim", help="of the robot (sim)")
     parser.add_argument("--how", choices=["kill", "stop", "cut"], default="kill", help="the blow (kill)")
 
 
@@ -162,7 +165,7 @@ def measure(chosen: argparse.Namespace, report: Report) -> None:
     if chosen.how == "cut" and (why := obstacle()):
         raise ConfigError(f"there can be no network of hosts here: {why}")
     runs, stood, took = Runs(report), [], []
-    for number in range(sized(chosen, chosen.count, 12, 1)):
+    for number in range(chosen.first, chosen.first + sized(chosen, chosen.count, 12, 1)):
         rng = random.Random(f"mend/{chosen.seed}/{number}")
         try:
             if chosen.how == "cut":
@@ -173,7 +176,7 @@ def measure(chosen: argparse.Namespace, report: Report) -> None:
                         site.up()
                         trial = asyncio.run(_cut(site, motion, [*PHASES][number % len(PHASES)], rng))
             else:
-                trial = asyncio.run(_local(number, chosen.how, rng))
+                trial = asyncio.run(_local(number, chosen.how, chosen.profile, rng))
         except (TimeoutError, CocoroError) as error:
             report.notes.append(
                 f"trial {number} is none: {error or 'the task did not come to the phase, or to its end'}"
