@@ -66,6 +66,7 @@ ENTRIES: dict[str, Entry] = {
     "hardware-faults": Entry("hardware_faults"),
     "idle": Entry("idle"),
     "installs": Entry("installs"),
+    "mend": Entry("mend"),
     "network": Entry("network"),
     "pursuit": Entry("pursuit"),
     "readme": Entry("readme"),

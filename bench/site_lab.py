@@ -13,8 +13,8 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
+from contextlib import asynccontextmanager, contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -159,13 +159,19 @@ class Lab:
 
     # --- what happens -----------------------------------------------------------------------------
 
-    async def fetch(self, label: str = "red_can") -> Fetched:
-        """The operator fetches an object; judged a while after the end, so that a slipping can counts as lost."""
-        judge = Judge(find_scene("paper", 0, label), label)
+    @asynccontextmanager
+    async def observer(self) -> AsyncIterator[Node]:
+        """A participant of the body's private mesh, past the network."""
         async with (
             await ZenohBus.open(self.run_dir.join_as("bench")) as bus,
             Node("bench", bus, FollowedClock(), Robot.load(), robot_name=ROBOT) as node,
         ):
+            yield node
+
+    async def fetch(self, label: str = "red_can") -> Fetched:
+        """The operator fetches an object; judged a while after the end, so that a slipping can counts as lost."""
+        judge = Judge(find_scene("paper", 0, label), label)
+        async with self.observer() as node:
             node.on(topics.TRUTH, judge.feed)
             code, said, seconds = await asyncio.to_thread(
                 self.command, self.desk, "fetch", label, *self.as_person("ada")

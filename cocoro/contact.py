@@ -23,6 +23,10 @@ class Contact:
         """Whether the process that was this service is known to live, so that only the contact with it is lost."""
         return False
 
+    def starting(self, service: str) -> bool:
+        """Whether a successor of the dead process that was this service is known to be starting."""
+        return False
+
     async def lost(self, service: str) -> str:
         """A service's token dropped. Returns what is known of it, in words."""
         return f"lost contact with {service}"

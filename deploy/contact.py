@@ -120,6 +120,14 @@ class ProcessContact(Contact):
     def lives(self, service: str) -> bool:
         return service in self._met and not self.dead(service)
 
+    def starting(self, service: str) -> bool:
+        if self._claimant is None or not self.dead(service):
+            return False
+        try:
+            return bool(self._claimant(service))
+        except OSError:
+            return False
+
     async def lost(self, service: str) -> str:
         """The reason for which the contact was lost, as the base class says it; returns within `CLAIM_S`."""
         asleep = "" if self._sleep_detector is None else self._sleep_detector.look()

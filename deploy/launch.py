@@ -84,15 +84,22 @@ def watch_parent(fd: int) -> None:
 
 
 def run(
-    process: str, run_dir: RunDir, profile: dict[str, Any], profile_name: str, *, raise_crashes: bool = False
+    process: str,
+    run_dir: RunDir,
+    profile: dict[str, Any],
+    profile_name: str,
+    *,
+    raise_crashes: bool = False,
+    beat_fd: int | None = None,
 ) -> int:
     """Runs a process until a signal ends it; returns the exit code. Logging must be set up. A crash is logged with its
-    traceback, or raised (`raise_crashes`) for a caller that reports it."""
+    traceback, or raised (`raise_crashes`) for a caller that reports it. A supervisor sees by `beat_fd` that the process
+    does not hang (`deploy.heartbeat`)."""
     log = logging.getLogger(f"cocoro.{process}")
     keep_freed()
     try:
         with asyncio.Runner(loop_factory=LendingLoop) as runner:
-            return runner.run(_main(process, run_dir, profile, profile_name))
+            return runner.run(_main(process, run_dir, profile, profile_name, beat_fd))
     except CocoroError as error:
         log.error("%s", error)
         return REFUSED if isinstance(error, RefusedError) else MISCONFIGURED
@@ -116,7 +123,9 @@ def run(
         return CRASHED
 
 
-async def _main(process: str, run_dir: RunDir, data: dict[str, Any], profile_name: str) -> int:
+async def _main(
+    process: str, run_dir: RunDir, data: dict[str, Any], profile_name: str, beat_fd: int | None = None
+) -> int:
     from cocoro.bus.zenoh import ZenohBus
     from cocoro.clock import FollowedClock
     from cocoro.component import load as load_component
@@ -125,6 +134,7 @@ async def _main(process: str, run_dir: RunDir, data: dict[str, Any], profile_nam
     from deploy import processes, profiles, robot_time
     from deploy.contact import ProcessContact, SleepDetector
     from deploy.delayed import DelayedNode
+    from deploy.heartbeat import beat
 
     profile = profiles.from_data(data, profile_name)
     row = processes.named(process)
@@ -159,6 +169,8 @@ async def _main(process: str, run_dir: RunDir, data: dict[str, Any], profile_nam
             ) as node,
         ):
             log.info("joined the mesh at %s", bus.where)
+            if beat_fd is not None:
+                node.spawn(beat(beat_fd))
             if await _until(stop, component.run(node, config)):
                 log.info("ended by a signal")
                 return OK
@@ -209,6 +221,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("process")
     parser.add_argument("--run-dir", type=Path, required=True, help="the robot's folder, with its profile.json")
     parser.add_argument("--parent-fd", type=int, help="a pipe that closes when the supervisor dies")
+    parser.add_argument("--beat-fd", type=int, help="a file in which the event loop counts, so that a hang is seen")
     options = parser.parse_args(arguments)
     faulthandler.enable()
     set_up_logging(options.process)
@@ -217,7 +230,7 @@ def main(arguments: list[str] | None = None) -> int:
     folder: Path = options.run_dir
     run_dir = RunDir(folder.name, folder.parent)
     profile = run_dir.resolved()
-    return run(options.process, run_dir, profile, profile.get("name", ""))
+    return run(options.process, run_dir, profile, profile.get("name", ""), beat_fd=options.beat_fd)
 
 
 if __name__ == "__main__":

@@ -15,6 +15,7 @@ from cocoro import child
 from cocoro.component import Component
 from cocoro.errors import ConfigError
 from deploy.contact import RECOVERY_S, SleepDetector
+from deploy.heartbeat import Pulse
 from deploy.launch import CRASHED, MISCONFIGURED, REFUSED
 from deploy.processes import BACKOFF_LIMIT_S, SETTLED_S
 from deploy.rundir import RunDir
@@ -65,6 +66,7 @@ class SupervisedProcess:
         self._unheard = False
         """Whether contact with the living process is lost, as reported."""
         self._process: subprocess.Popen[bytes] | None = None
+        self._pulse: Pulse | None = None
         self._exit: asyncio.Future[int] = asyncio.get_running_loop().create_future()
         self._started_s = 0.0
         self._stopping = False
@@ -147,6 +149,16 @@ class SupervisedProcess:
             self._ready.clear()
         self._report_contact(ready)
 
+    def feel_pulse(self, passed_s: float, grace_s: float) -> None:
+        """Kill the process when its event loop has not run for `grace_s`, though it could; `keep` then restarts it. A
+        process that is not ready yet has its time for that. `passed_s` is the time since the last call."""
+        if self._pulse is None or self.pid is None or not self._was_ready or self._stopping:
+            return
+        self._pulse.feel(self.pid, passed_s)
+        if self._pulse.still_s >= grace_s:
+            self._report(f"{self.row.name} hangs: its event loop has not run for {self._pulse.still_s:.0f} s; killed")
+            self._signal(signal.SIGKILL)
+
     def _report_contact(self, ready: bool) -> None:
         """Report that contact with the process, which lives, is lost, or that it is back. After a sleep of the
         supervisor itself, a loss is reported only when it lasts."""
@@ -179,6 +191,7 @@ class SupervisedProcess:
         self._was_ready = False
         self._exit = loop.create_future()
         self._started_s = time.monotonic()
+        pulse = self._pulse = Pulse()
         with self._log() as log:
             self._process = child.start(
                 "deploy.launch",
@@ -187,10 +200,12 @@ class SupervisedProcess:
                 str(self._run_dir.path),
                 "--parent-fd",
                 str(self._parent_fd),
+                "--beat-fd",
+                str(pulse.fd),
                 stdout=log,
                 stderr=log,
                 env=ENVIRONMENT | os.environ,
-                pass_fds=(self._parent_fd,),
+                pass_fds=(self._parent_fd, pulse.fd),
                 start_new_session=True,  # so that only the supervisor gets Ctrl-C of a terminal
             )
         pid_fd = os.pidfd_open(self._process.pid)
@@ -210,6 +225,9 @@ class SupervisedProcess:
         with suppress(ProcessLookupError, PermissionError):
             os.killpg(process.pid, signal.SIGKILL)  # its own children; the group's number is valid until it is reaped
         self._exit.set_result(process.wait())
+        if self._pulse is not None:
+            self._pulse.close()
+            self._pulse = None
         self._alive.clear()
         self._ready.clear()
         self._was_ready = False

@@ -14,6 +14,7 @@ import logging
 import os
 import signal
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -26,7 +27,7 @@ from cocoro.bus.zenoh import ZenohBus
 from cocoro.errors import CocoroError, ConfigError, RefusedError
 from cocoro.keys import alive_key, service_of
 from cocoro.stop.record import latch_dir, prepare
-from deploy import robot_time, service_manager
+from deploy import heartbeat, robot_time, service_manager
 from deploy.contact import SleepDetector
 from deploy.launch import CRASHED, Line
 from deploy.processes import shared_bytes, stoppable
@@ -69,6 +70,7 @@ class Supervisor:
         self._unshared = ""
         """Why not all frames fit into shared memory, as found before the processes were started."""
         self._sleep_detector = SleepDetector(self._report)
+        self._grace_s = heartbeat.grace_s()
 
     async def run(self) -> int:
         """Start everything, wait for SIGINT or SIGTERM, stop everything. Returns the exit code.
@@ -155,10 +157,22 @@ class Supervisor:
         async with asyncio.TaskGroup() as group:
             keeping = [group.create_task(child.keep()) for child in self._children]
             keeping.append(group.create_task(service_manager.keep_watchdog(self._works)))
+            if self._grace_s:
+                keeping.append(group.create_task(self._feel_pulses()))
             await self._stop.wait()
             for task in keeping:
                 task.cancel()
         return STOPPED
+
+    async def _feel_pulses(self) -> None:
+        """Kill processes that hang, for ever."""
+        before_s = time.monotonic()
+        while True:
+            await asyncio.sleep(heartbeat.LOOK_S)
+            now_s = time.monotonic()
+            for child in self._children:
+                child.feel_pulse(now_s - before_s, self._grace_s)
+            before_s = now_s
 
     def _works(self) -> bool:
         """Whether this supervisor has noticed the end of every process that has ended."""

@@ -31,6 +31,7 @@ mute = Component(name="mute", module="parts.mute", services=("mute",), doc="Neve
 slow = Component(name="slow", module="parts.mute", services=("slow",), doc="Takes for ever to get ready.")
 deaf = Component(name="deaf", module="parts.deaf", services=("deaf",), doc="Does not end when told.", stop_s=0.3)
 planning = Component(name="planning", module="parts.good", doc="Takes a taken name.")
+loops = Component(name="loops", module="parts.loops", doc="Loops for ever at SIGUSR1.", backoff_s=0.01)
 once = Component(name="once", module="parts.good", services=("once",), doc="Is not restarted.", restart="never")
 """
 GOOD = """
@@ -77,6 +78,20 @@ async def run(node, config):
             pass
 implementation = Implementation(Config, run)
 """
+LOOPS = """
+import asyncio, signal, msgspec
+from cocoro.component import Implementation
+class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    pass
+def for_ever():
+    while True:
+        pass
+async def run(node, config):
+    asyncio.get_running_loop().add_signal_handler(signal.SIGUSR1, for_ever)
+    node.ready()
+    await asyncio.Event().wait()
+implementation = Implementation(Config, run)
+"""
 
 
 def install_parts(folder: Path) -> None:
@@ -84,12 +99,14 @@ def install_parts(folder: Path) -> None:
     package = folder / "parts"
     package.mkdir()
     (package / "__init__.py").write_text(PARTS)
-    for name, text in {"good": GOOD, "dies": DIES, "mute": MUTE, "deaf": DEAF}.items():
+    for name, text in {"good": GOOD, "dies": DIES, "mute": MUTE, "deaf": DEAF, "loops": LOOPS}.items():
         (package / f"{name}.py").write_text(text)
     about = folder / "parts-1.0.dist-info"
     about.mkdir()
     (about / "METADATA").write_text("Metadata-Version: 2.1\nName: parts\nVersion: 1.0\n")
-    rows = "".join(f"{name} = parts:{name}\n" for name in ("good", "pair", "dies", "mute", "slow", "deaf", "once"))
+    rows = "".join(
+        f"{name} = parts:{name}\n" for name in ("good", "pair", "dies", "mute", "slow", "deaf", "once", "loops")
+    )
     (about / "entry_points.txt").write_text(f"[cocoro.components]\n{rows}")
 
 

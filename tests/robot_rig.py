@@ -58,14 +58,17 @@ class RobotRig:
         name: str = "",
         mesh: LocalMesh | None = None,
         clock_of: Callable[[str], Clock] | None = None,
+        bus_of: Callable[[LocalMesh, str, str], NotedBus] | None = None,
     ) -> None:
         """`settings`: by service; frames are small unless the settings of 'sim' are given. `name` and `mesh`: for
-        several robots on one mesh. `clock_of`: returns the clock of each service, in place of virtual time."""
+        several robots on one mesh. `clock_of`: returns the clock of each service, in place of virtual time.
+        `bus_of`: makes the bus of a component on a mesh, for a robot's name."""
         self._settings = {"sim": SMALL_FRAMES} | dict(settings or {})
         self._latency_s = latency_s or {}
         self._record_steps = record_steps
         self._clock = VirtualClock()
         self._clock_of = clock_of or (lambda _: self._clock)
+        self._bus_of = bus_of or (lambda mesh, robot, _: NotedBus(mesh, robot))
         self._robot = Robot.load()
         self._robot.name = name or self._robot.name
         self.mesh = mesh or LocalMesh()
@@ -100,7 +103,7 @@ class RobotRig:
         component = load(named(name))
         needed = {"needed": needs(name)} if name == "executive" else {}
         config = msgspec.convert(needed | dict(self._settings.get(name, {})), component.config)
-        bus = NotedBus(self.mesh, self._robot.name)
+        bus = self._bus_of(self.mesh, self._robot.name, name)
         node = DelayedNode(
             name, bus, self._clock_of(name), self._robot,
             latency_s=self._latency_s.get(name, 0.0), record_steps=self._record_steps,

@@ -234,7 +234,8 @@ def test_only_of_one_that_is_known_to_be_dead_it_is_said_that_it_died(
             state = await it.outcome()
             assert (state.outcome, state.reason) == ("failed", reason)
             waited_s = (state.stamp_ns - fault_ns) / NS
-            assert waited_s < 0.7 if "died" in reason else 10.0 <= waited_s < 10.7
+            longest_s = 30.0 if fate == "is begun anew" else 10.0  # while another process starts
+            assert longest_s <= waited_s < longest_s + 0.7
             assert (await it.ask()).text == refusal
             await it.service.advance(20.0)
             assert said == (["this machine was asleep or starved for 15 s"] if "all" in fate else [])

@@ -39,10 +39,10 @@ class Askers:
             self._here.discard(asker)
             self._gone(asker)
 
-    async def present(self, asker: str) -> bool:
-        """Whether an asker is there; waits `ARRIVAL_S` for one that is not known yet."""
+    async def present(self, asker: str, patience_s: float = ARRIVAL_S) -> bool:
+        """Whether an asker is there; waits so long for one that is not known now."""
         with suppress(TimeoutError):
-            async with asyncio.timeout(ARRIVAL_S):
+            async with asyncio.timeout(patience_s):
                 while asker not in self._here:
                     self._news.clear()
                     await self._news.wait()

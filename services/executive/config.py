@@ -32,4 +32,6 @@ class ExecutiveConfig(Limits, frozen=True, forbid_unknown_fields=True):
     planner_silence_s: Positive = 10.0
     """After so long without news of the planner, while this process runs, the task fails."""
     contact_s: Positive = 10.0
-    """After so long without contact to a needed service whose process lives, the task fails."""
+    """After so long without a needed service that died, or contact with which was lost, the task fails."""
+    resumptions: Annotated[int, Meta(ge=0)] = 3
+    """How often a task goes on after a needed service was lost (see `services.executive.recovery`)."""

@@ -27,23 +27,26 @@ from cocoro.messages import (
     TaskRequest,
     TaskState,
 )
-from cocoro.messages.actions import TASK_GROUP, Idle
+from cocoro.messages.actions import TASK_GROUP, Action
 from cocoro.node import Node
 from cocoro.objects import Catalogue
 from cocoro.tasks import Task, TaskFailedError
 from services.executive.askers import Askers
 from services.executive.config import ExecutiveConfig
 from services.executive.estop import Estop
+from services.executive.recovery import Recovery
 from services.executive.skills import PlannerSkills
 from services.executive.tasks import TASKS
 
 Ending = tuple[Outcome, str | Awaitable[str]]
 """A task's outcome and its reason, which may still have to be found out."""
-LOOK_S = 0.02
-"""Time between two looks whether a service that is not heard has died."""
 GONE = "the command or program that asked for it has ended, or is not heard any more"
 REMEMBERED = 64
 """Number of ended tasks that the executive remembers."""
+TOGETHER_S = 0.3
+"""A link that is cut ends all contacts beyond it within this time."""
+BACK_S = 3.0
+"""Time after the return of the services in which an asker who was cut off with them must be back."""
 _CLOCK_STANDS_S = 1.0
 """A clock that takes longer than this for 20 ms stands still."""
 
@@ -54,8 +57,6 @@ class Executive:
         self._config = config
         self._catalogue = catalogue
         self._alive: set[str] = set()
-        self._unheard: dict[str, str] = {}
-        """By needed service that the task waits for: what is known of it."""
         self._unreadable: dict[str, str] = {}
         """By service: the input that it cannot read, and the reason."""
         self._running: asyncio.Task[Any] | None = None
@@ -68,7 +69,9 @@ class Executive:
         self._over: deque[TaskState] = deque(maxlen=REMEMBERED)
         self._base = node.latest(topics.BASE_STATE)
         self._publisher = node.publisher(topics.TASK)
-        self._skills = PlannerSkills(node, config, catalogue, self._enter_phase)
+        self._skills = PlannerSkills(node, config, catalogue, self._enter_phase, self._on_step)
+        self._recovery: Recovery | None = None
+        """Of the running task."""
         self._askers = Askers(node, self._on_asker_gone)
         self._estop = Estop(node, config.latch_hz, self._on_latch)
         node.watch_alive(self._on_alive)
@@ -108,7 +111,10 @@ class Executive:
         now_ns = self._node.now_ns()
         task_id = f"{task.name}-{now_ns}-{self._count}"
         self.state = TaskState(task_id=task_id, task=task.name, label=task.target, phase="start", started_ns=now_ns)
-        self._skills.measures = self.state.measures
+        self._skills.begin_task(task_id, self.state.measures)
+        self._recovery = Recovery(
+            self._node, self._config, self._skills, self._alive, lambda reason: self._end("failed", reason)
+        )
         self._asker = request.asker
         self._ended = asyncio.get_running_loop().create_future()
         timeout_s = request.timeout_s or task.limit_s(self._config)
@@ -188,7 +194,6 @@ class Executive:
     async def _carry_out(self, task: Task, timeout_s: float, ended: asyncio.Future[Ending]) -> None:
         """Run a task from its acceptance to its outcome. An end from outside sets `ended` and never cancels this
         coroutine, so that every task comes to its outcome."""
-        self._skills.want(Idle(), self.state.task_id)
         work = asyncio.ensure_future(task.run(self._skills))
         timer = asyncio.ensure_future(self._node.sleep(timeout_s))
         outcome: Outcome
@@ -208,7 +213,9 @@ class Executive:
         finally:
             work.cancel()
             timer.cancel()
-            self._skills.want(Idle(), self.state.task_id)
+            if self._recovery is not None:
+                self._recovery.close()
+            self._skills.stop(self.state.task_id)
         await self._come_to_rest()
         self._finish(outcome, reason if isinstance(reason, str) else await reason)
 
@@ -253,7 +260,7 @@ class Executive:
 
     def _end(self, outcome: Outcome, reason: str | Callable[[], Awaitable[str]]) -> None:
         """End the running task from outside. `reason` may be a function that begins to find out the reason."""
-        if self._running is not None and self._ended is not None and not self._ended.done():
+        if self._runs and self._ended is not None:
             self._ended.set_result((outcome, reason if isinstance(reason, str) else reason()))
 
     def _what(self) -> str:
@@ -267,34 +274,32 @@ class Executive:
             return
         self._alive.discard(service)
         self._unreadable.pop(service, None)
-        if service in self._config.needed:
-            if not self._node.contact.lives(service):
-                self._end("failed", lambda: self._node.spawn(self._lost(service)))
-            elif service not in self._unheard:
-                self._unheard[service] = f"lost contact with {service}"
-                self._skills.pause(True)
-                self._node.spawn(self._wait_for(service))
+        if service in self._config.needed and self._recovery is not None and self._runs:
+            self._recovery.lost(service)
 
-    async def _lost(self, service: str) -> str:
-        return f"not_alive: {await self._node.contact.lost(service)}"
+    @property
+    def _runs(self) -> bool:
+        """Whether a task runs and nothing has ended it yet."""
+        return self._running is not None and self._ended is not None and not self._ended.done()
 
-    async def _wait_for(self, service: str) -> None:
-        """End the task when a service with a living process is not heard again in time, or dies meanwhile. Until then
-        the robot stands. The time is that of the loop: the simulator may be what is not heard."""
-        contact, loop = self._node.contact, asyncio.get_running_loop()
-        end_s = loop.time() + self._config.contact_s
-        why = self._unheard[service] = await contact.lost(service)
-        self._node.log.warning("%s", why)
-        while service not in self._alive and contact.lives(service) and loop.time() < end_s:  # noqa: ASYNC110 # a lock
-            await asyncio.sleep(LOOK_S)
-        del self._unheard[service]
-        if not self._unheard:
-            self._skills.pause(False)
-        if service not in self._alive:
-            self._end("failed", f"not_alive: {f'{service} died' if contact.dead(service) else why}")
+    def _on_step(self, action: Action) -> None:
+        if self._recovery is not None:
+            self._recovery.step_begins(action)
 
     def _on_asker_gone(self, asker: str) -> None:
-        if asker == self._asker:
+        if asker != self._asker or not self._runs or self._recovery is None:
+            return
+        if all(self._node.contact.lives(service) for service in self._config.needed):
+            self._end("cancelled", f"asker_gone: {GONE}")
+        else:  # a link to another machine may be cut, and the asker beyond it
+            self._node.spawn(self._cancel_without(asker, self._recovery))
+
+    async def _cancel_without(self, asker: str, recovery: Recovery) -> None:
+        """Cancel the task of an asker who has gone, unless he was cut off together with services and is back soon after
+        them. The robot stands meanwhile."""
+        with recovery.away():
+            here = await recovery.cut_off(TOGETHER_S) and await self._askers.present(asker, BACK_S)
+        if not here and recovery is self._recovery:
             self._end("cancelled", f"asker_gone: {GONE}")
 
     def _on_health(self, health: Health) -> None:
@@ -315,6 +320,8 @@ class Executive:
     # --- progress ---------------------------------------------------------------------------------
 
     def _enter_phase(self, name: str) -> None:
+        if self.state.phases and self.state.phases[-1].name == name and self.state.phase == name:
+            return  # it goes on after an interruption
         self._close_phase()
         self.state.phase = name
         self.state.phases = (*self.state.phases, Phase(name=name, start_ns=self._node.now_ns()))
@@ -336,8 +343,8 @@ class Executive:
             state.elapsed_s = self._elapsed_s()
             if status is not None:
                 state.text, state.distance_m = status.why, status.distance_m
-            if waits := self._skills.waits or next(iter(self._unheard.values()), ""):
-                state.text = waits
+            waits = self._recovery.text if self._recovery is not None and self._runs else ""
+            state.text = waits or self._skills.waits or state.text
         state.stamp_ns = self._node.now_ns()
         self._publisher.put(state)
 

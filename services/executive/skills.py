@@ -8,12 +8,13 @@ from collections.abc import Callable
 from cocoro import topics
 from cocoro.clock import NS
 from cocoro.messages import Intent, PlannerStatus
-from cocoro.messages.actions import Action, Idle
+from cocoro.messages.actions import Action, Approach, Carry, Idle
 from cocoro.node import Node
 from cocoro.objects import Catalogue
 from cocoro.tasks import Limits, TaskFailedError
 from cocoro.units import Vec2, Vec3
 from services.executive.config import ExecutiveConfig
+from services.executive.tasks.steps import find
 
 LOOSE_S = 0.5
 """A hand that feels nothing for longer has lost what it held. When the arm comes to rest the claws may feel nothing for
@@ -23,21 +24,52 @@ LISTEN_S = 0.25
 """Time after which this process notes that it heard nothing of the planner. However long it really was, it counts as
 this much: a process that did not run heard nothing, whoever spoke."""
 
+LATELY_S = 1.0
+"""Age of the newest sighting up to which an object need not be found again after an interruption."""
+GRACE_S = 5.0
+"""Time after an interruption in which a planner that lacks news of something may still get it."""
+
+
+class _InterruptedError(Exception):
+    """A step was interrupted, and the task may go on."""
+
 
 class PlannerSkills:
-    """Publishes intents and waits for the planner's answers. Calls `phase(name)` at the begin of each step."""
+    """Publishes intents and waits for the planner's answers. Calls `begins(action)` at the begin of each action, and
+    `phase(name)` at that of each phase.
 
-    def __init__(self, node: Node, config: ExecutiveConfig, catalogue: Catalogue, phase: Callable[[str], None]) -> None:
+    Between `pause` and `go_on` the robot stands; then the interrupted action begins anew.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        config: ExecutiveConfig,
+        catalogue: Catalogue,
+        phase: Callable[[str], None],
+        begins: Callable[[Action], None] = lambda _: None,
+    ) -> None:
         self._node = node
         self._config = config
         self._catalogue = catalogue
         self._phase = phase
+        self._begins = begins
         self._plan = node.latest(topics.PLAN)
+        self._base = node.latest(topics.BASE_STATE)
         self._publisher = node.publisher(topics.INTENT)
         self._step = 0
         self.paused = False
-        """Whether the planner is to stand still now, whatever the task wants; it begins the wanted action anew
-        afterwards."""
+        """Whether the planner is to stand still now, whatever the task wants."""
+        self._interrupted = False
+        """Whether the present step has to begin anew."""
+        self._resume: Callable[[Action], str] = lambda _: "again"
+        self._why = ""
+        """Of the last interruption: what it means to an action (`services.executive.recovery.Resume`), and the reason
+        of a task that fails by it."""
+        self._settled_since_ns: int | None = None
+        self._went_on_s = -GRACE_S
+        self._begun_by: int | None = None
+        """The incarnation of the base, which defines the odometry frame, when the task asked for its place."""
         self.waits = ""
         """Why a task waits for the planner; empty when it does not."""
         self.intent = Intent(action=Idle())
@@ -57,7 +89,18 @@ class PlannerSkills:
         status = self.status
         if status is None or status.body_m is None:
             raise TaskFailedError("not_alive", "the planner does not say where the robot stands")
+        self._begun_by = self._frame
         return status.body_m
+
+    @property
+    def _frame(self) -> int | None:
+        return self._base.value.incarnation if self._base.value is not None else None
+
+    @property
+    def action(self) -> Action:
+        """What the task wants now."""
+        action: Action = self.intent.action
+        return action
 
     def size_m(self, label: str) -> Vec3:
         known = self._catalogue.get(label)
@@ -74,9 +117,38 @@ class PlannerSkills:
         self.intent = Intent(task_id=task_id, step=self._step, action=action)
         self._publish()
 
-    def pause(self, paused: bool) -> None:
-        self.paused = paused
+    def begin_task(self, task_id: str, measures: dict[str, float]) -> None:
+        """Forget the task before, and have the planner stand still for this one."""
+        self.measures = measures
+        self._begun_by = None
+        self.stop(task_id)
+
+    def stop(self, task_id: str) -> None:
+        """Have the planner stand still, for a task that begins or has ended."""
+        self.paused = self._interrupted = False
+        self.want(Idle(), task_id)
+
+    def pause(self) -> None:
+        """Have the planner stand still until `go_on`."""
+        self.paused, self._settled_since_ns = True, None
         self._publish()
+
+    def settled(self, seconds: float) -> bool:
+        """Whether the planner, which is to stand still, has said for so long that it could move: it has a fresh state
+        of the whole robot, which is not latched. Ask often."""
+        status, now_ns = self.status, self._node.now_ns()
+        if status is None or (status.behaviour, status.state) != (Idle.tag(), "done"):
+            self._settled_since_ns = None
+            return False
+        if self._settled_since_ns is None or now_ns < self._settled_since_ns:
+            self._settled_since_ns = now_ns
+        return now_ns - self._settled_since_ns >= seconds * NS
+
+    def go_on(self, resume: Callable[[Action], str], why: str) -> None:
+        """End a pause. The step that was interrupted begins anew, as `resume` says of its action."""
+        self._resume, self._why = resume, why
+        self.paused, self._interrupted, self._went_on_s = False, True, self.now_s()
+        self.want(Idle(), self.intent.task_id)  # until the step begins anew
 
     def _publish(self) -> None:
         wanted = self.intent
@@ -89,8 +161,13 @@ class PlannerSkills:
             self._publish()
 
     async def do(self, action: Action, *, timeout_s: float) -> PlannerStatus:
-        self._begin(action)
-        ended = await self._watch(self.now_s() + timeout_s)
+        while True:
+            self._begin(action)
+            try:
+                ended = await self._watch(self.now_s() + timeout_s)
+                break
+            except _InterruptedError:
+                await self._prepare(action)
         if ended is None:
             status = self.status
             why = status.why if status is not None else ""
@@ -100,15 +177,35 @@ class PlannerSkills:
     async def keep_doing(
         self, action: Action, *, until_s: float, watch: Callable[[PlannerStatus], None] = lambda status: None
     ) -> None:
-        self._begin(action)
-        await self._watch(until_s, watch)
+        while True:
+            self._begin(action)
+            try:
+                await self._watch(until_s, watch)
+                return
+            except _InterruptedError:
+                await self._prepare(action)
 
     def measure(self, name: str, value: float) -> None:
         self.measures[name] = round(value, 3)
 
     def _begin(self, action: Action) -> None:
+        if isinstance(action, Carry) and self._frame != self._begun_by:
+            raise TaskFailedError("not_alive", "base was restarted, so the place to carry it to is not known any more")
         self._phase(action.name)
+        self._begins(action)
         self.want(action, self.intent.task_id)
+
+    async def _prepare(self, action: Action) -> None:
+        """Do what has to be done before an interrupted action begins anew."""
+        resume, label = self._resume(action), action.target
+        if resume == "holding" and (self.status is None or not self.status.holding):
+            raise TaskFailedError(*self._why.split(": ", 1))
+        if resume in ("find", "approach"):
+            known = self.status.known if self.status is not None else ()
+            if not any(item.label == label and item.age_s <= LATELY_S for item in known):
+                await find(self, label)
+        if resume == "approach":
+            await self.do(Approach(label), timeout_s=self.limits.approach_timeout_s)
 
     async def _watch(
         self, until_s: float, watch: Callable[[PlannerStatus], None] = lambda status: None
@@ -122,6 +219,9 @@ class PlannerSkills:
                 if status.state == "done":
                     return status
                 if status.state == "failed":
+                    if status.reason == "stale" and 0 <= self.now_s() - self._went_on_s < GRACE_S:
+                        await self._node.sleep(LISTEN_S)
+                        raise _InterruptedError
                     raise TaskFailedError(status.reason, status.why)
             if self.now_s() > until_s:
                 return None
@@ -133,6 +233,14 @@ class PlannerSkills:
 
     async def watch_hold(self, seconds: float) -> None:
         self._phase("hold")
+        while True:
+            try:
+                await self._hold(seconds)
+                return
+            except _InterruptedError:  # the arm stays where it is, and the time begins anew
+                pass
+
+    async def _hold(self, seconds: float) -> None:
         end_ns = self._node.now_ns() + round(seconds * NS)
         loose_since_ns: int | None = None
         while True:
@@ -148,7 +256,18 @@ class PlannerSkills:
                 raise TaskFailedError("slipped", "the hand has lost what it held")
 
     async def _next_status(self) -> PlannerStatus:
-        """The next status. Waits for a planner that is late; raises TaskFailedError when it is late for too long."""
+        """The next status. Waits for a planner that is late; raises TaskFailedError when it is late for too long.
+        Passes over a pause, and raises _InterruptedError after it."""
+        while True:
+            status = await self._heard()
+            if self._interrupted:
+                self._interrupted = False
+                raise _InterruptedError
+            if not self.paused:
+                return status
+
+    async def _heard(self) -> PlannerStatus:
+        """The next status, in a pause, too."""
         heard_nothing_s = 0.0
         waiting = asyncio.ensure_future(self._plan.next())
         try:
@@ -160,6 +279,9 @@ class PlannerSkills:
                     timer.cancel()
                 if waiting.done():
                     return waiting.result()
+                if self.paused:  # who paused it waits for the planner
+                    heard_nothing_s, self.waits = 0.0, ""
+                    continue
                 heard_nothing_s += LISTEN_S
                 if heard_nothing_s >= self._config.planner_silence_s:
                     raise TaskFailedError("not_alive", f"nothing from the planner for {heard_nothing_s:g} s")
