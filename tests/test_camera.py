@@ -260,6 +260,7 @@ def test_one_seed_gives_one_film_another_seed_another() -> None:
 
 
 @pytest.mark.process
+@pytest.mark.sim
 def test_another_process_takes_the_same_film() -> None:
     program = (
         f"import sys; sys.path.insert(0, {__file__.rpartition('/')[0]!r}); import test_camera as t; print(*t.film(3))"

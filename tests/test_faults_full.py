@@ -172,7 +172,10 @@ def test_a_run_directory_without_inodes_takes_commands_and_no_services(shell: Sh
             pass
         status = shell("status")
         assert status.returncode == exits.DONE, said(status)
-        assert "No space left on device" in said(status)
+        assert "good     ready" in said(status), "the supervisor tells it, which is in the mesh"
+        top = shell("top", "--once")
+        assert top.returncode == exits.DONE, said(top)
+        assert "No space left on device" in said(top), "a command that joins does so as a visitor"
         run = shell("run", "once", "--profile", shell.profile("good", "once"))
         assert run.returncode == exits.USAGE
         assert said(run).splitlines()[-1].endswith("make room there, or choose another by COCORO_RUN_DIR")
