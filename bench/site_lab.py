@@ -64,6 +64,24 @@ class Fetched(NamedTuple):
         return self.code == 0 and self.truth.held and not self.truth.knocked_over and not self.truth.collisions
 
 
+def files_of(address: str, sim: Mapping[str, Any], processes: Sequence[str] = ("capture", "sim")) -> dict[str, str]:
+    """The plan and the profile, by file name."""
+    settings = "".join(f"{key} = {json.dumps(value)}\n" for key, value in sim.items())
+    persons = "".join(f'[person.{name}]\nrole = "{role}"\n' for name, role in PERSONS.items())
+    return {
+        "profile.toml": (
+            f'robot = "{ROBOT}"\nclock = "sim"\nprocesses = {json.dumps([*processes, *BRAINS])}\n'
+            f"[service.sim]\n{settings}[service.capture]\nkeep_gb = 2.0\n"
+        ),
+        place.PLAN: (
+            f'name = "lab"\n[robot.{ROBOT}]\nprofile = "profile.toml"\n'
+            f'[host.{BODY}]\nrole = "robot"\nprocesses = {json.dumps(list(processes))}\n'
+            f'listen = ["tls/{address}:{PORT}"]\n'
+            f'[host.{BRAIN}]\nrole = "brain"\nprocesses = {json.dumps(BRAINS)}\n{persons}'
+        ),
+    }
+
+
 class Lab:
     """The site. Make it with `lab`."""
 
@@ -77,20 +95,8 @@ class Lab:
         self.run_dir = RunDir(ROBOT, self.body.folder / "run")
 
     def _write(self, sim: Mapping[str, Any], processes: Sequence[str]) -> None:
-        settings = "".join(f"{key} = {json.dumps(value)}\n" for key, value in sim.items())
-        (self.plan / "profile.toml").write_text(
-            f'robot = "{ROBOT}"\nclock = "sim"\nprocesses = {json.dumps([*processes, *BRAINS])}\n'
-            f"[service.sim]\n{settings}[service.capture]\nkeep_gb = 2.0\n",
-            encoding="utf-8",
-        )
-        persons = "".join(f'[person.{name}]\nrole = "{role}"\n' for name, role in PERSONS.items())
-        (self.plan / place.PLAN).write_text(
-            f'name = "lab"\n[robot.{ROBOT}]\nprofile = "profile.toml"\n'
-            f'[host.{BODY}]\nrole = "robot"\nprocesses = {json.dumps(list(processes))}\n'
-            f'listen = ["tls/{self.body.address}:{PORT}"]\n'
-            f'[host.{BRAIN}]\nrole = "brain"\nprocesses = {json.dumps(BRAINS)}\n{persons}',
-            encoding="utf-8",
-        )
+        for name, text in files_of(self.body.address, sim, processes).items():
+            (self.plan / name).write_text(text, encoding="utf-8")
         read_profile(str(self.plan / "profile.toml"))
 
     def _issue(self) -> None:

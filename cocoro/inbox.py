@@ -28,6 +28,7 @@ class Inbox(Generic[M]):
     - messages that are malformed, of the wrong type, or larger than the topic allows;
     - commands that are older than the topic allows, and commands, states and frames that are stamped more than
       CLOCKS_APART_NS ahead of the reader's clock (events are accepted at any time, and `judge` decides on clock ticks);
+    - commands of a second publisher while the first one's are fresh: nobody obeys two masters;
     - messages out of sequence, by the rules of `cocoro.stream_checks`.
     """
 
@@ -80,10 +81,18 @@ class Inbox(Generic[M]):
             tracker = self._trackers[key] = SequenceTracker()
         seq, stamp_ns = message.seq, message.stamp_ns
         if self._expires:
-            age_ns = self._clock.now_ns() - stamp_ns
+            now_ns = self._clock.now_ns()
+            age_ns = now_ns - stamp_ns
             if not -CLOCKS_APART_NS <= age_ns <= self._max_age_ns:  # `is_fresh`, without the call: for each message
                 self.expired += age_ns > 0
                 self._refuse(key, tracker, message, _untimely(-age_ns))
+                return
+            if (
+                message.incarnation != tracker.incarnation
+                and tracker.seq >= 0
+                and is_fresh(tracker.stamp_ns, now_ns, self.topic.max_age_s)
+            ):
+                self._reject(key, f"publisher {message.incarnation:x} commands while {tracker.incarnation:x} does")
                 return
         elif stamp_ns > self._horizon_ns and (ahead_ns := self._ahead_ns(stamp_ns)) > CLOCKS_APART_NS:
             self._refuse(key, tracker, message, _untimely(ahead_ns))

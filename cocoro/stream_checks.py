@@ -2,7 +2,8 @@
 
 A message is judged by its incarnation and sequence number against those of the last accepted one of its key:
 
-- Another incarnation is another publisher, or the same one restarted: it is followed at once, and nothing is lost.
+- Another incarnation is another publisher, or the same one restarted: it is followed at once, and nothing is lost. For
+  commands the reader waits until the former publisher's last one has expired (see `cocoro.inbox`).
 - The next number is accepted. A higher one is accepted too, and the numbers between count as lost, unless the jump
   cannot be traffic: by more than `FREE_JUMP`, and by more than `MARGIN` times what the topic's rate gives in the time
   between the two stamps. Such a message alone is rejected; the stream goes on where it was.

@@ -74,6 +74,7 @@ class Gateway:
         self._host = config.host
         self._directory = directory
         self._links: dict[str, Link] = {}
+        self._hosts: frozenset[str] = frozenset()
         self._refused: Counter[Refusal] = Counter()
         self._untold: Counter[Refusal] = Counter()
         self._loop = asyncio.get_running_loop()
@@ -89,13 +90,14 @@ class Gateway:
     async def run(self) -> None:
         tell_time(self._node, robot_time.clock(self._directory).now_ns)
         async with AsyncExitStack() as stack:
-            watch = Watch(self._on_refusal, lambda line: log.warning("%s", line))
+            watch = Watch(self._on_refusals, lambda line: log.warning("%s", line))
             stack.callback(watch.close)
             self._node.spawn(self._tell())
             while True:
                 marks, refused = self._marks(), self._timekeeping.refused
                 site, options = self._read()
                 self._timekeeping.follow(site.keeper(self._host), self._clock_limit_s(site))
+                self._hosts = frozenset(site.hosts)
                 router = await Router.open(
                     "gateway", self._directory, site.host(self._host).listen, site.endpoints(self._host), options
                 )
@@ -177,6 +179,9 @@ class Gateway:
             self._links.pop(link.zid, None)
         log.info("%s %s at %s", "linked with" if there else "lost the link with", link.who or "somebody", link.address)
         self._report()
+        for host, places in self._places().items():
+            if there and len(places) > 1 and link.who.rpartition(".")[0] == host:
+                log.warning("%s is linked from %s: is its certificate stolen?", host, " and ".join(sorted(places)))
 
     def _report(self) -> None:
         if not self._begun:
@@ -187,31 +192,52 @@ class Gateway:
             self._node.degraded(f"{trouble}; {text}")
         else:
             self._node.ready(text)
+        self._show_faults()
 
-    def _on_refusal(self, refusal: Refusal) -> None:
+    def _on_refusals(self, refused: Counter[Refusal]) -> None:
         """Called in the thread that reads the log."""
-        self._loop.call_soon_threadsafe(self._count, refusal)
+        self._loop.call_soon_threadsafe(self._count, refused)
 
-    def _count(self, refusal: Refusal) -> None:
-        if refusal.who in self._links:
-            refusal = refusal._replace(who=self._links[refusal.who].who)
-        if refusal not in self._refused and len(self._refused) >= KINDS:
-            refusal = Refusal(refusal.who, "more of other kinds")
-        if not self._refused[refusal]:
-            log.warning("refused: %s", _said(refusal))
-        else:
-            self._untold[refusal] += 1
-        self._refused[refusal] += 1
-        self._node.faults = tuple(
-            f"refused {_said(one)}{f', {count} times' if count > 1 else ''}"
-            for one, count in self._refused.most_common(SHOWN)
+    def _count(self, refused: Counter[Refusal]) -> None:
+        for refusal, times in refused.items():
+            if refusal.who in self._links:
+                refusal = refusal._replace(who=self._links[refusal.who].who)
+            if refusal not in self._refused and len(self._refused) >= KINDS:
+                refusal = Refusal(refusal.who, "more of other kinds")
+            if refusal not in self._refused:
+                log.warning("refused: %s", _said(refusal))
+                self._untold[refusal] -= 1
+            self._untold[refusal] += times
+            self._refused[refusal] += times
+        self._show_faults()
+
+    def _show_faults(self) -> None:
+        self._node.faults = (
+            *(
+                f"{host} is linked from {' and '.join(sorted(places))}: is its certificate stolen?"
+                for host, places in self._places().items()
+                if len(places) > 1
+            ),
+            *(
+                f"refused {_said(one)}{f', {count} times' if count > 1 else ''}"
+                for one, count in self._refused.most_common(SHOWN)
+            ),
         )
+
+    def _places(self) -> dict[str, set[str]]:
+        """The addresses from which each host of the site is linked: one host is at one place."""
+        found: dict[str, set[str]] = {}
+        for link in self._links.values():
+            name = link.who.rpartition(".")[0]
+            if name in self._hosts:
+                found.setdefault(name, set()).add(link.address.rpartition(":")[0].partition("/")[2])
+        return found
 
     async def _tell(self) -> None:
         while True:
             await asyncio.sleep(TELL_S)
             untold, self._untold = self._untold, Counter()
-            for refusal, count in untold.items():
+            for refusal, count in (+untold).items():
                 log.warning("refused %d times more: %s", count, _said(refusal))
 
 

@@ -54,7 +54,7 @@ def matrix(site: Site, robot: str) -> list[Row]:
         for row in _each(topic, services)
     ]
     rows += [
-        Row(row.name, REQUEST, _may(may, row.key(robot), REQUEST), QUESTION_BYTES, ASKED_HZ)
+        Row(row.name, REQUEST, _may(may, row.key(robot), REQUEST), QUESTION_BYTES, _asked(request))
         for request in all_requests()
         for row in _each(request, services)
     ]
@@ -95,3 +95,8 @@ def _rate(row: Topic[Any] | Request[Any, Any]) -> float | None:
     if not isinstance(row, Topic) or row.qos is Qos.EVENT:
         return None
     return row.rate_hz * HEADROOM if row.rate_hz else UNTABLED_HZ
+
+
+def _asked(request: Request[Any, Any]) -> float | None:
+    """Of a person's link; stops are not limited."""
+    return None if request.right == "stop" else ASKED_HZ

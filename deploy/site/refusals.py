@@ -6,10 +6,14 @@ beside what it lets pass. `Watch` takes that output over by a pipe, and `Sifter`
 
 from __future__ import annotations
 
+import fcntl
 import os
 import re
 import threading
+import time
+from collections import Counter
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from typing import NamedTuple
 
 import zenoh
@@ -26,12 +30,17 @@ LONGEST_LINE = 4096
 VERDICTS = 9
 """When a session names a key for the first time, zenoh computes what it may do with it, one line for each kind of
 message: nobody did any of that yet."""
-_READ_BYTES = 1 << 20
+PIPE_BYTES = 1 << 20
+"""zenoh waits where the pipe is full, and with it the robot's messages: it holds some thousand lines, and reading is
+faster than zenoh's writing."""
+_PAUSE_S = 0.01
+"""Between two readings: to wake for each line would cost more than to read it."""
+_KNOWN = 4096
+"""Lines that are remembered: a flood repeats itself."""
 _MATTERS = (b"unauthorized", b"caching permissions", b" WARN ", b" ERROR ")
-_THREAD = re.compile(rb"ThreadId\((\d+)\)")
 _WHAT = rb"is unauthorized to (.+?) \((ingress|egress)\)(?: on (\S+))?"
 _BY_NAME = re.compile(rb"CertCommonName\(([^)]*)\).* " + _WHAT)
-_BY_ID = re.compile(rb"access_control: (?:Using cached result: )?(\S+) .*?" + _WHAT)
+_BY_ID = re.compile(rb"(?:Using cached result: )?(\S+) .*?" + _WHAT)
 _HANDSHAKE = re.compile(rb"zenoh_link_tls\S*: (.+)")
 
 
@@ -51,6 +60,8 @@ class Sifter:
     def __init__(self) -> None:
         self._computed: dict[bytes, int] = {}
         """By thread, how many verdicts are still to come that are computed in advance."""
+        self._known: dict[bytes, Refusal | None] = {}
+        """What lines say, without their times."""
 
     def sift(self, lines: bytes) -> Iterator[Refusal | str]:
         """The refusals in whole lines, and as they are the lines of warnings and errors of another kind."""
@@ -69,34 +80,46 @@ class Sifter:
                     yield line.decode(errors="replace")
 
     def _verdict(self, line: bytes) -> Refusal | None:
-        thread = _THREAD.search(line)
-        if thread is None:
+        head, _, said = line.partition(b"access_control: ")
+        thread = head.partition(b"ThreadId(")[2]
+        if not thread:
             return None
-        if b"caching permissions" in line:
-            self._computed[thread[1]] = VERDICTS
+        if said.find(b"caching permissions") >= 0:
+            self._computed[thread] = VERDICTS
             return None
-        if left := self._computed.get(thread[1], 0):
-            if b"cached result" not in line:
-                self._computed[thread[1]] = left - 1
+        if left := self._computed.get(thread):
+            if not said.startswith(b"Using cached result"):
+                self._computed[thread] = left - 1
                 return None
-            del self._computed[thread[1]]
-        match = _BY_NAME.search(line) or _BY_ID.search(line)
-        if match is None or match[3] == b"egress" or match[2].startswith(b"Undeclare"):
-            return None  # what is kept from somebody, nobody did; and who ends what was refused does nothing either
-        who, what, key = (part.decode(errors="replace") if part else "" for part in (match[1], match[2], match[4]))
-        return Refusal(who, what, key)
+            del self._computed[thread]
+        if said not in self._known:
+            if len(self._known) >= _KNOWN:
+                self._known.clear()
+            self._known[said] = _refusal(said)
+        return self._known[said]
+
+
+def _refusal(said: bytes) -> Refusal | None:
+    match = _BY_NAME.search(said) or _BY_ID.match(said)
+    if match is None or match[3] == b"egress" or match[2].startswith(b"Undeclare"):
+        return None  # what is kept from somebody, nobody did; and who ends what was refused does nothing either
+    who, what, key = (part.decode(errors="replace") if part else "" for part in (match[1], match[2], match[4]))
+    return Refusal(who, what, key)
 
 
 class Watch:
     """Takes this process's standard output over, from its making to `close`; for a process that prints nothing.
 
-    `refused` is called with each refusal and `told` with each line of another kind, in a thread of its own.
+    `refused` is called with refusals and how often each came, and `told` with each line of another kind, in a thread of
+    its own.
     """
 
-    def __init__(self, refused: Callable[[Refusal], None], told: Callable[[str], None]) -> None:
+    def __init__(self, refused: Callable[[Counter[Refusal]], None], told: Callable[[str], None]) -> None:
         self._refused = refused
         self._told = told
         read_fd, write_fd = os.pipe()
+        with suppress(OSError):  # others of this user have taken all that there is
+            fcntl.fcntl(write_fd, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
         self._kept_fd = os.dup(1)
         os.dup2(write_fd, 1)
         os.close(write_fd)
@@ -114,11 +137,15 @@ class Watch:
         rest = b""
         sifter = Sifter()
         with os.fdopen(fd, "rb", buffering=0) as pipe:
-            while part := pipe.read(_READ_BYTES):
+            while part := pipe.read(PIPE_BYTES):
                 whole, _, rest = (rest + part).rpartition(b"\n")
                 rest = rest[:LONGEST_LINE]
+                refused: Counter[Refusal] = Counter()
                 for found in sifter.sift(whole):
                     if isinstance(found, Refusal):
-                        self._refused(found)
+                        refused[found] += 1
                     else:
                         self._told(found)
+                if refused:
+                    self._refused(refused)
+                time.sleep(_PAUSE_S)

@@ -21,6 +21,7 @@ from cocoro.installed import all_requests, all_topics
 from cocoro.node import QUESTION_BYTES
 from cocoro.topics import ANY, Request, Topic
 from deploy.processes import components
+from deploy.site.component import gateway_of
 from deploy.site.plan import Site
 from deploy.site.rights import Rights, rights
 
@@ -28,7 +29,9 @@ HEADROOM = 10.0
 """A key may be published this many times as often as its nominal rate: a network that stalls delivers what waited all
 at once, and only a flood comes more often than that for long."""
 ASKED_HZ = 1000.0
-"""A link may ask one request at most this often; what comes sooner after the last is dropped, without an answer."""
+"""A link may ask one service one request at most this often, where persons link; what comes sooner after the last is
+dropped, without an answer. Stops are never dropped. A link between hosts carries what several persons ask, and one of
+them must not have the others' requests dropped: it is limited where each comes in."""
 UNTABLED_HZ = 1000.0
 """A key without a nominal rate, as those of an author, may be published at most this often. Events are not
 limited, since each of them counts."""
@@ -39,6 +42,9 @@ EVERYTHING = (
     "put", "delete", "declare_subscriber", "query", "reply", "declare_queryable",
     "liveliness_token", "liveliness_query", "declare_liveliness_subscriber",
 )  # fmt: skip
+LARGEST_BYTES = max(ANSWER_BYTES, *(topic.max_bytes for topic in all_topics())) + QUESTION_BYTES
+"""A larger message is not put together from its fragments, so that it takes no memory, whoever sends it; with room for
+what zenoh adds."""
 LOCAL = "unixsock-stream"
 ALL = ("**", "@cocoro/**")
 """No wildcard matches a chunk with '@', as the tokens of the mesh's members have it: they stay on their machine."""
@@ -96,7 +102,8 @@ def compiled(
     return {
         "access_control": control,
         "low_pass_filter": _sizes(robot),
-        "downsampling": _rates(robot),
+        "downsampling": _rates(site, host),
+        "transport/link/rx/max_message_size": LARGEST_BYTES,
     }
 
 
@@ -183,19 +190,26 @@ def _sizes(robot: str) -> list[dict[str, Any]]:
     ]
 
 
-def _rates(robot: str) -> list[dict[str, Any]]:
-    """Limits of rates: a message that follows the last of its key too soon is dropped where it arrives."""
+def _rates(site: Site, host: str) -> list[dict[str, Any]]:
+    """Limits of rates: a message that follows the last one of its key on the same link too soon is dropped where it
+    arrives. A request with a wildcard counts as one of those that it reaches: a rule with a wildcard would count the
+    requests to several services as one."""
+    robot = site.host(host).robot
     services = [service for component in components() for service in component.services]
-    puts = []
+    services += [gateway_of(name).name for name in site.hosts]
+    puts, asked = [], []
     for topic in all_topics():
         freq = topic.rate_hz * HEADROOM if topic.rate_hz else UNTABLED_HZ
         each = [topic.of(service) for service in services] if topic.per_service else [topic]
         puts += [{"key_expr": row.key(robot), "freq": freq} for row in each if row.qos is not Qos.EVENT]
-    asked = [{"key_expr": _key(request, robot), "freq": ASKED_HZ} for request in all_requests()]
-    rows = (("put", puts), ("query", asked))
+    if site.host(host).listen:
+        for request in (row for row in all_requests() if row.right != "stop"):
+            alike = [request.of(service) for service in services] if request.per_service else [request]
+            asked += [{"key_expr": row.key(robot), "freq": ASKED_HZ} for row in alike]
     return [
         {"id": f"rate {kind}", "link_protocols": ["tls"], "flows": [IN], "messages": [kind], "rules": rules}
-        for kind, rules in rows
+        for kind, rules in (("put", puts), ("query", asked))
+        if rules
     ]
 
 
