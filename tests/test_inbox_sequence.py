@@ -146,6 +146,31 @@ def test_a_stale_command_as_if_of_another_publisher_does_not_change_who_is_follo
     assert talk.taken == [0, 1, 2], "and a repeated one is still known as such"
 
 
+@pytest.mark.parametrize("topic", [topics.BASE_COMMAND, topics.INTENT], ids=lambda topic: topic.name)
+def test_a_command_of_a_second_publisher_is_rejected_while_the_first_one_commands(topic: Topic[Any]) -> None:
+    talk = Talk(topic)
+    for number in range(10):
+        talk.say()
+        talk.deliver(number, incarnation=99)
+    assert talk.taken == list(range(10))
+    assert {message.incarnation for message in talk.got} == {1}
+    assert talk.inbox.last_error == "publisher 63 commands while 1 does"
+    assert (talk.inbox.rejected, talk.lost) == (10, 0)
+
+
+def test_a_publisher_that_was_restarted_is_followed_once_the_last_command_has_expired() -> None:
+    talk = Talk(topics.BASE_COMMAND)
+    talk.say(3)
+    talk.clock.at_ns += round(topics.BASE_COMMAND.max_age_s * NS)
+    talk.deliver(0, incarnation=2)
+    assert talk.taken == [0, 1, 2]
+    assert talk.inbox.rejected == 1, "it is as old as a command may be"
+    talk.clock.at_ns += 1
+    talk.deliver(1, incarnation=2)
+    talk.deliver(2, incarnation=2)
+    assert talk.taken == [0, 1, 2, 1, 2]
+
+
 @given(
     st.lists(
         st.tuples(st.sampled_from(["good", "lost", "far", "again", "ahead", "behind"]), st.integers(1, 400)),

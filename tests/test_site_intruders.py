@@ -155,7 +155,8 @@ def test_what_nobody_may_does_not_arrive_and_is_logged(one: Attempt, scene: Scen
 
 def test_there_are_attempts_of_each_kind_for_each_topic_and_request() -> None:
     kinds = {(one.who, one.do) for one in attempts()}
-    assert kinds >= {(who, do) for who in PRINCIPALS for do in ("put", "serve", "ask", "show")} | {(BRAIN, "hear")}
+    assert kinds >= {(who, do) for who in PRINCIPALS for do in ("put", "serve", "show")}
+    assert kinds >= {("eve", "ask"), ("bob", "ask"), (BRAIN, "ask"), (BRAIN, "hear")}, "an operator may ask everything"
     assert len(attempts()) >= 60
     assert {one.row for one in attempts() if (one.who, one.do) == (BRAIN, "hear")} >= {TRUTH.name, BASE_COMMAND.name}
 
@@ -254,7 +255,7 @@ def test_a_generation_that_is_not_admitted_may_do_nothing(scene: Scene) -> None:
     with Intruder(scene.lab.desk, newest.folder, scene.endpoint) as bob:
         bob("put", key=f"{ROBOT}/bob/anything", payload=f"{MARK}bob.4")
         assert not bob("ask", key=REPORT.key(ROBOT), payload="who answers?")
-        scene.logged("refused: bob.4: Query on robbie/executive/report")
+        scene.logged(f"bob.4 is linked from {scene.lab.desk.address}, not admitted, and may do nothing")
     assert not [found for found in scene.body.marked if b"bob.4" in found[1]]
 
 
@@ -268,19 +269,24 @@ def test_replayed_commands_are_not_obeyed(scene: Scene) -> None:
     scene.body.end(handle)
     with scene.intruder(BRAIN) as thief:
         before = scene.base().rejected
-        for payload in recorded[:50]:
-            thief("put", key=COMMAND, payload=f"0x{payload.hex()}")
-        until(lambda: scene.base().rejected >= before + 50)
+
+        def rejected() -> bool:
+            for payload in recorded[:50]:
+                thief("put", key=COMMAND, payload=f"0x{payload.hex()}")
+            return scene.base().rejected >= before + 50  # some come too soon after others, and are dropped before
+
+        until(rejected)
     scene.commanded()
 
 
 def test_a_second_planner_is_not_obeyed_beside_the_first(scene: Scene) -> None:
     where = scene.place()
+    true = msgspec.msgpack.decode(scene.body.newest[COMMAND], type=BaseCommand)
     with scene.intruder(BRAIN) as thief:
 
         def refused() -> bool:
-            true = msgspec.msgpack.decode(scene.body.newest[COMMAND], type=BaseCommand)
-            forged = msgspec.structs.replace(true, left_mps=0.2, right_mps=0.2, incarnation=true.incarnation ^ 1)
+            newest = msgspec.msgpack.decode(scene.body.newest[COMMAND], type=BaseCommand)
+            forged = msgspec.structs.replace(newest, left_mps=0.2, right_mps=0.2, incarnation=true.incarnation ^ 1)
             thief("put", key=COMMAND, payload=f"0x{msgspec.msgpack.encode(forged).hex()}")
             error = scene.base().last_error
             return error == f"publisher {forged.incarnation:x} commands while {true.incarnation:x} does"
@@ -292,13 +298,16 @@ def test_a_second_planner_is_not_obeyed_beside_the_first(scene: Scene) -> None:
 
 def test_a_forged_number_leads_nowhere(scene: Scene) -> None:
     """The incarnation is known to who hears the commands; the brain's certificate alone does not let him."""
+    far = msgspec.msgpack.decode(scene.body.newest[COMMAND], type=BaseCommand).seq + 1_000_000
     with scene.intruder(BRAIN) as thief:
 
         def refused() -> bool:
             true = msgspec.msgpack.decode(scene.body.newest[COMMAND], type=BaseCommand)
-            forged = msgspec.structs.replace(true, left_mps=0.2, right_mps=0.2, seq=true.seq + 1_000_000)
+            if true.seq == far:  # that was the forged one, which came here, too
+                return False
+            forged = msgspec.structs.replace(true, left_mps=0.2, right_mps=0.2, seq=far)
             thief("put", key=COMMAND, payload=f"0x{msgspec.msgpack.encode(forged).hex()}")
-            return str(forged.seq) in scene.base().last_error
+            return str(far) in scene.base().last_error
 
         until(refused)
     scene.commanded()
@@ -370,7 +379,7 @@ def test_who_is_revoked_may_do_nothing_from_then_on(scene: Scene) -> None:
         scene.logged("the router is opened anew", since)
         until(lambda: "linked with eve.1" in scene.log[since:])
         assert not eve("ask", key=REPORT.key(ROBOT), payload="who answers?")
-        scene.logged("refused: eve.1: Query on robbie/executive/report", since)
+        scene.logged(f"eve.1 is linked from {scene.lab.desk.address}, not admitted, and may do nothing", since)
     until(lambda: "linked with brain.1" in scene.log[since:])
     scene.commanded()
 

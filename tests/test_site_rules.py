@@ -184,6 +184,22 @@ def test_sizes_and_rates_are_those_of_the_table(lab: plan.Site) -> None:
     assert "calliope/executive/task" not in rates, "no event is ever dropped for coming too soon"
 
 
+def test_stops_are_never_dropped_and_requests_only_where_persons_link(lab: plan.Site) -> None:
+    limits = {host: compiled(lab, host, {})["downsampling"] for host in ("body", "brain")}
+    asked = {
+        host: {rule["key_expr"] for row in rows if row["messages"] == ["query"] for rule in row["rules"]}
+        for host, rows in limits.items()
+    }
+    assert RUN.key(ROBOT) in asked["body"]
+    assert not asked["brain"], "one person's flood would have the requests of others dropped"
+    assert not [key for key in asked["body"] if matches(key, ESTOP.of("base").key(ROBOT)) or "*" in key]
+
+
+def test_what_is_larger_than_any_message_is_not_put_together(lab: plan.Site) -> None:
+    largest = compiled(lab, "body", {})["transport/link/rx/max_message_size"]
+    assert max(topic.max_bytes for topic in all_topics()) < largest < 20 * 1024 * 1024
+
+
 # --- the table for people -------------------------------------------------------------------------
 
 

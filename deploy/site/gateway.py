@@ -75,6 +75,8 @@ class Gateway:
         self._directory = directory
         self._links: dict[str, Link] = {}
         self._hosts: frozenset[str] = frozenset()
+        self._admitted: frozenset[str] = frozenset()
+        self._odd: list[str] = []
         self._refused: Counter[Refusal] = Counter()
         self._untold: Counter[Refusal] = Counter()
         self._loop = asyncio.get_running_loop()
@@ -95,7 +97,7 @@ class Gateway:
             self._node.spawn(self._tell())
             while True:
                 marks, refused = self._marks(), self._timekeeping.refused
-                site, options = self._read()
+                site, options, self._admitted = self._read()
                 self._timekeeping.follow(site.keeper(self._host), self._clock_limit_s(site))
                 self._hosts = frozenset(site.hosts)
                 router = await Router.open(
@@ -117,8 +119,8 @@ class Gateway:
             self._begun = True
             self._node.spawn(self._timekeeping.run())
 
-    def _read(self) -> tuple[Site, dict[str, Any]]:
-        """The plan and the router's options. Raises ConfigError."""
+    def _read(self) -> tuple[Site, dict[str, Any], frozenset[str]]:
+        """The plan, the router's options, and the common names that are admitted. Raises ConfigError."""
         site = plan.read(self._folder)
         now = datetime.now(UTC)
         known = admitted.read(site.folder)
@@ -130,8 +132,9 @@ class Gateway:
             authority=known.authority,
         )
         names = {name: known.common_names(name, now) for name in known.names}
+        every = frozenset(common for name in site.principals for common in names.get(name, ()))
         only = of_clocks(site, site.host(self._host).robot) if self._timekeeping.refused else None
-        return site, {**mine.options, **compiled(site, self._host, names, only=only)}
+        return site, {**mine.options, **compiled(site, self._host, names, only=only)}, every
 
     def _clock_limit_s(self, site: Site) -> float:
         if self._config.clock_limit_ms is not None:
@@ -178,10 +181,12 @@ class Gateway:
         else:
             self._links.pop(link.zid, None)
         log.info("%s %s at %s", "linked with" if there else "lost the link with", link.who or "somebody", link.address)
+        odd = self._odd_links()
+        for fault in odd:
+            if fault not in self._odd:
+                log.warning("%s", fault)
+        self._odd = odd
         self._report()
-        for host, places in self._places().items():
-            if there and len(places) > 1 and link.who.rpartition(".")[0] == host:
-                log.warning("%s is linked from %s: is its certificate stolen?", host, " and ".join(sorted(places)))
 
     def _report(self) -> None:
         if not self._begun:
@@ -213,25 +218,32 @@ class Gateway:
 
     def _show_faults(self) -> None:
         self._node.faults = (
-            *(
-                f"{host} is linked from {' and '.join(sorted(places))}: is its certificate stolen?"
-                for host, places in self._places().items()
-                if len(places) > 1
-            ),
+            *self._odd_links(),
             *(
                 f"refused {_said(one)}{f', {count} times' if count > 1 else ''}"
                 for one, count in self._refused.most_common(SHOWN)
             ),
         )
 
-    def _places(self) -> dict[str, set[str]]:
-        """The addresses from which each host of the site is linked: one host is at one place."""
-        found: dict[str, set[str]] = {}
+    def _odd_links(self) -> list[str]:
+        """Faults of who is linked. What somebody tries who is not admitted is refused, and zenoh does not tell of it; a
+        host is at one place."""
+        found = []
+        places: dict[str, set[str]] = {}
         for link in self._links.values():
             name = link.who.rpartition(".")[0]
-            if name in self._hosts:
-                found.setdefault(name, set()).add(link.address.rpartition(":")[0].partition("/")[2])
-        return found
+            if link.who not in self._admitted:
+                found.append(
+                    f"{link.who or 'somebody'} is linked from {_place(link)}, not admitted, and may do nothing"
+                )
+            elif name in self._hosts:
+                places.setdefault(name, set()).add(_place(link))
+        found += [
+            f"{host} is linked from {' and '.join(sorted(at))}: is its certificate stolen?"
+            for host, at in places.items()
+            if len(at) > 1
+        ]
+        return list(dict.fromkeys(found))
 
     async def _tell(self) -> None:
         while True:
@@ -239,6 +251,11 @@ class Gateway:
             untold, self._untold = self._untold, Counter()
             for refusal, count in (+untold).items():
                 log.warning("refused %d times more: %s", count, _said(refusal))
+
+
+def _place(link: Link) -> str:
+    """The address of a link's other end, without the port."""
+    return link.address.partition("/")[2].rpartition(":")[0]
 
 
 def _said(refusal: Refusal) -> str:
