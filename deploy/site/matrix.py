@@ -67,7 +67,7 @@ def matrix(site: Site, robot: str) -> list[Row]:
         )
     ]
     authors = [name for name in names if site.role(name) == "author"]
-    rows += [Row(f"{name}/**", OWN, _may(may, f"{robot}/{name}/any", OWN), None, UNTABLED_HZ) for name in authors]
+    rows += [Row(f"{name}/**", OWN, _may(may, f"{robot}/{name}/any", OWN)) for name in authors]
     return [row for row in rows if any({"puts", "answers", "shows"} & {*verbs} for verbs in row.may.values())]
 
 

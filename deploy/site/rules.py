@@ -33,8 +33,8 @@ ASKED_HZ = 1000.0
 dropped, without an answer. Stops are never dropped. A link between hosts carries what several persons ask, and one of
 them must not have the others' requests dropped: it is limited where each comes in."""
 UNTABLED_HZ = 1000.0
-"""A key without a nominal rate, as those of an author, may be published at most this often. Events are not
-limited, since each of them counts."""
+"""A topic without a nominal rate may be published at most this often. Events are not limited, since each of them
+counts, nor are an author's own keys: one limit would hold for all of them together."""
 ANSWER_BYTES = 8 * 1024 * 1024
 """Upper bound of an answer: a learned model is the largest."""
 IN, OUT = "ingress", "egress"
