@@ -52,11 +52,17 @@ class Intruder:
     """The process, and the way to it. `refused` is the reason for which it was not let in, '' when it was."""
 
     def __init__(
-        self, host: Host, credentials: Path | None, endpoint: str, ca: Path | None = None, **options: Any
+        self,
+        host: Host,
+        credentials: Path | None,
+        endpoint: str,
+        ca: Path | None = None,
+        more: Mapping[str, Any] | None = None,
     ) -> None:
-        """`ca`: the authority that it trusts, without or instead of that of its credentials."""
+        """`ca`: the authority that it trusts, without or instead of that of its credentials; `more`: zenoh's options,
+        by path."""
         argv = [sys.executable, "-m", "bench.intruder", credentials or NOTHING, endpoint, ca or NOTHING]
-        argv.append(json.dumps(options))
+        argv.append(json.dumps(more or {}))
         self._process = host.run(argv, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
         self._lock = threading.Lock()
         self.refused: str = self._read()

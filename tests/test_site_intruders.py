@@ -79,7 +79,7 @@ class Scene(NamedTuple):
 
     def place(self) -> tuple[float, float]:
         state = msgspec.msgpack.decode(self.body.newest[BASE_STATE.key(ROBOT)], type=BaseState)
-        return tuple(state.odometry_m)
+        return state.odometry_m
 
 
 @pytest.fixture(scope="module")
@@ -224,7 +224,7 @@ def test_who_has_no_good_certificate_is_not_let_in(
 ) -> None:
     since = len(scene.log)
     trusted = scene.credentials("eve") / place.CA_CERT
-    with Intruder(scene.lab.desk, whose(scene), scene.endpoint, trusted, **{"connect/timeout_ms": 3000}) as intruder:
+    with Intruder(scene.lab.desk, whose(scene), scene.endpoint, trusted, more={"connect/timeout_ms": 3000}) as intruder:
         assert intruder.refused
         until(lambda: why in scene.log[since:] or f"more: somebody who was not let in: {why}" in scene.log[since:])
 
@@ -232,7 +232,7 @@ def test_who_has_no_good_certificate_is_not_let_in(
 def test_who_speaks_plain_tcp_to_the_port_is_not_let_in(scene: Scene) -> None:
     since = len(scene.log)
     plain = scene.endpoint.replace("tls/", "tcp/")
-    with Intruder(scene.lab.desk, None, plain, **{"connect/timeout_ms": 3000}) as intruder:
+    with Intruder(scene.lab.desk, None, plain, more={"connect/timeout_ms": 3000}) as intruder:
         assert intruder.refused
     until(lambda: "not let in: received corrupt message" in scene.log[since:])
 

@@ -104,8 +104,10 @@ class Gateway:
                     "gateway", self._directory, site.host(self._host).listen, site.endpoints(self._host), options
                 )
                 try:
-                    self._links = {link.zid: link for link in router.links()}
+                    self._links = {}
                     router.watch(self._on_link)
+                    for link in router.links():  # that came before
+                        self._on_link(link, True)
                     await self._begin()
                     self._report()
                     await self._until_changed(marks, refused)
@@ -176,6 +178,8 @@ class Gateway:
     # --- what it says ---------------------------------------------------------------------------------
 
     def _on_link(self, link: Link, there: bool) -> None:
+        if there and self._links.get(link.zid) == link:
+            return
         if there:
             self._links[link.zid] = link
         else:
