@@ -24,9 +24,11 @@ host names its own (`robot = "calliope"`), and a person may be limited to some (
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import msgspec
 from msgspec import Meta
@@ -82,8 +84,10 @@ class _File(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     person: dict[Name, Any] = {}
 
 
-class Site(NamedTuple):
-    """A site's plan, checked. Make it with `read`."""
+@dataclass(frozen=True)
+class Site:
+    """A site's plan, checked. Make it with `read`. It may have thousands of robots: who connects to whom is worked out
+    once."""
 
     name: str
     path: Path
@@ -128,12 +132,39 @@ class Site(NamedTuple):
         robots = self.persons[name].robots
         return tuple(self.profiles) if robots is None else robots
 
+    def deals_with_all(self, name: str) -> bool:
+        """Whether a principal deals with every robot, whichever they are."""
+        return self.is_hub(name) if name in self.hosts else self.persons[name].robots is None
+
+    def deals_with(self, name: str, robot: str) -> bool:
+        """Whether a principal deals with one robot; with `*`, whether with all, whichever they are."""
+        if self.deals_with_all(name):
+            return robot == "*" or robot in self.profiles
+        return robot in (self.persons[name].robots or () if name in self.persons else (self.hosts[name].robot,))
+
+    def robots_shared(self, name: str, other: str) -> tuple[str, ...]:
+        """The robots that both principals deal with."""
+        if self.deals_with_all(name):
+            return self.robots_of(other)
+        return tuple(robot for robot in self.robots_of(name) if self.deals_with(other, robot))
+
     def is_hub(self, name: str) -> bool:
         return name in self.hosts and self.hosts[name].role == "hub"
 
+    @cached_property
+    def _listening(self) -> Mapping[str, tuple[str, ...]]:
+        """The hosts that listen, by robot; under `""` the hubs."""
+        order = {name: number for number, name in enumerate(self.hosts)}
+        hubs = [name for name, row in self.hosts.items() if row.listen and self.is_hub(name)]
+        found: dict[str, list[str]] = {"": [], **{robot: [] for robot in self.profiles}}
+        for name, row in self.hosts.items():
+            if row.listen and row.robot in self.profiles:
+                found[row.robot].append(name)
+        return {robot: tuple(sorted((*names, *hubs), key=order.__getitem__)) for robot, names in found.items()}
+
     def listening(self, robot: str) -> tuple[str, ...]:
         """The hosts that accept others who deal with a robot: its own, and hubs."""
-        return tuple(name for name, row in self.hosts.items() if row.listen and robot in self.robots_of(name))
+        return self._listening[robot]
 
     def entrances(self, robot: str) -> tuple[str, ...]:
         """The hosts by which a person reaches a robot: the hubs where there are any, else the robot's that listen."""
@@ -152,20 +183,39 @@ class Site(NamedTuple):
 
     def connects(self, name: str) -> tuple[str, ...]:
         """The hosts that a principal connects to."""
+        return self._connects[name]
+
+    def connected(self, name: str) -> tuple[str, ...]:
+        """The principals that connect to a host."""
+        return self._connected.get(name, ())
+
+    @cached_property
+    def _connects(self) -> Mapping[str, tuple[str, ...]]:
+        order = {name: number for number, name in enumerate(self.hosts)}
+        return {name: self._goes_to(name, order) for name in self.principals}
+
+    @cached_property
+    def _connected(self) -> Mapping[str, tuple[str, ...]]:
+        found: dict[str, list[str]] = {}
+        for name, hosts in self._connects.items():
+            for host in hosts:
+                found.setdefault(host, []).append(name)
+        return {host: tuple(names) for host, names in found.items()}
+
+    def _goes_to(self, name: str, order: Mapping[str, int]) -> tuple[str, ...]:
         if name in self.persons:
             found = (host for robot in self.robots_of(name) for host in self.entrances(robot))
             return tuple(dict.fromkeys(found))
         row = self.hosts[name]
         if row.connect is not None:
             return row.connect
-        order = tuple(self.hosts)
-        # Of two that listen the later one connects, so that each pair has one link.
+        # Of two that listen the later one connects, so that each pair has one link; and no hub connects to a robot.
+        hub = self.is_hub(name)
+        there = self.listening("" if hub else row.robot)
         return tuple(
             host
-            for host in dict.fromkeys(host for robot in self.robots_of(name) for host in self.listening(robot))
-            if host != name
-            and (self.is_hub(host) or not self.is_hub(name))
-            and not (row.listen and self.is_hub(host) == self.is_hub(name) and order.index(host) > order.index(name))
+            for host in there
+            if host != name and not (row.listen and self.is_hub(host) == hub and order[host] > order[name])
         )
 
     def endpoints(self, name: str) -> tuple[str, ...]:
@@ -267,8 +317,12 @@ def _check(site: Site) -> None:
             raise ConfigError(f"[person.{name}]: a service has this name; an author's keys lie under his own name")
     for name, host in site.hosts.items():
         _check_host(site, name, host)
+    hosts: dict[str, dict[str, HostRow]] = {robot: {} for robot in site.profiles}
+    for name, host in site.hosts.items():
+        if host.robot:
+            hosts[host.robot][name] = host
     for robot, profile in site.profiles.items():
-        _check_shares(site, robot, profile)
+        _check_shares(site, robot, profile, hosts[robot])
 
 
 def _check_host(site: Site, name: str, host: HostRow) -> None:
@@ -319,15 +373,14 @@ def _foreign_key(component: Component) -> str:
     return next((key for key in keys if key.partition("/")[0] not in component.services), "")
 
 
-def _check_shares(site: Site, robot: str, profile: Profile) -> None:
-    hosts = {name: host for name, host in site.hosts.items() if host.robot == robot}
+def _check_shares(site: Site, robot: str, profile: Profile, hosts: Mapping[str, HostRow]) -> None:
     for process in profile.processes:
         on = [name for name, host in hosts.items() if process in host.processes]
         if len(on) != 1:
             there = f"on {' and on '.join(on)}" if on else "on no host"
             raise ConfigError(f"[robot.{robot}]: process {process} runs {there}; give it to one host's processes")
     if len(hosts) > 1:
-        joined = {name: host for name, host in site.hosts.items() if robot in site.robots_of(name)}
+        joined = (*hosts, *(name for name in site.listening("")))
         reached = {next(iter(hosts))}
         links = [{name, other} for name in joined for other in site.connects(name)]
         for _ in joined:

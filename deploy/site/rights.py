@@ -82,9 +82,9 @@ class Rights(NamedTuple):
 
 def rights(site: Site, name: str, robot: str) -> Rights:
     """What a principal may do with a robot: nothing with one that is none of his. A hub does nothing but pass on.
-    Raises ConfigError for a name that the site does not have."""
+    For a person who deals with all robots, `*` stands for each of them. Raises ConfigError for a name that the site does not have."""
     role = site.role(name)
-    if robot not in site.robots_of(name) or role == "hub":
+    if not site.deals_with(name, robot) or role == "hub":
         return Rights()
     if name in site.hosts:
         return of_host(robot, site.share(name), simulated=site.profiles[robot].clock == "sim")

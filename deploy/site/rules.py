@@ -137,34 +137,33 @@ def table(site: Site, host: str, *, only: frozenset[str] | None = None) -> list[
 def neighbours(site: Site, host: str) -> dict[str, Rights]:
     """The principals at the other ends of a host's links, and what may come and go there: what they may do
     themselves, and what those may do for whom they pass it on."""
-    mine = site.host(host)
-    direct = [name for name in site.principals if host in site.connects(name)] if mine.listen else []
-    direct += [name for name in site.connects(host) if name not in direct]
+    direct = site.connected(host) if site.host(host).listen else ()
     found = {}
-    for name in direct:
-        behind = _behind(site, name, host) if name in site.hosts else ()
+    for name in dict.fromkeys((*direct, *site.connects(host))):
         robots = _shared(site, host, name)
+        behind = _behind(site, name, host, robots) if name in site.hosts else ()
         found[name] = reduce(or_, (rights(site, one, robot) for one in (name, *behind) for robot in robots))
     return found
 
 
 def _shared(site: Site, host: str, name: str) -> tuple[str, ...]:
-    """The robots that both deal with."""
-    return tuple(robot for robot in site.robots_of(host) if robot in site.robots_of(name))
+    """The robots that both deal with. For a person who deals with all robots of a hub it is `*`, so that his rules are
+    as many as those of one robot."""
+    if name in site.persons and site.deals_with_all(name) and site.is_hub(host):
+        return ("*",)
+    return site.robots_shared(host, name)
 
 
-def _behind(site: Site, name: str, host: str) -> tuple[str, ...]:
-    """The principals that reach a host by way of `name`."""
-    found: list[str] = []
+def _behind(site: Site, name: str, host: str, robots: Iterable[str]) -> tuple[str, ...]:
+    """The principals that reach a host by way of `name`, and deal with one of these robots: others pass nothing on."""
+    robots = tuple(robots)
+    found: dict[str, None] = {}
     waiting = [name]
     while waiting:
         at = waiting.pop()
-        joined = [one for one in site.principals if at in site.connects(one)]
-        if at in site.hosts:
-            joined += site.connects(at)
-        for one in joined:
-            if one not in (*found, name, host):
-                found.append(one)
+        for one in (*site.connected(at), *(site.connects(at) if at in site.hosts else ())):
+            if one not in found and one not in (name, host) and any(site.deals_with(one, robot) for robot in robots):
+                found[one] = None
                 waiting += [one] if one in site.hosts else []
     return tuple(found)
 
