@@ -72,6 +72,7 @@ ENTRIES: dict[str, Entry] = {
     "readme": Entry("readme"),
     "rehearsals": Entry("rehearsals"),
     "rooms": Entry("rooms"),
+    "scale": Entry("scale"),
     "servos": Entry("servos"),
     "site": Entry("site"),
     "site-chaos": Entry("site_chaos"),

@@ -31,7 +31,8 @@ at once, and only a flood comes more often than that for long."""
 ASKED_HZ = 1000.0
 """A link may ask one service one request at most this often, where persons link; what comes sooner after the last is
 dropped, without an answer. Stops are never dropped. A link between hosts carries what several persons ask, and one of
-them must not have the others' requests dropped: it is limited where each comes in."""
+them must not have the others' requests dropped: it is limited where each comes in. A hub limits none, since zenoh counts all keys of a rule as one, and who asks
+fifty robots at once asks each of them once."""
 UNTABLED_HZ = 1000.0
 """A topic without a nominal rate may be published at most this often. Events are not limited, since each of them
 counts, nor are an author's own keys: one limit would hold for all of them together."""
@@ -98,7 +99,7 @@ def compiled(
             ),
         ],
     }
-    robot = "*" if site.is_hub(host) else site.host(host).robot
+    robot = ANY if site.is_hub(host) else site.host(host).robot
     return {
         "access_control": control,
         "low_pass_filter": _sizes(robot),
@@ -150,7 +151,7 @@ def _shared(site: Site, host: str, name: str) -> tuple[str, ...]:
     """The robots that both deal with. For a person who deals with all robots of a hub it is `*`, so that his rules are
     as many as those of one robot."""
     if name in site.persons and site.deals_with_all(name) and site.is_hub(host):
-        return ("*",)
+        return (ANY,)
     return site.robots_shared(host, name)
 
 
@@ -201,7 +202,7 @@ def _rates(site: Site, host: str) -> list[dict[str, Any]]:
         freq = topic.rate_hz * HEADROOM if topic.rate_hz else UNTABLED_HZ
         each = [topic.of(service) for service in services] if topic.per_service else [topic]
         puts += [{"key_expr": row.key(robot), "freq": freq} for row in each if row.qos is not Qos.EVENT]
-    if site.host(host).listen:
+    if site.host(host).listen and not site.is_hub(host):
         for request in (row for row in all_requests() if row.right != "stop"):
             alike = [request.of(service) for service in services] if request.per_service else [request]
             asked += [{"key_expr": row.key(robot), "freq": ASKED_HZ} for row in alike]
