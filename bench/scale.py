@@ -6,7 +6,8 @@ or frames. Two arrangements: every host's session connects straight to the hub, 
 An operator at the hub sees each robot's base and task, and a viewer everything of the first robot.
 
 The workers need the same cores as the hub. So processor time per message is what a figure here says about the hub;
-latencies and losses are good as long as the cores are not used up, which each row of the table says.
+latencies and losses are good as long as the cores are not used up, which each row of the table says. Each process is a
+session of its own, so that Linux shares the cores out between them, and the generators do not take the hub's time.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ from deploy.site.plan import Site
 NS = 1_000_000_000
 WORKERS = 2
 WARM_S = 2
-RESTART_S = 25
+RESTART_S = 20
 """Longest time for the restart of the hub; the robots speak for as long."""
 AHEAD_NS = NS // 2
 """Time from the order to speak until the first message."""
@@ -73,7 +74,7 @@ class Worker:
         with log.open("ab") as stream:
             self.process = subprocess.Popen(
                 [sys.executable, "-m", "bench.scale_worker", json.dumps(given)],
-                stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=stream, text=True,
+                stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=stream, text=True, start_new_session=True,
             )  # fmt: skip
 
     def answer(self) -> dict[str, Any]:
@@ -128,7 +129,7 @@ class Row(NamedTuple):
     workers_cpu: float
     """Cores that the generators used."""
     late: float
-    """Share of the messages that the generators sent more than 20 ms late."""
+    """Share of the messages that the generators did not send, since their time was 20 ms ago."""
     up_s: float
     """From the start of the hub's process until it listens."""
     restart_s: float | None
@@ -215,6 +216,7 @@ class Fleet:
                 [sys.executable, "-m", "deploy.launch", name, "--run-dir", str(run_dir.path)],
                 stderr=log,
                 env={**os.environ, RUN_DIR: str(root)},
+                start_new_session=True,
             )
         return psutil.Process(started.pid)
 
@@ -364,6 +366,7 @@ def row_of(fleet: Fleet, found: dict[str, Any], up_s: float, restart_s: float | 
     missed = STOPS * each - sum(stop["answers"] for stop in found["stops"])
     missed += FLEET_STOPS * acks - sum(stop["answers"] for stop in found["fleet"])
     seconds = found["seconds"]
+    late = sum(one["late"] for one in found["spoken"])
     real = fleet.gateway is not None
     return Row(
         robots=len(fleet.robots),
@@ -376,7 +379,7 @@ def row_of(fleet: Fleet, found: dict[str, Any], up_s: float, restart_s: float | 
         hub_cpu=found["used"][0], hub_mb=found["memory"][0],
         gateway_cpu=found["used"][1] if real else None, gateway_mb=found["memory"][1] if real else None,
         busy=found["busy"], workers_cpu=sum(one["cpu_s"] / one["took_s"] for one in found["spoken"]),
-        late=sum(one["late"] for one in found["spoken"]) / max(1, sent.total()),
+        late=late / max(1, sent.total() + late),
         up_s=up_s, restart_s=restart_s,
     )  # fmt: skip
 
@@ -419,7 +422,7 @@ def opened(folder: Path, site: Site, port: int) -> dict[str, float]:
 HEAD = [
     "robots", "in, out (1/s)", "out (Mbit/s)", "lost (%)", "command, median, 99th (ms)", "stop of one (ms)",
     "stop of all, last answer (ms)", "answers missed", "hub (% of a core)", "hub (us a message)", "hub (MB)",
-    "gateway (% of a core)", "gateway (MB)", "generators (cores)", "machine busy (%)", "sent late (%)",
+    "gateway (% of a core)", "gateway (MB)", "generators (cores)", "machine busy (%)", "not sent in time (%)",
     "hub up (s)", "all linked again (s)",
 ]  # fmt: skip
 
@@ -443,7 +446,7 @@ def cells(row: Row) -> list[str]:
         number(100 * row.busy),
         number(100 * row.late),
         number(row.up_s),
-        "not within 24" if row.restart_s is None else number(row.restart_s),
+        f"not within {RESTART_S - 2}" if row.restart_s is None else number(row.restart_s),
     ]
 
 

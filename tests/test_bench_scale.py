@@ -38,7 +38,7 @@ def test_the_generated_site_is_valid_and_everybody_meets_at_the_hub(site: plan.S
 
 def test_the_hosts_of_a_robot_say_what_its_components_declare(site: plan.Site) -> None:
     found = shares(site)
-    assert BASE_STATE in found["body1"].publishes and INTENT in found["body1"].publishes
+    assert {BASE_STATE, INTENT} <= {*found["body1"].publishes}
     assert BASE_COMMAND in found["brain1"].publishes
     assert any(matches(name, BASE_COMMAND.name) for name in found["body1"].reads)
     assert HEALTH.of("planning") in found["brain1"].publishes
@@ -53,11 +53,13 @@ def test_the_schedule_keeps_the_rates_of_the_table(site: plan.Site, phase_ns: in
         due = scale_site.schedule(rates, phase_ns)
         counted = Counter(each.topic for each in due)
         assert [counted[index] for index in range(len(rates))] == rates
-        assert due == sorted(due) and all(0 <= each.at_ns < PERIOD_NS for each in due)
+        assert due == sorted(due)
+        assert all(0 <= each.at_ns < PERIOD_NS for each in due)
         for index, rate_hz in enumerate(rates):
             times = [each.at_ns for each in due if each.topic == index]
             gaps = [b - a for a, b in zip(times, [*times[1:], times[0] + PERIOD_NS], strict=True)]
-            assert max(gaps) - min(gaps) <= 1 and abs(min(gaps) - PERIOD_NS / rate_hz) <= 1
+            assert max(gaps) - min(gaps) <= 1
+            assert abs(min(gaps) - PERIOD_NS / rate_hz) <= 1
 
 
 def test_messages_are_as_large_as_those_of_a_real_capture(site: plan.Site) -> None:

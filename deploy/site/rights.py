@@ -82,7 +82,8 @@ class Rights(NamedTuple):
 
 def rights(site: Site, name: str, robot: str) -> Rights:
     """What a principal may do with a robot: nothing with one that is none of his. A hub does nothing but pass on.
-    For a person who deals with all robots, `*` stands for each of them. Raises ConfigError for a name that the site does not have."""
+    For a person who deals with all robots, `*` stands for each of them. Raises ConfigError for a name that the site
+    does not have."""
     role = site.role(name)
     if not site.deals_with(name, robot) or role == "hub":
         return Rights()

@@ -38,6 +38,9 @@ UNTABLED_HZ = 1000.0
 counts, nor are an author's own keys: one limit would hold for all of them together."""
 ANSWER_BYTES = 8 * 1024 * 1024
 """Upper bound of an answer: a learned model is the largest."""
+ZENOHS_SESSIONS, SESSIONS_EACH = 1000, 4
+"""Sessions that a gateway accepts: zenoh's default, and so many more for each principal. A site of 1,000 robots has
+more hosts than the default, and each command of a person is a session."""
 IN, OUT = "ingress", "egress"
 EVERYTHING = (
     "put", "delete", "declare_subscriber", "query", "reply", "declare_queryable",
@@ -71,6 +74,9 @@ def compiled(
     admitted = {name: sorted(names.get(name, ())) for name in dict.fromkeys(rule.principal for rule in rules)}
     admitted = {name: known for name, known in admitted.items() if known}
     rows = [(f"{index}", rule) for index, rule in enumerate(rules) if rule.principal in admitted]
+    of: dict[str, list[str]] = {name: [] for name in admitted}
+    for index, rule in rows:
+        of[rule.principal].append(index)
     control = {
         "enabled": True,
         "default_permission": "deny",
@@ -93,15 +99,13 @@ def compiled(
         ],
         "policies": [
             {"rules": [LOCAL], "subjects": [LOCAL]},
-            *(
-                {"rules": [index for index, rule in rows if rule.principal == name], "subjects": [name]}
-                for name in admitted
-            ),
+            *({"rules": of[name], "subjects": [name]} for name in admitted),
         ],
     }
     robot = ANY if site.is_hub(host) else site.host(host).robot
     return {
         "access_control": control,
+        "transport/unicast/max_sessions": ZENOHS_SESSIONS + SESSIONS_EACH * len(site.principals),
         "low_pass_filter": _sizes(robot),
         "downsampling": _rates(site, host),
         "transport/link/rx/max_message_size": LARGEST_BYTES,
