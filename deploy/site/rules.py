@@ -39,7 +39,7 @@ counts, nor are an author's own keys: one limit would hold for all of them toget
 ANSWER_BYTES = 8 * 1024 * 1024
 """Upper bound of an answer: a learned model is the largest."""
 ZENOHS_SESSIONS, SESSIONS_EACH = 1000, 4
-"""Sessions that a gateway accepts: zenoh's default, and so many more for each principal. A site of 1,000 robots has
+"""Sessions that a hub accepts: zenoh's default, and so many more for each principal. A site of 1,000 robots has
 more hosts than the default, and each command of a person is a session."""
 IN, OUT = "ingress", "egress"
 EVERYTHING = (
@@ -102,10 +102,11 @@ def compiled(
             *({"rules": of[name], "subjects": [name]} for name in admitted),
         ],
     }
+    more = ZENOHS_SESSIONS + SESSIONS_EACH * len(site.principals)
     robot = ANY if site.is_hub(host) else site.host(host).robot
     return {
         "access_control": control,
-        "transport/unicast/max_sessions": ZENOHS_SESSIONS + SESSIONS_EACH * len(site.principals),
+        **({"transport/unicast/max_sessions": more} if site.is_hub(host) else {}),
         "low_pass_filter": _sizes(robot),
         "downsampling": _rates(site, host),
         "transport/link/rx/max_message_size": LARGEST_BYTES,
