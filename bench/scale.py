@@ -400,7 +400,12 @@ def measure(chosen: argparse.Namespace, report: Report) -> None:
                 place = folder / ("direct" if direct else "gateways")
                 place.mkdir()
                 with fleet(place, site, robots, direct=direct) as (up, up_s):
-                    up.link()
+                    try:
+                        up.link()
+                    except ConfigError as error:
+                        report.notes.append(f"{robots} robots, {how}: {error} within {LINKED_S:g} s")
+                        report.say(report.notes[-1])
+                        continue
                     row = row_of(up, up.measure(seconds), up_s, None)
                     rows[direct].append(row._replace(restart_s=up.restart()))
                 report.say(f"{robots} robots, {how}: {', '.join(cells(rows[direct][-1]))}")
@@ -456,6 +461,8 @@ def mid(values: Sequence[float]) -> float:
 
 def tell(report: Report, rows: dict[bool, list[Row]], hubs: dict[int, dict[str, float]]) -> None:
     for direct, how in ARRANGEMENTS.items():
+        if not rows[direct]:
+            continue
         report.tables.append(Table(f"Each host {how}", HEAD, [cells(row) for row in rows[direct]]))
         last = rows[direct][-1]
         report.value(f"{last.robots} robots, {how}: a command by way of the hub", last.command_ms, "ms")
@@ -484,8 +491,8 @@ def charts(rows: dict[bool, list[Row]]) -> list[Chart]:
         lines = []
         for what, value in series.items():
             for direct, how in ARRANGEMENTS.items():
-                points = [(float(row.robots), *value(row)) for row in rows[direct]]
-                lines.append(Series(f"{what.replace('_', ' ')}, {how}", points))
+                if points := [(float(row.robots), *value(row)) for row in rows[direct]]:
+                    lines.append(Series(f"{what.replace('_', ' ')}, {how}", points))
         return Chart(name, title, "robots", unit, lines)
 
     def one(value: float) -> tuple[float, float, float]:
