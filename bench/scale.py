@@ -142,7 +142,7 @@ def row_of(fleet: Fleet, found: dict[str, Any], up_s: float, restart_s: float | 
 
 
 def measure(chosen: argparse.Namespace, report: Report) -> None:
-    counts = chosen.robots or ([1, 5] if chosen.short else [1, 5, 10, 25, 50])
+    counts = sorted({*(chosen.robots or ([1, 5] if chosen.short else [1, 5, 10, 25, 50]))})
     seconds = chosen.seconds or (4 if chosen.short else 8)
     rows: dict[bool, list[Row]] = {direct: [] for direct in ARRANGEMENTS}
     hubs: dict[int, dict[str, float]] = {}

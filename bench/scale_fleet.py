@@ -27,14 +27,14 @@ from deploy.site.plan import Site
 NS = 1_000_000_000
 WORKERS = 2
 WARM_S = 2
-RESTART_S = 20
+RESTART_S = 12
 """Longest time for the restart of the hub; the robots speak for as long."""
 AHEAD_NS = NS // 2
 """Time from the order to speak until the first message."""
 DRAIN_S = 1.0
 STOPS, FLEET_STOPS = 20, 5
 PATIENCE_S = 120.0
-LINKED_S = 60.0
+LINKED_S = 30.0
 
 
 class Worker:

@@ -21,7 +21,7 @@ from cocoro.installed import all_requests, all_topics
 from cocoro.node import QUESTION_BYTES
 from cocoro.topics import ANY, Request, Topic
 from deploy.processes import components
-from deploy.site.component import gateway_of
+from deploy.site.component import PREFIX, gateway_of
 from deploy.site.plan import Site
 from deploy.site.rights import Rights, rights
 
@@ -199,15 +199,19 @@ def _rates(site: Site, host: str) -> list[dict[str, Any]]:
     """Limits of rates: a message that follows the last one of its key on the same link too soon is dropped where it
     arrives. A request with a wildcard counts as one of those that it reaches: a rule with a wildcard would count the
     requests to several services as one."""
-    robot = site.host(host).robot
+    hub = site.is_hub(host)
+    robot = ANY if hub else site.host(host).robot
     services = [service for component in components() for service in component.services]
-    services += [gateway_of(name).name for name in site.hosts]
+    # At a hub one rule stands for the gateways of all hosts: each has a link of its own.
+    services += (
+        [f"{PREFIX}$*"] if hub else [gateway_of(name).name for name in site.hosts if site.deals_with(name, robot)]
+    )
     puts, asked = [], []
     for topic in all_topics():
         freq = topic.rate_hz * HEADROOM if topic.rate_hz else UNTABLED_HZ
         each = [topic.of(service) for service in services] if topic.per_service else [topic]
         puts += [{"key_expr": row.key(robot), "freq": freq} for row in each if row.qos is not Qos.EVENT]
-    if site.host(host).listen and not site.is_hub(host):
+    if site.host(host).listen and not hub:
         for request in (row for row in all_requests() if row.right != "stop"):
             alike = [request.of(service) for service in services] if request.per_service else [request]
             asked += [{"key_expr": row.key(robot), "freq": ASKED_HZ} for row in alike]
