@@ -250,7 +250,7 @@ def charts(rows: dict[bool, list[Row]]) -> list[Chart]:
             for direct, how in ARRANGEMENTS.items():
                 if points := [(float(row.robots), *value(row)) for row in rows[direct]]:
                     lines.append(Series(f"{what.replace('_', ' ')}, {how}", points))
-        return Chart(name, title, "robots", unit, lines)
+        return Chart(name, title, "robots", unit, lines, log_y=unit == "ms")
 
     def one(value: float) -> tuple[float, float, float]:
         return value, value, value
@@ -261,7 +261,6 @@ def charts(rows: dict[bool, list[Row]]) -> list[Chart]:
     return [
         chart("hub", "The hub's processor time", "% of a core", hub=lambda row: one(100 * row.hub_cpu)),
         chart("memory", "The hub's own memory", "MB", hub=lambda row: one(row.hub_mb)),
-        chart("rate", "Messages that leave the hub", "1/s", out=lambda row: one(row.out_hz)),
         chart(
             "command", "A command by way of the hub, median to 99th", "ms", command=lambda row: spread(row.command_ms)
         ),
