@@ -31,8 +31,8 @@ at once, and only a flood comes more often than that for long."""
 ASKED_HZ = 1000.0
 """A link may ask one service one request at most this often, where persons link; what comes sooner after the last is
 dropped, without an answer. Stops are never dropped. A link between hosts carries what several persons ask, and one of
-them must not have the others' requests dropped: it is limited where each comes in. A hub limits none, since zenoh counts all keys of a rule as one, and who asks
-fifty robots at once asks each of them once."""
+them must not have the others' requests dropped: it is limited where each comes in. A hub limits none, since zenoh
+counts all keys of a rule as one, and who asks fifty robots at once asks each of them once."""
 UNTABLED_HZ = 1000.0
 """A topic without a nominal rate may be published at most this often. Events are not limited, since each of them
 counts, nor are an author's own keys: one limit would hold for all of them together."""
