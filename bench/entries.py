@@ -77,6 +77,7 @@ ENTRIES: dict[str, Entry] = {
     "site": Entry("site"),
     "site-chaos": Entry("site_chaos"),
     "site-cuts": Entry("site_cuts"),
+    "site-frames": Entry("site_frames"),
     "site-intruders": Entry("site_intruders"),
     "site-latency": Entry("site_latency"),
     "site-soak": Entry("site_soak"),

@@ -95,8 +95,8 @@ class FaultyBus:
 
         return self.whole.serve(key, answer)
 
-    async def call(self, keyexpr: str, payload: bytes, timeout_s: float) -> list[Reply]:
-        return await self.whole.call(keyexpr, payload, timeout_s)
+    async def call(self, keyexpr: str, payload: bytes, timeout_s: float, qos: Qos = Qos.COMMAND) -> list[Reply]:
+        return await self.whole.call(keyexpr, payload, timeout_s, qos)
 
     def declare_alive(self, key: str) -> Handle:
         token = self.whole.declare_alive(key)

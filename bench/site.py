@@ -23,6 +23,7 @@ def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--delay-ms", type=float, default=1.0, help="of each way between two hosts (1)")
     parser.add_argument("--jitter-ms", type=float, default=0.0, help="added to it, uniform from 0 to this (0)")
     parser.add_argument("--loss", type=float, default=0.0, help="share of the packets that are lost (0)")
+    parser.add_argument("--rate-mbps", type=float, help="of each way between two hosts, Mbit/s (without limit)")
     parser.add_argument("--sensors", choices=["ideal", "real"], default="real")
 
 
@@ -36,7 +37,10 @@ def measure(chosen: argparse.Namespace, report: Report) -> None:
             tempfile.TemporaryDirectory(prefix="site") as folder,
             lab(Path(folder), seed=number, sensors=chosen.sensors) as site,
         ):
-            site.network.links().set(delay_ms=chosen.delay_ms, jitter_ms=chosen.jitter_ms, loss=chosen.loss)
+            rate_bps = None if chosen.rate_mbps is None else chosen.rate_mbps * 1e6
+            site.network.links().set(
+                delay_ms=chosen.delay_ms, jitter_ms=chosen.jitter_ms, loss=chosen.loss, rate_bps=rate_bps
+            )
             site.up()
             fetched = asyncio.run(site.fetch())
         runs.add(fetched.well, f"{number}: {fetched.last_line}", [fetched.said, str(fetched.truth)])

@@ -128,7 +128,9 @@ class Participant:
 
     async def _ask(self, request: Request[Q, R], question: Q, timeout_s: float | None) -> list[Answer[R]]:
         wait_s = request.timeout_s if timeout_s is None else timeout_s
-        replies = await self.bus.call(request.key(self.robot_name), msgspec.msgpack.encode(question), wait_s)
+        replies = await self.bus.call(
+            request.key(self.robot_name), msgspec.msgpack.encode(question), wait_s, request.qos
+        )
         return [_decoded(request, reply) for reply in replies]
 
     def unserved(self, request: Request[Any, Any]) -> str:

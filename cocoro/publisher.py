@@ -52,6 +52,12 @@ class Publisher(Generic[M]):
         self._raw.put(payload)
         return message
 
+    def relay(self, message: M) -> None:
+        """Publishes a message of another publisher as it is, with that one's stamp and numbers."""
+        self.rate.count += 1
+        self.newest_stamp_ns = message.stamp_ns
+        self._raw.put(_ENCODER.encode(message))
+
     async def serve_newest(self, _key: str, _question: Payload) -> bytes:
         """Answers with the newest message. Raises CocoroError before the first."""
         if self._newest is None:

@@ -56,6 +56,8 @@ class Topic(Generic[M]):
     """A larger payload is rejected unread."""
     shown: bool = False
     """Its newest message can be asked for though it is fast: `cocoro status` shows it."""
+    local: bool = False
+    """It stays on its host: no gateway passes it on."""
 
     @property
     def slow(self) -> bool:
@@ -101,6 +103,8 @@ class Request(Generic[Q, R]):
     right: Right = "operate"
     recorded: bool = True
     """Questions and answers are published for recorders, unless this is False."""
+    qos: Qos = Qos.COMMAND
+    """Of question and answer."""
 
     @property
     def server(self) -> str:
@@ -138,7 +142,7 @@ def _service_of(name: str) -> str:
 
 FRAME = Topic(
     "kinect/frame", m.Frame, Qos.FRAME, 30.0, 0.5,
-    "Colour and raw depth. Perception ignores older frames.", max_bytes=16 * 1024 * 1024,
+    "Colour and raw depth. Perception ignores older frames.", max_bytes=16 * 1024 * 1024, local=True,
 )  # fmt: skip
 BASE_STATE = Topic(
     "base/state", m.BaseState, Qos.STATE, 50.0, 0.15,
@@ -284,6 +288,11 @@ SERVOS = Request(
     "Clear faults, relax or hold joints; answered by each real servo network.",
     timeout_s=3.0,
 )  # fmt: skip
+PACKED = Request(
+    "packer/frame", m.PackedRequest, m.PackedFrame,
+    "The newest frame, packed for a network, since frames themselves stay on their host.",
+    timeout_s=1.0, right="see", qos=Qos.FRAME, recorded=False,
+)  # fmt: skip
 ABOUT = Request(
     "{service}/about", m.AboutRequest, m.AboutReply,
     "The component, settings and versions of a service; answered by every service.",
@@ -298,4 +307,6 @@ TIME = Request(
 STOPS: tuple[Request[Any, Any], ...] = (ESTOP, RESET)
 """What each service that moves something serves."""
 
-REQUESTS: tuple[Request[Any, Any], ...] = (RUN, CANCEL, REPORT, OBJECTS, *STOPS, LEARNED, RECOVER, SERVOS, ABOUT, TIME)
+REQUESTS: tuple[Request[Any, Any], ...] = (
+    RUN, CANCEL, REPORT, OBJECTS, *STOPS, LEARNED, RECOVER, SERVOS, PACKED, ABOUT, TIME,
+)  # fmt: skip

@@ -19,6 +19,7 @@ from deploy.site.component import GATEWAY, PREFIX, gateway_of
 from services.base.component import BASE
 from services.capture.component import CAPTURE
 from services.executive.component import EXECUTIVE
+from services.frames.component import PACKER, UNPACKER, UNPACKER_PREFIX, unpacker_of
 from services.kinect.component import KINECT
 from services.perception.component import PERCEPTION
 from services.planning.component import PLANNING
@@ -30,7 +31,9 @@ BACKOFF_LIMIT_S = 10.0
 SETTLED_S = 30.0
 """A process that has been ready for this long starts again without the waits of its earlier restarts."""
 
-COMPONENTS: tuple[Component, ...] = (SIM, KINECT, BASE, SERVOS, PERCEPTION, PLANNING, EXECUTIVE, CAPTURE, WIRE, GATEWAY)
+COMPONENTS: tuple[Component, ...] = (
+    SIM, KINECT, BASE, SERVOS, PERCEPTION, PLANNING, EXECUTIVE, CAPTURE, WIRE, GATEWAY, PACKER, UNPACKER,
+)  # fmt: skip
 """The project's own."""
 
 
@@ -59,6 +62,8 @@ def named(name: str) -> Component:
             return component
     if name.startswith(PREFIX):
         return gateway_of(name.removeprefix(PREFIX))
+    if name.startswith(UNPACKER_PREFIX):
+        return unpacker_of(name.removeprefix(UNPACKER_PREFIX))
     if name not in table():
         raise ConfigError(f"there is no process {name!r}; {choice_of(name, table())}")
     return table()[name]

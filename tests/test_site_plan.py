@@ -39,7 +39,7 @@ def test_of_two_hosts_that_listen_the_later_one_connects(tmp_path: Path) -> None
 def test_a_share_is_the_robots_profile_with_the_processes_of_one_host_and_its_gateway(tmp_path: Path) -> None:
     site = read(tmp_path)
     share = site.share_profile("brain", ["service.planning.latency_s=0.5"])
-    assert share.processes == ("perception", "planning", "executive", "gateway-brain")
+    assert share.processes == ("perception", "planning", "executive", "gateway-brain", "frames-brain")
     assert share.service["gateway"] == {"site": str(tmp_path), "host": "brain"}
     assert share.service["planning"]["latency_s"] == 0.5
     assert share.clock == "sim"
@@ -157,3 +157,35 @@ def test_a_hub_joins_the_hosts_of_all_robots_and_the_persons(tmp_path: Path) -> 
 def test_a_hub_that_cannot_work_is_refused(change: tuple[str, str], told: str, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=told):
         read(tmp_path, HALL.replace(*change))
+
+
+@pytest.mark.parametrize(
+    ("changes", "shares"),
+    [
+        ({}, {"body": ["packer"], "brain": ["frames-brain"]}),
+        ({'"perception", ': "", '"capture", ': '"capture", "perception", '}, {"body": ["packer"], "brain": []}),
+        (
+            {'"capture", ': "", '"perception", ': '"capture", "perception", '},
+            {"body": ["packer"], "brain": ["frames-brain"]},
+        ),
+    ],
+    ids=["perception elsewhere", "persons alone", "recorder elsewhere"],
+)
+def test_what_carries_frames_runs_where_they_are_made_and_where_they_are_read(
+    tmp_path: Path, changes: dict[str, str], shares: dict[str, list[str]]
+) -> None:
+    text = LAB
+    for old, new in changes.items():
+        text = text.replace(old, new)
+    (tmp_path / "site.toml").write_text(text, encoding="utf-8")
+    site = plan.read(tmp_path)
+    for host, carriers in shares.items():
+        names = [component.name for component in site.share(host)]
+        assert [name for name in names if name == "packer" or name.startswith("frames")] == carriers
+        assert [*site.share_profile(host).processes] == names
+
+
+def test_a_site_of_one_host_without_persons_carries_no_frames(tmp_path: Path) -> None:
+    text = LAB.partition("[host.brain]")[0].replace('"sim"]', '"sim", "perception", "planning", "executive"]')
+    (tmp_path / "site.toml").write_text(text, encoding="utf-8")
+    assert [one.name for one in plan.read(tmp_path).share("body")][-1] == "gateway-body"

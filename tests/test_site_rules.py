@@ -9,6 +9,7 @@ import pytest
 from site_rig import HALL, LAB
 
 from bench import scale_site
+from cocoro.bus.base import Qos
 from cocoro.component import Component
 from cocoro.errors import ConfigError
 from cocoro.installed import all_requests, all_topics
@@ -17,9 +18,11 @@ from cocoro.topics import (
     BASE_COMMAND,
     BASE_STATE,
     ESTOP,
+    FRAME,
     HEALTH,
     INTENT,
     OFFSET,
+    PACKED,
     RESET,
     RUN,
     SERVOS,
@@ -64,7 +67,7 @@ def test_only_the_host_of_its_publisher_may_publish_a_topic(topic: Topic[Any], l
     for host, row in lab.hosts.items():
         here = [processes.named(name) for name in row.processes]
         ours = [row for one in here for row in one.all_publishes() if row.name == topic.name]
-        if not topic.per_service:
+        if not topic.per_service and not topic.local:
             assert (host in may_put(lab, topic.key(ROBOT))) == bool(ours)
     assert may_put(lab, topic.of("planning").key(ROBOT) if topic.per_service else topic.key(ROBOT)) <= {*lab.hosts}
 
@@ -98,7 +101,9 @@ def test_a_recorder_on_another_host_hears_everything_but_the_truth(tmp_path: Pat
     assert rights(site, "brain", ROBOT).may_hear("calliope/anything/at/all")
     assert not rights(site, "brain", ROBOT).may_hear(TRUTH.key(ROBOT))
     denied = [rule for rule in table(site, "body") if not rule.allow]
-    assert denied == [Rule("brain", OUT, ("put",), (TRUTH.key(ROBOT),), allow=False)]
+    local = tuple(topic.key(ROBOT) for topic in all_topics() if topic.local)
+    assert Rule("brain", OUT, ("put",), (*local, TRUTH.key(ROBOT)), allow=False) in denied
+    assert {rule.keys for rule in denied if rule.principal != "brain"} == {local}, "persons hear the truth"
 
 
 def test_an_author_publishes_and_serves_under_his_own_name_alone(lab: plan.Site) -> None:
@@ -298,3 +303,22 @@ def test_a_hub_keeps_the_robots_apart_and_does_nothing_itself(tmp_path: Path) ->
     assert not allows(site, "one", "hub", IN, "put", "a/base/command"), "and nobody commands the other one's wheels"
     keys = {key for row in compiled(site, "hub", {})["low_pass_filter"] for key in row["key_exprs"]}
     assert "*/base/command" in keys
+
+
+def test_frames_cross_no_link_and_everybody_may_ask_for_packed_ones(lab: plan.Site) -> None:
+    frames, packed = FRAME.key(ROBOT), PACKED.key(ROBOT)
+    assert not may_put(lab, frames)
+    assert not may_hear(lab, frames)
+    assert may_ask(lab, packed) == {"brain", "ada", "eve", "bob"}
+    assert not allows(lab, "body", "brain", OUT, "put", frames)
+    assert not allows(lab, "body", "eve", OUT, "put", frames), "though she hears everything else"
+    assert allows(lab, "body", "brain", IN, "query", packed)
+
+
+def test_no_link_to_another_host_keeps_an_event_waiting(lab: plan.Site) -> None:
+    (rule,) = compiled(lab, "body", {})["qos/network"]
+    assert (rule["link_protocols"], rule["flows"]) == (["tls"], [OUT])
+    assert rule["overwrite"] == {"congestion_control": "drop"}
+    for topic in all_topics():
+        key = (topic.of("base") if topic.per_service else topic).key(ROBOT)
+        assert any(matches(keyexpr, key) for keyexpr in rule["key_exprs"]) == (topic.qos is Qos.EVENT), topic.name

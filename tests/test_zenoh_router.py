@@ -17,6 +17,7 @@ from typing import Any
 
 import pytest
 import zenoh
+from zenoh.handlers import Callback
 
 from deploy.site import authority, credentials, place
 
@@ -29,6 +30,8 @@ EVERYTHING = [
 ]  # fmt: skip
 PATIENCE_S = 10.0
 SECOND_S = 1.0
+ENOUGH_TO_STALL = 40
+"""Samples of 1 MB: more than the sockets and queues between two sessions take."""
 
 
 def until(condition: Callable[[], object], what: str) -> None:
@@ -222,6 +225,86 @@ def test_sizes_and_rates_are_limited_where_a_message_comes_in(room: Room) -> Non
     assert room.heard_from(ada, "r/small") == 1
     assert room.heard.count("r/slow") == 1, "one in a hundred seconds"
     assert room.heard.count("r/fast") == 20, "other keys are not slowed down"
+
+
+EVENTS = {
+    "qos/network": [
+        {"id": "events", "link_protocols": ["tls"], "flows": ["egress"], "messages": ["put"],
+         "key_exprs": ["r/*/event"], "overwrite": {"congestion_control": "drop"}}
+    ]
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("room", [EVENTS], indirect=True)
+def test_an_event_is_put_to_wait_for_no_link_where_a_router_says_so(room: Room) -> None:
+    got: dict[str, Any] = {}
+
+    def on_sample(sample: zenoh.Sample) -> None:
+        got[str(sample.key_expr)] = sample.congestion_control
+
+    block = zenoh.CongestionControl.BLOCK
+    ada = room.client("ada")
+    with ada.declare_subscriber("r/**", on_sample), room.peer.declare_publisher("r/x/event") as publisher:
+        until(lambda: publisher.matching_status.matching, "the client is known")  # type: ignore[attr-defined]
+        for key in ("r/x/event", "r/x/other"):
+            room.peer.put(key, b"", congestion_control=block)
+        until(lambda: len(got) == 2, "both arrive")
+    assert got == {"r/x/event": zenoh.CongestionControl.DROP, "r/x/other": block}
+
+
+@pytest.mark.parametrize("room", [EVENTS], indirect=True)
+def test_who_takes_nothing_from_a_router_keeps_no_event_from_others(room: Room) -> None:
+    """A client that does not read its socket: without the rule the router's thread would wait for it."""
+    ada, eve = room.client("ada"), room.client("eve")
+    stuck, heard = threading.Event(), threading.Event()
+
+    def on_ada(_: zenoh.Sample) -> None:
+        stuck.wait(PATIENCE_S)
+
+    def on_eve(sample: zenoh.Sample) -> None:
+        if str(sample.key_expr) == "r/last":
+            heard.set()
+
+    with (
+        ada.declare_subscriber("r/x/event", Callback(on_ada, indirect=False)),
+        eve.declare_subscriber("r/last", Callback(on_eve, indirect=False)),
+        room.peer.declare_publisher("r/last") as last,
+        room.peer.declare_publisher("r/x/event", congestion_control=zenoh.CongestionControl.BLOCK) as events,
+    ):
+        for publisher in (last, events):
+            until(lambda of=publisher: of.matching_status.matching, "the client is known")  # type: ignore[misc]
+        for _ in range(ENOUGH_TO_STALL):
+            events.put(bytes(1_000_000))
+        last.put(b"")
+        assert heard.wait(PATIENCE_S / 2)
+        stuck.set()
+
+
+def test_an_answer_has_the_priority_of_its_question(issued: Path) -> None:
+    """Frames are answers: they must not go before commands."""
+    room = Room(issued, {})
+    ada = room.client("ada")
+    data = bytes(600_000)
+    try:
+        with room.peer.declare_queryable("r/frame", lambda query: answered(query, data)):
+            drop = zenoh.CongestionControl.DROP
+            how: dict[str, Any] = {"priority": zenoh.Priority.BACKGROUND, "congestion_control": drop}
+
+            def asked() -> list[zenoh.Sample]:
+                replies: Any = ada.get("r/frame", timeout=SECOND_S, **how)
+                return [reply.ok for reply in replies if reply.ok is not None]
+
+            until(asked, "it is answered")
+            (sample,) = asked()
+            assert len(sample.payload) == len(data)
+            assert {"priority": sample.priority, "congestion_control": sample.congestion_control} == how
+    finally:
+        room.close()
+
+
+def answered(query: zenoh.Query, data: bytes) -> None:
+    with query:
+        query.reply("r/frame", data)
 
 
 @pytest.mark.parametrize(

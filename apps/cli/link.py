@@ -112,10 +112,10 @@ def find(choice: RobotChoice) -> RunDir:
 
 @asynccontextmanager
 async def joined(
-    choice: RobotChoice, patience_s: float | None = None, *, frames: bool = False
+    choice: RobotChoice, patience_s: float | None = None, *, frames: bool = False, best: bool = False
 ) -> AsyncIterator[MeshLink]:
     """Joins the mesh of a robot. Raises MeshError when there is none. `frames`: the command reads frames, or all
-    keys."""
+    keys. `best`: over a site, it wants few pictures as good as they can be, rather than many in time."""
     if (through := through_site(choice)) is not None:
         from deploy.site import access  # slow to import; only a site needs it
 
@@ -141,4 +141,8 @@ async def joined(
             from deploy.site import asking
 
             link.clock = await asking.time_of(link, keeper) or link.clock
+        if frames and refusal is not None:
+            from apps.cli.packed_frames import unpacking  # slow to import; only a site needs it
+
+            link.bus = unpacking(bus, run_dir.robot, link, best=best)
         yield link

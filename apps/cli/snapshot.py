@@ -47,7 +47,7 @@ def snapshot(
 async def take_snapshot(choice: RobotChoice, out: Path, as_json: bool = False) -> int:
     """Writes the picture and returns the exit code. Raises ConfigError for a name that is not OUT.png, MeshError."""
     check(out)
-    async with joined(choice, frames=True) as link:
+    async with joined(choice, frames=True, best=True) as link:
         camera = SnapshotTaker(link)
         camera.open()
         text = await camera.write(out)

@@ -100,7 +100,7 @@ class Bus(Protocol):
 
     def serve(self, key: str, server: Server) -> Handle: ...
 
-    async def call(self, keyexpr: str, payload: bytes, timeout_s: float) -> list[Reply]:
+    async def call(self, keyexpr: str, payload: bytes, timeout_s: float, qos: Qos = Qos.COMMAND) -> list[Reply]:
         """Sends a request to every server with a matching key. Returns the answers when all have answered or the time
         is over; an empty list when there is no server. Raises CallTimeoutError when none has answered in time."""
 

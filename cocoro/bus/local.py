@@ -223,7 +223,7 @@ class LocalBus:
         self.mesh.servers.append(serving)
         return self._keep(serving)
 
-    async def call(self, keyexpr: str, payload: bytes, timeout_s: float) -> list[Reply]:
+    async def call(self, keyexpr: str, payload: bytes, timeout_s: float, qos: Qos = Qos.COMMAND) -> list[Reply]:
         tasks = [s.bus.answer(s, payload) for s in self.mesh.servers if matches(keyexpr, s.key)]
         if not tasks:
             return []

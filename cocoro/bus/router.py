@@ -16,7 +16,16 @@ import zenoh
 
 from cocoro.bus.endpoints import ZenohConfig
 from cocoro.bus.register import Membership
-from cocoro.bus.session import LEAVE_S, close_session, exit_guard, in_thread, open_session, options
+from cocoro.bus.session import (
+    LEAVE_S,
+    PACKETS,
+    SMALL_PRIORITIES,
+    close_session,
+    exit_guard,
+    in_thread,
+    open_session,
+    options,
+)
 from cocoro.bus.zenoh import MEMBER
 
 LEASE_S = 1.5
@@ -71,6 +80,8 @@ class Router:
                     "period_increase_factor": 2,
                 },
                 "transport/unicast/open_timeout": OPENING_MS,
+                # Of frames, too: each reader has one on the way, which the loss of a packet must not cost.
+                "transport/link/tx/queue/size": dict.fromkeys((*SMALL_PRIORITIES, "background"), PACKETS),
                 "transport/link/tx/queue/congestion_control/drop/max_wait_before_drop_fragments": STALLED_US,
                 **more,
             }

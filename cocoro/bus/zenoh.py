@@ -198,7 +198,7 @@ class ZenohBus:
 
         return self._keep(Declared(self._session.declare_queryable(key, Callback(on_query, indirect=False)), ring))
 
-    async def call(self, keyexpr: str, payload: bytes, timeout_s: float) -> list[Reply]:
+    async def call(self, keyexpr: str, payload: bytes, timeout_s: float, qos: Qos = Qos.COMMAND) -> list[Reply]:
         replies: list[Reply] = []
 
         def on_reply(reply: zenoh.Reply) -> None:
@@ -217,7 +217,7 @@ class ZenohBus:
                 timeout=timeout_s + LATER_S,
                 target=zenoh.QueryTarget.ALL,
                 consolidation=zenoh.ConsolidationMode.NONE,
-                **QOS[Qos.COMMAND],
+                **QOS[qos],  # the answer has it, too
             )
 
         try:

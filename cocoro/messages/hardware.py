@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from cocoro.messages.common import Finite, FiniteNonNegative, FiniteVec2, LatchState, Message, require_finite
+from cocoro.messages.common import Count, Finite, FiniteNonNegative, FiniteVec2, LatchState, Message, require_finite
 
 STOPPED_BY: dict[LatchState, str] = {"released": "", "latched": "estop", "unknown": "latch unknown"}
 """The field `stopped_by` of a hardware's state, as far as the emergency stop determines it."""
@@ -29,6 +29,34 @@ class Frame(Message):
         for name, have, want in (("colour", self.colour.nbytes, 3 * pixels), ("depth", self.depth.nbytes, 2 * pixels)):
             if have != want:
                 raise ValueError(f"{name} has {have} bytes, {self.width} x {self.height} needs {want}")
+
+
+class PackedRequest(msgspec.Struct, kw_only=True):
+    """Asks for the newest frame that the reader does not have yet, packed for a network."""
+
+    after_incarnation: Count = 0
+    after_seq: Annotated[int, Meta(ge=-1)] = -1
+    """The number of the frame that the reader has; -1 for none."""
+    divisor: Annotated[int, Meta(ge=1, le=8)] = 1
+    """Of both sides."""
+    quality: Annotated[int, Meta(ge=10, le=95)] = 90
+    """Of the JPEG picture."""
+
+
+class PackedFrame(msgspec.Struct, kw_only=True):
+    """A frame packed for a network. Stamp and numbers are those of the frame; `services.frames.packing` unpacks it."""
+
+    stamp_ns: int
+    seq: Count
+    incarnation: Count
+    width: Annotated[int, Meta(ge=1, le=4096)]
+    height: Annotated[int, Meta(ge=1, le=4096)]
+    colour: bytes
+    """JPEG."""
+    depth: bytes
+    """The codes of a `Frame`, by zstd."""
+    held_s: FiniteNonNegative = 0.0
+    """How long the packer held the question: until there was a frame, and while it packed that."""
 
 
 class BaseState(Message):

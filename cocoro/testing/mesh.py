@@ -92,9 +92,9 @@ class NotedBus(LocalBus):
         self.serves.add(self._name(key))
         return super().serve(key, server)
 
-    async def call(self, keyexpr: str, payload: bytes, timeout_s: float) -> list[Reply]:
+    async def call(self, keyexpr: str, payload: bytes, timeout_s: float, qos: Qos = Qos.COMMAND) -> list[Reply]:
         self.calls.add(self._name(keyexpr))
-        return await super().call(keyexpr, payload, timeout_s)
+        return await super().call(keyexpr, payload, timeout_s, qos)
 
     def _name(self, key: str) -> str:
         return key.removeprefix(self._prefix)

@@ -43,7 +43,7 @@ TELL_S = 10.0
 SHOWN = 3
 """Refusals in health, the most frequent ones."""
 KINDS = 1000
-"""Different refusals that are counted apart."""
+"""Different refusals of one sender that are counted apart. Who tries more than that hides his own alone."""
 MEASURED = (FRAME, BASE_STATE, ARM_STATE, HAND_STATE)
 """What is fused by its time stamps."""
 MEASURES_MS, ELSE_MS = 5.0, 40.0
@@ -78,6 +78,8 @@ class Gateway:
         self._admitted: frozenset[str] = frozenset()
         self._odd: list[str] = []
         self._refused: Counter[Refusal] = Counter()
+        self._kinds: Counter[str] = Counter()
+        """How many different refusals of each sender there were."""
         self._untold: Counter[Refusal] = Counter()
         self._loop = asyncio.get_running_loop()
         self._timekeeping = Timekeeping(
@@ -211,9 +213,10 @@ class Gateway:
         for refusal, times in refused.items():
             if refusal.who in self._links:
                 refusal = refusal._replace(who=self._links[refusal.who].who)
-            if refusal not in self._refused and len(self._refused) >= KINDS:
+            if refusal not in self._refused and self._kinds[refusal.who] >= KINDS:
                 refusal = Refusal(refusal.who, "more of other kinds")
             if refusal not in self._refused:
+                self._kinds[refusal.who] += 1
                 log.warning("refused: %s", _said(refusal))
                 self._untold[refusal] -= 1
             self._untold[refusal] += times

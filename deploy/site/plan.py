@@ -35,12 +35,14 @@ from msgspec import Meta
 
 from cocoro.component import Component
 from cocoro.errors import ConfigError, choice_of, field_text
+from cocoro.topics import FRAME
 from deploy import profiles
 from deploy.processes import COMPONENTS, components, hardware, named
 from deploy.profiles import Name, Profile
 from deploy.site.component import GATEWAY, gateway_of
 from deploy.site.place import PLAN
 from deploy.site.roles import HostRole, PersonRole, Role
+from services.frames.component import PACKER, unpacker_of
 
 T = TypeVar("T", bound=msgspec.Struct)
 Endpoint = Annotated[str, Meta(pattern=r"\Atls/(\[[0-9a-fA-F:]+\]|[A-Za-z0-9.-]+):[0-9]{1,5}\Z")]
@@ -223,7 +225,8 @@ class Site:
         return tuple(endpoint for host in self.connects(name) for endpoint in self.hosts[host].listen)
 
     def share_profile(self, name: str, overrides: Iterable[str] = ()) -> Profile:
-        """The profile of a host's share: its robot's profile with this host's processes, and its gateway. Raises
+        """The profile of a host's share: its robot's profile with this host's processes, and those that join it
+        with the others. Raises
         ConfigError for a host that the site does not have, and as `profiles.read` does."""
         row = self.host(name)
         settings = {"site": str(self.folder), "host": name}
@@ -235,13 +238,27 @@ class Site:
         return msgspec.structs.replace(
             whole,
             robot=row.robot,
-            processes=(*row.processes, gateway_of(name).name),
+            processes=tuple(component.name for component in self.share(name)),
             service={**whole.service, GATEWAY.name: settings},
         )
 
     def share(self, name: str) -> tuple[Component, ...]:
-        """The components that run on a host, its gateway among them."""
-        return (*(named(process) for process in self.host(name).processes), gateway_of(name))
+        """The components that run on a host: those of the plan, its gateway, and what carries frames between hosts,
+        which themselves stay on theirs."""
+        row = self.host(name)
+        mine = tuple(named(process) for process in row.processes)
+        makes = any(FRAME in component.publishes for component in mine)
+        readers = [host for host, other in self.hosts.items() if other.robot == row.robot and self._takes_frames(host)]
+        persons = [person for person in self.persons if row.robot in self.robots_of(person)]
+        carriers = (PACKER,) if makes and (persons or set(readers) - {name}) else ()
+        if not makes and name in readers:
+            carriers = (unpacker_of(name),)
+        return (*mine, gateway_of(name), *carriers)
+
+    def _takes_frames(self, name: str) -> bool:
+        """Whether a process of a host reads or records frames."""
+        components = [named(process) for process in self.hosts[name].processes]
+        return any(FRAME in component.reads or component.records for component in components)
 
 
 def read(where: Path) -> Site:

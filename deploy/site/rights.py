@@ -14,7 +14,7 @@ from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 from cocoro.component import Component
-from cocoro.installed import all_requests
+from cocoro.installed import all_requests, all_topics
 from cocoro.keys import alive_key, matches, recorder_key
 from cocoro.topics import (
     ABOUT,
@@ -104,21 +104,22 @@ def of_host(robot: str, share: Iterable[Component], *, simulated: bool) -> Right
     for component in share:
         nodes = {component.name, *component.services}
         own: list[Topic[Any]] = [row.of(node) for node in nodes for row in (HEALTH, STEPS, EXCHANGES)]
-        puts |= {*component.all_publishes(), *own}
+        puts |= {*(row for row in component.all_publishes() if not row.local), *own}
         answers |= {row.key(robot) for row in component.all_serves()}
         answers |= {ABOUT.of(node).key(robot) for node in nodes}
-        hears |= {_any(row).key(robot) for row in component.reads}
+        hears |= {_any(row).key(robot) for row in component.reads if not row.local}
         asks |= {_any(row).key(robot) for row in component.calls}
         shows |= {alive_key(robot, node) for node in nodes}
         if component.records:
             records = True
             hears.add(f"{robot}/**")
             shows |= {recorder_key(robot, service) for service in component.services}
+    local = frozenset(row.key(robot) for row in all_topics() if row.local)
     made_here = any(TRUTH in component.all_publishes() for component in share)
     return Rights(
         puts=frozenset(row.key(robot) for row in puts),
         hears=frozenset(hears),
-        never_hears=frozenset() if made_here else frozenset({TRUTH.key(robot)}),
+        never_hears=local | (frozenset() if made_here else frozenset({TRUTH.key(robot)})),
         asks=frozenset(asks),
         answers=frozenset(answers | {row.key(robot) for row in puts if row.askable}),
         shows=frozenset(shows),
@@ -144,6 +145,7 @@ def of_person(robot: str, role: Role, name: str) -> Rights:
     return Rights(
         puts=own,
         hears=frozenset({f"{robot}/**"}),
+        never_hears=frozenset(row.key(robot) for row in all_topics() if row.local),
         asks=frozenset(asks) | own,
         answers=own,
         shows=frozenset(shows) | own,

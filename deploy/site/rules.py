@@ -110,6 +110,7 @@ def compiled(
         "low_pass_filter": _sizes(robot),
         "downsampling": _rates(site, host),
         "transport/link/rx/max_message_size": LARGEST_BYTES,
+        "qos/network": _events(robot),
     }
 
 
@@ -219,6 +220,21 @@ def _rates(site: Site, host: str) -> list[dict[str, Any]]:
         {"id": f"rate {kind}", "link_protocols": ["tls"], "flows": [IN], "messages": [kind], "rules": rules}
         for kind, rules in (("put", puts), ("query", asked))
         if rules
+    ]
+
+
+def _events(robot: str) -> list[dict[str, Any]]:
+    """An event waits for a receiver on this machine, but not for a link to another: zenoh's thread that has it would
+    wait, and commands behind it. What a link does not carry is missing there, and shows by its number."""
+    return [
+        {
+            "id": "events",
+            "link_protocols": ["tls"],
+            "flows": [OUT],
+            "messages": ["put"],
+            "key_exprs": sorted(_key(topic, robot) for topic in all_topics() if topic.qos is Qos.EVENT),
+            "overwrite": {"congestion_control": "drop"},
+        }
     ]
 
 
