@@ -23,7 +23,8 @@ LARGE_MB = 400.0
 """The tests of a file that need more are a job of their own, so that the rest fits beside more."""
 GUESSED_MB = (({"zenoh", "sim", "process"}, 500.0), ({"sim"}, 230.0))
 """Markers of tests, and what those need that have all of them. The first: the processes of a robot."""
-TWO_ROBOTS = "test_faults_two_robots.py"
+TWO_ROBOTS = ("test_faults_two_robots.py", "test_site_clocks.py", "test_site_hosts.py", "test_site_intruders.py")
+"""Files with two robots, or with one over several hosts."""
 TWO_ROBOTS_MB = 740.0
 URGENT = ("alone", "beside")
 """Kinds of tests (`tests/run_spread.py`) by which the whole run gets longer when they wait."""
@@ -54,7 +55,7 @@ def jobs_of(items: Iterable[pytest.Item], folder: Path | None) -> list[Job]:
 def _need_mb(item: pytest.Item, known: dict[str, float] | None) -> float:
     if known is not None and item.nodeid in known:
         return max(known[item.nodeid], LEAST_MB)
-    if item.path.name == TWO_ROBOTS and item.get_closest_marker("zenoh"):
+    if item.path.name in TWO_ROBOTS and item.get_closest_marker("zenoh"):
         return TWO_ROBOTS_MB
     marks = {mark.name for mark in item.iter_markers()}
     guesses = (

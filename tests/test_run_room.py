@@ -32,7 +32,7 @@ def orders(room: Room, *idle: tuple[int, str]) -> list[tuple[int, int]]:
 
 def test_without_a_record_a_file_needs_what_its_most_demanding_test_may_need(tmp_path: Path) -> None:
     items = [item("a.py::a"), item("a.py::b", "process"), item("b.py::c"), item("b.py::d", "sim")]
-    robot, robots = (item(f"{file}::e", "sim", "zenoh", "process") for file in ("c.py", TWO_ROBOTS))
+    robot, robots = (item(f"{file}::e", "sim", "zenoh", "process") for file in ("c.py", TWO_ROBOTS[0]))
     for folder in (None, tmp_path):
         jobs = jobs_of([*items, robot, robots], folder)
         assert [job.items for job in jobs] == [items[:2], items[2:], [robot], [robots]]
@@ -42,7 +42,7 @@ def test_without_a_record_a_file_needs_what_its_most_demanding_test_may_need(tmp
 
 
 def test_the_file_with_two_robots_is_there() -> None:
-    assert (Path(__file__).parent / TWO_ROBOTS).is_file()
+    assert all((Path(__file__).parent / name).is_file() for name in TWO_ROBOTS)
 
 
 def test_with_a_record_a_file_needs_what_its_most_demanding_test_needed(tmp_path: Path) -> None:

@@ -310,17 +310,18 @@ class Capture:
 
     def _read_ahead(self, places: list[MessageBlock]) -> Iterator[tuple[MessageBlock, Future[Raw]]]:
         """Read and unpack the next blocks in a thread while the caller works on the current one."""
-        with ThreadPoolExecutor(1, "capture reader") as pool:
-            ahead: deque[tuple[MessageBlock, Future[Raw]]] = deque()
-            try:
-                for place in places:
-                    ahead.append((place, pool.submit(read_block, self._disk, place, self._contents.strict)))
-                    if len(ahead) > AHEAD:
-                        yield ahead.popleft()
-                while ahead:
+        pool = ThreadPoolExecutor(1, "capture reader")
+        ahead: deque[tuple[MessageBlock, Future[Raw]]] = deque()
+        try:
+            for place in places:
+                ahead.append((place, pool.submit(read_block, self._disk, place, self._contents.strict)))
+                if len(ahead) > AHEAD:
                     yield ahead.popleft()
-            finally:
-                pool.shutdown(cancel_futures=True)
+            while ahead:
+                yield ahead.popleft()
+        finally:
+            # Without waiting: a reader that was left in the middle may be collected in the pool's own thread.
+            pool.shutdown(wait=False, cancel_futures=True)
 
     def _messages_in(self, place: MessageBlock, raw: Future[Raw], wanted: set[int]) -> Iterator[mcap.McapMessage]:
         try:
