@@ -62,7 +62,7 @@ def test_what_a_profile_needs_comes_from_who_publishes_and_who_reads_frames() ->
 
 
 def test_who_publishes_the_frames_says_so_in_the_process_table() -> None:
-    assert [row for row in COMPONENTS if FRAME_TOPIC.publisher in row.services] == [
+    assert [row for row in COMPONENTS if FRAME_TOPIC in row.publishes] == [
         row for row in COMPONENTS if row.frames == "publishes"
     ]
 

@@ -207,7 +207,8 @@ class Executive:
             elif timer.result():
                 outcome, reason = "failed", f"timed_out: the task took over {timeout_s:g} s"
             else:
-                outcome, reason = "failed", "clock: the clock began anew"
+                died = self._recovery.died if self._recovery is not None else ""
+                outcome, reason = "failed", died or "clock: the clock began anew"
             if not ended.done():
                 ended.set_result((outcome, reason))
         finally:

@@ -121,6 +121,12 @@ class Recovery:
         return "going on in a moment" if self._skills.paused else ""
 
     @property
+    def died(self) -> str:
+        """The reason of a task that a new clock ends after the death of a simulator; '' without a death."""
+        dead = sorted(self._lost & self._dead)
+        return f"not_alive: {dead[0]} died" if dead else ""
+
+    @property
     def _why(self) -> str:
         """What is known of the services that are not heard: the same of all, or of the first."""
         whys = list(self._unheard.values())
