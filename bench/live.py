@@ -84,6 +84,11 @@ class Fetched(NamedTuple):
         return (self.said.partition("\nrecorded in ")[0].strip().splitlines() or ["it said nothing"])[-1]
 
     @property
+    def well(self) -> bool:
+        """It said done, the can is held, and nothing else was touched."""
+        return self.code == 0 and self.truth.held and not self.truth.knocked_over and not self.truth.collisions
+
+    @property
     def task_s(self) -> float | None:
         """Time of the task by the robot's clock, as the command said it; None where it did not."""
         took = re.search(r" in ([0-9.]+) s", self.last_line)
@@ -125,8 +130,7 @@ def measure(chosen: argparse.Namespace, report: Report) -> None:
             runs.add(False, f"{number}: it did not start", [said_up])
             continue
         truth = fetched.truth
-        well = (fetched.code, down) == (0, 0) and not left
-        well = well and truth.held and not truth.knocked_over and not truth.collisions
+        well = fetched.well and down == 0 and not left
         line = f"{number}: up {up_s:.1f} s  {fetched.last_line}  down {down_s:.1f} s"
         runs.add(well, line, [said_up, fetched.said, said_down, f"left: {left}", str(truth)])
         took["start"].append(up_s)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import re
 import shutil
 import subprocess
 import sys
@@ -17,8 +16,9 @@ from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
 from contextlib import asynccontextmanager, contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
+from bench.live import Fetched
 from cocoro import topics
 from cocoro.bus.zenoh import ZenohBus
 from cocoro.clock import FollowedClock
@@ -28,7 +28,7 @@ from deploy.profiles import read as read_profile
 from deploy.rundir import RunDir
 from deploy.site import authority, place
 from deploy.site.roles import Role
-from sim.judge import HELD_S, Judge, Verdict
+from sim.judge import HELD_S, Judge
 from sim.network.network import Host, Network
 from sim.random_scene import find_scene
 
@@ -40,28 +40,6 @@ PORT = 7447
 COMMAND_S = 120.0
 BRAINS = ("perception", "planning", "executive")
 FRAMES: dict[str, Any] = {"width": 320, "height": 240, "frame_rate_hz": 15.0}
-
-
-class Fetched(NamedTuple):
-    code: int
-    said: str
-    seconds: float
-    """Of the command, by the machine's clock."""
-    truth: Verdict
-
-    @property
-    def last_line(self) -> str:
-        return (self.said.partition("\nrecorded in ")[0].strip().splitlines() or ["it said nothing"])[-1]
-
-    @property
-    def task_s(self) -> float | None:
-        took = re.search(r" in ([0-9.]+) s", self.last_line)
-        return float(took[1]) if took else None
-
-    @property
-    def well(self) -> bool:
-        """It said done, the can is held, and nothing else was touched."""
-        return self.code == 0 and self.truth.held and not self.truth.knocked_over and not self.truth.collisions
 
 
 def files_of(address: str, sim: Mapping[str, Any], processes: Sequence[str] = ("capture", "sim")) -> dict[str, str]:
