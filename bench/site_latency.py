@@ -2,7 +2,7 @@
 
 A wheel command from a Node on the brain's host to a Node on the robot's, by both hosts' gateways, with mutual TLS,
 access rules and all limits; beside it, in turns in the same processes, raw zenoh over TLS straight from one program to
-the other. The same for frames, the other way.
+the other. Frames go another way: `python -m bench site-frames`.
 """
 
 from __future__ import annotations
@@ -29,7 +29,6 @@ from deploy.site.component import gateway_of
 from sim.network.network import Host, obstacle
 
 RAW_PORT = 7448
-FRAME_HZ = 5.0
 COMMAND_HZ = 50.0
 PATIENCE_S = 60.0
 
@@ -73,7 +72,7 @@ def measure(chosen: argparse.Namespace, report: Report) -> None:
         raise ConfigError(f"there can be no network of hosts here: {why}")
     commands = sized(chosen, chosen.count, 1500, 200)
     seconds = commands / COMMAND_HZ
-    more = {"commands": commands, "frames": round(seconds * FRAME_HZ), "frame_hz": FRAME_HZ, "seconds": seconds}
+    more = {"commands": commands, "frames": 0, "frame_hz": 1.0, "seconds": seconds}
     took: dict[str, list[float]] = {}
     with tempfile.TemporaryDirectory(prefix="site") as name, lab(Path(name)) as site:
         site.network.links().set(delay_ms=chosen.delay_ms)
@@ -83,7 +82,7 @@ def measure(chosen: argparse.Namespace, report: Report) -> None:
             said, _ = end.communicate(timeout=PATIENCE_S + seconds)
             found = json.loads(said)
             took |= {name: [ns / 1e6 for ns in times] for name, times in found.items() if times}
-    for what, sent in (("command", commands), ("frame", more["frames"])):
+    for what, sent in (("command", commands),):
         node, raw = took.get(f"node {what}", []), took.get(f"raw {what}", [])
         if not node or not raw:
             raise ConfigError(f"no {what} came through: {', '.join(sorted(took)) or 'nothing at all'}")
