@@ -21,6 +21,7 @@ import msgspec
 
 from bench.report import Report
 from bench.site_lab import ROBOT, Lab, lab
+from bench.site_speaker import HZ
 from bench.trials import number_of, sized
 from cocoro.errors import ConfigError
 from deploy.rundir import RunDir
@@ -29,7 +30,6 @@ from deploy.site.component import gateway_of
 from sim.network.network import Host, obstacle
 
 RAW_PORT = 7448
-COMMAND_HZ = 50.0
 PATIENCE_S = 60.0
 
 
@@ -71,8 +71,8 @@ def measure(chosen: argparse.Namespace, report: Report) -> None:
     if why := obstacle():
         raise ConfigError(f"there can be no network of hosts here: {why}")
     commands = sized(chosen, chosen.count, 1500, 200)
-    seconds = commands / COMMAND_HZ
-    more = {"commands": commands, "frames": 0, "frame_hz": 1.0, "seconds": seconds}
+    seconds = commands / HZ
+    more = {"commands": commands, "seconds": seconds}
     took: dict[str, list[float]] = {}
     with tempfile.TemporaryDirectory(prefix="site") as name, lab(Path(name)) as site:
         site.network.links().set(delay_ms=chosen.delay_ms)
@@ -82,20 +82,16 @@ def measure(chosen: argparse.Namespace, report: Report) -> None:
             said, _ = end.communicate(timeout=PATIENCE_S + seconds)
             found = json.loads(said)
             took |= {name: [ns / 1e6 for ns in times] for name, times in found.items() if times}
-    for what, sent in (("command", commands),):
-        node, raw = took.get(f"node {what}", []), took.get(f"raw {what}", [])
-        if not node or not raw:
-            raise ConfigError(f"no {what} came through: {', '.join(sorted(took)) or 'nothing at all'}")
-        report.value(f"a {what} from host to host, Node to Node", node, "ms")
-        report.value(f"a {what} from host to host, raw zenoh over TLS", raw, "ms")
-        report.value(f"a {what}, Node to Node, 99 of 100", [high(node)], "ms")
-        report.value(f"a {what}, raw, 99 of 100", [high(raw)], "ms")
-        bound = 1.3 if what == "command" else None
-        report.ratio(
-            f"a {what}: Node / raw, median", *_blocks(node, raw, statistics.median), at_most=bound, better="less"
-        )
-        report.ratio(f"a {what}: Node / raw, 99 of 100", *_blocks(node, raw, high), at_most=bound, better="less")
-        report.share(f"{what}s that came, Node to Node", len(node), sent)
+    node, raw = took.get("node command", []), took.get("raw command", [])
+    if not node or not raw:
+        raise ConfigError(f"no command came through: {', '.join(sorted(took)) or 'nothing at all'}")
+    report.value("a command from host to host, Node to Node", node, "ms")
+    report.value("a command from host to host, raw zenoh over TLS", raw, "ms")
+    report.value("a command, Node to Node, 99 of 100", [high(node)], "ms")
+    report.value("a command, raw, 99 of 100", [high(raw)], "ms")
+    for kind, figure in (("median", statistics.median), ("99 of 100", high)):
+        report.ratio(f"a command: Node / raw, {kind}", *_blocks(node, raw, figure), at_most=1.3)
+    report.share("commands that came, Node to Node", len(node), commands)
 
 
 def _blocks(node: list[float], raw: list[float], kind: Any) -> tuple[list[float], list[float]]:

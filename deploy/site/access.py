@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import NamedTuple
@@ -16,11 +15,6 @@ from deploy.site.rights import Rights, rights
 
 PATIENCE_S = 3.0
 """Longest wait for the mesh over a network."""
-
-
-def chosen(given: str | None) -> str | None:
-    """The site that a command goes through: the given one (`NAME@DIR` or `DIR`), else $COCORO_SITE; None without."""
-    return given or os.environ.get(place.SITE) or None
 
 
 class Way(NamedTuple):
@@ -41,9 +35,8 @@ class Way(NamedTuple):
 
 
 def way(given: str, robot: str | None, command: str) -> Way:
-    """The way to one robot. `given` is `NAME@DIR` or `DIR`, `command` the name
-    in logs. Raises ConfigError for a site, a name or credentials that cannot be used, and where the robot must be
-    chosen."""
+    """The way to one robot. `given` is `NAME@DIR` or `DIR`, `command` the name in logs. Raises ConfigError for a site,
+    a name or credentials that cannot be used, and where the robot must be chosen."""
     found = ways(given, robot, command)
     if len(found) > 1:
         names = " or ".join(f"--robot {one.run_dir.robot}" for one in found)

@@ -162,18 +162,19 @@ class Gateway:
     async def _until_changed(self, marks: tuple[object, ...], refused: bool) -> None:
         """Returns when the site's files have changed and can be read, or the trust in this host's clock has changed; a
         bad file changes nothing."""
+        told = ""
         while self._timekeeping.refused == refused:
             await asyncio.sleep(LOOK_S)
             if refused:
                 self._report()
-            now = self._marks()
-            if now != marks:
-                marks = now
+            if self._marks() != marks:
                 try:
                     self._read()
-                except CocoroError as error:
+                except CocoroError as error:  # files that are only half copied are read again
                     self._node.degraded(f"the site has changed, but not for the better; the former stays: {error}")
-                    log.error("%s; the former rules stay", error)
+                    if str(error) != told:
+                        told = str(error)
+                        log.error("%s; the former rules stay", error)
                 else:
                     return
 

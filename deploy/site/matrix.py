@@ -8,14 +8,13 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
-from cocoro.bus.base import Qos
 from cocoro.installed import all_requests, all_topics
 from cocoro.keys import alive_key, matches, recorder_key
 from cocoro.node import QUESTION_BYTES
-from cocoro.topics import Request, Topic
+from cocoro.topics import Request
 from deploy.site.plan import Site
 from deploy.site.rights import Rights, rights
-from deploy.site.rules import ASKED_HZ, HEADROOM, UNTABLED_HZ
+from deploy.site.rules import ASKED_HZ, most_hz
 from services.executive.askers import asker_key
 
 TOPIC, REQUEST, TOKEN, OWN = "topic", "request", "token", "author's"
@@ -49,7 +48,7 @@ def matrix(site: Site, robot: str) -> list[Row]:
     names = [name for name in names if not site.is_hub(name)]
     services = [service for name in hosts for service in _nodes(site, name)]
     rows = [
-        Row(row.name, TOPIC, _may(may, row.key(robot), TOPIC), row.max_bytes, _rate(row))
+        Row(row.name, TOPIC, _may(may, row.key(robot), TOPIC), row.max_bytes, most_hz(row))
         for topic in all_topics()
         for row in _each(topic, services)
     ]
@@ -89,12 +88,6 @@ def _may(may: dict[str, Rights], key: str, kind: str) -> dict[str, tuple[str, ..
             verbs.remove("hears")
         found[name] = tuple(verbs)
     return found
-
-
-def _rate(row: Topic[Any] | Request[Any, Any]) -> float | None:
-    if not isinstance(row, Topic) or row.qos is Qos.EVENT:
-        return None
-    return row.rate_hz * HEADROOM if row.rate_hz else UNTABLED_HZ
 
 
 def _asked(request: Request[Any, Any]) -> float | None:

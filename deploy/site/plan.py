@@ -225,9 +225,8 @@ class Site:
         return tuple(endpoint for host in self.connects(name) for endpoint in self.hosts[host].listen)
 
     def share_profile(self, name: str, overrides: Iterable[str] = ()) -> Profile:
-        """The profile of a host's share: its robot's profile with this host's processes, and those that join it
-        with the others. Raises
-        ConfigError for a host that the site does not have, and as `profiles.read` does."""
+        """The profile of a host's share: its robot's profile with this host's processes, and those that join it with
+        the others. Raises ConfigError for a host that the site does not have, and as `profiles.read` does."""
         row = self.host(name)
         settings = {"site": str(self.folder), "host": name}
         if self.is_hub(name):

@@ -196,6 +196,13 @@ def _sizes(robot: str) -> list[dict[str, Any]]:
     ]
 
 
+def most_hz(topic: Topic[Any]) -> float | None:
+    """How often a link may bring a topic's messages; None for events, which are not limited."""
+    if topic.qos is Qos.EVENT:
+        return None
+    return topic.rate_hz * HEADROOM if topic.rate_hz else UNTABLED_HZ
+
+
 def _rates(site: Site, host: str) -> list[dict[str, Any]]:
     """Limits of rates: a message that follows the last one of its key on the same link too soon is dropped where it
     arrives. A request with a wildcard counts as one of those that it reaches: a rule with a wildcard would count the
@@ -209,9 +216,9 @@ def _rates(site: Site, host: str) -> list[dict[str, Any]]:
     )
     puts, asked = [], []
     for topic in all_topics():
-        freq = topic.rate_hz * HEADROOM if topic.rate_hz else UNTABLED_HZ
+        freq = most_hz(topic)
         each = [topic.of(service) for service in services] if topic.per_service else [topic]
-        puts += [{"key_expr": row.key(robot), "freq": freq} for row in each if row.qos is not Qos.EVENT]
+        puts += [{"key_expr": row.key(robot), "freq": freq} for row in each if freq is not None]
     if site.host(host).listen and not hub:
         for request in (row for row in all_requests() if row.right != "stop"):
             alike = [request.of(service) for service in services] if request.per_service else [request]
