@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import shutil
 import signal
 import time
 from collections.abc import Callable, Iterator
@@ -15,7 +16,7 @@ import pytest
 from apps.cli import exits
 from bench.site_lab import BODY, BRAIN, DESK, ROBOT, Lab, lab
 from deploy.rundir import RunDir
-from deploy.site import authority
+from deploy.site import authority, place
 from sim.network.network import Host, obstacle
 
 pytestmark = [pytest.mark.process, pytest.mark.zenoh, pytest.mark.skipif(bool(obstacle()), reason=obstacle() or "-")]
@@ -96,7 +97,10 @@ def test_a_certificate_is_renewed_while_the_robot_runs(site: Lab) -> None:
     until(lambda: whole(site), "the hosts are linked")
     before = pids(site.body), pids(site.brain)
     authority.renew(site.plan, BRAIN, datetime.now(UTC))
-    site.deliver(site.brain, (BRAIN,))
+    fresh, there = (folder / place.CREDENTIALS / BRAIN for folder in (site.plan, site.site_of(site.brain)))
+    shutil.copy(fresh / place.CERT, there)
+    until(lambda: "the former rules stay" in site.log(site.brain, f"gateway-{BRAIN}"), "a key is missing still")
+    shutil.copy(fresh / place.KEY, there)
     until(lambda: "linked with brain.2" in site.log(site.body, f"gateway-{BODY}"), "the new generation is admitted")
     site.deliver(site.body, (BODY,))
     site.deliver(site.desk, ())
