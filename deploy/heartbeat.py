@@ -21,23 +21,32 @@ LATE_S = 2.0
 """A look that is later than this counts for nothing: the supervisor itself was asleep, and perhaps all others, too."""
 HANGS_S = 10.0
 """A process whose event loop has not run for so long, though it could, hangs."""
+STOPPED_S = 2.5
+"""The same for a process that a signal has stopped: it does not go on by itself, so there is nothing to wait for."""
 GRACE = "COCORO_DEBUG_GRACE_S"
-"""Environment variable of the supervisor that replaces `HANGS_S`, for debuggers; 0: nobody is killed for hanging."""
+"""Environment variable of the supervisor that replaces both times, for debuggers; 0: nobody is killed for hanging."""
 _BYTES = 8
 
 
-def grace_s() -> float:
-    """The time after which a process hangs, s; 0 for never. Raises ConfigError for a variable that is no time."""
+class Grace(NamedTuple):
+    """Times after which a process hangs, s; 0 for never."""
+
+    hangs_s: float = HANGS_S
+    stopped_s: float = STOPPED_S
+
+
+def grace() -> Grace:
+    """The times that hold here. Raises ConfigError for a variable that is no time."""
     text = os.environ.get(GRACE, "").strip()
     if not text:
-        return HANGS_S
+        return Grace()
     try:
         seconds = float(text)
     except ValueError:
         seconds = -1.0
     if not 0 <= seconds < float("inf"):
         raise ConfigError(f"{GRACE} is {text!r}: a number of seconds is expected, 0 for no limit")
-    return seconds
+    return Grace(seconds, seconds)
 
 
 async def beat(fd: int) -> None:
@@ -85,6 +94,11 @@ class Pulse:
 
     def close(self) -> None:
         os.close(self.fd)
+
+    def hangs(self, grace: Grace) -> bool:
+        """Whether the event loop has stood still for longer than the grace."""
+        stopped = self._before is not None and self._before.state == "T"
+        return self.still_s >= (grace.stopped_s if stopped else grace.hangs_s)
 
     def feel(self, pid: int, passed_s: float) -> None:
         """Look at the counter. `passed_s` is the time since the last look."""

@@ -15,7 +15,7 @@ from cocoro import child
 from cocoro.component import Component
 from cocoro.errors import ConfigError
 from deploy.contact import RECOVERY_S, SleepDetector
-from deploy.heartbeat import Pulse
+from deploy.heartbeat import Grace, Pulse
 from deploy.launch import CRASHED, MISCONFIGURED, REFUSED
 from deploy.processes import BACKOFF_LIMIT_S, SETTLED_S
 from deploy.rundir import RunDir
@@ -149,13 +149,13 @@ class SupervisedProcess:
             self._ready.clear()
         self._report_contact(ready)
 
-    def feel_pulse(self, passed_s: float, grace_s: float) -> None:
-        """Kill the process when its event loop has not run for `grace_s`, though it could; `keep` then restarts it. A
+    def feel_pulse(self, passed_s: float, grace: Grace) -> None:
+        """Kill the process when its event loop has not run for the grace, though it could; `keep` then restarts it. A
         process that is not ready yet has its time for that. `passed_s` is the time since the last call."""
         if self._pulse is None or self.pid is None or not self._was_ready or self._stopping:
             return
         self._pulse.feel(self.pid, passed_s)
-        if self._pulse.still_s >= grace_s:
+        if self._pulse.hangs(grace):
             self._report(f"{self.row.name} hangs: its event loop has not run for {self._pulse.still_s:.0f} s; killed")
             self._signal(signal.SIGKILL)
 

@@ -70,7 +70,7 @@ class Supervisor:
         self._unshared = ""
         """Why not all frames fit into shared memory, as found before the processes were started."""
         self._sleep_detector = SleepDetector(self._report)
-        self._grace_s = heartbeat.grace_s()
+        self._grace = heartbeat.grace()
 
     async def run(self) -> int:
         """Start everything, wait for SIGINT or SIGTERM, stop everything. Returns the exit code.
@@ -157,7 +157,7 @@ class Supervisor:
         async with asyncio.TaskGroup() as group:
             keeping = [group.create_task(child.keep()) for child in self._children]
             keeping.append(group.create_task(service_manager.keep_watchdog(self._works)))
-            if self._grace_s:
+            if self._grace.hangs_s:
                 keeping.append(group.create_task(self._feel_pulses()))
             await self._stop.wait()
             for task in keeping:
@@ -171,7 +171,7 @@ class Supervisor:
             await asyncio.sleep(heartbeat.LOOK_S)
             now_s = time.monotonic()
             for child in self._children:
-                child.feel_pulse(now_s - before_s, self._grace_s)
+                child.feel_pulse(now_s - before_s, self._grace)
             before_s = now_s
 
     def _works(self) -> bool:

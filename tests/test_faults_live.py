@@ -55,8 +55,10 @@ async def stands_in_time(robot: LiveRobot, fault_s: float, for_s: float = 0.9) -
 
 @pytest.mark.parametrize("service", ["planning", "perception", "executive"])
 def test_who_is_stopped_or_killed_while_driving_leaves_a_robot_that_stands(
-    service: str, tmp_path: Path, far: Path
+    service: str, tmp_path: Path, far: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setenv(GRACE, "60")  # so that who is stopped is not killed before it goes on
+
     async def scenario() -> None:
         async with live(tmp_path, scene=far) as robot:
             task_id = await robot.driving()
@@ -198,7 +200,11 @@ def test_a_simulator_that_is_killed_comes_back_and_all_others_work_with_it_as_be
     asyncio.run(scenario())
 
 
-def test_a_simulator_that_is_stopped_stops_time_and_when_it_goes_on_so_does_the_task(tmp_path: Path) -> None:
+def test_a_simulator_that_is_stopped_stops_time_and_when_it_goes_on_so_does_the_task(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(GRACE, "60")
+
     async def scenario() -> None:
         async with live(tmp_path) as robot:
             task_id = await robot.driving()

@@ -12,7 +12,7 @@ from operator_shell import Shell
 
 from cocoro.errors import ConfigError
 from deploy import heartbeat
-from deploy.heartbeat import GRACE, HANGS_S, LATE_S, Pulse, Use, grace_s, use_of
+from deploy.heartbeat import GRACE, HANGS_S, LATE_S, STOPPED_S, Grace, Pulse, Use, grace, use_of
 
 
 class Process:
@@ -76,6 +76,21 @@ def test_who_is_under_a_debugger_does_not_hang_and_has_the_whole_time_afterwards
     assert process.passes(3, state="T") == 3.0
 
 
+def test_a_stopped_process_has_a_shorter_grace_than_one_that_may_go_on_by_itself(process: Process) -> None:
+    process.passes(3, state="T")
+    assert process.pulse.hangs(Grace())
+    process.beat()
+    process.passes(3, state="S")
+    assert not process.pulse.hangs(Grace())
+    process.passes(7, state="S")
+    assert process.pulse.hangs(Grace())
+
+
+def test_the_grace_for_debuggers_holds_for_a_stopped_process_too(process: Process) -> None:
+    process.passes(60, state="T")
+    assert not process.pulse.hangs(Grace(600.0, 600.0))
+
+
 def test_where_there_is_no_proc_all_time_counts(process: Process) -> None:
     process.use = None
     assert process.passes(4) == 4.0
@@ -101,14 +116,14 @@ def test_the_own_process_is_read_from_proc() -> None:
 
 def test_the_grace_is_a_number_of_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv(GRACE, raising=False)
-    assert grace_s() == HANGS_S
-    for text, seconds in (("600", 600.0), ("0", 0.0), ("", HANGS_S)):
+    assert grace() == Grace(HANGS_S, STOPPED_S)
+    for text, times in (("600", Grace(600.0, 600.0)), ("0", Grace(0.0, 0.0)), ("", Grace())):
         monkeypatch.setenv(GRACE, text)
-        assert grace_s() == seconds
+        assert grace() == times
     for text in ("long", "-1", "inf", "nan"):
         monkeypatch.setenv(GRACE, text)
         with pytest.raises(ConfigError, match=GRACE):
-            grace_s()
+            grace()
 
 
 @pytest.mark.process
